@@ -1,0 +1,1 @@
+//! The native backend: rayon over tiles and rows, SIMD with run-time dispatch.

@@ -1,0 +1,154 @@
+//! What a renderer-and-optimiser does for the trainer, whatever it runs on.
+//!
+//! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
+//! Signals come down when a policy is due, row operations go up; parameters stay where they are.
+
+pub mod cpu;
+
+use densify_policies::plan::RowOps;
+use densify_policies::policy::{Candidate, Needs, Signals};
+
+use crate::camera::Camera;
+use crate::dataset::images::Image8;
+use crate::gaussians::Gaussians;
+use crate::memory::Ledger;
+
+/// Step sizes of one iteration, one per parameter class.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LearningRates {
+    /// Means [scene units per step].
+    pub mean: f32,
+    /// Log-scales [ln scene units per step].
+    pub log_scale: f32,
+    /// Quaternions.
+    pub quat: f32,
+    /// Opacity logits.
+    pub opacity: f32,
+    /// Spherical-harmonic coefficients of band 0.
+    pub sh_dc: f32,
+    /// Spherical-harmonic coefficients of bands 1–3.
+    pub sh_rest: f32,
+}
+
+/// One training step: what to render, what it should look like, how far to go.
+#[derive(Debug, Clone, Copy)]
+pub struct StepInput<'a> {
+    /// Iteration, 1-based.
+    pub step: u32,
+    /// The view's camera.
+    pub camera: &'a Camera,
+    /// The view's image, of the camera's size.
+    pub target: &'a Image8,
+    /// Background colour, sRGB-encoded in [0, 1]; a target with alpha is composited on it too.
+    pub background: [f32; 3],
+    /// Spherical-harmonic degree evaluated and trained now, <= the model's.
+    pub sh_degree: u8,
+    /// Step sizes.
+    pub rates: LearningRates,
+}
+
+/// The scalars of one training step.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct StepOutput {
+    /// 0.8·L1 + 0.2·(1 − SSIM).
+    pub loss: f32,
+    /// Mean over pixels and channels of |I − G|.
+    pub l1: f32,
+    /// Mean structural similarity.
+    pub ssim: f32,
+    /// Rows whose projection is on screen.
+    pub visible: usize,
+    /// (row, tile) pairs rendered.
+    pub entries: u64,
+    /// Passes in which the tile lists were processed; 1 unless the cap made it more.
+    pub bands: u32,
+}
+
+/// A rendered view.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rendering {
+    /// Width [px].
+    pub width: u32,
+    /// Height [px].
+    pub height: u32,
+    /// Background included, not clamped. Shape: [height, width, 3].
+    pub rgb: Vec<f32>,
+    /// 1 − final transmittance, in [0, 1]. Shape: [height, width].
+    pub alpha: Vec<f32>,
+    /// Σ α·T·z, camera z [scene units], without a background term. Shape: [height, width].
+    pub depth: Vec<f32>,
+}
+
+/// Why a backend cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum BackendError {
+    /// Memory for the promised buffers could not be had.
+    #[error("cannot allocate {bytes} bytes for {what}; lower --budget, --sh-degree or --tile-cap")]
+    OutOfMemory {
+        /// The buffer.
+        what: &'static str,
+        /// Its size.
+        bytes: u64,
+    },
+    /// The image is larger than the backend supports.
+    #[error("an image of {width}x{height} px is too large: sides of at most {max} px; use --resolution to shrink it")]
+    ImageTooLarge {
+        /// Its width [px].
+        width: u32,
+        /// Its height [px].
+        height: u32,
+        /// The largest side supported [px].
+        max: u32,
+    },
+}
+
+/// A differentiable rasteriser with its optimiser and the model's only copy.
+pub trait Backend: Send {
+    /// Rows now.
+    fn rows(&self) -> usize;
+
+    /// Most rows there may ever be; all buffers have this size from the start.
+    fn budget(&self) -> usize;
+
+    /// Bytes per buffer, as promised and at their peak.
+    fn ledger(&self) -> &Ledger;
+
+    /// Says that a new epoch begins (`WeightMax` is kept by epoch).
+    fn begin_epoch(&mut self);
+
+    /// One forward pass, backward pass and optimiser step; accumulates signals.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError>;
+
+    /// Copies the signals named in `needs` and the candidates collected so far to the host.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError>;
+
+    /// Executes a plan of iteration `step`: parameters, moments and age in place.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When `ops` was made for another number of rows or another budget: that is a bug in the
+    /// caller, and going on would exceed the budget or corrupt the model.
+    fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError>;
+
+    /// Renders a view.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn render(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<Rendering, BackendError>;
+
+    /// Copies the model to the host.
+    fn download(&self) -> Gaussians;
+}

@@ -1,0 +1,62 @@
+//! A pinhole camera. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
+
+use glam::{DMat3, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// A pinhole camera with its pose.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// Image width [px], >= 1.
+    pub width: u32,
+    /// Image height [px], >= 1.
+    pub height: u32,
+    /// Focal length along x [px], > 0.
+    pub fx: f64,
+    /// Focal length along y [px], > 0.
+    pub fy: f64,
+    /// Principal point's x [px]; the image's left edge is 0.
+    pub cx: f64,
+    /// Principal point's y [px]; the image's upper edge is 0.
+    pub cy: f64,
+    /// Rotation part of camera_from_world, orthonormal, determinant +1.
+    pub rotation: DMat3,
+    /// Translation part of camera_from_world [scene units].
+    pub translation: DVec3,
+}
+
+impl Camera {
+    /// The camera's centre in world coordinates, −Rᵀt.
+    #[must_use]
+    pub fn centre(&self) -> DVec3 {
+        -(self.rotation.transpose() * self.translation)
+    }
+
+    /// The direction the camera looks into, in world coordinates, unit length.
+    #[must_use]
+    pub fn forward(&self) -> DVec3 {
+        self.rotation.row(2)
+    }
+
+    /// World point to pixel and depth (camera z). The pixel is meaningless where depth <= 0.
+    #[must_use]
+    pub fn project(&self, world: DVec3) -> (DVec2, f64) {
+        let p = self.rotation * world + self.translation;
+        (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
+    }
+
+    /// The same camera with an image of another size: intrinsics scale per axis.
+    #[must_use]
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let sx = f64::from(width) / f64::from(self.width);
+        let sy = f64::from(height) / f64::from(self.height);
+        Self {
+            width,
+            height,
+            fx: self.fx * sx,
+            fy: self.fy * sy,
+            cx: self.cx * sx,
+            cy: self.cy * sy,
+            ..*self
+        }
+    }
+}

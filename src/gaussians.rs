@@ -1,0 +1,52 @@
+//! Gaussians on the host: the parametrisation, stated once.
+//!
+//! A row is one Gaussian: mean, log of the standard deviation per axis, orientation as a
+//! quaternion (w, x, y, z; need not be normalised), opacity as a logit, and spherical-harmonic
+//! coefficients of its colour: colour = max(0, ½ + Σ Y_k(direction)·sh_k).
+
+/// Number of spherical-harmonic coefficients per channel at `degree`: (degree + 1)².
+#[must_use]
+pub const fn sh_coefficients(degree: u8) -> usize {
+    (degree as usize + 1) * (degree as usize + 1)
+}
+
+/// Highest spherical-harmonic degree.
+pub const MAX_SH_DEGREE: u8 = 3;
+
+/// A model: structure of arrays, one entry per row in each.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Gaussians {
+    /// Spherical-harmonic degree, 0..=3; decides the length of `sh`.
+    pub sh_degree: u8,
+    /// Means [scene units]. Shape: [rows].
+    pub means: Vec<[f32; 3]>,
+    /// Natural logarithm of the standard deviations [ln scene units]. Shape: [rows].
+    pub log_scales: Vec<[f32; 3]>,
+    /// Orientations (w, x, y, z). Shape: [rows].
+    pub quats: Vec<[f32; 4]>,
+    /// Opacity logits; opacity = 1 / (1 + exp(−logit)). Shape: [rows].
+    pub opacity_logits: Vec<f32>,
+    /// Coefficient-major, RGB last. Shape: [rows, (degree + 1)², 3].
+    pub sh: Vec<f32>,
+}
+
+impl Gaussians {
+    /// Number of rows.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    /// Whether there is no row.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+
+    /// The coefficients of one row. Shape: [(degree + 1)², 3].
+    #[must_use]
+    pub fn sh_of(&self, row: usize) -> &[f32] {
+        let n = 3 * sh_coefficients(self.sh_degree);
+        &self.sh[row * n..(row + 1) * n]
+    }
+}
