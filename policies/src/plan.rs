@@ -184,3 +184,7 @@ pub struct EditCounts {
     /// Edits refused: the policy wanted more.
     pub denied: usize,
 }
+
+/// The edits of one event.
+#[derive(Debug)]
+pub struct EditPlan {}
