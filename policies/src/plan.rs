@@ -188,3 +188,4 @@ pub struct EditCounts {
 /// The edits of one event.
 #[derive(Debug)]
 pub struct EditPlan {}
+impl RowOps { pub fn check(&self) -> Result<(), String> { Ok(()) } }
