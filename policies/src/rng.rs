@@ -28,7 +28,10 @@ impl PolicyRng {
     #[must_use]
     pub fn new(seed: u64, step: u32) -> Self {
         // Folding keeps both halves of a 64-bit seed significant.
-        Self { seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32, step }
+        Self {
+            seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32,
+            step,
+        }
     }
 
     /// Four independent 32-bit words for (row, purpose, counter).
