@@ -4,3 +4,4 @@ mod ops;
 pub mod plan;
 pub mod policy;
 pub mod rng;
+pub mod sample;
