@@ -21,6 +21,7 @@ mod simd;
 mod tiles;
 
 use std::ops::Range;
+use std::time::{Duration, Instant};
 
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode, Needs, Signals};
@@ -128,6 +129,28 @@ pub struct CpuBackend {
     records: Vec<f32>,
     /// One record per row. Shape: [budget, stride of the signals' detail].
     sums: Vec<f32>,
+    clock: StageClock,
+}
+
+/// Wall time of the stages of the last step.
+#[derive(Debug, Default)]
+struct StageClock {
+    laps: Vec<(&'static str, Duration)>,
+    last: Option<Instant>,
+}
+
+impl StageClock {
+    fn start(&mut self) {
+        self.laps.clear();
+        self.last = Some(Instant::now());
+    }
+
+    fn lap(&mut self, stage: &'static str) {
+        let now = Instant::now();
+        if let Some(last) = self.last.replace(now) {
+            self.laps.push((stage, now - last));
+        }
+    }
 }
 
 /// One view between its forward and its backward pass.
@@ -187,7 +210,15 @@ impl CpuBackend {
             loss: LossBuffers::new(),
             records: vec![0.0; cap * stride],
             sums: vec![0.0; blocks * WIDTH * stride],
+            clock: StageClock::default(),
         })
+    }
+
+    /// Wall time of each stage of the last training step, in order. Bands add up under one name
+    /// only as far as they follow one another.
+    #[must_use]
+    pub fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.clock.laps
     }
 
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
@@ -297,10 +328,12 @@ impl CpuBackend {
         background: [f32; 3],
         error_weights: Option<[f32; 2]>,
     ) -> LossValue {
-        let Self { pool, loss, arch, canvas, gradient, .. } = self;
-        pool.install(|| {
+        let Self { pool, loss, arch, canvas, gradient, clock, .. } = self;
+        let value = pool.install(|| {
             loss.run(*arch, grid, canvas, target, background, gradient, error_weights)
-        })
+        });
+        clock.lap("loss");
+        value
     }
 
     /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band only, the
@@ -322,7 +355,8 @@ impl CpuBackend {
         let grid = Grid::new(camera.width, camera.height);
         self.resize_images(&grid);
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
-        let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, .. } = self;
+        let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, clock, .. } = self;
+        clock.start();
         let (rows, arch) = (*rows, *arch);
         let stride = params.stride();
         pool.install(|| {
@@ -353,10 +387,13 @@ impl CpuBackend {
                 lists.order.copy_within(first..first + count, visible);
                 visible += count;
             }
+            clock.lap("project");
             lists.sort(visible);
+            clock.lap("sort");
             let (bands, entries) = lists.bands(splats, &grid);
             for band in &bands {
                 lists.fill(splats, &grid, band.clone(), bands.len() == 1);
+                clock.lap("tiles");
                 canvas[band.clone()].par_iter_mut().enumerate().for_each(|(i, canvas)| {
                     arch.dispatch(Rasterize {
                         splats,
@@ -367,6 +404,7 @@ impl CpuBackend {
                         canvas,
                     });
                 });
+                clock.lap("rasterize");
             }
             Ok(Frame { view, grid, background, bands, entries, visible })
         })
@@ -375,7 +413,8 @@ impl CpuBackend {
     /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
     fn backward(&mut self, frame: &Frame, detail: Detail) {
         let Frame { grid, background, bands, .. } = frame;
-        let Self { pool, arch, lists, splats, records, sums, visible, canvas, gradient, .. } = self;
+        let Self { pool, arch, lists, splats, records, sums, visible, canvas, gradient, clock, .. } =
+            self;
         let stride = detail.stride();
         pool.install(|| {
             for band in bands {
@@ -405,6 +444,7 @@ impl CpuBackend {
                         records,
                     });
                 });
+                clock.lap("rasterize_bwd");
                 let first = band.start == 0;
                 let records = &records[..];
                 sums.par_chunks_mut(stride * WIDTH).zip(&visible[..]).enumerate().for_each(
@@ -420,6 +460,7 @@ impl CpuBackend {
                         }
                     },
                 );
+                clock.lap("gather");
             }
         });
     }
@@ -591,6 +632,7 @@ impl Backend for CpuBackend {
         let detail = self.signals.detail();
         self.backward(&frame, detail);
         self.optimise(&frame, input, detail);
+        self.clock.lap("project_bwd + adam");
         Ok(StepOutput {
             visible: frame.visible,
             entries: frame.entries,
