@@ -1,6 +1,6 @@
 //! Time per training step and stage on random scenes, on one thread and on two.
 //!
-//! `cargo bench --bench stages [-- --quick]`. Figures are medians of processor time, so that a
+//! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are medians of processor time, so that a
 //! loaded machine distorts them little; the stage columns are wall time of one thread.
 
 use std::time::{Duration, Instant};
@@ -20,14 +20,21 @@ use rand_chacha::ChaCha8Rng;
 fn scene(rows: usize, sh_degree: u8) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
-    let size = 0.030 * (10_000.0 / rows as f32).powf(0.4);
-    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
+    let size = 0.024 * (10_000.0 / rows as f32).powf(0.4);
+    let mut model = Gaussians {
+        sh_degree,
+        ..Gaussians::default()
+    };
     for _ in 0..rows {
         model.means.push([0, 1, 2].map(|_| uniform(-1.0, 1.0)));
-        model.log_scales.push([0, 1, 2].map(|_| (size * uniform(0.3, 1.5)).ln()));
+        model
+            .log_scales
+            .push([0, 1, 2].map(|_| (size * uniform(0.3, 1.5)).ln()));
         model.quats.push([0, 1, 2, 3].map(|_| uniform(-1.0, 1.0)));
         model.opacity_logits.push(uniform(-2.0, 2.5));
-        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| uniform(-0.3, 0.5)));
+        model
+            .sh
+            .extend((0..3 * sh_coefficients(sh_degree)).map(|_| uniform(-0.3, 0.5)));
     }
     model
 }
@@ -49,7 +56,13 @@ fn camera(size: u32) -> Camera {
 fn target(size: u32) -> Image8 {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let rgb = (0..3 * size * size).map(|_| rng.random::<u8>()).collect();
-    Image8 { width: size, height: size, rgb, alpha: None, mask: None }
+    Image8 {
+        width: size,
+        height: size,
+        rgb,
+        alpha: None,
+        mask: None,
+    }
 }
 
 fn median(mut times: Vec<Duration>) -> f64 {
@@ -58,7 +71,10 @@ fn median(mut times: Vec<Duration>) -> f64 {
 }
 
 fn main() {
-    let quick = std::env::args().any(|a| a == "--quick");
+    let only: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|a| a.contains('@'))
+        .collect();
     let rates = LearningRates {
         mean: 1e-6,
         log_scale: 1e-6,
@@ -68,10 +84,15 @@ fn main() {
         sh_rest: 1e-6,
     };
     println!("   rows  image   entries threads  CPU ms  wall ms  stages [ms]");
-    for (rows, size) in
-        [(10_000, 256), (10_000, 512), (50_000, 256), (50_000, 512), (200_000, 800), (1_000_000, 1024)]
-    {
-        if quick && rows > 50_000 {
+    for (rows, size) in [
+        (10_000, 256),
+        (10_000, 512),
+        (50_000, 256),
+        (50_000, 512),
+        (200_000, 800),
+        (1_000_000, 1024),
+    ] {
+        if !only.is_empty() && !only.contains(&format!("{rows}@{size}")) {
             continue;
         }
         for threads in [1, 2] {
