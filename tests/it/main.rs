@@ -10,3 +10,4 @@ mod oracle;
 mod reference;
 mod scenes;
 mod source_text;
+mod subject;

@@ -2,5 +2,6 @@
 //!
 //! The data is not part of the project; where it is absent these tests say so and pass.
 
+mod backend;
 pub(crate) mod case;
 mod reference;
