@@ -4,4 +4,5 @@ pub mod camera;
 pub mod dataset;
 pub mod gaussians;
 pub mod memory;
+pub mod metrics;
 pub mod sh;
