@@ -94,9 +94,7 @@ impl EditPlan {
     #[must_use]
     pub fn room(&self) -> usize {
         // Slots are u32 on every backend, whatever the budget says.
-        self.budget
-            .min(u32::MAX as usize)
-            .saturating_sub(self.rows() - self.pruned + self.born)
+        self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.born)
     }
 
     /// Edits refused so far.
@@ -196,30 +194,19 @@ impl EditPlan {
         let is_pruned = |&slot: &usize| self.fates[slot] == Fate::Pruned;
         // Every slot in `0..rows_after` that holds no live row: the first `born` of them are for
         // the newborn, the rest (only where the model shrinks) for rows of the tail.
-        let mut holes = (0..rows_before)
-            .filter(is_pruned)
-            .chain(rows_before..)
-            .map(|s| s as u32);
+        let mut holes = (0..rows_before).filter(is_pruned).chain(rows_before..).map(|s| s as u32);
 
         let born_in_families = self.born - self.seeds.len();
         let child_slots: Vec<u32> = holes.by_ref().take(born_in_families).collect();
         let mut first_child = 0;
         let families = self.families.iter().map(|&(parent, offspring)| {
-            let family = Family {
-                parent,
-                first_child,
-                offspring,
-            };
+            let family = Family { parent, first_child, offspring };
             first_child += offspring.children;
             family
         });
         let families: Vec<Family> = families.collect();
         // Seeds lead the zip: it must not draw a hole when there is no seed left to fill it.
-        let seeds = self
-            .seeds
-            .iter()
-            .zip(holes.by_ref())
-            .map(|(&seed, slot)| (slot, seed));
+        let seeds = self.seeds.iter().zip(holes.by_ref()).map(|(&seed, slot)| (slot, seed));
         let seeds: Vec<(u32, Seed)> = seeds.collect();
         let live_tail = (rows_after..rows_before).filter(|slot| !is_pruned(slot));
         let moves: Vec<(u32, u32)> = live_tail.map(|s| s as u32).zip(holes).collect();
@@ -290,17 +277,9 @@ mod tests {
         }
     }
 
-    const SEED: Seed = Seed {
-        position: [0.0; 3],
-        colour: [0.5; 3],
-        scale: 1.0,
-        opacity: 0.1,
-    };
-    const UPDATE: Update = Update {
-        opacity: OpacityRule::Same,
-        scale: ScaleRule::Uniform(1.0),
-        keep_moments: true,
-    };
+    const SEED: Seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 1.0, opacity: 0.1 };
+    const UPDATE: Update =
+        Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(1.0), keep_moments: true };
 
     #[test]
     fn a_row_has_one_fate() {
@@ -311,27 +290,16 @@ mod tests {
         for row in 0..3 {
             assert!(!plan.is_free(row));
             assert_eq!(plan.prune(row), Err(Refused::Taken));
-            assert_eq!(
-                plan.grow(row, family(1, ParentFate::Stays)),
-                Err(Refused::Taken)
-            );
+            assert_eq!(plan.grow(row, family(1, ParentFate::Stays)), Err(Refused::Taken));
             assert_eq!(plan.update(row, UPDATE), Err(Refused::Taken));
         }
         assert!(plan.is_free(3) && !plan.is_free(4));
         assert_eq!(plan.prune(4), Err(Refused::NoSuchRow));
-        assert_eq!(
-            plan.grow(4, family(1, ParentFate::Stays)),
-            Err(Refused::NoSuchRow)
-        );
+        assert_eq!(plan.grow(4, family(1, ParentFate::Stays)), Err(Refused::NoSuchRow));
         assert_eq!(plan.update(u32::MAX, UPDATE), Err(Refused::NoSuchRow));
         assert_eq!(plan.denied(), 12);
         assert_eq!(plan.room(), 4);
-        let counts = EditCounts {
-            removed: 1,
-            added: 1,
-            updated: 1,
-            denied: 12,
-        };
+        let counts = EditCounts { removed: 1, added: 1, updated: 1, denied: 12 };
         assert_eq!(plan.compile().counts, counts);
     }
 
@@ -349,37 +317,17 @@ mod tests {
         assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
         let ops = plan.compile();
         assert_eq!((ops.rows_after, &ops.child_slots[..]), (3, &[1, 2][..]));
-        assert_eq!(
-            ops.counts,
-            EditCounts {
-                removed: 2,
-                added: 2,
-                updated: 1,
-                denied: 3
-            }
-        );
+        assert_eq!(ops.counts, EditCounts { removed: 2, added: 2, updated: 1, denied: 3 });
     }
 
     #[test]
     fn a_refused_value_changes_nothing() {
         let mut plan = EditPlan::new(2, 8);
-        let lone = Offspring {
-            children: 0,
-            ..family(1, ParentFate::Stays)
-        };
+        let lone = Offspring { children: 0, ..family(1, ParentFate::Stays) };
         assert_eq!(plan.grow(0, lone), Err(Refused::BadValue));
-        let nowhere = Update {
-            scale: ScaleRule::Uniform(f32::NAN),
-            ..UPDATE
-        };
+        let nowhere = Update { scale: ScaleRule::Uniform(f32::NAN), ..UPDATE };
         assert_eq!(plan.update(0, nowhere), Err(Refused::BadValue));
-        assert_eq!(
-            plan.append(Seed {
-                opacity: 1.0,
-                ..SEED
-            }),
-            Err(Refused::BadValue)
-        );
+        assert_eq!(plan.append(Seed { opacity: 1.0, ..SEED }), Err(Refused::BadValue));
         assert_eq!(plan.clamp_opacity(0.0), Err(Refused::BadValue));
         assert!(plan.is_free(0) && plan.room() == 6);
         let ops = plan.compile();
@@ -411,10 +359,7 @@ mod tests {
         plan.append(SEED).unwrap();
         assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
         let ops = plan.compile();
-        assert_eq!(
-            (ops.rows_after, ops.seeds[0].0, ops.check()),
-            (3, 0, Ok(()))
-        );
+        assert_eq!((ops.rows_after, ops.seeds[0].0, ops.check()), (3, 0, Ok(())));
     }
 
     #[test]
@@ -472,29 +417,15 @@ mod tests {
         }
         let mut live = ops.rows_before - pruned.len();
         let mut bear = |model: &mut [Option<Who>], slot: u32, who: Who| {
-            assert!(
-                (slot as usize) < budget,
-                "slot {slot} is beyond the budget {budget}"
-            );
-            assert_eq!(
-                model[slot as usize].replace(who),
-                None,
-                "slot {slot} was not free"
-            );
+            assert!((slot as usize) < budget, "slot {slot} is beyond the budget {budget}");
+            assert_eq!(model[slot as usize].replace(who), None, "slot {slot} was not free");
             live += 1;
             assert!(live <= budget, "{live} rows, budget {budget}");
         };
         for family in &ops.families {
             assert_eq!(model[family.parent as usize], Some(Who::Row(family.parent)));
             for (number, &slot) in (1..).zip(ops.children(family)) {
-                bear(
-                    &mut model,
-                    slot,
-                    Who::Child {
-                        of: family.parent,
-                        number,
-                    },
-                );
+                bear(&mut model, slot, Who::Child { of: family.parent, number });
             }
         }
         for (row, _) in &ops.updates {
@@ -508,14 +439,8 @@ mod tests {
             assert!(row.is_some() && model[to as usize].is_none());
             model[to as usize] = row;
         }
-        assert!(
-            model[ops.rows_after..].iter().all(Option::is_none),
-            "rows beyond the last"
-        );
-        model[..ops.rows_after]
-            .iter()
-            .map(|slot| slot.expect("rows are dense"))
-            .collect()
+        assert!(model[ops.rows_after..].iter().all(Option::is_none), "rows beyond the last");
+        model[..ops.rows_after].iter().map(|slot| slot.expect("rows are dense")).collect()
     }
 
     proptest! {
