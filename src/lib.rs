@@ -4,3 +4,4 @@ pub mod camera;
 pub mod dataset;
 pub mod gaussians;
 pub mod memory;
+pub mod schedule;
