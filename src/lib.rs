@@ -5,3 +5,4 @@ pub mod dataset;
 pub mod gaussians;
 pub mod memory;
 pub mod schedule;
+pub mod trainer;
