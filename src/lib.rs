@@ -4,5 +4,6 @@ pub mod camera;
 pub mod dataset;
 pub mod gaussians;
 pub mod memory;
+pub mod metrics;
 pub mod schedule;
 pub mod trainer;

@@ -5,42 +5,15 @@
 //! pass and optimiser, and then, where the policy is due, one edit of the rows. A policy sees the
 //! model as the optimiser left it.
 
-use std::error::Error;
-
 use densify_policies::plan::{EditPlan, RowOps};
 use densify_policies::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 use serde::{Deserialize, Serialize};
 
 use crate::backend::{Backend, BackendError, StepInput, StepOutput};
-use crate::camera::Camera;
-use crate::dataset::images::SharedImage;
 use crate::gaussians::Gaussians;
 use crate::schedule::{self, Background, RateOptions};
-
-/// Why a view cannot be had: whatever the source of the views says.
-pub type ViewError = Box<dyn Error + Send + Sync>;
-
-/// Posed images by number, as the trainer needs them.
-pub trait ViewSource: Send {
-    /// Number of views, >= 1.
-    fn count(&self) -> usize;
-
-    /// Name of a view, for messages.
-    fn name(&self, view: usize) -> &str;
-
-    /// The view's camera.
-    fn camera(&self, view: usize) -> &Camera;
-
-    /// The view's pixels, of the camera's size.
-    ///
-    /// # Errors
-    /// When they cannot be read.
-    fn image(&self, view: usize) -> Result<SharedImage, ViewError>;
-
-    /// Says which views will be asked for next, soonest first.
-    fn prefetch(&self, upcoming: &[usize]);
-}
+use crate::views::{ViewError, ViewSource};
 
 /// How a run goes, beside its scene and its policy.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -8,7 +8,8 @@ use glam::{DMat3, DVec3};
 
 use super::*;
 use crate::backend::Rendering;
-use crate::dataset::images::Image8;
+use crate::camera::Camera;
+use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
 
 /// Everything that was asked of the fakes, in order.
