@@ -2,8 +2,12 @@
 pub mod backend;
 pub mod camera;
 pub mod dataset;
+pub mod evaluate;
 pub mod gaussians;
 pub mod memory;
 pub mod metrics;
+pub mod output;
 pub mod schedule;
+pub mod sh;
 pub mod trainer;
+pub mod views;

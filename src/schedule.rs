@@ -5,6 +5,9 @@
 //! Gaussian Splatting for Real-Time Radiance Field Rendering* (SIGGRAPH 2023), section 5 and its
 //! published code, for a run of 30,000 steps; shorter and longer runs scale them in proportion.
 
+use std::fmt;
+use std::str::FromStr;
+
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -105,16 +108,16 @@ pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
         .min(MAX_SH_DEGREE)
 }
 
-/// What lies behind the Gaussians.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+/// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "String", try_from = "String")]
 pub enum Background {
     /// (0, 0, 0).
     Black,
     /// (1, 1, 1).
     White,
-    /// This colour, sRGB-encoded in [0, 1].
-    Colour([f32; 3]),
+    /// This colour, sRGB-encoded.
+    Colour([u8; 3]),
     /// Another colour at each step, uniform in [0, 1]³.
     Random,
 }
@@ -139,8 +142,54 @@ impl Background {
         match self {
             Self::Black | Self::Random => [0.0; 3],
             Self::White => [1.0; 3],
-            Self::Colour(rgb) => rgb,
+            Self::Colour(rgb) => rgb.map(|channel| f32::from(channel) / 255.0),
         }
+    }
+}
+
+impl fmt::Display for Background {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Black => f.write_str("black"),
+            Self::White => f.write_str("white"),
+            Self::Random => f.write_str("random"),
+            Self::Colour([r, g, b]) => write!(f, "#{r:02x}{g:02x}{b:02x}"),
+        }
+    }
+}
+
+impl FromStr for Background {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let colour = |hex: &str| {
+            let value = u32::from_str_radix(hex, 16).ok()?;
+            let [_, r, g, b] = value.to_be_bytes();
+            // `from_str_radix` takes a sign as well.
+            (hex.len() == 6 && !hex.starts_with('+')).then_some(Self::Colour([r, g, b]))
+        };
+        match text {
+            "black" => Ok(Self::Black),
+            "white" => Ok(Self::White),
+            "random" => Ok(Self::Random),
+            _ => text.strip_prefix('#').and_then(colour).ok_or_else(|| {
+                format!("`{text}` is no background; give black, white, random or a colour such as #808080")
+            }),
+        }
+    }
+}
+
+impl From<Background> for String {
+    fn from(background: Background) -> Self {
+        background.to_string()
+    }
+}
+
+impl TryFrom<String> for Background {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
     }
 }
 
@@ -258,13 +307,35 @@ mod tests {
     }
 
     #[test]
+    fn backgrounds_as_text() {
+        for text in ["black", "white", "random", "#0a0b0c", "#ffffff"] {
+            assert_eq!(text.parse::<Background>().unwrap().to_string(), text);
+        }
+        assert_eq!("#0A0b0c".parse(), Ok(Background::Colour([10, 11, 12])));
+        for text in [
+            "",
+            "#",
+            "#fff",
+            "#+a0b0c",
+            "#0a0b0g",
+            "#0a0b0c0d",
+            "0a0b0c",
+            "grey",
+            "#äöü",
+        ] {
+            let message = text.parse::<Background>().unwrap_err();
+            assert!(message.contains("#808080"), "{message}");
+        }
+    }
+
+    #[test]
     fn backgrounds() {
         let same = |a: [f32; 3], b: [f32; 3]| a.map(f32::to_bits) == b.map(f32::to_bits);
         assert!(same(Background::White.at(1, 2), [1.0; 3]));
         assert!(same(Background::Black.at(1, 2), [0.0; 3]));
         assert!(same(
-            Background::Colour([0.1, 0.2, 0.3]).at(1, 2),
-            [0.1, 0.2, 0.3]
+            Background::Colour([0, 255, 51]).at(1, 2),
+            [0.0, 1.0, 0.2]
         ));
         assert!(same(Background::Random.fixed(), [0.0; 3]));
         let random = Background::Random.at(1, 2);

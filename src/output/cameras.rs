@@ -70,8 +70,9 @@ mod tests {
             rotation,
             translation: -(rotation * centre),
         };
-        let json =
-            cameras_json([("a/b.png", &camera), ("c.png", &camera)], |p| p * 2.0 + DVec3::X);
+        let json = cameras_json([("a/b.png", &camera), ("c.png", &camera)], |p| {
+            p * 2.0 + DVec3::X
+        });
         let json: serde_json::Value = serde_json::from_str(&json.unwrap()).unwrap();
         let first = &json[0];
         assert_eq!(first["position"], serde_json::json!([3.0, 4.0, 6.0]));

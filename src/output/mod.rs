@@ -25,9 +25,7 @@ pub use atomic::write_atomically;
 pub use cameras::cameras_json;
 pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
 pub use folder::RunFolder;
-pub use records::{
-    Mean, RecordLog, StepRecord, Summary, per_view_json, results_json, write_json,
-};
+pub use records::{Mean, RecordLog, StepRecord, Summary, per_view_json, results_json, write_json};
 pub use tensorboard::TensorBoard;
 
 use std::path::{Path, PathBuf};
@@ -36,7 +34,9 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
     /// The folder holds another run.
-    #[error("{path} holds another run; choose another folder with -o, or replace it with --overwrite")]
+    #[error(
+        "{path} holds another run; choose another folder with -o, or replace it with --overwrite"
+    )]
     Occupied {
         /// The folder.
         path: PathBuf,
@@ -48,7 +48,9 @@ pub enum OutputError {
         path: PathBuf,
     },
     /// There is no run in the folder.
-    #[error("{path} holds no run: there is no {missing}; name the folder that `densify train` wrote")]
+    #[error(
+        "{path} holds no run: there is no {missing}; name the folder that `densify train` wrote"
+    )]
     NoRun {
         /// The folder.
         path: PathBuf,
@@ -78,6 +80,10 @@ pub enum OutputError {
 impl OutputError {
     fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
-        move |source| Self::Io { action, path, source }
+        move |source| Self::Io {
+            action,
+            path,
+            source,
+        }
     }
 }
