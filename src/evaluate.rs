@@ -5,6 +5,15 @@ use crate::metrics::{MetricError, psnr, ssim};
 use crate::output::Mean;
 use crate::views::{ViewError, ViewSource};
 
+/// Which views of a dataset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Split {
+    /// Those held out.
+    Test,
+    /// Those trained on.
+    Train,
+}
+
 /// Scores of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewScore {

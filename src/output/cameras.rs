@@ -19,28 +19,25 @@ struct CameraRecord<'a> {
     fx: f64,
 }
 
-/// The cameras with their images' names, numbered in the order given, as JSON. `world_from_scene`
-/// takes a point from training coordinates to those of the dataset; it may move and scale, but
-/// not rotate.
+/// Cameras in world coordinates with their images' names, numbered in the order given, as JSON.
 ///
 /// # Errors
 /// Those of [`serde_json`].
 pub fn cameras_json<'a>(
-    cameras: impl IntoIterator<Item = (&'a str, &'a Camera)>,
-    world_from_scene: impl Fn(glam::DVec3) -> glam::DVec3,
+    cameras: impl IntoIterator<Item = (&'a str, Camera)>,
 ) -> serde_json::Result<String> {
     let records: Vec<_> = cameras
         .into_iter()
         .enumerate()
         .map(|(id, (img_name, camera))| {
-            let row = |i: usize| camera.rotation.transpose().row(i).to_array();
+            let world_from_camera = camera.rotation.transpose();
             CameraRecord {
                 id,
                 img_name,
                 width: camera.width,
                 height: camera.height,
-                position: world_from_scene(camera.centre()).to_array(),
-                rotation: [row(0), row(1), row(2)],
+                position: camera.centre().to_array(),
+                rotation: [0, 1, 2].map(|i| world_from_camera.row(i).to_array()),
                 fy: camera.fy,
                 fx: camera.fx,
             }
@@ -70,12 +67,10 @@ mod tests {
             rotation,
             translation: -(rotation * centre),
         };
-        let json = cameras_json([("a/b.png", &camera), ("c.png", &camera)], |p| {
-            p * 2.0 + DVec3::X
-        });
+        let json = cameras_json([("a/b.png", camera), ("c.png", camera)]);
         let json: serde_json::Value = serde_json::from_str(&json.unwrap()).unwrap();
         let first = &json[0];
-        assert_eq!(first["position"], serde_json::json!([3.0, 4.0, 6.0]));
+        assert_eq!(first["position"], serde_json::json!([1.0, 2.0, 3.0]));
         let expected = serde_json::json!([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]);
         assert_eq!(first["rotation"], expected);
         assert_eq!(json[1]["id"], 1);

@@ -9,15 +9,42 @@ use tempfile::TempDir;
 use super::OutputError;
 
 /// What a run owns in its folder. Anything else in there is the user's and is left alone.
-const OWNED: [&str; 6] = [
+const OWNED: [&str; 8] = [
     "config.toml",
     "cameras.json",
-    "point_cloud",
+    MODELS,
     "stats",
     "results.json",
     "per_view.json",
+    "results_train.json",
+    "per_view_train.json",
 ];
+const MODELS: &str = "point_cloud";
 const OWNED_PREFIX: &str = "events.out.tfevents.";
+
+/// Where a run keeps the model of an iteration.
+#[must_use]
+pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
+    run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
+}
+
+/// The iterations whose model a run has saved, in order.
+///
+/// # Errors
+/// [`OutputError::NoRun`] when there is none.
+pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
+    let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
+    let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
+    let mut saved: Vec<u32> = entries
+        .filter_map(|entry| iteration(&entry.file_name()))
+        .filter(|&iteration| model_path(run, iteration).is_file())
+        .collect();
+    saved.sort_unstable();
+    if saved.is_empty() {
+        return Err(OutputError::NoRun { path: run.to_owned(), missing: "saved model" });
+    }
+    Ok(saved)
+}
 
 /// The folder that a run writes to.
 ///
@@ -223,6 +250,18 @@ mod tests {
         let kept = run.abandon();
         assert_eq!(fs::read(kept.join("config.toml")).unwrap(), b"new");
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
+    }
+
+    #[test]
+    fn saved_models_are_found_in_numeric_order() {
+        let root = tempfile::tempdir().unwrap();
+        assert!(matches!(saved_iterations(root.path()), Err(OutputError::NoRun { .. })));
+        for iteration in [1_000, 30, 200] {
+            write(&model_path(root.path(), iteration), "ply");
+        }
+        fs::create_dir_all(root.path().join("point_cloud/iteration_7")).unwrap();
+        fs::create_dir_all(root.path().join("point_cloud/iteration_x")).unwrap();
+        assert_eq!(saved_iterations(root.path()).unwrap(), [30, 200, 1_000]);
     }
 
     #[test]

@@ -24,8 +24,8 @@ mod tensorboard;
 pub use atomic::write_atomically;
 pub use cameras::cameras_json;
 pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
-pub use folder::RunFolder;
-pub use records::{Mean, RecordLog, StepRecord, Summary, per_view_json, results_json, write_json};
+pub use folder::{RunFolder, model_path, saved_iterations};
+pub use records::{Mean, RecordLog, StepRecord, Summary, write_json, write_scores};
 pub use tensorboard::TensorBoard;
 
 use std::path::{Path, PathBuf};

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::{OutputError, write_atomically};
-use crate::evaluate::Scores;
+use crate::evaluate::{Scores, Split, ViewScore};
 use crate::memory::Ledger;
 
 /// A file of JSON records, one a line, that grows by whole lines.
@@ -123,31 +123,29 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError
     })
 }
 
-/// Enters mean scores into `results.json`: `{"ours_3000": {"PSNR": …, "SSIM": …}}`. Entries of
-/// other iterations stay.
+/// Enters scores into the files of a split: mean scores into `results.json` as
+/// `{"ours_3000": {"PSNR": …, "SSIM": …}}`, scores by view into `per_view.json` as
+/// `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`. Entries of other iterations stay.
 ///
 /// # Errors
 /// [`OutputError`].
-pub fn results_json(folder: &Path, iteration: u32, scores: &Scores) -> Result<(), OutputError> {
-    let mean = serde_json::to_value(scores.mean()).unwrap_or_default();
-    enter(&folder.join("results.json"), iteration, mean)
-}
-
-/// Enters scores into `per_view.json`: `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`.
-/// Entries of other iterations stay.
-///
-/// # Errors
-/// [`OutputError`].
-pub fn per_view_json(folder: &Path, iteration: u32, scores: &Scores) -> Result<(), OutputError> {
-    let column = |score: fn(&crate::evaluate::ViewScore) -> f64| -> Map<String, Value> {
-        scores
-            .views
-            .iter()
-            .map(|view| (view.name.clone(), score(view).into()))
-            .collect()
+pub fn write_scores(
+    run: &Path,
+    split: Split,
+    iteration: u32,
+    scores: &Scores,
+) -> Result<(), OutputError> {
+    let (results, per_view) = match split {
+        Split::Test => ("results.json", "per_view.json"),
+        Split::Train => ("results_train.json", "per_view_train.json"),
     };
-    let entry = serde_json::json!({ "PSNR": column(|v| v.psnr), "SSIM": column(|v| v.ssim) });
-    enter(&folder.join("per_view.json"), iteration, entry)
+    let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
+        scores.views.iter().map(|view| (view.name.clone(), score(view).into())).collect()
+    };
+    let views = serde_json::json!({ "PSNR": column(|v| v.psnr), "SSIM": column(|v| v.ssim) });
+    enter(&run.join(per_view), iteration, views)?;
+    let mean = serde_json::to_value(scores.mean()).unwrap_or_default();
+    enter(&run.join(results), iteration, mean)
 }
 
 fn enter(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
@@ -166,7 +164,6 @@ fn enter(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluate::ViewScore;
 
     fn scores(psnr: f64) -> Scores {
         let view = |name: &str, psnr| ViewScore {
@@ -183,8 +180,7 @@ mod tests {
     fn scores_of_several_iterations_share_the_files() {
         let root = tempfile::tempdir().unwrap();
         for (iteration, psnr) in [(7, 10.0), (30, 20.0), (7, 30.0)] {
-            results_json(root.path(), iteration, &scores(psnr)).unwrap();
-            per_view_json(root.path(), iteration, &scores(psnr)).unwrap();
+            write_scores(root.path(), Split::Test, iteration, &scores(psnr)).unwrap();
         }
         let read = |name: &str| -> Value {
             serde_json::from_slice(&std::fs::read(root.path().join(name)).unwrap()).unwrap()
@@ -196,9 +192,8 @@ mod tests {
         assert_eq!(read("results.json"), expected);
         assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);
         std::fs::write(root.path().join("results.json"), "[").unwrap();
-        let message = results_json(root.path(), 7, &scores(1.0))
-            .unwrap_err()
-            .to_string();
+        write_scores(root.path(), Split::Train, 7, &scores(1.0)).unwrap();
+        let message = write_scores(root.path(), Split::Test, 7, &scores(1.0)).unwrap_err().to_string();
         assert!(message.contains("results.json"), "{message}");
     }
 
