@@ -3,4 +3,6 @@ pub mod backend;
 pub mod camera;
 pub mod dataset;
 pub mod gaussians;
+pub mod init;
 pub mod memory;
+pub mod ply;
