@@ -1,5 +1,6 @@
 //! Density-control policies for 3D Gaussian Splatting.
 pub mod adc;
+pub mod conformance;
 pub mod diet;
 mod edit;
 #[cfg(test)]

@@ -85,7 +85,7 @@ pub fn parse_overrides(
     Ok(tables)
 }
 
-fn parse_value(text: &str) -> Value {
+pub(crate) fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     // A value with a line break could hold further keys; then it is no value.
     let single = parsed.filter(|table| table.len() == 1);

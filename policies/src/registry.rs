@@ -132,6 +132,20 @@ impl PolicyEntry {
         self.step_parameters
     }
 
+    /// Names of all parameters, in declaration order.
+    #[must_use]
+    pub fn parameter_names(&self) -> Vec<String> {
+        let known = (self.names)().unwrap_or_default();
+        let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
+        let more = self
+            .defaults()
+            .unwrap_or_default()
+            .into_iter()
+            .map(|(name, _)| name);
+        names.extend(more.filter(|name| !known.contains(&name.as_str())));
+        names
+    }
+
     /// Names and defaults for a run of 30,000 steps, in declaration order. A parameter that is
     /// `None` by default is not listed, as TOML has no such value, but can be set. Empty when the
     /// defaults have no form in TOML, which [`build`](Self::build) reports.
@@ -153,7 +167,7 @@ impl PolicyEntry {
     pub fn effective(&self, set: &Table, scene: &SceneInfo) -> Result<Table, PolicyError> {
         let mut table = self.defaults()?;
         for parameter in set.keys() {
-            self.must_know(parameter, &table)?;
+            self.must_know(parameter)?;
         }
         scale_steps(&mut table, self.step_parameters, scene.iterations);
         for (parameter, value) in set {
@@ -191,16 +205,15 @@ impl PolicyEntry {
         })
     }
 
-    fn must_know(&self, parameter: &str, defaults: &Table) -> Result<(), PolicyError> {
-        let mut known: Vec<&str> = defaults.keys().map(String::as_str).collect();
-        known.extend((self.names)().unwrap_or_default());
-        if known.contains(&parameter) {
+    fn must_know(&self, parameter: &str) -> Result<(), PolicyError> {
+        let known = self.parameter_names();
+        if known.iter().any(|name| name == parameter) {
             return Ok(());
         }
         Err(PolicyError::UnknownParameter {
             policy: self.name.to_owned(),
             parameter: parameter.to_owned(),
-            nearest: nearest(parameter, known),
+            nearest: nearest(parameter, known.iter().map(String::as_str)),
         })
     }
 
