@@ -114,16 +114,24 @@ impl Report {
     }
 }
 
-/// Runs every check but [`Check::IsDocumented`].
+/// Runs every check but [`Check::IsDocumented`], with the policy's defaults.
 ///
 /// # Errors
 /// A report of all checks that failed.
 pub fn check_policy(entry: &PolicyEntry) -> Result<(), Report> {
+    check_policy_with(entry, &Table::new())
+}
+
+/// Runs every check but [`Check::IsDocumented`], with some parameters set.
+///
+/// # Errors
+/// A report of all checks that failed.
+pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report> {
     let mut report = Report::new(entry);
-    check_building(entry, &mut report);
+    check_building(entry, set, &mut report);
     if report.failures.is_empty() {
         for scenario in script::scenarios() {
-            if let Err((check, how)) = script::run(entry, &scenario) {
+            if let Err((check, how)) = script::run(entry, set, &scenario) {
                 report.add(check, format!("{scenario}: {how}"));
             }
         }
@@ -185,13 +193,13 @@ fn is_same(documented: &Value, default: &Value) -> bool {
     }
 }
 
-fn check_building(entry: &PolicyEntry, report: &mut Report) {
+fn check_building(entry: &PolicyEntry, set: &Table, report: &mut Report) {
     for iterations in [1, 7, 600, 30_000, u32::MAX] {
         let scene = SceneInfo {
             iterations,
             ..script::scene(10, 100)
         };
-        if let Err(error) = entry.build(&Table::new(), &scene) {
+        if let Err(error) = entry.build(set, &scene) {
             report.add(Check::Builds, format!("for {iterations} steps: {error}"));
         }
     }

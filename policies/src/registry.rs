@@ -53,6 +53,8 @@ macro_rules! register_policy {
 
 inventory::collect!(PolicyEntry);
 
+type Built = Result<Box<dyn DensityPolicy>, PolicyError>;
+
 /// What the registry knows of a policy.
 #[derive(Debug, Clone, Copy)]
 pub struct PolicyEntry {
@@ -68,7 +70,7 @@ pub struct PolicyEntry {
     names: fn() -> Option<&'static [&'static str]>,
     defaults: fn() -> Result<Table, String>,
     retyped: fn(Table) -> Result<Table, String>,
-    build: fn(Table, &SceneInfo) -> Result<Box<dyn DensityPolicy>, PolicyError>,
+    build: fn(Table, &SceneInfo) -> Built,
 }
 
 impl PolicyEntry {

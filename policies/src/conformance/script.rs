@@ -124,10 +124,10 @@ type Failure = (Check, String);
 /// Four copies of the policy go through the run together: one as in a training; a twin; one that
 /// sees more than it asked for; and, from a third and from two thirds of the run on, one that has
 /// been saved and restored. All must make the same plans.
-pub(super) fn run(entry: &PolicyEntry, scenario: &Scenario) -> Result<(), Failure> {
+pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<(), Failure> {
     let scene = &scenario.scene;
     let build = || {
-        let built = guarded(|| entry.build(&Table::new(), scene));
+        let built = guarded(|| entry.build(set, scene));
         built
             .and_then(|built| built.map_err(|e| e.to_string()))
             .map_err(|why| (Check::Builds, why))
@@ -258,7 +258,7 @@ fn number(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f
         Pattern::Nan => f32::NAN,
         // Half of them plausible, so that policies act at all.
         Pattern::Mixture => {
-            let pattern = if bits[1] % 2 == 0 {
+            let pattern = if bits[1].is_multiple_of(2) {
                 0
             } else {
                 bits[2] as usize % (PATTERNS.len() - 2)

@@ -20,6 +20,35 @@ fn every_registered_policy_conforms() {
 }
 
 #[test]
+fn every_choice_of_the_built_in_policies_conforms() {
+    let choices = [
+        ("vanilla", "governor = true"),
+        ("vanilla", "grow_every = 0"),
+        (
+            "diet",
+            "mixed_gradient = false\nshift = \"none\"\nprotect = 0",
+        ),
+        (
+            "diet",
+            "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\"",
+        ),
+        (
+            "diet",
+            "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 1.0\nrho_c = 1.0",
+        ),
+        ("diet", "rho_c = 0.0\nrho = 0.0\ntau = 0.0"),
+        // All windows at once.
+        ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
+    ];
+    for (name, set) in choices {
+        let entry = crate::registry::find(name).unwrap();
+        if let Err(report) = check_policy_with(entry, &set.parse().unwrap()) {
+            panic!("{set}: {report}");
+        }
+    }
+}
+
+#[test]
 fn every_registered_policy_is_documented() {
     for entry in policies().unwrap() {
         if let Err(report) = check_manual(entry) {
@@ -99,7 +128,7 @@ impl<const FAULT: usize> Faulty<FAULT> {
 impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let mut signals = SignalSet::of(&[Signal::Opacity, Signal::ScreenGradient]);
-        if self.has(Fault::NeedsAtWhim) && roll() % 2 == 0 {
+        if self.has(Fault::NeedsAtWhim) && roll().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
         Needs {

@@ -197,8 +197,11 @@ fn clones_shift_by_the_rule() {
             .collect()
     };
     let near = |found: &[[f32; 3]], expected: [f32; 3]| {
-        assert_eq!(found[1], [0.0; 3]);
         for axis in 0..3 {
+            assert!(
+                found[1][axis].abs() < 1e-30,
+                "a row without gradients moved"
+            );
             assert!(
                 (found[0][axis] - expected[axis]).abs() < 1e-9,
                 "{found:?}, {expected:?}"
