@@ -335,17 +335,17 @@ mod tests {
             ("updated miscounted", |ops| ops.counts.updated = 1),
             ("opacity bound of one", |ops| ops.clamp_opacity = Some(1.0)),
             ("opacity bound not a number", |ops| {
-                ops.clamp_opacity = Some(f32::NAN)
+                ops.clamp_opacity = Some(f32::NAN);
             }),
             ("parent beyond the model", |ops| ops.families[0].parent = 10),
             ("parent is updated too", |ops| ops.families[0].parent = 7),
             ("parent not moved", |ops| ops.families[0].parent = 8),
             ("bad offspring", |ops| {
-                ops.families[0].offspring.scale = ScaleRule::Uniform(-1.0)
+                ops.families[0].offspring.scale = ScaleRule::Uniform(-1.0);
             }),
             ("children elsewhere", |ops| ops.families[0].first_child = 1),
             ("a child without a slot", |ops| {
-                ops.families[0].offspring.children = 2
+                ops.families[0].offspring.children = 2;
             }),
             ("child upon parent", |ops| ops.child_slots[0] = 9),
             ("child upon seed", |ops| ops.child_slots[0] = 2),
@@ -353,7 +353,7 @@ mod tests {
             ("updated row does not exist", |ops| ops.updates[0].0 = 12),
             ("updated row not moved", |ops| ops.updates[0].0 = 8),
             ("bad update", |ops| {
-                ops.updates[0].1.opacity = OpacityRule::Set(0.0)
+                ops.updates[0].1.opacity = OpacityRule::Set(0.0);
             }),
             ("seed upon child", |ops| ops.seeds[0].0 = 1),
             ("seed upon a moved row", |ops| ops.seeds[0].0 = 3),
