@@ -36,7 +36,10 @@ fn flat_colour(k: usize) -> f32 {
 fn needles_in_every_direction() {
     let camera = straight(48, 48);
     let mut table = Table::new("needles");
-    for sigma_px in [10.0_f32, 100.0, 1000.0] {
+    // The gradient of the long axis is what remains when the short axis's share of dL/dΣ, larger
+    // by the squared ratio of the widths, cancels; the usual route over the inverse of Σ
+    // leaves nothing of it at 300 px already.
+    for (sigma_px, tolerance) in [(10.0_f32, 1e-3), (100.0, 5e-3), (1000.0, 1e-1)] {
         for turn in 0..16 {
             let angle = std::f32::consts::PI * (turn as f32 + 0.3) / 16.0;
             let mut model = Gaussians::default();
@@ -51,18 +54,14 @@ fn needles_in_every_direction() {
                 2.0,
                 flat_colour,
             );
-            check_needle(
-                &mut table,
-                &format!("{sigma_px} px, turn {turn}"),
-                &model,
-                &camera,
-            );
+            let what = format!("{sigma_px} px, turn {turn}");
+            check_needle(&mut table, &what, &model, &camera, tolerance);
         }
     }
     table.finish();
 }
 
-fn check_needle(table: &mut Table, what: &str, model: &Gaussians, camera: &Camera) {
+fn check_needle(table: &mut Table, what: &str, model: &Gaussians, camera: &Camera, tolerance: f64) {
     let view = View {
         camera,
         background: GREY.map(f64::from),
@@ -84,7 +83,7 @@ fn check_needle(table: &mut Table, what: &str, model: &Gaussians, camera: &Camer
             subject::class(&measured, class),
             gradient.model.class(class),
         );
-        table.check(what, class, error, 1e-3);
+        table.check(what, class, error, tolerance);
     }
 }
 
@@ -207,7 +206,7 @@ fn a_poisoned_row_harms_no_other() {
             // Infinitely faint, and infinitely opaque, are opacities like others.
             if slot == 10 && value == f32::INFINITY {
                 if image.rgb.iter().any(|v| !v.is_finite()) {
-                    harmed.push(format!("{value} in slot {slot}: not finite"));
+                    harmed.push(format!("{value} in {}: not finite", place(slot)));
                 }
                 continue;
             }
@@ -219,17 +218,31 @@ fn a_poisoned_row_harms_no_other() {
             });
             if !same_image || !same_gradient {
                 harmed.push(format!(
-                    "{value} in slot {slot}: same image {same_image}, same gradient {same_gradient}"
+                    "{value} in {}: image {}, gradients {}",
+                    place(slot),
+                    if same_image { "same" } else { "changed" },
+                    if same_gradient { "same" } else { "changed" },
                 ));
             }
         }
     }
-    assert!(
-        harmed.is_empty(),
-        "{} cases:\n{}",
-        harmed.len(),
-        harmed.join("\n")
-    );
+    let cases = harmed.len();
+    harmed.dedup();
+    assert!(harmed.is_empty(), "{cases} cases:
+{}", harmed.join("
+"));
+}
+
+/// What slot `slot` belongs to.
+fn place(slot: usize) -> &'static str {
+    match slot {
+        0..3 => "a mean",
+        3..6 => "a log-scale",
+        6..10 => "a quaternion",
+        10 => "an opacity logit",
+        11..14 => "band 0 of the colour",
+        _ => "bands 1 to 3 of the colour",
+    }
 }
 
 /// The 59 numbers of a row: mean, log-scale, quaternion, opacity, coefficients.
@@ -276,18 +289,19 @@ fn any_finite_number_gives_a_finite_image() {
             });
             if !image_finite || !gradient_finite {
                 broken.push(format!(
-                    "{value:e} in slot {slot}: image finite {image_finite}, \
-                     other rows' gradients finite {gradient_finite}"
+                    "{value:e} in {}: image {}, gradients of others {}",
+                    place(slot),
+                    if image_finite { "finite" } else { "broken" },
+                    if gradient_finite { "finite" } else { "broken" },
                 ));
             }
         }
     }
-    assert!(
-        broken.is_empty(),
-        "{} cases:\n{}",
-        broken.len(),
-        broken.join("\n")
-    );
+    let cases = broken.len();
+    broken.dedup();
+    assert!(broken.is_empty(), "{cases} cases:
+{}", broken.join("
+"));
 }
 
 #[test]
