@@ -55,7 +55,11 @@ impl Gaussians {
 #[must_use]
 pub fn sigmoid(x: f32) -> f32 {
     let e = (-x.abs()).exp();
-    if x >= 0.0 { 1.0 / (1.0 + e) } else { e / (1.0 + e) }
+    if x >= 0.0 {
+        1.0 / (1.0 + e)
+    } else {
+        e / (1.0 + e)
+    }
 }
 
 /// Logit of an opacity in (0, 1): ln(o / (1 − o)).

@@ -21,7 +21,10 @@ pub struct LedgerLine {
 impl Ledger {
     /// Adds a buffer.
     pub fn add(&mut self, what: impl Into<String>, bytes: u64) {
-        self.lines.push(LedgerLine { what: what.into(), bytes });
+        self.lines.push(LedgerLine {
+            what: what.into(),
+            bytes,
+        });
     }
 
     /// Sum of all lines [bytes].

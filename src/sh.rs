@@ -8,7 +8,13 @@ use std::ops::{Add, Mul, Neg, Sub};
 /// Band 0.
 pub const C0: f32 = 0.282_094_79;
 const C1: f32 = 0.488_602_51;
-const C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_2];
+const C2: [f32; 5] = [
+    1.092_548_4,
+    -1.092_548_4,
+    0.315_391_57,
+    -1.092_548_4,
+    0.546_274_2,
+];
 const C3: [f32; 7] = [
     -0.590_043_6,
     2.890_611_4,
@@ -119,7 +125,10 @@ pub fn basis_gradient<T: Real>(degree: u8, d: [T; 3], g: &[T; 16], zero: T) -> [
         - g13 * xy * 2.0
         - g14 * yz * 2.0
         - g15 * xy * 2.0;
-    gz = gz + g10 * xy + g11 * yz * 8.0 + g12 * (zz * 2.0 - xx - yy)
+    gz = gz
+        + g10 * xy
+        + g11 * yz * 8.0
+        + g12 * (zz * 2.0 - xx - yy)
         + g13 * xz * 8.0
         + g14 * (xx - yy);
     [gx, gy, gz]
@@ -164,7 +173,10 @@ mod tests {
         let value = |d: [f32; 3]| {
             let mut y = [0.0_f32; 16];
             basis(3, d, &mut y);
-            y.iter().zip(&g).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum::<f64>()
+            y.iter()
+                .zip(&g)
+                .map(|(&a, &b)| f64::from(a) * f64::from(b))
+                .sum::<f64>()
         };
         for i in [3, 500, 1200, 1999] {
             let d = unit(i);

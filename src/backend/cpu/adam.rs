@@ -10,7 +10,7 @@
 use pulp::Simd;
 
 use super::blocks::plane;
-use super::simd::{V, WIDTH};
+use super::simd::{V, WIDTH, each};
 use crate::backend::LearningRates;
 
 const BETA1: f32 = 0.9;
@@ -103,20 +103,26 @@ pub(super) fn step<S: Simd>(
     }
     for lane in (0..WIDTH).step_by(S::F32_LANES) {
         let at = |p: usize| p * WIDTH + lane;
-        let q = [0, 1, 2, 3].map(|i| V::load(s, &params[at(plane::QUAT + i)..]));
+        let q = each!(i in 4 => V::load(s, &params[at(plane::QUAT + i)..]));
         let norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
         // A quaternion this short has no direction left; it starts again without rotation.
         let sound = c(1e-12).lt(norm2);
         let inv = c(1.0) / norm2.sqrt();
         for (i, x) in q.into_iter().enumerate() {
             let identity = if i == 0 { 1.0 } else { 0.0 };
-            sound.select(x * inv, c(identity)).store(&mut params[at(plane::QUAT + i)..]);
+            sound
+                .select(x * inv, c(identity))
+                .store(&mut params[at(plane::QUAT + i)..]);
         }
         for p in plane::LOG_SCALE..plane::QUAT {
             let x = V::load(s, &params[at(p)..]);
-            x.max(c(LOG_SCALE_RANGE[0])).min(c(LOG_SCALE_RANGE[1])).store(&mut params[at(p)..]);
+            x.max(c(LOG_SCALE_RANGE[0]))
+                .min(c(LOG_SCALE_RANGE[1]))
+                .store(&mut params[at(p)..]);
         }
         let x = V::load(s, &params[at(plane::OPACITY)..]);
-        x.max(c(-LOGIT_MAX)).min(c(LOGIT_MAX)).store(&mut params[at(plane::OPACITY)..]);
+        x.max(c(-LOGIT_MAX))
+            .min(c(LOGIT_MAX))
+            .store(&mut params[at(plane::OPACITY)..]);
     }
 }

@@ -1,8 +1,6 @@
 //! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
 
-use densify_policies::plan::{
-    Family, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
-};
+use densify_policies::plan::{Family, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed};
 use densify_policies::rng::{PolicyRng, Purpose};
 
 use super::blocks::{Blocks, plane};
@@ -101,10 +99,12 @@ impl Model<'_> {
     fn sow(&mut self, row: usize, seed: &Seed) {
         self.params.clear_row(row);
         self.params.set_n(row, plane::MEAN, seed.position);
-        self.params.set_n(row, plane::LOG_SCALE, [seed.scale.ln(); 3]);
+        self.params
+            .set_n(row, plane::LOG_SCALE, [seed.scale.ln(); 3]);
         self.params.set_n(row, plane::QUAT, [1.0, 0.0, 0.0, 0.0]);
         self.params.set(row, plane::OPACITY, logit(seed.opacity));
-        self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
+        self.params
+            .set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
         self.reborn(row);
     }
 
@@ -116,9 +116,7 @@ impl Model<'_> {
             OpacityRule::Set(o) => logit(o),
             OpacityRule::Scaled(factor) => logit(opacity * factor),
             // 1 − o from the logit, so that it does not round to 0.
-            OpacityRule::Conserved => {
-                logit(1.0 - sigmoid(-was).powf(1.0 / siblings.max(1) as f32))
-            }
+            OpacityRule::Conserved => logit(1.0 - sigmoid(-was).powf(1.0 / siblings.max(1) as f32)),
         };
         self.params.set(row, plane::OPACITY, logit);
     }
@@ -143,7 +141,13 @@ impl Model<'_> {
 }
 
 fn longest(log_scale: [f32; 3]) -> usize {
-    (1..3).fold(0, |best, i| if log_scale[i] > log_scale[best] { i } else { best })
+    (1..3).fold(0, |best, i| {
+        if log_scale[i] > log_scale[best] {
+            i
+        } else {
+            best
+        }
+    })
 }
 
 fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {

@@ -29,13 +29,19 @@ const SPARE: usize = 16;
 impl Candidates {
     pub(super) fn new(request: Option<CandidateRequest>) -> Self {
         let capacity = request.map_or(0, |r| r.capacity);
-        Self { request, list: Vec::with_capacity(capacity), ranking: Vec::new() }
+        Self {
+            request,
+            list: Vec::with_capacity(capacity),
+            ranking: Vec::new(),
+        }
     }
 
     /// Bytes of the list, and of the ranking of an image of so many pixels.
     pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
         let ranking = pixels * size_of::<(f32, u32)>();
-        request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
+        request.map_or(0, |r| {
+            (r.capacity * size_of::<Candidate>() + ranking) as u64
+        })
     }
 
     pub(super) fn list(&self) -> &[Candidate] {
@@ -77,7 +83,11 @@ impl Candidates {
             }
         }
         let worse = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
-        let ranked = if spaced { count.saturating_mul(SPARE) } else { count };
+        let ranked = if spaced {
+            count.saturating_mul(SPARE)
+        } else {
+            count
+        };
         if self.ranking.len() > ranked {
             self.ranking.select_nth_unstable_by(ranked, worse);
             self.ranking.truncate(ranked);

@@ -80,7 +80,11 @@ impl LossBuffers {
     }
 
     pub(super) fn new() -> Self {
-        Self { planes: Default::default(), error: Vec::new(), stride: 0 }
+        Self {
+            planes: Default::default(),
+            error: Vec::new(),
+            stride: 0,
+        }
     }
 
     /// Makes room for an image. Images of one size, or smaller ones, allocate nothing more.
@@ -119,7 +123,9 @@ impl LossBuffers {
             let error_strips: Vec<&mut [f32]> = if with_error {
                 self.error.chunks_mut(strip).collect()
             } else {
-                (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
+                (0..grid.height.div_ceil(STRIP))
+                    .map(|_| Default::default())
+                    .collect()
             };
             let parts: Vec<LossValue> = (
                 e.par_chunks_mut(strip),
@@ -133,7 +139,13 @@ impl LossBuffers {
                 .enumerate()
                 .map_init(Vec::new, |scratch, (i, (e, y, p1, p2, p3, error))| {
                     arch.dispatch(Similarity {
-                        source: Source { grid, canvas, target, background, channel },
+                        source: Source {
+                            grid,
+                            canvas,
+                            target,
+                            background,
+                            channel,
+                        },
                         first: i * STRIP,
                         stride,
                         scratch,
@@ -150,9 +162,10 @@ impl LossBuffers {
                 ssim += part.ssim;
             }
             let [e, y, p1, p2, p3] = &self.planes;
-            gradient.par_chunks_mut(grid.columns * STRIP / TILE).enumerate().for_each_init(
-                Vec::new,
-                |scratch, (i, tiles)| {
+            gradient
+                .par_chunks_mut(grid.columns * STRIP / TILE)
+                .enumerate()
+                .for_each_init(Vec::new, |scratch, (i, tiles)| {
                     arch.dispatch(Gradient {
                         grid,
                         channel,
@@ -165,10 +178,12 @@ impl LossBuffers {
                         scale: 1.0 / samples as f32,
                         tiles,
                     });
-                },
-            );
+                });
         }
-        LossValue { l1: l1 / samples, ssim: ssim / samples }
+        LossValue {
+            l1: l1 / samples,
+            ssim: ssim / samples,
+        }
     }
 
     /// Error of a pixel after a run with error weights.
@@ -190,7 +205,13 @@ impl Source<'_> {
     /// e = rendering − target and y = target of image row `row` (0 where masked and in the pads).
     #[inline(always)]
     fn lines(&self, row: usize, e: &mut [f32], y: &mut [f32]) {
-        let Self { grid, canvas, target, background, channel } = *self;
+        let Self {
+            grid,
+            canvas,
+            target,
+            background,
+            channel,
+        } = *self;
         e.fill(0.0);
         y.fill(0.0);
         let width = grid.width;
@@ -242,6 +263,25 @@ fn vertical<S: Simd>(s: S, lines: &[f32], stride: usize, at: usize) -> V<S> {
     sum
 }
 
+/// The vertical sums around `row` of `N` quantities that stand in `blurred` one after another,
+/// `lines` lines each. (A loop, not a closure: closures called often are not inlined, and then
+/// their vectors go through memory.)
+#[inline(always)]
+fn vertical_each<S: Simd, const N: usize>(
+    s: S,
+    blurred: &[f32],
+    lines: usize,
+    row: usize,
+    stride: usize,
+    at: usize,
+) -> [V<S>; N] {
+    let mut sums = [V::zero(s); N];
+    for (quantity, sum) in sums.iter_mut().enumerate() {
+        *sum = vertical(s, &blurred[(quantity * lines + row) * stride..], stride, at);
+    }
+    sums
+}
+
 /// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
 struct Similarity<'a> {
     source: Source<'a>,
@@ -263,7 +303,17 @@ impl WithSimd for Similarity<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> LossValue {
-        let Self { source, first, stride, scratch, e, y, derivatives, error, error_weights } = self;
+        let Self {
+            source,
+            first,
+            stride,
+            scratch,
+            e,
+            y,
+            derivatives,
+            error,
+            error_weights,
+        } = self;
         let [p1, p2, p3] = derivatives;
         let (width, height) = (source.grid.width, source.grid.height);
         let rows = e.len() / stride;
@@ -304,21 +354,18 @@ impl WithSimd for Similarity<'_> {
         for row in 0..rows {
             let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
             for at in columns.clone() {
-                let blur = |quantity: usize| {
-                    vertical(s, &blurred[(quantity * lines + row) * stride..], stride, at)
-                };
-                let (mu_e, mu_y) = (blur(0), blur(1));
+                let [mu_e, mu_y, mean_ee, mean_yy, mean_ey] =
+                    vertical_each(s, blurred, lines, row, stride, at);
                 let mu_x = mu_e + mu_y;
-                let var_e = (blur(2) - mu_e * mu_e).max(V::zero(s));
-                let var_y = (blur(3) - mu_y * mu_y).max(V::zero(s));
-                let cov = blur(4) - mu_e * mu_y;
+                let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
+                let var_y = (mean_yy - mu_y * mu_y).max(V::zero(s));
+                let cov = mean_ey - mu_e * mu_y;
                 let var_x = (var_y + cov * 2.0 + var_e).max(V::zero(s));
                 let inv_a = c(1.0) / (mu_x * mu_x + mu_y * mu_y + C1);
                 let inv_b = c(1.0) / (var_x + var_y + C2);
                 let luminance = c(1.0) - mu_e * mu_e * inv_a;
                 let contrast = c(1.0) - var_e * inv_b;
-                let by_luminance =
-                    mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
+                let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
                 let two_ve_bb = var_e * inv_b * inv_b * 2.0;
                 let by_contrast = mu_e * contrast * inv_b * 2.0 - mu_y * two_ve_bb;
                 let inside = V::load(s, &LANES[..]).lt(c((PAD + width - at) as f32));
@@ -326,7 +373,9 @@ impl WithSimd for Similarity<'_> {
                 inside
                     .keep(contrast * by_luminance + luminance * by_contrast)
                     .store(&mut p1[to..]);
-                inside.keep(-(luminance * contrast * inv_b)).store(&mut p2[to..]);
+                inside
+                    .keep(-(luminance * contrast * inv_b))
+                    .store(&mut p2[to..]);
                 inside.keep(luminance * two_ve_bb).store(&mut p3[to..]);
                 let abs = V::load(s, &e[to..]).abs();
                 let ssim = inside.keep(luminance * contrast);
@@ -377,14 +426,28 @@ impl WithSimd for Gradient<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, tiles } = self;
+        let Self {
+            grid,
+            channel,
+            first,
+            stride,
+            scratch,
+            e,
+            y,
+            derivatives,
+            scale,
+            tiles,
+        } = self;
         let rows = STRIP.min(grid.height - first);
         let lines = rows + 2 * REACH;
         scratch.clear();
         scratch.resize(3 * lines * stride, 0.0);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         for l in 0..lines {
-            let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < grid.height) else {
+            let Some(row) = (first + l)
+                .checked_sub(REACH)
+                .filter(|&row| row < grid.height)
+            else {
                 continue;
             };
             for at in columns.clone() {
@@ -402,12 +465,10 @@ impl WithSimd for Gradient<'_> {
         }
         for row in 0..rows {
             for at in columns.clone() {
-                let blur = |quantity: usize| {
-                    vertical(s, &scratch[(quantity * lines + row) * stride..], stride, at)
-                };
+                let [by_mu_e, by_ee, by_ey] = vertical_each(s, scratch, lines, row, stride, at);
                 let from = (first + row) * stride + at;
                 let (e, y) = (V::load(s, &e[from..]), V::load(s, &y[from..]));
-                let by_ssim = blur(0) + e * 2.0 * blur(1) + y * blur(2);
+                let by_ssim = by_mu_e + e * 2.0 * by_ee + y * by_ey;
                 let positive = zero.lt(e).keep(V::splat(s, l1_scale));
                 let negative = e.lt(zero).keep(V::splat(s, l1_scale));
                 let g = by_ssim * ssim_scale + (positive - negative);

@@ -21,6 +21,7 @@ mod simd;
 mod tiles;
 
 use std::ops::Range;
+use std::time::{Duration, Instant};
 
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode, Needs, Signals};
@@ -128,6 +129,28 @@ pub struct CpuBackend {
     records: Vec<f32>,
     /// One record per row. Shape: [budget, stride of the signals' detail].
     sums: Vec<f32>,
+    clock: StageClock,
+}
+
+/// Wall time of the stages of the last step.
+#[derive(Debug, Default)]
+struct StageClock {
+    laps: Vec<(&'static str, Duration)>,
+    last: Option<Instant>,
+}
+
+impl StageClock {
+    fn start(&mut self) {
+        self.laps.clear();
+        self.last = Some(Instant::now());
+    }
+
+    fn lap(&mut self, stage: &'static str) {
+        let now = Instant::now();
+        if let Some(last) = self.last.replace(now) {
+            self.laps.push((stage, now - last));
+        }
+    }
 }
 
 /// One view between its forward and its backward pass.
@@ -150,7 +173,11 @@ impl CpuBackend {
     /// When the model has more rows than the budget: the caller subsamples before.
     pub fn new(model: &Gaussians, options: &CpuOptions) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
-        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
+        assert!(
+            model.len() <= budget,
+            "{} rows over a budget of {budget}",
+            model.len()
+        );
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(options.threads.unwrap_or(0))
             .thread_name(|i| format!("densify-{i}"))
@@ -174,7 +201,10 @@ impl CpuBackend {
             sh_degree: model.sh_degree,
             near: options.near,
             params,
-            moments: [Blocks::zeros(budget, per_row), Blocks::zeros(budget, per_row)],
+            moments: [
+                Blocks::zeros(budget, per_row),
+                Blocks::zeros(budget, per_row),
+            ],
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
             signals,
@@ -187,7 +217,15 @@ impl CpuBackend {
             loss: LossBuffers::new(),
             records: vec![0.0; cap * stride],
             sums: vec![0.0; blocks * WIDTH * stride],
+            clock: StageClock::default(),
         })
+    }
+
+    /// Wall time of each stage of the last training step, in order. Bands add up under one name
+    /// only as far as they follow one another.
+    #[must_use]
+    pub fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.clock.laps
     }
 
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
@@ -213,8 +251,12 @@ impl CpuBackend {
         assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
         assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
         let detail = Detail::All;
-        self.records.resize(self.records.len().max(self.lists.cap() * detail.stride()), 0.0);
-        self.sums.resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
+        self.records.resize(
+            self.records.len().max(self.lists.cap() * detail.stride()),
+            0.0,
+        );
+        self.sums
+            .resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
         let frame = self.forward(camera, background, sh_degree, true)?;
         let rendering = self.rendering(&frame);
         let width = frame.grid.width;
@@ -287,7 +329,12 @@ impl CpuBackend {
 
     fn resize_images(&mut self, grid: &Grid) {
         self.canvas.resize(grid.tiles(), TileCanvas::EMPTY);
-        self.gradient.resize(grid.tiles(), TileGradient { planes: [[0.0; 256]; 5] });
+        self.gradient.resize(
+            grid.tiles(),
+            TileGradient {
+                planes: [[0.0; 256]; 5],
+            },
+        );
     }
 
     fn image_loss(
@@ -297,10 +344,28 @@ impl CpuBackend {
         background: [f32; 3],
         error_weights: Option<[f32; 2]>,
     ) -> LossValue {
-        let Self { pool, loss, arch, canvas, gradient, .. } = self;
-        pool.install(|| {
-            loss.run(*arch, grid, canvas, target, background, gradient, error_weights)
-        })
+        let Self {
+            pool,
+            loss,
+            arch,
+            canvas,
+            gradient,
+            clock,
+            ..
+        } = self;
+        let value = pool.install(|| {
+            loss.run(
+                *arch,
+                grid,
+                canvas,
+                target,
+                background,
+                gradient,
+                error_weights,
+            )
+        });
+        clock.lap("loss");
+        value
     }
 
     /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band only, the
@@ -322,7 +387,19 @@ impl CpuBackend {
         let grid = Grid::new(camera.width, camera.height);
         self.resize_images(&grid);
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
-        let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, .. } = self;
+        let Self {
+            pool,
+            arch,
+            lists,
+            splats,
+            visible: seen,
+            params,
+            canvas,
+            rows,
+            clock,
+            ..
+        } = self;
+        clock.start();
         let (rows, arch) = (*rows, *arch);
         let stride = params.stride();
         pool.install(|| {
@@ -353,29 +430,60 @@ impl CpuBackend {
                 lists.order.copy_within(first..first + count, visible);
                 visible += count;
             }
+            clock.lap("project");
             lists.sort(visible);
+            clock.lap("sort");
             let (bands, entries) = lists.bands(splats, &grid);
             for band in &bands {
                 lists.fill(splats, &grid, band.clone(), bands.len() == 1);
-                canvas[band.clone()].par_iter_mut().enumerate().for_each(|(i, canvas)| {
-                    arch.dispatch(Rasterize {
-                        splats,
-                        list: lists.of_tile(i),
-                        place: TilePlace::new(&grid, band.start + i),
-                        background,
-                        with_depth,
-                        canvas,
+                clock.lap("tiles");
+                canvas[band.clone()]
+                    .par_iter_mut()
+                    .enumerate()
+                    .for_each(|(i, canvas)| {
+                        arch.dispatch(Rasterize {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(&grid, band.start + i),
+                            background,
+                            with_depth,
+                            canvas,
+                        });
                     });
-                });
+                clock.lap("rasterize");
             }
-            Ok(Frame { view, grid, background, bands, entries, visible })
+            Ok(Frame {
+                view,
+                grid,
+                background,
+                bands,
+                entries,
+                visible,
+            })
         })
     }
 
     /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
     fn backward(&mut self, frame: &Frame, detail: Detail) {
-        let Frame { grid, background, bands, .. } = frame;
-        let Self { pool, arch, lists, splats, records, sums, visible, canvas, gradient, .. } = self;
+        let Frame {
+            grid,
+            background,
+            bands,
+            ..
+        } = frame;
+        let Self {
+            pool,
+            arch,
+            lists,
+            splats,
+            records,
+            sums,
+            visible,
+            canvas,
+            gradient,
+            clock,
+            ..
+        } = self;
         let stride = detail.stride();
         pool.install(|| {
             for band in bands {
@@ -405,10 +513,13 @@ impl CpuBackend {
                         records,
                     });
                 });
+                clock.lap("rasterize_bwd");
                 let first = band.start == 0;
                 let records = &records[..];
-                sums.par_chunks_mut(stride * WIDTH).zip(&visible[..]).enumerate().for_each(
-                    |(block, (sums, &seen))| {
+                sums.par_chunks_mut(stride * WIDTH)
+                    .zip(&visible[..])
+                    .enumerate()
+                    .for_each(|(block, (sums, &seen))| {
                         for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
                             if first {
                                 sum.fill(0.0);
@@ -418,8 +529,8 @@ impl CpuBackend {
                                 gather(sum, detail, records, entries);
                             }
                         }
-                    },
-                );
+                    });
+                clock.lap("gather");
             }
         });
     }
@@ -432,9 +543,29 @@ impl CpuBackend {
         request: &CandidateRequest,
         count: usize,
     ) {
-        let Frame { grid, bands, background, view, .. } = frame;
-        let Self { lists, splats, params, canvas, gradient, loss, candidates, .. } = self;
-        let place = |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, y % TILE * TILE + x % TILE);
+        let Frame {
+            grid,
+            bands,
+            background,
+            view,
+            ..
+        } = frame;
+        let Self {
+            lists,
+            splats,
+            params,
+            canvas,
+            gradient,
+            loss,
+            candidates,
+            ..
+        } = self;
+        let place = |x: usize, y: usize| {
+            (
+                y / TILE * grid.columns + x / TILE,
+                y % TILE * TILE + x % TILE,
+            )
+        };
         let error = |x: usize, y: usize| {
             let (tile, px) = place(x, y);
             let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][px];
@@ -515,7 +646,11 @@ fn scalars(value: LossValue) -> StepOutput {
 
 /// A single tile's list holds each row at most once, so that the budget is always enough.
 fn tile_cap(options: &CpuOptions) -> usize {
-    options.tile_cap.max(options.budget).max(1).min(u32::MAX as usize)
+    options
+        .tile_cap
+        .max(options.budget)
+        .max(1)
+        .min(u32::MAX as usize)
 }
 
 /// Bytes per buffer for these options.
@@ -532,15 +667,24 @@ fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
     let mut ledger = Ledger::default();
     ledger.add("parameters", Blocks::bytes(budget, per_row));
     ledger.add("optimiser moments", 2 * Blocks::bytes(budget, per_row));
-    ledger.add("optimiser ages and bias tables", padded * 2 + BiasCorrection::bytes());
+    ledger.add(
+        "optimiser ages and bias tables",
+        padded * 2 + BiasCorrection::bytes(),
+    );
     ledger.add("policy signals", Accumulators::bytes(budget, needs.signals));
-    ledger.add("policy candidates", Candidates::bytes(needs.candidates, grid.width * grid.height));
+    ledger.add(
+        "policy candidates",
+        Candidates::bytes(needs.candidates, grid.width * grid.height),
+    );
     ledger.add(
         "projected splats",
         budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
     );
     ledger.add("splat gradients", padded * stride as u64 * float);
-    ledger.add("tile lists", TileLists::bytes(budget, cap as usize, grid.tiles()));
+    ledger.add(
+        "tile lists",
+        TileLists::bytes(budget, cap as usize, grid.tiles()),
+    );
     ledger.add("tile gradients", cap * stride as u64 * float);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add("image and image gradient", (grid.tiles() * per_tile) as u64);
@@ -552,8 +696,13 @@ fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
 /// training and not an abort within it.
 fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
     let bytes = ledger.total();
-    let failed = BackendError::OutOfMemory { what: "the training buffers", bytes };
-    let Ok(size) = usize::try_from(bytes) else { return Err(failed) };
+    let failed = BackendError::OutOfMemory {
+        what: "the training buffers",
+        bytes,
+    };
+    let Ok(size) = usize::try_from(bytes) else {
+        return Err(failed);
+    };
     Vec::<u8>::new().try_reserve_exact(size).map_err(|_| failed)
 }
 
@@ -575,7 +724,12 @@ impl Backend for CpuBackend {
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, .. } = *input;
+        let StepInput {
+            camera,
+            target,
+            background,
+            ..
+        } = *input;
         assert_eq!(
             (camera.width, camera.height),
             (target.width, target.height),
@@ -591,6 +745,7 @@ impl Backend for CpuBackend {
         let detail = self.signals.detail();
         self.backward(&frame, detail);
         self.optimise(&frame, input, detail);
+        self.clock.lap("project_bwd + adam");
         Ok(StepOutput {
             visible: frame.visible,
             entries: frame.entries,
@@ -600,15 +755,24 @@ impl Backend for CpuBackend {
     }
 
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
-        let signals = self.signals.take(self.rows, needs.signals, &self.params, &self.ages);
+        let signals = self
+            .signals
+            .take(self.rows, needs.signals, &self.params, &self.ages);
         Ok((signals, self.candidates.list().to_vec()))
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
         // Kept in release builds: this is the promise.
-        assert_eq!(ops.rows_before, self.rows, "a plan for another number of rows");
+        assert_eq!(
+            ops.rows_before, self.rows,
+            "a plan for another number of rows"
+        );
         assert_eq!(ops.budget, self.budget, "a plan for another budget");
-        assert!(ops.rows_after <= self.budget, "{} rows over the budget", ops.rows_after);
+        assert!(
+            ops.rows_after <= self.budget,
+            "{} rows over the budget",
+            ops.rows_after
+        );
         if let Err(broken) = ops.check() {
             panic!("a plan that breaks its own rules: {broken}");
         }
@@ -644,21 +808,41 @@ impl Backend for CpuBackend {
 impl CpuBackend {
     /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
     fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>, detail: Detail) {
-        let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } = self;
+        let Self {
+            pool,
+            arch,
+            params,
+            moments,
+            ages,
+            signals,
+            sums,
+            visible,
+            bias,
+            rows,
+            ..
+        } = self;
         let (rows, arch) = (*rows, *arch);
         let [m, v] = moments;
         let layout = signals.layout();
         let (stride, signal_stride) = (params.stride(), signals.blocks.stride());
         let blocks = rows.div_ceil(WIDTH);
         let mut signal_blocks: Vec<&mut [f32]> = if signal_stride == 0 {
-            (0..blocks.div_ceil(BLOCKS_PER_TASK)).map(|_| Default::default()).collect()
+            (0..blocks.div_ceil(BLOCKS_PER_TASK))
+                .map(|_| Default::default())
+                .collect()
         } else {
             let per_task = signal_stride * BLOCKS_PER_TASK;
-            signals.blocks.of_rows_mut(rows).chunks_mut(per_task).collect()
+            signals
+                .blocks
+                .of_rows_mut(rows)
+                .chunks_mut(per_task)
+                .collect()
         };
         pool.install(|| {
             (
-                params.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
+                params
+                    .of_rows_mut(rows)
+                    .par_chunks_mut(stride * BLOCKS_PER_TASK),
                 m.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
                 v.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
                 ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),

@@ -13,7 +13,7 @@ use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};
 
 use super::blocks::plane;
-use super::simd::{V, WIDTH};
+use super::simd::{Mask, V, WIDTH, each};
 use crate::camera::Camera;
 use crate::gaussians::sh_coefficients;
 use crate::sh;
@@ -117,14 +117,14 @@ pub(super) struct Geometry<S: Simd> {
 }
 
 #[inline(always)]
-fn dot<S: Simd>(a: [V<S>; 3], b: [V<S>; 3]) -> V<S> {
+pub(super) fn dot<S: Simd>(a: [V<S>; 3], b: [V<S>; 3]) -> V<S> {
     a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
 }
 
 /// The rows of the view's rotation as vectors of equal lanes.
 #[inline(always)]
 pub(super) fn rotation<S: Simd>(s: S, view: &ViewParams) -> [[V<S>; 3]; 3] {
-    view.rotation.map(|row| row.map(|x| V::splat(s, x)))
+    each!(i in 3 => each!(k in 3 => V::splat(s, view.rotation[i][k])))
 }
 
 /// Lanes `at..` of the sixteen values of plane `plane` in `block`.
@@ -137,37 +137,48 @@ pub(super) fn lanes<S: Simd>(s: S, block: &[f32], plane: usize, at: usize) -> V<
 #[inline(always)]
 pub(super) fn geometry<S: Simd>(s: S, block: &[f32], at: usize, view: &ViewParams) -> Geometry<S> {
     let c = |x: f32| V::splat(s, x);
-    let plane3 = |first: usize| [0, 1, 2].map(|i| lanes(s, block, first + i, at));
-    let mean = plane3(plane::MEAN);
-    let scale = plane3(plane::LOG_SCALE).map(V::exp);
-    let raw = [0, 1, 2, 3].map(|i| lanes(s, block, plane::QUAT + i, at));
-    let norm2 = raw[0].mul_add(raw[0], raw[1].mul_add(raw[1], raw[2].mul_add(raw[2], raw[3] * raw[3])));
+    let mean = each!(i in 3 => lanes(s, block, plane::MEAN + i, at));
+    let scale = each!(i in 3 => lanes(s, block, plane::LOG_SCALE + i, at).exp());
+    let raw = each!(i in 4 => lanes(s, block, plane::QUAT + i, at));
+    let norm2 = raw[0].mul_add(
+        raw[0],
+        raw[1].mul_add(raw[1], raw[2].mul_add(raw[2], raw[3] * raw[3])),
+    );
     let quat_inv_norm = c(1.0) / norm2.sqrt();
-    let quat = raw.map(|q| q * quat_inv_norm);
+    let quat = each!(i in 4 => raw[i] * quat_inv_norm);
     let [w, x, y, z] = quat;
     let two = c(2.0);
     let axes = [
-        [c(1.0) - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)],
-        [two * (x * y - w * z), c(1.0) - two * (x * x + z * z), two * (y * z + w * x)],
-        [two * (x * z + w * y), two * (y * z - w * x), c(1.0) - two * (x * x + y * y)],
+        [
+            c(1.0) - two * (y * y + z * z),
+            two * (x * y + w * z),
+            two * (x * z - w * y),
+        ],
+        [
+            two * (x * y - w * z),
+            c(1.0) - two * (x * x + z * z),
+            two * (y * z + w * x),
+        ],
+        [
+            two * (x * z + w * y),
+            two * (y * z - w * x),
+            c(1.0) - two * (x * x + y * y),
+        ],
     ];
     let rot = rotation(s, view);
-    let p = [0, 1, 2].map(|i| {
-        rot[i][0].mul_add(
-            mean[0],
-            rot[i][1].mul_add(mean[1], rot[i][2].mul_add(mean[2], c(view.translation[i]))),
-        )
+    let p = each!(i in 3 => {
+        let [r0, r1, r2] = rot[i];
+        r0.mul_add(mean[0], r1.mul_add(mean[1], r2.mul_add(mean[2], c(view.translation[i]))))
     });
     let inv_z = c(1.0) / p[2];
     let ratio = [p[0] * inv_z, p[1] * inv_z];
-    let clamped =
-        [0, 1].map(|i| ratio[i].max(c(view.ratio_min[i])).min(c(view.ratio_max[i])));
-    let n = [0, 1].map(|i| {
+    let clamped = each!(i in 2 => ratio[i].max(c(view.ratio_min[i])).min(c(view.ratio_max[i])));
+    let n = each!(i in 2 => {
         let f = inv_z * view.focal[i];
-        let b = [0, 1, 2].map(|k| f * clamped[i].neg_mul_add(rot[2][k], rot[i][k]));
-        axes.map(|axis| dot(b, axis))
+        let b = each!(k in 3 => f * clamped[i].neg_mul_add(rot[2][k], rot[i][k]));
+        each!(k in 3 => dot(b, axes[k]))
     });
-    let v = n.map(|row| [row[0] * scale[0], row[1] * scale[1], row[2] * scale[2]]);
+    let v = each!(i in 2 => each!(k in 3 => n[i][k] * scale[k]));
     let (a, b, d) = (dot(v[0], v[0]), dot(v[0], v[1]), dot(v[1], v[1]));
     let cross = [
         difference_of_products(v[0][1], v[1][2], v[0][2], v[1][1]),
@@ -214,12 +225,12 @@ pub(super) fn direction<S: Simd>(
     at: usize,
     view: &ViewParams,
 ) -> ([V<S>; 3], V<S>) {
-    let v = [0, 1, 2].map(|i| lanes(s, block, plane::MEAN + i, at) - view.centre[i]);
+    let v = each!(i in 3 => lanes(s, block, plane::MEAN + i, at) - view.centre[i]);
     let norm2 = dot(v, v);
     // Below this the square has lost its bits; the direction is then undefined and its gradient 0.
     let far = V::splat(s, 1e-30).lt(norm2);
     let inv = far.keep(V::splat(s, 1.0) / norm2.sqrt());
-    (v.map(|x| x * inv), inv)
+    (each!(i in 3 => v[i] * inv), inv)
 }
 
 /// Basis functions for the view's degree at `d`.
@@ -254,6 +265,16 @@ pub(super) fn raw_colour<S: Simd>(
 fn log2_sigmoid<S: Simd>(s: S, x: V<S>) -> V<S> {
     let tail = (V::splat(s, 1.0) + (-x.abs()).exp()).log2_of_1_to_2();
     x.min(V::zero(s)) * std::f32::consts::LOG2_E - tail
+}
+
+/// Whether a splat reaches any pixel centre, from ½ to size − ½. Comparisons are false for NaN, so
+/// that a poisoned row is nowhere.
+#[inline(always)]
+fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
+    let last = V::splat(s, size as f32 - 0.5);
+    V::splat(s, 0.5)
+        .le(centre + half)
+        .and((centre - half).le(last))
 }
 
 /// Projects a run of whole blocks and lists the rows that are on screen.
@@ -301,23 +322,20 @@ impl WithSimd for Project<'_> {
                 let radius = reach.max(V::zero(s)).sqrt() * (1.0 / FOLD);
                 let half_width = radius * g.cov[0].sqrt();
                 let half_height = radius * g.cov[2].sqrt();
-                let u = g.ratio[0].mul_add(V::splat(s, view.focal[0]), V::splat(s, view.principal[0]));
-                let v = g.ratio[1].mul_add(V::splat(s, view.focal[1]), V::splat(s, view.principal[1]));
-                // A splat reaches pixel centres from ½ to size − ½. All comparisons are false for
-                // NaN, so that a poisoned row is nowhere.
-                let reaches = |centre: V<S>, half: V<S>, size: u32| {
-                    let last = V::splat(s, size as f32 - 0.5);
-                    V::splat(s, 0.5).le(centre + half).and((centre - half).le(last))
-                };
+                let u =
+                    g.ratio[0].mul_add(V::splat(s, view.focal[0]), V::splat(s, view.principal[0]));
+                let v =
+                    g.ratio[1].mul_add(V::splat(s, view.focal[1]), V::splat(s, view.principal[1]));
                 let alive = alive
-                    .and(reaches(u, half_width, view.width))
-                    .and(reaches(v, half_height, view.height));
+                    .and(reaches(s, u, half_width, view.width))
+                    .and(reaches(s, v, half_height, view.height));
                 if !alive.any() {
                     continue;
                 }
                 let (dir, _) = direction(s, block, at, view);
                 let y = sh_basis(s, view.sh_degree, dir);
-                let colour = raw_colour(s, block, at, view.sh_degree, &y).map(|c| c.max(V::zero(s)));
+                let raw = raw_colour(s, block, at, view.sh_degree, &y);
+                let colour = each!(i in 3 => raw[i].max(V::zero(s)));
                 let fields = [
                     u,
                     v,
@@ -344,8 +362,11 @@ impl WithSimd for Project<'_> {
                     continue;
                 }
                 let row = b * WIDTH + lane;
-                let splat: [f32; 12] = std::array::from_fn(|field| out[field][lane]);
-                let splat: Splat = bytemuck::cast(splat);
+                let mut fields = [0.0; 12];
+                for (field, line) in fields.iter_mut().zip(&out) {
+                    *field = line[lane];
+                }
+                let splat: Splat = bytemuck::cast(fields);
                 // Positive floats compare as their bits do; equal depths are ordered by row.
                 let key = u64::from(splat.depth.to_bits()) << 32 | (self.first_row + row) as u64;
                 self.seen[b] |= 1 << lane;

@@ -15,10 +15,11 @@ use pulp::Simd;
 
 use super::blocks::plane;
 use super::project::{
-    FOLD, Geometry, ViewParams, conic, direction, geometry, lanes, raw_colour, rotation, sh_basis,
+    FOLD, Geometry, ViewParams, conic, direction, dot, geometry, lanes, raw_colour, rotation,
+    sh_basis,
 };
 use super::rasterize_bwd::{Detail, field};
-use super::simd::{V, WIDTH};
+use super::simd::{V, WIDTH, each};
 use crate::gaussians::sh_coefficients;
 use crate::sh;
 
@@ -86,17 +87,34 @@ impl BlockGradient {
         let c = |x: f32| V::splat(s, x);
         let zero = V::zero(s);
         let seen = zero.lt(V::load(s, &self.visible[at..]));
-        let sum = |f: usize| V::load(s, &self.sums[f][at..]);
+        let params = &mut self.params;
+        macro_rules! put {
+            ($p:expr, $x:expr) => {{
+                let p = $p;
+                seen.keep($x)
+                    .store(&mut params[p * WIDTH + at..(p + 1) * WIDTH]);
+            }};
+        }
+        macro_rules! sum {
+            ($field:expr) => {
+                V::load(s, &self.sums[$field][at..])
+            };
+        }
+
         let g = geometry(s, block, at, view);
         let [l1, shear, l3] = conic(&g);
         // Out of the folded units of the rasteriser.
         let unfold = 1.0 / FOLD;
-        let (q, qu, qz) = (sum(field::Q), sum(field::U) * unfold, sum(field::Z) * unfold);
+        let (q, qu, qz) = (
+            sum!(field::Q),
+            sum!(field::U) * unfold,
+            sum!(field::Z) * unfold,
+        );
         let unfold2 = unfold * unfold;
         let (muu, muz, mzz) = (
-            sum(field::UU) * unfold2,
-            sum(field::UZ) * unfold2,
-            sum(field::ZZ) * unfold2,
+            sum!(field::UU) * unfold2,
+            sum!(field::UZ) * unfold2,
+            sum!(field::ZZ) * unfold2,
         );
 
         // Projected mean: L·Σ q·(u, z).
@@ -106,73 +124,70 @@ impl BlockGradient {
         }
         if detail == Detail::All {
             // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with folded u', z', l'.
-            let abs = [l1 * sum(field::ABS_X) * unfold, sum(field::ABS_Y) * unfold2];
+            let abs = [
+                l1 * sum!(field::ABS_X) * unfold,
+                sum!(field::ABS_Y) * unfold2,
+            ];
             for (slot, x) in self.mean2d_abs.iter_mut().zip(abs) {
                 seen.keep(x).store(&mut slot[at..]);
             }
         }
-        let mut put = |p: usize, x: V<S>| {
-            seen.keep(x).store(&mut self.params[p * WIDTH + at..(p + 1) * WIDTH]);
-        };
-
         // Columns of W without their scales, M·n, and so on.
-        let n0 = [0, 1, 2].map(|k| l1 * (g.n[0][k] - shear * g.n[1][k]));
-        let n1 = g.n[1].map(|x| l3 * x);
-        let mn0 = [0, 1, 2].map(|k| muu * n0[k] + muz * n1[k]);
-        let mn1 = [0, 1, 2].map(|k| muz * n0[k] + mzz * n1[k]);
-        let scale2 = g.scale.map(|x| x * x);
+        let n0 = each!(k in 3 => l1 * (g.n[0][k] - shear * g.n[1][k]));
+        let n1 = each!(k in 3 => l3 * g.n[1][k]);
+        let mn0 = each!(k in 3 => muu * n0[k] + muz * n1[k]);
+        let mn1 = each!(k in 3 => muz * n0[k] + mzz * n1[k]);
+        let scale2 = each!(k in 3 => g.scale[k] * g.scale[k]);
         for k in 0..3 {
-            put(plane::LOG_SCALE + k, (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
+            put!(
+                plane::LOG_SCALE + k,
+                (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]
+            );
         }
-        let pair = |i: usize, k: usize| n0[i] * mn0[k] + n1[i] * mn1[k];
-        let turn = [
-            pair(1, 2) * (scale2[1] - scale2[2]),
-            pair(2, 0) * (scale2[2] - scale2[0]),
-            pair(0, 1) * (scale2[0] - scale2[1]),
-        ];
+        let turn = each!(i in 3 => {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            (n0[j] * mn0[k] + n1[j] * mn1[k]) * (scale2[j] - scale2[k])
+        });
         let [w, x, y, z] = g.quat;
         let two = g.quat_inv_norm * 2.0;
         let [tx, ty, tz] = turn;
-        put(plane::QUAT, -(x * tx + y * ty + z * tz) * two);
-        put(plane::QUAT + 1, (w * tx + y * tz - z * ty) * two);
-        put(plane::QUAT + 2, (w * ty + z * tx - x * tz) * two);
-        put(plane::QUAT + 3, (w * tz + x * ty - y * tx) * two);
+        put!(plane::QUAT, -(x * tx + y * ty + z * tz) * two);
+        put!(plane::QUAT + 1, (w * tx + y * tz - z * ty) * two);
+        put!(plane::QUAT + 2, (w * ty + z * tx - x * tz) * two);
+        put!(plane::QUAT + 3, (w * tz + x * ty - y * tx) * two);
 
         // dL/d(row i of J·W) = Σ_k (L·M·n)[i][k]·sₖ²·axisₖ.
-        let d0 = mn0.map(|x| l1 * x);
-        let d1 = [0, 1, 2].map(|k| l3 * mn1[k] - l1 * shear * mn0[k]);
-        let onto_axes = |d: [V<S>; 3]| {
-            [0, 1, 2].map(|i| {
-                d[0] * scale2[0] * g.axes[0][i]
-                    + d[1] * scale2[1] * g.axes[1][i]
-                    + d[2] * scale2[2] * g.axes[2][i]
-            })
-        };
+        let d0 = each!(k in 3 => l1 * mn0[k] * scale2[k]);
+        let d1 = each!(k in 3 => (l3 * mn1[k] - l1 * shear * mn0[k]) * scale2[k]);
+        let [a0, a1, a2] = g.axes;
+        let db0 = each!(i in 3 => d0[0] * a0[i] + d0[1] * a1[i] + d0[2] * a2[i]);
+        let db1 = each!(i in 3 => d1[0] * a0[i] + d1[1] * a1[i] + d1[2] * a2[i]);
         let rot = rotation(s, view);
-        let along = |d: &[V<S>; 3], row: usize| {
-            d[0] * rot[row][0] + d[1] * rot[row][1] + d[2] * rot[row][2]
-        };
-        let [fx, fy] = view.focal.map(c);
-        let [db0, db1] = [onto_axes(d0), onto_axes(d1)];
-        let (j00, j02) = (along(&db0, 0), along(&db0, 2));
-        let (j11, j12) = (along(&db1, 1), along(&db1, 2));
-        let Geometry { inv_z, ratio, clamped, .. } = g;
+        let (fx, fy) = (c(view.focal[0]), c(view.focal[1]));
+        let (j00, j02) = (dot(db0, rot[0]), dot(db0, rot[2]));
+        let (j11, j12) = (dot(db1, rot[1]), dot(db1, rot[2]));
+        let Geometry {
+            inv_z,
+            ratio,
+            clamped,
+            ..
+        } = g;
         // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
         let by_inv_z = fx * (j00 - clamped[0] * j02) + fy * (j11 - clamped[1] * j12);
-        let free = |i: usize, x: V<S>| {
-            let inside = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
-            inside.keep(x)
+        let (focal, j_2) = ([fx, fy], [j02, j12]);
+        let by_ratio = each!(i in 2 => {
+            let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
+            focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
+        });
+        let by_depth = if detail == Detail::All {
+            sum!(field::DEPTH)
+        } else {
+            zero
         };
-        let by_ratio = [
-            fx * dm[0] - free(0, fx * inv_z * j02),
-            fy * dm[1] - free(1, fy * inv_z * j12),
-        ];
-        let by_depth = if detail == Detail::All { sum(field::DEPTH) } else { zero };
         let dp = [
             by_ratio[0] * inv_z,
             by_ratio[1] * inv_z,
-            by_depth
-                - inv_z * (by_ratio[0] * ratio[0] + by_ratio[1] * ratio[1] + inv_z * by_inv_z),
+            by_depth - inv_z * (by_ratio[0] * ratio[0] + by_ratio[1] * ratio[1] + inv_z * by_inv_z),
         ];
 
         // Colour: through the clamp at 0 to the coefficients, and through the direction to the mean.
@@ -180,25 +195,25 @@ impl BlockGradient {
         let (dir, inv_distance) = direction(s, block, at, view);
         let basis = sh_basis(s, degree, dir);
         let raw = raw_colour(s, block, at, degree, &basis);
-        let dc = [0, 1, 2].map(|i| zero.lt(raw[i]).keep(sum(field::COLOUR + i)));
+        let dc = each!(i in 3 => zero.lt(raw[i]).keep(sum!(field::COLOUR + i)));
         let mut weights = [zero; 16];
         for k in 0..sh_coefficients(degree) {
             for (channel, &dc) in dc.iter().enumerate() {
                 let p = plane::SH + 3 * k + channel;
                 weights[k] = dc.mul_add(lanes(s, block, p, at), weights[k]);
-                put(p, basis[k] * dc);
+                put!(p, basis[k] * dc);
             }
         }
         let by_dir = sh::basis_gradient(degree, dir, &weights, zero);
-        let radial = by_dir[0] * dir[0] + by_dir[1] * dir[1] + by_dir[2] * dir[2];
+        let radial = dot(by_dir, dir);
         for i in 0..3 {
             let from_p = rot[0][i] * dp[0] + rot[1][i] * dp[1] + rot[2][i] * dp[2];
             let from_dir = (by_dir[i] - radial * dir[i]) * inv_distance;
-            put(plane::MEAN + i, from_p + from_dir);
+            put!(plane::MEAN + i, from_p + from_dir);
         }
 
         // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
         let logit = lanes(s, block, plane::OPACITY, at);
-        put(plane::OPACITY, q / (c(1.0) + logit.exp()));
+        put!(plane::OPACITY, q / (c(1.0) + logit.exp()));
     }
 }

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use pulp::{Simd, WithSimd};
 
 use super::project::{LOG2_255, Splat};
-use super::simd::{V, WIDTH};
+use super::simd::{V, WIDTH, each};
 use super::tiles::{Grid, TILE, TILE_PIXELS};
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
@@ -41,8 +41,10 @@ pub(super) struct TileCanvas {
 }
 
 impl TileCanvas {
-    pub(super) const EMPTY: Self =
-        Self { planes: [[0.0; TILE_PIXELS]; CANVAS_PLANES], stop: [u32::MAX; TILE_PIXELS] };
+    pub(super) const EMPTY: Self = Self {
+        planes: [[0.0; TILE_PIXELS]; CANVAS_PLANES],
+        stop: [u32::MAX; TILE_PIXELS],
+    };
 }
 
 /// Where a tile lies in the image.
@@ -82,8 +84,12 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub(super) const EMPTY: Self =
-        Self { mask: 0, top: [0.0; WIDTH], offset: [0.0; WIDTH], z: [0.0; WIDTH] };
+    pub(super) const EMPTY: Self = Self {
+        mask: 0,
+        top: [0.0; WIDTH],
+        offset: [0.0; WIDTH],
+        z: [0.0; WIDTH],
+    };
 
     #[inline(always)]
     pub(super) fn set<S: Simd>(&mut self, s: S, splat: &Splat, place: &TilePlace) {
@@ -93,12 +99,17 @@ impl Rows {
         let first = (my - splat.half_height * 1.0001 - 0.52).ceil().max(0.0) as u32;
         let last = (my + splat.half_height * 1.0001 - 0.48).floor().min(15.0);
         let end = if last < 0.0 { 0 } else { last as u32 + 1 };
-        self.mask = if first < end { (1 << end) - (1 << first) } else { 0 };
+        self.mask = if first < end {
+            (1 << end) - (1 << first)
+        } else {
+            0
+        };
         for at in (0..WIDTH).step_by(S::F32_LANES) {
             let dy = V::load(s, &CENTRES[at..]) - my;
             let z = dy * splat.l3;
             z.store(&mut self.z[at..]);
-            z.neg_mul_add(z, c(splat.log2_opacity)).store(&mut self.top[at..]);
+            z.neg_mul_add(z, c(splat.log2_opacity))
+                .store(&mut self.top[at..]);
             let shift = c(splat.shear).mul_add(dy, c(mx));
             (shift * -splat.l1).store(&mut self.offset[at..]);
         }
@@ -131,18 +142,35 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        if self.with_depth { self.run::<S, true>(s) } else { self.run::<S, false>(s) }
+        if self.with_depth {
+            self.run::<S, true>(s)
+        } else {
+            self.run::<S, false>(s)
+        }
     }
 }
 
 impl Rasterize<'_> {
     #[inline(always)]
     fn run<S: Simd, const WITH_DEPTH: bool>(self, s: S) {
-        let Self { splats, list, place, background, canvas, .. } = self;
+        let Self {
+            splats,
+            list,
+            place,
+            background,
+            canvas,
+            ..
+        } = self;
         let c = |x: f32| V::splat(s, x);
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
-        for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
+        for plane in [
+            &mut *red,
+            &mut *green,
+            &mut *blue,
+            &mut *finished,
+            &mut *depth,
+        ] {
             plane.fill(0.0);
         }
         stop.fill(u32::MAX);
@@ -165,7 +193,7 @@ impl Rasterize<'_> {
                 rows.set(s, splat, &place);
                 let mut todo = rows.mask & alive;
                 let l1 = c(splat.l1);
-                let colour = splat.colour.map(c);
+                let colour = each!(i in 3 => c(splat.colour[i]));
                 let z = c(splat.depth);
                 while todo != 0 {
                     let y = todo.trailing_zeros() as usize;
@@ -181,15 +209,11 @@ impl Rasterize<'_> {
                         let next = alpha.neg_mul_add(t, t);
                         let goes_on = c(TRANSMITTANCE_MIN).lt(next).and(seen);
                         let w = goes_on.keep(alpha * t);
-                        let add = |plane: &mut Plane, x: V<S>| {
-                            let sum = w.mul_add(x, V::load(s, &plane[px..]));
-                            sum.store(&mut plane[px..]);
-                        };
-                        add(red, colour[0]);
-                        add(green, colour[1]);
-                        add(blue, colour[2]);
+                        blend(s, w, colour[0], &mut red[px..]);
+                        blend(s, w, colour[1], &mut green[px..]);
+                        blend(s, w, colour[2], &mut blue[px..]);
                         if WITH_DEPTH {
-                            add(depth, z);
+                            blend(s, w, z, &mut depth[px..]);
                         }
                         goes_on.select(next, t).store(&mut light[px..]);
                         let stops = next
@@ -219,11 +243,21 @@ impl Rasterize<'_> {
         for px in (0..TILE_PIXELS).step_by(S::F32_LANES) {
             let t = V::load(s, &light[px..]).max(V::load(s, &finished[px..]));
             t.store(&mut finished[px..]);
-            for (plane, background) in [&mut *red, &mut *green, &mut *blue].into_iter().zip(background) {
-                t.mul_add(c(background), V::load(s, &plane[px..])).store(&mut plane[px..]);
+            for (plane, background) in [&mut *red, &mut *green, &mut *blue]
+                .into_iter()
+                .zip(background)
+            {
+                t.mul_add(c(background), V::load(s, &plane[px..]))
+                    .store(&mut plane[px..]);
             }
         }
     }
+}
+
+/// plane += w·x.
+#[inline(always)]
+fn blend<S: Simd>(s: S, w: V<S>, x: V<S>, plane: &mut [f32]) {
+    w.mul_add(x, V::load(s, plane)).store(plane);
 }
 
 #[repr(align(64))]

@@ -22,7 +22,7 @@ use super::project::{LOG2_255, Splat};
 use super::rasterize::{
     ALPHA_MAX, Aligned, BATCH, CENTRES, Plane, Rows, TRANSMITTANCE, TileCanvas, TilePlace,
 };
-use super::simd::{V, WIDTH};
+use super::simd::{V, WIDTH, each};
 use super::tiles::{TILE, TILE_PIXELS};
 
 /// Fields of a record.
@@ -128,7 +128,17 @@ struct Sums<S: Simd> {
 impl RasterizeBwd<'_> {
     #[inline(always)]
     fn run<S: Simd, const DETAIL: u8>(self, s: S) {
-        let Self { splats, list, place, background, canvas, upstream, records, detail, .. } = self;
+        let Self {
+            splats,
+            list,
+            place,
+            background,
+            canvas,
+            upstream,
+            records,
+            detail,
+            ..
+        } = self;
         let stride = detail.stride();
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb] = upstream;
@@ -149,7 +159,12 @@ impl RasterizeBwd<'_> {
         let mut row_end = [0_u32; TILE];
         for (y, end) in row_end.iter_mut().enumerate().take(place.height) {
             let row = &canvas.stop[y * TILE..y * TILE + place.width];
-            *end = row.iter().copied().max().unwrap_or(0).min(list.len() as u32);
+            *end = row
+                .iter()
+                .copied()
+                .max()
+                .unwrap_or(0)
+                .min(list.len() as u32);
         }
         let list_end = row_end.iter().copied().max().unwrap_or(0) as usize;
         records[list_end * stride..].fill(0.0);
@@ -171,7 +186,7 @@ impl RasterizeBwd<'_> {
                 rows.set(s, splat, &place);
                 let mut todo = rows.mask & alive;
                 let l1 = c(splat.l1);
-                let colour = splat.colour.map(c);
+                let colour = each!(i in 3 => c(splat.colour[i]));
                 let at_depth = c(splat.depth);
                 let here = s.splat_u32s((first + i) as u32);
                 let y2_u = c(-splat.l1 * splat.shear);
@@ -199,8 +214,11 @@ impl RasterizeBwd<'_> {
                         let t = V::load(s, &light[px..]) / (c(1.0) - alpha);
                         t.store(&mut light[px..]);
                         let w = alpha * t;
-                        let (r, g, b) =
-                            (V::load(s, &gr[px..]), V::load(s, &gg[px..]), V::load(s, &gb[px..]));
+                        let (r, g, b) = (
+                            V::load(s, &gr[px..]),
+                            V::load(s, &gg[px..]),
+                            V::load(s, &gb[px..]),
+                        );
                         let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
                         if DETAIL == 2 {
                             let d = V::load(s, &gd[px..]);
@@ -263,7 +281,11 @@ pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[f32], entries:
     for &entry in entries {
         let record = &records[entry as usize * stride..(entry as usize + 1) * stride];
         for (i, (sum, &x)) in sums.iter_mut().zip(record).enumerate() {
-            *sum = if detail.maximum() == Some(i) { sum.max(x) } else { *sum + x };
+            *sum = if detail.maximum() == Some(i) {
+                sum.max(x)
+            } else {
+                *sum + x
+            };
         }
     }
 }

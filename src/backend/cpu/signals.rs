@@ -4,10 +4,10 @@ use densify_policies::policy::{Signal, SignalSet, Signals};
 use pulp::Simd;
 
 use super::blocks::{Blocks, plane};
-use super::project::ViewParams;
+use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::{Detail, field};
-use super::simd::{V, WIDTH};
+use super::simd::{V, WIDTH, each};
 
 /// Signals that are sums over views, in plane order.
 const SUMS: [Signal; 10] = [
@@ -40,6 +40,16 @@ pub(super) struct Layout {
     planes: usize,
 }
 
+#[inline(always)]
+fn norm2<S: Simd>(x: V<S>, y: V<S>) -> V<S> {
+    (x * x + y * y).sqrt()
+}
+
+#[inline(always)]
+fn norm3<S: Simd>(v: [V<S>; 3]) -> V<S> {
+    dot(v, v).sqrt()
+}
+
 impl Layout {
     fn new(requested: SignalSet) -> Self {
         let mut planes = 0;
@@ -51,7 +61,11 @@ impl Layout {
         let previous = next(requested.contains(Signal::WeightMax));
         let current = next(requested.contains(Signal::WeightMax));
         let weight_max = previous.zip(current).map(|(a, b)| [a, b]);
-        Self { sums, weight_max, planes }
+        Self {
+            sums,
+            weight_max,
+            planes,
+        }
     }
 
     /// Adds one view's contribution to the accumulators of a block.
@@ -64,43 +78,47 @@ impl Layout {
         detail: Detail,
         view: &ViewParams,
     ) {
-        let half = [view.width, view.height].map(|size| V::splat(s, 0.5 * size as f32));
+        let half = [
+            V::splat(s, 0.5 * view.width as f32),
+            V::splat(s, 0.5 * view.height as f32),
+        ];
         for at in (0..WIDTH).step_by(S::F32_LANES) {
-            let line = |line: &[f32; WIDTH]| V::load(s, &line[at..]);
-            let param = |p: usize| V::load(s, &g.params[p * WIDTH + at..]);
-            let sum = |f: usize| line(&g.sums[f]);
-            let norm2 = |x: V<S>, y: V<S>| (x * x + y * y).sqrt();
-            let norm3 = |x: V<S>, y: V<S>, z: V<S>| (x * x + y * y + z * z).sqrt();
+            macro_rules! line {
+                ($line:expr) => {
+                    V::load(s, &$line[at..])
+                };
+            }
+            macro_rules! sum {
+                ($field:expr) => {
+                    line!(g.sums[$field])
+                };
+            }
+            let mean = each!(i in 3 => lanes(s, &g.params, plane::MEAN + i, at));
             for (signal, plane) in SUMS.iter().zip(self.sums) {
                 let Some(plane) = plane else { continue };
                 let x = match signal {
-                    Signal::VisibleCount => line(&g.visible),
+                    Signal::VisibleCount => line!(g.visible),
                     Signal::ScreenGradient => {
-                        norm2(line(&g.mean2d[0]) * half[0], line(&g.mean2d[1]) * half[1])
+                        norm2(line!(g.mean2d[0]) * half[0], line!(g.mean2d[1]) * half[1])
                     }
-                    Signal::ScreenGradientAbs => {
-                        norm2(line(&g.mean2d_abs[0]) * half[0], line(&g.mean2d_abs[1]) * half[1])
-                    }
-                    Signal::ColourGradient => norm3(
-                        sum(field::COLOUR),
-                        sum(field::COLOUR + 1),
-                        sum(field::COLOUR + 2),
+                    Signal::ScreenGradientAbs => norm2(
+                        line!(g.mean2d_abs[0]) * half[0],
+                        line!(g.mean2d_abs[1]) * half[1],
                     ),
-                    Signal::MeanGradientX => param(plane::MEAN),
-                    Signal::MeanGradientY => param(plane::MEAN + 1),
-                    Signal::MeanGradientZ => param(plane::MEAN + 2),
-                    Signal::MeanGradientNorm => {
-                        norm3(param(plane::MEAN), param(plane::MEAN + 1), param(plane::MEAN + 2))
-                    }
-                    Signal::WeightSum => sum(field::WEIGHT_SUM),
-                    _ => sum(field::PIXELS),
+                    Signal::ColourGradient => norm3(each!(i in 3 => sum!(field::COLOUR + i))),
+                    Signal::MeanGradientX => mean[0],
+                    Signal::MeanGradientY => mean[1],
+                    Signal::MeanGradientZ => mean[2],
+                    Signal::MeanGradientNorm => norm3(mean),
+                    Signal::WeightSum => sum!(field::WEIGHT_SUM),
+                    _ => sum!(field::PIXELS),
                 };
                 let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
                 (V::load(s, to) + x).store(to);
             }
             if let (Some([_, current]), Some(maximum)) = (self.weight_max, detail.maximum()) {
                 let to = &mut block[current * WIDTH + at..(current + 1) * WIDTH];
-                V::load(s, to).max(sum(maximum)).store(to);
+                V::load(s, to).max(sum!(maximum)).store(to);
             }
         }
     }
@@ -109,7 +127,11 @@ impl Layout {
 impl Accumulators {
     pub(super) fn new(budget: usize, requested: SignalSet) -> Self {
         let layout = Layout::new(requested);
-        Self { requested, layout, blocks: Blocks::zeros(budget, layout.planes) }
+        Self {
+            requested,
+            layout,
+            blocks: Blocks::zeros(budget, layout.planes),
+        }
     }
 
     pub(super) fn bytes(budget: usize, requested: SignalSet) -> u64 {
@@ -123,7 +145,11 @@ impl Accumulators {
     /// Which record fields the requested signals need.
     pub(super) fn detail(&self) -> Detail {
         let any = |signals: &[Signal]| signals.iter().any(|&s| self.requested.contains(s));
-        if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
+        if any(&[
+            Signal::ScreenGradientAbs,
+            Signal::WeightSum,
+            Signal::PixelCount,
+        ]) {
             Detail::All
         } else if any(&[Signal::WeightMax]) {
             Detail::WeightMax
@@ -136,7 +162,8 @@ impl Accumulators {
     pub(super) fn begin_epoch(&mut self, rows: usize) {
         if let Some([previous, current]) = self.layout.weight_max {
             for row in 0..rows {
-                self.blocks.set(row, previous, self.blocks.get(row, current));
+                self.blocks
+                    .set(row, previous, self.blocks.get(row, current));
                 self.blocks.set(row, current, 0.0);
             }
         }
@@ -163,9 +190,13 @@ impl Accumulators {
         for signal in wanted.iter() {
             let value = |row: usize| -> f32 {
                 match signal {
-                    Signal::WeightMax => self.layout.weight_max.map_or(0.0, |[previous, current]| {
-                        self.blocks.get(row, previous).max(self.blocks.get(row, current))
-                    }),
+                    Signal::WeightMax => {
+                        self.layout.weight_max.map_or(0.0, |[previous, current]| {
+                            self.blocks
+                                .get(row, previous)
+                                .max(self.blocks.get(row, current))
+                        })
+                    }
                     Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
                     Signal::ScaleMax => {
                         let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);

@@ -11,6 +11,27 @@ use pulp::Simd;
 /// Rows per block, and pixels per tile row: every lane count divides it.
 pub(super) const WIDTH: usize = 16;
 
+/// `[e(0), e(1), …]` without a closure: `each!(k in 3 => e(k))`.
+///
+/// Closures, those given to `array::map` among them, are compiled without the kernel's instruction
+/// set unless they happen to be inlined, and then every operator in them is a call.
+macro_rules! each {
+    ($k:ident in 2 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e)]
+    };
+    ($k:ident in 3 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e), each!(@ $k 2 $e)]
+    };
+    ($k:ident in 4 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e), each!(@ $k 2 $e), each!(@ $k 3 $e)]
+    };
+    (@ $k:ident $value:literal $e:expr) => {{
+        let $k: usize = $value;
+        $e
+    }};
+}
+pub(super) use each;
+
 /// `S::F32_LANES` numbers.
 #[derive(Clone, Copy)]
 pub(super) struct V<S: Simd> {
@@ -28,7 +49,10 @@ pub(super) struct Mask<S: Simd> {
 impl<S: Simd> V<S> {
     #[inline(always)]
     pub(super) fn splat(s: S, x: f32) -> Self {
-        Self { s, v: s.splat_f32s(x) }
+        Self {
+            s,
+            v: s.splat_f32s(x),
+        }
     }
 
     /// `x` in every lane, with the token of another vector.
@@ -45,7 +69,10 @@ impl<S: Simd> V<S> {
     /// The lanes `at * LANES ..` of `from`.
     #[inline(always)]
     pub(super) fn load(s: S, from: &[f32]) -> Self {
-        Self { s, v: S::as_simd_f32s(from).0[0] }
+        Self {
+            s,
+            v: S::as_simd_f32s(from).0[0],
+        }
     }
 
     #[inline(always)]
@@ -53,56 +80,70 @@ impl<S: Simd> V<S> {
         S::as_mut_simd_f32s(to).0[0] = self.v;
     }
 
-    #[inline(always)]
-    pub(super) fn raw(self) -> S::f32s {
-        self.v
-    }
-
-    #[inline(always)]
-    pub(super) fn from_raw(s: S, v: S::f32s) -> Self {
-        Self { s, v }
-    }
-
     /// self · b + c.
     #[inline(always)]
     pub(super) fn mul_add(self, b: Self, c: Self) -> Self {
-        Self { s: self.s, v: self.s.mul_add_e_f32s(self.v, b.v, c.v) }
+        Self {
+            s: self.s,
+            v: self.s.mul_add_e_f32s(self.v, b.v, c.v),
+        }
     }
 
     /// c − self · b.
     #[inline(always)]
     pub(super) fn neg_mul_add(self, b: Self, c: Self) -> Self {
-        Self { s: self.s, v: self.s.negate_mul_add_e_f32s(self.v, b.v, c.v) }
+        Self {
+            s: self.s,
+            v: self.s.negate_mul_add_e_f32s(self.v, b.v, c.v),
+        }
     }
 
     #[inline(always)]
     pub(super) fn min(self, b: Self) -> Self {
-        Self { s: self.s, v: self.s.min_f32s(self.v, b.v) }
+        Self {
+            s: self.s,
+            v: self.s.min_f32s(self.v, b.v),
+        }
     }
 
     #[inline(always)]
     pub(super) fn max(self, b: Self) -> Self {
-        Self { s: self.s, v: self.s.max_f32s(self.v, b.v) }
+        Self {
+            s: self.s,
+            v: self.s.max_f32s(self.v, b.v),
+        }
     }
 
     #[inline(always)]
     pub(super) fn abs(self) -> Self {
-        Self { s: self.s, v: self.s.abs_f32s(self.v) }
+        Self {
+            s: self.s,
+            v: self.s.abs_f32s(self.v),
+        }
     }
 
     #[inline(always)]
     pub(super) fn sqrt(self) -> Self {
-        Self { s: self.s, v: self.s.sqrt_f32s(self.v) }
+        Self {
+            s: self.s,
+            v: self.s.sqrt_f32s(self.v),
+        }
     }
 
     #[inline(always)]
     pub(super) fn lt(self, b: Self) -> Mask<S> {
-        Mask { s: self.s, m: self.s.less_than_f32s(self.v, b.v) }
+        Mask {
+            s: self.s,
+            m: self.s.less_than_f32s(self.v, b.v),
+        }
     }
 
     #[inline(always)]
     pub(super) fn le(self, b: Self) -> Mask<S> {
-        Mask { s: self.s, m: self.s.less_than_or_equal_f32s(self.v, b.v) }
+        Mask {
+            s: self.s,
+            m: self.s.less_than_or_equal_f32s(self.v, b.v),
+        }
     }
 
     #[inline(always)]
@@ -132,10 +173,12 @@ impl<S: Simd> V<S> {
             .mul_add(f, c(0.240_226_46))
             .mul_add(f, c(0.693_147_2))
             .mul_add(f, c(1.0));
-        let exponent =
-            s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
+        let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
         let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
-        Self { s, v: s.transmute_f32s_u32s(bits) }
+        Self {
+            s,
+            v: s.transmute_f32s_u32s(bits),
+        }
     }
 
     /// e^self, clamped to self in [−87, 88]; relative error below 2e-7.
@@ -157,10 +200,12 @@ impl<S: Simd> V<S> {
             .mul_add(f, c(0.5))
             .mul_add(f, c(1.0))
             .mul_add(f, c(1.0));
-        let exponent =
-            s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
+        let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
         let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
-        Self { s, v: s.transmute_f32s_u32s(bits) }
+        Self {
+            s,
+            v: s.transmute_f32s_u32s(bits),
+        }
     }
 
     /// log₂ of self in [1, 2]; absolute error below 2e-7.
@@ -186,12 +231,18 @@ impl<S: Simd> V<S> {
 impl<S: Simd> Mask<S> {
     #[inline(always)]
     pub(super) fn and(self, b: Self) -> Self {
-        Self { s: self.s, m: self.s.and_m32s(self.m, b.m) }
+        Self {
+            s: self.s,
+            m: self.s.and_m32s(self.m, b.m),
+        }
     }
 
     #[inline(always)]
     pub(super) fn select(self, yes: V<S>, no: V<S>) -> V<S> {
-        V { s: self.s, v: self.s.select_f32s(self.m, yes.v, no.v) }
+        V {
+            s: self.s,
+            v: self.s.select_f32s(self.m, yes.v, no.v),
+        }
     }
 
     /// `yes` where true, 0 elsewhere.
@@ -209,7 +260,10 @@ impl<S: Simd> Mask<S> {
 /// Lane by lane, whether `a < b` as unsigned integers.
 #[inline(always)]
 pub(super) fn before<S: Simd>(s: S, a: S::u32s, b: S::u32s) -> Mask<S> {
-    Mask { s, m: s.less_than_u32s(a, b) }
+    Mask {
+        s,
+        m: s.less_than_u32s(a, b),
+    }
 }
 
 macro_rules! operator {
@@ -218,14 +272,20 @@ macro_rules! operator {
             type Output = Self;
             #[inline(always)]
             fn $method(self, b: Self) -> Self {
-                Self { s: self.s, v: self.s.$simd(self.v, b.v) }
+                Self {
+                    s: self.s,
+                    v: self.s.$simd(self.v, b.v),
+                }
             }
         }
         impl<S: Simd> $trait<f32> for V<S> {
             type Output = Self;
             #[inline(always)]
             fn $method(self, b: f32) -> Self {
-                Self { s: self.s, v: self.s.$simd(self.v, self.s.splat_f32s(b)) }
+                Self {
+                    s: self.s,
+                    v: self.s.$simd(self.v, self.s.splat_f32s(b)),
+                }
             }
         }
     };
@@ -239,7 +299,10 @@ impl<S: Simd> Neg for V<S> {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        Self { s: self.s, v: self.s.neg_f32s(self.v) }
+        Self {
+            s: self.s,
+            v: self.s.neg_f32s(self.v),
+        }
     }
 }
 
@@ -285,17 +348,34 @@ mod tests {
 
     fn grid(from: f32, to: f32) -> Vec<f32> {
         let n = 16 * 20_000;
-        (0..n).map(|i| from + (to - from) * i as f32 / (n - 1) as f32).collect()
+        (0..n)
+            .map(|i| from + (to - from) * i as f32 / (n - 1) as f32)
+            .collect()
     }
 
     #[test]
     fn elementary_functions_are_accurate() {
         let arch = Arch::new();
-        let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
+        let exp2 = Each(
+            &grid(-30.0, 0.0),
+            |x| f64::from(x).exp2(),
+            Function::Exp2,
+            0.0,
+        );
         assert!(arch.dispatch(exp2) < 3e-7);
-        let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
+        let exp = Each(
+            &grid(-80.0, 80.0),
+            |x| f64::from(x).exp(),
+            Function::Exp,
+            0.0,
+        );
         assert!(arch.dispatch(exp) < 2e-7);
-        let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
+        let log2 = Each(
+            &grid(1.0, 2.0),
+            |x| f64::from(x).log2(),
+            Function::Log2,
+            1.0,
+        );
         assert!(arch.dispatch(log2) < 2e-7);
     }
 }

@@ -37,7 +37,12 @@ pub(super) struct Grid {
 impl Grid {
     pub(super) fn new(width: u32, height: u32) -> Self {
         let (width, height) = (width as usize, height as usize);
-        Self { width, height, columns: width.div_ceil(TILE), rows: height.div_ceil(TILE) }
+        Self {
+            width,
+            height,
+            columns: width.div_ceil(TILE),
+            rows: height.div_ceil(TILE),
+        }
     }
 
     pub(super) fn tiles(&self) -> usize {
@@ -150,30 +155,37 @@ impl TileLists {
         let mut rest = &mut self.positions[..];
         let mut first = 0_u64;
         let mut work = Vec::with_capacity(order.len().div_ceil(chunk));
-        for (rows, cursors) in order.chunks(chunk).zip(self.counters.chunks_mut(tiles.max(1))) {
-            let length = rows.iter().map(|&key| run_of(runs, key).load(Relaxed)).sum::<u64>();
+        for (rows, cursors) in order
+            .chunks(chunk)
+            .zip(self.counters.chunks_mut(tiles.max(1)))
+        {
+            let length = rows
+                .iter()
+                .map(|&key| run_of(runs, key).load(Relaxed))
+                .sum::<u64>();
             let (mine, tail) = rest.split_at_mut(length as usize);
             rest = tail;
             work.push((rows, cursors, mine, first));
             first += length;
         }
         let entries = &self.entries;
-        work.into_par_iter().for_each(|(rows, cursors, positions, first)| {
-            let mut filled = 0;
-            for &key in rows {
-                let row = key as u32;
-                let before = filled;
-                for_each_tile(&splats[row as usize], grid, &band, |tile| {
-                    let position = cursors[tile];
-                    cursors[tile] += 1;
-                    entries[position as usize].store(row, Relaxed);
-                    positions[filled] = position;
-                    filled += 1;
-                });
-                let run = (first + before as u64) << 32 | (filled - before) as u64;
-                run_of(runs, key).store(run, Relaxed);
-            }
-        });
+        work.into_par_iter()
+            .for_each(|(rows, cursors, positions, first)| {
+                let mut filled = 0;
+                for &key in rows {
+                    let row = key as u32;
+                    let before = filled;
+                    for_each_tile(&splats[row as usize], grid, &band, |tile| {
+                        let position = cursors[tile];
+                        cursors[tile] += 1;
+                        entries[position as usize].store(row, Relaxed);
+                        positions[filled] = position;
+                        filled += 1;
+                    });
+                    let run = (first + before as u64) << 32 | (filled - before) as u64;
+                    run_of(runs, key).store(run, Relaxed);
+                }
+            });
     }
 
     /// Counts entries per (chunk, tile of the band), and leaves each row's count in its run.
@@ -185,8 +197,10 @@ impl TileLists {
         self.counters.clear();
         self.counters.resize(chunks.max(1) * tiles, 0);
         let runs = &self.runs;
-        order.par_chunks(chunk).zip(self.counters.par_chunks_mut(tiles.max(1))).for_each(
-            |(rows, counters)| {
+        order
+            .par_chunks(chunk)
+            .zip(self.counters.par_chunks_mut(tiles.max(1)))
+            .for_each(|(rows, counters)| {
                 for &key in rows {
                     let mut count = 0;
                     for_each_tile(&splats[key as u32 as usize], grid, &band, |tile| {
@@ -195,8 +209,7 @@ impl TileLists {
                     });
                     run_of(runs, key).store(count, Relaxed);
                 }
-            },
-        );
+            });
     }
 
     /// Rows per chunk: independent of the number of threads.
@@ -236,12 +249,21 @@ const SLACK: f32 = 0.02;
 #[inline]
 fn for_each_tile(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(usize)) {
     let [mx, my] = splat.mean;
-    let (hw, hh) = (splat.half_width * 1.0001 + SLACK, splat.half_height * 1.0001 + SLACK);
+    let (hw, hh) = (
+        splat.half_width * 1.0001 + SLACK,
+        splat.half_height * 1.0001 + SLACK,
+    );
     // Index of the tile whose pixel centres are the first at or after (last at or before) a bound.
     // `as` saturates, and makes NaN 0.
     let tile_of = |x: f32, most: usize| ((x * (1.0 / TILE as f32)).max(0.0) as usize).min(most - 1);
-    let (x0, x1) = (tile_of(mx - hw - 0.5, grid.columns), tile_of(mx + hw - 0.5, grid.columns));
-    let (y0, y1) = (tile_of(my - hh - 0.5, grid.rows), tile_of(my + hh - 0.5, grid.rows));
+    let (x0, x1) = (
+        tile_of(mx - hw - 0.5, grid.columns),
+        tile_of(mx + hw - 0.5, grid.columns),
+    );
+    let (y0, y1) = (
+        tile_of(my - hh - 0.5, grid.rows),
+        tile_of(my + hh - 0.5, grid.rows),
+    );
     let (first_row, last_row) = (band.start / grid.columns, band.end.div_ceil(grid.columns));
     if x0 == x1 || y0 == y1 {
         for ty in y0.max(first_row)..(y1 + 1).min(last_row) {
@@ -267,7 +289,10 @@ fn for_each_tile(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl Fn
         let left_at = (-peak).max(top).min(bottom);
         let right = (shear * right_at + half(right_at)).min(hw);
         let left = (shear * left_at - half(left_at)).max(-hw);
-        let (right, left) = (right + 1e-4 * right.abs() + SLACK, left - 1e-4 * left.abs() - SLACK);
+        let (right, left) = (
+            right + 1e-4 * right.abs() + SLACK,
+            left - 1e-4 * left.abs() - SLACK,
+        );
         let from = tile_of(mx + left - 0.5, grid.columns).max(x0);
         let to = tile_of(mx + right - 0.5, grid.columns).min(x1);
         for tx in from..=to {
