@@ -30,7 +30,6 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use console::Console;
-use failure::Failure;
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
 ///

@@ -20,7 +20,7 @@ pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure>
     if let Some(name) = &args.name {
         let entry = find(name)?;
         console.result(entry.manual().trim_end());
-        let parameters = entry.parameters()?;
+        let parameters = entry.parameters();
         if !parameters.is_empty() {
             console.result(format_args!("\nDefaults, for a run of 30,000 steps:\n"));
         }

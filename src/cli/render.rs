@@ -188,12 +188,7 @@ fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
 /// Photograph on the left, rendering on the right.
 fn pair(image: &Image8, background: [f32; 3], rendering: &Rendering) -> DynamicImage {
     let truth = |x: u32, y: u32| {
-        let at = y as usize * image.width as usize + x as usize;
-        let cover = image.alpha.as_ref().map_or(1.0, |alpha| f32::from(alpha[at]) / 255.0);
-        Rgb([0, 1, 2].map(|c| {
-            let colour = f32::from(image.rgb[3 * at + c]) / 255.0;
-            to_u8(cover * colour + (1.0 - cover) * background[c])
-        }))
+        Rgb(image.composited(x as usize, y as usize, background).map(to_u8))
     };
     let right = picture(rendering).into_rgb8();
     let (width, height) = right.dimensions();
