@@ -121,12 +121,16 @@ impl RowOps {
         let mut claimed = Slots::new(slots);
         self.check_families(&mut claimed)?;
         for (row, update) in &self.updates {
-            require(update.is_valid(), || format!("update of row {row} has a bad value"))?;
+            require(update.is_valid(), || {
+                format!("update of row {row} has a bad value")
+            })?;
             self.check_live("updated row", *row)?;
             claimed.claim("updated row", *row)?;
         }
         for (slot, seed) in &self.seeds {
-            require(seed.is_valid(), || format!("seed in slot {slot} has a bad value"))?;
+            require(seed.is_valid(), || {
+                format!("seed in slot {slot} has a bad value")
+            })?;
             self.check_birth("seed", *slot)?;
             claimed.claim("seed", *slot)?;
         }
@@ -134,18 +138,29 @@ impl RowOps {
     }
 
     fn check_totals(&self) -> Result<(), BrokenOps> {
-        let Self { rows_before, rows_after, budget, counts, .. } = self;
+        let Self {
+            rows_before,
+            rows_after,
+            budget,
+            counts,
+            ..
+        } = self;
         let born = self.child_slots.len() + self.seeds.len();
-        require(rows_after <= budget || (rows_after <= rows_before && born == 0), || {
-            format!("{rows_after} rows after, budget {budget}")
-        })?;
-        let holds = rows_before.checked_sub(counts.removed).map(|kept| kept + born);
+        require(
+            rows_after <= budget || (rows_after <= rows_before && born == 0),
+            || format!("{rows_after} rows after, budget {budget}"),
+        )?;
+        let holds = rows_before
+            .checked_sub(counts.removed)
+            .map(|kept| kept + born);
         require(holds == Some(*rows_after) && counts.added == born, || {
             format!("{rows_before} rows, {counts:?}, {born} born: not {rows_after} rows after")
         })?;
         let is_child = |family: &&Family| family.offspring.parent == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
-        require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
+        require(counts.updated == updated, || {
+            format!("{updated} updated, but {counts:?}")
+        })?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {
             format!("opacity bound {:?}", self.clamp_opacity)
         })
@@ -155,7 +170,9 @@ impl RowOps {
         let mut first_child = 0;
         for family in &self.families {
             let parent = family.parent;
-            require(family.offspring.is_valid(), || format!("family of row {parent}: bad value"))?;
+            require(family.offspring.is_valid(), || {
+                format!("family of row {parent}: bad value")
+            })?;
             require(family.first_child as usize == first_child, || {
                 format!("family of row {parent} starts at {}", family.first_child)
             })?;
@@ -164,7 +181,10 @@ impl RowOps {
             claimed.claim("parent", parent)?;
         }
         require(self.child_slots.len() == first_child, || {
-            format!("{} child slots for {first_child} children", self.child_slots.len())
+            format!(
+                "{} child slots for {first_child} children",
+                self.child_slots.len()
+            )
         })?;
         for &slot in &self.child_slots {
             self.check_birth("child", slot)?;
@@ -176,13 +196,20 @@ impl RowOps {
     /// Every move ends in a hole; every parent and updated row of the tail is moved; the rows from
     /// `rows_before` upward are all born.
     fn check_moves(&self, claimed: &mut Slots) -> Result<(), BrokenOps> {
-        let Self { rows_before, rows_after, .. } = self;
+        let Self {
+            rows_before,
+            rows_after,
+            ..
+        } = self;
         let mut moved = Slots::new(*rows_before);
         for &(from, to) in &self.moves {
-            require((*rows_after..*rows_before).contains(&(from as usize)), || {
-                format!("move from row {from}, not in the tail {rows_after}..{rows_before}")
+            require(
+                (*rows_after..*rows_before).contains(&(from as usize)),
+                || format!("move from row {from}, not in the tail {rows_after}..{rows_before}"),
+            )?;
+            require((to as usize) < *rows_after, || {
+                format!("move to row {to} of {rows_after}")
             })?;
-            require((to as usize) < *rows_after, || format!("move to row {to} of {rows_after}"))?;
             moved.claim("moved row", from)?;
             claimed.claim("hole", to)?;
         }
@@ -194,7 +221,9 @@ impl RowOps {
         }
         let seeds = self.seeds.iter().map(|seed| &seed.0);
         let births = self.child_slots.iter().chain(seeds);
-        let on_top = births.filter(|&&slot| slot as usize >= *rows_before).count();
+        let on_top = births
+            .filter(|&&slot| slot as usize >= *rows_before)
+            .count();
         require(on_top == rows_after.saturating_sub(*rows_before), || {
             format!("{on_top} rows born on top of {rows_before}, {rows_after} rows after")
         })
@@ -208,13 +237,20 @@ impl RowOps {
 
     fn check_birth(&self, what: &str, slot: u32) -> Result<(), BrokenOps> {
         require((slot as usize) < self.rows_after.min(self.budget), || {
-            format!("{what} in slot {slot}, {} rows after, budget {}", self.rows_after, self.budget)
+            format!(
+                "{what} in slot {slot}, {} rows after, budget {}",
+                self.rows_after, self.budget
+            )
         })
     }
 }
 
 fn require(holds: bool, broken: impl FnOnce() -> String) -> Result<(), BrokenOps> {
-    if holds { Ok(()) } else { Err(BrokenOps(broken())) }
+    if holds {
+        Ok(())
+    } else {
+        Err(BrokenOps(broken()))
+    }
 }
 
 /// A set of slots, one bit each.
@@ -226,7 +262,9 @@ impl Slots {
     }
 
     fn contains(&self, slot: u32) -> bool {
-        self.0.get(slot as usize / 64).is_some_and(|word| word >> (slot % 64) & 1 == 1)
+        self.0
+            .get(slot as usize / 64)
+            .is_some_and(|word| word >> (slot % 64) & 1 == 1)
     }
 
     fn claim(&mut self, what: &str, slot: u32) -> Result<(), BrokenOps> {
@@ -250,9 +288,17 @@ mod tests {
         scale: ScaleRule::Uniform(0.5),
         opacity: OpacityRule::Same,
     };
-    const SEED: Seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 1.0, opacity: 0.1 };
-    const UPDATE: Update =
-        Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(2.0), keep_moments: false };
+    const SEED: Seed = Seed {
+        position: [0.0; 3],
+        colour: [0.5; 3],
+        scale: 1.0,
+        opacity: 0.1,
+    };
+    const UPDATE: Update = Update {
+        opacity: OpacityRule::Same,
+        scale: ScaleRule::Uniform(2.0),
+        keep_moments: false,
+    };
 
     /// Ten rows: 1, 2, 3, 5 and 8 pruned, 9 split, 7 updated, one seed.
     fn shrinking() -> RowOps {
@@ -288,19 +334,27 @@ mod tests {
             ("added miscounted", |ops| ops.counts.added -= 1),
             ("updated miscounted", |ops| ops.counts.updated = 1),
             ("opacity bound of one", |ops| ops.clamp_opacity = Some(1.0)),
-            ("opacity bound not a number", |ops| ops.clamp_opacity = Some(f32::NAN)),
+            ("opacity bound not a number", |ops| {
+                ops.clamp_opacity = Some(f32::NAN);
+            }),
             ("parent beyond the model", |ops| ops.families[0].parent = 10),
             ("parent is updated too", |ops| ops.families[0].parent = 7),
             ("parent not moved", |ops| ops.families[0].parent = 8),
-            ("bad offspring", |ops| ops.families[0].offspring.scale = ScaleRule::Uniform(-1.0)),
+            ("bad offspring", |ops| {
+                ops.families[0].offspring.scale = ScaleRule::Uniform(-1.0);
+            }),
             ("children elsewhere", |ops| ops.families[0].first_child = 1),
-            ("a child without a slot", |ops| ops.families[0].offspring.children = 2),
+            ("a child without a slot", |ops| {
+                ops.families[0].offspring.children = 2;
+            }),
             ("child upon parent", |ops| ops.child_slots[0] = 9),
             ("child upon seed", |ops| ops.child_slots[0] = 2),
             ("child beyond the model", |ops| ops.child_slots[0] = 8),
             ("updated row does not exist", |ops| ops.updates[0].0 = 12),
             ("updated row not moved", |ops| ops.updates[0].0 = 8),
-            ("bad update", |ops| ops.updates[0].1.opacity = OpacityRule::Set(0.0)),
+            ("bad update", |ops| {
+                ops.updates[0].1.opacity = OpacityRule::Set(0.0);
+            }),
             ("seed upon child", |ops| ops.seeds[0].0 = 1),
             ("seed upon a moved row", |ops| ops.seeds[0].0 = 3),
             ("bad seed", |ops| ops.seeds[0].1.scale = f32::NAN),

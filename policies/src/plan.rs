@@ -97,6 +97,12 @@ impl EditPlan {
         self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.born)
     }
 
+    /// Rows pruned so far.
+    #[must_use]
+    pub fn pruned(&self) -> usize {
+        self.pruned
+    }
+
     /// Edits refused so far.
     #[must_use]
     pub fn denied(&self) -> usize {

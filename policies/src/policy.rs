@@ -132,6 +132,12 @@ impl SignalSet {
         Self(signals.iter().fold(0, |bits, &s| bits | 1 << s as u32))
     }
 
+    /// This set and `signal`.
+    #[must_use]
+    pub fn with(self, signal: Signal) -> Self {
+        Self(self.0 | 1 << signal as u32)
+    }
+
     /// Whether `signal` is in the set.
     #[must_use]
     pub fn contains(self, signal: Signal) -> bool {
@@ -179,6 +185,7 @@ pub struct CandidateRequest {
 #[serde(rename_all = "kebab-case")]
 pub enum ErrorMode {
     /// ‖dL/dC‖₂ of the rendered colour, as the Diet code does (a structure detector).
+    #[serde(rename = "grad")]
     Gradient,
     /// Mean over channels of |I − G|.
     L1,
@@ -334,4 +341,74 @@ pub enum PolicyError {
 
 fn did_you_mean(nearest: Option<&str>) -> String {
     nearest.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)"))
+}
+
+/// [`DensityPolicy::restore`] for a policy without state of its own, whose
+/// [`save`](DensityPolicy::save) returns `null`.
+///
+/// # Errors
+/// [`PolicyError::State`] when `state` is not `null`.
+pub fn restore_nothing(state: &PolicyState) -> Result<(), PolicyError> {
+    if state.is_null() {
+        return Ok(());
+    }
+    Err(PolicyError::State(format!(
+        "this policy keeps no state, but the checkpoint holds {state}"
+    )))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_lists_every_signal_in_order() {
+        for (index, signal) in Signal::ALL.into_iter().enumerate() {
+            assert_eq!(signal as usize, index);
+        }
+        assert_eq!(
+            SignalSet::of(&Signal::ALL).iter().collect::<Vec<_>>(),
+            Signal::ALL
+        );
+    }
+
+    #[test]
+    fn a_set_holds_what_was_put_in() {
+        let set = SignalSet::of(&[Signal::Age, Signal::VisibleCount]).with(Signal::Opacity);
+        let listed: Vec<Signal> = set.iter().collect();
+        assert_eq!(listed, [Signal::VisibleCount, Signal::Opacity, Signal::Age]);
+        assert_eq!(set.with(Signal::Age), set);
+        assert!(!set.contains(Signal::WeightMax) && !SignalSet::default().contains(Signal::Age));
+    }
+
+    #[test]
+    fn only_declared_signals_can_be_read() {
+        let scene = SceneInfo {
+            extent: 1.0,
+            train_views: 1,
+            budget: 3,
+            initial_rows: 3,
+            iterations: 30_000,
+            white_background: false,
+        };
+        let mut signals = Signals::zeros(3, SignalSet::of(&[Signal::Opacity]));
+        signals.get_mut(Signal::Opacity).unwrap()[1] = 0.5;
+        assert!(signals.get_mut(Signal::Age).is_none());
+        let now = Snapshot {
+            step: 1,
+            scene: &scene,
+            signals: &signals,
+            candidates: &[],
+        };
+        assert_eq!(now.rows(), 3);
+        assert_eq!(now.signal(Signal::Opacity), Ok(&[0.0, 0.5, 0.0][..]));
+        let refused = now.signal(Signal::Age).unwrap_err();
+        assert_eq!(
+            refused,
+            PolicyError::Undeclared {
+                signal: Signal::Age
+            }
+        );
+        assert!(refused.to_string().contains("Age"));
+    }
 }
