@@ -107,16 +107,18 @@
 //! Defaults that are steps are for a run of 30,000 and scale with its length, but for `protect`,
 //! which counts views.
 
-use crate::adc::{Mortality, Window, clone_at, mean_over_views, spare_one, split_by};
-use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Reset, ScaleRule, Seed};
+use crate::adc::{Mortality, Window, mean_over_views, spare_one};
+use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    CandidateRequest, DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet,
-    Snapshot, restore_nothing,
+    DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet, Snapshot,
+    restore_nothing,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
-use crate::sample::{largest, smallest, top_k};
+use crate::sample::{largest, smallest};
 
+mod compensate;
+mod offspring;
 mod parameters;
 
 pub use parameters::{CloneOpacity, DietParams, Growth, Importance, NewbornSize, Shift};
@@ -281,31 +283,11 @@ const MEAN_GRADIENT: [Signal; 3] = [
 
 /// ⌊`of` · `budget`⌋.
 fn fraction(of: f64, budget: usize) -> usize {
-    (of * budget as f64).floor() as usize
+    // 0.29 · 100 is 28.999999999999996, but 29 is meant: a product is off by at most 2⁻⁵³ of itself.
+    (of * budget as f64 * (1.0 + f64::EPSILON)).floor() as usize
 }
 
 impl Diet {
-    fn candidate_request(&self, scene: &SceneInfo) -> Option<CandidateRequest> {
-        let Window { from, until, every } = self.insert;
-        if every == 0 || from >= until {
-            return None;
-        }
-        // What one interval can bring at the budget, but no more than there can be rows.
-        let steps = every.min(until - from) as usize;
-        let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
-        let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);
-        Some(CandidateRequest {
-            from,
-            until,
-            rows_per_candidate: self.params.rows_per_candidate,
-            capacity,
-            error: self.params.error,
-            depth: self.params.depth,
-            min_alpha: self.params.min_alpha as f32,
-            spaced: self.params.nms,
-        })
-    }
-
     /// g of every row. Shape: [rows].
     fn gradient(&self, now: &Snapshot<'_>) -> Result<Vec<f32>, PolicyError> {
         let views = now.signal(Signal::VisibleCount)?;
@@ -391,113 +373,8 @@ impl Diet {
         Ok(())
     }
 
-    /// How a candidate grows.
-    fn offspring(&self, now: &Snapshot<'_>, row: usize) -> Result<Offspring, PolicyError> {
-        if now.signal(Signal::ScaleMax)?[row] > self.scene_units(self.params.small, now.scene) {
-            return Ok(split_by(self.params.split_factor as f32));
-        }
-        let clone = clone_at(self.shift(now, row)?);
-        match self.params.clone_opacity {
-            CloneOpacity::Unchanged => Ok(clone),
-            CloneOpacity::Conserve => {
-                let scale = conserving_scale(now.signal(Signal::Opacity)?[row]);
-                Ok(Offspring {
-                    parent: ParentFate::BecomesChild,
-                    scale: ScaleRule::Uniform(scale),
-                    opacity: OpacityRule::Conserved,
-                    ..clone
-                })
-            }
-        }
-    }
-
-    /// Offset of a clone from its parent [scene units].
-    fn shift(&self, now: &Snapshot<'_>, row: usize) -> Result<[f32; 3], PolicyError> {
-        let read = |signal| now.signal(signal).map(|column| column[row]);
-        if self.params.shift == Shift::None {
-            return Ok([0.0; 3]);
-        }
-        let [x, y, z] = MEAN_GRADIENT;
-        let sum = [read(x)?, read(y)?, read(z)?];
-        let factor = match self.params.shift {
-            Shift::None => 0.0,
-            Shift::Paper => 1.0,
-            Shift::Code => read(Signal::VisibleCount)?.powi(-2),
-            Shift::Descent => {
-                // A sum is no longer than the sum of lengths, but for rounding.
-                let length = sum.iter().map(|v| v * v).sum::<f32>().sqrt();
-                let of_lengths = read(Signal::MeanGradientNorm)?.max(length);
-                -(self.params.kappa as f32) * read(Signal::ScaleMax)? / of_lengths
-            }
-        };
-        let shift = sum.map(|v| factor * v);
-        // 0/0 where no view has seen the row.
-        Ok(if shift.iter().all(|v| v.is_finite()) {
-            shift
-        } else {
-            [0.0; 3]
-        })
-    }
-
-    /// Appends the worst candidates, and prunes victims for those that have no room.
-    fn insert(
-        &self,
-        now: &Snapshot<'_>,
-        plan: &mut EditPlan,
-        spared: &dyn Fn(u32) -> bool,
-    ) -> Result<(), PolicyError> {
-        let code_size = match self.params.newborn_size {
-            NewbornSize::Pixel => None,
-            NewbornSize::Code => Some(squared_geometric_mean(now.signal(Signal::ScaleMax)?)),
-        };
-        let seeds = now.candidates.iter().map(|candidate| {
-            let seed = Seed {
-                position: candidate.position,
-                colour: candidate.colour,
-                scale: code_size.unwrap_or(self.params.size_pixels as f32 * candidate.pixel_size),
-                opacity: self.params.newborn_opacity as f32,
-            };
-            (candidate.error, seed)
-        });
-        let (sound, unsound): (Vec<_>, Vec<_>) = seeds.partition(|(_, seed)| seed.is_valid());
-        // The plan refuses these and counts them; no victim shall die for them.
-        for (_, seed) in unsound {
-            let _ = plan.append(seed);
-        }
-        let errors: Vec<f32> = sound.iter().map(|(error, _)| *error).collect();
-        let worst = top_k(&errors, fraction(self.params.rho_c, plan.budget()));
-        self.prune_victims(now, plan, worst.len().saturating_sub(plan.room()), spared)?;
-        for index in worst {
-            let _ = plan.append(sound[index as usize].1);
-        }
-        Ok(())
-    }
-
     fn scene_units(&self, fraction: f64, scene: &SceneInfo) -> f32 {
         (fraction * f64::from(scene.extent)) as f32
-    }
-}
-
-/// (Geometric mean)² of the positive, finite values; NaN if there is none.
-fn squared_geometric_mean(values: &[f32]) -> f32 {
-    let logs = values
-        .iter()
-        .filter(|v| v.is_finite() && **v > 0.0)
-        .map(|v| f64::from(*v).ln());
-    let (count, sum) = logs.fold((0.0, 0.0), |(count, sum), log| (count + 1.0, sum + log));
-    (2.0 * sum / count).exp() as f32
-}
-
-/// The factor by which two Gaussians of opacity 1 − √(1 − o) must shrink to render like one of
-/// opacity o (Kheradmand et al. 2024, equation 9, for N = 2).
-fn conserving_scale(opacity: f32) -> f32 {
-    let shared = 1.0 - (1.0 - opacity).sqrt();
-    let factor = opacity / (2.0 * shared - shared * shared * std::f32::consts::FRAC_1_SQRT_2);
-    // 0/0 where opacity vanishes: the limit is 1.
-    if factor.is_finite() && factor > 0.0 {
-        factor
-    } else {
-        1.0
     }
 }
 

@@ -231,9 +231,19 @@ impl Signals {
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
         let columns = Signal::ALL
             .iter()
-            .map(|&s| if set.contains(s) { vec![0.0; rows] } else { Vec::new() })
+            .map(|&s| {
+                if set.contains(s) {
+                    vec![0.0; rows]
+                } else {
+                    Vec::new()
+                }
+            })
             .collect();
-        Self { rows, present: set, columns }
+        Self {
+            rows,
+            present: set,
+            columns,
+        }
     }
 
     /// Number of rows.
@@ -245,12 +255,16 @@ impl Signals {
     /// The column of `signal`, if present. Shape: [rows].
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
-        self.present.contains(signal).then(|| &self.columns[signal as usize][..])
+        self.present
+            .contains(signal)
+            .then(|| &self.columns[signal as usize][..])
     }
 
     /// The column of `signal` for writing, if present. Shape: [rows].
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
-        self.present.contains(signal).then(|| &mut self.columns[signal as usize][..])
+        self.present
+            .contains(signal)
+            .then(|| &mut self.columns[signal as usize][..])
     }
 }
 
@@ -280,7 +294,9 @@ impl<'a> Snapshot<'a> {
     /// # Errors
     /// [`PolicyError::Undeclared`] when the policy's needs did not list it.
     pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
-        self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
+        self.signals
+            .get(signal)
+            .ok_or(PolicyError::Undeclared { signal })
     }
 }
 
@@ -358,57 +374,4 @@ pub fn restore_nothing(state: &PolicyState) -> Result<(), PolicyError> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn all_lists_every_signal_in_order() {
-        for (index, signal) in Signal::ALL.into_iter().enumerate() {
-            assert_eq!(signal as usize, index);
-        }
-        assert_eq!(
-            SignalSet::of(&Signal::ALL).iter().collect::<Vec<_>>(),
-            Signal::ALL
-        );
-    }
-
-    #[test]
-    fn a_set_holds_what_was_put_in() {
-        let set = SignalSet::of(&[Signal::Age, Signal::VisibleCount]).with(Signal::Opacity);
-        let listed: Vec<Signal> = set.iter().collect();
-        assert_eq!(listed, [Signal::VisibleCount, Signal::Opacity, Signal::Age]);
-        assert_eq!(set.with(Signal::Age), set);
-        assert!(!set.contains(Signal::WeightMax) && !SignalSet::default().contains(Signal::Age));
-    }
-
-    #[test]
-    fn only_declared_signals_can_be_read() {
-        let scene = SceneInfo {
-            extent: 1.0,
-            train_views: 1,
-            budget: 3,
-            initial_rows: 3,
-            iterations: 30_000,
-            white_background: false,
-        };
-        let mut signals = Signals::zeros(3, SignalSet::of(&[Signal::Opacity]));
-        signals.get_mut(Signal::Opacity).unwrap()[1] = 0.5;
-        assert!(signals.get_mut(Signal::Age).is_none());
-        let now = Snapshot {
-            step: 1,
-            scene: &scene,
-            signals: &signals,
-            candidates: &[],
-        };
-        assert_eq!(now.rows(), 3);
-        assert_eq!(now.signal(Signal::Opacity), Ok(&[0.0, 0.5, 0.0][..]));
-        let refused = now.signal(Signal::Age).unwrap_err();
-        assert_eq!(
-            refused,
-            PolicyError::Undeclared {
-                signal: Signal::Age
-            }
-        );
-        assert!(refused.to_string().contains("Age"));
-    }
-}
+mod tests;

@@ -1,6 +1,10 @@
+//! The rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
+
+use super::offspring::conserving_scale;
 use super::*;
+use crate::adc::{clone_at, split_by};
 use crate::event::{Event, Outcome};
-use crate::plan::{EditCounts, Placement};
+use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
 use crate::registry::find;
 
@@ -79,6 +83,9 @@ fn at_the_budget_a_tenth_is_exchanged() {
         }
     );
     assert_eq!(run(&event, "rho = 0.2").pruned, [1, 3, 4, 5]);
+    // A product just below the integer that is meant.
+    assert_eq!(fraction(0.29, 100), 29);
+    assert_eq!(fraction(0.1, 29), 2);
     let none = run(&event, "rho = 0.0");
     assert!(none.pruned.is_empty() && none.cloned.is_empty());
     assert_eq!(none.ops.counts.denied, 5);
