@@ -228,9 +228,15 @@ fn a_poisoned_row_harms_no_other() {
     }
     let cases = harmed.len();
     harmed.dedup();
-    assert!(harmed.is_empty(), "{cases} cases:
-{}", harmed.join("
-"));
+    assert!(
+        harmed.is_empty(),
+        "{cases} cases:
+{}",
+        harmed.join(
+            "
+"
+        )
+    );
 }
 
 /// What slot `slot` belongs to.
@@ -299,9 +305,15 @@ fn any_finite_number_gives_a_finite_image() {
     }
     let cases = broken.len();
     broken.dedup();
-    assert!(broken.is_empty(), "{cases} cases:
-{}", broken.join("
-"));
+    assert!(
+        broken.is_empty(),
+        "{cases} cases:
+{}",
+        broken.join(
+            "
+"
+        )
+    );
 }
 
 #[test]
