@@ -39,10 +39,7 @@ impl Scores {
         let mean = |score: fn(&ViewScore) -> f64| {
             self.views.iter().map(score).sum::<f64>() / self.views.len() as f64
         };
-        Mean {
-            psnr: mean(|view| view.psnr),
-            ssim: mean(|view| view.ssim),
-        }
+        Mean { psnr: mean(|view| view.psnr), ssim: mean(|view| view.ssim) }
     }
 }
 
@@ -92,20 +89,12 @@ pub fn evaluate(
         let ahead: Vec<usize> = (view + 1..count.min(view + 3)).collect();
         views.prefetch(&ahead);
         let name = || views.name(view).to_owned();
-        let image = views.image(view).map_err(|source| EvaluateError::View {
-            view: name(),
-            source,
-        })?;
+        let image =
+            views.image(view).map_err(|source| EvaluateError::View { view: name(), source })?;
         let rendering = backend
             .render(views.camera(view), background, sh_degree)
-            .map_err(|source| EvaluateError::Backend {
-                view: name(),
-                source,
-            })?;
-        let metric = |source| EvaluateError::Metric {
-            view: name(),
-            source,
-        };
+            .map_err(|source| EvaluateError::Backend { view: name(), source })?;
+        let metric = |source| EvaluateError::Metric { view: name(), source };
         let score = ViewScore {
             name: name(),
             psnr: psnr(&rendering.rgb, &image, background).map_err(metric)?,

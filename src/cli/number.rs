@@ -111,7 +111,8 @@ mod tests {
         for (text, number) in good {
             assert_eq!(rows(text), Ok(number), "{text}");
         }
-        for text in ["", "k", "-1", "+5", "0.5", "1.0001k5", "28 k", "28kk", "inf", "NaN", "1e3é"] {
+        for text in ["", "k", "-1", "+5", "0.5", "1.0001k5", "28 k", "28kk", "inf", "NaN", "1e3é"]
+        {
             assert!(rows(text).unwrap_err().contains("200k"), "{text}");
         }
         for text in ["0", "0k", "4294967296", "1e30", "5000M"] {

@@ -45,9 +45,8 @@ impl<'a> Progress<'a> {
     pub(super) fn step(&mut self, step: u32, loss: f32, rows: usize) {
         let smooth = self.loss.map_or(loss, |before| before + NEWEST * (loss - before));
         self.loss = Some(smooth);
-        let text = || {
-            format!("loss {smooth:.4}  rows {} of {}", grouped(rows), grouped(self.budget))
-        };
+        let text =
+            || format!("loss {smooth:.4}  rows {} of {}", grouped(rows), grouped(self.budget));
         if let Some(bar) = &self.bar {
             if self.drawn.elapsed() >= REDRAW || step == self.iterations {
                 bar.set_message(text());

@@ -132,7 +132,9 @@ fn file_names(views: &[&str]) -> Vec<String> {
         if parts.is_empty() { "view".to_owned() } else { parts.join("/") }
     };
     let stem = |name: &str| match name.rsplit_once('.') {
-        Some((stem, ending)) if !ending.contains('/') && !stem.is_empty() && !stem.ends_with('/') => {
+        Some((stem, ending))
+            if !ending.contains('/') && !stem.is_empty() && !stem.ends_with('/') =>
+        {
             stem.to_owned()
         }
         _ => name.to_owned(),
@@ -167,8 +169,7 @@ fn picture(rendering: &Rendering) -> DynamicImage {
 
 fn alpha(rendering: &Rendering) -> DynamicImage {
     let Rendering { width, height, alpha, .. } = rendering;
-    let pixel =
-        |x: u32, y: u32| Luma([to_u8(alpha[y as usize * *width as usize + x as usize])]);
+    let pixel = |x: u32, y: u32| Luma([to_u8(alpha[y as usize * *width as usize + x as usize])]);
     ImageBuffer::from_fn(*width, *height, pixel).into()
 }
 
@@ -187,9 +188,8 @@ fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
 
 /// Photograph on the left, rendering on the right.
 fn pair(image: &Image8, background: [f32; 3], rendering: &Rendering) -> DynamicImage {
-    let truth = |x: u32, y: u32| {
-        Rgb(image.composited(x as usize, y as usize, background).map(to_u8))
-    };
+    let truth =
+        |x: u32, y: u32| Rgb(image.composited(x as usize, y as usize, background).map(to_u8));
     let right = picture(rendering).into_rgb8();
     let (width, height) = right.dimensions();
     let pixel = |x: u32, y: u32| {

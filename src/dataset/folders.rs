@@ -32,9 +32,17 @@ pub(super) struct Found {
 }
 
 impl Folders {
-    pub(super) fn new(root: &Root, options: &LoadOptions, within_images: bool) -> Result<Self, DatasetError> {
+    pub(super) fn new(
+        root: &Root,
+        options: &LoadOptions,
+        within_images: bool,
+    ) -> Result<Self, DatasetError> {
         // A folder that the user names may lie anywhere; one that is not absolute lies in the dataset.
-        let chosen = options.images.as_ref().map(|folder| Root::new(&root.path().join(folder))).transpose()?;
+        let chosen = options
+            .images
+            .as_ref()
+            .map(|folder| Root::new(&root.path().join(folder)))
+            .transpose()?;
         let reduced = match options.resolution {
             Some(Resolution::Divisor(k)) if k > 1 && chosen.is_none() => {
                 let folder = root.path().join(format!("images_{k}"));
@@ -82,7 +90,9 @@ impl Folders {
     pub(super) fn mask(&self, named: Named<'_>) -> Result<Option<PathBuf>, DatasetError> {
         let inside = self.inside_images(named.value);
         let stem = Path::new(&inside).with_extension("").to_string_lossy().into_owned();
-        for value in [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")] {
+        for value in
+            [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")]
+        {
             if let Some(path) = self.root.existing(Named { value: &value, ..named })? {
                 return Ok(Some(path));
             }
@@ -92,7 +102,11 @@ impl Folders {
 
     pub(super) fn missing(&self, named: Named<'_>) -> DatasetError {
         let folder = self.chosen.as_ref().unwrap_or(&self.root);
-        let within = if self.chosen.is_some() { self.inside_images(named.value) } else { self.from_root(named.value) };
+        let within = if self.chosen.is_some() {
+            self.inside_images(named.value)
+        } else {
+            self.from_root(named.value)
+        };
         DatasetError::MissingImage {
             path: named.file.to_owned(),
             field: named.field.to_owned(),
@@ -102,7 +116,10 @@ impl Folders {
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {
         let folder = self.reduced.as_ref().map(|(root, _)| root.path().display().to_string());
-        format!("{count} images are not in {} and are shrunk from the full size", folder.unwrap_or_default())
+        format!(
+            "{count} images are not in {} and are shrunk from the full size",
+            folder.unwrap_or_default()
+        )
     }
 
     fn inside_images(&self, value: &str) -> String {

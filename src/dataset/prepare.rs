@@ -14,7 +14,11 @@ use crate::camera::Camera;
 const MAX_BAD_POINTS: f64 = 0.01;
 
 /// Checks every frame, splits, and moves all into normalised coordinates.
-pub(super) fn dataset(path: &Path, scene: Scene, options: &LoadOptions) -> Result<Dataset, DatasetError> {
+pub(super) fn dataset(
+    path: &Path,
+    scene: Scene,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
     let Scene { listing, mut frames, mut points, points_file, own_split, mut notes } = scene;
     // Bytewise, as the field sorts names for its test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
@@ -52,13 +56,20 @@ pub(super) fn dataset(path: &Path, scene: Scene, options: &LoadOptions) -> Resul
         view.camera = normalisation.camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
             let problem = "the camera is too far from the others";
-            return Err(DatasetError::malformed(&listing, &view.name, problem, "repair the pose or remove the frame"));
+            return Err(DatasetError::malformed(
+                &listing,
+                &view.name,
+                problem,
+                "repair the pose or remove the frame",
+            ));
         }
     }
     for position in &mut points.positions {
         *position = normalisation.point(*position);
     }
-    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| p.as_vec3().is_finite())?;
+    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
+        p.as_vec3().is_finite()
+    })?;
     Ok(Dataset { root: path.to_owned(), train, test, points, normalisation, notes })
 }
 
@@ -66,7 +77,12 @@ fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetErro
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
             let problem = "the image is listed twice";
-            return Err(DatasetError::malformed(listing, &pair[0].name, problem, "remove one of the two"));
+            return Err(DatasetError::malformed(
+                listing,
+                &pair[0].name,
+                problem,
+                "remove one of the two",
+            ));
         }
     }
     Ok(())
@@ -85,7 +101,10 @@ fn drop_bad(
         return Err(DatasetError::BadPoints { path: path.to_owned(), bad, total });
     }
     if bad > 0 {
-        notes.push(format!("{}: {bad} of {total} points are not {what} and are dropped", path.display()));
+        notes.push(format!(
+            "{}: {bad} of {total} points are not {what} and are dropped",
+            path.display()
+        ));
     }
     Ok(())
 }
@@ -94,13 +113,14 @@ fn drop_bad(
 fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetError> {
     let header = images::probe(&frame.image)?;
     let lens = &frame.lens;
-    let size_fault = |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
-        path: path.to_owned(),
-        width: found.width,
-        height: found.height,
-        camera_width: width,
-        camera_height: height,
-    };
+    let size_fault =
+        |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
+            path: path.to_owned(),
+            width: found.width,
+            height: found.height,
+            camera_width: width,
+            camera_height: height,
+        };
     let k = frame.reduced.unwrap_or(1);
     let fits = match frame.reduced {
         Some(k) => {
@@ -110,7 +130,12 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
         None => proportional((header.width, header.height), (lens.width, lens.height)),
     };
     if !fits {
-        return Err(size_fault(&frame.image, header, divided(lens.width, k), divided(lens.height, k)));
+        return Err(size_fault(
+            &frame.image,
+            header,
+            divided(lens.width, k),
+            divided(lens.height, k),
+        ));
     }
     if let Some(mask) = &frame.mask {
         let found = images::probe(mask)?;
@@ -157,7 +182,9 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
 /// The size to train at.
 fn target_size(header: &ImageHeader, resolution: Option<Resolution>, reduced: bool) -> (u32, u32) {
     match resolution {
-        Some(Resolution::Divisor(k)) if !reduced => (divided(header.width, k), divided(header.height, k)),
+        Some(Resolution::Divisor(k)) if !reduced => {
+            (divided(header.width, k), divided(header.height, k))
+        }
         Some(Resolution::Width(width)) if width < header.width => {
             let height = f64::from(header.height) * f64::from(width) / f64::from(header.width);
             (width.max(1), (height.round() as u32).max(1))

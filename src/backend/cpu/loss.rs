@@ -7,13 +7,14 @@
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight.
 //!
+//! The file is one piece because the two passes share their window, their planes and their strips.
 //! Both passes run over strips of rows. A strip convolves its rows and five more on either side
-//! horizontally into its own lines and then vertically; nothing is shared between strips.
+//! horizontally into its own lines and then vertically; strips write nothing that others read.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::rasterize::{Plane, TileCanvas};
+use super::rasterize::{DARK, TileCanvas};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH};
 use super::tiles::{Grid, TILE};
@@ -75,7 +76,7 @@ impl LossBuffers {
     /// Bytes for an image of this size, and for the strips of so many threads.
     pub(super) fn bytes(width: usize, height: usize, threads: usize) -> u64 {
         let planes = 6 * line(width) * height;
-        let strips = threads * (7 + 5 * (STRIP + 2 * REACH)) * line(width);
+        let strips = threads * (3 + 5 * (STRIP + 2 * REACH)) * line(width);
         ((planes + strips) * size_of::<f32>()) as u64
     }
 
@@ -121,9 +122,13 @@ impl LossBuffers {
             } else {
                 (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
             };
+            let source = Source { grid, canvas, target, background, channel };
+            (e.par_chunks_mut(stride), y.par_chunks_mut(stride))
+                .into_par_iter()
+                .enumerate()
+                .with_min_len(STRIP)
+                .for_each(|(row, (e, y))| source.lines(row, e, y));
             let parts: Vec<LossValue> = (
-                e.par_chunks_mut(strip),
-                y.par_chunks_mut(strip),
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),
                 p3.par_chunks_mut(strip),
@@ -131,9 +136,9 @@ impl LossBuffers {
             )
                 .into_par_iter()
                 .enumerate()
-                .map_init(Vec::new, |scratch, (i, (e, y, p1, p2, p3, error))| {
+                .map_init(Vec::new, |scratch, (i, (p1, p2, p3, error))| {
                     arch.dispatch(Similarity {
-                        source: Source { grid, canvas, target, background, channel },
+                        grid,
                         first: i * STRIP,
                         stride,
                         scratch,
@@ -163,6 +168,7 @@ impl LossBuffers {
                         y,
                         derivatives: [p1, p2, p3],
                         scale: 1.0 / samples as f32,
+                        mask: target.mask.as_deref(),
                         tiles,
                     });
                 },
@@ -177,7 +183,16 @@ impl LossBuffers {
     }
 }
 
+/// Multiplies a line by the weights of a mask's row.
+#[inline(always)]
+fn masked(line: &mut [f32], mask: &[u8]) {
+    for (x, &m) in line.iter_mut().zip(mask) {
+        *x *= f32::from(m) * (1.0 / 255.0);
+    }
+}
+
 /// One channel of rendering and target, line by line.
+#[derive(Clone, Copy)]
 struct Source<'a> {
     grid: &'a Grid,
     canvas: &'a [TileCanvas],
@@ -208,45 +223,34 @@ impl Source<'_> {
         }
         let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
         for (tile, e) in tiles.iter().zip(e[PAD..].chunks_exact_mut(TILE)) {
-            e.copy_from_slice(&tile.planes[channel][row % TILE * TILE..][..TILE]);
+            e.copy_from_slice(&tile.planes[channel][row % TILE]);
         }
         e[PAD + width..].fill(0.0);
         for (e, &y) in e[inner.clone()].iter_mut().zip(&y[inner.clone()]) {
             *e -= y;
         }
         if let Some(mask) = &target.mask {
-            for (e, &m) in e[inner].iter_mut().zip(&mask[pixels]) {
-                *e *= f32::from(m) * (1.0 / 255.0);
-            }
+            masked(&mut e[inner], &mask[pixels]);
         }
     }
 }
 
-/// Σ_k WINDOW[k]·line[at + k − 5].
+/// Σ_k WINDOW[k]·line[at + k − 5], for one vector. The window is cut out once, so that its eleven
+/// loads need no bounds check each.
 #[inline(always)]
 fn horizontal<S: Simd>(s: S, line: &[f32], at: usize) -> V<S> {
+    let around = &line[at - REACH..at + S::F32_LANES + REACH];
     let mut sum = V::zero(s);
     for (k, &w) in WINDOW.iter().enumerate() {
-        sum = V::splat(s, w).mul_add(V::load(s, &line[at + k - REACH..]), sum);
+        sum = V::splat(s, w).mul_add(V::load(s, &around[k..k + S::F32_LANES]), sum);
     }
     sum
 }
 
-/// Σ_k WINDOW[k]·(line k of the eleven from `lines` on)[at].
+/// The sums Σ_k WINDOW[k]·(line row + k)[at] of `N` quantities that stand in `blurred` one after
+/// another, `lines` lines each.
 #[inline(always)]
-fn vertical<S: Simd>(s: S, lines: &[f32], stride: usize, at: usize) -> V<S> {
-    let mut sum = V::zero(s);
-    for (k, &w) in WINDOW.iter().enumerate() {
-        sum = V::splat(s, w).mul_add(V::load(s, &lines[k * stride + at..]), sum);
-    }
-    sum
-}
-
-/// The vertical sums around `row` of `N` quantities that stand in `blurred` one after another,
-/// `lines` lines each. (A loop, not a closure: closures called often are not inlined, and then
-/// their vectors go through memory.)
-#[inline(always)]
-fn vertical_each<S: Simd, const N: usize>(
+fn vertical<S: Simd, const N: usize>(
     s: S,
     blurred: &[f32],
     lines: usize,
@@ -256,21 +260,27 @@ fn vertical_each<S: Simd, const N: usize>(
 ) -> [V<S>; N] {
     let mut sums = [V::zero(s); N];
     for (quantity, sum) in sums.iter_mut().enumerate() {
-        *sum = vertical(s, &blurred[(quantity * lines + row) * stride..], stride, at);
+        let first = (quantity * lines + row) * stride + at;
+        let below = &blurred[first..first + 2 * REACH * stride + S::F32_LANES];
+        for (k, &w) in WINDOW.iter().enumerate() {
+            let line = &below[k * stride..k * stride + S::F32_LANES];
+            *sum = V::splat(s, w).mul_add(V::load(s, line), *sum);
+        }
     }
     sums
 }
 
 /// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
 struct Similarity<'a> {
-    source: Source<'a>,
+    grid: &'a Grid,
     first: usize,
     stride: usize,
     scratch: &'a mut Vec<f32>,
-    e: &'a mut [f32],
-    y: &'a mut [f32],
+    e: &'a [f32],
+    y: &'a [f32],
+    /// The strip's lines.
     derivatives: [&'a mut [f32]; 3],
-    /// Empty unless asked for.
+    /// The strip's lines; empty unless asked for.
     error: &'a mut [f32],
     /// Weights of |e| and of 1 − SSIM in it.
     error_weights: [f32; 2],
@@ -282,29 +292,23 @@ impl WithSimd for Similarity<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> LossValue {
-        let Self { source, first, stride, scratch, e, y, derivatives, error, error_weights } = self;
+        let Self { grid, first, stride, scratch, e, y, derivatives, error, error_weights } = self;
         let [p1, p2, p3] = derivatives;
-        let (width, height) = (source.grid.width, source.grid.height);
-        let rows = e.len() / stride;
+        let (width, height) = (grid.width, grid.height);
+        let rows = p1.len() / stride;
         let lines = rows + 2 * REACH;
         scratch.clear();
-        scratch.resize((5 + 5 * lines) * stride, 0.0);
-        let (line, blurred) = scratch.split_at_mut(5 * stride);
-        let (line_e, rest) = line.split_at_mut(stride);
-        let (line_y, rest) = rest.split_at_mut(stride);
-        let (ee, rest) = rest.split_at_mut(stride);
+        scratch.resize((3 + 5 * lines) * stride, 0.0);
+        let (products, blurred) = scratch.split_at_mut(3 * stride);
+        let (ee, rest) = products.split_at_mut(stride);
         let (yy, ey) = rest.split_at_mut(stride);
         let columns = (PAD..PAD + width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         for l in 0..lines {
             let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < height) else {
                 continue;
             };
-            source.lines(row, line_e, line_y);
-            if (REACH..REACH + rows).contains(&l) {
-                let at = (l - REACH) * stride;
-                e[at..at + stride].copy_from_slice(line_e);
-                y[at..at + stride].copy_from_slice(line_y);
-            }
+            let line_e = &e[row * stride..(row + 1) * stride];
+            let line_y = &y[row * stride..(row + 1) * stride];
             for at in columns.clone() {
                 let (e, y) = (V::load(s, &line_e[at..]), V::load(s, &line_y[at..]));
                 (e * e).store(&mut ee[at..]);
@@ -312,7 +316,7 @@ impl WithSimd for Similarity<'_> {
                 (e * y).store(&mut ey[at..]);
             }
             for at in columns.clone() {
-                for (quantity, line) in [&*line_e, &*line_y, &*ee, &*yy, &*ey].iter().enumerate() {
+                for (quantity, line) in [line_e, line_y, &*ee, &*yy, &*ey].iter().enumerate() {
                     let to = (quantity * lines + l) * stride + at;
                     horizontal(s, line, at).store(&mut blurred[to..]);
                 }
@@ -324,7 +328,7 @@ impl WithSimd for Similarity<'_> {
             let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
             for at in columns.clone() {
                 let [mu_e, mu_y, mean_ee, mean_yy, mean_ey] =
-                    vertical_each(s, blurred, lines, row, stride, at);
+                    vertical(s, blurred, lines, row, stride, at);
                 let mu_x = mu_e + mu_y;
                 let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
                 let var_y = (mean_yy - mu_y * mu_y).max(V::zero(s));
@@ -342,7 +346,7 @@ impl WithSimd for Similarity<'_> {
                 inside.keep(contrast * by_luminance + luminance * by_contrast).store(&mut p1[to..]);
                 inside.keep(-(luminance * contrast * inv_b)).store(&mut p2[to..]);
                 inside.keep(luminance * two_ve_bb).store(&mut p3[to..]);
-                let abs = V::load(s, &e[to..]).abs();
+                let abs = V::load(s, &e[first * stride + to..]).abs();
                 let ssim = inside.keep(luminance * contrast);
                 row_l1 = row_l1 + abs;
                 row_ssim = row_ssim + ssim;
@@ -382,6 +386,7 @@ struct Gradient<'a> {
     derivatives: [&'a [f32]; 3],
     /// 1 / number of samples.
     scale: f32,
+    mask: Option<&'a [u8]>,
     /// The strip's tiles.
     tiles: &'a mut [TileGradient],
 }
@@ -391,7 +396,8 @@ impl WithSimd for Gradient<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, tiles } = self;
+        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, mask, tiles } =
+            self;
         let rows = STRIP.min(grid.height - first);
         let lines = rows + 2 * REACH;
         scratch.clear();
@@ -412,11 +418,11 @@ impl WithSimd for Gradient<'_> {
         let (l1_scale, ssim_scale) = ((1.0 - SSIM_WEIGHT) * scale, -SSIM_WEIGHT * scale);
         let zero = V::zero(s);
         for tile in tiles.iter_mut() {
-            tile.planes[channel].fill(0.0);
+            tile.planes[channel] = DARK;
         }
         for row in 0..rows {
             for at in columns.clone() {
-                let [by_mu_e, by_ee, by_ey] = vertical_each(s, scratch, lines, row, stride, at);
+                let [by_mu_e, by_ee, by_ey] = vertical(s, scratch, lines, row, stride, at);
                 let from = (first + row) * stride + at;
                 let (e, y) = (V::load(s, &e[from..]), V::load(s, &y[from..]));
                 let by_ssim = by_mu_e + e * 2.0 * by_ee + y * by_ey;
@@ -425,8 +431,15 @@ impl WithSimd for Gradient<'_> {
                 let g = by_ssim * ssim_scale + (positive - negative);
                 let x = at - PAD;
                 let tile = &mut tiles[row / TILE * grid.columns + x / TILE];
-                let plane: &mut Plane = &mut tile.planes[channel];
-                g.store(&mut plane[row % TILE * TILE + x % TILE..]);
+                g.store(&mut tile.planes[channel][row % TILE][x % TILE..]);
+            }
+            // The loss sees e·mask, so the chain rule has the mask once more.
+            if let Some(mask) = mask {
+                let row_of_tiles = row / TILE * grid.columns;
+                let mask = &mask[(first + row) * grid.width..][..grid.width];
+                for (tile, mask) in tiles[row_of_tiles..].iter_mut().zip(mask.chunks(TILE)) {
+                    masked(&mut tile.planes[channel][row % TILE], mask);
+                }
             }
         }
     }

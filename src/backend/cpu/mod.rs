@@ -41,7 +41,7 @@ use candidates::Candidates;
 use loss::{LossBuffers, LossValue};
 use optimise::{Differentiate, Optimise};
 use project::{Project, Splat, ViewParams};
-use rasterize::{CANVAS_PLANES, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace};
+use rasterize::{CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace};
 use rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
 use signals::Accumulators;
 use simd::WIDTH;
@@ -49,7 +49,7 @@ use tiles::{Grid, TILE, TileLists, Visible};
 
 pub use optimise::ModelGradient;
 
-/// Largest image side [px]; at this size every index of the stages still fits its type.
+/// Largest image side [y][x]; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
 /// Blocks per task: 256 rows, about a megabyte of parameters and moments at degree 3.
 const BLOCKS_PER_TASK: usize = 16;
@@ -252,23 +252,15 @@ impl CpuBackend {
         self.sums.resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
         let frame = self.forward(camera, background, sh_degree, true)?;
         let rendering = self.rendering(&frame);
-        let width = frame.grid.width;
         for (tile, gradient) in self.gradient.iter_mut().enumerate() {
-            let place = TilePlace::new(&frame.grid, tile);
-            for plane in &mut gradient.planes {
-                plane.fill(0.0);
-            }
-            for y in 0..place.height {
-                for x in 0..place.width {
-                    let at = (place.y as usize + y) * width + place.x as usize + x;
-                    let px = y * TILE + x;
-                    for channel in 0..3 {
-                        gradient.planes[channel][px] = upstream.rgb[3 * at + channel];
-                    }
-                    gradient.planes[3][px] = upstream.alpha[at];
-                    gradient.planes[4][px] = upstream.depth[at];
+            gradient.planes = [DARK; 5];
+            for_each_pixel(&frame.grid, tile, |y, x, at| {
+                for channel in 0..3 {
+                    gradient.planes[channel][y][x] = upstream.rgb[3 * at + channel];
                 }
-            }
+                gradient.planes[3][y][x] = upstream.alpha[at];
+                gradient.planes[4][y][x] = upstream.depth[at];
+            });
         }
         self.backward(&frame, detail);
         let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
@@ -302,18 +294,18 @@ impl CpuBackend {
         let grid = Grid::new(rendering.width, rendering.height);
         self.resize_images(&grid);
         for (tile, canvas) in self.canvas.iter_mut().enumerate() {
-            for_each_pixel(&grid, tile, |px, at| {
+            for_each_pixel(&grid, tile, |y, x, at| {
                 for channel in 0..3 {
-                    canvas.planes[channel][px] = rendering.rgb[3 * at + channel];
+                    canvas.planes[channel][y][x] = rendering.rgb[3 * at + channel];
                 }
             });
         }
         let value = self.image_loss(&grid, target, background, None);
         let mut gradient = vec![0.0; rendering.rgb.len()];
         for (tile, from) in self.gradient.iter().enumerate() {
-            for_each_pixel(&grid, tile, |px, at| {
+            for_each_pixel(&grid, tile, |y, x, at| {
                 for channel in 0..3 {
-                    gradient[3 * at + channel] = from.planes[channel][px];
+                    gradient[3 * at + channel] = from.planes[channel][y][x];
                 }
             });
         }
@@ -322,7 +314,7 @@ impl CpuBackend {
 
     fn resize_images(&mut self, grid: &Grid) {
         self.canvas.resize(grid.tiles(), TileCanvas::EMPTY);
-        self.gradient.resize(grid.tiles(), TileGradient { planes: [[0.0; 256]; 5] });
+        self.gradient.resize(grid.tiles(), TileGradient { planes: [DARK; 5] });
     }
 
     fn image_loss(
@@ -471,14 +463,13 @@ impl CpuBackend {
         let Frame { grid, bands, background, view, .. } = frame;
         let Self { lists, splats, params, canvas, gradient, loss, candidates, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
-        let place =
-            |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, y % TILE * TILE + x % TILE);
+        let place = |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, y % TILE, x % TILE);
         let error = |x: usize, y: usize| {
-            let (tile, px) = place(x, y);
-            let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][px];
+            let (tile, y_in, x_in) = place(x, y);
+            let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][y_in][x_in];
             (alpha >= request.min_alpha).then(|| match request.error {
                 ErrorMode::Gradient => {
-                    let g = |channel: usize| gradient[tile].planes[channel][px];
+                    let g = |channel: usize| gradient[tile].planes[channel][y_in][x_in];
                     (g(0) * g(0) + g(1) * g(1) + g(2) * g(2)).sqrt()
                 }
                 ErrorMode::L1 | ErrorMode::L1Dssim => loss.error_at(x, y),
@@ -519,25 +510,25 @@ impl CpuBackend {
             depth: vec![0.0; pixels],
         };
         for (tile, canvas) in self.canvas.iter().enumerate() {
-            for_each_pixel(grid, tile, |px, at| {
+            for_each_pixel(grid, tile, |y, x, at| {
                 for channel in 0..3 {
-                    out.rgb[3 * at + channel] = canvas.planes[channel][px];
+                    out.rgb[3 * at + channel] = canvas.planes[channel][y][x];
                 }
-                out.alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][px];
-                out.depth[at] = canvas.planes[DEPTH][px];
+                out.alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][y][x];
+                out.depth[at] = canvas.planes[DEPTH][y][x];
             });
         }
         out
     }
 }
 
-/// Calls `f(pixel of the tile, pixel of the image)` for every pixel of a tile inside the image.
-fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize)) {
+/// Calls `f(y, x within the tile, pixel of the image)` for every pixel of a tile inside the image.
+fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize, usize)) {
     let place = TilePlace::new(grid, tile);
     for y in 0..place.height {
         for x in 0..place.width {
             let at = (place.y as usize + y) * grid.width + place.x as usize + x;
-            f(y * TILE + x, at);
+            f(y, x, at);
         }
     }
 }

@@ -27,6 +27,9 @@ pub(super) const LOG2_255: f32 = 7.994_353_4;
 /// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
+/// A row whose colour is beyond this is broken, and not drawn: its neighbours in a pixel would
+/// lose all their bits to it.
+const COLOUR_MAX: f32 = 1e6;
 /// √(½·log₂ e): folded into the conic so that exp(−p) becomes 2^(−u² − z²).
 pub(super) const FOLD: f32 = 0.849_321_8;
 
@@ -262,6 +265,12 @@ fn log2_sigmoid<S: Simd>(s: S, x: V<S>) -> V<S> {
     x.min(V::zero(s)) * std::f32::consts::LOG2_E - tail
 }
 
+/// |x| <= most; false for NaN.
+#[inline(always)]
+fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
+    x.abs().le(V::splat_like(x, most))
+}
+
 /// Whether a splat reaches any pixel centre, from ½ to size − ½. Comparisons are false for NaN, so
 /// that a poisoned row is nowhere.
 #[inline(always)]
@@ -297,11 +306,15 @@ impl WithSimd for Project<'_> {
                 let g = geometry(s, block, at, view);
                 let in_front = V::splat(s, view.near).lt(g.p[2]);
                 let logit = lanes(s, block, plane::OPACITY, at);
+                // Minimum and maximum may swallow a NaN, so these two are looked at themselves.
+                let sound =
+                    each!(i in 3 => below(lanes(s, block, plane::LOG_SCALE + i, at), f32::MAX));
+                let sound = sound[0].and(sound[1]).and(sound[2]).and(below(logit, f32::MAX));
                 let log2_opacity = log2_sigmoid(s, logit);
                 // How far the exponent may fall; <= 0 where even the centre is below 1/255.
                 let reach = log2_opacity + LOG2_255;
                 let opaque = V::zero(s).lt(reach);
-                let alive = in_front.and(opaque);
+                let alive = in_front.and(opaque).and(sound);
                 if !alive.any() {
                     continue;
                 }
@@ -326,6 +339,8 @@ impl WithSimd for Project<'_> {
                 let y = sh_basis(s, view.sh_degree, dir);
                 let raw = raw_colour(s, block, at, view.sh_degree, &y);
                 let colour = each!(i in 3 => raw[i].max(V::zero(s)));
+                let sound = each!(i in 3 => below(raw[i], COLOUR_MAX));
+                let alive = alive.and(sound[0]).and(sound[1]).and(sound[2]);
                 let fields = [
                     u,
                     v,

@@ -13,7 +13,7 @@ use pulp::{Simd, WithSimd};
 
 use super::project::{LOG2_255, Splat};
 use super::simd::{V, WIDTH, each};
-use super::tiles::{Entry, Grid, TILE, TILE_PIXELS};
+use super::tiles::{Entry, Grid, TILE};
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
 pub(super) const ALPHA_MAX: f32 = 0.99;
@@ -27,8 +27,10 @@ pub(super) const CANVAS_PLANES: usize = 5;
 pub(super) const TRANSMITTANCE: usize = 3;
 pub(super) const DEPTH: usize = 4;
 
-/// The pixels of one tile.
-pub(super) type Plane = [f32; TILE_PIXELS];
+/// The pixels of one tile, row by row.
+pub(super) type Plane = [[f32; WIDTH]; TILE];
+/// A plane of zeros.
+pub(super) const DARK: Plane = [[0.0; WIDTH]; TILE];
 
 /// One rendered tile.
 #[derive(Debug, Clone)]
@@ -37,12 +39,12 @@ pub(super) struct TileCanvas {
     /// Red, green, blue (background included), final transmittance, depth.
     pub(super) planes: [Plane; CANVAS_PLANES],
     /// Place in the tile's list at which each pixel stopped; `u32::MAX` if it did not.
-    pub(super) stop: [u32; TILE_PIXELS],
+    pub(super) stop: [[u32; WIDTH]; TILE],
 }
 
 impl TileCanvas {
     pub(super) const EMPTY: Self =
-        Self { planes: [[0.0; TILE_PIXELS]; CANVAS_PLANES], stop: [u32::MAX; TILE_PIXELS] };
+        Self { planes: [DARK; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; TILE] };
 }
 
 /// Where a tile lies in the image.
@@ -144,15 +146,15 @@ impl Rasterize<'_> {
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
-            plane.fill(0.0);
+            *plane = DARK;
         }
-        stop.fill(u32::MAX);
+        *stop = [[u32::MAX; WIDTH]; TILE];
         // Transmittance while the pixel takes light; 0 once it has stopped (its last value is then
         // in `finished`) and from the start outside the image.
-        let mut light = Aligned([0.0; TILE_PIXELS]);
+        let mut light = Aligned(DARK);
         let light = &mut light.0;
-        for y in 0..place.height {
-            light[y * TILE..y * TILE + place.width].fill(1.0);
+        for row in &mut light[..place.height] {
+            row[..place.width].fill(1.0);
         }
         let mut alive = (1_u32 << place.height) - 1;
         let mut batch = [Splat::default(); BATCH];
@@ -169,37 +171,37 @@ impl Rasterize<'_> {
                 let colour = each!(i in 3 => c(splat.colour[i]));
                 let z = c(splat.depth);
                 while todo != 0 {
-                    let y = todo.trailing_zeros() as usize;
+                    // The mask has sixteen bits; saying so again spares every load its bounds check.
+                    let y = todo.trailing_zeros() as usize % TILE;
                     todo &= todo - 1;
                     let (top, offset) = (c(rows.top[y]), c(rows.offset[y]));
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let px = y * TILE + at;
                         let u = l1.mul_add(V::load(s, &CENTRES[at..]), offset);
                         let e = u.neg_mul_add(u, top);
                         let seen = c(-LOG2_255).le(e);
                         let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &light[px..]);
+                        let t = V::load(s, &light[y][at..]);
                         let next = alpha.neg_mul_add(t, t);
                         let goes_on = c(TRANSMITTANCE_MIN).lt(next).and(seen);
                         let w = goes_on.keep(alpha * t);
-                        blend(s, w, colour[0], &mut red[px..]);
-                        blend(s, w, colour[1], &mut green[px..]);
-                        blend(s, w, colour[2], &mut blue[px..]);
+                        blend(s, w, colour[0], &mut red[y][at..]);
+                        blend(s, w, colour[1], &mut green[y][at..]);
+                        blend(s, w, colour[2], &mut blue[y][at..]);
                         if WITH_DEPTH {
-                            blend(s, w, z, &mut depth[px..]);
+                            blend(s, w, z, &mut depth[y][at..]);
                         }
-                        goes_on.select(next, t).store(&mut light[px..]);
+                        goes_on.select(next, t).store(&mut light[y][at..]);
                         let stops = next.le(c(TRANSMITTANCE_MIN)).and(seen).and(V::zero(s).lt(t));
                         if stops.any() {
                             let place_in_list = (n * BATCH + i) as u32;
                             stop_pixels(
-                                &mut light[px..px + S::F32_LANES],
-                                &mut finished[px..],
-                                &mut stop[px..],
+                                &mut light[y][at..at + S::F32_LANES],
+                                &mut finished[y][at..],
+                                &mut stop[y][at..],
                                 stops.keep(c(1.0)),
                                 place_in_list,
                             );
-                            if light[y * TILE..(y + 1) * TILE].iter().all(|&t| t == 0.0) {
+                            if light[y] == [0.0; WIDTH] {
                                 alive &= !(1 << y);
                             }
                         }
@@ -210,13 +212,13 @@ impl Rasterize<'_> {
                 }
             }
         }
-        for px in (0..TILE_PIXELS).step_by(S::F32_LANES) {
-            let t = V::load(s, &light[px..]).max(V::load(s, &finished[px..]));
-            t.store(&mut finished[px..]);
-            for (plane, background) in
-                [&mut *red, &mut *green, &mut *blue].into_iter().zip(background)
-            {
-                t.mul_add(c(background), V::load(s, &plane[px..])).store(&mut plane[px..]);
+        for y in 0..TILE {
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let t = V::load(s, &light[y][at..]).max(V::load(s, &finished[y][at..]));
+                t.store(&mut finished[y][at..]);
+                blend(s, t, c(background[0]), &mut red[y][at..]);
+                blend(s, t, c(background[1]), &mut green[y][at..]);
+                blend(s, t, c(background[2]), &mut blue[y][at..]);
             }
         }
     }

@@ -20,10 +20,10 @@ use pulp::{Simd, WithSimd};
 
 use super::project::{LOG2_255, Splat};
 use super::rasterize::{
-    ALPHA_MAX, Aligned, BATCH, CENTRES, Plane, Rows, TRANSMITTANCE, TileCanvas, TilePlace,
+    ALPHA_MAX, Aligned, BATCH, CENTRES, DARK, Plane, Rows, TRANSMITTANCE, TileCanvas, TilePlace,
 };
 use super::simd::{V, WIDTH, each};
-use super::tiles::{Entry, TILE, TILE_PIXELS};
+use super::tiles::{Entry, TILE};
 
 /// Fields of a record.
 pub(super) mod field {
@@ -134,23 +134,24 @@ impl RasterizeBwd<'_> {
         let stride = detail.stride();
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb] = upstream;
-        let zeros = [0.0; TILE_PIXELS];
-        let [ga, gd] = self.upstream_more.unwrap_or([&zeros, &zeros]);
+        let [ga, gd] = self.upstream_more.unwrap_or([&DARK, &DARK]);
 
         // State per pixel, as it is behind the splat at hand.
         let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
-        let mut behind = Aligned([0.0; TILE_PIXELS]);
+        let mut behind = Aligned(DARK);
         let (light, behind) = (&mut light.0, &mut behind.0);
-        for px in (0..TILE_PIXELS).step_by(S::F32_LANES) {
-            let b = V::load(s, &gr[px..]) * background[0]
-                + V::load(s, &gg[px..]) * background[1]
-                + V::load(s, &gb[px..]) * background[2];
-            b.store(&mut behind[px..]);
+        for y in 0..TILE {
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let b = V::load(s, &gr[y][at..]) * background[0]
+                    + V::load(s, &gg[y][at..]) * background[1]
+                    + V::load(s, &gb[y][at..]) * background[2];
+                b.store(&mut behind[y][at..]);
+            }
         }
         // One past the last list entry that any pixel of the row takes.
         let mut row_end = [0_u32; TILE];
         for (y, end) in row_end.iter_mut().enumerate().take(place.height) {
-            let row = &canvas.stop[y * TILE..y * TILE + place.width];
+            let row = &canvas.stop[y][..place.width];
             *end = row.iter().copied().max().unwrap_or(0).min(list.len() as u32);
         }
         let list_end = row_end.iter().copied().max().unwrap_or(0) as usize;
@@ -189,31 +190,33 @@ impl RasterizeBwd<'_> {
                     weight_max: zero,
                 };
                 while todo != 0 {
-                    let y = todo.trailing_zeros() as usize;
+                    let y = todo.trailing_zeros() as usize % TILE;
                     todo &= todo - 1;
                     let (top, offset, z) = (c(rows.top[y]), c(rows.offset[y]), c(rows.z[y]));
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let px = y * TILE + at;
                         let u = l1.mul_add(V::load(s, &CENTRES[at..]), offset);
                         let e = u.neg_mul_add(u, top);
-                        let stop = S::as_simd_u32s(&canvas.stop[px..]).0[0];
+                        let stop = S::as_simd_u32s(&canvas.stop[y][at..]).0[0];
                         let seen = c(-LOG2_255).le(e).and(super::simd::before(s, here, stop));
                         let unclamped = e.exp2();
                         let alpha = seen.keep(unclamped.min(c(ALPHA_MAX)));
-                        let t = V::load(s, &light[px..]) / (c(1.0) - alpha);
-                        t.store(&mut light[px..]);
+                        let t = V::load(s, &light[y][at..]) / (c(1.0) - alpha);
+                        t.store(&mut light[y][at..]);
                         let w = alpha * t;
-                        let (r, g, b) =
-                            (V::load(s, &gr[px..]), V::load(s, &gg[px..]), V::load(s, &gb[px..]));
+                        let (r, g, b) = (
+                            V::load(s, &gr[y][at..]),
+                            V::load(s, &gg[y][at..]),
+                            V::load(s, &gb[y][at..]),
+                        );
                         let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
                         if DETAIL == 2 {
-                            let d = V::load(s, &gd[px..]);
-                            own = at_depth.mul_add(d, own + V::load(s, &ga[px..]));
+                            let d = V::load(s, &gd[y][at..]);
+                            own = at_depth.mul_add(d, own + V::load(s, &ga[y][at..]));
                             sums.depth = w.mul_add(d, sums.depth);
                         }
-                        let was = V::load(s, &behind[px..]);
+                        let was = V::load(s, &behind[y][at..]);
                         let ahead = own - was;
-                        alpha.mul_add(ahead, was).store(&mut behind[px..]);
+                        alpha.mul_add(ahead, was).store(&mut behind[y][at..]);
                         // No gradient where alpha is at its clamp.
                         let q = unclamped.le(c(ALPHA_MAX)).keep(w * ahead);
                         let qu = q * u;

@@ -27,8 +27,6 @@ use super::simd::WIDTH;
 
 /// Side of a tile [px].
 pub(super) const TILE: usize = WIDTH;
-/// Pixels per tile.
-pub(super) const TILE_PIXELS: usize = TILE * TILE;
 /// Bound for (chunks of rows) × (tiles) counters: 4 MiB of them.
 const MOST_COUNTERS: usize = 1 << 20;
 const MOST_CHUNKS: usize = 64;

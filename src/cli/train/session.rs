@@ -127,7 +127,9 @@ impl<'a> Session<'a> {
             Err(error @ (TrainError::Policy { .. } | TrainError::BrokenPlan { .. })) => {
                 let step = self.run.trainer.steps_done();
                 let saved = match self.save(step) {
-                    Ok(path) => format!("the model as it was before is saved in {}", path.display()),
+                    Ok(path) => {
+                        format!("the model as it was before is saved in {}", path.display())
+                    }
                     Err(e) => format!("the model could not be saved: {e}"),
                 };
                 Err(Failure::from(error).and(&saved))
@@ -182,10 +184,8 @@ impl<'a> Session<'a> {
         let scores = evaluate(trainer.backend(), test, background, degree, |_| ())?;
         let mean = scores.mean();
         write_scores(&self.folder, Split::Test, step, &scores)?;
-        self.board.scalars(
-            step,
-            &[("test/psnr", mean.psnr as f32), ("test/ssim", mean.ssim as f32)],
-        )?;
+        self.board
+            .scalars(step, &[("test/psnr", mean.psnr as f32), ("test/ssim", mean.ssim as f32)])?;
         self.tested.insert(step, mean);
         if !is_last {
             let Mean { psnr, ssim } = mean;

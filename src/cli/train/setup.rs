@@ -98,7 +98,8 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, 1);
     dataset.points = crate::dataset::PointCloud::default();
-    let (backend, ledger) = backend(args, &config, &dataset, policy.as_ref(), &scene, model, [&views, &test])?;
+    let (backend, ledger) =
+        backend(args, &config, &dataset, policy.as_ref(), &scene, model, [&views, &test])?;
     console.say(format_args!("memory promised\n{ledger}"));
     let options = TrainOptions {
         iterations: args.iterations,
@@ -151,7 +152,11 @@ fn backend(
     if test.count() > 0 {
         let (width, height) = options.largest_image;
         let rendering = u64::from(width) * u64::from(height) * 5 * float;
-        ledger.add_to(Section::Passing, "measuring a test view", rendering + test.cache().bytes_needed());
+        ledger.add_to(
+            Section::Passing,
+            "measuring a test view",
+            rendering + test.cache().bytes_needed(),
+        );
     }
     if let Some(bytes) = before {
         ledger.add_to(Section::Process, "program and dataset", bytes);
@@ -262,9 +267,9 @@ fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table, Failure> {
 fn learning_rates(settings: &[String]) -> Result<RateOptions, Failure> {
     let mut table = Table::new();
     for setting in settings {
-        let value = setting.split_once('=').and_then(|(name, rate)| {
-            Some((name.trim(), rate.trim().parse::<f64>().ok()?))
-        });
+        let value = setting
+            .split_once('=')
+            .and_then(|(name, rate)| Some((name.trim(), rate.trim().parse::<f64>().ok()?)));
         let Some((name, rate)) = value else {
             return Err(Failure::input(format!(
                 "--lr {setting} is not of the form NAME=RATE, such as opacity=0.05"
@@ -305,9 +310,13 @@ mod tests {
         let rates = learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()]).unwrap();
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
         assert_eq!(rates, expected);
-        for (bad, part) in
-            [("opacity", "NAME=RATE"), ("opacity=x", "NAME=RATE"), ("colour=1", "colour"), ("quat=0", "quat"), ("quat=inf", "quat")]
-        {
+        for (bad, part) in [
+            ("opacity", "NAME=RATE"),
+            ("opacity=x", "NAME=RATE"),
+            ("colour=1", "colour"),
+            ("quat=0", "quat"),
+            ("quat=inf", "quat"),
+        ] {
             let message = learning_rates(&[bad.into()]).unwrap_err().message;
             assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
         }
