@@ -53,7 +53,7 @@ pub(crate) fn compare_images(
     limits: Limits,
 ) -> Result<f64, String> {
     let pixels = boundary.len();
-    if measured.len() != expected.len() || expected.len() % pixels.max(1) != 0 {
+    if measured.len() != expected.len() || !expected.len().is_multiple_of(pixels.max(1)) {
         return Err(format!(
             "{} values measured, {} expected, {pixels} pixels",
             measured.len(),
@@ -172,8 +172,11 @@ impl Table {
 
     /// Everything that failed, or `None`.
     fn failures(&self) -> Option<String> {
-        // Not `error > tolerance`: a NaN fails.
-        let failed: Vec<_> = self.rows.iter().filter(|row| !(row.2 <= row.3)).collect();
+        let failed: Vec<_> = self
+            .rows
+            .iter()
+            .filter(|row| row.2.is_nan() || row.2 > row.3)
+            .collect();
         if failed.is_empty() && self.messages.is_empty() {
             return None;
         }
@@ -228,7 +231,7 @@ mod tests {
 
     /// Every tenth pixel lies on a boundary.
     fn boundary() -> Vec<bool> {
-        (0..PIXELS).map(|p| p % 10 == 0).collect()
+        (0..PIXELS).map(|p| p.is_multiple_of(10)).collect()
     }
 
     /// The expected image with `by(k)` added to the k-th of the given pixels.
@@ -334,7 +337,10 @@ mod tests {
         );
         refused(&corrupted(flips(), |_| 0.004), lenient, "bias 1.00");
         refused(
-            &corrupted(flips(), |k| if k % 5 == 0 { 0.004 } else { -0.004 }),
+            &corrupted(
+                flips(),
+                |k| if k.is_multiple_of(5) { 0.004 } else { -0.004 },
+            ),
             lenient,
             "bias -0.60",
         );

@@ -11,7 +11,7 @@ use crate::subject;
 /// Of loss, L1 and mean SSIM.
 const VALUE: f64 = 1e-6;
 /// Of the gradient, against its largest value. Flat images lose most, as C₂ is small beside the
-/// rounding of their squares (extremes.md case 24 allows 1e-3).
+/// rounding of their squares.
 const GRADIENT: f64 = 5e-5;
 
 fn random(width: u32, height: u32, noise: f32, seed: u64) -> (Vec<f32>, Image8) {

@@ -218,7 +218,7 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
         signals: SignalSet::of(&[Signal::WeightMax]),
         candidates: None,
     };
-    let mut now = |backend: &mut CpuBackend| {
+    let now = |backend: &mut CpuBackend| {
         let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
         signals
             .get(Signal::WeightMax)
