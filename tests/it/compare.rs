@@ -303,7 +303,7 @@ mod tests {
 
     #[test]
     fn a_few_flips_at_boundaries_pass_and_many_fail() {
-        let alternating = |k: usize| if k % 2 == 0 { 0.004 } else { -0.004 };
+        let alternating = |k: usize| if k.is_multiple_of(2) { 0.004 } else { -0.004 };
         assert!(outcome(&corrupted((0..100).step_by(10), alternating), Limits::CPU).is_ok());
         refused(
             &corrupted((0..110).step_by(10), alternating),
@@ -330,7 +330,11 @@ mod tests {
         let flips = || (0..1000).step_by(10);
         assert!(
             outcome(
-                &corrupted(flips(), |k| if k % 2 == 0 { 0.004 } else { -0.004 }),
+                &corrupted(flips(), |k| if k.is_multiple_of(2) {
+                    0.004
+                } else {
+                    -0.004
+                }),
                 lenient
             )
             .is_ok()

@@ -216,7 +216,7 @@ fn flat_and_nearly_flat_images() {
     table.finish();
 
     // A hair apart: the sign of the difference is the whole gradient, and SSIM stays at 1.
-    let (scalars, _) = subject::loss(&vec![0.6 + 1e-7; n], &flat(153), [0.0; 3]);
+    let (scalars, _) = subject::loss(&vec![0.600_000_1; n], &flat(153), [0.0; 3]);
     assert!(
         scalars.ssim <= 1.0 && scalars.ssim > 1.0 - 1e-6,
         "{}",
