@@ -21,20 +21,13 @@ fn scene(rows: usize, sh_degree: u8) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
     let size = 0.024 * (10_000.0 / rows as f32).powf(0.4);
-    let mut model = Gaussians {
-        sh_degree,
-        ..Gaussians::default()
-    };
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
     for _ in 0..rows {
         model.means.push([0, 1, 2].map(|_| uniform(-1.0, 1.0)));
-        model
-            .log_scales
-            .push([0, 1, 2].map(|_| (size * uniform(0.3, 1.5)).ln()));
+        model.log_scales.push([0, 1, 2].map(|_| (size * uniform(0.3, 1.5)).ln()));
         model.quats.push([0, 1, 2, 3].map(|_| uniform(-1.0, 1.0)));
         model.opacity_logits.push(uniform(-2.0, 2.5));
-        model
-            .sh
-            .extend((0..3 * sh_coefficients(sh_degree)).map(|_| uniform(-0.3, 0.5)));
+        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| uniform(-0.3, 0.5)));
     }
     model
 }
@@ -56,13 +49,7 @@ fn camera(size: u32) -> Camera {
 fn target(size: u32) -> Image8 {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let rgb = (0..3 * size * size).map(|_| rng.random::<u8>()).collect();
-    Image8 {
-        width: size,
-        height: size,
-        rgb,
-        alpha: None,
-        mask: None,
-    }
+    Image8 { width: size, height: size, rgb, alpha: None, mask: None }
 }
 
 fn median(mut times: Vec<Duration>) -> f64 {
@@ -71,10 +58,7 @@ fn median(mut times: Vec<Duration>) -> f64 {
 }
 
 fn main() {
-    let only: Vec<String> = std::env::args()
-        .skip(1)
-        .filter(|a| a.contains('@'))
-        .collect();
+    let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
     let rates = LearningRates {
         mean: 1e-6,
         log_scale: 1e-6,

@@ -41,10 +41,7 @@ impl Camera {
     #[must_use]
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let p = self.rotation * world + self.translation;
-        (
-            DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy),
-            p.z,
-        )
+        (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
     }
 
     /// The same camera with an image of another size: intrinsics scale per axis.

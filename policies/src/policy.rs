@@ -132,6 +132,12 @@ impl SignalSet {
         Self(signals.iter().fold(0, |bits, &s| bits | 1 << s as u32))
     }
 
+    /// This set and `signal`.
+    #[must_use]
+    pub fn with(self, signal: Signal) -> Self {
+        Self(self.0 | 1 << signal as u32)
+    }
+
     /// Whether `signal` is in the set.
     #[must_use]
     pub fn contains(self, signal: Signal) -> bool {
@@ -179,6 +185,7 @@ pub struct CandidateRequest {
 #[serde(rename_all = "kebab-case")]
 pub enum ErrorMode {
     /// ‖dL/dC‖₂ of the rendered colour, as the Diet code does (a structure detector).
+    #[serde(rename = "grad")]
     Gradient,
     /// Mean over channels of |I − G|.
     L1,
@@ -351,3 +358,20 @@ pub enum PolicyError {
 fn did_you_mean(nearest: Option<&str>) -> String {
     nearest.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)"))
 }
+
+/// [`DensityPolicy::restore`] for a policy without state of its own, whose
+/// [`save`](DensityPolicy::save) returns `null`.
+///
+/// # Errors
+/// [`PolicyError::State`] when `state` is not `null`.
+pub fn restore_nothing(state: &PolicyState) -> Result<(), PolicyError> {
+    if state.is_null() {
+        return Ok(());
+    }
+    Err(PolicyError::State(format!(
+        "this policy keeps no state, but the checkpoint holds {state}"
+    )))
+}
+
+#[cfg(test)]
+mod tests;

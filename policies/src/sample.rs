@@ -22,7 +22,7 @@ pub fn top_k(values: &[f32], k: usize) -> Vec<u32> {
 pub fn largest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     first_k(rows, k, |&a, &b| {
         let (x, y) = (values[a as usize], values[b as usize]);
-        nan_last(x, y, y.total_cmp(&x)).then(a.cmp(&b))
+        nan_last(x, y, Ordering::reverse).then(a.cmp(&b))
     })
 }
 
@@ -34,7 +34,7 @@ pub fn largest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
 pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     first_k(rows, k, |&a, &b| {
         let (x, y) = (values[a as usize], values[b as usize]);
-        nan_last(x, y, x.total_cmp(&y)).then(a.cmp(&b))
+        nan_last(x, y, |order| order).then(a.cmp(&b))
     })
 }
 
@@ -57,12 +57,10 @@ pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     keyed.into_iter().map(|(_, row)| row).collect()
 }
 
-/// −0 equals 0, and NaN of either sign comes last; otherwise `order`.
-fn nan_last(x: f32, y: f32, order: Ordering) -> Ordering {
-    match (x.is_nan(), y.is_nan()) {
-        (false, false) if x != y => order,
-        (x, y) => x.cmp(&y),
-    }
+/// Numbers in the direction wanted (−0 equals 0), then NaN of either sign.
+fn nan_last(x: f32, y: f32, direction: impl Fn(Ordering) -> Ordering) -> Ordering {
+    x.partial_cmp(&y)
+        .map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
 }
 
 /// The first `k` items in a total order, sorted.

@@ -79,13 +79,7 @@ impl<'a> Pair<'a> {
         for (part, found, expected) in parts {
             if let Some(found) = found.filter(|&found| found != expected) {
                 let (width, height) = (target.width, target.height);
-                return Err(MetricError::BadTarget {
-                    part,
-                    found,
-                    expected,
-                    width,
-                    height,
-                });
+                return Err(MetricError::BadTarget { part, found, expected, width, height });
             }
         }
         if rendered.len() != 3 * pixels {
@@ -96,21 +90,12 @@ impl<'a> Pair<'a> {
                 height: target.height,
             });
         }
-        Ok(Self {
-            rendered,
-            target,
-            background: background.map(f64::from),
-            width,
-            height,
-        })
+        Ok(Self { rendered, target, background: background.map(f64::from), width, height })
     }
 
     /// How much pixel `p` counts, in [0, 1].
     fn weight(&self, p: usize) -> f64 {
-        self.target
-            .mask
-            .as_ref()
-            .map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
+        self.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
     }
 
     /// Channel `c` of the target at pixel `p`, on the background.

@@ -16,13 +16,9 @@ use crate::dataset::images::Image8;
 pub fn psnr(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f64, MetricError> {
     let pair = Pair::new(rendered, target, background)?;
     // One sum per image row, added in order: the same bits at any thread count.
-    let rows: Vec<[f64; 2]> = (0..pair.height)
-        .into_par_iter()
-        .map(|y| row(&pair, y))
-        .collect();
-    let [squared, weight] = rows
-        .iter()
-        .fold([0.0; 2], |sum, row| [sum[0] + row[0], sum[1] + row[1]]);
+    let rows: Vec<[f64; 2]> = (0..pair.height).into_par_iter().map(|y| row(&pair, y)).collect();
+    let [squared, weight] =
+        rows.iter().fold([0.0; 2], |sum, row| [sum[0] + row[0], sum[1] + row[1]]);
     if weight == 0.0 {
         return Err(MetricError::NothingToCompare);
     }
@@ -50,13 +46,7 @@ mod tests {
 
     fn target(width: u32, height: u32, value: u8) -> Image8 {
         let pixels = (width * height) as usize;
-        Image8 {
-            width,
-            height,
-            rgb: vec![value; 3 * pixels],
-            alpha: None,
-            mask: None,
-        }
+        Image8 { width, height, rgb: vec![value; 3 * pixels], alpha: None, mask: None }
     }
 
     #[test]
@@ -64,10 +54,7 @@ mod tests {
         let black = target(7, 5, 0);
         for (value, expected) in [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0), (0.5, 6.020_599_913)] {
             let measured = psnr(&[value; 105], &black, [0.0; 3]).unwrap();
-            assert!(
-                (measured - expected).abs() < 1e-6,
-                "{value}: {measured} for {expected}"
-            );
+            assert!((measured - expected).abs() < 1e-6, "{value}: {measured} for {expected}");
         }
     }
 
@@ -76,10 +63,7 @@ mod tests {
         let mut rendered = vec![0.0; 300];
         rendered[137] = 1.0;
         let measured = psnr(&rendered, &target(10, 10, 0), [0.0; 3]).unwrap();
-        assert!(
-            (measured - 10.0 * 300.0_f64.log10()).abs() < 1e-12,
-            "{measured}"
-        );
+        assert!((measured - 10.0 * 300.0_f64.log10()).abs() < 1e-12, "{measured}");
     }
 
     #[test]
@@ -87,10 +71,7 @@ mod tests {
         let white = target(4, 4, 255);
         assert_eq!(psnr(&[1.0; 48], &white, [0.0; 3]), Ok(f64::INFINITY));
         assert_eq!(psnr(&[7.5; 48], &white, [0.0; 3]), Ok(f64::INFINITY));
-        assert_eq!(
-            psnr(&[-3.0; 48], &target(4, 4, 0), [0.0; 3]),
-            Ok(f64::INFINITY)
-        );
+        assert_eq!(psnr(&[-3.0; 48], &target(4, 4, 0), [0.0; 3]), Ok(f64::INFINITY));
         assert!(psnr(&[f32::NAN; 48], &white, [0.0; 3]).unwrap().is_nan());
     }
 
@@ -98,10 +79,7 @@ mod tests {
     fn coverage_is_composited_on_the_background() {
         let mut covered = target(1, 1, 255);
         covered.alpha = Some(vec![0]);
-        assert_eq!(
-            psnr(&[0.25, 0.5, 0.75], &covered, [0.25, 0.5, 0.75]),
-            Ok(f64::INFINITY)
-        );
+        assert_eq!(psnr(&[0.25, 0.5, 0.75], &covered, [0.25, 0.5, 0.75]), Ok(f64::INFINITY));
         covered.alpha = Some(vec![51]);
         // 0.2 · 1 + 0.8 · 0.5 = 0.6, so a render of 0.5 is 0.1 off.
         let measured = psnr(&[0.5; 3], &covered, [0.5; 3]).unwrap();
@@ -117,16 +95,10 @@ mod tests {
 
         half.mask = Some(vec![204, 51]);
         let measured = psnr(&[0.0, 0.0, 0.0, 1.0, 1.0, 1.0], &half, [0.0; 3]).unwrap();
-        assert!(
-            (measured - 10.0 * 5.0_f64.log10()).abs() < 1e-12,
-            "{measured}"
-        );
+        assert!((measured - 10.0 * 5.0_f64.log10()).abs() < 1e-12, "{measured}");
 
         half.mask = Some(vec![0, 0]);
-        assert_eq!(
-            psnr(&[0.0; 6], &half, [0.0; 3]),
-            Err(MetricError::NothingToCompare)
-        );
+        assert_eq!(psnr(&[0.0; 6], &half, [0.0; 3]), Err(MetricError::NothingToCompare));
     }
 
     #[test]
@@ -134,23 +106,13 @@ mod tests {
         let error = psnr(&[0.0; 11], &target(2, 2, 0), [0.0; 3]).unwrap_err();
         assert_eq!(
             error,
-            MetricError::SizeMismatch {
-                rendered: 11,
-                expected: 12,
-                width: 2,
-                height: 2
-            }
+            MetricError::SizeMismatch { rendered: 11, expected: 12, width: 2, height: 2 }
         );
         let mut bad = target(2, 2, 0);
         bad.alpha = Some(vec![0; 3]);
         assert!(matches!(
             psnr(&[0.0; 12], &bad, [0.0; 3]),
-            Err(MetricError::BadTarget {
-                part: "coverage",
-                found: 3,
-                expected: 4,
-                ..
-            })
+            Err(MetricError::BadTarget { part: "coverage", found: 3, expected: 4, .. })
         ));
     }
 
@@ -160,9 +122,6 @@ mod tests {
         let n = 3 * 2048 * 2048;
         let measured = psnr(&vec![0.001; n], &target(2048, 2048, 0), [0.0; 3]).unwrap();
         let expected = -20.0 * f64::from(0.001_f32).log10();
-        assert!(
-            (measured - expected).abs() < 1e-9,
-            "{measured} for {expected}"
-        );
+        assert!((measured - expected).abs() < 1e-9, "{measured} for {expected}");
     }
 }

@@ -48,21 +48,18 @@ pub fn ssim(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
             let last = (first + BLOCK).min(pair.height);
             let map = block_map(&pair, &window, first, last);
             let pixels = first * pair.width..last * pair.width;
-            pixels
-                .zip(map.chunks_exact(3))
-                .fold([0.0; 2], |sum, (p, ssim)| {
-                    let weight = pair.weight(p);
-                    if weight > 0.0 {
-                        [sum[0] + weight * ssim.iter().sum::<f64>(), sum[1] + weight]
-                    } else {
-                        sum
-                    }
-                })
+            pixels.zip(map.chunks_exact(3)).fold([0.0; 2], |sum, (p, ssim)| {
+                let weight = pair.weight(p);
+                if weight > 0.0 {
+                    [sum[0] + weight * ssim.iter().sum::<f64>(), sum[1] + weight]
+                } else {
+                    sum
+                }
+            })
         })
         .collect();
-    let [similarity, weight] = sums.iter().fold([0.0; 2], |sum, block| {
-        [sum[0] + block[0], sum[1] + block[1]]
-    });
+    let [similarity, weight] =
+        sums.iter().fold([0.0; 2], |sum, block| [sum[0] + block[0], sum[1] + block[1]]);
     if weight == 0.0 {
         return Err(MetricError::NothingToCompare);
     }
@@ -97,10 +94,8 @@ fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<
             let (from, to) = (x.saturating_sub(REACH), (x + REACH + 1).min(pair.width));
             let taps = &window[from + REACH - x..];
             let mut sum = Moments::default();
-            for (w, moments) in taps
-                .iter()
-                .zip(row[3 * from + c..].iter().step_by(3))
-                .take(to - from)
+            for (w, moments) in
+                taps.iter().zip(row[3 * from + c..].iter().step_by(3)).take(to - from)
             {
                 add(&mut sum, *w, moments);
             }
@@ -113,11 +108,7 @@ fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<
         for i in 0..values {
             let mut sum = Moments::default();
             for row in from..to {
-                add(
-                    &mut sum,
-                    window[row + REACH - y],
-                    &across[(row - above) * values + i],
-                );
+                add(&mut sum, window[row + REACH - y], &across[(row - above) * values + i]);
             }
             map.push(similarity(sum));
         }
@@ -138,11 +129,7 @@ fn moments_of_row(pair: &Pair<'_>, y: usize, row: &mut Vec<Moments>) {
         for c in 0..3 {
             let truth = pair.truth(p, c);
             // An ignored pixel may hold anything, NaN included.
-            let error = if weight > 0.0 {
-                weight * pair.error(p, c)
-            } else {
-                0.0
-            };
+            let error = if weight > 0.0 { weight * pair.error(p, c) } else { 0.0 };
             let x = truth + error;
             row.push([error, truth, error * error, x * x + truth * truth]);
         }
@@ -211,23 +198,11 @@ mod tests {
             .iter()
             .map(|&v| f32::from(v) / 255.0 + noise * (rng.random::<f32>() - 0.5))
             .collect();
-        (
-            rendered,
-            Image8 {
-                width,
-                height,
-                rgb,
-                alpha: None,
-                mask: None,
-            },
-        )
+        (rendered, Image8 { width, height, rgb, alpha: None, mask: None })
     }
 
     fn clamped(rendered: &[f32]) -> Vec<f64> {
-        rendered
-            .iter()
-            .map(|&v| f64::from(v).clamp(0.0, 1.0))
-            .collect()
+        rendered.iter().map(|&v| f64::from(v).clamp(0.0, 1.0)).collect()
     }
 
     fn unpacked(target: &Image8) -> Vec<f64> {
@@ -240,27 +215,12 @@ mod tests {
 
     fn flat(width: u32, height: u32, value: u8) -> Image8 {
         let n = (3 * width * height) as usize;
-        Image8 {
-            width,
-            height,
-            rgb: vec![value; n],
-            alpha: None,
-            mask: None,
-        }
+        Image8 { width, height, rgb: vec![value; n], alpha: None, mask: None }
     }
 
     #[test]
     fn agrees_with_the_textbook_pixel_by_pixel_at_every_size() {
-        let sizes = [
-            (1, 1),
-            (1, 17),
-            (17, 1),
-            (5, 4),
-            (11, 11),
-            (15, 15),
-            (16, 16),
-            (33, 67),
-        ];
+        let sizes = [(1, 1), (1, 17), (17, 1), (5, 4), (11, 11), (15, 15), (16, 16), (33, 67)];
         for (seed, (width, height)) in sizes.into_iter().enumerate() {
             for noise in [0.02, 1.0] {
                 let (rendered, target) = noisy(width, height, noise, seed as u64);
@@ -271,18 +231,12 @@ mod tests {
                 let map: Vec<f64> = blocks
                     .flat_map(|y| block_map(&pair, &window(), y, (y + BLOCK).min(h)))
                     .collect();
-                let worst = map
-                    .iter()
-                    .zip(&expected)
-                    .map(|(a, b)| (a - b).abs())
-                    .fold(0.0, f64::max);
+                let worst =
+                    map.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 assert!(worst < 1e-12, "{width}x{height}, noise {noise}: {worst:e}");
                 let measured = ssim(&rendered, &target, [0.0; 3]).unwrap();
                 let difference = (measured - mean(&expected)).abs();
-                assert!(
-                    difference < 1e-13,
-                    "{width}x{height}: mean off by {difference:e}"
-                );
+                assert!(difference < 1e-13, "{width}x{height}: mean off by {difference:e}");
             }
         }
     }
@@ -296,14 +250,8 @@ mod tests {
             // f32 holds value/255 to half an ulp only.
             assert!((measured - 1.0).abs() < 1e-9, "{value}: {measured}");
         }
-        assert_eq!(
-            ssim(&[0.0; 19 * 23 * 3], &flat(19, 23, 0), [0.0; 3]),
-            Ok(1.0)
-        );
-        assert_eq!(
-            ssim(&[1.0; 19 * 23 * 3], &flat(19, 23, 255), [0.0; 3]),
-            Ok(1.0)
-        );
+        assert_eq!(ssim(&[0.0; 19 * 23 * 3], &flat(19, 23, 0), [0.0; 3]), Ok(1.0));
+        assert_eq!(ssim(&[1.0; 19 * 23 * 3], &flat(19, 23, 255), [0.0; 3]), Ok(1.0));
     }
 
     #[test]
@@ -340,10 +288,7 @@ mod tests {
         let expected = (2.0 * w * w * x * y + c1) * (2.0 * (w - w * w) * x * y + c2)
             / ((w * w * (x * x + y * y) + c1) * ((w - w * w) * (x * x + y * y) + c2));
         let measured = ssim(&[0.75; 3], &flat(1, 1, 51), [0.0; 3]).unwrap();
-        assert!(
-            (measured - expected).abs() < 1e-13,
-            "{measured} for {expected}"
-        );
+        assert!((measured - expected).abs() < 1e-13, "{measured} for {expected}");
     }
 
     #[test]
@@ -359,19 +304,12 @@ mod tests {
     fn noise_of_a_thousandth_on_a_flat_image() {
         let mut rng = ChaCha8Rng::seed_from_u64(24);
         let target = flat(40, 40, 230);
-        let rendered: Vec<f32> = (0..40 * 40 * 3)
-            .map(|_| 230.0 / 255.0 + 1e-3 * (rng.random::<f32>() - 0.5))
-            .collect();
+        let rendered: Vec<f32> =
+            (0..40 * 40 * 3).map(|_| 230.0 / 255.0 + 1e-3 * (rng.random::<f32>() - 0.5)).collect();
         let expected = mean(&textbook(&clamped(&rendered), &unpacked(&target), 40, 40));
         let measured = ssim(&rendered, &target, [0.0; 3]).unwrap();
-        assert!(
-            (measured - expected).abs() < 1e-12,
-            "{measured} for {expected}"
-        );
-        assert!(
-            measured < 1.0 - 1e-6,
-            "the noise went unnoticed: {measured}"
-        );
+        assert!((measured - expected).abs() < 1e-12, "{measured} for {expected}");
+        assert!(measured < 1.0 - 1e-6, "the noise went unnoticed: {measured}");
     }
 
     #[test]
@@ -386,9 +324,7 @@ mod tests {
     #[test]
     fn masked_pixels_leave_no_trace() {
         let (mut rendered, mut target) = noisy(20, 20, 0.1, 5);
-        let mask: Vec<u8> = (0..400)
-            .map(|p| if p % 20 < 10 { 255 } else { 0 })
-            .collect();
+        let mask: Vec<u8> = (0..400).map(|p| if p % 20 < 10 { 255 } else { 0 }).collect();
         target.mask = Some(mask.clone());
         let before = ssim(&rendered, &target, [0.0; 3]).unwrap();
         for (p, _) in mask.iter().enumerate().filter(|&(_, &m)| m == 0) {
@@ -404,19 +340,12 @@ mod tests {
             .map(|(i, (&x, y))| if mask[i / 3] == 0 { y } else { x })
             .collect();
         let map = textbook(&x, &unpacked(&target), 20, 20);
-        let counted: Vec<f64> = map
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| mask[i / 3] != 0)
-            .map(|(_, &v)| v)
-            .collect();
+        let counted: Vec<f64> =
+            map.iter().enumerate().filter(|(i, _)| mask[i / 3] != 0).map(|(_, &v)| v).collect();
         assert!((before - mean(&counted)).abs() < 1e-13);
 
         target.mask = Some(vec![0; 400]);
-        assert_eq!(
-            ssim(&rendered, &target, [0.0; 3]),
-            Err(MetricError::NothingToCompare)
-        );
+        assert_eq!(ssim(&rendered, &target, [0.0; 3]), Err(MetricError::NothingToCompare));
     }
 
     #[test]
@@ -435,10 +364,7 @@ mod tests {
         let expected = mean(&textbook(&clamped(&rendered), &y, 14, 12));
         target.alpha = Some(alpha);
         let measured = ssim(&rendered, &target, background).unwrap();
-        assert!(
-            (measured - expected).abs() < 1e-13,
-            "{measured} for {expected}"
-        );
+        assert!((measured - expected).abs() < 1e-13, "{measured} for {expected}");
     }
 
     #[test]
@@ -447,13 +373,8 @@ mod tests {
         let bits: Vec<u64> = [1, 2, 5]
             .into_iter()
             .map(|threads| {
-                let pool = rayon::ThreadPoolBuilder::new()
-                    .num_threads(threads)
-                    .build()
-                    .unwrap();
-                pool.install(|| ssim(&rendered, &target, [0.0; 3]))
-                    .unwrap()
-                    .to_bits()
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                pool.install(|| ssim(&rendered, &target, [0.0; 3])).unwrap().to_bits()
             })
             .collect();
         assert!(bits.iter().all(|&b| b == bits[0]), "{bits:?}");
@@ -463,11 +384,7 @@ mod tests {
     fn sizes_that_disagree_are_refused() {
         assert!(matches!(
             ssim(&[0.0; 9], &flat(2, 2, 0), [0.0; 3]),
-            Err(MetricError::SizeMismatch {
-                rendered: 9,
-                expected: 12,
-                ..
-            })
+            Err(MetricError::SizeMismatch { rendered: 9, expected: 12, .. })
         ));
     }
 }

@@ -23,20 +23,12 @@ pub(crate) struct Limits {
 
 impl Limits {
     /// For values around 1 computed on a CPU.
-    pub(crate) const CPU: Self = Self {
-        interior: 2e-5,
-        step: 1.5 / 255.0,
-        flipped: 0.001,
-        bias: 0.5,
-    };
+    pub(crate) const CPU: Self =
+        Self { interior: 2e-5, step: 1.5 / 255.0, flipped: 0.001, bias: 0.5 };
 
     /// The same for values around `scale`.
     pub(crate) fn scaled(self, scale: f64) -> Self {
-        Self {
-            interior: self.interior * scale,
-            step: self.step * scale,
-            ..self
-        }
+        Self { interior: self.interior * scale, step: self.step * scale, ..self }
     }
 }
 
@@ -67,11 +59,7 @@ pub(crate) fn compare_images(
             (p * channels..(p + 1) * channels).map(|i| f64::from(measured[i]) - expected[i]);
         // The channel that differs most speaks for the pixel; a NaN differs most of all.
         let worst = differences.fold(0.0_f64, |worst, d| {
-            if worst.is_nan() || d.abs() <= worst.abs() {
-                worst
-            } else {
-                d
-            }
+            if worst.is_nan() || d.abs() <= worst.abs() { worst } else { d }
         });
         if worst.abs() <= limits.interior {
             largest = largest.max(worst.abs());
@@ -92,38 +80,26 @@ pub(crate) fn compare_images(
     }
     let most = ((limits.flipped * pixels as f64) as usize).max(1);
     if flips > most {
-        return Err(format!(
-            "{flips} of {pixels} pixels flipped at a boundary, {most} allowed"
-        ));
+        return Err(format!("{flips} of {pixels} pixels flipped at a boundary, {most} allowed"));
     }
     let bias = directions / flips.max(1) as f64;
     if flips >= FLIPS_WITH_DIRECTION && bias.abs() >= limits.bias {
-        return Err(format!(
-            "{flips} pixels flipped with bias {bias:.2}, {} allowed",
-            limits.bias
-        ));
+        return Err(format!("{flips} pixels flipped with bias {bias:.2}, {} allowed", limits.bias));
     }
     Ok(largest)
 }
 
 /// max |measured − expected| / max |expected|; 0 where both are all zero, NaN where a NaN is.
 pub(crate) fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> f64 {
-    assert_eq!(
-        measured.len(),
-        expected.len(),
-        "two arrays of one quantity differ in length"
-    );
+    assert_eq!(measured.len(), expected.len(), "two arrays of one quantity differ in length");
     let mut largest = 0.0_f64;
     let mut worst = 0.0_f64;
     for (&m, &e) in measured.iter().zip(expected) {
         let difference = (m.into() - e).abs();
         largest = largest.max(e.abs());
         // `max` would drop a NaN.
-        worst = if difference.is_nan() || worst.is_nan() {
-            f64::NAN
-        } else {
-            worst.max(difference)
-        };
+        worst =
+            if difference.is_nan() || worst.is_nan() { f64::NAN } else { worst.max(difference) };
     }
     if worst == 0.0 { 0.0 } else { worst / largest }
 }
@@ -138,17 +114,12 @@ pub(crate) struct Table {
 
 impl Table {
     pub(crate) fn new(title: &str) -> Self {
-        Self {
-            title: title.into(),
-            rows: Vec::new(),
-            messages: Vec::new(),
-        }
+        Self { title: title.into(), rows: Vec::new(), messages: Vec::new() }
     }
 
     /// Records that `quantity` of `case` is off by `error`.
     pub(crate) fn check(&mut self, case: &str, quantity: &str, error: f64, tolerance: f64) {
-        self.rows
-            .push((case.into(), quantity.into(), error, tolerance));
+        self.rows.push((case.into(), quantity.into(), error, tolerance));
     }
 
     /// Records the outcome of a comparison of images.
@@ -172,11 +143,8 @@ impl Table {
 
     /// Everything that failed, or `None`.
     fn failures(&self) -> Option<String> {
-        let failed: Vec<_> = self
-            .rows
-            .iter()
-            .filter(|row| row.2.is_nan() || row.2 > row.3)
-            .collect();
+        let failed: Vec<_> =
+            self.rows.iter().filter(|row| row.2.is_nan() || row.2 > row.3).collect();
         if failed.is_empty() && self.messages.is_empty() {
             return None;
         }
@@ -187,10 +155,7 @@ impl Table {
             self.rows.len() + self.messages.len()
         );
         for (case, quantity, error, tolerance) in failed {
-            let _ = writeln!(
-                text,
-                "  {case:<28} {quantity:<26} {error:9.2e} > {tolerance:.2e}"
-            );
+            let _ = writeln!(text, "  {case:<28} {quantity:<26} {error:9.2e} > {tolerance:.2e}");
         }
         for message in &self.messages {
             let _ = writeln!(text, "  {message}");
@@ -200,19 +165,12 @@ impl Table {
 
     /// The largest error in units of its tolerance.
     pub(crate) fn worst(&self) -> f64 {
-        self.rows
-            .iter()
-            .map(|row| row.2 / row.3)
-            .fold(0.0, f64::max)
+        self.rows.iter().map(|row| row.2 / row.3).fold(0.0, f64::max)
     }
 
     /// Panics with the table of failures, if there are any, or if nothing was compared.
     pub(crate) fn finish(self) {
-        assert!(
-            !self.rows.is_empty(),
-            "{}: nothing was compared",
-            self.title
-        );
+        assert!(!self.rows.is_empty(), "{}: nothing was compared", self.title);
         if let Some(failures) = self.failures() {
             panic!("{failures}");
         }
@@ -254,39 +212,20 @@ mod tests {
 
     #[test]
     fn rounding_passes() {
-        let error = outcome(
-            &corrupted(0..PIXELS, |k| 1e-5 * (k as f32).sin()),
-            Limits::CPU,
-        );
+        let error = outcome(&corrupted(0..PIXELS, |k| 1e-5 * (k as f32).sin()), Limits::CPU);
         assert!((9e-6..2e-5).contains(&error.unwrap()));
     }
 
     #[test]
     fn one_wrong_interior_pixel_fails() {
-        refused(
-            &corrupted([4321].into_iter(), |_| 3e-5),
-            Limits::CPU,
-            "pixel 4321",
-        );
-        refused(
-            &corrupted([4321].into_iter(), |_| -0.5),
-            Limits::CPU,
-            "pixel 4321",
-        );
+        refused(&corrupted([4321].into_iter(), |_| 3e-5), Limits::CPU, "pixel 4321");
+        refused(&corrupted([4321].into_iter(), |_| -0.5), Limits::CPU, "pixel 4321");
     }
 
     #[test]
     fn nan_fails_everywhere() {
-        refused(
-            &corrupted([7].into_iter(), |_| f32::NAN),
-            Limits::CPU,
-            "pixel 7",
-        );
-        refused(
-            &corrupted([70].into_iter(), |_| f32::NAN),
-            Limits::CPU,
-            "pixel 70",
-        );
+        refused(&corrupted([7].into_iter(), |_| f32::NAN), Limits::CPU, "pixel 7");
+        refused(&corrupted([70].into_iter(), |_| f32::NAN), Limits::CPU, "pixel 70");
         let mut table = Table::new("NaN");
         table.check("case", "quantity", f64::NAN, 1.0);
         assert!(table.failures().is_some());
@@ -305,46 +244,28 @@ mod tests {
     fn a_few_flips_at_boundaries_pass_and_many_fail() {
         let alternating = |k: usize| if k.is_multiple_of(2) { 0.004 } else { -0.004 };
         assert!(outcome(&corrupted((0..100).step_by(10), alternating), Limits::CPU).is_ok());
-        refused(
-            &corrupted((0..110).step_by(10), alternating),
-            Limits::CPU,
-            "11 of 10000",
-        );
+        refused(&corrupted((0..110).step_by(10), alternating), Limits::CPU, "11 of 10000");
     }
 
     #[test]
     fn a_flip_larger_than_a_step_fails() {
-        refused(
-            &corrupted([50].into_iter(), |_| 0.006),
-            Limits::CPU,
-            "at a boundary",
-        );
+        refused(&corrupted([50].into_iter(), |_| 0.006), Limits::CPU, "at a boundary");
     }
 
     #[test]
     fn flips_in_one_direction_fail() {
-        let lenient = Limits {
-            flipped: 0.01,
-            ..Limits::CPU
-        };
+        let lenient = Limits { flipped: 0.01, ..Limits::CPU };
         let flips = || (0..1000).step_by(10);
         assert!(
             outcome(
-                &corrupted(flips(), |k| if k.is_multiple_of(2) {
-                    0.004
-                } else {
-                    -0.004
-                }),
+                &corrupted(flips(), |k| if k.is_multiple_of(2) { 0.004 } else { -0.004 }),
                 lenient
             )
             .is_ok()
         );
         refused(&corrupted(flips(), |_| 0.004), lenient, "bias 1.00");
         refused(
-            &corrupted(
-                flips(),
-                |k| if k.is_multiple_of(5) { 0.004 } else { -0.004 },
-            ),
+            &corrupted(flips(), |k| if k.is_multiple_of(5) { 0.004 } else { -0.004 }),
             lenient,
             "bias -0.60",
         );
@@ -371,16 +292,8 @@ mod tests {
         table.fail("and a message".into());
         assert!((table.worst() - 2.0).abs() < 1e-12);
         let text = table.failures().unwrap();
-        assert!(
-            text.starts_with("title: 3 of 4 comparisons failed"),
-            "{text}"
-        );
-        assert!(
-            ["bad", "worse", "and a message"]
-                .iter()
-                .all(|w| text.contains(w)),
-            "{text}"
-        );
+        assert!(text.starts_with("title: 3 of 4 comparisons failed"), "{text}");
+        assert!(["bad", "worse", "and a message"].iter().all(|w| text.contains(w)), "{text}");
         assert!(!text.contains("good"), "{text}");
     }
 }

@@ -46,14 +46,7 @@ fn needles_in_every_direction() {
             // At z = 1 a pixel is 1/64 wide; the needle is 0.01 px thin before the blur.
             let scale = [sigma_px / 64.0, 0.01 / 64.0, 0.01 / 64.0];
             let quat = [(0.5 * angle).cos(), 0.0, 0.0, (0.5 * angle).sin()];
-            scenes::push(
-                &mut model,
-                [0.01, -0.02, 1.0],
-                scale,
-                quat,
-                2.0,
-                flat_colour,
-            );
+            scenes::push(&mut model, [0.01, -0.02, 1.0], scale, quat, 2.0, flat_colour);
             let what = format!("{sigma_px} px, turn {turn}");
             check_needle(&mut table, &what, &model, &camera, tolerance);
         }
@@ -62,27 +55,16 @@ fn needles_in_every_direction() {
 }
 
 fn check_needle(table: &mut Table, what: &str, model: &Gaussians, camera: &Camera, tolerance: f64) {
-    let view = View {
-        camera,
-        background: GREY.map(f64::from),
-        sh_degree: 0,
-    };
+    let view = View { camera, background: GREY.map(f64::from), sh_degree: 0 };
     let upstream = scenes::upstream(camera, 4);
     let (image, gradient) = differentiate(&Model::of(model), view, &Rules::STANDARD, &upstream);
     let mut backend = subject::backend(model, Resources::default());
     let (found, measured) = subject::differentiate(&mut backend, camera, GREY, 0, &upstream);
-    let limits = Limits {
-        interior: 1e-3,
-        step: 1.5 / 255.0,
-        ..Limits::CPU
-    };
+    let limits = Limits { interior: 1e-3, step: 1.5 / 255.0, ..Limits::CPU };
     let outcome = compare_images(&found.alpha, &image.alpha, &image.boundary, limits);
     table.image(what, "alpha", outcome, limits);
     for class in CLASSES {
-        let error = relative_error(
-            subject::class(&measured, class),
-            gradient.model.class(class),
-        );
+        let error = relative_error(subject::class(&measured, class), gradient.model.class(class));
         table.check(what, class, error, tolerance);
     }
 }
@@ -105,14 +87,7 @@ fn thousands_of_faint_layers() {
                 shade,
             );
         }
-        check(
-            &mut table,
-            &format!("{rows} layers"),
-            &model,
-            &camera,
-            GREY,
-            0,
-        );
+        check(&mut table, &format!("{rows} layers"), &model, &camera, GREY, 0);
     }
     table.finish();
 }
@@ -121,9 +96,8 @@ fn thousands_of_faint_layers() {
 fn opacities_to_both_ends() {
     let camera = scenes::camera(40, 30, 17);
     let mut table = Table::new("opacities");
-    let logits = [
-        -104.0, -88.0, -50.0, -9.2, -5.6, -5.5, 0.0, 4.4, 4.7, 9.2, 16.6, 17.0, 40.0, 90.0,
-    ];
+    let logits =
+        [-104.0, -88.0, -50.0, -9.2, -5.6, -5.5, 0.0, 4.4, 4.7, 9.2, 16.6, 17.0, 40.0, 90.0];
     for (seed, &logit) in logits.iter().enumerate() {
         let mut model = scenes::cloud(12, 0, &camera, 30 + seed as u64);
         for (row, opacity) in model.opacity_logits.iter_mut().enumerate() {
@@ -131,14 +105,7 @@ fn opacities_to_both_ends() {
                 *opacity = logit;
             }
         }
-        check(
-            &mut table,
-            &format!("logit {logit}"),
-            &model,
-            &camera,
-            GREY,
-            0,
-        );
+        check(&mut table, &format!("logit {logit}"), &model, &camera, GREY, 0);
     }
     table.finish();
 }
@@ -152,14 +119,7 @@ fn quaternions_of_any_length() {
         for quat in &mut model.quats {
             *quat = quat.map(|v| v * length);
         }
-        check(
-            &mut table,
-            &format!("length {length:e}"),
-            &model,
-            &camera,
-            GREY,
-            0,
-        );
+        check(&mut table, &format!("length {length:e}"), &model, &camera, GREY, 0);
     }
     table.finish();
 }
@@ -266,20 +226,8 @@ fn slot_of(model: &mut Gaussians, row: usize, slot: usize) -> &mut f32 {
 fn any_finite_number_gives_a_finite_image() {
     let camera = scenes::camera(33, 30, 20);
     let model = scenes::cloud(24, 3, &camera, 33);
-    let values = [
-        0.0,
-        -0.0,
-        1e-45,
-        -1e-45,
-        1e-38,
-        1e-20,
-        1e4,
-        -1e4,
-        1e19,
-        -1e19,
-        f32::MAX,
-        f32::MIN,
-    ];
+    let values =
+        [0.0, -0.0, 1e-45, -1e-45, 1e-38, 1e-20, 1e4, -1e4, 1e19, -1e19, f32::MAX, f32::MIN];
     let mut broken = Vec::new();
     for value in values {
         for slot in 0..59 {
@@ -289,9 +237,7 @@ fn any_finite_number_gives_a_finite_image() {
             let image_finite = image.rgb.iter().chain(&image.depth).all(|v| v.is_finite());
             let gradient_finite = CLASSES.iter().all(|class| {
                 let all = subject::class(&gradient, class);
-                without(all, 11, all.len() / model.len())
-                    .iter()
-                    .all(|v| v.is_finite())
+                without(all, 11, all.len() / model.len()).iter().all(|v| v.is_finite())
             });
             if !image_finite || !gradient_finite {
                 broken.push(format!(
@@ -327,11 +273,6 @@ fn a_camera_at_a_row_s_mean_or_inside_it_is_harmless() {
     let (image, gradient) = run(&model, &camera);
     assert!(image.rgb.iter().all(|v| v.is_finite()));
     for class in CLASSES {
-        assert!(
-            subject::class(&gradient, class)
-                .iter()
-                .all(|v| v.is_finite()),
-            "{class}"
-        );
+        assert!(subject::class(&gradient, class).iter().all(|v| v.is_finite()), "{class}");
     }
 }

@@ -23,11 +23,7 @@ pub(crate) fn check(
     background: [f32; 3],
     sh_degree: u8,
 ) {
-    let view = View {
-        camera,
-        background: background.map(f64::from),
-        sh_degree,
-    };
+    let view = View { camera, background: background.map(f64::from), sh_degree };
     let exact = Model::of(model);
     let boundary = render(&exact, view, &Rules::STANDARD).boundary;
     let upstream = undecided_ignored(scenes::upstream(camera, 99), &boundary);
@@ -38,10 +34,7 @@ pub(crate) fn check(
 
     compare(table, what, &found, &image);
     for class in CLASSES {
-        let error = relative_error(
-            subject::class(&measured, class),
-            gradient.model.class(class),
-        );
+        let error = relative_error(subject::class(&measured, class), gradient.model.class(class));
         table.check(what, class, error, GRADIENT);
     }
     let rows = &gradient.screen;
@@ -51,38 +44,17 @@ pub(crate) fn check(
     let flat = |f: fn(&crate::reference::ScreenGradient) -> Vec<f64>| {
         rows.iter().flat_map(f).collect::<Vec<f64>>()
     };
-    on_screen(
-        "mean2d",
-        measured.mean2d.as_flattened(),
-        flat(|s| s.mean.to_vec()),
-    );
-    on_screen(
-        "mean2d_abs",
-        measured.mean2d_abs.as_flattened(),
-        flat(|s| s.mean_abs.to_vec()),
-    );
-    on_screen(
-        "colour",
-        measured.colour.as_flattened(),
-        flat(|s| s.colour.to_vec()),
-    );
-    on_screen(
-        "max_weight",
-        &measured.max_weight,
-        flat(|s| vec![s.max_weight]),
-    );
+    on_screen("mean2d", measured.mean2d.as_flattened(), flat(|s| s.mean.to_vec()));
+    on_screen("mean2d_abs", measured.mean2d_abs.as_flattened(), flat(|s| s.mean_abs.to_vec()));
+    on_screen("colour", measured.colour.as_flattened(), flat(|s| s.colour.to_vec()));
+    on_screen("max_weight", &measured.max_weight, flat(|s| vec![s.max_weight]));
     let close = boundary.iter().filter(|b| **b).count();
     for (row, expected) in rows.iter().enumerate() {
         let off = f64::from(measured.pixel_count[row].abs_diff(expected.pixels));
         table.check(what, "pixel_count", off, close as f64);
         let off = f64::from(measured.sum_weight[row]) - expected.sum_weight;
         let flips = close as f64 * Limits::CPU.step;
-        table.check(
-            what,
-            "sum_weight",
-            off.abs(),
-            GRADIENT * expected.sum_weight + flips,
-        );
+        table.check(what, "sum_weight", off.abs(), GRADIENT * expected.sum_weight + flips);
         if expected.pixels > 0 && !measured.visible[row] {
             table.fail(format!("{what}: row {row} is blended but not visible"));
         }
@@ -98,16 +70,10 @@ pub(crate) fn check_image(
     background: [f32; 3],
     sh_degree: u8,
 ) {
-    let view = View {
-        camera,
-        background: background.map(f64::from),
-        sh_degree,
-    };
+    let view = View { camera, background: background.map(f64::from), sh_degree };
     let image = render(&Model::of(model), view, &Rules::STANDARD);
     let mut backend = subject::backend(model, Resources::default());
-    let found = backend
-        .render(camera, background, sh_degree)
-        .expect("a small image is rendered");
+    let found = backend.render(camera, background, sh_degree).expect("a small image is rendered");
     compare(table, what, &found, &image);
 }
 
@@ -116,12 +82,7 @@ fn compare(table: &mut Table, what: &str, found: &Rendering, image: &Image) {
     let arrays = [
         ("rgb", &found.rgb, &image.rgb, Limits::CPU),
         ("alpha", &found.alpha, &image.alpha, Limits::CPU),
-        (
-            "depth",
-            &found.depth,
-            &image.depth,
-            Limits::CPU.scaled(deepest),
-        ),
+        ("depth", &found.depth, &image.depth, Limits::CPU.scaled(deepest)),
     ];
     for (quantity, found, expected, limits) in arrays {
         table.image(
@@ -163,16 +124,7 @@ fn every_degree() {
 #[test]
 fn odd_sizes_and_backgrounds() {
     let mut table = Table::new("sizes");
-    let sizes = [
-        (1, 1),
-        (1, 17),
-        (17, 1),
-        (15, 15),
-        (16, 16),
-        (17, 17),
-        (33, 47),
-        (257, 17),
-    ];
+    let sizes = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (257, 17)];
     for (seed, (width, height)) in sizes.into_iter().enumerate() {
         let camera = scenes::camera(width, height, seed as u64);
         let model = scenes::cloud(37, 1, &camera, 50 + seed as u64);
@@ -186,32 +138,14 @@ fn odd_sizes_and_backgrounds() {
 fn lenses() {
     let base = scenes::camera(40, 32, 3);
     let focal = |degrees: f64| 20.0 / (0.5 * degrees).to_radians().tan();
-    let wide = |degrees| Camera {
-        fx: focal(degrees),
-        fy: focal(degrees),
-        ..base
-    };
+    let wide = |degrees| Camera { fx: focal(degrees), fy: focal(degrees), ..base };
     let lenses = [
         ("0.5 degrees", wide(0.5)),
         ("1 degree", wide(1.0)),
         ("120 degrees", wide(120.0)),
         ("160 degrees", wide(160.0)),
-        (
-            "fx = 100 fy",
-            Camera {
-                fx: 400.0,
-                fy: 4.0,
-                ..base
-            },
-        ),
-        (
-            "centre outside",
-            Camera {
-                cx: -30.0,
-                cy: 55.0,
-                ..base
-            },
-        ),
+        ("fx = 100 fy", Camera { fx: 400.0, fy: 4.0, ..base }),
+        ("centre outside", Camera { cx: -30.0, cy: 55.0, ..base }),
     ];
     let mut table = Table::new("lenses");
     for (seed, (what, camera)) in lenses.into_iter().enumerate() {
@@ -225,10 +159,7 @@ fn lenses() {
 #[test]
 fn rows_behind_and_near_the_camera_are_left_out() {
     let camera = scenes::camera(30, 26, 6);
-    let mut model = Gaussians {
-        sh_degree: 1,
-        ..Gaussians::default()
-    };
+    let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
     // Left-out rows first: an index among the visible ones is not a row's index.
     for z in [-3.0, -0.5, -0.02, 0.0, 0.004, 0.0099, 0.0101, 0.02, 0.3] {
         let colour = |k| if k < 3 { 0.5 - 0.2 * k as f32 } else { 0.05 };
@@ -244,14 +175,7 @@ fn rows_behind_and_near_the_camera_are_left_out() {
     model.opacity_logits.extend(cloud.opacity_logits);
     model.sh.extend(cloud.sh);
     let mut table = Table::new("near plane");
-    check(
-        &mut table,
-        "behind and near",
-        &model,
-        &camera,
-        BACKGROUNDS[2],
-        1,
-    );
+    check(&mut table, "behind and near", &model, &camera, BACKGROUNDS[2], 1);
     table.finish();
 }
 
@@ -260,13 +184,8 @@ fn rows_beside_the_frustum() {
     let camera = scenes::camera(34, 28, 12);
     let mut table = Table::new("beside the frustum");
     for times in [1.0, 1.1, 1.2, 1.5, 2.0, 5.0, 20.0] {
-        let mut model = Gaussians {
-            sh_degree: 1,
-            ..Gaussians::default()
-        };
-        for (row, [x, y]) in [[1.0, 0.1], [-0.2, 1.0], [-1.0, -1.0], [1.0, -0.7]]
-            .iter()
-            .enumerate()
+        let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
+        for (row, [x, y]) in [[1.0, 0.1], [-0.2, 1.0], [-1.0, -1.0], [1.0, -0.7]].iter().enumerate()
         {
             let z = 2.0 + 0.4 * row as f64;
             let side = z * times * 0.5;
@@ -274,14 +193,7 @@ fn rows_beside_the_frustum() {
             // Long enough to reach into the image.
             let scale = [0.5 * side as f32, 0.2 * side as f32, 0.1];
             let colour = |k| if k < 3 { 0.5 - 0.2 * k as f32 } else { 0.05 };
-            scenes::push(
-                &mut model,
-                mean,
-                scale,
-                [0.9, 0.1 * row as f32, -0.3, 0.2],
-                0.6,
-                colour,
-            );
+            scenes::push(&mut model, mean, scale, [0.9, 0.1 * row as f32, -0.3, 0.2], 0.6, colour);
         }
         let what = format!("{times} times the half width");
         check(&mut table, &what, &model, &camera, BACKGROUNDS[2], 1);
@@ -292,27 +204,14 @@ fn rows_beside_the_frustum() {
 #[test]
 fn an_empty_model_is_the_background() {
     let camera = scenes::camera(21, 13, 1);
-    let model = Gaussians {
-        sh_degree: 2,
-        ..Gaussians::default()
-    };
+    let model = Gaussians { sh_degree: 2, ..Gaussians::default() };
     let mut backend = subject::backend(&model, Resources::default());
     let background = [0.25, 0.5, 0.75];
     let upstream = scenes::upstream(&camera, 1);
     let (image, gradient) = subject::differentiate(&mut backend, &camera, background, 2, &upstream);
     assert!(image.rgb.chunks_exact(3).all(|rgb| rgb == background));
-    assert!(
-        image
-            .alpha
-            .iter()
-            .chain(&image.depth)
-            .all(|&v| v.to_bits() == 0)
-    );
-    assert!(
-        CLASSES
-            .iter()
-            .all(|class| subject::class(&gradient, class).is_empty())
-    );
+    assert!(image.alpha.iter().chain(&image.depth).all(|&v| v.to_bits() == 0));
+    assert!(CLASSES.iter().all(|class| subject::class(&gradient, class).is_empty()));
 }
 
 #[test]
@@ -327,10 +226,7 @@ fn the_background_enters_linearly() {
     for (p, alpha) in on_black.alpha.iter().enumerate() {
         for (c, background) in [0.3, 0.6, 0.9].iter().enumerate() {
             let expected = on_black.rgb[3 * p + c] + (1.0 - alpha) * background;
-            assert!(
-                (on_colour.rgb[3 * p + c] - expected).abs() < 1e-6,
-                "pixel {p}"
-            );
+            assert!((on_colour.rgb[3 * p + c] - expected).abs() < 1e-6, "pixel {p}");
         }
     }
 }

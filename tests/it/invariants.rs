@@ -26,11 +26,7 @@ fn sources() -> Vec<Source> {
         let entries = std::fs::read_dir(folder);
         let entries = entries.unwrap_or_else(|e| panic!("{}: {e}", folder.display()));
         for path in entries.map(|entry| entry.expect("a folder's entry").path()) {
-            let name = path
-                .file_name()
-                .unwrap_or_default()
-                .to_string_lossy()
-                .into_owned();
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             if path.is_dir() {
                 if !name.starts_with('.') && !matches!(&*name, "target" | "out") {
                     walk(&path, found);
@@ -47,17 +43,10 @@ fn sources() -> Vec<Source> {
         .into_iter()
         .map(|path| {
             let inside = path.strip_prefix(root()).expect("found under the root");
-            Source {
-                path: inside.to_string_lossy().replace('\\', "/"),
-                text: read(&path),
-            }
+            Source { path: inside.to_string_lossy().replace('\\', "/"), text: read(&path) }
         })
         .collect();
-    assert!(
-        sources.len() > 10,
-        "only {} source files found",
-        sources.len()
-    );
+    assert!(sources.len() > 10, "only {} source files found", sources.len());
     sources
 }
 
@@ -74,14 +63,11 @@ fn check(applies: impl Fn(&str) -> bool, complaint: impl Fn(&str) -> Option<Stri
 
 /// The words of a text: runs of letters, digits and underscores.
 fn words(text: &str) -> impl Iterator<Item = &str> {
-    text.split(|c: char| !c.is_alphanumeric() && c != '_')
-        .filter(|w| !w.is_empty())
+    text.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|w| !w.is_empty())
 }
 
 fn is_production(path: &str) -> bool {
-    ["src/", "policies/src/", "scenegen/src/"]
-        .iter()
-        .any(|p| path.starts_with(p))
+    ["src/", "policies/src/", "scenegen/src/"].iter().any(|p| path.starts_with(p))
         && path.ends_with(".rs")
         && !path.ends_with("/tests.rs")
 }
@@ -92,24 +78,15 @@ fn is_production(path: &str) -> bool {
 fn dependencies(lock: &str, package: &str) -> BTreeSet<String> {
     let lock: toml::Table = lock.parse().expect("Cargo.lock is TOML");
     let mut direct: BTreeMap<String, Vec<String>> = BTreeMap::new();
-    for entry in lock["package"]
-        .as_array()
-        .expect("Cargo.lock lists packages")
-    {
-        let name = entry["name"]
-            .as_str()
-            .expect("a package has a name")
-            .to_owned();
+    for entry in lock["package"].as_array().expect("Cargo.lock lists packages") {
+        let name = entry["name"].as_str().expect("a package has a name").to_owned();
         let needs = entry.get("dependencies").and_then(toml::Value::as_array);
         let needs = needs.into_iter().flatten().filter_map(toml::Value::as_str);
         // "name", or "name version" where there are several.
         let needs = needs.filter_map(|n| n.split(' ').next()).map(str::to_owned);
         direct.entry(name).or_default().extend(needs);
     }
-    assert!(
-        direct.contains_key(package),
-        "Cargo.lock has no package {package}"
-    );
+    assert!(direct.contains_key(package), "Cargo.lock has no package {package}");
     let (mut found, mut open) = (BTreeSet::new(), vec![package.to_owned()]);
     while let Some(name) = open.pop() {
         for need in direct.get(&name).into_iter().flatten() {
@@ -126,10 +103,7 @@ fn policies_depend_on_no_device_no_image_and_not_on_the_root() {
     let found = dependencies(&read(&root().join("Cargo.lock")), "densify-policies");
     assert!(found.contains("serde"), "the lock file was not understood");
     for forbidden in ["wgpu", "image", "rayon", "densify", "densify-scenegen"] {
-        assert!(
-            !found.contains(forbidden),
-            "densify-policies depends on {forbidden}"
-        );
+        assert!(!found.contains(forbidden), "densify-policies depends on {forbidden}");
     }
 }
 
@@ -137,10 +111,7 @@ fn policies_depend_on_no_device_no_image_and_not_on_the_root() {
 fn scenegen_depends_on_neither_of_the_others() {
     let found = dependencies(&read(&root().join("Cargo.lock")), "densify-scenegen");
     for forbidden in ["densify", "densify-policies", "wgpu"] {
-        assert!(
-            !found.contains(forbidden),
-            "densify-scenegen depends on {forbidden}"
-        );
+        assert!(!found.contains(forbidden), "densify-scenegen depends on {forbidden}");
     }
 }
 
@@ -167,16 +138,11 @@ fn dependencies_are_followed_through_others() {
 #[test]
 fn unsafe_code_is_forbidden_everywhere() {
     let workspace: toml::Table = read(&root().join("Cargo.toml")).parse().unwrap();
-    assert_eq!(
-        workspace["workspace"]["lints"]["rust"]["unsafe_code"].as_str(),
-        Some("forbid")
-    );
+    assert_eq!(workspace["workspace"]["lints"]["rust"]["unsafe_code"].as_str(), Some("forbid"));
     let members = workspace["workspace"]["members"].as_array().unwrap();
     let members = members.iter().map(|m| m.as_str().unwrap()).chain(["."]);
     for member in members {
-        let manifest: toml::Table = read(&root().join(member).join("Cargo.toml"))
-            .parse()
-            .unwrap();
+        let manifest: toml::Table = read(&root().join(member).join("Cargo.toml")).parse().unwrap();
         let inherited = manifest.get("lints").and_then(|l| l.get("workspace"));
         assert_eq!(
             inherited.and_then(toml::Value::as_bool),
@@ -198,10 +164,7 @@ fn prints(text: &str) -> Option<String> {
 
 #[test]
 fn only_the_command_line_prints() {
-    check(
-        |path| is_production(path) && !path.starts_with("src/cli/"),
-        prints,
-    );
+    check(|path| is_production(path) && !path.starts_with("src/cli/"), prints);
 }
 
 #[test]
@@ -210,28 +173,20 @@ fn only_the_gpu_backend_names_wgpu() {
         |path| is_production(path) && !path.starts_with("src/backend/gpu"),
         |text| {
             let code = code(text, Strings::Drop);
-            words(&code)
-                .any(|w| w == "wgpu")
-                .then(|| "names wgpu".into())
+            words(&code).any(|w| w == "wgpu").then(|| "names wgpu".into())
         },
     );
 }
 
 /// Names under which policies are registered, and those the design promises.
 fn policy_names() -> BTreeSet<String> {
-    let mut names: BTreeSet<String> = ["vanilla", "taming", "diet", "mcmc", "igs"]
-        .map(str::to_owned)
-        .into();
-    for source in sources()
-        .iter()
-        .filter(|s| s.path.starts_with("policies/src/"))
-    {
+    let mut names: BTreeSet<String> =
+        ["vanilla", "taming", "diet", "mcmc", "igs"].map(str::to_owned).into();
+    for source in sources().iter().filter(|s| s.path.starts_with("policies/src/")) {
         let code = code(&source.text, Strings::Keep);
         for call in code.split("register_policy!").skip(1) {
             let name = call.trim_start().strip_prefix('(').map(str::trim_start);
-            let name = name
-                .and_then(|n| n.strip_prefix('"'))
-                .and_then(|n| n.split('"').next());
+            let name = name.and_then(|n| n.strip_prefix('"')).and_then(|n| n.split('"').next());
             names.extend(name.map(str::to_owned));
         }
     }
@@ -240,9 +195,7 @@ fn policy_names() -> BTreeSet<String> {
 
 fn names_a_policy(text: &str, names: &BTreeSet<String>) -> Option<String> {
     let code = code(text, Strings::Keep).to_lowercase();
-    words(&code)
-        .find(|w| names.contains(*w))
-        .map(|w| format!("names the policy {w}"))
+    words(&code).find(|w| names.contains(*w)).map(|w| format!("names the policy {w}"))
 }
 
 #[test]
@@ -273,19 +226,13 @@ fn no_policy_names_a_backend() {
 
 /// The comment that opens a file: leading lines that start with `//`, and blank ones.
 fn head(text: &str) -> Vec<&str> {
-    text.lines()
-        .take_while(|l| l.is_empty() || l.starts_with("//"))
-        .collect()
+    text.lines().take_while(|l| l.is_empty() || l.starts_with("//")).collect()
 }
 
 fn is_long_without_a_word(text: &str) -> Option<String> {
     let lines = text.lines().count();
     // A comment breaks its lines anywhere.
-    let head = head(text)
-        .join(" ")
-        .replace("//!", " ")
-        .replace("//", " ")
-        .to_lowercase();
+    let head = head(text).join(" ").replace("//!", " ").replace("//", " ").to_lowercase();
     let head = head.split_whitespace().collect::<Vec<_>>().join(" ");
     (lines > 400 && !head.contains("one piece"))
         .then(|| format!("{lines} lines; its head does not say why it is one piece"))

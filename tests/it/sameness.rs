@@ -42,13 +42,7 @@ fn target(camera: &Camera, seed: u64) -> Image8 {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let n = 3 * (camera.width * camera.height) as usize;
     let rgb = (0..n).map(|_| rng.random()).collect();
-    Image8 {
-        width: camera.width,
-        height: camera.height,
-        rgb,
-        alpha: None,
-        mask: None,
-    }
+    Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
 }
 
 const RATES: LearningRates = LearningRates {
@@ -74,9 +68,7 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
                 sh_degree: model.sh_degree,
                 rates: RATES,
             };
-            backend
-                .train_step(&input)
-                .expect("a small image is rendered")
+            backend.train_step(&input).expect("a small image is rendered")
         })
         .collect();
     (backend.download(), outputs)
@@ -86,23 +78,11 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
 fn threads_change_nothing() {
     let camera = scenes::camera(150, 90, 31);
     let model = scenes::cloud(700, 2, &camera, 41);
-    let with = |threads| Resources {
-        threads: Some(threads),
-        ..Resources::default()
-    };
-    let (image, trained) = (
-        run(&model, &camera, with(1)),
-        train(&model, &camera, with(1)),
-    );
+    let with = |threads| Resources { threads: Some(threads), ..Resources::default() };
+    let (image, trained) = (run(&model, &camera, with(1)), train(&model, &camera, with(1)));
     for threads in [1, 2, 5] {
-        assert!(
-            bits(&run(&model, &camera, with(threads))) == bits(&image),
-            "{threads} threads"
-        );
-        assert!(
-            train(&model, &camera, with(threads)) == trained,
-            "{threads} threads, training"
-        );
+        assert!(bits(&run(&model, &camera, with(threads))) == bits(&image), "{threads} threads");
+        assert!(train(&model, &camera, with(threads)) == trained, "{threads} threads, training");
     }
 }
 
@@ -110,36 +90,17 @@ fn threads_change_nothing() {
 fn bands_change_nothing() {
     let camera = scenes::camera(140, 120, 32);
     let model = scenes::cloud(150, 1, &camera, 42);
-    let capped = |cap| Resources {
-        tile_cap: Some(cap),
-        ..Resources::default()
-    };
-    let (image, (trained, steps)) = (
-        run(&model, &camera, capped(1 << 20)),
-        train(&model, &camera, capped(1 << 20)),
-    );
+    let capped = |cap| Resources { tile_cap: Some(cap), ..Resources::default() };
+    let (image, (trained, steps)) =
+        (run(&model, &camera, capped(1 << 20)), train(&model, &camera, capped(1 << 20)));
     assert_eq!(steps[0].bands, 1);
     for cap in [1, 500, 1500] {
-        assert!(
-            bits(&run(&model, &camera, capped(cap))) == bits(&image),
-            "cap {cap}"
-        );
+        assert!(bits(&run(&model, &camera, capped(cap))) == bits(&image), "cap {cap}");
         let (banded, banded_steps) = train(&model, &camera, capped(cap));
-        assert!(
-            banded_steps[0].bands > 1,
-            "cap {cap}: {} entries fit",
-            steps[0].entries
-        );
+        assert!(banded_steps[0].bands > 1, "cap {cap}: {} entries fit", steps[0].entries);
         assert!(banded == trained, "cap {cap}, training");
         for (banded, step) in banded_steps.iter().zip(&steps) {
-            assert_eq!(
-                StepOutput {
-                    bands: 1,
-                    ..*banded
-                },
-                *step,
-                "cap {cap}"
-            );
+            assert_eq!(StepOutput { bands: 1, ..*banded }, *step, "cap {cap}");
         }
     }
 }
@@ -156,13 +117,8 @@ fn running_twice_changes_nothing() {
     let _ = subject::differentiate(&mut backend, &other, GREY, 1, &scenes::upstream(&other, 1));
     let second = subject::differentiate(&mut backend, &camera, GREY, 3, &upstream);
     assert!(bits(&first) == bits(&second));
-    let rendered = backend
-        .render(&camera, GREY, 3)
-        .expect("a small image is rendered");
-    assert!(
-        rendered == first.0,
-        "render and differentiate draw different images"
-    );
+    let rendered = backend.render(&camera, GREY, 3).expect("a small image is rendered");
+    assert!(rendered == first.0, "render and differentiate draw different images");
 }
 
 fn permuted(model: &Gaussians, order: &[usize]) -> Gaussians {
@@ -172,14 +128,8 @@ fn permuted(model: &Gaussians, order: &[usize]) -> Gaussians {
         means: order.iter().map(|r| model.means[pick(r)]).collect(),
         log_scales: order.iter().map(|r| model.log_scales[pick(r)]).collect(),
         quats: order.iter().map(|r| model.quats[pick(r)]).collect(),
-        opacity_logits: order
-            .iter()
-            .map(|r| model.opacity_logits[pick(r)])
-            .collect(),
-        sh: order
-            .iter()
-            .flat_map(|r| model.sh_of(pick(r)).to_vec())
-            .collect(),
+        opacity_logits: order.iter().map(|r| model.opacity_logits[pick(r)]).collect(),
+        sh: order.iter().flat_map(|r| model.sh_of(pick(r)).to_vec()).collect(),
     }
 }
 
@@ -191,21 +141,12 @@ fn the_order_of_the_rows_changes_nothing_where_depths_differ() {
     order.shuffle(&mut ChaCha8Rng::seed_from_u64(9));
     let (image, gradient) = run(&model, &camera, Resources::default());
     let (shuffled_image, shuffled) = run(&permuted(&model, &order), &camera, Resources::default());
-    assert!(
-        image == shuffled_image,
-        "the image depends on the order of the rows"
-    );
+    assert!(image == shuffled_image, "the image depends on the order of the rows");
     for class in CLASSES {
-        let (from, to) = (
-            subject::class(&gradient, class),
-            subject::class(&shuffled, class),
-        );
+        let (from, to) = (subject::class(&gradient, class), subject::class(&shuffled, class));
         let n = from.len() / model.len();
         for (new, &old) in order.iter().enumerate() {
-            assert!(
-                from[old * n..(old + 1) * n] == to[new * n..(new + 1) * n],
-                "{class} of {old}"
-            );
+            assert!(from[old * n..(old + 1) * n] == to[new * n..(new + 1) * n], "{class} of {old}");
         }
     }
 }
@@ -216,16 +157,10 @@ fn equal_depths_are_drawn_in_row_order() {
     let mut model = scenes::cloud(30, 0, &camera, 45);
     let place = scenes::world(&camera, [0.0, 0.0, 3.0]);
     model.means.fill(place);
-    let with = |threads| Resources {
-        threads: Some(threads),
-        ..Resources::default()
-    };
+    let with = |threads| Resources { threads: Some(threads), ..Resources::default() };
     let image = run(&model, &camera, with(1));
     for threads in [2, 3, 8] {
-        assert!(
-            bits(&run(&model, &camera, with(threads))) == bits(&image),
-            "{threads} threads"
-        );
+        assert!(bits(&run(&model, &camera, with(threads))) == bits(&image), "{threads} threads");
     }
     let mut table = crate::compare::Table::new("equal depths");
     crate::gradients::check_image(&mut table, "row order", &model, &camera, GREY, 0);
@@ -246,14 +181,7 @@ fn a_row_that_is_not_seen_changes_nothing() {
     for (what, local, logit) in unseen {
         let mut more = model.clone();
         let mean = scenes::world(&camera, local);
-        scenes::push(
-            &mut more,
-            mean,
-            [0.1; 3],
-            [1.0, 0.0, 0.0, 0.0],
-            logit,
-            colour,
-        );
+        scenes::push(&mut more, mean, [0.1; 3], [1.0, 0.0, 0.0, 0.0], logit, colour);
         let (with, gradient) = run(&more, &camera, Resources::default());
         assert!(with == image, "{what}");
         let last = more.len() - 1;

@@ -61,19 +61,14 @@ pub(crate) fn push(
     model.log_scales.push(scale.map(f32::ln));
     model.quats.push(quat);
     model.opacity_logits.push(opacity_logit);
-    model
-        .sh
-        .extend((0..3 * sh_coefficients(model.sh_degree)).map(sh));
+    model.sh.extend((0..3 * sh_coefficients(model.sh_degree)).map(sh));
 }
 
 /// `rows` Gaussians over the image and a little beyond, at depths of 2 to 5 that differ by more
 /// than rounding, 2 to 40 % of the image wide, translucent, with quaternions of any length.
 pub(crate) fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut model = Gaussians {
-        sh_degree,
-        ..Gaussians::default()
-    };
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
     let mut order: Vec<usize> = (0..rows).collect();
     for i in (1..rows).rev() {
         order.swap(i, rng.random_range(0..=i));
@@ -82,11 +77,7 @@ pub(crate) fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> G
         let z = 2.0 + 3.0 * (place as f64 + rng.random_range(0.2..0.8)) / rows as f64;
         let u = f64::from(camera.width) * rng.random_range(-0.1..1.1);
         let v = f64::from(camera.height) * rng.random_range(-0.1..1.1);
-        let local = [
-            (u - camera.cx) / camera.fx * z,
-            (v - camera.cy) / camera.fy * z,
-            z,
-        ];
+        let local = [(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z];
         let scale = [(); 3].map(|()| (z * 0.02 * 20.0_f64.powf(rng.random())) as f32);
         let quat = [(); 4].map(|()| rng.random_range(-1.0_f32..1.0));
         let logit = rng.random_range(-2.0..2.0);
@@ -99,14 +90,9 @@ pub(crate) fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> G
 
 /// One row at a place given in camera axes, with colour that depends on the view (degree 1).
 pub(crate) fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
-    let mut model = Gaussians {
-        sh_degree: 1,
-        ..Gaussians::default()
-    };
+    let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
     let quat = [0.9, -0.3, 0.4, 0.2];
-    push(&mut model, world(camera, local), scale, quat, 1.0, |k| {
-        0.3 - 0.05 * k as f32
-    });
+    push(&mut model, world(camera, local), scale, quat, 1.0, |k| 0.3 - 0.05 * k as f32);
     model
 }
 
@@ -116,13 +102,7 @@ pub(crate) fn upstream(camera: &Camera, seed: u64) -> Upstream {
     let pixels = (camera.width * camera.height) as usize;
     // Rounded to f32, as a backend takes them.
     let mut noise = |n: usize, scale: f32| -> Vec<f64> {
-        (0..n)
-            .map(|_| f64::from(scale * rng.random_range(-1.0_f32..1.0)))
-            .collect()
+        (0..n).map(|_| f64::from(scale * rng.random_range(-1.0_f32..1.0))).collect()
     };
-    Upstream {
-        rgb: noise(3 * pixels, 1.0),
-        alpha: noise(pixels, 1.0),
-        depth: noise(pixels, 0.3),
-    }
+    Upstream { rgb: noise(3 * pixels, 1.0), alpha: noise(pixels, 1.0), depth: noise(pixels, 0.3) }
 }

@@ -22,14 +22,8 @@ const TOLERANCE: f64 = 2e-4;
 const FLIPPED: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 /// Steps of length zero: every view sees the same model.
-const STILL: LearningRates = LearningRates {
-    mean: 0.0,
-    log_scale: 0.0,
-    quat: 0.0,
-    opacity: 0.0,
-    sh_dc: 0.0,
-    sh_rest: 0.0,
-};
+const STILL: LearningRates =
+    LearningRates { mean: 0.0, log_scale: 0.0, quat: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
 
 struct Views {
     model: Gaussians,
@@ -40,11 +34,7 @@ struct Views {
 /// Two views of one cloud, of different size.
 fn views() -> Views {
     let first = scenes::camera(45, 37, 61);
-    let mut second = Camera {
-        width: 38,
-        height: 50,
-        ..first
-    };
+    let mut second = Camera { width: 38, height: 50, ..first };
     second.translation.x += 0.3;
     let cameras = vec![first, scenes::rounded(&second)];
     let mut model = scenes::cloud(21, 2, &first, 62);
@@ -59,46 +49,22 @@ fn views() -> Views {
         .map(|c| {
             let n = 3 * (c.width * c.height) as usize;
             let rgb = (0..n).map(|_| rng.random()).collect();
-            Image8 {
-                width: c.width,
-                height: c.height,
-                rgb,
-                alpha: None,
-                mask: None,
-            }
+            Image8 { width: c.width, height: c.height, rgb, alpha: None, mask: None }
         })
         .collect();
-    Views {
-        model,
-        cameras,
-        targets,
-    }
+    Views { model, cameras, targets }
 }
 
 /// The reference's gradient of the training loss of one view.
 fn reference(views: &Views, v: usize) -> Gradient {
     let (camera, target) = (&views.cameras[v], &views.targets[v]);
-    let view = View {
-        camera,
-        background: BACKGROUND.map(f64::from),
-        sh_degree: 2,
-    };
+    let view = View { camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
     let model = Model::of(&views.model);
     let image = render(&model, view, &Rules::STANDARD);
     let truth: Vec<f64> = target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
-    let rgb = loss(
-        &image.rgb,
-        &truth,
-        camera.width as usize,
-        camera.height as usize,
-    )
-    .gradient;
+    let rgb = loss(&image.rgb, &truth, camera.width as usize, camera.height as usize).gradient;
     let nothing = vec![0.0; image.alpha.len()];
-    let upstream = Upstream {
-        rgb,
-        alpha: nothing.clone(),
-        depth: nothing,
-    };
+    let upstream = Upstream { rgb, alpha: nothing.clone(), depth: nothing };
     differentiate(&model, view, &Rules::STANDARD, &upstream).1
 }
 
@@ -108,10 +74,7 @@ fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
 
 /// One view's contribution to a signal. Shape: [rows].
 fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64> {
-    let ndc = [
-        0.5 * f64::from(camera.width),
-        0.5 * f64::from(camera.height),
-    ];
+    let ndc = [0.5 * f64::from(camera.width), 0.5 * f64::from(camera.height)];
     let rows = gradient.screen.iter().zip(&gradient.model.means);
     rows.map(|(s, mean)| match signal {
         Signal::VisibleCount => f64::from(u8::from(s.pixels > 0)),
@@ -132,10 +95,7 @@ fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64
 
 /// Runs one step per view and takes the signals.
 fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
-    let needs = Needs {
-        signals: SignalSet::of(wanted),
-        candidates: None,
-    };
+    let needs = Needs { signals: SignalSet::of(wanted), candidates: None };
     let mut options = subject::options(views.model.len(), Resources::default());
     options.needs = needs.clone();
     let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
@@ -148,24 +108,18 @@ fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
             sh_degree: 2,
             rates: STILL,
         };
-        backend
-            .train_step(&input)
-            .expect("a small image is rendered");
+        backend.train_step(&input).expect("a small image is rendered");
     }
     let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
-    let columns = wanted
-        .iter()
-        .map(|&s| signals.get(s).expect("a requested signal").to_vec())
-        .collect();
+    let columns =
+        wanted.iter().map(|&s| signals.get(s).expect("a requested signal").to_vec()).collect();
     (backend, columns)
 }
 
 #[test]
 fn every_signal_whatever_else_is_asked_for() {
     let views = views();
-    let gradients: Vec<Gradient> = (0..views.cameras.len())
-        .map(|v| reference(&views, v))
-        .collect();
+    let gradients: Vec<Gradient> = (0..views.cameras.len()).map(|v| reference(&views, v)).collect();
     let gradient_sums = [
         Signal::VisibleCount,
         Signal::ScreenGradient,
@@ -190,20 +144,12 @@ fn every_signal_whatever_else_is_asked_for() {
             for (gradient, camera) in gradients.iter().zip(&views.cameras) {
                 let parts = contribution(signal, gradient, camera);
                 for (sum, part) in expected.iter_mut().zip(parts) {
-                    *sum = if signal == Signal::WeightMax {
-                        part.max(*sum)
-                    } else {
-                        *sum + part
-                    };
+                    *sum = if signal == Signal::WeightMax { part.max(*sum) } else { *sum + part };
                 }
             }
             let what = format!("{} signals", request.len());
             let error = relative_error(&column, &expected);
-            let flips = if signal == Signal::PixelCount {
-                FLIPPED
-            } else {
-                0.0
-            };
+            let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
             table.check(&what, &format!("{signal:?}"), error, TOLERANCE + flips);
         }
     }
@@ -214,23 +160,14 @@ fn every_signal_whatever_else_is_asked_for() {
 fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let views = views();
     let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
-    let needs = Needs {
-        signals: SignalSet::of(&[Signal::WeightMax]),
-        candidates: None,
-    };
+    let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), candidates: None };
     let now = |backend: &mut CpuBackend| {
         let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
-        signals
-            .get(Signal::WeightMax)
-            .expect("a requested signal")
-            .to_vec()
+        signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
     };
     assert!(columns[0].iter().any(|&w| w > 0.1));
     backend.begin_epoch();
     assert!(now(&mut backend) == columns[0], "the previous epoch counts");
     backend.begin_epoch();
-    assert!(
-        now(&mut backend).iter().all(|&w| w.to_bits() == 0),
-        "the one before does not"
-    );
+    assert!(now(&mut backend).iter().all(|&w| w.to_bits() == 0), "the one before does not");
 }

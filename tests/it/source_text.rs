@@ -13,11 +13,9 @@ pub(crate) enum Strings {
 /// The text without comments and without the unit tests at its end; with or without the
 /// contents of string literals.
 pub(crate) fn code(text: &str, strings: Strings) -> String {
-    let tests = text.match_indices("#[cfg(test)]").find(|(at, mark)| {
-        text[at + mark.len()..]
-            .trim_start()
-            .starts_with("mod tests {")
-    });
+    let tests = text
+        .match_indices("#[cfg(test)]")
+        .find(|(at, mark)| text[at + mark.len()..].trim_start().starts_with("mod tests {"));
     let text = tests.map_or(text, |(at, _)| &text[..at]);
     let mut code = String::with_capacity(text.len());
     let mut rest = text;
@@ -29,11 +27,7 @@ pub(crate) fn code(text: &str, strings: Strings) -> String {
             continue;
         }
         let continues_word = code.ends_with(|c: char| c.is_alphanumeric() || c == '_');
-        let length = if continues_word && first != '"' {
-            0
-        } else {
-            literal_length(rest)
-        };
+        let length = if continues_word && first != '"' { 0 } else { literal_length(rest) };
         if length > 0 {
             match strings {
                 Strings::Keep => code.push_str(&rest[..length]),
@@ -87,9 +81,7 @@ fn literal_length(text: &str) -> usize {
         }
         let open = start + hashes + 1;
         let close = format!("\"{}", "#".repeat(hashes));
-        return text[open..]
-            .find(&close)
-            .map_or(text.len(), |at| open + at + close.len());
+        return text[open..].find(&close).map_or(text.len(), |at| open + at + close.len());
     }
     match bytes.get(start) {
         Some(b'"') => {
@@ -136,9 +128,6 @@ mod tests {
         assert!(code(text, Strings::Keep).contains("println!"));
         let code = code(text, Strings::Drop);
         assert!(!code.contains("println!"), "{code}");
-        assert!(
-            code.contains("write!") && code.contains("fn f<'a>(x: &'a str)"),
-            "{code}"
-        );
+        assert!(code.contains("write!") && code.contains("fn f<'a>(x: &'a str)"), "{code}");
     }
 }

@@ -110,19 +110,13 @@ pub(super) fn step<S: Simd>(
         let inv = c(1.0) / norm2.sqrt();
         for (i, x) in q.into_iter().enumerate() {
             let identity = if i == 0 { 1.0 } else { 0.0 };
-            sound
-                .select(x * inv, c(identity))
-                .store(&mut params[at(plane::QUAT + i)..]);
+            sound.select(x * inv, c(identity)).store(&mut params[at(plane::QUAT + i)..]);
         }
         for p in plane::LOG_SCALE..plane::QUAT {
             let x = V::load(s, &params[at(p)..]);
-            x.max(c(LOG_SCALE_RANGE[0]))
-                .min(c(LOG_SCALE_RANGE[1]))
-                .store(&mut params[at(p)..]);
+            x.max(c(LOG_SCALE_RANGE[0])).min(c(LOG_SCALE_RANGE[1])).store(&mut params[at(p)..]);
         }
         let x = V::load(s, &params[at(plane::OPACITY)..]);
-        x.max(c(-LOGIT_MAX))
-            .min(c(LOGIT_MAX))
-            .store(&mut params[at(plane::OPACITY)..]);
+        x.max(c(-LOGIT_MAX)).min(c(LOGIT_MAX)).store(&mut params[at(plane::OPACITY)..]);
     }
 }

@@ -99,12 +99,10 @@ impl Model<'_> {
     fn sow(&mut self, row: usize, seed: &Seed) {
         self.params.clear_row(row);
         self.params.set_n(row, plane::MEAN, seed.position);
-        self.params
-            .set_n(row, plane::LOG_SCALE, [seed.scale.ln(); 3]);
+        self.params.set_n(row, plane::LOG_SCALE, [seed.scale.ln(); 3]);
         self.params.set_n(row, plane::QUAT, [1.0, 0.0, 0.0, 0.0]);
         self.params.set(row, plane::OPACITY, logit(seed.opacity));
-        self.params
-            .set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
+        self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
         self.reborn(row);
     }
 
@@ -141,13 +139,7 @@ impl Model<'_> {
 }
 
 fn longest(log_scale: [f32; 3]) -> usize {
-    (1..3).fold(0, |best, i| {
-        if log_scale[i] > log_scale[best] {
-            i
-        } else {
-            best
-        }
-    })
+    (1..3).fold(0, |best, i| if log_scale[i] > log_scale[best] { i } else { best })
 }
 
 fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {

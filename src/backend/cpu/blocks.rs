@@ -33,10 +33,7 @@ pub(super) struct Blocks {
 
 impl Blocks {
     pub(super) fn zeros(capacity: usize, planes: usize) -> Self {
-        Self {
-            planes,
-            data: vec![0.0; capacity.div_ceil(WIDTH) * WIDTH * planes],
-        }
+        Self { planes, data: vec![0.0; capacity.div_ceil(WIDTH) * WIDTH * planes] }
     }
 
     /// Bytes for `capacity` rows.

@@ -5,7 +5,7 @@
 //! scalar code, to find the Gaussian that stands for its surface. That is a few thousand
 //! operations per step, where a per-pixel record of the whole image would burden every pixel.
 
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
 
 use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
 use glam::{Quat, Vec3};
@@ -13,6 +13,7 @@ use glam::{Quat, Vec3};
 use super::blocks::{Blocks, plane};
 use super::project::{ALPHA_MIN, Splat, ViewParams};
 use super::rasterize::ALPHA_MAX;
+use super::tiles::Entry;
 
 /// The list, and what goes into it.
 #[derive(Debug)]
@@ -29,19 +30,13 @@ const SPARE: usize = 16;
 impl Candidates {
     pub(super) fn new(request: Option<CandidateRequest>) -> Self {
         let capacity = request.map_or(0, |r| r.capacity);
-        Self {
-            request,
-            list: Vec::with_capacity(capacity),
-            ranking: Vec::new(),
-        }
+        Self { request, list: Vec::with_capacity(capacity), ranking: Vec::new() }
     }
 
     /// Bytes of the list, and of the ranking of an image of so many pixels.
     pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
         let ranking = pixels * size_of::<(f32, u32)>();
-        request.map_or(0, |r| {
-            (r.capacity * size_of::<Candidate>() + ranking) as u64
-        })
+        request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
     }
 
     pub(super) fn list(&self) -> &[Candidate] {
@@ -83,11 +78,7 @@ impl Candidates {
             }
         }
         let worse = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
-        let ranked = if spaced {
-            count.saturating_mul(SPARE)
-        } else {
-            count
-        };
+        let ranked = if spaced { count.saturating_mul(SPARE) } else { count };
         if self.ranking.len() > ranked {
             self.ranking.select_nth_unstable_by(ranked, worse);
             self.ranking.truncate(ranked);
@@ -127,15 +118,15 @@ pub(super) fn error_weights(mode: ErrorMode) -> Option<[f32; 2]> {
 /// or the one at which half the light is gone.
 pub(super) fn surface_row(
     splats: &[Splat],
-    list: &[AtomicU32],
+    list: &[AtomicU64],
     at: [f32; 2],
     mode: DepthMode,
 ) -> Option<usize> {
     let mut light = 1.0_f32;
     let mut best = None;
     let mut most = 0.0;
-    for row in list {
-        let row = row.load(Relaxed) as usize;
+    for entry in list {
+        let row = Entry::load(entry).row;
         let splat = &splats[row];
         let (dx, dy) = (at[0] - splat.mean[0], at[1] - splat.mean[1]);
         let u = splat.l1 * (dx - splat.shear * dy);

@@ -80,11 +80,7 @@ impl LossBuffers {
     }
 
     pub(super) fn new() -> Self {
-        Self {
-            planes: Default::default(),
-            error: Vec::new(),
-            stride: 0,
-        }
+        Self { planes: Default::default(), error: Vec::new(), stride: 0 }
     }
 
     /// Makes room for an image. Images of one size, or smaller ones, allocate nothing more.
@@ -123,9 +119,7 @@ impl LossBuffers {
             let error_strips: Vec<&mut [f32]> = if with_error {
                 self.error.chunks_mut(strip).collect()
             } else {
-                (0..grid.height.div_ceil(STRIP))
-                    .map(|_| Default::default())
-                    .collect()
+                (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
             };
             let parts: Vec<LossValue> = (
                 e.par_chunks_mut(strip),
@@ -139,13 +133,7 @@ impl LossBuffers {
                 .enumerate()
                 .map_init(Vec::new, |scratch, (i, (e, y, p1, p2, p3, error))| {
                     arch.dispatch(Similarity {
-                        source: Source {
-                            grid,
-                            canvas,
-                            target,
-                            background,
-                            channel,
-                        },
+                        source: Source { grid, canvas, target, background, channel },
                         first: i * STRIP,
                         stride,
                         scratch,
@@ -162,10 +150,9 @@ impl LossBuffers {
                 ssim += part.ssim;
             }
             let [e, y, p1, p2, p3] = &self.planes;
-            gradient
-                .par_chunks_mut(grid.columns * STRIP / TILE)
-                .enumerate()
-                .for_each_init(Vec::new, |scratch, (i, tiles)| {
+            gradient.par_chunks_mut(grid.columns * STRIP / TILE).enumerate().for_each_init(
+                Vec::new,
+                |scratch, (i, tiles)| {
                     arch.dispatch(Gradient {
                         grid,
                         channel,
@@ -178,12 +165,10 @@ impl LossBuffers {
                         scale: 1.0 / samples as f32,
                         tiles,
                     });
-                });
+                },
+            );
         }
-        LossValue {
-            l1: l1 / samples,
-            ssim: ssim / samples,
-        }
+        LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
     /// Error of a pixel after a run with error weights.
@@ -205,13 +190,7 @@ impl Source<'_> {
     /// e = rendering − target and y = target of image row `row` (0 where masked and in the pads).
     #[inline(always)]
     fn lines(&self, row: usize, e: &mut [f32], y: &mut [f32]) {
-        let Self {
-            grid,
-            canvas,
-            target,
-            background,
-            channel,
-        } = *self;
+        let Self { grid, canvas, target, background, channel } = *self;
         e.fill(0.0);
         y.fill(0.0);
         let width = grid.width;
@@ -303,17 +282,7 @@ impl WithSimd for Similarity<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> LossValue {
-        let Self {
-            source,
-            first,
-            stride,
-            scratch,
-            e,
-            y,
-            derivatives,
-            error,
-            error_weights,
-        } = self;
+        let Self { source, first, stride, scratch, e, y, derivatives, error, error_weights } = self;
         let [p1, p2, p3] = derivatives;
         let (width, height) = (source.grid.width, source.grid.height);
         let rows = e.len() / stride;
@@ -370,12 +339,8 @@ impl WithSimd for Similarity<'_> {
                 let by_contrast = mu_e * contrast * inv_b * 2.0 - mu_y * two_ve_bb;
                 let inside = V::load(s, &LANES[..]).lt(c((PAD + width - at) as f32));
                 let to = row * stride + at;
-                inside
-                    .keep(contrast * by_luminance + luminance * by_contrast)
-                    .store(&mut p1[to..]);
-                inside
-                    .keep(-(luminance * contrast * inv_b))
-                    .store(&mut p2[to..]);
+                inside.keep(contrast * by_luminance + luminance * by_contrast).store(&mut p1[to..]);
+                inside.keep(-(luminance * contrast * inv_b)).store(&mut p2[to..]);
                 inside.keep(luminance * two_ve_bb).store(&mut p3[to..]);
                 let abs = V::load(s, &e[to..]).abs();
                 let ssim = inside.keep(luminance * contrast);
@@ -426,28 +391,14 @@ impl WithSimd for Gradient<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self {
-            grid,
-            channel,
-            first,
-            stride,
-            scratch,
-            e,
-            y,
-            derivatives,
-            scale,
-            tiles,
-        } = self;
+        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, tiles } = self;
         let rows = STRIP.min(grid.height - first);
         let lines = rows + 2 * REACH;
         scratch.clear();
         scratch.resize(3 * lines * stride, 0.0);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         for l in 0..lines {
-            let Some(row) = (first + l)
-                .checked_sub(REACH)
-                .filter(|&row| row < grid.height)
-            else {
+            let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < grid.height) else {
                 continue;
             };
             for at in columns.clone() {

@@ -21,6 +21,7 @@ mod simd;
 mod tiles;
 
 use std::ops::Range;
+use std::sync::atomic::AtomicU32;
 use std::time::{Duration, Instant};
 
 use densify_policies::plan::RowOps;
@@ -44,7 +45,7 @@ use rasterize::{CANVAS_PLANES, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, Tile
 use rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
 use signals::Accumulators;
 use simd::WIDTH;
-use tiles::{Grid, TILE, TileLists};
+use tiles::{Grid, TILE, TileLists, Visible};
 
 pub use optimise::ModelGradient;
 
@@ -125,8 +126,8 @@ pub struct CpuBackend {
     /// Shape: [tiles].
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// One record per entry. Shape: [tile cap, stride of the signals' detail].
-    records: Vec<f32>,
+    /// Bits of one record per slot. Shape: [tile cap, stride of the signals' detail].
+    records: Vec<AtomicU32>,
     /// One record per row. Shape: [budget, stride of the signals' detail].
     sums: Vec<f32>,
     clock: StageClock,
@@ -173,11 +174,7 @@ impl CpuBackend {
     /// When the model has more rows than the budget: the caller subsamples before.
     pub fn new(model: &Gaussians, options: &CpuOptions) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
-        assert!(
-            model.len() <= budget,
-            "{} rows over a budget of {budget}",
-            model.len()
-        );
+        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(options.threads.unwrap_or(0))
             .thread_name(|i| format!("densify-{i}"))
@@ -201,10 +198,7 @@ impl CpuBackend {
             sh_degree: model.sh_degree,
             near: options.near,
             params,
-            moments: [
-                Blocks::zeros(budget, per_row),
-                Blocks::zeros(budget, per_row),
-            ],
+            moments: [Blocks::zeros(budget, per_row), Blocks::zeros(budget, per_row)],
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
             signals,
@@ -215,7 +209,7 @@ impl CpuBackend {
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
-            records: vec![0.0; cap * stride],
+            records: atomic_zeros(cap * stride),
             sums: vec![0.0; blocks * WIDTH * stride],
             clock: StageClock::default(),
         })
@@ -251,12 +245,11 @@ impl CpuBackend {
         assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
         assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
         let detail = Detail::All;
-        self.records.resize(
-            self.records.len().max(self.lists.cap() * detail.stride()),
-            0.0,
-        );
-        self.sums
-            .resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
+        let records = self.lists.cap() * detail.stride();
+        if self.records.len() < records {
+            self.records = atomic_zeros(records);
+        }
+        self.sums.resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
         let frame = self.forward(camera, background, sh_degree, true)?;
         let rendering = self.rendering(&frame);
         let width = frame.grid.width;
@@ -329,12 +322,7 @@ impl CpuBackend {
 
     fn resize_images(&mut self, grid: &Grid) {
         self.canvas.resize(grid.tiles(), TileCanvas::EMPTY);
-        self.gradient.resize(
-            grid.tiles(),
-            TileGradient {
-                planes: [[0.0; 256]; 5],
-            },
-        );
+        self.gradient.resize(grid.tiles(), TileGradient { planes: [[0.0; 256]; 5] });
     }
 
     fn image_loss(
@@ -344,26 +332,9 @@ impl CpuBackend {
         background: [f32; 3],
         error_weights: Option<[f32; 2]>,
     ) -> LossValue {
-        let Self {
-            pool,
-            loss,
-            arch,
-            canvas,
-            gradient,
-            clock,
-            ..
-        } = self;
-        let value = pool.install(|| {
-            loss.run(
-                *arch,
-                grid,
-                canvas,
-                target,
-                background,
-                gradient,
-                error_weights,
-            )
-        });
+        let Self { pool, loss, arch, canvas, gradient, clock, .. } = self;
+        let value = pool
+            .install(|| loss.run(*arch, grid, canvas, target, background, gradient, error_weights));
         clock.lap("loss");
         value
     }
@@ -387,90 +358,51 @@ impl CpuBackend {
         let grid = Grid::new(camera.width, camera.height);
         self.resize_images(&grid);
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
-        let Self {
-            pool,
-            arch,
-            lists,
-            splats,
-            visible: seen,
-            params,
-            canvas,
-            rows,
-            clock,
-            ..
-        } = self;
+        let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, clock, .. } =
+            self;
         clock.start();
         let (rows, arch) = (*rows, *arch);
         let stride = params.stride();
         pool.install(|| {
-            let runs: Vec<usize> = (
+            (
                 params.of_rows(rows).par_chunks(stride * BLOCKS_PER_TASK),
                 splats[..rows].par_chunks_mut(ROWS_PER_TASK),
-                lists.order[..rows].par_chunks_mut(ROWS_PER_TASK),
                 seen.par_chunks_mut(BLOCKS_PER_TASK),
             )
                 .into_par_iter()
-                .enumerate()
-                .map(|(task, (params, splats, keys, seen))| {
-                    arch.dispatch(Project {
-                        view: &view,
-                        params,
-                        stride,
-                        first_row: task * ROWS_PER_TASK,
-                        rows: splats.len(),
-                        splats,
-                        keys,
-                        seen,
-                    })
-                })
-                .collect();
-            let mut visible = 0;
-            for (task, count) in runs.into_iter().enumerate() {
-                let first = task * ROWS_PER_TASK;
-                lists.order.copy_within(first..first + count, visible);
-                visible += count;
-            }
+                .for_each(|(params, splats, seen)| {
+                    let rows = splats.len();
+                    arch.dispatch(Project { view: &view, params, stride, rows, splats, seen });
+                });
             clock.lap("project");
-            lists.sort(visible);
-            clock.lap("sort");
-            let (bands, entries) = lists.bands(splats, &grid);
+            let visible = Visible { splats: &splats[..rows], seen };
+            let (bands, entries) = lists.bands(visible, &grid);
             for band in &bands {
-                lists.fill(splats, &grid, band.clone(), bands.len() == 1);
+                lists.fill(visible, &grid, band.clone(), bands.len() == 1);
                 clock.lap("tiles");
-                canvas[band.clone()]
-                    .par_iter_mut()
-                    .enumerate()
-                    .for_each(|(i, canvas)| {
-                        arch.dispatch(Rasterize {
-                            splats,
-                            list: lists.of_tile(i),
-                            place: TilePlace::new(&grid, band.start + i),
-                            background,
-                            with_depth,
-                            canvas,
-                        });
+                let tiles = canvas[band.clone()].par_iter_mut().enumerate();
+                tiles.for_each_init(Vec::new, |scratch, (i, canvas)| {
+                    lists.sort(i, scratch);
+                    arch.dispatch(Rasterize {
+                        splats,
+                        list: lists.of_tile(i),
+                        place: TilePlace::new(&grid, band.start + i),
+                        background,
+                        with_depth,
+                        canvas,
                     });
+                });
                 clock.lap("rasterize");
             }
-            Ok(Frame {
-                view,
-                grid,
-                background,
-                bands,
-                entries,
-                visible,
-            })
+            let visible =
+                seen[..rows.div_ceil(WIDTH)].iter().map(|s| s.count_ones() as usize).sum();
+            Ok(Frame { view, grid, background, bands, entries, visible })
         })
     }
 
     /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
     fn backward(&mut self, frame: &Frame, detail: Detail) {
-        let Frame {
-            grid,
-            background,
-            bands,
-            ..
-        } = frame;
+        let Frame { grid, background, bands, .. } = frame;
         let Self {
             pool,
             arch,
@@ -482,23 +414,16 @@ impl CpuBackend {
             canvas,
             gradient,
             clock,
+            rows,
             ..
         } = self;
         let stride = detail.stride();
         pool.install(|| {
             for band in bands {
                 if bands.len() > 1 {
-                    lists.fill(splats, grid, band.clone(), false);
+                    lists.refill(Visible { splats: &splats[..*rows], seen: visible }, grid, band);
                 }
-                let mut rest = &mut records[..];
-                let mut work = Vec::with_capacity(band.len());
-                for tile in 0..band.len() {
-                    let length = lists.range_of_tile(tile).len() * stride;
-                    let (mine, tail) = rest.split_at_mut(length);
-                    rest = tail;
-                    work.push((tile, mine));
-                }
-                work.into_par_iter().for_each(|(i, records)| {
+                (0..band.len()).into_par_iter().for_each(|i| {
                     let tile = band.start + i;
                     let [r, g, b, alpha, depth] = &gradient[tile].planes;
                     arch.dispatch(RasterizeBwd {
@@ -516,20 +441,20 @@ impl CpuBackend {
                 clock.lap("rasterize_bwd");
                 let first = band.start == 0;
                 let records = &records[..];
-                sums.par_chunks_mut(stride * WIDTH)
-                    .zip(&visible[..])
-                    .enumerate()
-                    .for_each(|(block, (sums, &seen))| {
+                sums.par_chunks_mut(stride * WIDTH).zip(&visible[..]).enumerate().for_each(
+                    |(block, (sums, &seen))| {
                         for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
                             if first {
                                 sum.fill(0.0);
                             }
                             if seen >> lane & 1 == 1 {
-                                let entries = lists.entries_of_row(block * WIDTH + lane);
-                                gather(sum, detail, records, entries);
+                                let slots = lists.slots_of_row(block * WIDTH + lane);
+                                let mine = &records[slots.start * stride..slots.end * stride];
+                                gather(sum, detail, mine);
                             }
                         }
-                    });
+                    },
+                );
                 clock.lap("gather");
             }
         });
@@ -543,29 +468,11 @@ impl CpuBackend {
         request: &CandidateRequest,
         count: usize,
     ) {
-        let Frame {
-            grid,
-            bands,
-            background,
-            view,
-            ..
-        } = frame;
-        let Self {
-            lists,
-            splats,
-            params,
-            canvas,
-            gradient,
-            loss,
-            candidates,
-            ..
-        } = self;
-        let place = |x: usize, y: usize| {
-            (
-                y / TILE * grid.columns + x / TILE,
-                y % TILE * TILE + x % TILE,
-            )
-        };
+        let Frame { grid, bands, background, view, .. } = frame;
+        let Self { lists, splats, params, canvas, gradient, loss, candidates, visible, .. } = self;
+        let visible = Visible { splats: &splats[..self.rows], seen: visible };
+        let place =
+            |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, y % TILE * TILE + x % TILE);
         let error = |x: usize, y: usize| {
             let (tile, px) = place(x, y);
             let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][px];
@@ -582,7 +489,7 @@ impl CpuBackend {
         for band in bands {
             let here = |&&(x, y, _): &&(usize, usize, f32)| band.contains(&place(x, y).0);
             if worst.iter().find(here).is_some() && bands.len() > 1 {
-                lists.fill(splats, grid, band.clone(), false);
+                lists.refill(visible, grid, band);
             }
             for &(x, y, error) in worst.iter().filter(here) {
                 let at = [x as f32 + 0.5, y as f32 + 0.5];
@@ -635,6 +542,10 @@ fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize)) {
     }
 }
 
+fn atomic_zeros(n: usize) -> Vec<AtomicU32> {
+    (0..n).map(|_| AtomicU32::new(0)).collect()
+}
+
 fn scalars(value: LossValue) -> StepOutput {
     StepOutput {
         loss: value.loss() as f32,
@@ -646,11 +557,7 @@ fn scalars(value: LossValue) -> StepOutput {
 
 /// A single tile's list holds each row at most once, so that the budget is always enough.
 fn tile_cap(options: &CpuOptions) -> usize {
-    options
-        .tile_cap
-        .max(options.budget)
-        .max(1)
-        .min(u32::MAX as usize)
+    options.tile_cap.max(options.budget).max(1).min(u32::MAX as usize)
 }
 
 /// Bytes per buffer for these options.
@@ -667,24 +574,15 @@ fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
     let mut ledger = Ledger::default();
     ledger.add("parameters", Blocks::bytes(budget, per_row));
     ledger.add("optimiser moments", 2 * Blocks::bytes(budget, per_row));
-    ledger.add(
-        "optimiser ages and bias tables",
-        padded * 2 + BiasCorrection::bytes(),
-    );
+    ledger.add("optimiser ages and bias tables", padded * 2 + BiasCorrection::bytes());
     ledger.add("policy signals", Accumulators::bytes(budget, needs.signals));
-    ledger.add(
-        "policy candidates",
-        Candidates::bytes(needs.candidates, grid.width * grid.height),
-    );
+    ledger.add("policy candidates", Candidates::bytes(needs.candidates, grid.width * grid.height));
     ledger.add(
         "projected splats",
         budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
     );
     ledger.add("splat gradients", padded * stride as u64 * float);
-    ledger.add(
-        "tile lists",
-        TileLists::bytes(budget, cap as usize, grid.tiles()),
-    );
+    ledger.add("tile lists", TileLists::bytes(budget, cap as usize, grid.tiles()));
     ledger.add("tile gradients", cap * stride as u64 * float);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add("image and image gradient", (grid.tiles() * per_tile) as u64);
@@ -696,10 +594,7 @@ fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
 /// training and not an abort within it.
 fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
     let bytes = ledger.total();
-    let failed = BackendError::OutOfMemory {
-        what: "the training buffers",
-        bytes,
-    };
+    let failed = BackendError::OutOfMemory { what: "the training buffers", bytes };
     let Ok(size) = usize::try_from(bytes) else {
         return Err(failed);
     };
@@ -724,12 +619,7 @@ impl Backend for CpuBackend {
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput {
-            camera,
-            target,
-            background,
-            ..
-        } = *input;
+        let StepInput { camera, target, background, .. } = *input;
         assert_eq!(
             (camera.width, camera.height),
             (target.width, target.height),
@@ -755,24 +645,15 @@ impl Backend for CpuBackend {
     }
 
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
-        let signals = self
-            .signals
-            .take(self.rows, needs.signals, &self.params, &self.ages);
+        let signals = self.signals.take(self.rows, needs.signals, &self.params, &self.ages);
         Ok((signals, self.candidates.list().to_vec()))
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
         // Kept in release builds: this is the promise.
-        assert_eq!(
-            ops.rows_before, self.rows,
-            "a plan for another number of rows"
-        );
+        assert_eq!(ops.rows_before, self.rows, "a plan for another number of rows");
         assert_eq!(ops.budget, self.budget, "a plan for another budget");
-        assert!(
-            ops.rows_after <= self.budget,
-            "{} rows over the budget",
-            ops.rows_after
-        );
+        assert!(ops.rows_after <= self.budget, "{} rows over the budget", ops.rows_after);
         if let Err(broken) = ops.check() {
             panic!("a plan that breaks its own rules: {broken}");
         }
@@ -808,41 +689,22 @@ impl Backend for CpuBackend {
 impl CpuBackend {
     /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
     fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>, detail: Detail) {
-        let Self {
-            pool,
-            arch,
-            params,
-            moments,
-            ages,
-            signals,
-            sums,
-            visible,
-            bias,
-            rows,
-            ..
-        } = self;
+        let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
+            self;
         let (rows, arch) = (*rows, *arch);
         let [m, v] = moments;
         let layout = signals.layout();
         let (stride, signal_stride) = (params.stride(), signals.blocks.stride());
         let blocks = rows.div_ceil(WIDTH);
         let mut signal_blocks: Vec<&mut [f32]> = if signal_stride == 0 {
-            (0..blocks.div_ceil(BLOCKS_PER_TASK))
-                .map(|_| Default::default())
-                .collect()
+            (0..blocks.div_ceil(BLOCKS_PER_TASK)).map(|_| Default::default()).collect()
         } else {
             let per_task = signal_stride * BLOCKS_PER_TASK;
-            signals
-                .blocks
-                .of_rows_mut(rows)
-                .chunks_mut(per_task)
-                .collect()
+            signals.blocks.of_rows_mut(rows).chunks_mut(per_task).collect()
         };
         pool.install(|| {
             (
-                params
-                    .of_rows_mut(rows)
-                    .par_chunks_mut(stride * BLOCKS_PER_TASK),
+                params.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
                 m.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
                 v.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
                 ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),

@@ -38,24 +38,8 @@ impl WithSimd for Optimise<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self {
-            params,
-            moments: [m, v],
-            stride,
-            ages,
-            signals,
-            layout,
-            sums,
-            ..
-        } = self;
-        let Self {
-            detail,
-            visible,
-            view,
-            rates,
-            bias,
-            ..
-        } = self;
+        let Self { params, moments: [m, v], stride, ages, signals, layout, sums, .. } = self;
+        let Self { detail, visible, view, rates, bias, .. } = self;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
@@ -150,14 +134,7 @@ impl WithSimd for Differentiate<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self {
-            params,
-            stride,
-            sums,
-            visible,
-            view,
-            out,
-        } = self;
+        let Self { params, stride, sums, visible, view, out } = self;
         let per_block = WIDTH * Detail::All.stride();
         let sh_planes = stride / WIDTH - plane::SH;
         let trained = planes(view.sh_degree) - plane::SH;

@@ -72,7 +72,7 @@ impl ViewParams {
 
 /// A projected row, as the tile kernels read it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
-#[repr(C)]
+#[repr(C, align(64))]
 pub(super) struct Splat {
     /// Projected mean [px].
     pub(super) mean: [f32; 2],
@@ -92,7 +92,16 @@ pub(super) struct Splat {
     pub(super) half_height: f32,
     /// Half the width of that region [px].
     pub(super) half_width: f32,
+    /// 1/l1 [px].
+    pub(super) inv_l1: f32,
+    /// How far below the mean that region's rightmost point is [px].
+    pub(super) peak: f32,
+    /// A splat fills one cache line.
+    pub(super) unused: [f32; 2],
 }
+
+/// Numbers of a [`Splat`].
+const SPLAT_FIELDS: usize = 16;
 
 /// Everything of the forward projection that the backward pass needs again.
 pub(super) struct Geometry<S: Simd> {
@@ -140,30 +149,16 @@ pub(super) fn geometry<S: Simd>(s: S, block: &[f32], at: usize, view: &ViewParam
     let mean = each!(i in 3 => lanes(s, block, plane::MEAN + i, at));
     let scale = each!(i in 3 => lanes(s, block, plane::LOG_SCALE + i, at).exp());
     let raw = each!(i in 4 => lanes(s, block, plane::QUAT + i, at));
-    let norm2 = raw[0].mul_add(
-        raw[0],
-        raw[1].mul_add(raw[1], raw[2].mul_add(raw[2], raw[3] * raw[3])),
-    );
+    let norm2 =
+        raw[0].mul_add(raw[0], raw[1].mul_add(raw[1], raw[2].mul_add(raw[2], raw[3] * raw[3])));
     let quat_inv_norm = c(1.0) / norm2.sqrt();
     let quat = each!(i in 4 => raw[i] * quat_inv_norm);
     let [w, x, y, z] = quat;
     let two = c(2.0);
     let axes = [
-        [
-            c(1.0) - two * (y * y + z * z),
-            two * (x * y + w * z),
-            two * (x * z - w * y),
-        ],
-        [
-            two * (x * y - w * z),
-            c(1.0) - two * (x * x + z * z),
-            two * (y * z + w * x),
-        ],
-        [
-            two * (x * z + w * y),
-            two * (y * z - w * x),
-            c(1.0) - two * (x * x + y * y),
-        ],
+        [c(1.0) - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)],
+        [two * (x * y - w * z), c(1.0) - two * (x * x + z * z), two * (y * z + w * x)],
+        [two * (x * z + w * y), two * (y * z - w * x), c(1.0) - two * (x * x + y * y)],
     ];
     let rot = rotation(s, view);
     let p = each!(i in 3 => {
@@ -272,9 +267,7 @@ fn log2_sigmoid<S: Simd>(s: S, x: V<S>) -> V<S> {
 #[inline(always)]
 fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
     let last = V::splat(s, size as f32 - 0.5);
-    V::splat(s, 0.5)
-        .le(centre + half)
-        .and((centre - half).le(last))
+    V::splat(s, 0.5).le(centre + half).and((centre - half).le(last))
 }
 
 /// Projects a run of whole blocks and lists the rows that are on screen.
@@ -283,28 +276,22 @@ pub(super) struct Project<'a> {
     /// Parameter blocks of these rows.
     pub(super) params: &'a [f32],
     pub(super) stride: usize,
-    /// First row, and number of rows (the last block may be partly empty).
-    pub(super) first_row: usize,
+    /// Number of rows (the last block may be partly empty).
     pub(super) rows: usize,
     /// Shape: [rows].
     pub(super) splats: &'a mut [Splat],
-    /// Sort keys of the visible rows, depth bits above row number; filled from the front.
-    /// Shape: [rows].
-    pub(super) keys: &'a mut [u64],
     /// Bit per lane of each block: on screen. Shape: [blocks].
     pub(super) seen: &'a mut [u16],
 }
 
 impl WithSimd for Project<'_> {
-    /// Number of visible rows.
-    type Output = usize;
+    type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> usize {
+    fn with_simd<S: Simd>(self, s: S) {
         let view = self.view;
-        let mut visible = 0;
         for (b, block) in self.params.chunks_exact(self.stride).enumerate() {
-            let mut out = [[0.0_f32; WIDTH]; 12];
+            let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];
             for at in (0..WIDTH).step_by(S::F32_LANES) {
                 let g = geometry(s, block, at, view);
@@ -326,9 +313,12 @@ impl WithSimd for Project<'_> {
                     g.ratio[0].mul_add(V::splat(s, view.focal[0]), V::splat(s, view.principal[0]));
                 let v =
                     g.ratio[1].mul_add(V::splat(s, view.focal[1]), V::splat(s, view.principal[1]));
-                let alive = alive
-                    .and(reaches(s, u, half_width, view.width))
-                    .and(reaches(s, v, half_height, view.height));
+                let alive = alive.and(reaches(s, u, half_width, view.width)).and(reaches(
+                    s,
+                    v,
+                    half_height,
+                    view.height,
+                ));
                 if !alive.any() {
                     continue;
                 }
@@ -349,6 +339,8 @@ impl WithSimd for Project<'_> {
                     g.p[2],
                     half_height,
                     half_width,
+                    V::splat(s, 1.0 / FOLD) / l1,
+                    g.cov[1] / g.cov[0] * half_width,
                 ];
                 for (line, field) in out.iter_mut().zip(fields) {
                     field.store(&mut line[at..]);
@@ -362,19 +354,13 @@ impl WithSimd for Project<'_> {
                     continue;
                 }
                 let row = b * WIDTH + lane;
-                let mut fields = [0.0; 12];
+                let mut fields = [0.0; SPLAT_FIELDS];
                 for (field, line) in fields.iter_mut().zip(&out) {
                     *field = line[lane];
                 }
-                let splat: Splat = bytemuck::cast(fields);
-                // Positive floats compare as their bits do; equal depths are ordered by row.
-                let key = u64::from(splat.depth.to_bits()) << 32 | (self.first_row + row) as u64;
                 self.seen[b] |= 1 << lane;
-                self.splats[row] = splat;
-                self.keys[visible] = key;
-                visible += 1;
+                self.splats[row] = bytemuck::cast(fields);
             }
         }
-        visible
     }
 }

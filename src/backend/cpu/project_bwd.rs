@@ -91,8 +91,7 @@ impl BlockGradient {
         macro_rules! put {
             ($p:expr, $x:expr) => {{
                 let p = $p;
-                seen.keep($x)
-                    .store(&mut params[p * WIDTH + at..(p + 1) * WIDTH]);
+                seen.keep($x).store(&mut params[p * WIDTH + at..(p + 1) * WIDTH]);
             }};
         }
         macro_rules! sum {
@@ -105,17 +104,10 @@ impl BlockGradient {
         let [l1, shear, l3] = conic(&g);
         // Out of the folded units of the rasteriser.
         let unfold = 1.0 / FOLD;
-        let (q, qu, qz) = (
-            sum!(field::Q),
-            sum!(field::U) * unfold,
-            sum!(field::Z) * unfold,
-        );
+        let (q, qu, qz) = (sum!(field::Q), sum!(field::U) * unfold, sum!(field::Z) * unfold);
         let unfold2 = unfold * unfold;
-        let (muu, muz, mzz) = (
-            sum!(field::UU) * unfold2,
-            sum!(field::UZ) * unfold2,
-            sum!(field::ZZ) * unfold2,
-        );
+        let (muu, muz, mzz) =
+            (sum!(field::UU) * unfold2, sum!(field::UZ) * unfold2, sum!(field::ZZ) * unfold2);
 
         // Projected mean: L·Σ q·(u, z).
         let dm = [l1 * qu, l3 * qz - l1 * shear * qu];
@@ -124,10 +116,7 @@ impl BlockGradient {
         }
         if detail == Detail::All {
             // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with folded u', z', l'.
-            let abs = [
-                l1 * sum!(field::ABS_X) * unfold,
-                sum!(field::ABS_Y) * unfold2,
-            ];
+            let abs = [l1 * sum!(field::ABS_X) * unfold, sum!(field::ABS_Y) * unfold2];
             for (slot, x) in self.mean2d_abs.iter_mut().zip(abs) {
                 seen.keep(x).store(&mut slot[at..]);
             }
@@ -139,10 +128,7 @@ impl BlockGradient {
         let mn1 = each!(k in 3 => muz * n0[k] + mzz * n1[k]);
         let scale2 = each!(k in 3 => g.scale[k] * g.scale[k]);
         for k in 0..3 {
-            put!(
-                plane::LOG_SCALE + k,
-                (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]
-            );
+            put!(plane::LOG_SCALE + k, (n0[k] * mn0[k] + n1[k] * mn1[k]) * scale2[k]);
         }
         let turn = each!(i in 3 => {
             let (j, k) = ((i + 1) % 3, (i + 2) % 3);
@@ -166,12 +152,7 @@ impl BlockGradient {
         let (fx, fy) = (c(view.focal[0]), c(view.focal[1]));
         let (j00, j02) = (dot(db0, rot[0]), dot(db0, rot[2]));
         let (j11, j12) = (dot(db1, rot[1]), dot(db1, rot[2]));
-        let Geometry {
-            inv_z,
-            ratio,
-            clamped,
-            ..
-        } = g;
+        let Geometry { inv_z, ratio, clamped, .. } = g;
         // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
         let by_inv_z = fx * (j00 - clamped[0] * j02) + fy * (j11 - clamped[1] * j12);
         let (focal, j_2) = ([fx, fy], [j02, j12]);
@@ -179,11 +160,7 @@ impl BlockGradient {
             let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
             focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
         });
-        let by_depth = if detail == Detail::All {
-            sum!(field::DEPTH)
-        } else {
-            zero
-        };
+        let by_depth = if detail == Detail::All { sum!(field::DEPTH) } else { zero };
         let dp = [
             by_ratio[0] * inv_z,
             by_ratio[1] * inv_z,

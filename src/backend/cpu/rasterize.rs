@@ -7,13 +7,13 @@
 //! pixel costs two operations before its exp2. A bit per row says whether any of its pixels still
 //! takes light.
 
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
 
 use pulp::{Simd, WithSimd};
 
 use super::project::{LOG2_255, Splat};
 use super::simd::{V, WIDTH, each};
-use super::tiles::{Grid, TILE, TILE_PIXELS};
+use super::tiles::{Entry, Grid, TILE, TILE_PIXELS};
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
 pub(super) const ALPHA_MAX: f32 = 0.99;
@@ -41,10 +41,8 @@ pub(super) struct TileCanvas {
 }
 
 impl TileCanvas {
-    pub(super) const EMPTY: Self = Self {
-        planes: [[0.0; TILE_PIXELS]; CANVAS_PLANES],
-        stop: [u32::MAX; TILE_PIXELS],
-    };
+    pub(super) const EMPTY: Self =
+        Self { planes: [[0.0; TILE_PIXELS]; CANVAS_PLANES], stop: [u32::MAX; TILE_PIXELS] };
 }
 
 /// Where a tile lies in the image.
@@ -84,12 +82,8 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub(super) const EMPTY: Self = Self {
-        mask: 0,
-        top: [0.0; WIDTH],
-        offset: [0.0; WIDTH],
-        z: [0.0; WIDTH],
-    };
+    pub(super) const EMPTY: Self =
+        Self { mask: 0, top: [0.0; WIDTH], offset: [0.0; WIDTH], z: [0.0; WIDTH] };
 
     #[inline(always)]
     pub(super) fn set<S: Simd>(&mut self, s: S, splat: &Splat, place: &TilePlace) {
@@ -99,17 +93,12 @@ impl Rows {
         let first = (my - splat.half_height * 1.0001 - 0.52).ceil().max(0.0) as u32;
         let last = (my + splat.half_height * 1.0001 - 0.48).floor().min(15.0);
         let end = if last < 0.0 { 0 } else { last as u32 + 1 };
-        self.mask = if first < end {
-            (1 << end) - (1 << first)
-        } else {
-            0
-        };
+        self.mask = if first < end { (1 << end) - (1 << first) } else { 0 };
         for at in (0..WIDTH).step_by(S::F32_LANES) {
             let dy = V::load(s, &CENTRES[at..]) - my;
             let z = dy * splat.l3;
             z.store(&mut self.z[at..]);
-            z.neg_mul_add(z, c(splat.log2_opacity))
-                .store(&mut self.top[at..]);
+            z.neg_mul_add(z, c(splat.log2_opacity)).store(&mut self.top[at..]);
             let shift = c(splat.shear).mul_add(dy, c(mx));
             (shift * -splat.l1).store(&mut self.offset[at..]);
         }
@@ -130,7 +119,8 @@ pub(super) const CENTRES: [f32; WIDTH] = {
 /// Renders one tile.
 pub(super) struct Rasterize<'a> {
     pub(super) splats: &'a [Splat],
-    pub(super) list: &'a [AtomicU32],
+    /// Sorted.
+    pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) with_depth: bool,
@@ -142,35 +132,18 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        if self.with_depth {
-            self.run::<S, true>(s)
-        } else {
-            self.run::<S, false>(s)
-        }
+        if self.with_depth { self.run::<S, true>(s) } else { self.run::<S, false>(s) }
     }
 }
 
 impl Rasterize<'_> {
     #[inline(always)]
     fn run<S: Simd, const WITH_DEPTH: bool>(self, s: S) {
-        let Self {
-            splats,
-            list,
-            place,
-            background,
-            canvas,
-            ..
-        } = self;
+        let Self { splats, list, place, background, canvas, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
-        for plane in [
-            &mut *red,
-            &mut *green,
-            &mut *blue,
-            &mut *finished,
-            &mut *depth,
-        ] {
+        for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
             plane.fill(0.0);
         }
         stop.fill(u32::MAX);
@@ -186,8 +159,8 @@ impl Rasterize<'_> {
         let mut rows = Rows::EMPTY;
 
         'list: for (n, chunk) in list.chunks(BATCH).enumerate() {
-            for (slot, row) in batch.iter_mut().zip(chunk) {
-                *slot = splats[row.load(Relaxed) as usize];
+            for (splat, entry) in batch.iter_mut().zip(chunk) {
+                *splat = splats[Entry::load(entry).row];
             }
             for (i, splat) in batch[..chunk.len()].iter().enumerate() {
                 rows.set(s, splat, &place);
@@ -216,10 +189,7 @@ impl Rasterize<'_> {
                             blend(s, w, z, &mut depth[px..]);
                         }
                         goes_on.select(next, t).store(&mut light[px..]);
-                        let stops = next
-                            .le(c(TRANSMITTANCE_MIN))
-                            .and(seen)
-                            .and(V::zero(s).lt(t));
+                        let stops = next.le(c(TRANSMITTANCE_MIN)).and(seen).and(V::zero(s).lt(t));
                         if stops.any() {
                             let place_in_list = (n * BATCH + i) as u32;
                             stop_pixels(
@@ -243,12 +213,10 @@ impl Rasterize<'_> {
         for px in (0..TILE_PIXELS).step_by(S::F32_LANES) {
             let t = V::load(s, &light[px..]).max(V::load(s, &finished[px..]));
             t.store(&mut finished[px..]);
-            for (plane, background) in [&mut *red, &mut *green, &mut *blue]
-                .into_iter()
-                .zip(background)
+            for (plane, background) in
+                [&mut *red, &mut *green, &mut *blue].into_iter().zip(background)
             {
-                t.mul_add(c(background), V::load(s, &plane[px..]))
-                    .store(&mut plane[px..]);
+                t.mul_add(c(background), V::load(s, &plane[px..])).store(&mut plane[px..]);
             }
         }
     }

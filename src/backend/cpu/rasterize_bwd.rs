@@ -14,7 +14,7 @@
 //!
 //! Records are summed per row in order of tile number, so the sum does not depend on threads.
 
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use pulp::{Simd, WithSimd};
 
@@ -23,7 +23,7 @@ use super::rasterize::{
     ALPHA_MAX, Aligned, BATCH, CENTRES, Plane, Rows, TRANSMITTANCE, TileCanvas, TilePlace,
 };
 use super::simd::{V, WIDTH, each};
-use super::tiles::{TILE, TILE_PIXELS};
+use super::tiles::{Entry, TILE, TILE_PIXELS};
 
 /// Fields of a record.
 pub(super) mod field {
@@ -90,7 +90,8 @@ pub(super) struct TileGradient {
 /// Differentiates one tile.
 pub(super) struct RasterizeBwd<'a> {
     pub(super) splats: &'a [Splat],
-    pub(super) list: &'a [AtomicU32],
+    /// Sorted.
+    pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) canvas: &'a TileCanvas,
@@ -98,8 +99,9 @@ pub(super) struct RasterizeBwd<'a> {
     /// Alpha and depth, for [`Detail::All`].
     pub(super) upstream_more: Option<[&'a Plane; 2]>,
     pub(super) detail: Detail,
-    /// Shape: [list, detail.stride()].
-    pub(super) records: &'a mut [f32],
+    /// Bits of one record per slot; this tile writes those of its own entries.
+    /// Shape: [cap, detail.stride()].
+    pub(super) records: &'a [AtomicU32],
 }
 
 impl WithSimd for RasterizeBwd<'_> {
@@ -128,17 +130,7 @@ struct Sums<S: Simd> {
 impl RasterizeBwd<'_> {
     #[inline(always)]
     fn run<S: Simd, const DETAIL: u8>(self, s: S) {
-        let Self {
-            splats,
-            list,
-            place,
-            background,
-            canvas,
-            upstream,
-            records,
-            detail,
-            ..
-        } = self;
+        let Self { splats, list, place, background, canvas, upstream, records, detail, .. } = self;
         let stride = detail.stride();
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb] = upstream;
@@ -159,15 +151,12 @@ impl RasterizeBwd<'_> {
         let mut row_end = [0_u32; TILE];
         for (y, end) in row_end.iter_mut().enumerate().take(place.height) {
             let row = &canvas.stop[y * TILE..y * TILE + place.width];
-            *end = row
-                .iter()
-                .copied()
-                .max()
-                .unwrap_or(0)
-                .min(list.len() as u32);
+            *end = row.iter().copied().max().unwrap_or(0).min(list.len() as u32);
         }
         let list_end = row_end.iter().copied().max().unwrap_or(0) as usize;
-        records[list_end * stride..].fill(0.0);
+        for entry in &list[list_end..] {
+            write(record_of(records, entry, stride), &[0.0; field::ALL]);
+        }
 
         let mut batch = [Splat::default(); BATCH];
         let mut rows = Rows::EMPTY;
@@ -175,8 +164,8 @@ impl RasterizeBwd<'_> {
         for n in (0..batches).rev() {
             let first = n * BATCH;
             let chunk = &list[first..list_end.min(first + BATCH)];
-            for (slot, row) in batch.iter_mut().zip(chunk) {
-                *slot = splats[row.load(Relaxed) as usize];
+            for (splat, entry) in batch.iter_mut().zip(chunk) {
+                *splat = splats[Entry::load(entry).row];
             }
             let mut alive = 0_u32;
             for (y, &end) in row_end.iter().enumerate() {
@@ -214,11 +203,8 @@ impl RasterizeBwd<'_> {
                         let t = V::load(s, &light[px..]) / (c(1.0) - alpha);
                         t.store(&mut light[px..]);
                         let w = alpha * t;
-                        let (r, g, b) = (
-                            V::load(s, &gr[px..]),
-                            V::load(s, &gg[px..]),
-                            V::load(s, &gb[px..]),
-                        );
+                        let (r, g, b) =
+                            (V::load(s, &gr[px..]), V::load(s, &gg[px..]), V::load(s, &gb[px..]));
                         let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
                         if DETAIL == 2 {
                             let d = V::load(s, &gd[px..]);
@@ -254,7 +240,7 @@ impl RasterizeBwd<'_> {
                         }
                     }
                 }
-                let record = &mut records[(first + i) * stride..(first + i + 1) * stride];
+                let mut record = [0.0; field::ALL];
                 for (slot, sum) in record.iter_mut().zip(sums.few) {
                     *slot = sum.sum();
                 }
@@ -270,22 +256,31 @@ impl RasterizeBwd<'_> {
                     }
                     _ => {}
                 }
+                write(record_of(records, &chunk[i], stride), &record);
             }
         }
     }
 }
 
-/// Adds the records of the entries of one row to its sums, in order.
-pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[f32], entries: &[u32]) {
-    let stride = detail.stride();
-    for &entry in entries {
-        let record = &records[entry as usize * stride..(entry as usize + 1) * stride];
-        for (i, (sum, &x)) in sums.iter_mut().zip(record).enumerate() {
-            *sum = if detail.maximum() == Some(i) {
-                sum.max(x)
-            } else {
-                *sum + x
-            };
+#[inline(always)]
+fn record_of<'a>(records: &'a [AtomicU32], entry: &AtomicU64, stride: usize) -> &'a [AtomicU32] {
+    let slot = Entry::load(entry).slot;
+    &records[slot * stride..(slot + 1) * stride]
+}
+
+#[inline(always)]
+fn write(to: &[AtomicU32], record: &[f32; field::ALL]) {
+    for (to, x) in to.iter().zip(record) {
+        to.store(x.to_bits(), Relaxed);
+    }
+}
+
+/// Adds the records of one row, which lie side by side, to its sums, in order.
+pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
+    for record in records.chunks_exact(detail.stride()) {
+        for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
+            let x = f32::from_bits(x.load(Relaxed));
+            *sum = if detail.maximum() == Some(i) { sum.max(x) } else { *sum + x };
         }
     }
 }

@@ -61,11 +61,7 @@ impl Layout {
         let previous = next(requested.contains(Signal::WeightMax));
         let current = next(requested.contains(Signal::WeightMax));
         let weight_max = previous.zip(current).map(|(a, b)| [a, b]);
-        Self {
-            sums,
-            weight_max,
-            planes,
-        }
+        Self { sums, weight_max, planes }
     }
 
     /// Adds one view's contribution to the accumulators of a block.
@@ -78,10 +74,7 @@ impl Layout {
         detail: Detail,
         view: &ViewParams,
     ) {
-        let half = [
-            V::splat(s, 0.5 * view.width as f32),
-            V::splat(s, 0.5 * view.height as f32),
-        ];
+        let half = [V::splat(s, 0.5 * view.width as f32), V::splat(s, 0.5 * view.height as f32)];
         for at in (0..WIDTH).step_by(S::F32_LANES) {
             macro_rules! line {
                 ($line:expr) => {
@@ -101,10 +94,9 @@ impl Layout {
                     Signal::ScreenGradient => {
                         norm2(line!(g.mean2d[0]) * half[0], line!(g.mean2d[1]) * half[1])
                     }
-                    Signal::ScreenGradientAbs => norm2(
-                        line!(g.mean2d_abs[0]) * half[0],
-                        line!(g.mean2d_abs[1]) * half[1],
-                    ),
+                    Signal::ScreenGradientAbs => {
+                        norm2(line!(g.mean2d_abs[0]) * half[0], line!(g.mean2d_abs[1]) * half[1])
+                    }
                     Signal::ColourGradient => norm3(each!(i in 3 => sum!(field::COLOUR + i))),
                     Signal::MeanGradientX => mean[0],
                     Signal::MeanGradientY => mean[1],
@@ -127,11 +119,7 @@ impl Layout {
 impl Accumulators {
     pub(super) fn new(budget: usize, requested: SignalSet) -> Self {
         let layout = Layout::new(requested);
-        Self {
-            requested,
-            layout,
-            blocks: Blocks::zeros(budget, layout.planes),
-        }
+        Self { requested, layout, blocks: Blocks::zeros(budget, layout.planes) }
     }
 
     pub(super) fn bytes(budget: usize, requested: SignalSet) -> u64 {
@@ -145,11 +133,7 @@ impl Accumulators {
     /// Which record fields the requested signals need.
     pub(super) fn detail(&self) -> Detail {
         let any = |signals: &[Signal]| signals.iter().any(|&s| self.requested.contains(s));
-        if any(&[
-            Signal::ScreenGradientAbs,
-            Signal::WeightSum,
-            Signal::PixelCount,
-        ]) {
+        if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
             Detail::All
         } else if any(&[Signal::WeightMax]) {
             Detail::WeightMax
@@ -162,8 +146,7 @@ impl Accumulators {
     pub(super) fn begin_epoch(&mut self, rows: usize) {
         if let Some([previous, current]) = self.layout.weight_max {
             for row in 0..rows {
-                self.blocks
-                    .set(row, previous, self.blocks.get(row, current));
+                self.blocks.set(row, previous, self.blocks.get(row, current));
                 self.blocks.set(row, current, 0.0);
             }
         }
@@ -192,9 +175,7 @@ impl Accumulators {
                 match signal {
                     Signal::WeightMax => {
                         self.layout.weight_max.map_or(0.0, |[previous, current]| {
-                            self.blocks
-                                .get(row, previous)
-                                .max(self.blocks.get(row, current))
+                            self.blocks.get(row, previous).max(self.blocks.get(row, current))
                         })
                     }
                     Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),

@@ -38,10 +38,7 @@ fn check_image(table: &mut Table, case: &Case, camera: usize, image: &Rendering)
     let scale = depth.iter().fold(1.0_f64, |m, d| m.max(*d));
     // A flipped row changes depth by its share of the depth; elsewhere all three are held to
     // the same absolute difference.
-    let deep = Limits {
-        step: Limits::CPU.step * scale,
-        ..Limits::CPU
-    };
+    let deep = Limits { step: Limits::CPU.step * scale, ..Limits::CPU };
     let arrays = [
         ("rgb", &image.rgb, Limits::CPU),
         ("alpha", &image.alpha, Limits::CPU),
@@ -49,12 +46,7 @@ fn check_image(table: &mut Table, case: &Case, camera: usize, image: &Rendering)
     ];
     for (key, measured, limits) in arrays {
         let expected = case.of_camera(key, camera);
-        table.image(
-            &case.name,
-            key,
-            compare_images(measured, expected, &close, limits),
-            limits,
-        );
+        table.image(&case.name, key, compare_images(measured, expected, &close, limits), limits);
     }
 }
 
@@ -76,12 +68,7 @@ fn check_gradients(table: &mut Table, case: &Case, part: Part) {
     let mut sums: Vec<Vec<f64>> = Vec::new();
     let prefix = format!("grad_{}", part.key());
     let mut check = |key: &str, measured: &[f64], expected: &[f64]| {
-        table.check(
-            &case.name,
-            key,
-            relative_error(measured, expected),
-            case.tolerance(key),
-        );
+        table.check(&case.name, key, relative_error(measured, expected), case.tolerance(key));
     };
     for camera in 0..case.cameras.len() {
         let (_, gradient) = subject::differentiate(
@@ -91,9 +78,7 @@ fn check_gradients(table: &mut Table, case: &Case, part: Part) {
             case.sh_degree,
             &case.upstream(camera, part),
         );
-        let classes: Vec<Vec<f64>> = CLASSES
-            .map(|c| widened(subject::class(&gradient, c)))
-            .into();
+        let classes: Vec<Vec<f64>> = CLASSES.map(|c| widened(subject::class(&gradient, c))).into();
         if sums.is_empty() {
             sums = classes;
         } else {
@@ -170,9 +155,7 @@ fn check_statistics(table: &mut Table, case: &Case, camera: usize, found: &Model
 
         if found.visible[row] != (stored("visible")[row] > 0.0) {
             let name = &case.name;
-            table.fail(format!(
-                "{name}: row {row} in view {camera}: visible is wrong"
-            ));
+            table.fail(format!("{name}: row {row} in view {camera}: visible is wrong"));
         }
     }
 }

@@ -49,10 +49,8 @@ impl Part {
 /// The folder of data shared between projects: `DENSIFY_SHARED`, else `shared` beside the
 /// workspace.
 pub(crate) fn shared() -> PathBuf {
-    std::env::var_os("DENSIFY_SHARED").map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
-        PathBuf::from,
-    )
+    std::env::var_os("DENSIFY_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from)
 }
 
 /// All cases, or `None` (said aloud) where the data is absent.
@@ -67,12 +65,7 @@ pub(crate) fn cases() -> Option<Vec<Case>> {
     let index: serde_json::Value = serde_json::from_str(&text).expect("index.json is JSON");
     let cases = index["cases"].as_object().expect("index.json lists cases");
     assert!(!cases.is_empty(), "index.json lists no case");
-    Some(
-        cases
-            .iter()
-            .map(|(name, entry)| Case::read(&folder, name, entry))
-            .collect(),
-    )
+    Some(cases.iter().map(|(name, entry)| Case::read(&folder, name, entry)).collect())
 }
 
 impl Case {
@@ -109,9 +102,7 @@ impl Case {
     }
 
     fn array(&self, key: &str) -> &[f64] {
-        self.arrays
-            .get(key)
-            .unwrap_or_else(|| panic!("{}: no array {key}", self.name))
+        self.arrays.get(key).unwrap_or_else(|| panic!("{}: no array {key}", self.name))
     }
 
     /// One camera's part of a stored array whose first axis is the camera.
@@ -126,10 +117,7 @@ impl Case {
 
     /// Whether no decision in a pixel is close. Shape: [height, width].
     pub(crate) fn decided(&self, camera: usize) -> Vec<bool> {
-        self.split(self.array("pixel_ok"), camera)
-            .iter()
-            .map(|&ok| ok > 0.0)
-            .collect()
+        self.split(self.array("pixel_ok"), camera).iter().map(|&ok| ok > 0.0).collect()
     }
 
     /// The weights of a stored loss.
@@ -151,17 +139,12 @@ impl Case {
     pub(crate) fn tolerance(&self, key: &str) -> f64 {
         let class = key.rsplit('.').next().unwrap_or(key);
         let largest = |of: &dyn Fn(&str) -> bool| {
-            let floors = self
-                .floors
-                .iter()
-                .filter(|(k, _)| !k.contains(':') && of(k));
+            let floors = self.floors.iter().filter(|(k, _)| !k.contains(':') && of(k));
             floors.map(|(_, &floor)| floor).reduce(f64::max)
         };
         let floor = self.floors.get(key).copied();
         let floor = floor.or_else(|| largest(&|k| k.ends_with(&format!(".{class}"))));
-        10.0 * floor
-            .or_else(|| largest(&|k| k.starts_with("grad_")))
-            .expect("a case has floors")
+        10.0 * floor.or_else(|| largest(&|k| k.starts_with("grad_"))).expect("a case has floors")
     }
 }
 

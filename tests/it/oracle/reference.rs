@@ -34,20 +34,12 @@ fn view(case: &Case, camera: usize) -> View<'_> {
 }
 
 fn check(table: &mut Table, case: &Case, key: &str, measured: &[f64], expected: &[f64]) {
-    table.check(
-        &case.name,
-        key,
-        relative_error(measured, expected),
-        TOLERANCE,
-    );
+    table.check(&case.name, key, relative_error(measured, expected), TOLERANCE);
 }
 
 fn check_projection(table: &mut Table, case: &Case, model: &Model, camera: usize) {
     let splats = project(model, view(case, camera), &Rules::STANDARD);
-    let in_front: Vec<f64> = splats
-        .iter()
-        .map(|s| f64::from(u8::from(s.in_front)))
-        .collect();
+    let in_front: Vec<f64> = splats.iter().map(|s| f64::from(u8::from(s.in_front))).collect();
     let expected = case.of_camera("g_near_ok", camera);
     check(table, case, "g_near_ok", &in_front, expected);
     let mut quantity = |key: &str, values: Vec<Vec<f64>>| {
@@ -56,23 +48,16 @@ fn check_projection(table: &mut Table, case: &Case, model: &Model, camera: usize
         // Behind the camera everything stored is meaningless.
         let rows = || (0..values.len()).filter(|&row| splats[row].in_front);
         let measured: Vec<f64> = rows().flat_map(|row| values[row].clone()).collect();
-        let expected: Vec<f64> = rows()
-            .flat_map(|row| stored[row * n..(row + 1) * n].to_vec())
-            .collect();
+        let expected: Vec<f64> =
+            rows().flat_map(|row| stored[row * n..(row + 1) * n].to_vec()).collect();
         check(table, case, key, &measured, &expected);
     };
     quantity("g_mean2d", splats.iter().map(|s| s.mean.to_vec()).collect());
-    quantity(
-        "g_cov2d",
-        splats.iter().map(|s| s.covariance.to_vec()).collect(),
-    );
+    quantity("g_cov2d", splats.iter().map(|s| s.covariance.to_vec()).collect());
     quantity("g_conic", splats.iter().map(|s| s.conic.to_vec()).collect());
     quantity("g_depth", splats.iter().map(|s| vec![s.depth]).collect());
     let clamped = |s: &[f64; 3]| s.map(|c| c.max(0.0)).to_vec();
-    quantity(
-        "g_color",
-        splats.iter().map(|s| clamped(&s.colour)).collect(),
-    );
+    quantity("g_color", splats.iter().map(|s| clamped(&s.colour)).collect());
 }
 
 fn check_image(table: &mut Table, case: &Case, model: &Model, camera: usize) {
@@ -82,10 +67,7 @@ fn check_image(table: &mut Table, case: &Case, model: &Model, camera: usize) {
         let expected = case.of_camera(key, camera);
         let keep = |values: &[f64]| -> Vec<f64> {
             let pixels = values.chunks_exact(channels).zip(&decided);
-            pixels
-                .filter(|(_, ok)| **ok)
-                .flat_map(|(v, _)| v.to_vec())
-                .collect()
+            pixels.filter(|(_, ok)| **ok).flat_map(|(v, _)| v.to_vec()).collect()
         };
         check(table, case, key, &keep(measured), &keep(expected));
     };
@@ -102,10 +84,7 @@ fn check_image(table: &mut Table, case: &Case, model: &Model, camera: usize) {
     // The reference calls a pixel close more rarely than the stored mask, which is wider.
     for (p, (&close, &ok)) in image.boundary.iter().zip(&decided).enumerate() {
         if close && ok {
-            table.fail(format!(
-                "{}: pixel {p} of view {camera} is decided",
-                case.name
-            ));
+            table.fail(format!("{}: pixel {p} of view {camera} is decided", case.name));
         }
     }
 }
@@ -160,13 +139,7 @@ fn check_statistics(
 ) {
     let rows = &gradient.screen;
     let all: Vec<f64> = rows.iter().map(|s| s.max_weight).collect();
-    check(
-        table,
-        case,
-        "max_weight_all",
-        &all,
-        case.of_camera("max_weight_all", camera),
-    );
+    check(table, case, "max_weight_all", &all, case.of_camera("max_weight_all", camera));
     let splats = project(model, view(case, camera), &Rules::STANDARD);
     let decided = case.decided(camera);
     let leeway =

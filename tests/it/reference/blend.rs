@@ -32,18 +32,11 @@ const CLOSE_TRANSMITTANCE: f64 = 1e-2;
 const CLOSE_DEPTH: f64 = 1e-6;
 
 fn trace(splats: &[Splat], order: &[usize], x: u32, y: u32, rules: &Rules) -> Pixel {
-    let mut pixel = Pixel {
-        contributions: Vec::new(),
-        transmittance: 1.0,
-        boundary: false,
-    };
+    let mut pixel = Pixel { contributions: Vec::new(), transmittance: 1.0, boundary: false };
     let mut last_depth = f64::NEG_INFINITY;
     for &row in order {
         let splat = &splats[row];
-        let offset = [
-            f64::from(x) + 0.5 - splat.mean[0],
-            f64::from(y) + 0.5 - splat.mean[1],
-        ];
+        let offset = [f64::from(x) + 0.5 - splat.mean[0], f64::from(y) + 0.5 - splat.mean[1]];
         let [dx, dy] = offset;
         let [a, b, c] = splat.conic;
         let falloff = (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp();
@@ -164,10 +157,7 @@ pub(crate) fn backward(
 fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_exponent: f64) {
     let [dx, dy] = hit.offset;
     let [a, b, c] = splat.conic;
-    let d_mean = [
-        -d_exponent * (a * dx + b * dy),
-        -d_exponent * (b * dx + c * dy),
-    ];
+    let d_mean = [-d_exponent * (a * dx + b * dy), -d_exponent * (b * dx + c * dy)];
     for (axis, d) in d_mean.into_iter().enumerate() {
         sum.mean[axis] += d;
         sum.mean_abs[axis] += d.abs();
@@ -186,10 +176,7 @@ pub(crate) fn leeway(
     counted: &[bool],
 ) -> Vec<(f64, f64, u32)> {
     // Without the two steps nothing is skipped; 10 % below the step nothing can be blended.
-    let rules = Rules {
-        alpha_min: 0.9 / 255.0,
-        ..Rules::SMOOTH
-    };
+    let rules = Rules { alpha_min: 0.9 / 255.0, ..Rules::SMOOTH };
     let mut most = vec![(0.0, 0.0, 0); splats.len()];
     for y in 0..view.camera.height {
         for x in 0..view.camera.width {

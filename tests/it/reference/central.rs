@@ -38,22 +38,14 @@ fn check(table: &mut Table, what: &str, model: &Model, view: View<'_>, upstream:
             let below = value(&moved);
             moved.class_mut(class)[i] = at;
             let difference = ((above - below) / (2.0 * STEP) - analytic).abs();
-            worst = if difference.is_nan() {
-                f64::NAN
-            } else {
-                worst.max(difference)
-            };
+            worst = if difference.is_nan() { f64::NAN } else { worst.max(difference) };
         }
         table.check(what, class, worst / largest.max(1e-3), TOLERANCE);
     }
 }
 
 fn view(camera: &Camera, sh_degree: u8) -> View<'_> {
-    View {
-        camera,
-        background: [0.2, 0.9, 0.5],
-        sh_degree,
-    }
+    View { camera, background: [0.2, 0.9, 0.5], sh_degree }
 }
 
 #[test]
@@ -63,23 +55,11 @@ fn gradients_of_every_class_at_every_degree() {
         let camera = scenes::camera(13, 11, 40 + u64::from(degree));
         let model = Model::of(&scenes::cloud(7, degree, &camera, 70 + u64::from(degree)));
         let upstream = scenes::upstream(&camera, 3);
-        check(
-            &mut table,
-            &format!("degree {degree}"),
-            &model,
-            view(&camera, degree),
-            &upstream,
-        );
+        check(&mut table, &format!("degree {degree}"), &model, view(&camera, degree), &upstream);
         if degree > 0 {
             // Fewer harmonics evaluated than stored: the rest gets no gradient.
             let what = format!("degree {} of {degree}", degree - 1);
-            check(
-                &mut table,
-                &what,
-                &model,
-                view(&camera, degree - 1),
-                &upstream,
-            );
+            check(&mut table, &what, &model, view(&camera, degree - 1), &upstream);
         }
     }
     table.finish();
@@ -89,41 +69,20 @@ fn gradients_of_every_class_at_every_degree() {
 fn gradients_where_the_jacobian_is_clamped() {
     // Centres far outside the image, wide enough to be seen: the slope is clamped in x, in y,
     // and in both.
-    let camera = Camera {
-        cx: 2.0,
-        cy: 9.5,
-        fx: 9.0,
-        fy: 14.0,
-        ..scenes::camera(12, 10, 5)
-    };
+    let camera = Camera { cx: 2.0, cy: 9.5, fx: 9.0, fy: 14.0, ..scenes::camera(12, 10, 5) };
     let mut table = Table::new("reference beyond the frustum");
-    for (what, local) in [
-        ("x", [4.0, 0.2, 2.0]),
-        ("y", [0.1, -3.5, 2.2]),
-        ("both", [-2.6, 2.0, 2.1]),
-    ] {
+    for (what, local) in
+        [("x", [4.0, 0.2, 2.0]), ("y", [0.1, -3.5, 2.2]), ("both", [-2.6, 2.0, 2.1])]
+    {
         let model = Model::of(&scenes::one_at(&camera, local, [1.1, 0.9, 1.3]));
-        let seen = differentiate(
-            &model,
-            view(&camera, 1),
-            &Rules::SMOOTH,
-            &scenes::upstream(&camera, 9),
-        )
-        .0
-        .alpha
-        .iter()
-        .fold(0.0_f64, |m, &a| m.max(a));
-        assert!(
-            seen > 0.01,
-            "{what}: the row is not seen, largest alpha {seen:e}"
-        );
-        check(
-            &mut table,
-            what,
-            &model,
-            view(&camera, 1),
-            &scenes::upstream(&camera, 9),
-        );
+        let seen =
+            differentiate(&model, view(&camera, 1), &Rules::SMOOTH, &scenes::upstream(&camera, 9))
+                .0
+                .alpha
+                .iter()
+                .fold(0.0_f64, |m, &a| m.max(a));
+        assert!(seen > 0.01, "{what}: the row is not seen, largest alpha {seen:e}");
+        check(&mut table, what, &model, view(&camera, 1), &scenes::upstream(&camera, 9));
     }
     table.finish();
 }
@@ -141,10 +100,7 @@ fn gradient_of_the_loss() {
             .map(|t| t + rng.random_range(0.01..0.3) * if rng.random() { 1.0 } else { -1.0 })
             .collect();
         let analytic = loss(&rendered, &target, width, height);
-        let largest = analytic
-            .gradient
-            .iter()
-            .fold(0.0_f64, |m, g| m.max(g.abs()));
+        let largest = analytic.gradient.iter().fold(0.0_f64, |m, g| m.max(g.abs()));
         let mut moved = rendered.clone();
         let mut worst = 0.0_f64;
         for i in 0..n {
@@ -156,12 +112,7 @@ fn gradient_of_the_loss() {
             let difference = (above - below) / (2.0 * STEP) - analytic.gradient[i];
             worst = worst.max(difference.abs());
         }
-        table.check(
-            &format!("{width}x{height}"),
-            "rendered",
-            worst / largest,
-            TOLERANCE,
-        );
+        table.check(&format!("{width}x{height}"), "rendered", worst / largest, TOLERANCE);
     }
     table.finish();
 }
@@ -170,10 +121,6 @@ fn gradient_of_the_loss() {
 fn equal_images_have_no_loss_and_no_gradient() {
     let image: Vec<f64> = (0..3 * 12 * 9).map(|i| f64::from(i % 7) / 7.0).collect();
     let same = loss(&image, &image, 12, 9);
-    assert!(
-        same.loss.abs() < 1e-15 && (same.ssim - 1.0).abs() < 1e-15,
-        "{}",
-        same.loss
-    );
+    assert!(same.loss.abs() < 1e-15 && (same.ssim - 1.0).abs() < 1e-15, "{}", same.loss);
     assert!(same.gradient.iter().all(|g| g.abs() < 1e-15));
 }

@@ -24,9 +24,7 @@ fn window() -> Vec<(i64, i64, f64)> {
         }
     }
     let sum: f64 = taps.iter().map(|tap| tap.2).sum();
-    taps.into_iter()
-        .map(|(dy, dx, weight)| (dy, dx, weight / sum))
-        .collect()
+    taps.into_iter().map(|(dy, dx, weight)| (dy, dx, weight / sum)).collect()
 }
 
 /// Convolves an image of [height, width, 3] with the window; zeros beyond the border. The window
@@ -84,10 +82,5 @@ pub(crate) fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize
         })
         .collect();
     l1 /= n;
-    Loss {
-        loss: 0.8 * l1 + 0.2 * (1.0 - ssim),
-        l1,
-        ssim,
-        gradient,
-    }
+    Loss { loss: 0.8 * l1 + 0.2 * (1.0 - ssim), l1, ssim, gradient }
 }

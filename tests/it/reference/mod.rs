@@ -36,19 +36,12 @@ const FRUSTUM_MARGIN: f64 = 1.3;
 
 impl Rules {
     /// The rules of the renderer.
-    pub(crate) const STANDARD: Self = Self {
-        near: 0.01,
-        alpha_min: 1.0 / 255.0,
-        alpha_max: 0.99,
-        transmittance_min: 1e-4,
-    };
+    pub(crate) const STANDARD: Self =
+        Self { near: 0.01, alpha_min: 1.0 / 255.0, alpha_max: 0.99, transmittance_min: 1e-4 };
     /// The same without the two steps that make a render discontinuous in its parameters, so
     /// that differences approximate derivatives.
-    pub(crate) const SMOOTH: Self = Self {
-        alpha_min: 0.0,
-        transmittance_min: f64::NEG_INFINITY,
-        ..Self::STANDARD
-    };
+    pub(crate) const SMOOTH: Self =
+        Self { alpha_min: 0.0, transmittance_min: f64::NEG_INFINITY, ..Self::STANDARD };
 }
 
 /// A model in `f64`, or a gradient with respect to one. Fields as in [`Gaussians`].
@@ -81,18 +74,9 @@ impl Model {
         Self {
             coefficients: sh_coefficients(gaussians.sh_degree),
             means: gaussians.means.iter().map(|v| v.map(f64::from)).collect(),
-            log_scales: gaussians
-                .log_scales
-                .iter()
-                .map(|v| v.map(f64::from))
-                .collect(),
+            log_scales: gaussians.log_scales.iter().map(|v| v.map(f64::from)).collect(),
             quats: gaussians.quats.iter().map(|v| v.map(f64::from)).collect(),
-            opacity_logits: gaussians
-                .opacity_logits
-                .iter()
-                .copied()
-                .map(f64::from)
-                .collect(),
+            opacity_logits: gaussians.opacity_logits.iter().copied().map(f64::from).collect(),
             sh: gaussians.sh.iter().copied().map(f64::from).collect(),
         }
     }

@@ -45,10 +45,7 @@ impl Geometry {
         let limits = |size: u32, focal: f64, centre: f64| {
             let (half, margin) = (0.5 * f64::from(size), FRUSTUM_MARGIN);
             let excess = (margin - 1.0) * half;
-            (
-                (-centre - excess) / focal,
-                (f64::from(size) - centre + excess) / focal,
-            )
+            ((-centre - excess) / focal, (f64::from(size) - centre + excess) / focal)
         };
         let raw = [local.x / local.z, local.y / local.z];
         let bounds = [
@@ -60,15 +57,7 @@ impl Geometry {
         let axes = rotation_of(model.quats[row]);
         let scale = DVec3::from(model.log_scales[row].map(f64::exp));
         let m = axes * DMat3::from_diagonal(scale);
-        Self {
-            local,
-            slope,
-            clamped,
-            rotation: camera.rotation,
-            m,
-            axes,
-            scale,
-        }
+        Self { local, slope, clamped, rotation: camera.rotation, m, axes, scale }
     }
 
     /// d(pixel)/d(local), as two rows.
@@ -89,9 +78,7 @@ pub(crate) fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat
             let local = geometry.local;
             let sigma = geometry.m * geometry.m.transpose();
             // Rows of J·W; covariance = (JW)·Σ·(JW)ᵀ.
-            let jw = geometry
-                .jacobian(view)
-                .map(|j| geometry.rotation.transpose() * j);
+            let jw = geometry.jacobian(view).map(|j| geometry.rotation.transpose() * j);
             let a = jw[0].dot(sigma * jw[0]) + BLUR;
             let b = jw[0].dot(sigma * jw[1]);
             let c = jw[1].dot(sigma * jw[1]) + BLUR;
@@ -154,18 +141,10 @@ fn geometry_backward(
     let DVec3 { x, y, z } = geometry.local;
     // d(covariance) = −Q·d(Q)·Q with Q the conic; B enters the exponent once, hence the halves.
     let [qa, qb, qc] = splat.conic;
-    let [ga, gb, gc] = [
-        upstream.conic[0],
-        0.5 * upstream.conic[1],
-        upstream.conic[2],
-    ];
+    let [ga, gb, gc] = [upstream.conic[0], 0.5 * upstream.conic[1], upstream.conic[2]];
     let (t00, t01) = (qa * ga + qb * gb, qa * gb + qb * gc);
     let (t10, t11) = (qb * ga + qc * gb, qb * gb + qc * gc);
-    let d_cov = [
-        -(t00 * qa + t01 * qb),
-        -(t00 * qb + t01 * qc),
-        -(t10 * qb + t11 * qc),
-    ];
+    let d_cov = [-(t00 * qa + t01 * qb), -(t00 * qb + t01 * qc), -(t10 * qb + t11 * qc)];
     let jacobian = geometry.jacobian(view);
     let jw = jacobian.map(|j| geometry.rotation.transpose() * j);
     let sigma = geometry.m * geometry.m.transpose();
@@ -216,21 +195,9 @@ type Product = (f64, usize, usize);
 /// Entry (i, j) of the rotation matrix of a unit quaternion (w, x, y, z) is
 /// δij + Σ of coefficient · q[a] · q[b] over the entry's terms.
 const ROTATION: [[&[Product]; 3]; 3] = [
-    [
-        &[(-2.0, 2, 2), (-2.0, 3, 3)],
-        &[(2.0, 1, 2), (-2.0, 0, 3)],
-        &[(2.0, 1, 3), (2.0, 0, 2)],
-    ],
-    [
-        &[(2.0, 1, 2), (2.0, 0, 3)],
-        &[(-2.0, 1, 1), (-2.0, 3, 3)],
-        &[(2.0, 2, 3), (-2.0, 0, 1)],
-    ],
-    [
-        &[(2.0, 1, 3), (-2.0, 0, 2)],
-        &[(2.0, 2, 3), (2.0, 0, 1)],
-        &[(-2.0, 1, 1), (-2.0, 2, 2)],
-    ],
+    [&[(-2.0, 2, 2), (-2.0, 3, 3)], &[(2.0, 1, 2), (-2.0, 0, 3)], &[(2.0, 1, 3), (2.0, 0, 2)]],
+    [&[(2.0, 1, 2), (2.0, 0, 3)], &[(-2.0, 1, 1), (-2.0, 3, 3)], &[(2.0, 2, 3), (-2.0, 0, 1)]],
+    [&[(2.0, 1, 3), (-2.0, 0, 2)], &[(2.0, 2, 3), (2.0, 0, 1)], &[(-2.0, 1, 1), (-2.0, 2, 2)]],
 ];
 
 fn norm(q: [f64; 4]) -> f64 {
@@ -242,10 +209,7 @@ fn rotation_of(q: [f64; 4]) -> DMat3 {
     let mut columns = DMat3::IDENTITY.to_cols_array_2d();
     for (i, row) in ROTATION.iter().enumerate() {
         for (j, terms) in row.iter().enumerate() {
-            columns[j][i] += terms
-                .iter()
-                .map(|&(k, a, b)| k * unit[a] * unit[b])
-                .sum::<f64>();
+            columns[j][i] += terms.iter().map(|&(k, a, b)| k * unit[a] * unit[b]).sum::<f64>();
         }
     }
     DMat3::from_cols_array_2d(&columns)
@@ -305,10 +269,7 @@ const HARMONICS: [&[Monomial]; 16] = {
 };
 
 fn evaluate(harmonic: &[Monomial], d: DVec3) -> f64 {
-    harmonic
-        .iter()
-        .map(|(k, p)| k * d.x.powi(p[0]) * d.y.powi(p[1]) * d.z.powi(p[2]))
-        .sum()
+    harmonic.iter().map(|(k, p)| k * d.x.powi(p[0]) * d.y.powi(p[1]) * d.z.powi(p[2])).sum()
 }
 
 fn derivative(harmonic: &[Monomial], d: DVec3) -> DVec3 {
@@ -358,13 +319,7 @@ fn colour_backward(
 ) -> DVec3 {
     let sight = sight(model, row, view);
     let direction = sight.normalize();
-    let d_colour = [0, 1, 2].map(|c| {
-        if splat.colour[c] > 0.0 {
-            upstream.colour[c]
-        } else {
-            0.0
-        }
-    });
+    let d_colour = [0, 1, 2].map(|c| if splat.colour[c] > 0.0 { upstream.colour[c] } else { 0.0 });
     let mut d_direction = DVec3::ZERO;
     for (k, harmonic) in active(view) {
         let value = evaluate(harmonic, direction);
