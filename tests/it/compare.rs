@@ -45,7 +45,7 @@ pub(crate) fn compare_images(
     limits: Limits,
 ) -> Result<f64, String> {
     let pixels = boundary.len();
-    if measured.len() != expected.len() || expected.len() % pixels.max(1) != 0 {
+    if measured.len() != expected.len() || !expected.len().is_multiple_of(pixels.max(1)) {
         return Err(format!(
             "{} values measured, {} expected, {pixels} pixels",
             measured.len(),
@@ -143,8 +143,8 @@ impl Table {
 
     /// Everything that failed, or `None`.
     fn failures(&self) -> Option<String> {
-        // Not `error > tolerance`: a NaN fails.
-        let failed: Vec<_> = self.rows.iter().filter(|row| !(row.2 <= row.3)).collect();
+        let failed: Vec<_> =
+            self.rows.iter().filter(|row| row.2.is_nan() || row.2 > row.3).collect();
         if failed.is_empty() && self.messages.is_empty() {
             return None;
         }
@@ -189,7 +189,7 @@ mod tests {
 
     /// Every tenth pixel lies on a boundary.
     fn boundary() -> Vec<bool> {
-        (0..PIXELS).map(|p| p % 10 == 0).collect()
+        (0..PIXELS).map(|p| p.is_multiple_of(10)).collect()
     }
 
     /// The expected image with `by(k)` added to the k-th of the given pixels.
@@ -242,7 +242,7 @@ mod tests {
 
     #[test]
     fn a_few_flips_at_boundaries_pass_and_many_fail() {
-        let alternating = |k: usize| if k % 2 == 0 { 0.004 } else { -0.004 };
+        let alternating = |k: usize| if k.is_multiple_of(2) { 0.004 } else { -0.004 };
         assert!(outcome(&corrupted((0..100).step_by(10), alternating), Limits::CPU).is_ok());
         refused(&corrupted((0..110).step_by(10), alternating), Limits::CPU, "11 of 10000");
     }
@@ -257,12 +257,15 @@ mod tests {
         let lenient = Limits { flipped: 0.01, ..Limits::CPU };
         let flips = || (0..1000).step_by(10);
         assert!(
-            outcome(&corrupted(flips(), |k| if k % 2 == 0 { 0.004 } else { -0.004 }), lenient)
-                .is_ok()
+            outcome(
+                &corrupted(flips(), |k| if k.is_multiple_of(2) { 0.004 } else { -0.004 }),
+                lenient
+            )
+            .is_ok()
         );
         refused(&corrupted(flips(), |_| 0.004), lenient, "bias 1.00");
         refused(
-            &corrupted(flips(), |k| if k % 5 == 0 { 0.004 } else { -0.004 }),
+            &corrupted(flips(), |k| if k.is_multiple_of(5) { 0.004 } else { -0.004 }),
             lenient,
             "bias -0.60",
         );

@@ -161,7 +161,7 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let views = views();
     let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
     let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), candidates: None };
-    let mut now = |backend: &mut CpuBackend| {
+    let now = |backend: &mut CpuBackend| {
         let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
         signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
     };

@@ -26,7 +26,7 @@ struct Pixel {
 
 /// Decisions this close are not held against `f32`: alpha to its least value and to its clamp,
 /// relative; transmittance to its least value, relative; depths of neighbours in the order,
-/// relative. The values of extremes.md, which f32 undercuts by two orders of magnitude.
+/// relative. What f32 loses is smaller by two orders of magnitude.
 const CLOSE_ALPHA: f64 = 1e-3;
 const CLOSE_TRANSMITTANCE: f64 = 1e-2;
 const CLOSE_DEPTH: f64 = 1e-6;
@@ -136,8 +136,8 @@ pub(crate) fn backward(
                 behind += weight * value;
 
                 let sum = &mut gradient[hit.row];
-                for c in 0..3 {
-                    sum.colour[c] += weight * d_rgb[c];
+                for (colour, d) in sum.colour.iter_mut().zip(d_rgb) {
+                    *colour += weight * d;
                 }
                 sum.depth += weight * d_depth;
                 sum.max_weight = sum.max_weight.max(weight);
@@ -158,9 +158,9 @@ fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_e
     let [dx, dy] = hit.offset;
     let [a, b, c] = splat.conic;
     let d_mean = [-d_exponent * (a * dx + b * dy), -d_exponent * (b * dx + c * dy)];
-    for axis in 0..2 {
-        sum.mean[axis] += d_mean[axis];
-        sum.mean_abs[axis] += d_mean[axis].abs();
+    for (axis, d) in d_mean.into_iter().enumerate() {
+        sum.mean[axis] += d;
+        sum.mean_abs[axis] += d.abs();
     }
     sum.conic[0] += d_exponent * 0.5 * dx * dx;
     sum.conic[1] += d_exponent * dx * dy;

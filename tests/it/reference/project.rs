@@ -180,18 +180,21 @@ fn geometry_backward(
         + d_cov[2] * outer(jw[1], jw[1]);
     let d_m = 2.0 * (d_sigma * geometry.m);
     let mut d_axes = [DVec3::ZERO; 3];
-    for axis in 0..3 {
+    for (axis, d_axis) in d_axes.iter_mut().enumerate() {
         let (column, s) = (d_m.col(axis), geometry.scale[axis]);
         gradient.log_scales[row][axis] = column.dot(geometry.axes.col(axis)) * s;
-        d_axes[axis] = column * s;
+        *d_axis = column * s;
     }
     gradient.quats[row] = rotation_backward(model.quats[row], d_axes);
     geometry.rotation.transpose() * d_local
 }
 
+/// A coefficient and the two components of the quaternion it multiplies.
+type Product = (f64, usize, usize);
+
 /// Entry (i, j) of the rotation matrix of a unit quaternion (w, x, y, z) is
 /// δij + Σ of coefficient · q[a] · q[b] over the entry's terms.
-const ROTATION: [[&[(f64, usize, usize)]; 3]; 3] = [
+const ROTATION: [[&[Product]; 3]; 3] = [
     [&[(-2.0, 2, 2), (-2.0, 3, 3)], &[(2.0, 1, 2), (-2.0, 0, 3)], &[(2.0, 1, 3), (2.0, 0, 2)]],
     [&[(2.0, 1, 2), (2.0, 0, 3)], &[(-2.0, 1, 1), (-2.0, 3, 3)], &[(2.0, 2, 3), (-2.0, 0, 1)]],
     [&[(2.0, 1, 3), (-2.0, 0, 2)], &[(2.0, 2, 3), (2.0, 0, 1)], &[(-2.0, 1, 1), (-2.0, 2, 2)]],
