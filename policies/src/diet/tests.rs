@@ -222,6 +222,15 @@ fn a_model_too_large_is_cut_to_the_budget() {
 }
 
 #[test]
+fn what_goes_for_the_budget_does_not_grow() {
+    // Two of six rows are too many; candidate 0 is one of them, so one victim is enough.
+    let event = event(600, 6, 4).with(Signal::ScreenGradient, &wanting(6, &[0, 5]));
+    let done = run(&event, "rho = 0.5");
+    assert_eq!(done.pruned, [0, 1, 2]);
+    assert_eq!((done.cloned, done.ops.counts.denied), (vec![5], 0));
+}
+
+#[test]
 fn the_worst_pixels_become_rows() {
     // Budget 40: two rows per insertion. 39 rows: one victim.
     let mut event = event(10_500, 39, 40);
