@@ -84,7 +84,8 @@ pub fn initialise(
         return Err(InitError::ShDegree(sh_degree));
     }
     let mut report = InitReport { points: points.len(), ..InitReport::default() };
-    let mut chosen: Vec<usize> = (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect();
+    let mut chosen: Vec<usize> =
+        (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect();
     report.unusable = points.len() - chosen.len();
     let usable = chosen.len();
     drop_duplicates(&mut chosen, &points.positions);
@@ -104,7 +105,8 @@ pub fn initialise(
     let stride = 3 * sh_coefficients(sh_degree);
     let mut sh = vec![0.0; rows * stride];
     for (row, &i) in sh.chunks_exact_mut(stride).zip(&chosen) {
-        let rgb = points.colours[i].map(|v| (f64::from(v) / 255.0).clamp(COLOUR_MARGIN, 1.0 - COLOUR_MARGIN));
+        let rgb = points.colours[i]
+            .map(|v| (f64::from(v) / 255.0).clamp(COLOUR_MARGIN, 1.0 - COLOUR_MARGIN));
         row[..3].copy_from_slice(&rgb.map(dc_from_rgb));
     }
     let gaussians = Gaussians {
@@ -149,8 +151,8 @@ fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
     if neighbours == 0 {
         return Ok(vec![LONE_SCALE.ln() as f32]);
     }
-    let tree: ImmutableKdTree<f64, 3> =
-        ImmutableKdTree::new_from_slice(positions).map_err(|_| InitError::TooManyPoints(positions.len()))?;
+    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(positions)
+        .map_err(|_| InitError::TooManyPoints(positions.len()))?;
     // One more: the point itself is its own nearest.
     let wanted = NonZeroUsize::MIN.saturating_add(neighbours);
     let scale = |position: &[f64; 3]| {
@@ -162,4 +164,5 @@ fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests;

@@ -68,8 +68,13 @@ impl ImageCache {
         let capacity = cache_bytes.max(2 * largest(&sources, ImageSource::loaded_bytes));
         let slots = sources.iter().map(|_| Slot::default()).collect();
         let state = Mutex::new(State { slots, ..State::default() });
-        let shared =
-            Arc::new(Shared { sources, capacity, state, work: Condvar::new(), loaded: Condvar::new() });
+        let shared = Arc::new(Shared {
+            sources,
+            capacity,
+            state,
+            work: Condvar::new(),
+            loaded: Condvar::new(),
+        });
         let threads = (0..threads)
             .map_while(|index| {
                 let shared = Arc::clone(&shared);
@@ -107,7 +112,9 @@ impl ImageCache {
     /// Most bytes in use for decoding: one image per thread, and one on demand.
     #[must_use]
     pub fn decode_bytes(&self) -> u64 {
-        let beyond_result = |source: &ImageSource| source.working_bytes() - source.loaded_bytes().min(source.working_bytes());
+        let beyond_result = |source: &ImageSource| {
+            source.working_bytes() - source.loaded_bytes().min(source.working_bytes())
+        };
         (self.threads.len() as u64 + 1) * largest(&self.shared.sources, beyond_result)
             + largest(&self.shared.sources, ImageSource::loaded_bytes)
     }
@@ -126,7 +133,9 @@ impl ImageCache {
             slot.wanted = false;
         }
         for &index in upcoming {
-            let Some(slot) = state.slots.get_mut(index) else { continue };
+            let Some(slot) = state.slots.get_mut(index) else {
+                continue;
+            };
             let first = !std::mem::replace(&mut slot.wanted, true);
             if first && matches!(slot.content, Content::Empty) && !self.threads.is_empty() {
                 state.queue.push_back(index);
@@ -227,7 +236,9 @@ impl State {
         let needed = shared.sources[index].loaded_bytes();
         while self.bytes + needed > shared.capacity {
             let victim = (self.slots.iter().enumerate())
-                .filter(|(i, slot)| *i != index && !slot.wanted && matches!(slot.content, Content::Ready(_)))
+                .filter(|(i, slot)| {
+                    *i != index && !slot.wanted && matches!(slot.content, Content::Ready(_))
+                })
                 .max_by_key(|(_, slot)| slot.used)
                 .map(|(i, _)| i);
             let Some(victim) = victim else { return false };
@@ -239,7 +250,12 @@ impl State {
     }
 
     /// Ends a load that [`Self::make_room`] began. An error without a value was returned already.
-    fn finish(&mut self, shared: &Shared, index: usize, result: Result<SharedImage, Option<DatasetError>>) {
+    fn finish(
+        &mut self,
+        shared: &Shared,
+        index: usize,
+        result: Result<SharedImage, Option<DatasetError>>,
+    ) {
         if result.is_err() {
             self.bytes -= shared.sources[index].loaded_bytes();
         }
@@ -323,7 +339,9 @@ mod tests {
         let cache = ImageCache::new(sources(folder.path(), 6), 3 * 768, 2);
         cache.prefetch(&[4, 2, 5, 1]);
         let mut state = cache.shared.lock();
-        while state.slots.iter().filter(|slot| matches!(slot.content, Content::Ready(_))).count() < 3 {
+        while state.slots.iter().filter(|slot| matches!(slot.content, Content::Ready(_))).count()
+            < 3
+        {
             state = cache.shared.loaded.wait(state).unwrap();
         }
         drop(state);

@@ -52,7 +52,9 @@ pub enum DatasetError {
         problem: &'static str,
     },
     /// A camera whose lens cannot be turned into a pinhole.
-    #[error("{path}: {field}: {problem}; undistort the images first, e.g. with `colmap image_undistorter`")]
+    #[error(
+        "{path}: {field}: {problem}; undistort the images first, e.g. with `colmap image_undistorter`"
+    )]
     Lens {
         /// The file that holds the camera.
         path: PathBuf,
@@ -79,7 +81,9 @@ pub enum DatasetError {
         camera_height: u32,
     },
     /// An image that cannot be decoded.
-    #[error("cannot decode {path}: {problem}; convert it to an 8- or 16-bit PNG, JPEG or WebP of at most 16384 px a side")]
+    #[error(
+        "cannot decode {path}: {problem}; convert it to an 8- or 16-bit PNG, JPEG or WebP of at most 16384 px a side"
+    )]
     Image {
         /// The image.
         path: PathBuf,
@@ -87,7 +91,9 @@ pub enum DatasetError {
         problem: String,
     },
     /// An image that the dataset names is not there.
-    #[error("{path}: {field}: there is no file {image}; restore it, or name the folder that holds the images with --images")]
+    #[error(
+        "{path}: {field}: there is no file {image}; restore it, or name the folder that holds the images with --images"
+    )]
     MissingImage {
         /// The file that names it.
         path: PathBuf,
@@ -103,13 +109,17 @@ pub enum DatasetError {
         path: PathBuf,
     },
     /// The test split takes every view.
-    #[error("no view is left to train on: the test split takes all {views}; use a larger --test-every, or none")]
+    #[error(
+        "no view is left to train on: the test split takes all {views}; use a larger --test-every, or none"
+    )]
     NoTrainingViews {
         /// Number of views.
         views: usize,
     },
     /// Too many points are unusable.
-    #[error("{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction")]
+    #[error(
+        "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+    )]
     BadPoints {
         /// The file of the points.
         path: PathBuf,
@@ -134,6 +144,11 @@ impl DatasetError {
         problem: impl Into<String>,
         remedy: &'static str,
     ) -> Self {
-        Self::Malformed { path: path.to_owned(), field: field.into(), problem: problem.into(), remedy }
+        Self::Malformed {
+            path: path.to_owned(),
+            field: field.into(),
+            problem: problem.into(),
+            remedy,
+        }
     }
 }

@@ -32,9 +32,17 @@ pub(super) struct Found {
 }
 
 impl Folders {
-    pub(super) fn new(root: &Root, options: &LoadOptions, within_images: bool) -> Result<Self, DatasetError> {
+    pub(super) fn new(
+        root: &Root,
+        options: &LoadOptions,
+        within_images: bool,
+    ) -> Result<Self, DatasetError> {
         // A folder that the user names may lie anywhere; one that is not absolute lies in the dataset.
-        let chosen = options.images.as_ref().map(|folder| Root::new(&root.path().join(folder))).transpose()?;
+        let chosen = options
+            .images
+            .as_ref()
+            .map(|folder| Root::new(&root.path().join(folder)))
+            .transpose()?;
         let reduced = match options.resolution {
             Some(Resolution::Divisor(k)) if k > 1 && chosen.is_none() => {
                 let folder = root.path().join(format!("images_{k}"));
@@ -57,8 +65,8 @@ impl Folders {
             let mut fell_back = false;
             if let Some((folder, k)) = &self.reduced {
                 // The folder itself may be a link out of the dataset.
-                let from_root = format!("images_{k}/{within}");
-                self.root.existing(Named { value: &from_root, ..named })?;
+                let below_root = format!("images_{k}/{within}");
+                self.root.existing(Named { value: &below_root, ..named })?;
                 if let Some(path) = folder.existing(Named { value: &within, ..named })? {
                     return Ok(Some(Found { path, reduced: Some(*k), fell_back: false }));
                 }
@@ -67,7 +75,7 @@ impl Folders {
             let path = match &self.chosen {
                 Some(folder) => folder.existing(Named { value: &within, ..named })?,
                 None => {
-                    let value = self.from_root(named.value) + ending;
+                    let value = self.below_root(named.value) + ending;
                     self.root.existing(Named { value: &value, ..named })?
                 }
             };
@@ -82,7 +90,9 @@ impl Folders {
     pub(super) fn mask(&self, named: Named<'_>) -> Result<Option<PathBuf>, DatasetError> {
         let inside = self.inside_images(named.value);
         let stem = Path::new(&inside).with_extension("").to_string_lossy().into_owned();
-        for value in [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")] {
+        for value in
+            [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")]
+        {
             if let Some(path) = self.root.existing(Named { value: &value, ..named })? {
                 return Ok(Some(path));
             }
@@ -92,7 +102,11 @@ impl Folders {
 
     pub(super) fn missing(&self, named: Named<'_>) -> DatasetError {
         let folder = self.chosen.as_ref().unwrap_or(&self.root);
-        let within = if self.chosen.is_some() { self.inside_images(named.value) } else { self.from_root(named.value) };
+        let within = if self.chosen.is_some() {
+            self.inside_images(named.value)
+        } else {
+            self.below_root(named.value)
+        };
         DatasetError::MissingImage {
             path: named.file.to_owned(),
             field: named.field.to_owned(),
@@ -102,7 +116,10 @@ impl Folders {
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {
         let folder = self.reduced.as_ref().map(|(root, _)| root.path().display().to_string());
-        format!("{count} images are not in {} and are shrunk from the full size", folder.unwrap_or_default())
+        format!(
+            "{count} images are not in {} and are shrunk from the full size",
+            folder.unwrap_or_default()
+        )
     }
 
     fn inside_images(&self, value: &str) -> String {
@@ -113,7 +130,7 @@ impl Folders {
         }
     }
 
-    fn from_root(&self, value: &str) -> String {
+    fn below_root(&self, value: &str) -> String {
         let value = relative(value);
         if self.within_images { format!("images/{value}") } else { value }
     }

@@ -86,7 +86,8 @@ impl Image8 {
     /// No pixels yet, room for all, and the channels of `like`.
     pub(super) fn blank(width: u32, height: u32, like: &Self) -> Self {
         let pixels = width as usize * height as usize;
-        let channel = |channel: &Option<Vec<u8>>| channel.as_ref().map(|_| Vec::with_capacity(pixels));
+        let channel =
+            |channel: &Option<Vec<u8>>| channel.as_ref().map(|_| Vec::with_capacity(pixels));
         Self {
             width,
             height,
@@ -163,7 +164,13 @@ impl ImageSource {
 fn pack(decoded: DynamicImage) -> Image8 {
     let (width, height) = (decoded.width(), decoded.height());
     if !decoded.color().has_alpha() {
-        return Image8 { width, height, rgb: decoded.into_rgb8().into_raw(), alpha: None, mask: None };
+        return Image8 {
+            width,
+            height,
+            rgb: decoded.into_rgb8().into_raw(),
+            alpha: None,
+            mask: None,
+        };
     }
     let rgba = decoded.into_rgba8();
     let pixels = width as usize * height as usize;
@@ -229,8 +236,9 @@ fn header_of<R: std::io::BufRead + std::io::Seek>(
 
 fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
     let file = File::open(path).map_err(DatasetError::io(path))?;
-    let mut reader =
-        ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(DatasetError::io(path))?;
+    let mut reader = ImageReader::new(BufReader::new(file))
+        .with_guessed_format()
+        .map_err(DatasetError::io(path))?;
     reader.limits(limits());
     reader.decode().map_err(|problem| fault(path, problem))
 }
@@ -241,18 +249,58 @@ mod tests {
 
     fn source(path: PathBuf) -> ImageSource {
         let header = probe(&path).unwrap();
-        ImageSource { path, mask: None, width: header.width, height: header.height, undistortion: None, header }
+        ImageSource {
+            path,
+            mask: None,
+            width: header.width,
+            height: header.height,
+            undistortion: None,
+            header,
+        }
     }
 
     #[test]
     fn every_colour_type_packs_to_eight_bits() {
         let folder = tempfile::tempdir().unwrap();
         let cases: [(&str, DynamicImage, [u8; 3], Option<u8>); 5] = [
-            ("l8.png", DynamicImage::ImageLuma8(image::ImageBuffer::from_pixel(3, 2, [7].into())), [7; 3], None),
-            ("rgb16.png", DynamicImage::ImageRgb16(image::ImageBuffer::from_pixel(3, 2, [257, 65535, 0].into())), [1, 255, 0], None),
-            ("rgba.png", DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(3, 2, [1, 2, 3, 4].into())), [1, 2, 3], Some(4)),
-            ("opaque.png", DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(3, 2, [1, 2, 3, 255].into())), [1, 2, 3], None),
-            ("rgb.webp", DynamicImage::ImageRgb8(image::ImageBuffer::from_pixel(3, 2, [9, 8, 7].into())), [9, 8, 7], None),
+            (
+                "l8.png",
+                DynamicImage::ImageLuma8(image::ImageBuffer::from_pixel(3, 2, [7].into())),
+                [7; 3],
+                None,
+            ),
+            (
+                "rgb16.png",
+                DynamicImage::ImageRgb16(image::ImageBuffer::from_pixel(
+                    3,
+                    2,
+                    [257, 65535, 0].into(),
+                )),
+                [1, 255, 0],
+                None,
+            ),
+            (
+                "rgba.png",
+                DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(3, 2, [1, 2, 3, 4].into())),
+                [1, 2, 3],
+                Some(4),
+            ),
+            (
+                "opaque.png",
+                DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(
+                    3,
+                    2,
+                    [1, 2, 3, 255].into(),
+                )),
+                [1, 2, 3],
+                None,
+            ),
+            (
+                "rgb.webp",
+                DynamicImage::ImageRgb8(image::ImageBuffer::from_pixel(3, 2, [9, 8, 7].into())),
+                [9, 8, 7],
+                None,
+            ),
         ];
         for (name, image, rgb, alpha) in cases {
             let path = folder.path().join(name);
@@ -270,7 +318,9 @@ mod tests {
         let path = folder.path().join("a.png");
         image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
         let mask = folder.path().join("m.png");
-        image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into()).save(&mask).unwrap();
+        image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
+            .save(&mask)
+            .unwrap();
         let source = ImageSource { mask: Some(mask), width: 2, height: 2, ..source(path) };
         let loaded = source.load().unwrap();
         assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
@@ -283,7 +333,9 @@ mod tests {
     fn broken_and_oversized_files_are_errors_that_name_them() {
         let folder = tempfile::tempdir().unwrap();
         let good = folder.path().join("good.png");
-        image::RgbImage::from_fn(64, 64, |x, y| [x as u8 * 3, y as u8 * 5, (x * y) as u8].into()).save(&good).unwrap();
+        image::RgbImage::from_fn(64, 64, |x, y| [x as u8, y as u8, (x * y) as u8].into())
+            .save(&good)
+            .unwrap();
         let bytes = std::fs::read(&good).unwrap();
         let cut = folder.path().join("cut.png");
         std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
@@ -294,7 +346,9 @@ mod tests {
         huge[16..24].copy_from_slice(&[0, 1, 0x86, 0xa0, 0, 1, 0x86, 0xa0]);
         let crc = crc32(&huge[12..29]);
         huge[29..33].copy_from_slice(&crc.to_be_bytes());
-        for (name, contents) in [("huge.png", huge), ("text.jpg", b"not an image".to_vec()), ("empty.png", vec![])] {
+        for (name, contents) in
+            [("huge.png", huge), ("text.jpg", b"not an image".to_vec()), ("empty.png", vec![])]
+        {
             let path = folder.path().join(name);
             std::fs::write(&path, contents).unwrap();
             let message = probe(&path).unwrap_err().to_string();
@@ -305,7 +359,9 @@ mod tests {
 
     fn crc32(bytes: &[u8]) -> u32 {
         !bytes.iter().fold(!0u32, |crc, &byte| {
-            (0..8).fold(crc ^ u32::from(byte), |crc, _| (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg()))
+            (0..8).fold(crc ^ u32::from(byte), |crc, _| {
+                (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg())
+            })
         })
     }
 }

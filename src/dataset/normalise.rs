@@ -55,7 +55,11 @@ impl Normalisation {
         if unit <= SAME_PLACE * centre.length() {
             let mut distances: Vec<f64> = points.iter().map(|p| p.distance(centre)).collect();
             let middle = distances.len() / 2;
-            unit = if distances.is_empty() { 1.0 } else { *distances.select_nth_unstable_by(middle, f64::total_cmp).1 };
+            unit = if distances.is_empty() {
+                1.0
+            } else {
+                *distances.select_nth_unstable_by(middle, f64::total_cmp).1
+            };
         }
         let scale = 1.0 / unit;
         // A unit of zero, or one whose inverse is not a normal number, cannot be one.
@@ -100,7 +104,12 @@ impl Normalisation {
         self.mapped(world, self.scale.ln(), |mean| self.point(mean))
     }
 
-    fn mapped(&self, model: &Gaussians, ln_scale: f64, point: impl Fn(DVec3) -> DVec3) -> Gaussians {
+    fn mapped(
+        &self,
+        model: &Gaussians,
+        ln_scale: f64,
+        point: impl Fn(DVec3) -> DVec3,
+    ) -> Gaussians {
         if *self == Self::IDENTITY {
             return model.clone();
         }
@@ -129,6 +138,7 @@ impl Normalisation {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests {
     use glam::DMat3;
 
@@ -137,7 +147,16 @@ mod tests {
     fn camera(centre: DVec3) -> Camera {
         let rotation = DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(0.9);
         let (fx, fy, cx, cy) = (200.0, 210.0, 100.0, 80.0);
-        Camera { width: 200, height: 160, fx, fy, cx, cy, rotation, translation: rotation * -centre }
+        Camera {
+            width: 200,
+            height: 160,
+            fx,
+            fy,
+            cx,
+            cy,
+            rotation,
+            translation: rotation * -centre,
+        }
     }
 
     #[test]
@@ -175,7 +194,8 @@ mod tests {
 
     #[test]
     fn powers_of_two_change_no_bit_of_the_scene() {
-        let centres = [DVec3::new(0.3, 1.7, -2.0), DVec3::new(1.1, 0.2, 0.9), DVec3::new(-0.7, 0.4, 0.1)];
+        let centres =
+            [DVec3::new(0.3, 1.7, -2.0), DVec3::new(1.1, 0.2, 0.9), DVec3::new(-0.7, 0.4, 0.1)];
         let points = [DVec3::new(0.123, 4.5, -6.7)];
         let scene = |k: i32| {
             let by = 2f64.powi(k);

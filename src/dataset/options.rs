@@ -45,7 +45,9 @@ impl Split {
 
 /// A word that is no resolution.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} is no resolution: give 1, 2, 4 or 8 to divide the images' sides by, or a width in px above 8")]
+#[error(
+    "{0:?} is no resolution: give 1, 2, 4 or 8 to divide the images' sides by, or a width in px above 8"
+)]
 pub struct ParseResolutionError(String);
 
 impl FromStr for Resolution {

@@ -85,7 +85,10 @@ fn lexical_fault(value: &str) -> Option<&'static str> {
         Some("is longer than 4 KiB")
     } else if value.contains('\0') {
         Some("contains a NUL character")
-    } else if value.starts_with(['/', '\\']) || value.as_bytes().get(1) == Some(&b':') || value.starts_with("file:") {
+    } else if value.starts_with(['/', '\\'])
+        || value.as_bytes().get(1) == Some(&b':')
+        || value.starts_with("file:")
+    {
         Some("is absolute")
     } else if parts().any(|part| part == "..") {
         Some("contains `..`")
@@ -107,10 +110,23 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let root = Root::new(folder.path()).unwrap();
         let long = "a".repeat(5000);
-        for bad in
-            ["", "./", "/etc/passwd", "../a", "a/../../b", "a\\..\\b", "C:\\a", "\\\\host\\a", "file:///a", "a\0b", &long]
-        {
-            assert!(matches!(root.join(named(bad)), Err(DatasetError::UnsafePath { .. })), "{bad:?}");
+        for bad in [
+            "",
+            "./",
+            "/etc/passwd",
+            "../a",
+            "a/../../b",
+            "a\\..\\b",
+            "C:\\a",
+            "\\\\host\\a",
+            "file:///a",
+            "a\0b",
+            &long,
+        ] {
+            assert!(
+                matches!(root.join(named(bad)), Err(DatasetError::UnsafePath { .. })),
+                "{bad:?}"
+            );
         }
         assert_eq!(root.join(named("./a//b.png")).unwrap(), folder.path().join("a/b.png"));
         assert_eq!(root.existing(named("a/b.png")).unwrap(), None);

@@ -29,7 +29,9 @@ pub(super) fn checked_pose(
     let error = (rotation.transpose() * rotation - DMat3::IDENTITY).to_cols_array();
     let error = error.iter().fold(0.0, |largest: f64, e| largest.max(e.abs()));
     if error > ROTATION_TOLERANCE {
-        return fault(format!("the rotation is not orthonormal: |RᵀR − I| = {error:.3e} > {ROTATION_TOLERANCE:e}"));
+        return fault(format!(
+            "the rotation is not orthonormal: |RᵀR − I| = {error:.3e} > {ROTATION_TOLERANCE:e}"
+        ));
     }
     if rotation.determinant() < 0.0 {
         return fault("the rotation is a reflection (determinant −1)".into());
@@ -43,9 +45,13 @@ pub(super) fn checked_pose(
 }
 
 /// The rotation of a quaternion (w, x, y, z) of unit length, checked.
-pub(super) fn checked_quaternion(file: &Path, frame: &str, q: [f64; 4]) -> Result<DMat3, DatasetError> {
+pub(super) fn checked_quaternion(
+    file: &Path,
+    frame: &str,
+    q: [f64; 4],
+) -> Result<DMat3, DatasetError> {
     let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
-    if !((norm - 1.0).abs() <= ROTATION_TOLERANCE) {
+    if !norm.is_finite() || (norm - 1.0).abs() > ROTATION_TOLERANCE {
         let problem = format!("the quaternion {q:?} has length {norm} instead of 1");
         return Err(DatasetError::malformed(file, frame, problem, POSE_REMEDY));
     }
@@ -87,7 +93,8 @@ mod tests {
     #[test]
     fn a_slightly_skewed_rotation_is_repaired_and_a_skewed_one_refused() {
         let exact = DMat3::from_rotation_y(0.7) * DMat3::from_rotation_x(-0.2);
-        let skew = |amount: f64| exact * DMat3::from_diagonal(DVec3::new(1.0 + amount, 1.0, 1.0 - amount));
+        let skew =
+            |amount: f64| exact * DMat3::from_diagonal(DVec3::new(1.0 + amount, 1.0, 1.0 - amount));
         let check = |r| checked_pose(Path::new("f"), "frame 3", r, DVec3::ZERO);
         let (repaired, _) = check(skew(4e-4)).unwrap();
         let left = repaired.transpose() * repaired - DMat3::IDENTITY;
@@ -97,7 +104,9 @@ mod tests {
             let message = check(bad).unwrap_err().to_string();
             assert!(message.contains("frame 3"), "{message}");
         }
-        assert!(checked_pose(Path::new("f"), "g", exact, DVec3::new(0.0, f64::INFINITY, 0.0)).is_err());
+        assert!(
+            checked_pose(Path::new("f"), "g", exact, DVec3::new(0.0, f64::INFINITY, 0.0)).is_err()
+        );
     }
 
     #[test]

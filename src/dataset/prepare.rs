@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::error::DatasetError;
@@ -14,7 +15,11 @@ use crate::camera::Camera;
 const MAX_BAD_POINTS: f64 = 0.01;
 
 /// Checks every frame, splits, and moves all into normalised coordinates.
-pub(super) fn dataset(path: &Path, scene: Scene, options: &LoadOptions) -> Result<Dataset, DatasetError> {
+pub(super) fn dataset(
+    path: &Path,
+    scene: Scene,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
     let Scene { listing, mut frames, mut points, points_file, own_split, mut notes } = scene;
     // Bytewise, as the field sorts names for its test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
@@ -38,27 +43,38 @@ pub(super) fn dataset(path: &Path, scene: Scene, options: &LoadOptions) -> Resul
     let (mut train, mut test) = (Vec::new(), Vec::new());
     for (index, (view, frame)) in views.into_iter().zip(&frames).enumerate() {
         let held_out = every.map_or(frame.held_out, |every| index % every == 0);
-        if held_out { test.push(view) } else { train.push(view) }
+        if held_out {
+            test.push(view);
+        } else {
+            train.push(view);
+        }
     }
     if train.is_empty() {
         return Err(DatasetError::NoTrainingViews { views: count });
     }
 
     let points_path = points_file.as_deref().unwrap_or(path);
-    drop_bad(points_path, &mut points, &mut notes, "finite", |p| p.is_finite())?;
+    drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
     let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
             let problem = "the camera is too far from the others";
-            return Err(DatasetError::malformed(&listing, &view.name, problem, "repair the pose or remove the frame"));
+            return Err(DatasetError::malformed(
+                &listing,
+                &view.name,
+                problem,
+                "repair the pose or remove the frame",
+            ));
         }
     }
     for position in &mut points.positions {
         *position = normalisation.point(*position);
     }
-    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| p.as_vec3().is_finite())?;
+    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
+        p.as_vec3().is_finite()
+    })?;
     Ok(Dataset { root: path.to_owned(), train, test, points, normalisation, notes })
 }
 
@@ -66,7 +82,12 @@ fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetErro
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
             let problem = "the image is listed twice";
-            return Err(DatasetError::malformed(listing, &pair[0].name, problem, "remove one of the two"));
+            return Err(DatasetError::malformed(
+                listing,
+                &pair[0].name,
+                problem,
+                "remove one of the two",
+            ));
         }
     }
     Ok(())
@@ -77,7 +98,7 @@ fn drop_bad(
     points: &mut PointCloud,
     notes: &mut Vec<String>,
     what: &str,
-    keep: impl Fn(glam::DVec3) -> bool,
+    keep: impl Fn(DVec3) -> bool,
 ) -> Result<(), DatasetError> {
     let total = points.len();
     let bad = points.retain(keep);
@@ -85,7 +106,10 @@ fn drop_bad(
         return Err(DatasetError::BadPoints { path: path.to_owned(), bad, total });
     }
     if bad > 0 {
-        notes.push(format!("{}: {bad} of {total} points are not {what} and are dropped", path.display()));
+        notes.push(format!(
+            "{}: {bad} of {total} points are not {what} and are dropped",
+            path.display()
+        ));
     }
     Ok(())
 }
@@ -94,13 +118,14 @@ fn drop_bad(
 fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetError> {
     let header = images::probe(&frame.image)?;
     let lens = &frame.lens;
-    let size_fault = |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
-        path: path.to_owned(),
-        width: found.width,
-        height: found.height,
-        camera_width: width,
-        camera_height: height,
-    };
+    let size_fault =
+        |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
+            path: path.to_owned(),
+            width: found.width,
+            height: found.height,
+            camera_width: width,
+            camera_height: height,
+        };
     let k = frame.reduced.unwrap_or(1);
     let fits = match frame.reduced {
         Some(k) => {
@@ -110,7 +135,12 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
         None => proportional((header.width, header.height), (lens.width, lens.height)),
     };
     if !fits {
-        return Err(size_fault(&frame.image, header, divided(lens.width, k), divided(lens.height, k)));
+        return Err(size_fault(
+            &frame.image,
+            header,
+            divided(lens.width, k),
+            divided(lens.height, k),
+        ));
     }
     if let Some(mask) = &frame.mask {
         let found = images::probe(mask)?;
@@ -157,7 +187,9 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
 /// The size to train at.
 fn target_size(header: &ImageHeader, resolution: Option<Resolution>, reduced: bool) -> (u32, u32) {
     match resolution {
-        Some(Resolution::Divisor(k)) if !reduced => (divided(header.width, k), divided(header.height, k)),
+        Some(Resolution::Divisor(k)) if !reduced => {
+            (divided(header.width, k), divided(header.height, k))
+        }
         Some(Resolution::Width(width)) if width < header.width => {
             let height = f64::from(header.height) * f64::from(width) / f64::from(header.width);
             (width.max(1), (height.round() as u32).max(1))

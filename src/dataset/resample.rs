@@ -106,7 +106,8 @@ fn shares(from: u32, to: u32) -> Vec<Share> {
     let scale = f64::from(from) / f64::from(to);
     (0..to)
         .map(|i| {
-            let (low, high) = (f64::from(i) * scale, (f64::from(i + 1) * scale).min(f64::from(from)));
+            let (low, high) =
+                (f64::from(i) * scale, (f64::from(i + 1) * scale).min(f64::from(from)));
             let first = (low as u32).min(from - 1);
             let last = ((high.ceil() as u32).max(first + 1) - 1).min(from - 1);
             let first_end = f64::from(first + 1).min(high);
@@ -146,7 +147,8 @@ mod tests {
 
     #[test]
     fn uncovered_colour_does_not_bleed() {
-        let image = Image8 { alpha: Some(vec![255, 0]), mask: Some(vec![0, 255]), ..grey(2, 1, &[200, 0]) };
+        let image =
+            Image8 { alpha: Some(vec![255, 0]), mask: Some(vec![0, 255]), ..grey(2, 1, &[200, 0]) };
         let out = shrink(&image, 1, 1);
         assert_eq!(out.rgb, [200; 3]);
         assert_eq!(out.alpha, Some(vec![128]));

@@ -26,7 +26,8 @@ const REMEDY: &str = "correct the file or export it again";
 /// file: 3DGS and nerfstudio.
 const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
 /// Camera models that are a pinhole with k1, k2, p1, p2.
-const PINHOLES: [&str; 6] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"];
+const PINHOLES: [&str; 6] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"];
 
 /// The pair of files that brings its own test split.
 pub(super) const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
@@ -117,10 +118,15 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     if let Some(value) = top.text("ply_file_path")? {
         let named = Named { file: &path, field: "ply_file_path", value };
         let found = root.existing(named)?;
-        points_file = Some(found.ok_or_else(|| top.fault("ply_file_path", format!("there is no file {value:?}")))?);
+        points_file =
+            Some(found.ok_or_else(|| {
+                top.fault("ply_file_path", format!("there is no file {value:?}"))
+            })?);
     } else if !held_out {
         for value in POINT_FILES {
-            if let Some(found) = root.existing(Named { file: &path, field: "initial points", value })? {
+            if let Some(found) =
+                root.existing(Named { file: &path, field: "initial points", value })?
+            {
                 notes.push(format!("initial points are taken from {value}"));
                 points_file = Some(found);
                 break;
@@ -142,7 +148,8 @@ fn parse(path: &Path) -> Result<Value, DatasetError> {
         return Err(DatasetError::malformed(path, "the file", "it is larger than 64 MiB", REMEDY));
     }
     // serde_json says line and column.
-    serde_json::from_slice(&text).map_err(|e| DatasetError::malformed(path, "JSON", e.to_string(), REMEDY))
+    serde_json::from_slice(&text)
+        .map_err(|e| DatasetError::malformed(path, "JSON", e.to_string(), REMEDY))
 }
 
 /// One frame's fields, with those at the top as defaults.
@@ -181,12 +188,16 @@ impl<'a> Fields<'a> {
     }
 
     fn number(&self, field: &str) -> Result<Option<f64>, DatasetError> {
-        let Some(value) = self.inherited(field) else { return Ok(None) };
+        let Some(value) = self.inherited(field) else {
+            return Ok(None);
+        };
         value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is no number"))
     }
 
     fn side(&self, field: &str) -> Result<Option<u32>, DatasetError> {
-        let Some(value) = self.number(field)? else { return Ok(None) };
+        let Some(value) = self.number(field)? else {
+            return Ok(None);
+        };
         if value >= 1.0 && value <= f64::from(u32::MAX) && value.fract().abs() < f64::EPSILON {
             return Ok(Some(value as u32));
         }
@@ -212,7 +223,8 @@ impl<'a> Fields<'a> {
         let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
         let world_from_camera = DMat3::from_cols(column(0), -column(1), -column(2));
         let frame = format!("{} ({file})", self.full(FIELD));
-        let (rotation, centre) = checked_pose(self.path, &frame, world_from_camera.transpose(), column(3))?;
+        let (rotation, centre) =
+            checked_pose(self.path, &frame, world_from_camera.transpose(), column(3))?;
         Ok((rotation, -(rotation * centre)))
     }
 
@@ -232,7 +244,9 @@ impl<'a> Fields<'a> {
         let fx = match (self.number("fl_x")?, self.number("camera_angle_x")?) {
             (Some(fx), _) => fx,
             (None, Some(angle)) => from_angle(width, angle),
-            (None, None) => return Err(self.fault("fl_x", "neither fl_x nor camera_angle_x is there")),
+            (None, None) => {
+                return Err(self.fault("fl_x", "neither fl_x nor camera_angle_x is there"));
+            }
         };
         let fy = match (self.number("fl_y")?, self.number("camera_angle_y")?) {
             (Some(fy), _) => fy,
@@ -258,9 +272,13 @@ impl<'a> Fields<'a> {
             problem,
         };
         if let Some(model) = self.inherited("camera_model") {
-            let model = model.as_str().ok_or_else(|| self.fault("camera_model", "it is no string"))?;
+            let model =
+                model.as_str().ok_or_else(|| self.fault("camera_model", "it is no string"))?;
             if !PINHOLES.contains(&model) {
-                return Err(refusal("camera_model", format!("{model:?} is not one of {}", PINHOLES.join(", "))));
+                return Err(refusal(
+                    "camera_model",
+                    format!("{model:?} is not one of {}", PINHOLES.join(", ")),
+                ));
             }
         }
         if self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false)) {
@@ -269,7 +287,10 @@ impl<'a> Fields<'a> {
         for field in ["k3", "k4", "k5", "k6"] {
             let value = self.number(field)?.unwrap_or(0.0);
             if value != 0.0 {
-                return Err(refusal(field, format!("{value} is a term that is not supported (k1, k2, p1, p2 are)")));
+                return Err(refusal(
+                    field,
+                    format!("{value} is a term that is not supported (k1, k2, p1, p2 are)"),
+                ));
             }
         }
         Ok(())

@@ -58,7 +58,13 @@ impl Lens {
             f64::from(width) / f64::from(self.width),
             f64::from(height) / f64::from(self.height),
         );
-        Self { width, height, focal: self.focal * scale, principal: self.principal * scale, ..*self }
+        Self {
+            width,
+            height,
+            focal: self.focal * scale,
+            principal: self.principal * scale,
+            ..*self
+        }
     }
 
     /// Where the lens moves the point (x/z, y/z) of the image plane to.
@@ -100,7 +106,7 @@ impl Lens {
             let mut converged = false;
             for _ in 0..20 {
                 let jacobian = self.distort_jacobian(p);
-                if !(jacobian.determinant() > 1e-6) {
+                if !keeps_orientation(jacobian) {
                     return Err(NotInvertible);
                 }
                 let change = jacobian.inverse() * (goal - self.distort(p));
@@ -112,7 +118,7 @@ impl Lens {
                 }
             }
             // Folding shows as a Jacobian that is not positive, or as no convergence.
-            if !converged || !p.is_finite() || !(self.distort_jacobian(p).determinant() > 1e-6) {
+            if !converged || !p.is_finite() || !keeps_orientation(self.distort_jacobian(p)) {
                 return Err(NotInvertible);
             }
         }
@@ -144,6 +150,12 @@ impl Lens {
     }
 }
 
+/// Whether the map has an inverse nearby on the branch of the principal point, where the
+/// determinant is 1. At 1e-6 areas shrink a million times: no lens images so.
+fn keeps_orientation(jacobian: DMat2) -> bool {
+    jacobian.determinant() > 1e-6
+}
+
 impl Undistortion {
     /// The pinhole resampled to.
     #[must_use]
@@ -166,7 +178,8 @@ impl Undistortion {
         for y in 0..height {
             for x in 0..width {
                 let at = self.source_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)) - 0.5;
-                let at = at.clamp(DVec2::ZERO, DVec2::new(f64::from(width - 1), f64::from(height - 1)));
+                let at =
+                    at.clamp(DVec2::ZERO, DVec2::new(f64::from(width - 1), f64::from(height - 1)));
                 let (x0, y0) = (at.x as u32, at.y as u32);
                 let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
                 let (tx, ty) = ((at.x - f64::from(x0)) as f32, (at.y - f64::from(y0)) as f32);
@@ -187,11 +200,21 @@ mod tests {
     use super::*;
 
     fn lens(distortion: [f64; 4]) -> Lens {
-        Lens { width: 288, height: 192, focal: DVec2::new(210.0, 214.0), principal: DVec2::new(150.0, 92.0), distortion }
+        Lens {
+            width: 288,
+            height: 192,
+            focal: DVec2::new(210.0, 214.0),
+            principal: DVec2::new(150.0, 92.0),
+            distortion,
+        }
     }
 
-    const LENSES: [[f64; 4]; 4] =
-        [[0.058, -0.08, -9.8e-4, 1.6e-4], [-0.12, 0.02, 0.0, 0.0], [0.3, 0.0, 2e-3, -3e-3], [0.0, 0.0, 0.0, 1e-3]];
+    const LENSES: [[f64; 4]; 4] = [
+        [0.058, -0.08, -9.8e-4, 1.6e-4],
+        [-0.12, 0.02, 0.0, 0.0],
+        [0.3, 0.0, 2e-3, -3e-3],
+        [0.0, 0.0, 0.0, 1e-3],
+    ];
 
     #[test]
     fn undistortion_inverts_distortion() {
@@ -199,7 +222,8 @@ mod tests {
             let lens = lens(k);
             for (x, y) in [(0.0, 0.0), (288.0, 0.0), (13.5, 190.0), (150.0, 92.0), (288.0, 192.0)] {
                 let pixel = DVec2::new(x, y);
-                let back = lens.distort(lens.undistort(pixel).unwrap()) * lens.focal + lens.principal;
+                let back =
+                    lens.distort(lens.undistort(pixel).unwrap()) * lens.focal + lens.principal;
                 assert!((back - pixel).length() < 1e-9, "{k:?} at {pixel}: {back}");
             }
         }
@@ -223,7 +247,12 @@ mod tests {
             let mut slack = [f64::INFINITY; 4];
             for i in 0..=500 {
                 let (u, v) = (288.0 * f64::from(i) / 500.0, 192.0 * f64::from(i) / 500.0);
-                for pixel in [DVec2::new(u, 0.0), DVec2::new(u, 192.0), DVec2::new(0.0, v), DVec2::new(288.0, v)] {
+                for pixel in [
+                    DVec2::new(u, 0.0),
+                    DVec2::new(u, 192.0),
+                    DVec2::new(0.0, v),
+                    DVec2::new(288.0, v),
+                ] {
                     let s = undistortion.source_of(pixel);
                     let inside = [s.x, s.y, 288.0 - s.x, 192.0 - s.y];
                     assert!(inside.iter().all(|&d| d > -0.01), "{k:?} at {pixel}: {s}");
@@ -236,7 +265,12 @@ mod tests {
 
     #[test]
     fn a_distortion_that_folds_over_is_refused() {
-        for k in [[-1.5, 0.0, 0.0, 0.0], [0.0, -4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [f64::NAN, 0.0, 0.0, 0.0]] {
+        for k in [
+            [-1.5, 0.0, 0.0, 0.0],
+            [0.0, -4.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0],
+            [f64::NAN, 0.0, 0.0, 0.0],
+        ] {
             assert_eq!(lens(k).undistortion(), Err(NotInvertible), "{k:?}");
         }
         let aside = Lens { principal: DVec2::new(-40.0, 92.0), ..lens(LENSES[0]) };
@@ -251,7 +285,13 @@ mod tests {
             let lens = lens(k);
             let undistortion = lens.undistortion().unwrap();
             let pinhole = undistortion.pinhole();
-            let mut image = Image8 { width: 288, height: 192, rgb: vec![0; 288 * 192 * 3], alpha: None, mask: None };
+            let mut image = Image8 {
+                width: 288,
+                height: 192,
+                rgb: vec![0; 288 * 192 * 3],
+                alpha: None,
+                mask: None,
+            };
             let mut expected = Vec::new();
             for (i, j) in (0..7).flat_map(|i| (0..5).map(move |j| (i, j))) {
                 let pixel = DVec2::new(30.0 + 38.0 * f64::from(i), 24.0 + 36.0 * f64::from(j));
@@ -260,7 +300,8 @@ mod tests {
                 let dot = lens.distort(ray) * lens.focal + lens.principal;
                 for (index, rgb) in image.rgb.chunks_exact_mut(3).enumerate() {
                     let centre = DVec2::new((index % 288) as f64 + 0.5, (index / 288) as f64 + 0.5);
-                    let value = 255.0 * (-(centre - dot).length_squared() / (2.0 * 2.5 * 2.5)).exp();
+                    let value =
+                        255.0 * (-(centre - dot).length_squared() / (2.0 * 1.5 * 1.5)).exp();
                     rgb.fill(rgb[0].max(value.round() as u8));
                 }
             }
@@ -269,7 +310,7 @@ mod tests {
                 let (mut sum, mut moment) = (0.0, DVec2::ZERO);
                 for (index, rgb) in out.rgb.chunks_exact(3).enumerate() {
                     let centre = DVec2::new((index % 288) as f64 + 0.5, (index / 288) as f64 + 0.5);
-                    if (centre - pixel).length() < 9.0 {
+                    if (centre - pixel).length() < 7.0 {
                         sum += f64::from(rgb[0]);
                         moment += centre * f64::from(rgb[0]);
                     }

@@ -11,7 +11,7 @@ use crate::dataset::PointCloud;
 /// cube of ±1.3 for NeRF-synthetic scenes, whose cameras are 4.03 away.
 const CUBE: f64 = 1.0 / 3.0;
 /// Depths of the surroundings, in distances of the cameras from their focus.
-const BEYOND: (f64, f64) = (0.5, 4.0);
+const BEYOND: (f64, f64) = (2.0 / 3.0, 4.0);
 /// Depths in scenes without a focus [scene units]; the rig's radius is 1.
 const AROUND: (f64, f64) = (0.25, 5.0);
 /// Colours are drawn from the middle half, where no channel is near its clamp.
@@ -33,12 +33,16 @@ pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u
             Some((centre, distance)) if !background || index % 2 == 0 || cameras.is_empty() => {
                 centre + (2.0 * draw.unit3() - 1.0) * (CUBE * distance)
             }
-            Some((_, distance)) => seen(&mut draw, cameras, (BEYOND.0 * distance, BEYOND.1 * distance)),
+            Some((_, distance)) => {
+                seen(&mut draw, cameras, (BEYOND.0 * distance, BEYOND.1 * distance))
+            }
             None if cameras.is_empty() => 2.0 * draw.unit3() - 1.0,
             None => seen(&mut draw, cameras, AROUND),
         };
         points.positions.push(position);
-        points.colours.push((draw.unit3() * f64::from(COLOURS.1)).to_array().map(|v| COLOURS.0 + v as u8));
+        points
+            .colours
+            .push((draw.unit3() * f64::from(COLOURS.1)).to_array().map(|v| COLOURS.0 + v as u8));
     }
     points
 }
@@ -49,7 +53,8 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let axis = camera.forward();
-        let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+        let across =
+            DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
         normal += across;
         right += across * camera.centre();
     }
@@ -66,7 +71,11 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
             let offset = focus - camera.centre();
             let depth = offset.dot(camera.forward());
             // Behind the camera is missed by any measure.
-            let miss = if depth > 0.0 { (offset - depth * camera.forward()).length() } else { f64::INFINITY };
+            let miss = if depth > 0.0 {
+                (offset - depth * camera.forward()).length()
+            } else {
+                f64::INFINITY
+            };
             (offset.length(), miss)
         })
         .unzip();
@@ -81,7 +90,8 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
 /// A point in view of one of the cameras.
 fn seen(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
     let camera = &cameras[((draw.unit() * cameras.len() as f64) as usize).min(cameras.len() - 1)];
-    let pixel = DVec2::new(draw.unit() * f64::from(camera.width), draw.unit() * f64::from(camera.height));
+    let pixel =
+        DVec2::new(draw.unit() * f64::from(camera.width), draw.unit() * f64::from(camera.height));
     let depth = 1.0 / (1.0 / far + draw.unit() * (1.0 / near - 1.0 / far));
     let ray = DVec3::new((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy, 1.0);
     camera.rotation.transpose() * (depth * ray - camera.translation)

@@ -134,32 +134,51 @@ impl Header {
                     });
                 }
                 _ if encoding.is_none() => {
-                    return Err(lines.fault("expected `format ascii|binary_little_endian|binary_big_endian 1.0`"));
+                    return Err(lines.fault(
+                        "expected `format ascii|binary_little_endian|binary_big_endian 1.0`",
+                    ));
                 }
                 ["element", name, rows] => {
-                    let rows = rows.bytes().all(|b| b.is_ascii_digit()).then(|| rows.parse().ok()).flatten();
+                    let rows = rows
+                        .bytes()
+                        .all(|b| b.is_ascii_digit())
+                        .then(|| rows.parse().ok())
+                        .flatten();
                     let rows = rows.filter(|&rows| rows < MAX_ROWS);
-                    let rows = rows.ok_or_else(|| lines.fault("the number of rows is none, or above 2^32"))?;
+                    let rows = rows
+                        .ok_or_else(|| lines.fault("the number of rows is none, or above 2^32"))?;
                     if elements.iter().any(|element| element.name == name) {
                         return Err(lines.fault(format!("the element {name:?} occurs twice")));
                     }
                     elements.push(Element { name: name.to_owned(), rows, properties: Vec::new() });
                 }
                 ["property", "list", length, kind, name] => {
-                    let length = Scalar::parse(length).filter(|s| !matches!(s, Scalar::F32 | Scalar::F64));
+                    let length =
+                        Scalar::parse(length).filter(|s| !matches!(s, Scalar::F32 | Scalar::F64));
                     let (Some(length), Some(kind)) = (length, Scalar::parse(kind)) else {
                         return Err(lines.fault("a type is unknown, or a list's length no integer"));
                     };
-                    lines.push(&mut elements, Property { name: name.to_owned(), kind, list: Some(length) })?;
+                    lines.push(
+                        &mut elements,
+                        Property { name: name.to_owned(), kind, list: Some(length) },
+                    )?;
                 }
                 ["property", kind, name] => {
                     let Some(kind) = Scalar::parse(kind) else {
                         return Err(lines.fault(format!("the type {kind:?} is unknown")));
                     };
-                    lines.push(&mut elements, Property { name: name.to_owned(), kind, list: None })?;
+                    lines.push(
+                        &mut elements,
+                        Property { name: name.to_owned(), kind, list: None },
+                    )?;
                 }
                 ["end_header"] => break,
-                _ => return Err(lines.fault(format!("{:?} is no header line", line.trim().chars().take(60).collect::<String>()))),
+                _ => {
+                    return Err(lines.fault(format!(
+                        "{:?} is no header line",
+                        line.trim().chars().take(60).collect::<String>()
+                    )));
+                }
             }
         }
         let encoding = encoding.ok_or_else(|| lines.fault("there is no `format` line"))?;
@@ -183,7 +202,8 @@ impl<R: BufRead> Lines<'_, R> {
         let mut line = Vec::new();
         self.number += 1;
         let room = MAX_HEADER.saturating_sub(self.read);
-        let read = self.input.take(room).read_until(b'\n', &mut line).map_err(PlyError::io(self.path))?;
+        let read =
+            self.input.take(room).read_until(b'\n', &mut line).map_err(PlyError::io(self.path))?;
         self.read += read as u64;
         if line.last() != Some(&b'\n') && line.trim_ascii() != b"end_header" {
             return Err(self.fault("the header ends without `end_header`, or is longer than 1 MiB"));

@@ -55,7 +55,9 @@ pub enum PlyError {
         path: PathBuf,
     },
     /// Too many rows are unusable.
-    #[error("{path}: {bad} of {total} rows are not finite, more than 1 %; the file is damaged: export it again")]
+    #[error(
+        "{path}: {bad} of {total} rows are not finite, more than 1 %; the file is damaged: export it again"
+    )]
     NotFinite {
         /// The file.
         path: PathBuf,
@@ -77,4 +79,5 @@ impl PlyError {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests;

@@ -26,9 +26,12 @@ pub fn read_points(path: &Path) -> Result<PointCloud, PlyError> {
             PlyError::Missing { path: path.to_owned(), property: axis.to_owned(), remedy }
         })?);
     }
-    let channels: [Option<usize>; 3] =
-        [["red", "diffuse_red", "r"], ["green", "diffuse_green", "g"], ["blue", "diffuse_blue", "b"]]
-            .map(|names| vertices.find(&names));
+    let channels: [Option<usize>; 3] = [
+        ["red", "diffuse_red", "r"],
+        ["green", "diffuse_green", "g"],
+        ["blue", "diffuse_blue", "b"],
+    ]
+    .map(|names| vertices.find(&names));
     let mut full = [1.0; 3];
     if let [Some(r), Some(g), Some(b)] = channels {
         full = [r, g, b].map(|column| vertices.properties[column].kind.full());

@@ -33,7 +33,9 @@ impl<'a> Ply<'a> {
     /// The element of this name.
     pub(super) fn element(&self, name: &str) -> Result<Element, PlyError> {
         let found = self.header.elements.iter().find(|element| element.name == name).cloned();
-        found.ok_or_else(|| PlyError::malformed(self.path, "header", format!("there is no element {name:?}")))
+        found.ok_or_else(|| {
+            PlyError::malformed(self.path, "header", format!("there is no element {name:?}"))
+        })
     }
 
     /// Calls `each` with the values of `columns` for every row of `wanted`, after skipping the
@@ -54,7 +56,11 @@ impl<'a> Ply<'a> {
     }
 
     fn fault(&self, element: &Element, row: u64, problem: impl Into<String>) -> PlyError {
-        PlyError::malformed(self.path, format!("{} {row} of {}", element.name, element.rows), problem)
+        PlyError::malformed(
+            self.path,
+            format!("{} {row} of {}", element.name, element.rows),
+            problem,
+        )
     }
 
     fn rows(
@@ -67,8 +73,15 @@ impl<'a> Ply<'a> {
         let least = element.least_bytes(encoding);
         // The last number of an ascii file needs no separator.
         if element.rows.saturating_mul(least) > self.data + 1 {
-            let problem = format!("{} rows need {least} bytes each, but the file holds {}", element.rows, self.data);
-            return Err(PlyError::malformed(self.path, format!("element {}", element.name), problem));
+            let problem = format!(
+                "{} rows need {least} bytes each, but the file holds {}",
+                element.rows, self.data
+            );
+            return Err(PlyError::malformed(
+                self.path,
+                format!("element {}", element.name),
+                problem,
+            ));
         }
         if least == 0 {
             return Ok(());
@@ -93,7 +106,13 @@ impl<'a> Ply<'a> {
         Ok(())
     }
 
-    fn skip_list(&mut self, element: &Element, row: u64, length: Scalar, kind: Scalar) -> Result<(), PlyError> {
+    fn skip_list(
+        &mut self,
+        element: &Element,
+        row: u64,
+        length: Scalar,
+        kind: Scalar,
+    ) -> Result<(), PlyError> {
         let length = self.scalar(element, row, length)?;
         if !(0.0..=f64::from(u32::MAX)).contains(&length) {
             return Err(self.fault(element, row, format!("a list of length {length}")));
@@ -146,7 +165,9 @@ impl<'a> Ply<'a> {
             let buffer = match self.input.fill_buf() {
                 Ok(buffer) => buffer,
                 Err(source) if source.kind() == ErrorKind::Interrupted => continue,
-                Err(source) => return Err(PlyError::Io { path: self.path.to_owned(), source }),
+                Err(source) => {
+                    return Err(PlyError::Io { path: self.path.to_owned(), source });
+                }
             };
             let at_end = buffer.is_empty();
             let mut used = 0;
@@ -155,7 +176,11 @@ impl<'a> Ply<'a> {
                 used += 1;
                 if !byte.is_ascii_whitespace() {
                     if length == MAX_WORD {
-                        return Err(self.fault(element, row, "a number is longer than 128 characters"));
+                        return Err(self.fault(
+                            element,
+                            row,
+                            "a number is longer than 128 characters",
+                        ));
                     }
                     word[length] = byte;
                     length += 1;

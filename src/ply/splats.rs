@@ -44,7 +44,8 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
     let vertices = ply.element("vertex")?;
     let sh_degree = degree(path, &vertices)?;
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
-    let columns = layout(rest).map(|name| column(path, &vertices, &name)).collect::<Result<Vec<_>, _>>()?;
+    let columns =
+        layout(rest).map(|name| column(path, &vertices, &name)).collect::<Result<Vec<_>, _>>()?;
 
     let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
     let (mut total, mut dropped, mut repaired) = (0, 0, 0);
@@ -69,7 +70,8 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
 /// The properties that carry a row, without the normals, in the order of [`push`].
 fn layout(rest: usize) -> impl Iterator<Item = String> {
     let named = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
-    let numbered = |prefix: &str, count: usize| (0..count).map(|i| format!("{prefix}{i}")).collect::<Vec<_>>();
+    let numbered =
+        |prefix: &str, count: usize| (0..count).map(|i| format!("{prefix}{i}")).collect::<Vec<_>>();
     [
         named(&["x", "y", "z"]),
         numbered("f_dc_", 3),
@@ -126,7 +128,8 @@ fn degree(path: &Path, vertices: &Element) -> Result<u8, PlyError> {
 /// What `out` says.
 pub fn write_splats(model: &Gaussians, out: &mut impl Write) -> io::Result<()> {
     let coefficients = sh_coefficients(model.sh_degree);
-    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", model.len());
+    let mut header =
+        format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", model.len());
     for (index, name) in layout(3 * (coefficients - 1)).enumerate() {
         if index == 3 {
             for normal in ["nx", "ny", "nz"] {

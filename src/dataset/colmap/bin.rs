@@ -39,7 +39,10 @@ impl<'a> Reader<'a> {
     /// Counts bytes as read, if there are so many.
     fn claim(&mut self, field: &str, bytes: u64) -> Result<(), DatasetError> {
         if bytes > self.left {
-            let problem = format!("the file ends here: {bytes} bytes needed, {} left (truncated?)", self.left);
+            let problem = format!(
+                "the file ends here: {bytes} bytes needed, {} left (truncated?)",
+                self.left
+            );
             return Err(self.fault(field, problem));
         }
         self.left -= bytes;
@@ -86,7 +89,11 @@ impl<'a> Reader<'a> {
     fn count(&mut self, what: &str, size: u64, most: u64) -> Result<u64, DatasetError> {
         let count = self.u64(what)?;
         if count > most || count > self.left / size {
-            let problem = format!("the file says {count}, but the {} bytes that follow hold at most {}", self.left, self.left / size);
+            let problem = format!(
+                "the file says {count}, but the {} bytes that follow hold at most {}",
+                self.left,
+                self.left / size
+            );
             return Err(self.fault(what, problem));
         }
         Ok(count)
@@ -108,7 +115,10 @@ impl<'a> Reader<'a> {
         if self.left == 0 {
             return Ok(());
         }
-        Err(self.fault(what, format!("{} bytes follow the {count} records the file announced", self.left)))
+        Err(self.fault(
+            what,
+            format!("{} bytes follow the {count} records the file announced", self.left),
+        ))
     }
 }
 

@@ -34,7 +34,13 @@ struct Image {
 }
 
 impl Image {
-    fn checked(file: &Path, name: String, camera: u32, q: [f64; 4], t: [f64; 3]) -> Result<Self, DatasetError> {
+    fn checked(
+        file: &Path,
+        name: String,
+        camera: u32,
+        q: [f64; 4],
+        t: [f64; 3],
+    ) -> Result<Self, DatasetError> {
         let frame = format!("image {name}");
         let rotation = checked_quaternion(file, &frame, q)?;
         let (rotation, translation) = checked_pose(file, &frame, rotation, t.into())?;
@@ -53,7 +59,9 @@ struct Model {
 /// The folder of the model, if there is one: `sparse/0`, else `sparse`.
 pub(super) fn find(root: &Path) -> Option<PathBuf> {
     ["sparse/0", "sparse"].iter().map(|folder| root.join(folder)).find(|folder| {
-        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"].iter().any(|name| folder.join(name).is_file())
+        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"]
+            .iter()
+            .any(|name| folder.join(name).is_file())
     })
 }
 
@@ -109,13 +117,30 @@ pub(super) fn read(root: &Root, folder: &Path, folders: &Folders) -> Result<Scen
     if reduced_missing > 0 {
         notes.push(folders.fell_back_note(reduced_missing));
     }
-    Ok(Scene { listing: images, frames, points: model.points, points_file: Some(points), own_split: false, notes })
+    Ok(Scene {
+        listing: images,
+        frames,
+        points: model.points,
+        points_file: Some(points),
+        own_split: false,
+        notes,
+    })
 }
 
 /// A camera's size, if an image can have it.
-fn checked_size(file: &Path, field: &str, width: u64, height: u64) -> Result<(u32, u32), DatasetError> {
+fn checked_size(
+    file: &Path,
+    field: &str,
+    width: u64,
+    height: u64,
+) -> Result<(u32, u32), DatasetError> {
     match (u32::try_from(width), u32::try_from(height)) {
         (Ok(width), Ok(height)) if width > 0 && height > 0 => Ok((width, height)),
-        _ => Err(DatasetError::malformed(file, field, format!("the size {width}x{height} px is impossible"), REMEDY)),
+        _ => Err(DatasetError::malformed(
+            file,
+            field,
+            format!("the size {width}x{height} px is impossible"),
+            REMEDY,
+        )),
     }
 }

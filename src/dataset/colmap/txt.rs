@@ -32,7 +32,12 @@ impl<'a> Lines<'a> {
     }
 
     fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
-        DatasetError::malformed(self.path, format!("line {}: {field}", self.number), problem, REMEDY)
+        DatasetError::malformed(
+            self.path,
+            format!("line {}: {field}", self.number),
+            problem,
+            REMEDY,
+        )
     }
 
     /// Reads the next line, comment or not; false at the end.
@@ -63,7 +68,11 @@ impl<'a> Lines<'a> {
     }
 
     /// The next word of the line as a number.
-    fn number<T: FromStr>(&self, words: &mut SplitWhitespace<'_>, field: &str) -> Result<T, DatasetError> {
+    fn number<T: FromStr>(
+        &self,
+        words: &mut SplitWhitespace<'_>,
+        field: &str,
+    ) -> Result<T, DatasetError> {
         let word = words.next().ok_or_else(|| self.fault(field, "the line ends before it"))?;
         word.parse().map_err(|_| {
             let word: String = word.chars().take(40).collect();
