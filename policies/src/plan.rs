@@ -5,7 +5,11 @@
 //! each row has one fate, and the number of rows after the edit, and at every instant of it, is at
 //! most the budget. A refused call changes nothing, returns why, and is counted.
 
-use serde::{Deserialize, Serialize};
+use crate::edit::in_open_unit;
+pub use crate::edit::{
+    Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, Update,
+};
+pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
 
 /// Why a plan refused an edit. A value, never a panic; each refusal is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -24,167 +28,258 @@ pub enum Refused {
     BadValue,
 }
 
-/// How a parent's rows come to be: `count` Gaussians stand where one stood.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Offspring {
-    /// Rows born beside the parent's own slot, >= 1.
-    pub children: u32,
-    /// What happens to the parent's own slot.
-    pub parent: ParentFate,
-    /// Where the children stand.
-    pub placement: Placement,
-    /// How the scales of children (and of a rewritten parent) follow from the parent's.
-    pub scale: ScaleRule,
-    /// How the opacities of children (and of a rewritten parent) follow from the parent's.
-    pub opacity: OpacityRule,
-}
-
-/// What happens to the row that grows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum ParentFate {
-    /// Untouched: parameters, moments and age stay (a clone's parent).
-    Stays,
-    /// Rewritten as one more child: moments zero, age 0 (a split's parent).
-    BecomesChild,
-}
-
-/// Where children stand. A rewritten parent is child 0, the new rows are children 1, 2, …; beside
-/// a parent that stays, the new rows are also numbered from 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub enum Placement {
-    /// New rows at the parent's mean + this offset [scene units]; a rewritten parent does not move.
-    Offset([f32; 3]),
-    /// Every child at mean + R·diag(s)·ξ, ξ ~ N(0, I), s the parent's scales
-    /// (original adaptive density control, Kerbl et al. 2023, section 5.2).
-    Sampled,
-    /// Children at ±`sigmas`·s along the parent's longest axis: even children +, odd children −.
-    LongAxis {
-        /// Distance from the parent's mean in standard deviations of its longest axis.
-        sigmas: f32,
-    },
-}
-
-/// How scales follow from the parent's.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub enum ScaleRule {
-    /// All three multiplied by this factor, > 0.
-    Uniform(f32),
-    /// The longest axis multiplied by `long`, the others by `other`, both > 0.
-    LongAxis {
-        /// Factor of the longest axis.
-        long: f32,
-        /// Factor of the two others.
-        other: f32,
-    },
-}
-
-/// How opacities follow from the parent's.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub enum OpacityRule {
-    /// The same.
-    Same,
-    /// This value, in (0, 1).
-    Set(f32),
-    /// Multiplied by this factor, in (0, 1].
-    Scaled(f32),
-    /// 1 − (1 − o)^(1/n), n = children (+ 1 if the parent becomes a child): n of them together
-    /// are as opaque as the parent was.
-    Conserved,
-}
-
-/// A row rewritten in place.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Update {
-    /// New opacity.
-    pub opacity: OpacityRule,
-    /// New scales.
-    pub scale: ScaleRule,
-    /// Whether the row keeps its moments and its age; otherwise both become zero.
-    pub keep_moments: bool,
-}
-
-/// A row born without a parent: isotropic, unrotated, view-independent.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Seed {
-    /// Mean [scene units].
-    pub position: [f32; 3],
-    /// Colour, sRGB-encoded in [0, 1].
-    pub colour: [f32; 3],
-    /// Standard deviation of all three axes [scene units], > 0.
-    pub scale: f32,
-    /// Opacity, in (0, 1).
-    pub opacity: f32,
-}
-
-/// An accumulator that a plan starts anew.
+/// What a plan does with a row. One byte per row is all that a plan holds for untouched rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reset {
-    /// The sums of every [`Signal`](crate::policy::Signal), but not `WeightMax` (which is kept by
-    /// epoch) nor the present values (`Opacity`, `ScaleMax`, `Age`).
-    Signals,
-    /// The list of candidates.
-    Candidates,
-}
-
-/// A plan as slots: what a backend executes, in this order. Rows `0..rows_before` are live before,
-/// rows `0..rows_after` after; no slot >= the budget is ever written.
-///
-/// Pass 1: `families` (the parent is read once, then its children and the parent itself are
-/// written), `updates`, `seeds`: no slot is written twice and no written slot is read by another
-/// entry. Pass 2: `moves`. Then `clamp_opacity` over all rows, then the resets.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct RowOps {
-    /// Rows before the edit.
-    pub rows_before: usize,
-    /// Rows after the edit, <= budget.
-    pub rows_after: usize,
-    /// The budget the plan was made for.
-    pub budget: usize,
-    /// Parents and their offspring.
-    pub families: Vec<Family>,
-    /// Slots of all children, family after family.
-    pub child_slots: Vec<u32>,
-    /// Rows rewritten in place.
-    pub updates: Vec<(u32, Update)>,
-    /// Rows born without a parent, with their slots.
-    pub seeds: Vec<(u32, Seed)>,
-    /// (from, to): live tail rows that fill the holes left by pruned rows; every `from` >=
-    /// `rows_after` > every `to`.
-    pub moves: Vec<(u32, u32)>,
-    /// Upper bound for all opacities, in (0, 1); both opacity moments of all rows become zero.
-    pub clamp_opacity: Option<f32>,
-    /// Whether the signal sums start anew; otherwise moved rows carry theirs.
-    pub reset_signals: bool,
-    /// Whether the candidate list starts anew.
-    pub reset_candidates: bool,
-    /// What was done, for the event log.
-    pub counts: EditCounts,
-}
-
-/// One parent and its children.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Family {
-    /// The parent's row.
-    pub parent: u32,
-    /// Its first child's place in [`RowOps::child_slots`].
-    pub first_child: u32,
-    /// How they come to be.
-    pub offspring: Offspring,
-}
-
-/// How many rows an edit touched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct EditCounts {
-    /// Rows pruned.
-    pub removed: usize,
-    /// Rows born (children and seeds).
-    pub added: usize,
-    /// Rows rewritten in place (updates and parents that became children).
-    pub updated: usize,
-    /// Edits refused: the policy wanted more.
-    pub denied: usize,
+enum Fate {
+    Free,
+    Pruned,
+    Grown,
+    Updated,
 }
 
 /// The edits of one event.
+///
+/// Rows are named by their index before the edit. At every call
+/// `rows − pruned + grown <= budget` holds, so that a policy at its budget prunes first, then
+/// grows. (A plan that starts above its budget has no [`room`](Self::room) and can only shrink.)
 #[derive(Debug)]
-pub struct EditPlan {}
+pub struct EditPlan {
+    budget: usize,
+    fates: Vec<Fate>,
+    pruned: usize,
+    born: usize,
+    denied: usize,
+    families: Vec<(u32, Offspring)>,
+    updates: Vec<(u32, Update)>,
+    seeds: Vec<Seed>,
+    clamp_opacity: Option<f32>,
+    reset_signals: bool,
+    reset_candidates: bool,
+    cause: String,
+}
+
+impl EditPlan {
+    /// An empty plan for a model of `rows` rows that may never have more than `budget`.
+    #[must_use]
+    pub fn new(rows: usize, budget: usize) -> Self {
+        Self {
+            budget,
+            fates: vec![Fate::Free; rows],
+            pruned: 0,
+            born: 0,
+            denied: 0,
+            families: Vec::new(),
+            updates: Vec::new(),
+            seeds: Vec::new(),
+            clamp_opacity: None,
+            reset_signals: false,
+            reset_candidates: false,
+            cause: String::new(),
+        }
+    }
+
+    /// Rows before the edit.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.fates.len()
+    }
+
+    /// Most rows there may ever be.
+    #[must_use]
+    pub fn budget(&self) -> usize {
+        self.budget
+    }
+
+    /// How many more rows this plan can bear: budget − (rows − pruned + grown).
+    #[must_use]
+    pub fn room(&self) -> usize {
+        // Slots are u32 on every backend, whatever the budget says.
+        self.budget
+            .min(u32::MAX as usize)
+            .saturating_sub(self.rows() - self.pruned + self.born)
+    }
+
+    /// Rows pruned so far.
+    #[must_use]
+    pub fn pruned(&self) -> usize {
+        self.pruned
+    }
+
+    /// Edits refused so far.
+    #[must_use]
+    pub fn denied(&self) -> usize {
+        self.denied
+    }
+
+    /// Whether `row` exists and has no fate yet.
+    #[must_use]
+    pub fn is_free(&self, row: u32) -> bool {
+        self.fates.get(row as usize) == Some(&Fate::Free)
+    }
+
+    /// Removes `row`. Its slot is free at once, within this plan.
+    ///
+    /// # Errors
+    /// [`Refused::NoSuchRow`], [`Refused::Taken`].
+    pub fn prune(&mut self, row: u32) -> Result<(), Refused> {
+        self.claim(row, true, 0, Fate::Pruned)?;
+        self.pruned += 1;
+        Ok(())
+    }
+
+    /// Lets `parent` have children: a clone or a split.
+    ///
+    /// # Errors
+    /// [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`], and [`Refused::NoRoom`]
+    /// when there is not room for all the children.
+    pub fn grow(&mut self, parent: u32, offspring: Offspring) -> Result<(), Refused> {
+        let children = offspring.children as usize;
+        self.claim(parent, offspring.is_valid(), children, Fate::Grown)?;
+        self.born += children;
+        self.families.push((parent, offspring));
+        Ok(())
+    }
+
+    /// Rewrites `row` in place.
+    ///
+    /// # Errors
+    /// [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
+    pub fn update(&mut self, row: u32, update: Update) -> Result<(), Refused> {
+        self.claim(row, update.is_valid(), 0, Fate::Updated)?;
+        self.updates.push((row, update));
+        Ok(())
+    }
+
+    /// Adds a row that has no parent.
+    ///
+    /// # Errors
+    /// [`Refused::BadValue`], [`Refused::NoRoom`].
+    pub fn append(&mut self, seed: Seed) -> Result<(), Refused> {
+        self.check(seed.is_valid(), 1)?;
+        self.born += 1;
+        self.seeds.push(seed);
+        Ok(())
+    }
+
+    /// Bounds the opacity of all rows, after all other edits. Of several bounds the lowest holds.
+    ///
+    /// # Errors
+    /// [`Refused::BadValue`] when `max` is not in (0, 1).
+    pub fn clamp_opacity(&mut self, max: f32) -> Result<(), Refused> {
+        self.check(in_open_unit(max), 0)?;
+        self.clamp_opacity = Some(self.clamp_opacity.map_or(max, |lowest| lowest.min(max)));
+        Ok(())
+    }
+
+    /// Starts an accumulator anew, after all other edits.
+    pub fn reset(&mut self, what: Reset) {
+        match what {
+            Reset::Signals => self.reset_signals = true,
+            Reset::Candidates => self.reset_candidates = true,
+        }
+    }
+
+    /// Says why, for the event log. Several tags are joined by `+`; one said twice counts once.
+    pub fn cause(&mut self, tag: &str) {
+        if tag.is_empty() || self.cause.split('+').any(|said| said == tag) {
+            return;
+        }
+        if !self.cause.is_empty() {
+            self.cause.push('+');
+        }
+        self.cause.push_str(tag);
+    }
+
+    /// Turns the edits into slots.
+    ///
+    /// Children, family after family in the order of the calls, then seeds, fill the slots of
+    /// pruned rows in ascending order, then slots from `rows` upward. Live rows from the tail move
+    /// into the holes that are left, the order among them unchanged.
+    #[must_use]
+    pub fn compile(self) -> RowOps {
+        let rows_before = self.rows();
+        let rows_after = rows_before - self.pruned + self.born;
+        let is_pruned = |&slot: &usize| self.fates[slot] == Fate::Pruned;
+        // Every slot in `0..rows_after` that holds no live row: the first `born` of them are for
+        // the newborn, the rest (only where the model shrinks) for rows of the tail.
+        let mut holes = (0..rows_before)
+            .filter(is_pruned)
+            .chain(rows_before..)
+            .map(|s| s as u32);
+
+        let born_in_families = self.born - self.seeds.len();
+        let child_slots: Vec<u32> = holes.by_ref().take(born_in_families).collect();
+        let mut first_child = 0;
+        let families = self.families.iter().map(|&(parent, offspring)| {
+            let family = Family {
+                parent,
+                first_child,
+                offspring,
+            };
+            first_child += offspring.children;
+            family
+        });
+        let families: Vec<Family> = families.collect();
+        // Seeds lead the zip: it must not draw a hole when there is no seed left to fill it.
+        let seeds = self
+            .seeds
+            .iter()
+            .zip(holes.by_ref())
+            .map(|(&seed, slot)| (slot, seed));
+        let seeds: Vec<(u32, Seed)> = seeds.collect();
+        let live_tail = (rows_after..rows_before).filter(|slot| !is_pruned(slot));
+        let moves: Vec<(u32, u32)> = live_tail.map(|s| s as u32).zip(holes).collect();
+
+        let rewritten = |f: &&Family| f.offspring.parent == ParentFate::BecomesChild;
+        let counts = EditCounts {
+            removed: self.pruned,
+            added: self.born,
+            updated: self.updates.len() + families.iter().filter(rewritten).count(),
+            denied: self.denied,
+        };
+        let ops = RowOps {
+            rows_before,
+            rows_after,
+            budget: self.budget,
+            families,
+            child_slots,
+            updates: self.updates,
+            seeds,
+            moves,
+            clamp_opacity: self.clamp_opacity,
+            reset_signals: self.reset_signals,
+            reset_candidates: self.reset_candidates,
+            counts,
+            cause: self.cause,
+        };
+        ops.assert_valid();
+        ops
+    }
+
+    /// Gives `row` its fate, if it is free, the edit's values are good and there is room.
+    fn claim(&mut self, row: u32, good: bool, children: usize, fate: Fate) -> Result<(), Refused> {
+        match self.fates.get(row as usize) {
+            None => return self.refuse(Refused::NoSuchRow),
+            Some(Fate::Free) => self.check(good, children)?,
+            Some(_) => return self.refuse(Refused::Taken),
+        }
+        self.fates[row as usize] = fate;
+        Ok(())
+    }
+
+    fn check(&mut self, good: bool, births: usize) -> Result<(), Refused> {
+        match (good, births <= self.room()) {
+            (false, _) => self.refuse(Refused::BadValue),
+            (true, false) => self.refuse(Refused::NoRoom),
+            (true, true) => Ok(()),
+        }
+    }
+
+    fn refuse(&mut self, why: Refused) -> Result<(), Refused> {
+        self.denied += 1;
+        Err(why)
+    }
+}
+
+#[cfg(test)]
+mod tests;

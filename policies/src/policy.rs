@@ -132,6 +132,12 @@ impl SignalSet {
         Self(signals.iter().fold(0, |bits, &s| bits | 1 << s as u32))
     }
 
+    /// This set and `signal`.
+    #[must_use]
+    pub fn with(self, signal: Signal) -> Self {
+        Self(self.0 | 1 << signal as u32)
+    }
+
     /// Whether `signal` is in the set.
     #[must_use]
     pub fn contains(self, signal: Signal) -> bool {
@@ -179,6 +185,7 @@ pub struct CandidateRequest {
 #[serde(rename_all = "kebab-case")]
 pub enum ErrorMode {
     /// ‖dL/dC‖₂ of the rendered colour, as the Diet code does (a structure detector).
+    #[serde(rename = "grad")]
     Gradient,
     /// Mean over channels of |I − G|.
     L1,
@@ -224,9 +231,19 @@ impl Signals {
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
         let columns = Signal::ALL
             .iter()
-            .map(|&s| if set.contains(s) { vec![0.0; rows] } else { Vec::new() })
+            .map(|&s| {
+                if set.contains(s) {
+                    vec![0.0; rows]
+                } else {
+                    Vec::new()
+                }
+            })
             .collect();
-        Self { rows, present: set, columns }
+        Self {
+            rows,
+            present: set,
+            columns,
+        }
     }
 
     /// Number of rows.
@@ -238,12 +255,16 @@ impl Signals {
     /// The column of `signal`, if present. Shape: [rows].
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
-        self.present.contains(signal).then(|| &self.columns[signal as usize][..])
+        self.present
+            .contains(signal)
+            .then(|| &self.columns[signal as usize][..])
     }
 
     /// The column of `signal` for writing, if present. Shape: [rows].
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
-        self.present.contains(signal).then(|| &mut self.columns[signal as usize][..])
+        self.present
+            .contains(signal)
+            .then(|| &mut self.columns[signal as usize][..])
     }
 }
 
@@ -273,7 +294,9 @@ impl<'a> Snapshot<'a> {
     /// # Errors
     /// [`PolicyError::Undeclared`] when the policy's needs did not list it.
     pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
-        self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
+        self.signals
+            .get(signal)
+            .ok_or(PolicyError::Undeclared { signal })
     }
 }
 
@@ -335,3 +358,20 @@ pub enum PolicyError {
 fn did_you_mean(nearest: Option<&str>) -> String {
     nearest.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)"))
 }
+
+/// [`DensityPolicy::restore`] for a policy without state of its own, whose
+/// [`save`](DensityPolicy::save) returns `null`.
+///
+/// # Errors
+/// [`PolicyError::State`] when `state` is not `null`.
+pub fn restore_nothing(state: &PolicyState) -> Result<(), PolicyError> {
+    if state.is_null() {
+        return Ok(());
+    }
+    Err(PolicyError::State(format!(
+        "this policy keeps no state, but the checkpoint holds {state}"
+    )))
+}
+
+#[cfg(test)]
+mod tests;

@@ -28,19 +28,32 @@ impl PolicyRng {
     #[must_use]
     pub fn new(seed: u64, step: u32) -> Self {
         // Folding keeps both halves of a 64-bit seed significant.
-        Self { seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32, step }
+        Self {
+            seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32,
+            step,
+        }
     }
 
-    /// Four independent 32-bit words for (row, purpose, counter).
+    /// Four independent 32-bit words for (row, purpose, counter). Draws are told apart for
+    /// `counter` < 65,536.
     #[must_use]
     pub fn bits(&self, row: u32, purpose: Purpose, counter: u32) -> [u32; 4] {
         pcg4d([row, self.step, self.seed, (purpose as u32) << 16 ^ counter])
     }
 
-    /// A number in (0, 1), never 0 or 1: (k + ½) / 2²⁴.
+    /// A number in (0, 1), never 0 or 1: (k + ½) / 2²³.
     #[must_use]
     pub fn uniform(&self, row: u32, purpose: Purpose) -> f32 {
         unit_open(self.bits(row, purpose, 0)[0])
+    }
+
+    /// A number in (0, 1), never 0 or 1, of 52 bits: among millions of rows, 23 bits would often
+    /// repeat.
+    #[must_use]
+    pub fn uniform_f64(&self, row: u32, purpose: Purpose) -> f64 {
+        let [high, low, ..] = self.bits(row, purpose, 0);
+        let bits = (u64::from(high) << 32 | u64::from(low)) >> 12;
+        (bits as f64 + 0.5) / (1_u64 << 52) as f64
     }
 
     /// Three independent standard normals, by Box–Muller.
@@ -58,9 +71,10 @@ impl PolicyRng {
     }
 }
 
-/// The top 24 bits as a number strictly between 0 and 1.
+/// The top 23 bits as a number strictly between 0 and 1. With 24 bits, k + ½ would need a 25-bit
+/// mantissa, and the largest would round to 1.
 fn unit_open(bits: u32) -> f32 {
-    ((bits >> 8) as f32 + 0.5) * (1.0 / 16_777_216.0)
+    ((bits >> 9) as f32 + 0.5) * (1.0 / 8_388_608.0)
 }
 
 fn pcg4d(v: [u32; 4]) -> [u32; 4] {
@@ -76,4 +90,169 @@ fn pcg4d(v: [u32; 4]) -> [u32; 4] {
         }
     }
     [x, y, z, w]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PURPOSES: [Purpose; 3] = [Purpose::Select, Purpose::Place, Purpose::Noise];
+    const DRAWS: u32 = 1 << 16;
+
+    /// χ² of counts that should all be equal, in standard deviations from its mean.
+    fn deviation(counts: &[u32]) -> f64 {
+        let expected = f64::from(counts.iter().sum::<u32>()) / counts.len() as f64;
+        let chi2: f64 = counts
+            .iter()
+            .map(|&n| (f64::from(n) - expected).powi(2) / expected)
+            .sum();
+        let freedom = (counts.len() - 1) as f64;
+        (chi2 - freedom) / (2.0 * freedom).sqrt()
+    }
+
+    /// How far pairs of numbers in (0, 1) are from filling the unit square evenly.
+    fn joint(pair: impl Fn(u32) -> (f32, f32)) -> f64 {
+        let mut counts = [0; 256];
+        for draw in 0..DRAWS {
+            let (a, b) = pair(draw);
+            counts[(a * 16.0) as usize * 16 + (b * 16.0) as usize] += 1;
+        }
+        deviation(&counts)
+    }
+
+    #[test]
+    fn bits_are_those_of_pcg4d() {
+        // From an independent transcription of the paper's listing.
+        let expected = [0x3622_cd16, 0xf114_71d8, 0xe110_9b3f, 0x02b9_4c2f];
+        assert_eq!(pcg4d([1, 2, 3, 4]), expected);
+        let rng = PolicyRng::new(42, 600);
+        let expected = [0xacb5_591e, 0x199d_5110, 0x2221_19f4, 0x7972_97a9];
+        assert_eq!(rng.bits(7, Purpose::Place, 1), expected);
+    }
+
+    #[test]
+    fn unit_numbers_exclude_both_ends() {
+        assert!(unit_open(0) > 0.0);
+        assert!(unit_open(u32::MAX) < 1.0);
+        let normal = PolicyRng::new(0, 0).normal3(0, Purpose::Noise, 0);
+        assert!(normal.iter().all(|v| v.is_finite()));
+    }
+
+    #[test]
+    fn draws_are_uniform() {
+        for seed in [0, 1, u64::MAX] {
+            for purpose in PURPOSES {
+                let rng = PolicyRng::new(seed, 600);
+                let mut counts = [[0; 256]; 2];
+                for row in 0..DRAWS {
+                    counts[0][(rng.uniform(row, purpose) * 256.0) as usize] += 1;
+                    counts[1][(rng.uniform_f64(row, purpose) * 256.0) as usize] += 1;
+                }
+                for counts in counts {
+                    let deviation = deviation(&counts);
+                    assert!(deviation.abs() < 5.0, "{seed} {purpose:?}: {deviation}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn draws_are_independent() {
+        let rng = PolicyRng::new(9, 600);
+        let u = |rng: PolicyRng, row: u32, purpose| rng.uniform(row, purpose);
+        let select = Purpose::Select;
+        let found = [
+            (
+                "rows",
+                joint(|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select))),
+            ),
+            (
+                "steps",
+                joint(|i| (u(rng, i, select), u(PolicyRng::new(9, 601), i, select))),
+            ),
+            (
+                "step by step",
+                joint(|i| {
+                    let at = |step| u(PolicyRng::new(9, step), 5, select);
+                    (at(2 * i), at(2 * i + 1))
+                }),
+            ),
+            (
+                "seeds",
+                joint(|i| (u(rng, i, select), u(PolicyRng::new(10, 600), i, select))),
+            ),
+            (
+                "high halves of seeds",
+                joint(|i| {
+                    (
+                        u(rng, i, select),
+                        u(PolicyRng::new(9 + (1 << 32), 600), i, select),
+                    )
+                }),
+            ),
+            (
+                "purposes",
+                joint(|i| (u(rng, i, select), u(rng, i, Purpose::Place))),
+            ),
+            (
+                "purposes",
+                joint(|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place))),
+            ),
+            (
+                "counters",
+                joint(|i| {
+                    let at = |counter| unit_open(rng.bits(i, select, counter)[0]);
+                    (at(0), at(1))
+                }),
+            ),
+            (
+                "words",
+                joint(|i| {
+                    let [a, b, ..] = rng.bits(i, select, 0).map(unit_open);
+                    (a, b)
+                }),
+            ),
+            (
+                "words",
+                joint(|i| {
+                    let [.., c, d] = rng.bits(i, select, 0).map(unit_open);
+                    (c, d)
+                }),
+            ),
+        ];
+        let bad: Vec<_> = found
+            .iter()
+            .filter(|(_, deviation)| deviation.abs() > 5.0)
+            .collect();
+        assert!(bad.is_empty(), "{bad:?}");
+    }
+
+    #[test]
+    fn normals_have_the_moments_of_a_normal() {
+        let rng = PolicyRng::new(3, 700);
+        let draws: Vec<[f32; 3]> = (0..DRAWS)
+            .map(|i| rng.normal3(i, Purpose::Place, 1))
+            .collect();
+        let n = f64::from(DRAWS);
+        let mean = |f: &dyn Fn(&[f64; 3]) -> f64| {
+            draws.iter().map(|d| f(&d.map(f64::from))).sum::<f64>() / n
+        };
+        for axis in 0..3 {
+            // Five standard errors of each moment of n standard normals.
+            let moments = [(1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)];
+            for (power, expected, variance) in moments {
+                let found = mean(&|d| d[axis].powi(power));
+                let bound = 5.0 * f64::sqrt(variance / n);
+                assert!(
+                    (found - expected).abs() < bound,
+                    "axis {axis}, moment {power}: {found}"
+                );
+            }
+            let covariance = mean(&|d| d[axis] * d[(axis + 1) % 3]);
+            assert!(
+                covariance.abs() < 5.0 / n.sqrt(),
+                "axis {axis}: {covariance}"
+            );
+        }
+    }
 }

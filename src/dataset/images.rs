@@ -76,6 +76,17 @@ pub struct Image8 {
 pub type SharedImage = Arc<Image8>;
 
 impl Image8 {
+    /// The pixel's colour over `background`, in [0, 1].
+    #[must_use]
+    pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
+        let pixel = y * self.width as usize + x;
+        let alpha = self.alpha.as_ref().map_or(1.0, |a| f32::from(a[pixel]) / 255.0);
+        std::array::from_fn(|channel| {
+            alpha * f32::from(self.rgb[3 * pixel + channel]) / 255.0
+                + (1.0 - alpha) * background[channel]
+        })
+    }
+
     /// Size of the pixels [bytes].
     #[must_use]
     pub fn bytes(&self) -> u64 {

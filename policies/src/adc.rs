@@ -1,0 +1,151 @@
+//! The operators of adaptive density control that several policies share: which rows need detail,
+//! how they are cloned and split, which are dead.
+//!
+//! Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance Field Rendering*, 2023, section 5.2;
+//! constants of its public code.
+
+use crate::plan::{Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
+use crate::sample::top_k;
+
+/// Steps at which something happens: `from` < step < `until`, multiples of `every` (0: never).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    /// Start (exclusive) [steps].
+    pub from: u32,
+    /// End (exclusive) [steps].
+    pub until: u32,
+    /// Interval [steps].
+    pub every: u32,
+}
+
+impl Window {
+    /// Whether it happens at `step` (1-based).
+    #[must_use]
+    pub fn is_due(&self, step: u32) -> bool {
+        self.every > 0 && self.from < step && step < self.until && step.is_multiple_of(self.every)
+    }
+}
+
+/// Mean per visible view of a signal that is summed over views; 0 for a row that no view saw, and
+/// where the mean is not finite. Shape: [rows].
+#[must_use]
+pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
+    let mean = |(&sum, &views): (&f32, &f32)| {
+        let mean = sum / views;
+        if views > 0.0 && mean.is_finite() {
+            mean
+        } else {
+            0.0
+        }
+    };
+    sum.iter().zip(views).map(mean).collect()
+}
+
+/// A copy beside a parent that stays as it is, at `offset` from it [scene units].
+#[must_use]
+pub fn clone_at(offset: [f32; 3]) -> Offspring {
+    Offspring {
+        children: 1,
+        parent: ParentFate::Stays,
+        placement: Placement::Offset(offset),
+        scale: ScaleRule::Uniform(1.0),
+        opacity: OpacityRule::Same,
+    }
+}
+
+/// Two samples of the parent, smaller by `factor`, in its place: the parent's slot and one more.
+#[must_use]
+pub fn split_by(factor: f32) -> Offspring {
+    Offspring {
+        children: 1,
+        parent: ParentFate::BecomesChild,
+        placement: Placement::Sampled,
+        scale: ScaleRule::Uniform(1.0 / factor),
+        opacity: OpacityRule::Same,
+    }
+}
+
+/// What makes a row not worth its slot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mortality {
+    /// Rows less opaque than this are dead.
+    pub min_opacity: f32,
+    /// Rows larger than this are dead [scene units].
+    pub max_scale: f32,
+}
+
+impl Mortality {
+    /// Whether a row of this opacity and largest standard deviation [scene units] is dead. Numbers
+    /// that are not finite are: no gradient will ever mend them.
+    #[must_use]
+    pub fn is_dead(&self, opacity: f32, scale: f32) -> bool {
+        !(opacity.is_finite() && scale.is_finite())
+            || opacity < self.min_opacity
+            || scale > self.max_scale
+    }
+}
+
+/// Takes the most opaque row (ties by row) off the list of the dead if all rows are on it: an
+/// empty model can never grow again.
+pub fn spare_one(dead: &mut Vec<u32>, opacity: &[f32]) {
+    if dead.len() == opacity.len() {
+        let spared = top_k(opacity, 1);
+        dead.retain(|row| !spared.contains(row));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_exclude_their_ends() {
+        let window = Window {
+            from: 500,
+            until: 1000,
+            every: 100,
+        };
+        let due: Vec<u32> = (0..2000).filter(|&step| window.is_due(step)).collect();
+        assert_eq!(due, [600, 700, 800, 900]);
+        assert!((0..2000).all(|step| !Window { every: 0, ..window }.is_due(step)));
+    }
+
+    #[test]
+    fn means_are_finite() {
+        let sum = [6.0, 0.0, 1.0, f32::NAN, f32::INFINITY, 1.0];
+        let views = [3.0, 0.0, 0.0, 2.0, 2.0, f32::NAN];
+        assert_eq!(
+            mean_over_views(&sum, &views),
+            [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        );
+    }
+
+    #[test]
+    fn dead_are_the_faint_the_huge_and_the_undefined() {
+        let mortality = Mortality {
+            min_opacity: 0.005,
+            max_scale: 2.0,
+        };
+        assert!(!mortality.is_dead(0.005, 2.0));
+        assert!(mortality.is_dead(0.0049, 1.0) && mortality.is_dead(0.5, 2.1));
+        assert!(mortality.is_dead(f32::NAN, 1.0) && mortality.is_dead(0.5, f32::NAN));
+        let boundless = Mortality {
+            max_scale: f32::INFINITY,
+            ..mortality
+        };
+        assert!(!boundless.is_dead(0.5, 1e30) && boundless.is_dead(0.5, f32::INFINITY));
+    }
+
+    #[test]
+    fn one_row_is_spared() {
+        let opacity = [0.001, 0.003, f32::NAN, 0.003];
+        let mut dead = vec![0, 1, 2, 3];
+        spare_one(&mut dead, &opacity);
+        assert_eq!(dead, [0, 2, 3]);
+        spare_one(&mut dead, &opacity);
+        assert_eq!(dead, [0, 2, 3]);
+        let mut none = Vec::new();
+        spare_one(&mut none, &[]);
+        assert!(none.is_empty());
+    }
+}

@@ -1,0 +1,364 @@
+//! Scripted runs: a model without parameters, whose statistics are made up.
+
+use std::any::Any;
+use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use toml::Table;
+
+use super::Check;
+use crate::plan::{EditPlan, RowOps};
+use crate::policy::{
+    Candidate, DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet,
+    Signals, Snapshot,
+};
+use crate::registry::PolicyEntry;
+use crate::rng::{PolicyRng, Purpose};
+
+/// What the statistics of a run hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Pattern {
+    Plausible,
+    Zero,
+    Equal,
+    Negative,
+    Huge,
+    Denormal,
+    Infinite,
+    MinusInfinite,
+    Nan,
+    /// Each number after another of the patterns above.
+    Mixture,
+    /// Each event after another of the patterns above.
+    Changing,
+}
+
+const PATTERNS: [Pattern; 11] = [
+    Pattern::Plausible,
+    Pattern::Zero,
+    Pattern::Equal,
+    Pattern::Negative,
+    Pattern::Huge,
+    Pattern::Denormal,
+    Pattern::Infinite,
+    Pattern::MinusInfinite,
+    Pattern::Nan,
+    Pattern::Mixture,
+    Pattern::Changing,
+];
+
+/// One run.
+#[derive(Debug, Clone)]
+pub(super) struct Scenario {
+    name: &'static str,
+    scene: SceneInfo,
+    /// Whether plans have no room, whatever the scene's budget says.
+    refuses: bool,
+    pattern: Pattern,
+}
+
+impl fmt::Display for Scenario {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{}, statistics {:?}, {} steps",
+            self.name, self.pattern, self.scene.iterations
+        )
+    }
+}
+
+/// A scene whose schedules, written for 30,000 steps, pass in a fiftieth of the time.
+pub(super) fn scene(initial_rows: usize, budget: usize) -> SceneInfo {
+    SceneInfo {
+        extent: 3.0,
+        train_views: 7,
+        budget,
+        initial_rows,
+        iterations: 600,
+        white_background: true,
+    }
+}
+
+/// All runs that a policy must pass.
+pub(super) fn scenarios() -> Vec<Scenario> {
+    let models = [
+        ("an empty model", scene(0, 8), false),
+        ("one row at its budget", scene(1, 1), false),
+        ("one row", scene(1, 16), false),
+        ("a full model", scene(24, 24), false),
+        ("a model with room", scene(30, 300), false),
+        (
+            "a single view",
+            SceneInfo {
+                train_views: 1,
+                ..scene(30, 300)
+            },
+            false,
+        ),
+        ("plans that refuse growth", scene(20, 200), true),
+        (
+            "full length",
+            SceneInfo {
+                iterations: 30_000,
+                ..scene(20, 60)
+            },
+            false,
+        ),
+    ];
+    let runs = models.into_iter().flat_map(|(name, scene, refuses)| {
+        PATTERNS.map(|pattern| Scenario {
+            name,
+            scene: scene.clone(),
+            refuses,
+            pattern,
+        })
+    });
+    runs.collect()
+}
+
+/// Most events of one run: a policy that is due at every step need not be led through all.
+const MOST_EVENTS: usize = 400;
+
+type Failure = (Check, String);
+
+/// Four copies of the policy go through the run together: one as in a training; a twin; one that
+/// sees more than it asked for; and, from a third and from two thirds of the run on, one that has
+/// been saved and restored. All must make the same plans.
+pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<(), Failure> {
+    let scene = &scenario.scene;
+    let build = || {
+        let built = guarded(|| entry.build(set, scene));
+        built
+            .and_then(|built| built.map_err(|e| e.to_string()))
+            .map_err(|why| (Check::Builds, why))
+    };
+    let mut policy = build()?;
+    let mut twins: Vec<(Check, Box<dyn DensityPolicy>)> = vec![
+        (Check::Repeats, build()?),
+        (Check::ReadsOnlyWhatItDeclares, build()?),
+    ];
+    refuses_foreign_state(&mut *build()?)?;
+
+    let needs = policy.needs(scene);
+    if needs != policy.needs(scene) || needs != twins[0].1.needs(scene) {
+        return Err((Check::Repeats, "its needs change".to_owned()));
+    }
+    let due: Vec<u32> = (1..=scene.iterations)
+        .filter(|&step| policy.is_due(step))
+        .collect();
+    let mut model = Model {
+        rows: scene.initial_rows,
+        candidates: Vec::new(),
+    };
+    let events = due.len().min(MOST_EVENTS);
+    for (event, &step) in due.iter().take(events).enumerate() {
+        let rows = model.rows;
+        let at = |(check, why): Failure| (check, format!("step {step}, {rows} rows: {why}"));
+        if event == events / 3 || event == 2 * events / 3 {
+            twins.push((Check::Remembers, restored(&*policy, build()?).map_err(at)?));
+        }
+        let seen = model.observe(scenario, step, &needs);
+        let ops = plan(&mut *policy, scenario, &seen, false).map_err(at)?;
+        for (check, twin) in &mut twins {
+            if !twin.is_due(step) {
+                return Err(at((*check, "a copy is not due at this step".to_owned())));
+            }
+            let sees_all = *check == Check::ReadsOnlyWhatItDeclares;
+            let again = plan(&mut **twin, scenario, &seen, sees_all).map_err(at)?;
+            if again != ops {
+                return Err(at((
+                    *check,
+                    format!("{ops:?}, but a copy planned {again:?}"),
+                )));
+            }
+            if twin.save() != policy.save() {
+                return Err(at((*check, "a copy saves another state".to_owned())));
+            }
+        }
+        model.apply(&ops);
+    }
+    Ok(())
+}
+
+/// The made-up model: nothing but its size.
+struct Model {
+    rows: usize,
+    candidates: Vec<Candidate>,
+}
+
+/// What there is to see at an event.
+struct Seen {
+    step: u32,
+    declared: Signals,
+    all: Signals,
+    candidates: Vec<Candidate>,
+    candidates_declared: bool,
+}
+
+impl Model {
+    fn observe(&mut self, scenario: &Scenario, step: u32, needs: &Needs) -> Seen {
+        let rng = PolicyRng::new(7, step);
+        let pattern = match scenario.pattern {
+            Pattern::Changing => PATTERNS[step as usize % (PATTERNS.len() - 1)],
+            pattern => pattern,
+        };
+        let fill = |set: SignalSet| {
+            let mut signals = Signals::zeros(self.rows, set);
+            for signal in set.iter() {
+                for (row, value) in (0..).zip(signals.get_mut(signal).into_iter().flatten()) {
+                    let bits = rng.bits(row, Purpose::Noise, signal as u32);
+                    *value = number(pattern, bits, |u| plausible(signal, u, &scenario.scene));
+                }
+            }
+            signals
+        };
+        let (declared, all) = (fill(needs.signals), fill(SignalSet::of(&Signal::ALL)));
+        let capacity = needs.candidates.map_or(5, |request| request.capacity);
+        for index in 0..capacity.saturating_sub(self.candidates.len()).min(5) as u32 {
+            let values = |part: u32| {
+                let bits = rng.bits(index, Purpose::Noise, 100 + part);
+                number(pattern, bits, |u| u)
+            };
+            self.candidates.push(Candidate {
+                position: [0, 1, 2].map(values),
+                colour: [3, 4, 5].map(values),
+                pixel_size: values(6) * 0.01,
+                error: values(7),
+            });
+        }
+        Seen {
+            step,
+            declared,
+            all,
+            candidates: self.candidates.clone(),
+            candidates_declared: needs.candidates.is_some(),
+        }
+    }
+
+    fn apply(&mut self, ops: &RowOps) {
+        self.rows = ops.rows_after;
+        if ops.reset_candidates {
+            self.candidates.clear();
+        }
+    }
+}
+
+/// A number after the pattern, from four random words.
+fn number(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f32 {
+    let u = (bits[0] >> 9) as f32 / 8_388_608.0;
+    match pattern {
+        Pattern::Plausible | Pattern::Changing => plausible(u),
+        Pattern::Zero => 0.0,
+        Pattern::Equal => 0.5,
+        Pattern::Negative => -plausible(u),
+        Pattern::Huge => f32::MAX,
+        Pattern::Denormal => f32::from_bits(1),
+        Pattern::Infinite => f32::INFINITY,
+        Pattern::MinusInfinite => f32::NEG_INFINITY,
+        Pattern::Nan => f32::NAN,
+        // Half of them plausible, so that policies act at all.
+        Pattern::Mixture => {
+            let pattern = if bits[1].is_multiple_of(2) {
+                0
+            } else {
+                bits[2] as usize % (PATTERNS.len() - 2)
+            };
+            number(PATTERNS[pattern], bits, plausible)
+        }
+    }
+}
+
+/// A value such as a training may show, for u in [0, 1).
+fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
+    match signal {
+        Signal::VisibleCount => (20.0 * u).floor(),
+        Signal::ScreenGradient | Signal::ScreenGradientAbs => 0.02 * u.powi(3),
+        Signal::ColourGradient => 1e-3 * u.powi(3),
+        Signal::MeanGradientX | Signal::MeanGradientY | Signal::MeanGradientZ => 1e-3 * (u - 0.5),
+        Signal::MeanGradientNorm => 2e-3 * u,
+        Signal::WeightMax => u,
+        Signal::WeightSum | Signal::PixelCount => (1000.0 * u).floor(),
+        Signal::Opacity => 0.99 * u.powi(3) + 1e-3,
+        Signal::ScaleMax => 0.15 * scene.extent * u.powi(3) + 1e-6,
+        Signal::Age => (300.0 * u).floor(),
+    }
+}
+
+/// Lets a copy plan, with what it declared or with everything.
+fn plan(
+    policy: &mut dyn DensityPolicy,
+    scenario: &Scenario,
+    seen: &Seen,
+    sees_all: bool,
+) -> Result<RowOps, Failure> {
+    let signals = if sees_all { &seen.all } else { &seen.declared };
+    let has_candidates = sees_all || seen.candidates_declared;
+    let now = Snapshot {
+        step: seen.step,
+        scene: &scenario.scene,
+        signals,
+        candidates: if has_candidates {
+            &seen.candidates
+        } else {
+            &[]
+        },
+    };
+    let rows = now.rows();
+    let budget = if scenario.refuses {
+        rows
+    } else {
+        scenario.scene.budget
+    };
+    let mut plan = EditPlan::new(rows, budget);
+    let rng = PolicyRng::new(3, seen.step);
+    let planned = guarded(|| policy.plan(&now, &rng, &mut plan));
+    match planned.map_err(|why| (Check::GoesOn, why))? {
+        Err(PolicyError::Undeclared { signal }) => {
+            let why = format!("{signal:?} was read but not declared");
+            return Err((Check::ReadsOnlyWhatItDeclares, why));
+        }
+        Err(error) => return Err((Check::GoesOn, error.to_string())),
+        Ok(()) => {}
+    }
+    let ops = plan.compile();
+    if (ops.rows_before, ops.budget) != (rows, budget) || ops.rows_after > budget {
+        let why = format!("budget {budget}, but the plan was made for {ops:?}");
+        return Err((Check::KeepsItsPlan, why));
+    }
+    if rows > 0 && ops.rows_after == 0 {
+        return Err((Check::LeavesARow, "all rows were pruned".to_owned()));
+    }
+    Ok(ops)
+}
+
+/// A new copy with the policy's state, which goes through text as in a checkpoint.
+fn restored(
+    policy: &dyn DensityPolicy,
+    mut copy: Box<dyn DensityPolicy>,
+) -> Result<Box<dyn DensityPolicy>, Failure> {
+    let text = policy.save().to_string();
+    let state: Result<PolicyState, _> = serde_json::from_str(&text);
+    let state = state.map_err(|error| (Check::Remembers, error.to_string()))?;
+    let result = guarded(|| copy.restore(state)).map_err(|why| (Check::Remembers, why))?;
+    result.map_err(|error| (Check::Remembers, error.to_string()))?;
+    Ok(copy)
+}
+
+fn refuses_foreign_state(policy: &mut dyn DensityPolicy) -> Result<(), Failure> {
+    let foreign = serde_json::json!({ "conformance": "not a state" });
+    match guarded(|| policy.restore(foreign)) {
+        Ok(Err(PolicyError::State(_))) => Ok(()),
+        Ok(Err(error)) => Err((Check::RefusesForeignState, format!("wrong error: {error}"))),
+        Ok(Ok(())) => Err((Check::RefusesForeignState, "it was accepted".to_owned())),
+        Err(why) => Err((Check::RefusesForeignState, why)),
+    }
+}
+
+/// The result, or what a panic said.
+fn guarded<T>(action: impl FnOnce() -> T) -> Result<T, String> {
+    catch_unwind(AssertUnwindSafe(action)).map_err(|panic: Box<dyn Any + Send>| {
+        let text = panic.downcast_ref::<String>().map(String::as_str);
+        let text = text.or_else(|| panic.downcast_ref::<&str>().copied());
+        format!("panic: {}", text.unwrap_or("no message"))
+    })
+}

@@ -1,0 +1,339 @@
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use serde::{Deserialize, Serialize};
+
+use super::*;
+use crate::adc::clone_at;
+use crate::plan::EditPlan;
+use crate::policy::{DensityPolicy, Needs, PolicyState, Signal, SignalSet, Snapshot};
+use crate::registry::{ConfiguredPolicy, policies};
+use crate::rng::{PolicyRng, Purpose};
+use crate::sample::{smallest, top_k};
+
+#[test]
+fn every_registered_policy_conforms() {
+    for entry in policies().unwrap() {
+        if let Err(report) = check_policy(entry) {
+            panic!("{report}");
+        }
+    }
+}
+
+#[test]
+fn every_choice_of_the_built_in_policies_conforms() {
+    let choices = [
+        ("vanilla", "governor = true"),
+        ("vanilla", "grow_every = 0"),
+        (
+            "diet",
+            "mixed_gradient = false\nshift = \"none\"\nprotect = 0",
+        ),
+        (
+            "diet",
+            "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\"",
+        ),
+        (
+            "diet",
+            "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 1.0\nrho_c = 1.0",
+        ),
+        ("diet", "rho_c = 0.0\nrho = 0.0\ntau = 0.0"),
+        // All windows at once.
+        ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
+    ];
+    for (name, set) in choices {
+        let entry = crate::registry::find(name).unwrap();
+        if let Err(report) = check_policy_with(entry, &set.parse().unwrap()) {
+            panic!("{set}: {report}");
+        }
+    }
+}
+
+#[test]
+fn every_registered_policy_is_documented() {
+    for entry in policies().unwrap() {
+        if let Err(report) = check_manual(entry) {
+            panic!("{report}");
+        }
+    }
+}
+
+/// What is wrong with a [`Faulty`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fault {
+    None,
+    ReadsUndeclared,
+    PeeksIfItCan,
+    PeeksAtCandidates,
+    RollsItsOwnDice,
+    ForgetsItsState,
+    AcceptsAnyState,
+    FearsNan,
+    GivesUpWhenRefused,
+    PrunesAll,
+    SwapsItsPlan,
+    NeedsAtWhim,
+}
+
+const FAULTS: [(Fault, Option<Check>); 12] = [
+    (Fault::None, None),
+    (Fault::ReadsUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
+    (Fault::PeeksIfItCan, Some(Check::ReadsOnlyWhatItDeclares)),
+    (
+        Fault::PeeksAtCandidates,
+        Some(Check::ReadsOnlyWhatItDeclares),
+    ),
+    (Fault::RollsItsOwnDice, Some(Check::Repeats)),
+    (Fault::ForgetsItsState, Some(Check::Remembers)),
+    (Fault::AcceptsAnyState, Some(Check::RefusesForeignState)),
+    (Fault::FearsNan, Some(Check::GoesOn)),
+    (Fault::GivesUpWhenRefused, Some(Check::GoesOn)),
+    (Fault::PrunesAll, Some(Check::LeavesARow)),
+    (Fault::SwapsItsPlan, Some(Check::KeepsItsPlan)),
+    (Fault::NeedsAtWhim, Some(Check::Repeats)),
+];
+
+/// Randomness that belongs to nobody.
+static DICE: AtomicU64 = AtomicU64::new(0);
+
+fn roll() -> u64 {
+    DICE.fetch_add(1, Ordering::Relaxed)
+}
+
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Params {
+    every: u32,
+}
+
+/// A policy with a state: at every third event of its life it prunes the faintest row, at the
+/// others it clones two rows, one by gradient and one by chance. Sound, but for its fault.
+struct Faulty<const FAULT: usize> {
+    events: u64,
+}
+
+impl<const FAULT: usize> ConfiguredPolicy for Faulty<FAULT> {
+    type Params = Params;
+    const STEP_PARAMETERS: &'static [&'static str] = &["every"];
+    fn new(_params: Params, _scene: &SceneInfo) -> Result<Self, PolicyError> {
+        Ok(Self { events: 0 })
+    }
+}
+
+impl<const FAULT: usize> Faulty<FAULT> {
+    fn has(&self, fault: Fault) -> bool {
+        FAULTS[FAULT].0 == fault
+    }
+}
+
+impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
+    fn needs(&self, _scene: &SceneInfo) -> Needs {
+        let mut signals = SignalSet::of(&[Signal::Opacity, Signal::ScreenGradient]);
+        if self.has(Fault::NeedsAtWhim) && roll().is_multiple_of(2) {
+            signals = signals.with(Signal::Age);
+        }
+        Needs {
+            signals,
+            candidates: None,
+        }
+    }
+
+    fn is_due(&self, step: u32) -> bool {
+        step.is_multiple_of(5)
+    }
+
+    fn plan(
+        &mut self,
+        now: &Snapshot<'_>,
+        rng: &PolicyRng,
+        plan: &mut EditPlan,
+    ) -> Result<(), PolicyError> {
+        self.events += 1;
+        let opacity = now.signal(Signal::Opacity)?;
+        let gradient = now.signal(Signal::ScreenGradient)?;
+        let rows: Vec<u32> = (0..now.rows() as u32).collect();
+        if self.has(Fault::SwapsItsPlan) {
+            *plan = EditPlan::new(now.rows(), plan.budget() + 1);
+        }
+        if self.events.is_multiple_of(3) {
+            let keep = if self.has(Fault::PrunesAll) { 0 } else { 1 };
+            for row in smallest(rows, opacity, now.rows().saturating_sub(keep).min(1)) {
+                let _ = plan.prune(row);
+            }
+            return Ok(());
+        }
+        if self.has(Fault::FearsNan) {
+            assert!(
+                gradient.iter().all(|g| !g.is_nan()),
+                "a gradient is not a number"
+            );
+        }
+        let mut by_chance: Vec<f32> = rows
+            .iter()
+            .map(|&row| rng.uniform(row, Purpose::Select))
+            .collect();
+        let mut by_gradient = gradient.to_vec();
+        if self.has(Fault::ReadsUndeclared) {
+            by_gradient = now.signal(Signal::ScreenGradientAbs)?.to_vec();
+        }
+        if self.has(Fault::PeeksIfItCan) {
+            let better = now.signals.get(Signal::ScreenGradientAbs);
+            by_gradient = better.unwrap_or(gradient).to_vec();
+        }
+        if self.has(Fault::PeeksAtCandidates) {
+            by_gradient.truncate(now.candidates.len());
+        }
+        if self.has(Fault::RollsItsOwnDice) {
+            for chance in &mut by_chance {
+                *chance = (roll() % 7) as f32;
+            }
+        }
+        for row in top_k(&by_gradient, 1)
+            .into_iter()
+            .chain(top_k(&by_chance, 1))
+        {
+            let grown = plan.grow(row, clone_at([0.0; 3]));
+            if self.has(Fault::GivesUpWhenRefused) {
+                grown.map_err(|refused| PolicyError::Other(refused.to_string()))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn save(&self) -> PolicyState {
+        serde_json::json!({ "events": self.events })
+    }
+
+    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
+        if self.has(Fault::ForgetsItsState) && state["events"].is_u64() {
+            return Ok(());
+        }
+        match state["events"].as_u64() {
+            Some(events) => self.events = events,
+            None if self.has(Fault::AcceptsAnyState) => {}
+            None => return Err(PolicyError::State("no `events`".to_owned())),
+        }
+        Ok(())
+    }
+}
+
+fn faulty<const FAULT: usize>() -> PolicyEntry {
+    PolicyEntry::of::<Faulty<FAULT>>("faulty", "for tests", "nowhere", "", ("tests.rs", 1))
+}
+
+#[test]
+fn every_fault_is_found() {
+    let entries = [
+        faulty::<0>(),
+        faulty::<1>(),
+        faulty::<2>(),
+        faulty::<3>(),
+        faulty::<4>(),
+        faulty::<5>(),
+        faulty::<6>(),
+        faulty::<7>(),
+        faulty::<8>(),
+        faulty::<9>(),
+        faulty::<10>(),
+        faulty::<11>(),
+    ];
+    let mut missed = Vec::new();
+    for (entry, (fault, expected)) in entries.iter().zip(FAULTS) {
+        let report = check_policy(entry);
+        let found: Vec<Check> = match &report {
+            Ok(()) => Vec::new(),
+            Err(report) => report.failures.iter().map(|(check, _)| *check).collect(),
+        };
+        let is_found = expected.map_or(found.is_empty(), |check| found.contains(&check));
+        if !is_found {
+            missed.push(format!("{fault:?}: {report:?}"));
+        }
+    }
+    assert!(missed.is_empty(), "{}", missed.join("\n"));
+}
+
+#[test]
+fn a_report_names_the_policy_and_the_step() {
+    let report = check_policy(&faulty::<1>()).unwrap_err().to_string();
+    assert!(report.starts_with("policy `faulty` (tests.rs:1) does not conform:\n- it reads only"));
+    assert!(
+        report.contains("an empty model") && report.contains("step 5"),
+        "{report}"
+    );
+    assert!(report.contains("ScreenGradientAbs"), "{report}");
+}
+
+/// Parameters that the registry cannot keep its promises for.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+struct Lax {
+    threshold: f64,
+}
+
+struct Unbuildable;
+
+impl ConfiguredPolicy for Unbuildable {
+    type Params = Lax;
+    const STEP_PARAMETERS: &'static [&'static str] = &["threshold"];
+    fn new(_params: Lax, scene: &SceneInfo) -> Result<Self, PolicyError> {
+        if scene.iterations == 7 {
+            Err(PolicyError::Other("not seven".to_owned()))
+        } else {
+            Ok(Self)
+        }
+    }
+}
+
+impl DensityPolicy for Unbuildable {
+    fn needs(&self, _scene: &SceneInfo) -> Needs {
+        Needs::default()
+    }
+    fn is_due(&self, _step: u32) -> bool {
+        false
+    }
+    fn plan(
+        &mut self,
+        _now: &Snapshot<'_>,
+        _rng: &PolicyRng,
+        _plan: &mut EditPlan,
+    ) -> Result<(), PolicyError> {
+        Ok(())
+    }
+    fn save(&self) -> PolicyState {
+        PolicyState::Null
+    }
+    fn restore(&mut self, _state: PolicyState) -> Result<(), PolicyError> {
+        Ok(())
+    }
+}
+
+#[test]
+fn building_is_checked() {
+    let entry = PolicyEntry::of::<Unbuildable>("x", "", "", "", ("tests.rs", 2));
+    let failures = check_policy(&entry).unwrap_err().failures;
+    assert_eq!(
+        failures,
+        [(Check::Builds, "for 7 steps: not seven".to_owned())]
+    );
+}
+
+#[test]
+fn manuals_are_checked() {
+    let manual = |doc| {
+        let entry = PolicyEntry::of::<Unbuildable>("x", "", "", doc, ("tests.rs", 2));
+        check_manual(&entry).map_err(|report| report.failures[0].1.clone())
+    };
+    let head = "//! | name | default | range | unit | what |\n//! |---|---|---|---|---|\n";
+    let with = |rows: &str| -> &'static str { format!("{head}{rows}").leak() };
+    assert_eq!(
+        manual(with("//! | threshold | 0 | | | what |\n//!\n")),
+        Ok(())
+    );
+    assert_eq!(manual(""), Err("`threshold` is missing".to_owned()));
+    let wrong = manual(with(
+        "//! | threshold | 0.1 | | | what |\n//! | ghost | 1 | | | what |\n",
+    ));
+    let told = "`threshold` has the default 0.0, not 0.1, `ghost` is no parameter";
+    assert_eq!(wrong, Err(told.to_owned()));
+    let short = manual(with("//! | threshold | 0 | what |\n"));
+    assert_eq!(short, Err("`threshold` has 3 cells".to_owned()));
+}

@@ -1,0 +1,75 @@
+//! Compensation: badly explained pixels become rows.
+
+use super::{Diet, NewbornSize, fraction};
+use crate::adc::Window;
+use crate::plan::{EditPlan, Seed};
+use crate::policy::{CandidateRequest, PolicyError, SceneInfo, Signal, Snapshot};
+use crate::sample::top_k;
+
+impl Diet {
+    /// The pixels to collect, if the policy compensates at all.
+    pub(super) fn candidate_request(&self, scene: &SceneInfo) -> Option<CandidateRequest> {
+        let Window { from, until, every } = self.insert;
+        if every == 0 || from >= until {
+            return None;
+        }
+        // What one interval can bring at the budget, but no more than there can be rows.
+        let steps = every.min(until - from) as usize;
+        let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
+        let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);
+        Some(CandidateRequest {
+            from,
+            until,
+            rows_per_candidate: self.params.rows_per_candidate,
+            capacity,
+            error: self.params.error,
+            depth: self.params.depth,
+            min_alpha: self.params.min_alpha as f32,
+            spaced: self.params.nms,
+        })
+    }
+
+    /// Appends the worst candidates, and prunes victims for those that have no room.
+    pub(super) fn insert(
+        &self,
+        now: &Snapshot<'_>,
+        plan: &mut EditPlan,
+        spared: &dyn Fn(u32) -> bool,
+    ) -> Result<(), PolicyError> {
+        let code_size = match self.params.newborn_size {
+            NewbornSize::Pixel => None,
+            NewbornSize::Code => Some(squared_geometric_mean(now.signal(Signal::ScaleMax)?)),
+        };
+        let seeds = now.candidates.iter().map(|candidate| {
+            let seed = Seed {
+                position: candidate.position,
+                colour: candidate.colour,
+                scale: code_size.unwrap_or(self.params.size_pixels as f32 * candidate.pixel_size),
+                opacity: self.params.newborn_opacity as f32,
+            };
+            (candidate.error, seed)
+        });
+        let (sound, unsound): (Vec<_>, Vec<_>) = seeds.partition(|(_, seed)| seed.is_valid());
+        // The plan refuses these and counts them; no victim shall die for them.
+        for (_, seed) in unsound {
+            let _ = plan.append(seed);
+        }
+        let errors: Vec<f32> = sound.iter().map(|(error, _)| *error).collect();
+        let worst = top_k(&errors, fraction(self.params.rho_c, plan.budget()));
+        self.prune_victims(now, plan, worst.len().saturating_sub(plan.room()), spared)?;
+        for index in worst {
+            let _ = plan.append(sound[index as usize].1);
+        }
+        Ok(())
+    }
+}
+
+/// (Geometric mean)² of the positive, finite values; NaN if there is none.
+fn squared_geometric_mean(values: &[f32]) -> f32 {
+    let logs = values
+        .iter()
+        .filter(|v| v.is_finite() && **v > 0.0)
+        .map(|v| f64::from(*v).ln());
+    let (count, sum) = logs.fold((0.0, 0.0), |(count, sum), log| (count + 1.0, sum + log));
+    (2.0 * sum / count).exp() as f32
+}

@@ -1,0 +1,73 @@
+//! How a candidate grows: a clone, shifted or not, or a split.
+
+use super::{CloneOpacity, Diet, MEAN_GRADIENT, Shift};
+use crate::adc::{clone_at, split_by};
+use crate::plan::{Offspring, OpacityRule, ParentFate, ScaleRule};
+use crate::policy::{PolicyError, Signal, Snapshot};
+
+impl Diet {
+    /// How a candidate grows.
+    pub(super) fn offspring(
+        &self,
+        now: &Snapshot<'_>,
+        row: usize,
+    ) -> Result<Offspring, PolicyError> {
+        if now.signal(Signal::ScaleMax)?[row] > self.scene_units(self.params.small, now.scene) {
+            return Ok(split_by(self.params.split_factor as f32));
+        }
+        let clone = clone_at(self.shift(now, row)?);
+        match self.params.clone_opacity {
+            CloneOpacity::Unchanged => Ok(clone),
+            CloneOpacity::Conserve => {
+                let scale = conserving_scale(now.signal(Signal::Opacity)?[row]);
+                Ok(Offspring {
+                    parent: ParentFate::BecomesChild,
+                    scale: ScaleRule::Uniform(scale),
+                    opacity: OpacityRule::Conserved,
+                    ..clone
+                })
+            }
+        }
+    }
+
+    /// Offset of a clone from its parent [scene units].
+    fn shift(&self, now: &Snapshot<'_>, row: usize) -> Result<[f32; 3], PolicyError> {
+        let read = |signal| now.signal(signal).map(|column| column[row]);
+        if self.params.shift == Shift::None {
+            return Ok([0.0; 3]);
+        }
+        let [x, y, z] = MEAN_GRADIENT;
+        let sum = [read(x)?, read(y)?, read(z)?];
+        let factor = match self.params.shift {
+            Shift::None => 0.0,
+            Shift::Paper => 1.0,
+            Shift::Code => read(Signal::VisibleCount)?.powi(-2),
+            Shift::Descent => {
+                // A sum is no longer than the sum of lengths, but for rounding.
+                let length = sum.iter().map(|v| v * v).sum::<f32>().sqrt();
+                let of_lengths = read(Signal::MeanGradientNorm)?.max(length);
+                -(self.params.kappa as f32) * read(Signal::ScaleMax)? / of_lengths
+            }
+        };
+        let shift = sum.map(|v| factor * v);
+        // 0/0 where no view has seen the row.
+        Ok(if shift.iter().all(|v| v.is_finite()) {
+            shift
+        } else {
+            [0.0; 3]
+        })
+    }
+}
+
+/// The factor by which two Gaussians of opacity 1 − √(1 − o) must shrink to render like one of
+/// opacity o (Kheradmand et al. 2024, equation 9, for N = 2).
+pub(super) fn conserving_scale(opacity: f32) -> f32 {
+    let shared = 1.0 - (1.0 - opacity).sqrt();
+    let factor = opacity / (2.0 * shared - shared * shared * std::f32::consts::FRAC_1_SQRT_2);
+    // 0/0 where opacity vanishes: the limit is 1.
+    if factor.is_finite() && factor > 0.0 {
+        factor
+    } else {
+        1.0
+    }
+}

@@ -1,0 +1,192 @@
+//! The parameters of `diet`. Its manual page says what they mean.
+
+use std::ops::Bound::{Excluded, Unbounded};
+
+use serde::{Deserialize, Serialize};
+
+use crate::parameters::{bad, in_range};
+use crate::policy::{DepthMode, ErrorMode, PolicyError};
+
+/// Parameters of [`Diet`](super::Diet).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+#[expect(
+    missing_docs,
+    reason = "the manual page documents every parameter, and a test checks it"
+)]
+pub struct DietParams {
+    pub grow_from: u32,
+    pub grow_until: u32,
+    pub grow_every: u32,
+    pub tau: f64,
+    pub mixed_gradient: bool,
+    pub colour_weight: f64,
+    pub growth: Growth,
+    pub rho: f64,
+    pub small: f64,
+    pub split_factor: f64,
+    pub shift: Shift,
+    pub kappa: f64,
+    pub clone_opacity: CloneOpacity,
+    pub min_opacity: f64,
+    pub max_scale: f64,
+    pub max_scale_from: u32,
+    pub importance: Importance,
+    pub protect: u32,
+    pub prune_every: u32,
+    pub compensate_from: u32,
+    pub compensate_until: u32,
+    pub insert_every: u32,
+    pub rho_c: f64,
+    pub rows_per_candidate: u32,
+    pub error: ErrorMode,
+    pub depth: DepthMode,
+    pub nms: bool,
+    pub min_alpha: f64,
+    pub newborn_size: NewbornSize,
+    pub size_pixels: f64,
+    pub newborn_opacity: f64,
+    pub reinit_at: u32,
+}
+
+/// How many candidates grow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Growth {
+    /// As many as there is room for, and `rho` · budget in exchange for victims.
+    Turnover,
+    /// As many as there are room and victims for.
+    All,
+}
+
+/// Where a clone stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Shift {
+    /// Down the mean gradient, bounded by `kappa` standard deviations.
+    Descent,
+    /// At the sum of the gradients.
+    Paper,
+    /// At the mean gradient divided by the number of views.
+    Code,
+    /// Where its parent stands.
+    None,
+}
+
+/// What cloning does to opacity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CloneOpacity {
+    /// Parent and clone are as opaque as the parent was: together they are more so.
+    Unchanged,
+    /// Together they are as opaque as the parent was.
+    Conserve,
+}
+
+/// How the importance of a row is measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Importance {
+    /// Largest blend weight in the training renders of the previous and the current epoch.
+    Epochs,
+    /// Largest blend weight in fresh renders of random training views; not available yet.
+    Fresh,
+}
+
+/// The size of an inserted row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NewbornSize {
+    /// That of some pixels at the row's depth.
+    Pixel,
+    /// The square of the geometric mean of all sizes.
+    Code,
+}
+
+impl Default for DietParams {
+    fn default() -> Self {
+        Self {
+            grow_from: 500,
+            grow_until: 10_000,
+            grow_every: 100,
+            tau: 4e-4,
+            mixed_gradient: true,
+            colour_weight: 30.0,
+            growth: Growth::Turnover,
+            rho: 0.1,
+            small: 0.01,
+            split_factor: 1.6,
+            shift: Shift::Descent,
+            kappa: 0.1,
+            clone_opacity: CloneOpacity::Unchanged,
+            min_opacity: 0.005,
+            max_scale: 0.1,
+            max_scale_from: 3000,
+            importance: Importance::Epochs,
+            protect: 100,
+            prune_every: 50,
+            compensate_from: 10_000,
+            compensate_until: 15_000,
+            insert_every: 500,
+            rho_c: 0.05,
+            rows_per_candidate: 3000,
+            error: ErrorMode::L1Dssim,
+            depth: DepthMode::MaxWeight,
+            nms: true,
+            min_alpha: 0.5,
+            newborn_size: NewbornSize::Pixel,
+            size_pixels: 2.0,
+            newborn_opacity: 0.1,
+            reinit_at: 0,
+        }
+    }
+}
+
+impl DietParams {
+    /// Checks ranges, and refuses what is not available yet.
+    pub(super) fn check(&self) -> Result<(), PolicyError> {
+        in_range("tau", self.tau, 0.0..)?;
+        in_range("colour_weight", self.colour_weight, 0.0..)?;
+        in_range("rho", self.rho, 0.0..=1.0)?;
+        in_range("small", self.small, 0.0..)?;
+        in_range("split_factor", self.split_factor, 1.0..=100.0)?;
+        in_range("kappa", self.kappa, 0.0..)?;
+        in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
+        in_range("max_scale", self.max_scale, (Excluded(0.0), Unbounded))?;
+        // `Signal::Age` goes no further.
+        in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;
+        in_range("rho_c", self.rho_c, 0.0..=1.0)?;
+        in_range(
+            "rows_per_candidate",
+            f64::from(self.rows_per_candidate),
+            1.0..,
+        )?;
+        in_range("min_alpha", self.min_alpha, 0.0..=1.0)?;
+        in_range("size_pixels", self.size_pixels, (Excluded(0.0), Unbounded))?;
+        // As the f32 that the plan will check.
+        let newborn_opacity = f64::from(self.newborn_opacity as f32);
+        in_range(
+            "newborn_opacity",
+            newborn_opacity,
+            (Excluded(0.0), Excluded(1.0)),
+        )?;
+        if self.importance == Importance::Fresh {
+            return Err(bad(
+                "importance",
+                "`fresh` is not available yet: it needs renders of training views, for which a \
+                 policy cannot ask; use `epochs`",
+            ));
+        }
+        if self.reinit_at != 0 {
+            return Err(bad(
+                "reinit_at",
+                format!(
+                    "{} is not available yet: it needs depth maps of all training views, for \
+                     which a policy cannot ask; leave it at 0 (never)",
+                    self.reinit_at
+                ),
+            ));
+        }
+        Ok(())
+    }
+}

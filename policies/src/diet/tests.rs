@@ -1,0 +1,486 @@
+//! The rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
+
+use super::offspring::conserving_scale;
+use super::*;
+use crate::adc::{clone_at, split_by};
+use crate::event::{Event, Outcome};
+use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
+use crate::policy::{Candidate, DepthMode, ErrorMode};
+use crate::registry::find;
+
+fn diet(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
+    find("diet")
+        .unwrap()
+        .build(&set.parse().unwrap(), scene)
+        .unwrap()
+}
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run(&mut *diet(&event.scene, set)).unwrap()
+}
+
+/// Grown-up rows of opacity 0.5, seen by four views, of size 0.05: small, as the extent is 10.
+/// Row i has importance i/100.
+fn event(step: u32, rows: usize, budget: usize) -> Event {
+    let importance: Vec<f32> = (0..rows).map(|row| row as f32 / 100.0).collect();
+    Event::new(step, rows, budget)
+        .with_all(Signal::VisibleCount, 4.0)
+        .with_all(Signal::Opacity, 0.5)
+        .with_all(Signal::ScaleMax, 0.05)
+        .with_all(Signal::Age, 1000.0)
+        .with(Signal::WeightMax, &importance)
+}
+
+/// Screen gradient sums of `rows` rows: those listed get 1, 2, 3, … in this order, others 0.
+fn wanting(rows: usize, listed: &[usize]) -> Vec<f32> {
+    let mut sums = vec![0.0; rows];
+    for (sum, &row) in (1..).zip(listed) {
+        sums[row] = sum as f32;
+    }
+    sums
+}
+
+fn candidate(error: f32, pixel_size: f32) -> Candidate {
+    Candidate {
+        position: [error, 0.0, 0.0],
+        colour: [error, 0.5, 1.0],
+        pixel_size,
+        error,
+    }
+}
+
+#[test]
+fn the_gradient_mixes_screen_and_colour() {
+    // Means: 4.0e-4; 2e-4 + 30·7e-6 = 4.1e-4; 2e-4 + 30·6e-6 = 3.8e-4; 30·1.4e-5 = 4.2e-4; 1.9e-4.
+    let event = event(600, 5, 100)
+        .with(
+            Signal::ScreenGradient,
+            &[16.01e-4, 8.01e-4, 8.01e-4, 0.0, 7.6e-4],
+        )
+        .with(Signal::ColourGradient, &[0.0, 2.8e-5, 2.4e-5, 5.6e-5, 0.0]);
+    let done = run(&event, "");
+    assert_eq!(done.cloned, [3, 1, 0]);
+    assert!(done.ops.reset_signals && !done.ops.reset_candidates);
+    assert_eq!(done.ops.cause, "grow");
+    // Without colour: twice 4e-4, 2e-4, 2e-4, 0, 1.9e-4.
+    assert_eq!(run(&event, "mixed_gradient = false").cloned, [0, 1, 2]);
+}
+
+#[test]
+fn at_the_budget_a_tenth_is_exchanged() {
+    // Budget 20, so two victims: of rows 0, 1, 2, … the least important that are no candidates.
+    let event = event(600, 20, 20).with(Signal::ScreenGradient, &wanting(20, &[0, 2, 9, 12, 19]));
+    let done = run(&event, "");
+    assert_eq!(done.pruned, [1, 3]);
+    assert_eq!(done.cloned, [19, 12]);
+    assert_eq!(
+        done.ops.counts,
+        EditCounts {
+            removed: 2,
+            added: 2,
+            updated: 0,
+            denied: 3
+        }
+    );
+    assert_eq!(run(&event, "rho = 0.2").pruned, [1, 3, 4, 5]);
+    // A product just below the integer that is meant.
+    assert_eq!(fraction(0.29, 100), 29);
+    assert_eq!(fraction(0.1, 29), 2);
+    let none = run(&event, "rho = 0.0");
+    assert!(none.pruned.is_empty() && none.cloned.is_empty());
+    assert_eq!(none.ops.counts.denied, 5);
+    let all = run(&event, "growth = \"all\"");
+    assert_eq!((all.cloned.len(), all.pruned), (5, vec![1, 3, 4, 5, 6]));
+}
+
+#[test]
+fn the_dead_and_the_room_come_first() {
+    // 19 rows, one dead, budget 20: room for 2, and 2 more for victims.
+    let mut opacity = [0.5; 19];
+    opacity[7] = 0.0049;
+    let event = event(600, 19, 20)
+        .with(
+            Signal::ScreenGradient,
+            &wanting(19, &[7, 10, 11, 12, 13, 14]),
+        )
+        .with(Signal::Opacity, &opacity);
+    let done = run(&event, "");
+    assert_eq!(done.pruned, [0, 1, 7]);
+    assert_eq!(done.cloned, [14, 13, 12, 11]);
+    assert_eq!(done.ops.counts.denied, 1);
+    assert_eq!(done.ops.rows_after, 20);
+    // With room for all there is no victim.
+    let roomy = run(
+        &Event {
+            budget: 23,
+            ..event
+        },
+        "",
+    );
+    assert_eq!((roomy.pruned, roomy.cloned.len()), (vec![7], 5));
+}
+
+#[test]
+fn huge_rows_die_after_step_3000_at_growth_only() {
+    let event = event(3000, 4, 100)
+        .with(Signal::ScaleMax, &[0.05, 1.01, 1.0, 1.01])
+        .with(Signal::ScreenGradient, &[0.0, 0.0, 9.0, 8.0]);
+    let early = run(&event, "");
+    assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
+    let late = run(
+        &Event {
+            step: 3100,
+            ..event.clone()
+        },
+        "",
+    );
+    assert_eq!((late.pruned, late.split), (vec![1, 3], vec![2]));
+    assert!(
+        run(
+            &Event {
+                step: 3150,
+                ..event
+            },
+            ""
+        )
+        .ops
+        .is_empty()
+    );
+}
+
+#[test]
+fn the_last_row_lives() {
+    let event = event(600, 3, 8).with(Signal::Opacity, &[0.001, 0.003, 0.002]);
+    assert_eq!(run(&event, "").pruned, [0, 2]);
+}
+
+#[test]
+fn newborns_are_protected_for_an_epoch() {
+    let mut age = [1000.0; 20];
+    age[..5].copy_from_slice(&[0.0, 99.0, 100.0, 29.0, 30.0]);
+    let mut event = event(600, 20, 20)
+        .with(Signal::ScreenGradient, &wanting(20, &[18, 19]))
+        .with(Signal::Age, &age);
+    event.scene.train_views = 300;
+    assert_eq!(run(&event, "").pruned, [2, 5]);
+    assert_eq!(run(&event, "protect = 0").pruned, [0, 1]);
+    assert_eq!(run(&event, "protect = 30").pruned, [1, 2]);
+    event.scene.train_views = 30;
+    assert_eq!(run(&event, "").pruned, [1, 2]);
+}
+
+#[test]
+fn where_all_are_newborn_the_oldest_fall() {
+    // One grown-up, three wanted: the grown-up first, then ages 60, 60 by importance.
+    let event = event(600, 6, 6)
+        .with(Signal::ScreenGradient, &wanting(6, &[5]))
+        .with(Signal::Age, &[10.0, 60.0, 60.0, 59.0, 200.0, 0.0]);
+    assert_eq!(run(&event, "rho = 0.5").pruned, [4]);
+    let event = Event { budget: 3, ..event };
+    let over = run(&event, "rho = 0.0");
+    assert_eq!(over.pruned, [1, 2, 4]);
+    assert_eq!(over.ops.cause, "grow+prune");
+}
+
+#[test]
+fn clones_shift_by_the_rule() {
+    let event = event(600, 3, 10)
+        .with(Signal::ScreenGradient, &[3.0, 2.0, 1.0])
+        .with(Signal::ScaleMax, &[0.05, 0.05, 1.0])
+        .with(Signal::MeanGradientX, &[3e-4, 0.0, 1.0])
+        .with(Signal::MeanGradientY, &[0.0, 0.0, 1.0])
+        .with(Signal::MeanGradientZ, &[4e-4, 0.0, 1.0])
+        .with(Signal::MeanGradientNorm, &[1e-3, 0.0, 3.0]);
+    let shifts = |set: &str| -> Vec<[f32; 3]> {
+        let families = run(&event, set).ops.families;
+        assert_eq!(families[2].offspring.placement, Placement::Sampled);
+        let offset = |placement| match placement {
+            Placement::Offset(offset) => offset,
+            other => panic!("{other:?}"),
+        };
+        families[..2]
+            .iter()
+            .map(|family| offset(family.offspring.placement))
+            .collect()
+    };
+    let near = |found: &[[f32; 3]], expected: [f32; 3]| {
+        for axis in 0..3 {
+            assert!(
+                found[1][axis].abs() < 1e-30,
+                "a row without gradients moved"
+            );
+            assert!(
+                (found[0][axis] - expected[axis]).abs() < 1e-9,
+                "{found:?}, {expected:?}"
+            );
+        }
+    };
+    // −0.1 · 0.05 · (0.3, 0, 0.4)
+    near(&shifts(""), [-1.5e-3, 0.0, -2.0e-3]);
+    near(&shifts("kappa = 0.2"), [-3e-3, 0.0, -4e-3]);
+    near(&shifts("shift = \"paper\""), [3e-4, 0.0, 4e-4]);
+    near(&shifts("shift = \"code\""), [3e-4 / 16.0, 0.0, 4e-4 / 16.0]);
+    near(&shifts("shift = \"none\""), [0.0; 3]);
+}
+
+#[test]
+fn splits_and_clones_are_those_of_the_original() {
+    let event = event(600, 2, 10)
+        .with(Signal::ScreenGradient, &[2.0, 1.0])
+        .with(Signal::ScaleMax, &[0.101, 0.1]);
+    let families = run(&event, "").ops.families;
+    assert_eq!(families[0].offspring, split_by(1.6));
+    assert_eq!(families[0].offspring.scale, ScaleRule::Uniform(0.625));
+    assert_eq!(families[1].offspring, clone_at([0.0; 3]));
+}
+
+#[test]
+fn a_conserving_clone_shares_its_opacity() {
+    let event = event(600, 2, 10)
+        .with(Signal::ScreenGradient, &[2.0, 0.0])
+        .with(Signal::Opacity, &[0.75, 0.5]);
+    let done = run(&event, "clone_opacity = \"conserve\"");
+    let offspring = done.ops.families[0].offspring;
+    assert_eq!(
+        (offspring.parent, offspring.opacity),
+        (ParentFate::BecomesChild, OpacityRule::Conserved)
+    );
+    assert_eq!(offspring.siblings(), 2);
+    // o′ = 0.5, so 0.75 / (1 − 0.25/√2).
+    let ScaleRule::Uniform(scale) = offspring.scale else {
+        panic!("{offspring:?}")
+    };
+    assert!((scale - 0.911_053).abs() < 1e-5, "{scale}");
+    // The limits given by Kheradmand et al.: hardly smaller when faint, much when opaque.
+    assert!((conserving_scale(0.05) - 0.996).abs() < 1e-3);
+    assert!((conserving_scale(0.99) - 0.81).abs() < 5e-3);
+    assert!((conserving_scale(0.0) - 1.0).abs() < 1e-6);
+}
+
+#[test]
+fn at_the_budget_with_nothing_to_do_the_plan_is_empty() {
+    let pruning = run(&event(650, 20, 20), "");
+    assert!(pruning.ops.is_empty() && pruning.ops.counts == EditCounts::default());
+    assert_eq!(pruning.ops.cause, "");
+    let growing = run(&event(700, 20, 20), "");
+    assert!(!growing.ops.edits_rows() && growing.ops.reset_signals);
+    assert_eq!(growing.ops.counts, EditCounts::default());
+}
+
+#[test]
+fn a_model_too_large_is_cut_to_the_budget() {
+    let weights = [0.5, 0.1, 0.4, 0.2, 0.3, f32::NAN];
+    let event = event(550, 6, 4).with(Signal::WeightMax, &weights);
+    let done = run(&event, "");
+    assert_eq!(done.pruned, [1, 3]);
+    assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (4, "prune"));
+}
+
+#[test]
+fn the_worst_pixels_become_rows() {
+    // Budget 40: two rows per insertion. 39 rows: one victim.
+    let mut event = event(10_500, 39, 40);
+    event.candidates = vec![
+        candidate(0.1, 0.01),
+        candidate(0.3, 0.02),
+        candidate(0.2, 0.03),
+    ];
+    let done = run(&event, "");
+    assert_eq!(done.pruned, [0]);
+    let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
+    let seed = |error, scale| Seed {
+        position: [error, 0.0, 0.0],
+        colour: [error, 0.5, 1.0],
+        scale,
+        opacity: 0.1,
+    };
+    assert_eq!(seeds, [seed(0.3, 0.04), seed(0.2, 0.06)]);
+    assert_eq!(
+        done.ops.counts,
+        EditCounts {
+            removed: 1,
+            added: 2,
+            updated: 0,
+            denied: 0
+        }
+    );
+    assert!(done.ops.reset_candidates && !done.ops.reset_signals);
+    assert_eq!(done.ops.cause, "insert");
+    assert_eq!(
+        run(
+            &Event {
+                budget: 41,
+                ..event.clone()
+            },
+            ""
+        )
+        .pruned,
+        [0_u32; 0]
+    );
+    event.candidates.clear();
+    let idle = run(&event, "");
+    assert!(!idle.ops.edits_rows() && idle.ops.reset_candidates);
+}
+
+#[test]
+fn nobody_dies_for_a_pixel_without_a_point() {
+    let mut event = event(10_500, 40, 40);
+    let nowhere = Candidate {
+        position: [f32::NAN; 3],
+        ..candidate(0.9, 0.01)
+    };
+    event.candidates = vec![nowhere, candidate(0.1, 0.0), candidate(0.2, 0.01)];
+    let done = run(&event, "");
+    assert_eq!(done.pruned, [0]);
+    assert_eq!(
+        done.ops.counts,
+        EditCounts {
+            removed: 1,
+            added: 1,
+            updated: 0,
+            denied: 2
+        }
+    );
+}
+
+#[test]
+fn the_size_of_the_code_is_the_squared_geometric_mean() {
+    let mut event = event(10_500, 3, 40).with(Signal::ScaleMax, &[0.1, 0.4, f32::NAN]);
+    event.candidates = vec![candidate(0.1, 7.0)];
+    let scale = |set| run(&event, set).ops.seeds[0].1.scale;
+    assert!((scale("newborn_size = \"code\"") - 0.04).abs() < 1e-6);
+    assert!((scale("size_pixels = 0.5") - 3.5).abs() < 1e-6);
+}
+
+#[test]
+fn growth_pruning_and_insertion_can_fall_on_one_step() {
+    // 44 rows, budget 40: four go; three candidates want room, two rows are to be inserted.
+    let mut event = event(1000, 44, 40).with(Signal::ScreenGradient, &wanting(44, &[5, 40, 41]));
+    event.candidates = (1..9).map(|i| candidate(i as f32 / 10.0, 0.01)).collect();
+    let done = run(&event, "compensate_from = 500");
+    assert_eq!(done.ops.cause, "grow+prune+insert");
+    assert_eq!(done.pruned, [0, 1, 2, 3, 4, 6, 7, 8, 9]);
+    assert_eq!(done.cloned, [41, 40, 5]);
+    assert_eq!((done.ops.seeds.len(), done.ops.rows_after), (2, 40));
+    assert!(done.ops.reset_signals && done.ops.reset_candidates);
+}
+
+#[test]
+fn windows_are_those_of_the_paper() {
+    let scene = Event::new(1, 1, 1).scene;
+    let due = |set: &str, iterations: u32| -> Vec<u32> {
+        let policy = diet(
+            &SceneInfo {
+                iterations,
+                ..scene.clone()
+            },
+            set,
+        );
+        (0..=iterations)
+            .filter(|&step| policy.is_due(step))
+            .collect()
+    };
+    let grow = due("prune_every = 0\ninsert_every = 0", 30_000);
+    assert_eq!((grow.len(), grow[0], grow.last()), (94, 600, Some(&9900)));
+    let insert = due("prune_every = 0\ngrow_every = 0", 30_000);
+    assert_eq!(insert, (10_500..15_000).step_by(500).collect::<Vec<_>>());
+    let prune = due("grow_every = 0\ninsert_every = 0", 30_000);
+    assert_eq!(
+        (prune.len(), prune[0], prune.last()),
+        (289, 550, Some(&14_950))
+    );
+    let insert = due("prune_every = 0\ngrow_every = 0", 3000);
+    assert_eq!(insert, (1050..1500).step_by(50).collect::<Vec<_>>());
+}
+
+#[test]
+fn only_what_is_used_is_asked_for() {
+    let mut scene = Event::new(1, 1, 1).scene;
+    scene.budget = 30_000;
+    let needs = |set: &str| diet(&scene, set).needs(&scene);
+    let full = needs("");
+    assert_eq!(full.signals.iter().count(), 11);
+    assert!(full.signals.contains(Signal::MeanGradientNorm) && full.signals.contains(Signal::Age));
+    let request = full.candidates.unwrap();
+    // 500 steps of 30,000/3000 pixels.
+    assert_eq!(
+        (request.capacity, request.from, request.until),
+        (5000, 10_000, 15_000)
+    );
+    assert_eq!(
+        (request.error, request.depth),
+        (ErrorMode::L1Dssim, DepthMode::MaxWeight)
+    );
+    assert!(request.spaced && request.rows_per_candidate == 3000);
+    assert!((request.min_alpha - 0.5).abs() < 1e-9);
+
+    let lean = needs("shift = \"none\"\nmixed_gradient = false\nprotect = 0\nrho_c = 0.0");
+    let listed: Vec<Signal> = lean.signals.iter().collect();
+    use Signal::{Opacity, ScaleMax, ScreenGradient, VisibleCount, WeightMax};
+    assert_eq!(
+        listed,
+        [VisibleCount, ScreenGradient, WeightMax, Opacity, ScaleMax]
+    );
+    assert_eq!(lean.candidates, None);
+    assert!(
+        !needs("shift = \"paper\"")
+            .signals
+            .contains(Signal::MeanGradientNorm)
+    );
+    let switched =
+        needs("error = \"grad\"\ndepth = \"median\"\nnms = false\nrows_per_candidate = 1");
+    let request = switched.candidates.unwrap();
+    assert_eq!(
+        (request.error, request.depth),
+        (ErrorMode::Gradient, DepthMode::Median)
+    );
+    assert_eq!((request.spaced, request.capacity), (false, 30_000));
+    assert_eq!(
+        needs("error = \"l1\"").candidates.unwrap().error,
+        ErrorMode::L1
+    );
+    assert_eq!(needs("compensate_until = 10000").candidates, None);
+}
+
+#[test]
+fn ranges_are_checked_and_what_is_missing_is_said() {
+    let scene = Event::new(1, 1, 1).scene;
+    let refused = |set: &str| match find("diet").unwrap().build(&set.parse().unwrap(), &scene) {
+        Err(PolicyError::BadParameter {
+            policy,
+            parameter,
+            reason,
+        }) => {
+            assert_eq!(
+                (policy.as_str(), parameter.as_str()),
+                ("diet", set.split(' ').next().unwrap())
+            );
+            reason
+        }
+        other => panic!("{set}: {:?}", other.err()),
+    };
+    for set in [
+        "tau = -1",
+        "colour_weight = inf",
+        "rho = 1.1",
+        "small = -0.1",
+        "split_factor = 0",
+        "kappa = -0.1",
+        "min_opacity = -1",
+        "max_scale = 0",
+        "protect = 65536",
+        "rho_c = 2",
+        "rows_per_candidate = 0",
+        "min_alpha = 1.5",
+        "size_pixels = 0",
+        "newborn_opacity = 1",
+        "growth = \"some\"",
+        "shift = \"up\"",
+        "error = \"l2\"",
+        "nms = 1",
+    ] {
+        refused(set);
+    }
+    assert!(refused("importance = \"fresh\"").contains("not available yet"));
+    assert!(refused("reinit_at = 5000").contains("5000 is not available yet"));
+}

@@ -1,0 +1,279 @@
+//! A compiled plan: slots, in the order in which a backend executes them.
+
+use serde::{Deserialize, Serialize};
+
+use crate::edit::{Offspring, ParentFate, Seed, Update, in_open_unit};
+
+/// A plan as slots: what a backend executes, in this order. Rows `0..rows_before` are live before,
+/// rows `0..rows_after` after; no slot >= the budget is ever written.
+///
+/// Pass 1: `families` (the parent is read once, then its children and the parent itself are
+/// written), `updates`, `seeds`: no slot is written twice and no written slot is read by another
+/// entry. Pass 2: `moves`. Then `clamp_opacity` over all rows, then the resets.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RowOps {
+    /// Rows before the edit.
+    pub rows_before: usize,
+    /// Rows after the edit, <= budget.
+    pub rows_after: usize,
+    /// The budget the plan was made for.
+    pub budget: usize,
+    /// Parents and their offspring.
+    pub families: Vec<Family>,
+    /// Slots of all children, family after family.
+    pub child_slots: Vec<u32>,
+    /// Rows rewritten in place.
+    pub updates: Vec<(u32, Update)>,
+    /// Rows born without a parent, with their slots.
+    pub seeds: Vec<(u32, Seed)>,
+    /// (from, to): live tail rows that fill the holes left by pruned rows; every `from` >=
+    /// `rows_after` > every `to`.
+    pub moves: Vec<(u32, u32)>,
+    /// Upper bound for all opacities, in (0, 1); both opacity moments of all rows become zero.
+    pub clamp_opacity: Option<f32>,
+    /// Whether the signal sums start anew; otherwise moved rows carry theirs.
+    pub reset_signals: bool,
+    /// Whether the candidate list starts anew.
+    pub reset_candidates: bool,
+    /// What was done, for the event log.
+    pub counts: EditCounts,
+    /// Why it was done, for the event log: tags joined by `+`.
+    pub cause: String,
+}
+
+/// One parent and its children.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Family {
+    /// The parent's row.
+    pub parent: u32,
+    /// Its first child's place in [`RowOps::child_slots`].
+    pub first_child: u32,
+    /// How they come to be.
+    pub offspring: Offspring,
+}
+
+/// How many rows an edit touched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct EditCounts {
+    /// Rows pruned.
+    pub removed: usize,
+    /// Rows born (children and seeds).
+    pub added: usize,
+    /// Rows rewritten in place (updates and parents that became children).
+    pub updated: usize,
+    /// Edits refused: the policy wanted more.
+    pub denied: usize,
+}
+
+/// What is wrong with a [`RowOps`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("broken row operations: {0}")]
+pub struct BrokenOps(String);
+
+impl RowOps {
+    /// Whether there is nothing to do: no row changes and no accumulator starts anew. A plan whose
+    /// edits were all refused is empty too; see [`EditCounts::denied`].
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        !self.edits_rows() && !self.reset_signals && !self.reset_candidates
+    }
+
+    /// Whether any row is born, removed, rewritten or clamped.
+    #[must_use]
+    pub fn edits_rows(&self) -> bool {
+        !(self.families.is_empty()
+            && self.updates.is_empty()
+            && self.seeds.is_empty()
+            && self.moves.is_empty()
+            && self.rows_before == self.rows_after
+            && self.clamp_opacity.is_none())
+    }
+
+    /// The slots of `family`'s children.
+    ///
+    /// # Panics
+    /// When `family` is not one of this plan's.
+    #[must_use]
+    pub fn children(&self, family: &Family) -> &[u32] {
+        &self.child_slots[family.first_child as usize..][..family.offspring.children as usize]
+    }
+
+    /// Panics with the reason when [`check`](Self::check) finds one: going on would exceed the
+    /// budget or corrupt the model.
+    ///
+    /// # Panics
+    /// See above.
+    pub fn assert_valid(&self) {
+        if let Err(broken) = self.check() {
+            panic!("{broken}");
+        }
+    }
+
+    /// Verifies everything this type promises: rows within the budget, no slot written twice, no
+    /// written slot read by another entry, rows `0..rows_after` dense, values in range, counts
+    /// right. Takes time in proportion to the operations, and one bit per row.
+    ///
+    /// # Errors
+    /// The first promise that is broken, with the values.
+    pub fn check(&self) -> Result<(), BrokenOps> {
+        self.check_totals()?;
+        let slots = self.rows_before.max(self.rows_after);
+        let mut claimed = Slots::new(slots);
+        self.check_families(&mut claimed)?;
+        for (row, update) in &self.updates {
+            require(update.is_valid(), || {
+                format!("update of row {row} has a bad value")
+            })?;
+            self.check_live("updated row", *row)?;
+            claimed.claim("updated row", *row)?;
+        }
+        for (slot, seed) in &self.seeds {
+            require(seed.is_valid(), || {
+                format!("seed in slot {slot} has a bad value")
+            })?;
+            self.check_birth("seed", *slot)?;
+            claimed.claim("seed", *slot)?;
+        }
+        self.check_moves(&mut claimed)
+    }
+
+    fn check_totals(&self) -> Result<(), BrokenOps> {
+        let Self {
+            rows_before,
+            rows_after,
+            budget,
+            counts,
+            ..
+        } = self;
+        let born = self.child_slots.len() + self.seeds.len();
+        require(
+            rows_after <= budget || (rows_after <= rows_before && born == 0),
+            || format!("{rows_after} rows after, budget {budget}"),
+        )?;
+        let holds = rows_before
+            .checked_sub(counts.removed)
+            .map(|kept| kept + born);
+        require(holds == Some(*rows_after) && counts.added == born, || {
+            format!("{rows_before} rows, {counts:?}, {born} born: not {rows_after} rows after")
+        })?;
+        let is_child = |family: &&Family| family.offspring.parent == ParentFate::BecomesChild;
+        let updated = self.updates.len() + self.families.iter().filter(is_child).count();
+        require(counts.updated == updated, || {
+            format!("{updated} updated, but {counts:?}")
+        })?;
+        require(self.clamp_opacity.is_none_or(in_open_unit), || {
+            format!("opacity bound {:?}", self.clamp_opacity)
+        })
+    }
+
+    fn check_families(&self, claimed: &mut Slots) -> Result<(), BrokenOps> {
+        let mut first_child = 0;
+        for family in &self.families {
+            let parent = family.parent;
+            require(family.offspring.is_valid(), || {
+                format!("family of row {parent}: bad value")
+            })?;
+            require(family.first_child as usize == first_child, || {
+                format!("family of row {parent} starts at {}", family.first_child)
+            })?;
+            first_child += family.offspring.children as usize;
+            self.check_live("parent", parent)?;
+            claimed.claim("parent", parent)?;
+        }
+        require(self.child_slots.len() == first_child, || {
+            format!(
+                "{} child slots for {first_child} children",
+                self.child_slots.len()
+            )
+        })?;
+        for &slot in &self.child_slots {
+            self.check_birth("child", slot)?;
+            claimed.claim("child", slot)?;
+        }
+        Ok(())
+    }
+
+    /// Every move ends in a hole; every parent and updated row of the tail is moved; the rows from
+    /// `rows_before` upward are all born.
+    fn check_moves(&self, claimed: &mut Slots) -> Result<(), BrokenOps> {
+        let Self {
+            rows_before,
+            rows_after,
+            ..
+        } = self;
+        let mut moved = Slots::new(*rows_before);
+        for &(from, to) in &self.moves {
+            require(
+                (*rows_after..*rows_before).contains(&(from as usize)),
+                || format!("move from row {from}, not in the tail {rows_after}..{rows_before}"),
+            )?;
+            require((to as usize) < *rows_after, || {
+                format!("move to row {to} of {rows_after}")
+            })?;
+            moved.claim("moved row", from)?;
+            claimed.claim("hole", to)?;
+        }
+        let parents = self.families.iter().map(|family| family.parent);
+        for row in parents.chain(self.updates.iter().map(|update| update.0)) {
+            require((row as usize) < *rows_after || moved.contains(row), || {
+                format!("row {row} lives on, but is beyond row {rows_after} and not moved")
+            })?;
+        }
+        let seeds = self.seeds.iter().map(|seed| &seed.0);
+        let births = self.child_slots.iter().chain(seeds);
+        let on_top = births
+            .filter(|&&slot| slot as usize >= *rows_before)
+            .count();
+        require(on_top == rows_after.saturating_sub(*rows_before), || {
+            format!("{on_top} rows born on top of {rows_before}, {rows_after} rows after")
+        })
+    }
+
+    fn check_live(&self, what: &str, row: u32) -> Result<(), BrokenOps> {
+        require((row as usize) < self.rows_before, || {
+            format!("{what} {row} of {} rows", self.rows_before)
+        })
+    }
+
+    fn check_birth(&self, what: &str, slot: u32) -> Result<(), BrokenOps> {
+        require((slot as usize) < self.rows_after.min(self.budget), || {
+            format!(
+                "{what} in slot {slot}, {} rows after, budget {}",
+                self.rows_after, self.budget
+            )
+        })
+    }
+}
+
+fn require(holds: bool, broken: impl FnOnce() -> String) -> Result<(), BrokenOps> {
+    if holds {
+        Ok(())
+    } else {
+        Err(BrokenOps(broken()))
+    }
+}
+
+/// A set of slots, one bit each.
+struct Slots(Vec<u64>);
+
+impl Slots {
+    fn new(slots: usize) -> Self {
+        Self(vec![0; slots.div_ceil(64)])
+    }
+
+    fn contains(&self, slot: u32) -> bool {
+        self.0
+            .get(slot as usize / 64)
+            .is_some_and(|word| word >> (slot % 64) & 1 == 1)
+    }
+
+    fn claim(&mut self, what: &str, slot: u32) -> Result<(), BrokenOps> {
+        let is_new = !self.contains(slot);
+        require(is_new, || format!("{what} {slot} is used by another entry"))?;
+        self.0[slot as usize / 64] |= 1 << (slot % 64);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests;

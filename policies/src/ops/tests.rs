@@ -1,0 +1,139 @@
+use super::*;
+use crate::edit::{OpacityRule, Placement, ScaleRule};
+use crate::plan::EditPlan;
+
+const SPLIT: Offspring = Offspring {
+    children: 1,
+    parent: ParentFate::BecomesChild,
+    placement: Placement::Sampled,
+    scale: ScaleRule::Uniform(0.5),
+    opacity: OpacityRule::Same,
+};
+const SEED: Seed = Seed {
+    position: [0.0; 3],
+    colour: [0.5; 3],
+    scale: 1.0,
+    opacity: 0.1,
+};
+const UPDATE: Update = Update {
+    opacity: OpacityRule::Same,
+    scale: ScaleRule::Uniform(2.0),
+    keep_moments: false,
+};
+
+/// Ten rows: 1, 2, 3, 5 and 8 pruned, 9 split, 7 updated, one seed.
+fn shrinking() -> RowOps {
+    let mut plan = EditPlan::new(10, 10);
+    for row in [1, 2, 3, 5, 8] {
+        plan.prune(row).unwrap();
+    }
+    plan.grow(9, SPLIT).unwrap();
+    plan.update(7, UPDATE).unwrap();
+    plan.append(SEED).unwrap();
+    plan.compile()
+}
+
+#[test]
+fn a_plan_passes() {
+    let ops = shrinking();
+    assert_eq!(ops.rows_after, 7);
+    assert_eq!(ops.child_slots, [1]);
+    assert_eq!(ops.children(&ops.families[0]), [1]);
+    assert_eq!(ops.seeds[0].0, 2);
+    assert_eq!(ops.moves, [(7, 3), (9, 5)]);
+    assert_eq!(ops.check(), Ok(()));
+}
+
+#[test]
+fn every_corruption_is_found() {
+    type Corruption = (&'static str, fn(&mut RowOps));
+    let corruptions: &[Corruption] = &[
+        ("over budget", |ops| ops.budget = 6),
+        ("a row too many", |ops| ops.rows_after += 1),
+        ("a row too few", |ops| ops.rows_after -= 1),
+        ("removed miscounted", |ops| ops.counts.removed += 1),
+        ("added miscounted", |ops| ops.counts.added -= 1),
+        ("updated miscounted", |ops| ops.counts.updated = 1),
+        ("opacity bound of one", |ops| ops.clamp_opacity = Some(1.0)),
+        ("opacity bound not a number", |ops| {
+            ops.clamp_opacity = Some(f32::NAN);
+        }),
+        ("parent beyond the model", |ops| ops.families[0].parent = 10),
+        ("parent is updated too", |ops| ops.families[0].parent = 7),
+        ("parent not moved", |ops| ops.families[0].parent = 8),
+        ("bad offspring", |ops| {
+            ops.families[0].offspring.scale = ScaleRule::Uniform(-1.0);
+        }),
+        ("children elsewhere", |ops| ops.families[0].first_child = 1),
+        ("a child without a slot", |ops| {
+            ops.families[0].offspring.children = 2;
+        }),
+        ("child upon parent", |ops| ops.child_slots[0] = 9),
+        ("child upon seed", |ops| ops.child_slots[0] = 2),
+        ("child beyond the model", |ops| ops.child_slots[0] = 8),
+        ("updated row does not exist", |ops| ops.updates[0].0 = 12),
+        ("updated row not moved", |ops| ops.updates[0].0 = 8),
+        ("bad update", |ops| {
+            ops.updates[0].1.opacity = OpacityRule::Set(0.0);
+        }),
+        ("seed upon child", |ops| ops.seeds[0].0 = 1),
+        ("seed upon a moved row", |ops| ops.seeds[0].0 = 3),
+        ("bad seed", |ops| ops.seeds[0].1.scale = f32::NAN),
+        ("move out of the middle", |ops| ops.moves[0].0 = 4),
+        ("move of nothing", |ops| ops.moves[0].0 = 10),
+        ("move twice", |ops| ops.moves[0].0 = 9),
+        ("move upon child", |ops| ops.moves[0].1 = 1),
+        ("move beyond the model", |ops| ops.moves[0].1 = 8),
+        ("move missing", |ops| ops.moves.truncate(1)),
+    ];
+    let passed: Vec<&str> = corruptions
+        .iter()
+        .filter(|(_, corrupt)| {
+            let mut ops = shrinking();
+            corrupt(&mut ops);
+            ops.check().is_ok()
+        })
+        .map(|(name, _)| *name)
+        .collect();
+    assert!(passed.is_empty(), "not found: {passed:?}");
+}
+
+#[test]
+fn a_hole_left_on_top_is_found() {
+    let mut plan = EditPlan::new(3, 5);
+    plan.prune(0).unwrap();
+    plan.append(SEED).unwrap();
+    plan.append(SEED).unwrap();
+    let mut ops = plan.compile();
+    assert_eq!(ops.rows_after, 4);
+    assert_eq!(ops.seeds.iter().map(|s| s.0).collect::<Vec<_>>(), [0, 3]);
+    ops.seeds[1].0 = 2;
+    assert!(ops.check().is_err());
+}
+
+#[test]
+#[should_panic(expected = "broken row operations: 7 rows after, budget 6")]
+fn a_broken_plan_stops_the_run() {
+    let mut ops = shrinking();
+    ops.budget = 6;
+    ops.assert_valid();
+}
+
+#[test]
+fn empty_means_nothing_to_do() {
+    let empty = || EditPlan::new(3, 3);
+    let mut refused = empty();
+    refused.append(SEED).unwrap_err();
+    let refused = refused.compile();
+    assert!(refused.is_empty() && refused.counts.denied == 1);
+    let mut pruned_tail = empty();
+    pruned_tail.prune(2).unwrap();
+    assert!(!pruned_tail.compile().is_empty());
+    let mut clamped = empty();
+    clamped.clamp_opacity(0.5).unwrap();
+    assert!(!clamped.compile().is_empty());
+    let mut reset = empty();
+    reset.reset(crate::edit::Reset::Signals);
+    let reset = reset.compile();
+    assert!(!reset.is_empty() && !reset.edits_rows());
+}

@@ -1,0 +1,271 @@
+//! Parameters of policies: their names, their ranges, and how they follow the length of a run.
+
+use std::collections::BTreeMap;
+use std::ops::{Bound, RangeBounds};
+
+use serde::de::{DeserializeOwned, Deserializer, Error, Visitor, value};
+use toml::{Table, Value};
+
+use crate::policy::PolicyError;
+
+/// Length of the run for which the defaults of schedules are written [steps].
+pub const REFERENCE_ITERATIONS: u32 = 30_000;
+
+/// Checks that a parameter is finite and in its range; for [`ConfiguredPolicy::new`]. The
+/// registry fills in the policy's name.
+///
+/// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
+///
+/// # Errors
+/// [`PolicyError::BadParameter`] with the value and the range.
+pub fn in_range(
+    parameter: &str,
+    value: f64,
+    range: impl RangeBounds<f64>,
+) -> Result<(), PolicyError> {
+    if value.is_finite() && range.contains(&value) {
+        return Ok(());
+    }
+    let mut must = Vec::new();
+    match range.start_bound() {
+        Bound::Included(low) => must.push(format!("at least {low}")),
+        Bound::Excluded(low) => must.push(format!("greater than {low}")),
+        Bound::Unbounded => {}
+    }
+    match range.end_bound() {
+        Bound::Included(high) => must.push(format!("at most {high}")),
+        Bound::Excluded(high) => must.push(format!("less than {high}")),
+        Bound::Unbounded => {}
+    }
+    if must.is_empty() {
+        must.push("finite".to_owned());
+    }
+    Err(bad(
+        parameter,
+        format!("{value} is out of range; it must be {}", must.join(" and ")),
+    ))
+}
+
+/// A [`PolicyError::BadParameter`]; for [`ConfiguredPolicy::new`]. The registry fills in the
+/// policy's name.
+///
+/// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
+#[must_use]
+pub fn bad(parameter: &str, reason: impl Into<String>) -> PolicyError {
+    PolicyError::BadParameter {
+        policy: String::new(),
+        parameter: parameter.to_owned(),
+        reason: reason.into(),
+    }
+}
+
+/// Parses settings of the form `policy.parameter=value` into one table per policy.
+///
+/// The value is TOML (`0.2`, `true`, `"text"`); what is no TOML value is taken as text, so that
+/// words need no quotes. Of several settings of one parameter the last holds.
+///
+/// # Errors
+/// [`PolicyError::Other`] naming the setting that has another form.
+pub fn parse_overrides(
+    settings: &[impl AsRef<str>],
+) -> Result<BTreeMap<String, Table>, PolicyError> {
+    let mut tables: BTreeMap<String, Table> = BTreeMap::new();
+    for setting in settings.iter().map(AsRef::as_ref) {
+        let (key, value) = setting.split_once('=').unwrap_or((setting, ""));
+        let (policy, parameter) = key.split_once('.').unwrap_or((key, ""));
+        let [policy, parameter, value] = [policy, parameter, value].map(str::trim);
+        if policy.is_empty() || parameter.is_empty() || value.is_empty() {
+            return Err(PolicyError::Other(format!(
+                "`{setting}` is not of the form policy.parameter=value, such as diet.rho=0.2"
+            )));
+        }
+        let table = tables.entry(policy.to_owned()).or_default();
+        table.insert(parameter.to_owned(), parse_value(value));
+    }
+    Ok(tables)
+}
+
+pub(crate) fn parse_value(text: &str) -> Value {
+    let parsed = format!("value = {text}").parse::<Table>().ok();
+    // A value with a line break could hold further keys; then it is no value.
+    let single = parsed.filter(|table| table.len() == 1);
+    single
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| text.into())
+}
+
+/// Multiplies the step counts named in `names` by `iterations` / 30,000: rounded, at least 1, but
+/// 0 (which switches something off) stays 0.
+pub(crate) fn scale_steps(table: &mut Table, names: &[&str], iterations: u32) {
+    for name in names {
+        if let Some(Value::Integer(steps)) = table.get_mut(*name)
+            && *steps > 0
+        {
+            let factor = f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
+            *steps = ((*steps as f64 * factor).round() as i64).max(1);
+        }
+    }
+}
+
+/// The name in `known` most like `name`, if any is like it.
+pub(crate) fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
+    // 0.7 lets a missing or a wrong letter of a short name pass, but not another word.
+    let alike = known
+        .into_iter()
+        .map(|k| (strsim::jaro_winkler(name, k), k));
+    let best = alike
+        .filter(|(likeness, _)| *likeness >= 0.7)
+        .max_by(|a, b| a.0.total_cmp(&b.0));
+    best.map(|(_, k)| k.to_owned())
+}
+
+/// The names of the fields of `T`, a struct that derives `Deserialize`, in declaration order:
+/// those that are `None` by default included, which a table of defaults cannot hold. `None` when
+/// `T` is no plain struct.
+pub(crate) fn field_names<T: DeserializeOwned>() -> Option<&'static [&'static str]> {
+    let mut names = None;
+    // Always an error: the deserialiser only listens.
+    let _ = T::deserialize(Listener(&mut names));
+    names
+}
+
+struct Listener<'a>(&'a mut Option<&'static [&'static str]>);
+
+impl<'de> Deserializer<'de> for Listener<'_> {
+    type Error = value::Error;
+
+    fn deserialize_struct<V: Visitor<'de>>(
+        self,
+        _name: &'static str,
+        fields: &'static [&'static str],
+        _visitor: V,
+    ) -> Result<V::Value, Self::Error> {
+        *self.0 = Some(fields);
+        Err(Error::custom("names only"))
+    }
+
+    fn deserialize_any<V: Visitor<'de>>(self, _visitor: V) -> Result<V::Value, Self::Error> {
+        Err(Error::custom("names only"))
+    }
+
+    serde::forward_to_deserialize_any! {
+        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf option
+        unit unit_struct newtype_struct seq tuple tuple_struct map enum identifier ignored_any
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde::Deserialize;
+
+    fn reason(result: Result<(), PolicyError>) -> String {
+        match result {
+            Err(PolicyError::BadParameter {
+                parameter, reason, ..
+            }) if parameter == "rho" => reason,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn ranges_are_kept_and_told() {
+        assert_eq!(in_range("rho", 1.0, 0.0..=1.0), Ok(()));
+        assert_eq!(in_range("rho", -5.0, ..), Ok(()));
+        let told = reason(in_range("rho", 1.5, 0.0..=1.0));
+        assert_eq!(
+            told,
+            "1.5 is out of range; it must be at least 0 and at most 1"
+        );
+        let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
+        let told = reason(in_range("rho", 0.0, open));
+        assert_eq!(
+            told,
+            "0 is out of range; it must be greater than 0 and less than 1"
+        );
+        assert_eq!(
+            reason(in_range("rho", f64::NAN, ..)),
+            "NaN is out of range; it must be finite"
+        );
+        reason(in_range("rho", f64::INFINITY, 0.0..));
+    }
+
+    #[test]
+    fn overrides_are_toml_or_words() {
+        let settings = [
+            "diet.rho=0.2",
+            "vanilla.governor=true",
+            "diet.shift=none",
+            "diet.rho = 0.3",
+            "diet.a=\"x=y\"",
+            "diet.b=1\nc=2",
+            "diet.d=x=y",
+            "diet.e=1e-4",
+        ];
+        let tables = parse_overrides(&settings).unwrap();
+        assert_eq!(tables.keys().collect::<Vec<_>>(), ["diet", "vanilla"]);
+        let diet = &tables["diet"];
+        assert_eq!(diet["rho"], Value::Float(0.3));
+        assert_eq!(diet["shift"], Value::String("none".into()));
+        assert_eq!(diet["a"], Value::String("x=y".into()));
+        assert_eq!(diet["b"], Value::String("1\nc=2".into()));
+        assert_eq!(diet["d"], Value::String("x=y".into()));
+        assert_eq!(diet["e"], Value::Float(1e-4));
+        assert_eq!(tables["vanilla"]["governor"], Value::Boolean(true));
+        assert!(parse_overrides(&[""; 0]).unwrap().is_empty());
+        for broken in [
+            "",
+            "diet",
+            "diet.rho",
+            "diet=0.2",
+            ".rho=1",
+            "diet.=1",
+            "diet.rho=",
+            "=",
+            ".",
+        ] {
+            let error = parse_overrides(&[broken]).unwrap_err().to_string();
+            assert!(error.contains(&format!("`{broken}`")), "{error}");
+        }
+    }
+
+    #[test]
+    fn schedules_follow_the_run() {
+        let scaled = |steps: i64, iterations| {
+            let mut table = Table::new();
+            table.insert("every".into(), steps.into());
+            table.insert("rows".into(), 100.into());
+            scale_steps(&mut table, &["every", "absent"], iterations);
+            assert_eq!(table["rows"].as_integer(), Some(100));
+            table["every"].as_integer().unwrap()
+        };
+        assert_eq!(scaled(100, 30_000), 100);
+        assert_eq!(scaled(100, 2_000), 7);
+        assert_eq!(scaled(50, 2_000), 3);
+        assert_eq!(scaled(100, 60_000), 200);
+        assert_eq!(scaled(100, 1), 1);
+        assert_eq!(scaled(100, 0), 1);
+        assert_eq!(scaled(0, 60_000), 0);
+    }
+
+    #[test]
+    fn fields_are_known_by_name() {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        #[expect(dead_code, reason = "only the names matter")]
+        struct Params {
+            later: u32,
+            earlier: Option<u32>,
+        }
+        assert_eq!(field_names::<Params>(), Some(&["later", "earlier"][..]));
+        assert_eq!(field_names::<BTreeMap<String, u32>>(), None);
+    }
+
+    #[test]
+    fn a_slip_finds_the_name() {
+        let known = ["diet", "taming", "vanilla"];
+        assert_eq!(nearest("dite", known).as_deref(), Some("diet"));
+        assert_eq!(nearest("vanila", known).as_deref(), Some("vanilla"));
+        assert_eq!(nearest("mcmc", known), None);
+    }
+}

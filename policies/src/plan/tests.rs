@@ -1,0 +1,285 @@
+use super::*;
+use proptest::prelude::*;
+
+fn family(children: u32, parent: ParentFate) -> Offspring {
+    Offspring {
+        children,
+        parent,
+        placement: Placement::Sampled,
+        scale: ScaleRule::Uniform(0.625),
+        opacity: OpacityRule::Same,
+    }
+}
+
+const SEED: Seed = Seed {
+    position: [0.0; 3],
+    colour: [0.5; 3],
+    scale: 1.0,
+    opacity: 0.1,
+};
+const UPDATE: Update = Update {
+    opacity: OpacityRule::Same,
+    scale: ScaleRule::Uniform(1.0),
+    keep_moments: true,
+};
+
+#[test]
+fn a_row_has_one_fate() {
+    let mut plan = EditPlan::new(4, 8);
+    plan.prune(0).unwrap();
+    plan.grow(1, family(1, ParentFate::Stays)).unwrap();
+    plan.update(2, UPDATE).unwrap();
+    for row in 0..3 {
+        assert!(!plan.is_free(row));
+        assert_eq!(plan.prune(row), Err(Refused::Taken));
+        assert_eq!(
+            plan.grow(row, family(1, ParentFate::Stays)),
+            Err(Refused::Taken)
+        );
+        assert_eq!(plan.update(row, UPDATE), Err(Refused::Taken));
+    }
+    assert!(plan.is_free(3) && !plan.is_free(4));
+    assert_eq!(plan.prune(4), Err(Refused::NoSuchRow));
+    assert_eq!(
+        plan.grow(4, family(1, ParentFate::Stays)),
+        Err(Refused::NoSuchRow)
+    );
+    assert_eq!(plan.update(u32::MAX, UPDATE), Err(Refused::NoSuchRow));
+    assert_eq!(plan.denied(), 12);
+    assert_eq!(plan.room(), 4);
+    let counts = EditCounts {
+        removed: 1,
+        added: 1,
+        updated: 1,
+        denied: 12,
+    };
+    assert_eq!(plan.compile().counts, counts);
+}
+
+#[test]
+fn pruned_rows_make_room_in_the_same_plan() {
+    let mut plan = EditPlan::new(3, 3);
+    let twins = family(2, ParentFate::BecomesChild);
+    assert_eq!(plan.grow(0, twins), Err(Refused::NoRoom));
+    plan.prune(1).unwrap();
+    assert_eq!(plan.room(), 1);
+    assert_eq!(plan.grow(0, twins), Err(Refused::NoRoom));
+    plan.prune(2).unwrap();
+    plan.grow(0, twins).unwrap();
+    assert_eq!(plan.room(), 0);
+    assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
+    let ops = plan.compile();
+    assert_eq!((ops.rows_after, &ops.child_slots[..]), (3, &[1, 2][..]));
+    assert_eq!(
+        ops.counts,
+        EditCounts {
+            removed: 2,
+            added: 2,
+            updated: 1,
+            denied: 3
+        }
+    );
+}
+
+#[test]
+fn a_refused_value_changes_nothing() {
+    let mut plan = EditPlan::new(2, 8);
+    let lone = Offspring {
+        children: 0,
+        ..family(1, ParentFate::Stays)
+    };
+    assert_eq!(plan.grow(0, lone), Err(Refused::BadValue));
+    let nowhere = Update {
+        scale: ScaleRule::Uniform(f32::NAN),
+        ..UPDATE
+    };
+    assert_eq!(plan.update(0, nowhere), Err(Refused::BadValue));
+    assert_eq!(
+        plan.append(Seed {
+            opacity: 1.0,
+            ..SEED
+        }),
+        Err(Refused::BadValue)
+    );
+    assert_eq!(plan.clamp_opacity(0.0), Err(Refused::BadValue));
+    assert!(plan.is_free(0) && plan.room() == 6);
+    let ops = plan.compile();
+    assert!(ops.is_empty());
+    assert_eq!(ops.counts.denied, 4);
+}
+
+#[test]
+fn more_children_than_slots_are_refused() {
+    let mut plan = EditPlan::new(1, usize::MAX);
+    let many = family(u32::MAX, ParentFate::Stays);
+    assert_eq!(plan.grow(0, many), Err(Refused::NoRoom));
+    assert_eq!(plan.room(), u32::MAX as usize - 1);
+}
+
+#[test]
+fn above_the_budget_a_plan_only_shrinks() {
+    let mut plan = EditPlan::new(5, 3);
+    assert_eq!(plan.room(), 0);
+    plan.prune(0).unwrap();
+    assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
+    let ops = plan.compile();
+    assert_eq!((ops.rows_after, ops.check()), (4, Ok(())));
+
+    let mut plan = EditPlan::new(5, 3);
+    for row in [0, 3, 4] {
+        plan.prune(row).unwrap();
+    }
+    plan.append(SEED).unwrap();
+    assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
+    let ops = plan.compile();
+    assert_eq!(
+        (ops.rows_after, ops.seeds[0].0, ops.check()),
+        (3, 0, Ok(()))
+    );
+}
+
+#[test]
+fn the_lowest_bound_and_every_cause_hold() {
+    let mut plan = EditPlan::new(1, 1);
+    plan.clamp_opacity(0.01).unwrap();
+    plan.clamp_opacity(0.5).unwrap();
+    plan.reset(Reset::Candidates);
+    for tag in ["grow", "reset", "grow", ""] {
+        plan.cause(tag);
+    }
+    let ops = plan.compile();
+    assert_eq!(ops.clamp_opacity, Some(0.01));
+    assert_eq!(ops.cause, "grow+reset");
+    assert!(ops.reset_candidates && !ops.reset_signals && !ops.is_empty());
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Call {
+    Prune(u32),
+    Grow(u32, u32, bool),
+    Update(u32),
+    Append,
+}
+
+fn calls() -> impl Strategy<Value = (usize, usize, Vec<Call>)> {
+    (0..40_usize, 0..60_usize).prop_flat_map(|(rows, budget)| {
+        let row = 0..rows as u32 + 2;
+        let call = prop_oneof![
+            4 => row.clone().prop_map(Call::Prune),
+            3 => (row.clone(), 0..4_u32, any::<bool>()).prop_map(|(r, n, b)| Call::Grow(r, n, b)),
+            1 => row.prop_map(Call::Update),
+            2 => Just(Call::Append),
+        ];
+        (Just(rows), Just(budget), prop::collection::vec(call, 0..80))
+    })
+}
+
+/// Who sits in a slot of the naive model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Who {
+    Row(u32),
+    Child { of: u32, number: u32 },
+    Seed(usize),
+}
+
+/// Executes `ops` on a plain vector, checking every sub-step, and returns who is left.
+fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Who> {
+    let slots = ops.rows_before.max(budget);
+    let mut model: Vec<Option<Who>> = (0..slots)
+        .map(|slot| (slot < ops.rows_before).then_some(Who::Row(slot as u32)))
+        .collect();
+    for &row in pruned {
+        assert_eq!(model[row as usize].take(), Some(Who::Row(row)));
+    }
+    let mut live = ops.rows_before - pruned.len();
+    let mut bear = |model: &mut [Option<Who>], slot: u32, who: Who| {
+        assert!(
+            (slot as usize) < budget,
+            "slot {slot} is beyond the budget {budget}"
+        );
+        assert_eq!(
+            model[slot as usize].replace(who),
+            None,
+            "slot {slot} was not free"
+        );
+        live += 1;
+        assert!(live <= budget, "{live} rows, budget {budget}");
+    };
+    for family in &ops.families {
+        assert_eq!(model[family.parent as usize], Some(Who::Row(family.parent)));
+        for (number, &slot) in (1..).zip(ops.children(family)) {
+            bear(
+                &mut model,
+                slot,
+                Who::Child {
+                    of: family.parent,
+                    number,
+                },
+            );
+        }
+    }
+    for (row, _) in &ops.updates {
+        assert_eq!(model[*row as usize], Some(Who::Row(*row)));
+    }
+    for (index, (slot, _)) in ops.seeds.iter().enumerate() {
+        bear(&mut model, *slot, Who::Seed(index));
+    }
+    for &(from, to) in &ops.moves {
+        let row = model[from as usize].take();
+        assert!(row.is_some() && model[to as usize].is_none());
+        model[to as usize] = row;
+    }
+    assert!(
+        model[ops.rows_after..].iter().all(Option::is_none),
+        "rows beyond the last"
+    );
+    model[..ops.rows_after]
+        .iter()
+        .map(|slot| slot.expect("rows are dense"))
+        .collect()
+}
+
+proptest! {
+    #[test]
+    fn any_plan_agrees_with_a_plain_vector((rows, budget, calls) in calls()) {
+        let mut plan = EditPlan::new(rows, budget);
+        let mut pruned = Vec::new();
+        let mut expected: Vec<Who> = (0..rows as u32).map(Who::Row).collect();
+        let mut denied = 0;
+        let mut seeds = 0;
+        for call in calls {
+            let room = plan.room();
+            let done = match call {
+                Call::Prune(row) => plan.prune(row).map(|()| {
+                    pruned.push(row);
+                    expected.retain(|&who| who != Who::Row(row));
+                }),
+                Call::Grow(row, children, stays) => {
+                    let parent = if stays { ParentFate::Stays } else { ParentFate::BecomesChild };
+                    plan.grow(row, family(children, parent)).map(|()| {
+                        expected.extend((1..=children).map(|number| Who::Child { of: row, number }));
+                    })
+                }
+                Call::Update(row) => plan.update(row, UPDATE),
+                Call::Append => plan.append(SEED).map(|()| {
+                    expected.push(Who::Seed(seeds));
+                    seeds += 1;
+                }),
+            };
+            if done.is_err() {
+                denied += 1;
+                prop_assert_eq!(plan.room(), room);
+            }
+            prop_assert!(expected.len() <= budget.max(rows - pruned.len()));
+            prop_assert_eq!(plan.room(), budget.saturating_sub(expected.len()));
+        }
+        let ops = plan.compile();
+        prop_assert_eq!(ops.check(), Ok(()));
+        prop_assert_eq!(ops.counts.denied, denied);
+        prop_assert!(ops.rows_after <= budget.max(rows));
+        let mut found = execute(&ops, &pruned, budget);
+        found.sort();
+        expected.sort();
+        prop_assert_eq!(found, expected);
+    }
+}

@@ -1,0 +1,280 @@
+//! The registry: policies by name, from this crate and from any other that is linked.
+//!
+//! [`register_policy!`](crate::register_policy) enters a policy where it is defined; no central
+//! list names it. A linker drops a crate that nothing names, so an outside crate of policies is
+//! used with `use my_policies as _;` in the program's main file.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use toml::{Table, Value};
+
+use crate::parameters::{field_names, nearest, scale_steps};
+use crate::policy::{DensityPolicy, PolicyError, SceneInfo};
+
+#[doc(hidden)]
+pub use inventory;
+
+/// A policy that is made from a table of parameters.
+pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
+    /// The parameters: a struct with `#[serde(deny_unknown_fields, default)]`. Numbers are best
+    /// `f64`, `u32` or `bool`, choices enums without data, so that defaults print as written.
+    type Params: Serialize + DeserializeOwned + Default;
+
+    /// Integer parameters that count steps. Their defaults are written for a run of 30,000 and
+    /// scale with its length; what the user sets is taken as given.
+    const STEP_PARAMETERS: &'static [&'static str] = &[];
+
+    /// Makes the policy. Check ranges here, with [`in_range`](crate::parameters::in_range).
+    ///
+    /// # Errors
+    /// [`PolicyError::BadParameter`] when a value is out of range.
+    fn new(params: Self::Params, scene: &SceneInfo) -> Result<Self, PolicyError>;
+}
+
+/// Registers a policy under a name.
+///
+/// `doc` is the text of the defining file, `include_str!("this_file.rs")`: its leading `//!` block
+/// is the manual page. (A text without such a block is the manual page itself.) For an example see
+/// the [crate's guide](crate).
+#[macro_export]
+macro_rules! register_policy {
+    ($name:expr, $policy:ty, summary: $summary:expr, source: $source:expr, doc: $doc:expr $(,)?) => {
+        $crate::registry::inventory::submit! {
+            $crate::registry::PolicyEntry::of::<$policy>(
+                $name,
+                $summary,
+                $source,
+                $doc,
+                (::core::file!(), ::core::line!()),
+            )
+        }
+    };
+}
+
+inventory::collect!(PolicyEntry);
+
+type Built = Result<Box<dyn DensityPolicy>, PolicyError>;
+
+/// What the registry knows of a policy.
+#[derive(Debug, Clone, Copy)]
+pub struct PolicyEntry {
+    /// Its name, as given on the command line.
+    pub name: &'static str,
+    /// What it does, in one line.
+    pub summary: &'static str,
+    /// Where it is published.
+    pub source: &'static str,
+    doc: &'static str,
+    place: (&'static str, u32),
+    step_parameters: &'static [&'static str],
+    names: fn() -> Option<&'static [&'static str]>,
+    defaults: fn() -> Result<Table, String>,
+    retyped: fn(Table) -> Result<Table, String>,
+    build: fn(Table, &SceneInfo) -> Built,
+}
+
+impl PolicyEntry {
+    /// The entry of policy `P`; called by [`register_policy!`](crate::register_policy).
+    #[must_use]
+    pub const fn of<P: ConfiguredPolicy>(
+        name: &'static str,
+        summary: &'static str,
+        source: &'static str,
+        doc: &'static str,
+        place: (&'static str, u32),
+    ) -> Self {
+        Self {
+            name,
+            summary,
+            source,
+            doc,
+            place,
+            step_parameters: P::STEP_PARAMETERS,
+            names: field_names::<P::Params>,
+            defaults: || Table::try_from(P::Params::default()).map_err(first_line),
+            retyped: |table| {
+                let params: P::Params = table.try_into().map_err(first_line)?;
+                Table::try_from(params).map_err(first_line)
+            },
+            build: |table, scene| {
+                let params = table
+                    .try_into()
+                    .map_err(|e| PolicyError::Other(first_line(e)))?;
+                Ok(Box::new(P::new(params, scene)?))
+            },
+        }
+    }
+
+    /// Where the policy is registered (file:line).
+    #[must_use]
+    pub fn location(&self) -> String {
+        format!("{}:{}", self.place.0, self.place.1)
+    }
+
+    /// The manual page: the leading `//!` block of the file that defines the policy.
+    #[must_use]
+    pub fn manual(&self) -> String {
+        let block: Vec<&str> = self
+            .doc
+            .lines()
+            .map_while(|line| line.trim_end().strip_prefix("//!"))
+            .map(|line| line.strip_prefix(' ').unwrap_or(line))
+            .collect();
+        let text = if block.is_empty() {
+            self.doc.to_owned()
+        } else {
+            block.join("\n")
+        };
+        text.trim().to_owned() + "\n"
+    }
+
+    /// Names of the parameters that count steps and follow the run's length.
+    #[must_use]
+    pub fn step_parameters(&self) -> &'static [&'static str] {
+        self.step_parameters
+    }
+
+    /// Names of all parameters, in declaration order.
+    #[must_use]
+    pub fn parameter_names(&self) -> Vec<String> {
+        let known = (self.names)().unwrap_or_default();
+        let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
+        let more = self
+            .defaults()
+            .unwrap_or_default()
+            .into_iter()
+            .map(|(name, _)| name);
+        names.extend(more.filter(|name| !known.contains(&name.as_str())));
+        names
+    }
+
+    /// Names and defaults for a run of 30,000 steps, in declaration order. A parameter that is
+    /// `None` by default is not listed, as TOML has no such value, but can be set. Empty when the
+    /// defaults have no form in TOML, which [`build`](Self::build) reports.
+    #[must_use]
+    pub fn parameters(&self) -> Vec<(String, Value)> {
+        let mut defaults = self.defaults().unwrap_or_default();
+        let known = (self.names)().unwrap_or_default();
+        let in_order = known.iter().filter_map(|name| defaults.remove_entry(*name));
+        let mut listed: Vec<(String, Value)> = in_order.collect();
+        listed.extend(defaults);
+        listed
+    }
+
+    /// The parameters that a run uses: the defaults, scaled to its length, overlaid with `set`.
+    /// Ranges are checked by [`build`](Self::build).
+    ///
+    /// # Errors
+    /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type.
+    pub fn effective(&self, set: &Table, scene: &SceneInfo) -> Result<Table, PolicyError> {
+        let mut table = self.defaults()?;
+        for parameter in set.keys() {
+            self.must_know(parameter)?;
+        }
+        scale_steps(&mut table, self.step_parameters, scene.iterations);
+        for (parameter, value) in set {
+            // One at a time, so that the error can name the parameter.
+            table.insert(parameter.clone(), value.clone());
+            (self.retyped)(table.clone()).map_err(|why| PolicyError::BadParameter {
+                policy: self.name.to_owned(),
+                parameter: parameter.clone(),
+                reason: format!("{value} does not fit: {why}"),
+            })?;
+        }
+        (self.retyped)(table).map_err(|why| self.broken(&why))
+    }
+
+    /// Makes the policy with the parameters in `set`, all others at their
+    /// [effective](Self::effective) defaults.
+    ///
+    /// # Errors
+    /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type or a
+    /// value out of range; whatever else the policy says.
+    pub fn build(
+        &self,
+        set: &Table,
+        scene: &SceneInfo,
+    ) -> Result<Box<dyn DensityPolicy>, PolicyError> {
+        (self.build)(self.effective(set, scene)?, scene).map_err(|error| match error {
+            PolicyError::BadParameter {
+                parameter, reason, ..
+            } => PolicyError::BadParameter {
+                policy: self.name.to_owned(),
+                parameter,
+                reason,
+            },
+            other => other,
+        })
+    }
+
+    fn must_know(&self, parameter: &str) -> Result<(), PolicyError> {
+        let known = self.parameter_names();
+        if known.iter().any(|name| name == parameter) {
+            return Ok(());
+        }
+        Err(PolicyError::UnknownParameter {
+            policy: self.name.to_owned(),
+            parameter: parameter.to_owned(),
+            nearest: nearest(parameter, known.iter().map(String::as_str)),
+        })
+    }
+
+    fn defaults(&self) -> Result<Table, PolicyError> {
+        (self.defaults)().map_err(|why| self.broken(&why))
+    }
+
+    fn broken(&self, why: &str) -> PolicyError {
+        PolicyError::Other(format!(
+            "policy `{}` ({}) has defaults that are not its own parameters: {why}",
+            self.name,
+            self.location()
+        ))
+    }
+}
+
+/// All policies, sorted by name. (The linker decides the order in which they are found.)
+///
+/// # Errors
+/// [`PolicyError::DuplicateName`] when two have one name.
+pub fn policies() -> Result<Vec<&'static PolicyEntry>, PolicyError> {
+    sorted(inventory::iter::<PolicyEntry>.into_iter().collect())
+}
+
+/// The policy of this name.
+///
+/// # Errors
+/// [`PolicyError::UnknownPolicy`] with the nearest name; [`PolicyError::DuplicateName`].
+pub fn find(name: &str) -> Result<&'static PolicyEntry, PolicyError> {
+    let all = policies()?;
+    all.iter()
+        .find(|entry| entry.name == name)
+        .copied()
+        .ok_or_else(|| PolicyError::UnknownPolicy {
+            name: name.to_owned(),
+            nearest: nearest(name, all.iter().map(|entry| entry.name)),
+        })
+}
+
+fn sorted(mut entries: Vec<&PolicyEntry>) -> Result<Vec<&PolicyEntry>, PolicyError> {
+    entries.sort_by_key(|entry| (entry.name, entry.place));
+    match entries.windows(2).find(|pair| pair[0].name == pair[1].name) {
+        None => Ok(entries),
+        Some(pair) => Err(PolicyError::DuplicateName {
+            name: pair[0].name.to_owned(),
+            first: pair[0].location(),
+            second: pair[1].location(),
+        }),
+    }
+}
+
+fn first_line(error: impl ToString) -> String {
+    error
+        .to_string()
+        .lines()
+        .next()
+        .unwrap_or_default()
+        .to_owned()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,192 @@
+use serde::Deserialize;
+
+use super::*;
+use crate::parameters::in_range;
+use crate::plan::EditPlan;
+use crate::policy::{Needs, PolicyState, Snapshot};
+use crate::rng::PolicyRng;
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Params {
+    threshold: f64,
+    every: u32,
+    from: u32,
+    mode: Mode,
+    seldom: Option<u32>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Mode {
+    First,
+    SecondOne,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self {
+            threshold: 0.1,
+            every: 100,
+            from: 500,
+            mode: Mode::First,
+            seldom: None,
+        }
+    }
+}
+
+struct Idle(Params);
+
+impl DensityPolicy for Idle {
+    fn needs(&self, _scene: &SceneInfo) -> Needs {
+        Needs::default()
+    }
+    fn is_due(&self, step: u32) -> bool {
+        step.is_multiple_of(self.0.every)
+    }
+    fn plan(
+        &mut self,
+        _now: &Snapshot<'_>,
+        _rng: &PolicyRng,
+        _plan: &mut EditPlan,
+    ) -> Result<(), PolicyError> {
+        Ok(())
+    }
+    fn save(&self) -> PolicyState {
+        PolicyState::Null
+    }
+    fn restore(&mut self, _state: PolicyState) -> Result<(), PolicyError> {
+        Ok(())
+    }
+}
+
+impl ConfiguredPolicy for Idle {
+    type Params = Params;
+    const STEP_PARAMETERS: &'static [&'static str] = &["every", "from"];
+    fn new(params: Params, _scene: &SceneInfo) -> Result<Self, PolicyError> {
+        in_range("threshold", params.threshold, 0.0..=1.0)?;
+        Ok(Self(params))
+    }
+}
+
+fn idle(name: &'static str, line: u32) -> PolicyEntry {
+    PolicyEntry::of::<Idle>(
+        name,
+        "does nothing",
+        "nowhere",
+        "//! # Idle\n//!\n//! Text.\nuse x;\n//! no",
+        ("idle.rs", line),
+    )
+}
+
+fn scene(iterations: u32) -> SceneInfo {
+    SceneInfo {
+        extent: 1.0,
+        train_views: 10,
+        budget: 100,
+        initial_rows: 10,
+        iterations,
+        white_background: false,
+    }
+}
+
+fn set(text: &str) -> Table {
+    text.parse().unwrap()
+}
+
+#[test]
+fn names_are_sorted_and_unique() {
+    let (a, b, c) = (idle("b", 1), idle("a", 2), idle("c", 3));
+    let names: Vec<_> = sorted(vec![&a, &b, &c])
+        .unwrap()
+        .iter()
+        .map(|e| e.name)
+        .collect();
+    assert_eq!(names, ["a", "b", "c"]);
+    let twin = idle("c", 1);
+    let error = sorted(vec![&a, &c, &b, &twin]).unwrap_err().to_string();
+    assert!(error.contains("`c`"), "{error}");
+    assert!(error.contains("idle.rs:1 and idle.rs:3"), "{error}");
+}
+
+#[test]
+fn the_built_in_policies_are_found() {
+    let names: Vec<_> = policies().unwrap().iter().map(|entry| entry.name).collect();
+    assert!(
+        names.contains(&"diet") && names.contains(&"vanilla"),
+        "{names:?}"
+    );
+    let diet = find("diet").unwrap();
+    assert!(diet.location().contains("diet.rs:"), "{}", diet.location());
+    let error = find("vanila").unwrap_err().to_string();
+    assert!(error.contains("did you mean `vanilla`?"), "{error}");
+    let error = find("quux").unwrap_err();
+    assert_eq!(
+        error,
+        PolicyError::UnknownPolicy {
+            name: "quux".into(),
+            nearest: None
+        }
+    );
+}
+
+#[test]
+fn the_manual_is_the_leading_block() {
+    assert_eq!(idle("idle", 1).manual(), "# Idle\n\nText.\n");
+    let plain = PolicyEntry {
+        doc: "Only text.",
+        ..idle("idle", 1)
+    };
+    assert_eq!(plain.manual(), "Only text.\n");
+}
+
+#[test]
+fn parameters_are_listed_as_declared() {
+    let listed = idle("idle", 1).parameters();
+    let names: Vec<&str> = listed.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(names, ["threshold", "every", "from", "mode"]);
+    assert_eq!(listed[3].1.as_str(), Some("first"));
+}
+
+#[test]
+fn defaults_scale_with_the_run_and_settings_do_not() {
+    let idle = idle("idle", 1);
+    let effective = idle
+        .effective(&set("every = 100\nthreshold = 1"), &scene(3_000))
+        .unwrap();
+    assert_eq!(effective["every"].as_integer(), Some(100));
+    assert_eq!(effective["from"].as_integer(), Some(50));
+    assert_eq!(effective["threshold"].as_float(), Some(1.0));
+    assert!(!effective.contains_key("seldom"));
+    let policy = idle.build(&Table::new(), &scene(3_000)).unwrap();
+    assert!(policy.is_due(20) && !policy.is_due(25));
+    let with_option = idle.effective(&set("seldom = 7"), &scene(3_000)).unwrap();
+    assert_eq!(with_option["seldom"].as_integer(), Some(7));
+}
+
+#[test]
+fn bad_parameters_are_named() {
+    let build = |text| match idle("idle", 1).build(&set(text), &scene(30_000)) {
+        Ok(_) => panic!("`{text}` was accepted"),
+        Err(error) => error.to_string(),
+    };
+    let told = build("treshold = 1");
+    assert!(told.contains("no parameter `treshold`"), "{told}");
+    assert!(told.contains("did you mean `threshold`?"), "{told}");
+    let told = build("threshold = 2");
+    assert!(
+        told.contains("`idle.threshold`: 2 is out of range"),
+        "{told}"
+    );
+    let told = build("every = \"often\"");
+    assert!(
+        told.contains("`idle.every`: \"often\" does not fit"),
+        "{told}"
+    );
+    let told = build("every = -1");
+    assert!(told.contains("`idle.every`: -1 does not fit"), "{told}");
+    let told = build("mode = \"third\"");
+    assert!(told.contains("second-one"), "{told}");
+    let told = build("threshold = nan");
+    assert!(told.contains("NaN is out of range"), "{told}");
+}

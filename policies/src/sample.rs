@@ -1,0 +1,182 @@
+//! Choosing rows: the largest, the smallest, or at random by weight.
+//!
+//! All choices are deterministic: ties go to the lower row, numbers that are NaN come last, and
+//! random draws are hashes of (seed, step, row, purpose). Each takes O(n) to select and
+//! O(k log k) to sort.
+
+use std::cmp::Ordering;
+
+use crate::rng::{PolicyRng, Purpose};
+
+/// The `k` rows with the largest values, largest first; ties by row, NaN last.
+#[must_use]
+pub fn top_k(values: &[f32], k: usize) -> Vec<u32> {
+    largest((0..values.len() as u32).collect(), values, k)
+}
+
+/// Of `rows`, the `k` with the largest `values[row]`, largest first; ties by row, NaN last.
+///
+/// # Panics
+/// When a row is not in `values`.
+#[must_use]
+pub fn largest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
+    first_k(rows, k, |&a, &b| {
+        let (x, y) = (values[a as usize], values[b as usize]);
+        nan_last(x, y, Ordering::reverse).then(a.cmp(&b))
+    })
+}
+
+/// Of `rows`, the `k` with the smallest `values[row]`, smallest first; ties by row, NaN last.
+///
+/// # Panics
+/// When a row is not in `values`.
+#[must_use]
+pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
+    first_k(rows, k, |&a, &b| {
+        let (x, y) = (values[a as usize], values[b as usize]);
+        nan_last(x, y, |order| order).then(a.cmp(&b))
+    })
+}
+
+/// Draws `k` distinct rows, one after the other, each with a probability in proportion to its
+/// weight among those left. In the order drawn; fewer than `k` when fewer weights are positive.
+///
+/// A row is drawn by the smallest of −ln(u) / weight, an exponential variable whose rate is the
+/// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Weights
+/// that are zero, negative or NaN are never drawn; infinite ones always come first.
+#[must_use]
+pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
+    let drawn = (0..).zip(weights).filter(|(_, weight)| **weight > 0.0);
+    let keyed = drawn.map(|(row, &weight)| {
+        let u: f64 = rng.uniform_f64(row, Purpose::Select);
+        (-u.ln() / f64::from(weight), row)
+    });
+    let keyed = first_k(keyed.collect(), k, |a: &(f64, u32), b| {
+        a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
+    });
+    keyed.into_iter().map(|(_, row)| row).collect()
+}
+
+/// Numbers in the direction wanted (−0 equals 0), then NaN of either sign.
+fn nan_last(x: f32, y: f32, direction: impl Fn(Ordering) -> Ordering) -> Ordering {
+    x.partial_cmp(&y)
+        .map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
+}
+
+/// The first `k` items in a total order, sorted.
+fn first_k<T>(mut items: Vec<T>, k: usize, order: impl Fn(&T, &T) -> Ordering) -> Vec<T> {
+    if k == 0 {
+        return Vec::new();
+    }
+    if k < items.len() {
+        items.select_nth_unstable_by(k - 1, &order);
+        items.truncate(k);
+    }
+    items.sort_unstable_by(order);
+    items
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const NAN: f32 = f32::NAN;
+
+    #[test]
+    fn top_k_by_hand() {
+        let values = [
+            1.0,
+            NAN,
+            3.0,
+            -NAN,
+            3.0,
+            f32::INFINITY,
+            -2.0,
+            f32::NEG_INFINITY,
+        ];
+        assert_eq!(top_k(&values, 3), [5, 2, 4]);
+        assert_eq!(top_k(&values, 100), [5, 2, 4, 0, 6, 7, 1, 3]);
+        assert_eq!(top_k(&[-NAN, NAN, 1.0], 3), [2, 0, 1]);
+        assert_eq!(top_k(&values, 0), [0_u32; 0]);
+        assert_eq!(top_k(&[], 3), [0_u32; 0]);
+        assert_eq!(top_k(&[0.0, -0.0, 0.0], 3), [0, 1, 2]);
+        assert_eq!(smallest(vec![7, 1, 0, 6], &values, 3), [7, 6, 0]);
+        assert_eq!(largest(vec![3, 4, 2, 0], &values, 9), [2, 4, 0, 3]);
+    }
+
+    proptest! {
+        #[test]
+        fn selection_agrees_with_sorting(values in prop::collection::vec(-3..4_i8, 0..50), k in 0..60_usize) {
+            let values: Vec<f32> = values.into_iter().map(|v| if v == -3 { NAN } else { f32::from(v) }).collect();
+            let rank = |row: &u32| {
+                let value = values[*row as usize];
+                (value.is_nan(), if value.is_nan() { 0 } else { value as i32 }, *row)
+            };
+            let rows: Vec<u32> = (0..values.len() as u32).collect();
+            let mut sorted = rows.clone();
+            sorted.sort_by_key(&rank);
+            sorted.truncate(k);
+            prop_assert_eq!(smallest(rows.clone(), &values, k), sorted);
+            let mut sorted = rows;
+            sorted.sort_by_key(|row| { let (nan, value, row) = rank(row); (nan, -value, row) });
+            sorted.truncate(k);
+            prop_assert_eq!(top_k(&values, k), sorted);
+        }
+    }
+
+    #[test]
+    fn only_positive_weights_are_drawn() {
+        let weights = [
+            0.0,
+            NAN,
+            1.0,
+            -1.0,
+            f32::NEG_INFINITY,
+            1e-40,
+            f32::INFINITY,
+            -0.0,
+        ];
+        for step in 0..50 {
+            let rng = PolicyRng::new(1, step);
+            let drawn = weighted(&weights, 8, &rng);
+            assert_eq!(drawn, [6, 2, 5]);
+            assert_eq!(weighted(&weights, 2, &rng), drawn[..2]);
+            assert!(weighted(&weights, 0, &rng).is_empty());
+        }
+        assert_eq!(
+            weighted(&[f32::INFINITY; 3], 2, &PolicyRng::new(1, 1)),
+            [0, 1]
+        );
+    }
+
+    #[test]
+    fn draws_follow_the_weights_without_replacement() {
+        // Two of the weights 1, 2, 5: (i, j) has probability w_i / 8 · w_j / (8 − w_i).
+        let weights = [1.0, 2.0, 5.0];
+        let trials = 40_000;
+        let mut counts = [[0.0_f64; 3]; 3];
+        for step in 0..trials {
+            let drawn = weighted(&weights, 2, &PolicyRng::new(77, step));
+            assert_eq!(drawn.len(), 2);
+            counts[drawn[0] as usize][drawn[1] as usize] += 1.0;
+        }
+        for i in 0..3 {
+            for j in 0..3 {
+                let (first, second) = (f64::from(weights[i]), f64::from(weights[j]));
+                let p = if i == j {
+                    0.0
+                } else {
+                    first / 8.0 * second / (8.0 - first)
+                };
+                let n = f64::from(trials);
+                let bound = 5.0 * (n * p * (1.0 - p)).sqrt();
+                assert!(
+                    (counts[i][j] - n * p).abs() <= bound,
+                    "{i} {j}: {}",
+                    counts[i][j] / n
+                );
+            }
+        }
+    }
+}
