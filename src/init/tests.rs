@@ -1,6 +1,6 @@
 use super::*;
 use crate::camera::Camera;
-use crate::gaussians::rgb_from_dc;
+use crate::sh::C0;
 
 fn cloud(positions: &[[f64; 3]]) -> PointCloud {
     PointCloud {
@@ -40,7 +40,7 @@ fn rows_are_as_the_original_starts_them() {
         let sh = model.sh_of(row);
         let expected = [(row as f64 / 255.0).max(1.0 / 510.0), 1.0 / 510.0, 1.0 - 1.0 / 510.0];
         for channel in 0..3 {
-            assert!((rgb_from_dc(sh[channel]) - expected[channel]).abs() < 1e-6);
+            assert!((0.5 + f64::from(C0 * sh[channel]) - expected[channel]).abs() < 1e-6);
         }
         assert!(sh[3..].iter().all(|&v| v.to_bits() == 0));
     }
