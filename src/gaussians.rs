@@ -13,21 +13,6 @@ pub const fn sh_coefficients(degree: u8) -> usize {
 /// Highest spherical-harmonic degree.
 pub const MAX_SH_DEGREE: u8 = 3;
 
-/// The constant basis function of band 0: 1 / (2·√π).
-pub const C0: f64 = 0.282_094_791_773_878_14;
-
-/// The coefficient of band 0 that shows as `rgb` from everywhere; one channel, in [0, 1].
-#[must_use]
-pub fn dc_from_rgb(rgb: f64) -> f32 {
-    ((rgb - 0.5) / C0) as f32
-}
-
-/// What a coefficient of band 0 shows as from everywhere: one channel, >= 0.
-#[must_use]
-pub fn rgb_from_dc(dc: f32) -> f64 {
-    (0.5 + C0 * f64::from(dc)).max(0.0)
-}
-
 /// A model: structure of arrays, one entry per row in each.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Gaussians {

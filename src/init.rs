@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 use crate::dataset::PointCloud;
 use crate::dataset::normalise::EXTENT;
-use crate::gaussians::{Gaussians, dc_from_rgb, sh_coefficients};
+use crate::gaussians::{Gaussians, rgb_to_dc, sh_coefficients};
 pub use random::random_points;
 
 /// Diameter D of a normalised scene [scene units]; scales and floors are relative to it.
@@ -107,7 +107,11 @@ pub fn initialise(
     for (row, &i) in sh.chunks_exact_mut(stride).zip(&chosen) {
         let rgb = points.colours[i]
             .map(|v| (f64::from(v) / 255.0).clamp(COLOUR_MARGIN, 1.0 - COLOUR_MARGIN));
+<<<<<<< HEAD
         row[..3].copy_from_slice(&rgb.map(dc_from_rgb));
+=======
+        row[..3].copy_from_slice(&rgb.map(|v| rgb_to_dc(v as f32)));
+>>>>>>> data
     }
     let gaussians = Gaussians {
         sh_degree,
@@ -164,4 +168,5 @@ fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests;

@@ -133,7 +133,9 @@ impl ImageCache {
             slot.wanted = false;
         }
         for &index in upcoming {
-            let Some(slot) = state.slots.get_mut(index) else { continue };
+            let Some(slot) = state.slots.get_mut(index) else {
+                continue;
+            };
             let first = !std::mem::replace(&mut slot.wanted, true);
             if first && matches!(slot.content, Content::Empty) && !self.threads.is_empty() {
                 state.queue.push_back(index);

@@ -65,8 +65,8 @@ impl Folders {
             let mut fell_back = false;
             if let Some((folder, k)) = &self.reduced {
                 // The folder itself may be a link out of the dataset.
-                let from_root = format!("images_{k}/{within}");
-                self.root.existing(Named { value: &from_root, ..named })?;
+                let below_root = format!("images_{k}/{within}");
+                self.root.existing(Named { value: &below_root, ..named })?;
                 if let Some(path) = folder.existing(Named { value: &within, ..named })? {
                     return Ok(Some(Found { path, reduced: Some(*k), fell_back: false }));
                 }
@@ -75,7 +75,7 @@ impl Folders {
             let path = match &self.chosen {
                 Some(folder) => folder.existing(Named { value: &within, ..named })?,
                 None => {
-                    let value = self.from_root(named.value) + ending;
+                    let value = self.below_root(named.value) + ending;
                     self.root.existing(Named { value: &value, ..named })?
                 }
             };
@@ -105,7 +105,11 @@ impl Folders {
         let within = if self.chosen.is_some() {
             self.inside_images(named.value)
         } else {
+<<<<<<< HEAD
             self.from_root(named.value)
+=======
+            self.below_root(named.value)
+>>>>>>> data
         };
         DatasetError::MissingImage {
             path: named.file.to_owned(),
@@ -130,7 +134,7 @@ impl Folders {
         }
     }
 
-    fn from_root(&self, value: &str) -> String {
+    fn below_root(&self, value: &str) -> String {
         let value = relative(value);
         if self.within_images { format!("images/{value}") } else { value }
     }

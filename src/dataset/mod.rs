@@ -19,7 +19,12 @@ mod transforms;
 pub mod undistort;
 
 #[cfg(test)]
-mod tests;
+#[allow(
+    clippy::semicolon_if_nothing_returned,
+    clippy::float_cmp,
+    reason = "tables of one-line edits; exact values"
+)]
+pub(crate) mod tests;
 
 use std::path::{Path, PathBuf};
 

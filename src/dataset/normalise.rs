@@ -138,6 +138,7 @@ impl Normalisation {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests {
     use glam::DMat3;
 

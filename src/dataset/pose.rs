@@ -51,7 +51,7 @@ pub(super) fn checked_quaternion(
     q: [f64; 4],
 ) -> Result<DMat3, DatasetError> {
     let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
-    if !((norm - 1.0).abs() <= ROTATION_TOLERANCE) {
+    if !norm.is_finite() || (norm - 1.0).abs() > ROTATION_TOLERANCE {
         let problem = format!("the quaternion {q:?} has length {norm} instead of 1");
         return Err(DatasetError::malformed(file, frame, problem, POSE_REMEDY));
     }

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::error::DatasetError;
@@ -42,14 +43,18 @@ pub(super) fn dataset(
     let (mut train, mut test) = (Vec::new(), Vec::new());
     for (index, (view, frame)) in views.into_iter().zip(&frames).enumerate() {
         let held_out = every.map_or(frame.held_out, |every| index % every == 0);
-        if held_out { test.push(view) } else { train.push(view) }
+        if held_out {
+            test.push(view);
+        } else {
+            train.push(view);
+        }
     }
     if train.is_empty() {
         return Err(DatasetError::NoTrainingViews { views: count });
     }
 
     let points_path = points_file.as_deref().unwrap_or(path);
-    drop_bad(points_path, &mut points, &mut notes, "finite", |p| p.is_finite())?;
+    drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
     let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
@@ -93,7 +98,7 @@ fn drop_bad(
     points: &mut PointCloud,
     notes: &mut Vec<String>,
     what: &str,
-    keep: impl Fn(glam::DVec3) -> bool,
+    keep: impl Fn(DVec3) -> bool,
 ) -> Result<(), DatasetError> {
     let total = points.len();
     let bad = points.retain(keep);

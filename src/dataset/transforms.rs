@@ -188,12 +188,16 @@ impl<'a> Fields<'a> {
     }
 
     fn number(&self, field: &str) -> Result<Option<f64>, DatasetError> {
-        let Some(value) = self.inherited(field) else { return Ok(None) };
+        let Some(value) = self.inherited(field) else {
+            return Ok(None);
+        };
         value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is no number"))
     }
 
     fn side(&self, field: &str) -> Result<Option<u32>, DatasetError> {
-        let Some(value) = self.number(field)? else { return Ok(None) };
+        let Some(value) = self.number(field)? else {
+            return Ok(None);
+        };
         if value >= 1.0 && value <= f64::from(u32::MAX) && value.fract().abs() < f64::EPSILON {
             return Ok(Some(value as u32));
         }

@@ -106,7 +106,7 @@ impl Lens {
             let mut converged = false;
             for _ in 0..20 {
                 let jacobian = self.distort_jacobian(p);
-                if !(jacobian.determinant() > 1e-6) {
+                if !keeps_orientation(jacobian) {
                     return Err(NotInvertible);
                 }
                 let change = jacobian.inverse() * (goal - self.distort(p));
@@ -118,7 +118,7 @@ impl Lens {
                 }
             }
             // Folding shows as a Jacobian that is not positive, or as no convergence.
-            if !converged || !p.is_finite() || !(self.distort_jacobian(p).determinant() > 1e-6) {
+            if !converged || !p.is_finite() || !keeps_orientation(self.distort_jacobian(p)) {
                 return Err(NotInvertible);
             }
         }
@@ -148,6 +148,12 @@ impl Lens {
         let to = Self { focal, principal: -low * focal, distortion: [0.0; 4], ..*self };
         Ok(Undistortion { from: *self, to })
     }
+}
+
+/// Whether the map has an inverse nearby on the branch of the principal point, where the
+/// determinant is 1. At 1e-6 areas shrink a million times: no lens images so.
+fn keeps_orientation(jacobian: DMat2) -> bool {
+    jacobian.determinant() > 1e-6
 }
 
 impl Undistortion {
@@ -295,7 +301,11 @@ mod tests {
                 for (index, rgb) in image.rgb.chunks_exact_mut(3).enumerate() {
                     let centre = DVec2::new((index % 288) as f64 + 0.5, (index / 288) as f64 + 0.5);
                     let value =
+<<<<<<< HEAD
                         255.0 * (-(centre - dot).length_squared() / (2.0 * 2.5 * 2.5)).exp();
+=======
+                        255.0 * (-(centre - dot).length_squared() / (2.0 * 1.5 * 1.5)).exp();
+>>>>>>> data
                     rgb.fill(rgb[0].max(value.round() as u8));
                 }
             }
@@ -304,7 +314,7 @@ mod tests {
                 let (mut sum, mut moment) = (0.0, DVec2::ZERO);
                 for (index, rgb) in out.rgb.chunks_exact(3).enumerate() {
                     let centre = DVec2::new((index % 288) as f64 + 0.5, (index / 288) as f64 + 0.5);
-                    if (centre - pixel).length() < 9.0 {
+                    if (centre - pixel).length() < 7.0 {
                         sum += f64::from(rgb[0]);
                         moment += centre * f64::from(rgb[0]);
                     }

@@ -11,7 +11,7 @@ use crate::dataset::PointCloud;
 /// cube of ±1.3 for NeRF-synthetic scenes, whose cameras are 4.03 away.
 const CUBE: f64 = 1.0 / 3.0;
 /// Depths of the surroundings, in distances of the cameras from their focus.
-const BEYOND: (f64, f64) = (0.5, 4.0);
+const BEYOND: (f64, f64) = (2.0 / 3.0, 4.0);
 /// Depths in scenes without a focus [scene units]; the rig's radius is 1.
 const AROUND: (f64, f64) = (0.25, 5.0);
 /// Colours are drawn from the middle half, where no channel is near its clamp.

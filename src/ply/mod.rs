@@ -79,4 +79,5 @@ impl PlyError {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests;

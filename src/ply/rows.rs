@@ -165,7 +165,9 @@ impl<'a> Ply<'a> {
             let buffer = match self.input.fill_buf() {
                 Ok(buffer) => buffer,
                 Err(source) if source.kind() == ErrorKind::Interrupted => continue,
-                Err(source) => return Err(PlyError::Io { path: self.path.to_owned(), source }),
+                Err(source) => {
+                    return Err(PlyError::Io { path: self.path.to_owned(), source });
+                }
             };
             let at_end = buffer.is_empty();
             let mut used = 0;
