@@ -48,7 +48,7 @@ impl Default for RateOptions {
             quat: 1e-3,
             opacity: 0.025,
             sh_dc: 2.5e-3,
-            sh_rest: 2.5e-3 / 20.0,
+            sh_rest: 1.25e-4,
         }
     }
 }

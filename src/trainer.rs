@@ -43,7 +43,7 @@ pub struct StepReport {
     pub output: StepOutput,
     /// Rows after the step.
     pub rows: usize,
-    /// The edit of this step, if the policy was due.
+    /// The edit of this step, if the policy was due and had something to do.
     pub event: Option<EditEvent>,
 }
 
@@ -239,7 +239,7 @@ impl<V: ViewSource> Trainer<V> {
             });
         }
         let event = if self.policy.is_due(step) {
-            Some(self.edit(step)?)
+            self.edit(step)?
         } else {
             None
         };
@@ -273,8 +273,9 @@ impl<V: ViewSource> Trainer<V> {
         self.order[place]
     }
 
-    /// Asks the policy for a plan and executes it.
-    fn edit(&mut self, step: u32) -> Result<EditEvent, TrainError> {
+    /// Asks the policy for a plan and executes it. A plan that changes no row and was refused
+    /// nothing is no event: policies may be due at steps at which they find nothing to do.
+    fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let (signals, candidates) = self
             .backend
             .take_signals(&self.needs)
@@ -303,6 +304,9 @@ impl<V: ViewSource> Trainer<V> {
             .peak_rows
             .max(rows_within(&ops))
             .max(self.backend.rows());
+        if !ops.edits_rows() && ops.counts.denied == 0 {
+            return Ok(None);
+        }
         let event = EditEvent::new(step, &ops);
         let EditEvent {
             before,
@@ -316,7 +320,7 @@ impl<V: ViewSource> Trainer<V> {
         let cause = &event.cause;
         tracing::info!(step, before, removed, added, updated, denied, after, %cause, "edit");
         self.events.push(event.clone());
-        Ok(event)
+        Ok(Some(event))
     }
 
     /// A plan compiles only from accepted calls; this is the second lock on the budget, and it

@@ -25,7 +25,9 @@ const OWNED_PREFIX: &str = "events.out.tfevents.";
 /// Where a run keeps the model of an iteration.
 #[must_use]
 pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
-    run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
+    run.join(MODELS)
+        .join(format!("iteration_{iteration}"))
+        .join("point_cloud.ply")
 }
 
 /// The iterations whose model a run has saved, in order.
@@ -34,14 +36,20 @@ pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
 /// [`OutputError::NoRun`] when there is none.
 pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
     let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
-    let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
+    let entries = fs::read_dir(run.join(MODELS))
+        .into_iter()
+        .flatten()
+        .flatten();
     let mut saved: Vec<u32> = entries
         .filter_map(|entry| iteration(&entry.file_name()))
         .filter(|&iteration| model_path(run, iteration).is_file())
         .collect();
     saved.sort_unstable();
     if saved.is_empty() {
-        return Err(OutputError::NoRun { path: run.to_owned(), missing: "saved model" });
+        return Err(OutputError::NoRun {
+            path: run.to_owned(),
+            missing: "saved model",
+        });
     }
     Ok(saved)
 }
@@ -255,7 +263,10 @@ mod tests {
     #[test]
     fn saved_models_are_found_in_numeric_order() {
         let root = tempfile::tempdir().unwrap();
-        assert!(matches!(saved_iterations(root.path()), Err(OutputError::NoRun { .. })));
+        assert!(matches!(
+            saved_iterations(root.path()),
+            Err(OutputError::NoRun { .. })
+        ));
         for iteration in [1_000, 30, 200] {
             write(&model_path(root.path(), iteration), "ply");
         }

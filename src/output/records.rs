@@ -140,7 +140,11 @@ pub fn write_scores(
         Split::Train => ("results_train.json", "per_view_train.json"),
     };
     let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
-        scores.views.iter().map(|view| (view.name.clone(), score(view).into())).collect()
+        scores
+            .views
+            .iter()
+            .map(|view| (view.name.clone(), score(view).into()))
+            .collect()
     };
     let views = serde_json::json!({ "PSNR": column(|v| v.psnr), "SSIM": column(|v| v.ssim) });
     enter(&run.join(per_view), iteration, views)?;
@@ -193,7 +197,9 @@ mod tests {
         assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);
         std::fs::write(root.path().join("results.json"), "[").unwrap();
         write_scores(root.path(), Split::Train, 7, &scores(1.0)).unwrap();
-        let message = write_scores(root.path(), Split::Test, 7, &scores(1.0)).unwrap_err().to_string();
+        let message = write_scores(root.path(), Split::Test, 7, &scores(1.0))
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("results.json"), "{message}");
     }
 

@@ -94,6 +94,7 @@ struct ToldPolicy {
 enum Told {
     Split,
     Halve,
+    Nothing,
     Fail,
     ReadUndeclared,
 }
@@ -136,6 +137,7 @@ impl DensityPolicy for ToldPolicy {
                         .map_err(|e| PolicyError::Other(e.to_string()))?;
                 }
             }
+            Told::Nothing => {}
             Told::Fail => return Err(PolicyError::Other("out of ideas".into())),
             Told::ReadUndeclared => {
                 now.signal(Signal::Age)?;
@@ -340,6 +342,18 @@ fn edits_are_reported_and_the_budget_holds() {
         (trainer.peak_rows(), trainer.rows(), trainer.steps_done()),
         (10, 10, 9)
     );
+}
+
+#[test]
+fn a_plan_that_does_nothing_is_no_event() {
+    let (mut trainer, diary, _) = trainer(&Case {
+        what: Told::Nothing,
+        ..CASE
+    });
+    assert!((0..9).all(|_| trainer.step().unwrap().event.is_none()));
+    assert!(trainer.events().is_empty());
+    // It may reset statistics and is executed all the same.
+    assert!(diary.lock().unwrap().contains(&"apply 2".to_owned()));
 }
 
 #[test]

@@ -44,10 +44,20 @@ pub(super) struct TrainArgs {
     tile_cap: Option<usize>,
 
     /// What decides where Gaussians are born and die; `densify policies` lists the choices
-    #[arg(short, long, value_name = "NAME", help_heading = "Density control", default_value = "diet")]
+    #[arg(
+        short,
+        long,
+        value_name = "NAME",
+        help_heading = "Density control",
+        default_value = "diet"
+    )]
     policy: String,
     /// Set a parameter of the policy, such as diet.rho=0.2; may be repeated
-    #[arg(long, value_name = "POLICY.NAME=VALUE", help_heading = "Density control")]
+    #[arg(
+        long,
+        value_name = "POLICY.NAME=VALUE",
+        help_heading = "Density control"
+    )]
     policy_set: Vec<String>,
     /// TOML file with parameters in a table per policy; --policy-set wins over it
     #[arg(long, value_name = "FILE", help_heading = "Density control")]
