@@ -1,12 +1,13 @@
 //! Standard output and standard error, side by side with a progress bar.
 
+use std::cell::RefCell;
 use std::fmt;
 use std::io::{self, IsTerminal, Write};
 
 use indicatif::MultiProgress;
 use tracing_subscriber::EnvFilter;
 
-use super::failure::Failure;
+use super::failure::{Failure, OTHER};
 
 /// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
 const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
@@ -16,6 +17,8 @@ const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
 pub(super) struct Console {
     quiet: bool,
     bars: MultiProgress,
+    /// The first error of standard output, if it is one.
+    broken: RefCell<Option<io::Error>>,
 }
 
 impl Console {
@@ -36,7 +39,11 @@ impl Console {
             .with_target(false)
             .without_time()
             .try_init();
-        Self { quiet, bars }
+        Self {
+            quiet,
+            bars,
+            broken: RefCell::new(None),
+        }
     }
 
     /// Whether only results and errors are shown.
@@ -58,11 +65,31 @@ impl Console {
 
     /// A result on standard output.
     pub(super) fn result(&self, line: impl fmt::Display) {
-        // A reader that has gone away (a closed pipe) wants no more; that is no failure.
-        self.bars.suspend(|| {
+        let written = self.bars.suspend(|| {
             let mut out = io::stdout().lock();
-            let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+            writeln!(out, "{line}").and_then(|()| out.flush())
         });
+        match written {
+            // A reader that has gone away wants no more; that is no failure.
+            Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+                self.broken.borrow_mut().get_or_insert(error);
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether everything said could be written.
+    ///
+    /// # Errors
+    /// The first error of standard output, such as a full disk.
+    pub(super) fn finish(&self) -> Result<(), Failure> {
+        match self.broken.take() {
+            None => Ok(()),
+            Some(error) => Err(Failure {
+                code: OTHER,
+                message: format!("cannot write to standard output: {error}"),
+            }),
+        }
     }
 
     /// A line of progress on standard error; nothing when quiet.

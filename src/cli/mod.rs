@@ -85,7 +85,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Render(render) => render::run(&render, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
     };
-    match done {
+    match done.and_then(|()| console.finish()) {
         Ok(()) => 0,
         Err(failure) => {
             console.error(&failure);
@@ -120,8 +120,14 @@ mod tests {
         assert_eq!(run_with(["densify", "--help"]), 0);
         assert_eq!(run_with(["densify", "--version"]), 0);
         assert_eq!(run_with(["densify", "train"]), failure::INPUT);
-        assert_eq!(run_with(["densify", "train", "x", "--budget", "0"]), failure::INPUT);
+        assert_eq!(
+            run_with(["densify", "train", "x", "--budget", "0"]),
+            failure::INPUT
+        );
         assert_eq!(run_with(["densify", "nonsense"]), failure::INPUT);
-        assert_eq!(run_with(["densify", "eval", "/no/such/run"]), failure::INPUT);
+        assert_eq!(
+            run_with(["densify", "eval", "/no/such/run"]),
+            failure::INPUT
+        );
     }
 }

@@ -50,7 +50,10 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let rates = learning_rates(&args.lr)?;
     check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
     check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
-    let output = args.output.clone().unwrap_or_else(|| default_output(&args.scene, &args.policy));
+    let output = args
+        .output
+        .clone()
+        .unwrap_or_else(|| default_output(&args.scene, &args.policy));
     RunFolder::check(&output, args.overwrite)?;
     use_threads(args.threads);
 
@@ -98,8 +101,15 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, 1);
     dataset.points = crate::dataset::PointCloud::default();
-    let (backend, ledger) =
-        backend(args, &config, &dataset, policy.as_ref(), &scene, model, [&views, &test])?;
+    let (backend, ledger) = backend(
+        args,
+        &config,
+        &dataset,
+        policy.as_ref(),
+        &scene,
+        model,
+        [&views, &test],
+    )?;
     console.say(format_args!("memory promised\n{ledger}"));
     let options = TrainOptions {
         iterations: args.iterations,
@@ -110,7 +120,14 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
         prefetch: AHEAD,
     };
     let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
-    Ok(Prepared { config, output, trainer, test, dataset, ledger })
+    Ok(Prepared {
+        config,
+        output,
+        trainer,
+        test,
+        dataset,
+        ledger,
+    })
 }
 
 /// The renderer with the model, and the ledger of the whole run.
@@ -138,7 +155,11 @@ fn backend(
 
     let mut ledger = backend.ledger().clone();
     let cache = views.cache();
-    ledger.add_to(Section::Images, "decoded training views", cache.held_bytes());
+    ledger.add_to(
+        Section::Images,
+        "decoded training views",
+        cache.held_bytes(),
+    );
     ledger.add_to(Section::Images, "decoding", cache.decode_bytes());
     let budget = scene.budget as u64;
     let float = size_of::<f32>() as u64;
@@ -185,9 +206,14 @@ fn first_model(
         }
         InitChoice::Points => (&dataset.points, None),
         InitChoice::Random => {
-            let count = args.init_points.unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
+            let count = args
+                .init_points
+                .unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
             let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
-            let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
+            let opaque = !dataset
+                .train
+                .iter()
+                .any(|view| view.source.header.has_alpha);
             random = random_points(count, &cameras, opaque, args.seed);
             (&random, Some(count))
         }
@@ -196,12 +222,22 @@ fn first_model(
     let left_out = [
         (report.unusable, "not finite"),
         (report.duplicates, "at the place of another"),
-        (report.over_budget, "beyond the budget; which ones follows from the seed"),
+        (
+            report.over_budget,
+            "beyond the budget; which ones follows from the seed",
+        ),
     ];
     for (number, why) in left_out.into_iter().filter(|(number, _)| *number > 0) {
-        console.say(format_args!("note: {} points left out: {why}", grouped(number)));
+        console.say(format_args!(
+            "note: {} points left out: {why}",
+            grouped(number)
+        ));
     }
-    let what = if count.is_some() { "random points" } else { "points of the scene" };
+    let what = if count.is_some() {
+        "random points"
+    } else {
+        "points of the scene"
+    };
     console.say(format_args!(
         "start    {} rows from {} {what}",
         grouped(model.len()),
@@ -217,8 +253,15 @@ fn announce(
     output: &Path,
     console: &Console,
 ) {
-    let default = if args.budget.is_none() { " (default; choose with --budget)" } else { "" };
-    console.say(format_args!("budget   {} rows{default}", grouped(config.train.budget)));
+    let default = if args.budget.is_none() {
+        " (default; choose with --budget)"
+    } else {
+        ""
+    };
+    console.say(format_args!(
+        "budget   {} rows{default}",
+        grouped(config.train.budget)
+    ));
     console.say(format_args!("policy   {}: {}", entry.name, entry.summary));
     console.say(format_args!(
         "run      {} iterations, seed {}, degree {}, background {}",
@@ -238,7 +281,9 @@ fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table, Failure> {
             Failure::input(format!("--policy-config {}: {problem}", path.display()))
         };
         let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-        let file: Table = text.parse().map_err(|e| fail(format!("{e}").trim().to_owned()))?;
+        let file: Table = text
+            .parse()
+            .map_err(|e| fail(format!("{e}").trim().to_owned()))?;
         for (policy, table) in file {
             // One file may serve several policies; a misspelt name may not pass for another one.
             let known = find(&policy).map_err(|e| fail(e.to_string()))?;
@@ -297,7 +342,9 @@ fn check_iterations(flag: &str, chosen: &[u32], iterations: u32) -> Result<(), F
 /// `output/SCENE-POLICY`, SCENE being the dataset folder's name.
 fn default_output(scene: &Path, policy: &str) -> PathBuf {
     let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
-    let name = full.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+    let name = full
+        .file_name()
+        .map_or_else(|| "scene".into(), |name| name.to_string_lossy());
     Path::new("output").join(format!("{name}-{policy}"))
 }
 
@@ -308,7 +355,11 @@ mod tests {
     #[test]
     fn learning_rates_by_name() {
         let rates = learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()]).unwrap();
-        let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
+        let expected = RateOptions {
+            opacity: 0.05,
+            mean_end: 1e-5,
+            ..RateOptions::default()
+        };
         assert_eq!(rates, expected);
         for (bad, part) in [
             ("opacity", "NAME=RATE"),
@@ -318,7 +369,10 @@ mod tests {
             ("quat=inf", "quat"),
         ] {
             let message = learning_rates(&[bad.into()]).unwrap_err().message;
-            assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
+            assert!(
+                message.contains(part) && message.contains("--lr"),
+                "{bad}: {message}"
+            );
         }
     }
 
@@ -327,7 +381,11 @@ mod tests {
         assert!(check_iterations("--save-iterations", &[1, 30], 30).is_ok());
         for bad in [0, 31] {
             let failure = check_iterations("--save-iterations", &[5, bad], 30).unwrap_err();
-            assert!(failure.message.starts_with(&format!("--save-iterations {bad} ")));
+            assert!(
+                failure
+                    .message
+                    .starts_with(&format!("--save-iterations {bad} "))
+            );
         }
     }
 
@@ -336,8 +394,16 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let scene = root.path().join("garden");
         std::fs::create_dir(&scene).unwrap();
-        for spelling in [scene.clone(), scene.join(""), scene.join("."), scene.join("../garden")] {
-            assert_eq!(default_output(&spelling, "diet"), Path::new("output/garden-diet"));
+        for spelling in [
+            scene.clone(),
+            scene.join(""),
+            scene.join("."),
+            scene.join("../garden"),
+        ] {
+            assert_eq!(
+                default_output(&spelling, "diet"),
+                Path::new("output/garden-diet")
+            );
         }
     }
 }
