@@ -107,11 +107,7 @@ pub fn initialise(
     for (row, &i) in sh.chunks_exact_mut(stride).zip(&chosen) {
         let rgb = points.colours[i]
             .map(|v| (f64::from(v) / 255.0).clamp(COLOUR_MARGIN, 1.0 - COLOUR_MARGIN));
-<<<<<<< HEAD
-        row[..3].copy_from_slice(&rgb.map(dc_from_rgb));
-=======
         row[..3].copy_from_slice(&rgb.map(|v| rgb_to_dc(v as f32)));
->>>>>>> data
     }
     let gaussians = Gaussians {
         sh_degree,

@@ -105,11 +105,7 @@ impl Folders {
         let within = if self.chosen.is_some() {
             self.inside_images(named.value)
         } else {
-<<<<<<< HEAD
-            self.from_root(named.value)
-=======
             self.below_root(named.value)
->>>>>>> data
         };
         DatasetError::MissingImage {
             path: named.file.to_owned(),

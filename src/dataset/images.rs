@@ -344,11 +344,7 @@ mod tests {
     fn broken_and_oversized_files_are_errors_that_name_them() {
         let folder = tempfile::tempdir().unwrap();
         let good = folder.path().join("good.png");
-<<<<<<< HEAD
-        image::RgbImage::from_fn(64, 64, |x, y| [x as u8 * 3, y as u8 * 5, (x * y) as u8].into())
-=======
         image::RgbImage::from_fn(64, 64, |x, y| [x as u8, y as u8, (x * y) as u8].into())
->>>>>>> data
             .save(&good)
             .unwrap();
         let bytes = std::fs::read(&good).unwrap();

@@ -301,11 +301,7 @@ mod tests {
                 for (index, rgb) in image.rgb.chunks_exact_mut(3).enumerate() {
                     let centre = DVec2::new((index % 288) as f64 + 0.5, (index / 288) as f64 + 0.5);
                     let value =
-<<<<<<< HEAD
-                        255.0 * (-(centre - dot).length_squared() / (2.0 * 2.5 * 2.5)).exp();
-=======
                         255.0 * (-(centre - dot).length_squared() / (2.0 * 1.5 * 1.5)).exp();
->>>>>>> data
                     rgb.fill(rgb[0].max(value.round() as u8));
                 }
             }

@@ -1,6 +1,3 @@
-<<<<<<< HEAD
-
-=======
 use super::*;
 use crate::camera::Camera;
 use crate::sh::C0;
@@ -173,4 +170,3 @@ fn random_points_are_where_cameras_look() {
     assert_eq!(random_points(10, &[], true, 0).len(), 10);
     assert_eq!(random_points(10, &inward[..1], true, 0).len(), 10);
 }
->>>>>>> data

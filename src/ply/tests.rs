@@ -1,6 +1,3 @@
-<<<<<<< HEAD
-
-=======
 use std::path::PathBuf;
 
 use super::*;
@@ -273,4 +270,3 @@ fn malformed_files_do_not_panic() {
         let _ = (read_points(&path), read_splats(&path));
     }
 }
->>>>>>> data
