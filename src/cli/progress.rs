@@ -1,9 +1,10 @@
 //! How far training is: a bar on a terminal, a line now and then elsewhere.
 
+use std::fmt;
 use std::io::{IsTerminal, stderr};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use super::console::Console;
 use super::number::{duration, grouped};
@@ -31,9 +32,16 @@ impl<'a> Progress<'a> {
     pub(super) fn new(console: &'a Console, iterations: u32, budget: usize) -> Self {
         let bar = (!console.is_quiet() && stderr().is_terminal()).then(|| {
             let style = ProgressStyle::with_template(
-                "{bar:24.cyan/dim} {pos}/{len}  {per_sec:>9}  {msg}  {eta} left",
+                "{bar:24.cyan/dim} {pos}/{len}  {speed}  {msg}  {eta} left",
             )
-            .unwrap_or_else(|_| ProgressStyle::default_bar());
+            .unwrap_or_else(|_| ProgressStyle::default_bar())
+            .with_key(
+                "speed",
+                |state: &ProgressState, out: &mut dyn fmt::Write| {
+                    // The bar's own buffer; writing to it does not fail.
+                    let _ = write!(out, "{:.1} it/s", state.per_sec());
+                },
+            );
             let bar = ProgressBar::new(u64::from(iterations)).with_style(style);
             console.bars().add(bar)
         });

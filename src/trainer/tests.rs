@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use densify_policies::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
-use densify_policies::policy::{Candidate, PolicyState, Signal, SignalSet, Signals};
+use densify_policies::policy::{Candidate, PolicyError, PolicyState, Signal, SignalSet, Signals};
 use glam::{DMat3, DVec3};
 
 use super::*;
@@ -11,6 +11,7 @@ use crate::backend::Rendering;
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
+use crate::views::ViewError;
 
 /// Everything that was asked of the fakes, in order.
 type Diary = Arc<Mutex<Vec<String>>>;

@@ -1,5 +1,6 @@
 //! `densify train`.
 
+mod choices;
 mod session;
 mod setup;
 
