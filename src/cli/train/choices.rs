@@ -18,9 +18,7 @@ pub(super) fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table,
             Failure::input(format!("--policy-config {}: {problem}", path.display()))
         };
         let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-        let file: Table = text
-            .parse()
-            .map_err(|e| fail(format!("{e}").trim().to_owned()))?;
+        let file: Table = text.parse().map_err(|e| fail(format!("{e}").trim().to_owned()))?;
         for (policy, table) in file {
             // One file may serve several policies; a misspelt name may not pass for another one.
             let known = find(&policy).map_err(|e| fail(e.to_string()))?;
@@ -79,9 +77,7 @@ pub(super) fn check_iterations(flag: &str, chosen: &[u32], iterations: u32) -> R
 /// `output/SCENE-POLICY`, SCENE being the dataset folder's name.
 pub(super) fn default_output(scene: &Path, policy: &str) -> PathBuf {
     let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
-    let name = full
-        .file_name()
-        .map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+    let name = full.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy());
     Path::new("output").join(format!("{name}-{policy}"))
 }
 
@@ -92,11 +88,7 @@ mod tests {
     #[test]
     fn learning_rates_by_name() {
         let rates = learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()]).unwrap();
-        let expected = RateOptions {
-            opacity: 0.05,
-            mean_end: 1e-5,
-            ..RateOptions::default()
-        };
+        let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
         assert_eq!(rates, expected);
         for (bad, part) in [
             ("opacity", "NAME=RATE"),
@@ -106,10 +98,7 @@ mod tests {
             ("quat=inf", "quat"),
         ] {
             let message = learning_rates(&[bad.into()]).unwrap_err().message;
-            assert!(
-                message.contains(part) && message.contains("--lr"),
-                "{bad}: {message}"
-            );
+            assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
         }
     }
 
@@ -118,11 +107,7 @@ mod tests {
         assert!(check_iterations("--save-iterations", &[1, 30], 30).is_ok());
         for bad in [0, 31] {
             let failure = check_iterations("--save-iterations", &[5, bad], 30).unwrap_err();
-            assert!(
-                failure
-                    .message
-                    .starts_with(&format!("--save-iterations {bad} "))
-            );
+            assert!(failure.message.starts_with(&format!("--save-iterations {bad} ")));
         }
     }
 
@@ -131,16 +116,8 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let scene = root.path().join("garden");
         std::fs::create_dir(&scene).unwrap();
-        for spelling in [
-            scene.clone(),
-            scene.join(""),
-            scene.join("."),
-            scene.join("../garden"),
-        ] {
-            assert_eq!(
-                default_output(&spelling, "diet"),
-                Path::new("output/garden-diet")
-            );
+        for spelling in [scene.clone(), scene.join(""), scene.join("."), scene.join("../garden")] {
+            assert_eq!(default_output(&spelling, "diet"), Path::new("output/garden-diet"));
         }
     }
 }

@@ -49,10 +49,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let rates = learning_rates(&args.lr)?;
     check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
     check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
-    let output = args
-        .output
-        .clone()
-        .unwrap_or_else(|| default_output(&args.scene, &args.policy));
+    let output = args.output.clone().unwrap_or_else(|| default_output(&args.scene, &args.policy));
     RunFolder::check(&output, args.overwrite)?;
     use_threads(args.threads);
 
@@ -100,15 +97,8 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, 1);
     dataset.points = crate::dataset::PointCloud::default();
-    let (backend, ledger) = backend(
-        args,
-        &config,
-        &dataset,
-        policy.as_ref(),
-        &scene,
-        model,
-        [&views, &test],
-    )?;
+    let (backend, ledger) =
+        backend(args, &config, &dataset, policy.as_ref(), &scene, model, [&views, &test])?;
     console.say(format_args!("memory promised\n{ledger}"));
     let options = TrainOptions {
         iterations: args.iterations,
@@ -119,14 +109,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
         prefetch: AHEAD,
     };
     let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
-    Ok(Prepared {
-        config,
-        output,
-        trainer,
-        test,
-        dataset,
-        ledger,
-    })
+    Ok(Prepared { config, output, trainer, test, dataset, ledger })
 }
 
 /// The renderer with the model, and the ledger of the whole run.
@@ -154,11 +137,7 @@ fn backend(
 
     let mut ledger = backend.ledger().clone();
     let cache = views.cache();
-    ledger.add_to(
-        Section::Images,
-        "decoded training views",
-        cache.held_bytes(),
-    );
+    ledger.add_to(Section::Images, "decoded training views", cache.held_bytes());
     ledger.add_to(Section::Images, "decoding", cache.decode_bytes());
     let budget = scene.budget as u64;
     let float = size_of::<f32>() as u64;
@@ -205,14 +184,9 @@ fn first_model(
         }
         InitChoice::Points => (&dataset.points, None),
         InitChoice::Random => {
-            let count = args
-                .init_points
-                .unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
+            let count = args.init_points.unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
             let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
-            let opaque = !dataset
-                .train
-                .iter()
-                .any(|view| view.source.header.has_alpha);
+            let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
             random = random_points(count, &cameras, opaque, args.seed);
             (&random, Some(count))
         }
@@ -221,22 +195,12 @@ fn first_model(
     let left_out = [
         (report.unusable, "not finite"),
         (report.duplicates, "at the place of another"),
-        (
-            report.over_budget,
-            "beyond the budget; which ones follows from the seed",
-        ),
+        (report.over_budget, "beyond the budget; which ones follows from the seed"),
     ];
     for (number, why) in left_out.into_iter().filter(|(number, _)| *number > 0) {
-        console.say(format_args!(
-            "note: {} points left out: {why}",
-            grouped(number)
-        ));
+        console.say(format_args!("note: {} points left out: {why}", grouped(number)));
     }
-    let what = if count.is_some() {
-        "random points"
-    } else {
-        "points of the scene"
-    };
+    let what = if count.is_some() { "random points" } else { "points of the scene" };
     console.say(format_args!(
         "start    {} rows from {} {what}",
         grouped(model.len()),
@@ -252,15 +216,8 @@ fn announce(
     output: &Path,
     console: &Console,
 ) {
-    let default = if args.budget.is_none() {
-        " (default; choose with --budget)"
-    } else {
-        ""
-    };
-    console.say(format_args!(
-        "budget   {} rows{default}",
-        grouped(config.train.budget)
-    ));
+    let default = if args.budget.is_none() { " (default; choose with --budget)" } else { "" };
+    console.say(format_args!("budget   {} rows{default}", grouped(config.train.budget)));
     console.say(format_args!("policy   {}: {}", entry.name, entry.summary));
     console.say(format_args!(
         "run      {} iterations, seed {}, degree {}, background {}",
