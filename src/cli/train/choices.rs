@@ -30,7 +30,9 @@ pub(super) fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table,
             }
         }
     }
-    for (policy, table) in parse_overrides(&args.policy_set)? {
+    let overrides = parse_overrides(&args.policy_set)
+        .map_err(|error| Failure::input(format!("--policy-set: {error}")))?;
+    for (policy, table) in overrides {
         if find(&policy)?.name != entry.name {
             return Err(Failure::input(format!(
                 "--policy-set sets a parameter of `{policy}`, but the policy of this run is `{}`; \
