@@ -8,7 +8,7 @@
 //!
 //! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. Candidates are rows
 //! with g >= `tau`, where g = g_p + `colour_weight` · g_c; g_p and g_c are the means, over the views
-//! that saw the row, of the norms of the loss gradient by its mean on screen [NDC] and by its
+//! that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
 //! colour. Dead rows (less opaque than `min_opacity`; after step `max_scale_from` also larger than
 //! `max_scale` · scene extent) are pruned; they are no candidates. If there are more candidates than
 //! room, up to `rho` · budget of them are paid for by as many victims. Then the candidates grow, the
@@ -138,7 +138,7 @@ pub struct Diet {
     grow: Window,
     prune: Window,
     insert: Window,
-    /// Age below which a row is protected [steps].
+    /// Age below which a row is protected `[steps]`.
     protected_age: f32,
 }
 
@@ -288,7 +288,7 @@ fn fraction(of: f64, budget: usize) -> usize {
 }
 
 impl Diet {
-    /// g of every row. Shape: [rows].
+    /// g of every row. Shape: `[rows]`.
     fn gradient(&self, now: &Snapshot<'_>) -> Result<Vec<f32>, PolicyError> {
         let views = now.signal(Signal::VisibleCount)?;
         let mut gradient = mean_over_views(now.signal(Signal::ScreenGradient)?, views);

@@ -252,7 +252,7 @@ impl Signals {
         self.rows
     }
 
-    /// The column of `signal`, if present. Shape: [rows].
+    /// The column of `signal`, if present. Shape: `[rows]`.
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
         self.present
@@ -260,7 +260,7 @@ impl Signals {
             .then(|| &self.columns[signal as usize][..])
     }
 
-    /// The column of `signal` for writing, if present. Shape: [rows].
+    /// The column of `signal` for writing, if present. Shape: `[rows]`.
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
         self.present
             .contains(signal)
@@ -289,7 +289,7 @@ impl<'a> Snapshot<'a> {
         self.signals.rows()
     }
 
-    /// The values of `signal`. Shape: [rows].
+    /// The values of `signal`. Shape: `[rows]`.
     ///
     /// # Errors
     /// [`PolicyError::Undeclared`] when the policy's needs did not list it.
