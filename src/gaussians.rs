@@ -50,3 +50,22 @@ impl Gaussians {
         &self.sh[row * n..(row + 1) * n]
     }
 }
+
+/// Opacity of a logit: 1 / (1 + exp(−x)), without overflow at either end.
+#[must_use]
+pub fn sigmoid(x: f32) -> f32 {
+    let e = (-x.abs()).exp();
+    if x >= 0.0 { 1.0 / (1.0 + e) } else { e / (1.0 + e) }
+}
+
+/// Logit of an opacity in (0, 1): ln(o / (1 − o)).
+#[must_use]
+pub fn logit(opacity: f32) -> f32 {
+    opacity.ln() - (-opacity).ln_1p()
+}
+
+/// Band-0 coefficient of a colour seen the same from everywhere: (c − ½)/Y₀.
+#[must_use]
+pub fn rgb_to_dc(colour: f32) -> f32 {
+    (colour - 0.5) / crate::sh::C0
+}

@@ -1,4 +1,9 @@
-//! The ledger: bytes per buffer, promised before training.
+//! The ledger: bytes per buffer, promised before training, and the peak that was measured.
+//!
+//! Every buffer of a run has its size before the first step, because it is allocated once, at the
+//! budget. The ledger lists them, so that a user learns before training whether a run fits.
+
+use std::fmt;
 
 use serde::Serialize;
 
@@ -12,21 +17,218 @@ pub struct Ledger {
 /// One buffer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LedgerLine {
+    /// What kind of thing it belongs to.
+    pub section: Section,
     /// What it holds.
     pub what: String,
     /// Its size [bytes].
     pub bytes: u64,
 }
 
+/// What a buffer belongs to. The table lists sections in this order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Section {
+    /// Parameters, moments, age.
+    Model,
+    /// Gradients of the parameters.
+    Gradients,
+    /// Lists of (row, tile) pairs and what belongs to each pair.
+    Tiles,
+    /// Buffers of the renderer that belong to no other section.
+    Renderer,
+    /// Signals, candidates and plans of the policy.
+    Policy,
+    /// Decoded images.
+    Images,
+    /// What is held for a moment only: evaluation, export. Its lines are not needed at once.
+    Passing,
+    /// The program itself before any of the above.
+    Process,
+}
+
+impl Section {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Model => "model",
+            Self::Gradients => "gradients",
+            Self::Tiles => "tile lists",
+            Self::Renderer => "renderer",
+            Self::Policy => "policy",
+            Self::Images => "images",
+            Self::Passing => "in passing",
+            Self::Process => "process",
+        }
+    }
+}
+
 impl Ledger {
-    /// Adds a buffer.
+    /// Adds a buffer of the renderer.
     pub fn add(&mut self, what: impl Into<String>, bytes: u64) {
-        self.lines.push(LedgerLine { what: what.into(), bytes });
+        self.add_to(Section::Renderer, what, bytes);
     }
 
-    /// Sum of all lines [bytes].
+    /// Adds a buffer to a section.
+    pub fn add_to(&mut self, section: Section, what: impl Into<String>, bytes: u64) {
+        self.lines.push(LedgerLine {
+            section,
+            what: what.into(),
+            bytes,
+        });
+    }
+
+    /// Adds all lines of another ledger.
+    pub fn extend(&mut self, other: &Self) {
+        self.lines.extend_from_slice(&other.lines);
+    }
+
+    /// Sum of all lines [bytes]; of the lines held in passing only the largest counts, as they
+    /// are never held together.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.lines.iter().map(|line| line.bytes).sum()
+        let (passing, lasting): (Vec<_>, Vec<_>) = self
+            .lines
+            .iter()
+            .partition(|line| line.section == Section::Passing);
+        let lasting = lasting
+            .iter()
+            .fold(0_u64, |sum, line| sum.saturating_add(line.bytes));
+        lasting.saturating_add(passing.iter().map(|line| line.bytes).max().unwrap_or(0))
+    }
+}
+
+/// A table: section, buffer, size; the total below.
+impl fmt::Display for Ledger {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut lines: Vec<_> = self.lines.iter().collect();
+        lines.sort_by_key(|line| line.section);
+        let what_width = lines
+            .iter()
+            .map(|line| line.what.chars().count())
+            .max()
+            .unwrap_or(0)
+            .max(5);
+        let mut previous = None;
+        for line in lines {
+            let name = if previous == Some(line.section) {
+                ""
+            } else {
+                line.section.name()
+            };
+            previous = Some(line.section);
+            let LedgerLine { what, bytes, .. } = line;
+            writeln!(
+                f,
+                "  {name:<11} {what:<what_width$} {:>12}",
+                Bytes(*bytes).to_string()
+            )?;
+        }
+        let total = Bytes(self.total()).to_string();
+        write!(f, "  {:<11} {:<what_width$} {total:>12}", "total", "")
+    }
+}
+
+/// A number of bytes, shown in the binary unit that suits it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bytes(pub u64);
+
+impl fmt::Display for Bytes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const UNITS: [&str; 4] = ["KiB", "MiB", "GiB", "TiB"];
+        if self.0 < 1024 {
+            return write!(f, "{} B", self.0);
+        }
+        let mut value = self.0 as f64 / 1024.0;
+        let mut unit = 0;
+        // 1,023.95 would print as 1024.0.
+        while value >= 1023.95 && unit + 1 < UNITS.len() {
+            value /= 1024.0;
+            unit += 1;
+        }
+        write!(f, "{value:.1} {}", UNITS[unit])
+    }
+}
+
+/// Resident memory of this process now [bytes]; `None` where the system does not say.
+#[must_use]
+pub fn resident() -> Option<u64> {
+    status_line("VmRSS:")
+}
+
+/// Largest resident memory of this process so far [bytes]; `None` where the system does not say.
+#[must_use]
+pub fn peak_resident() -> Option<u64> {
+    status_line("VmHWM:")
+}
+
+fn status_line(key: &str) -> Option<u64> {
+    parse_status(&std::fs::read_to_string("/proc/self/status").ok()?, key)
+}
+
+/// Reads a line of `/proc/<pid>/status`, "VmRSS:     1234 kB" (proc(5): kB means 1,024 bytes).
+fn parse_status(status: &str, key: &str) -> Option<u64> {
+    let value = status.lines().find_map(|line| line.strip_prefix(key))?;
+    let kibibytes: u64 = value.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    kibibytes.checked_mul(1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample() -> Ledger {
+        let mut ledger = Ledger::default();
+        ledger.add_to(Section::Process, "program", 3 << 20);
+        ledger.add_to(Section::Model, "parameters", 10 << 20);
+        ledger.add_to(Section::Model, "moments", 20 << 20);
+        ledger.add("projections", 1536);
+        ledger.add_to(Section::Passing, "evaluation", 5 << 20);
+        ledger.add_to(Section::Passing, "export", 7 << 20);
+        ledger
+    }
+
+    #[test]
+    fn of_what_passes_only_the_largest_counts() {
+        assert_eq!(sample().total(), (40 << 20) + 1536);
+        let mut full = Ledger::default();
+        full.add("a", u64::MAX);
+        full.add("b", 1);
+        assert_eq!(full.total(), u64::MAX);
+    }
+
+    #[test]
+    fn the_table_is_aligned_and_ordered() {
+        let table = sample().to_string();
+        let expected = "  model       parameters      10.0 MiB
+              moments         20.0 MiB
+  renderer    projections      1.5 KiB
+  in passing  evaluation       5.0 MiB
+              export           7.0 MiB
+  process     program          3.0 MiB
+  total                       40.0 MiB";
+        assert_eq!(table, expected);
+    }
+
+    #[test]
+    fn bytes_read_well() {
+        let shown = |n| Bytes(n).to_string();
+        assert_eq!(
+            [0, 1023, 1024, 1536, (1 << 20) - 1, 1 << 20, 1 << 30].map(shown),
+            [
+                "0 B", "1023 B", "1.0 KiB", "1.5 KiB", "1.0 MiB", "1.0 MiB", "1.0 GiB"
+            ]
+        );
+    }
+
+    #[test]
+    fn status_lines() {
+        let status = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t     10 kB\n";
+        assert_eq!(parse_status(status, "VmHWM:"), Some(2 << 20));
+        assert_eq!(parse_status(status, "VmRSS:"), Some(10 << 10));
+        assert_eq!(parse_status(status, "VmPeak:"), None);
+        assert_eq!(parse_status("VmHWM: many kB", "VmHWM:"), None);
+        if let (Some(now), Some(peak)) = (resident(), peak_resident()) {
+            assert!(now > 0 && peak > 0);
+        }
     }
 }

@@ -32,11 +32,7 @@ impl Window {
 pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     let mean = |(&sum, &views): (&f32, &f32)| {
         let mean = sum / views;
-        if views > 0.0 && mean.is_finite() {
-            mean
-        } else {
-            0.0
-        }
+        if views > 0.0 && mean.is_finite() { mean } else { 0.0 }
     };
     sum.iter().zip(views).map(mean).collect()
 }
@@ -100,11 +96,7 @@ mod tests {
 
     #[test]
     fn windows_exclude_their_ends() {
-        let window = Window {
-            from: 500,
-            until: 1000,
-            every: 100,
-        };
+        let window = Window { from: 500, until: 1000, every: 100 };
         let due: Vec<u32> = (0..2000).filter(|&step| window.is_due(step)).collect();
         assert_eq!(due, [600, 700, 800, 900]);
         assert!((0..2000).all(|step| !Window { every: 0, ..window }.is_due(step)));
@@ -114,25 +106,16 @@ mod tests {
     fn means_are_finite() {
         let sum = [6.0, 0.0, 1.0, f32::NAN, f32::INFINITY, 1.0];
         let views = [3.0, 0.0, 0.0, 2.0, 2.0, f32::NAN];
-        assert_eq!(
-            mean_over_views(&sum, &views),
-            [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-        );
+        assert_eq!(mean_over_views(&sum, &views), [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     }
 
     #[test]
     fn dead_are_the_faint_the_huge_and_the_undefined() {
-        let mortality = Mortality {
-            min_opacity: 0.005,
-            max_scale: 2.0,
-        };
+        let mortality = Mortality { min_opacity: 0.005, max_scale: 2.0 };
         assert!(!mortality.is_dead(0.005, 2.0));
         assert!(mortality.is_dead(0.0049, 1.0) && mortality.is_dead(0.5, 2.1));
         assert!(mortality.is_dead(f32::NAN, 1.0) && mortality.is_dead(0.5, f32::NAN));
-        let boundless = Mortality {
-            max_scale: f32::INFINITY,
-            ..mortality
-        };
+        let boundless = Mortality { max_scale: f32::INFINITY, ..mortality };
         assert!(!boundless.is_dead(0.5, 1e30) && boundless.is_dead(0.5, f32::INFINITY));
     }
 

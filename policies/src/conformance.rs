@@ -92,10 +92,7 @@ impl std::error::Error for Report {}
 impl Report {
     fn new(entry: &PolicyEntry) -> Self {
         let policy = format!("`{}` ({})", entry.name, entry.location());
-        Self {
-            policy,
-            failures: Vec::new(),
-        }
+        Self { policy, failures: Vec::new() }
     }
 
     /// Keeps the first failure of each check.
@@ -106,11 +103,7 @@ impl Report {
     }
 
     fn result(self) -> Result<(), Self> {
-        if self.failures.is_empty() {
-            Ok(())
-        } else {
-            Err(self)
-        }
+        if self.failures.is_empty() { Ok(()) } else { Err(self) }
     }
 }
 
@@ -145,10 +138,7 @@ pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report>
 /// A report of all parameters that are not documented as they are.
 pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
     let manual = entry.manual();
-    let table = manual
-        .lines()
-        .skip_while(|line| !line.starts_with("| name | default |"))
-        .skip(2);
+    let table = manual.lines().skip_while(|line| !line.starts_with("| name | default |")).skip(2);
     let rows: Vec<Vec<&str>> = table
         .take_while(|line| line.starts_with('|'))
         .map(|line| line.trim_matches('|').split('|').map(str::trim).collect())
@@ -160,19 +150,13 @@ pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
             None => wrong.push(format!("`{name}` is missing")),
             Some(row) if row.len() != 5 => wrong.push(format!("`{name}` has {} cells", row.len())),
             Some(row) if !is_same(&parse_value(row[1]), default) => {
-                wrong.push(format!(
-                    "`{name}` has the default {default}, not {}",
-                    row[1]
-                ));
+                wrong.push(format!("`{name}` has the default {default}, not {}", row[1]));
             }
             Some(_) => {}
         }
     }
     let known = entry.parameter_names();
-    let unknown = rows
-        .iter()
-        .map(|row| row[0])
-        .filter(|name| known.iter().all(|k| k != name));
+    let unknown = rows.iter().map(|row| row[0]).filter(|name| known.iter().all(|k| k != name));
     wrong.extend(unknown.map(|name| format!("`{name}` is no parameter")));
     let mut report = Report::new(entry);
     if !wrong.is_empty() {
@@ -182,11 +166,7 @@ pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
 }
 
 fn is_same(documented: &Value, default: &Value) -> bool {
-    let number = |value: &Value| {
-        value
-            .as_float()
-            .or_else(|| value.as_integer().map(|v| v as f64))
-    };
+    let number = |value: &Value| value.as_float().or_else(|| value.as_integer().map(|v| v as f64));
     match (number(documented), number(default)) {
         (Some(documented), Some(default)) => documented.total_cmp(&default).is_eq(),
         _ => documented == default,
@@ -195,33 +175,21 @@ fn is_same(documented: &Value, default: &Value) -> bool {
 
 fn check_building(entry: &PolicyEntry, set: &Table, report: &mut Report) {
     for iterations in [1, 7, 600, 30_000, u32::MAX] {
-        let scene = SceneInfo {
-            iterations,
-            ..script::scene(10, 100)
-        };
+        let scene = SceneInfo { iterations, ..script::scene(10, 100) };
         if let Err(error) = entry.build(set, &scene) {
             report.add(Check::Builds, format!("for {iterations} steps: {error}"));
         }
     }
     let parameters = entry.parameters();
     for step in entry.step_parameters() {
-        if !parameters
-            .iter()
-            .any(|(name, value)| name == step && value.is_integer())
-        {
-            report.add(
-                Check::Builds,
-                format!("`{step}` counts steps but is no integer parameter"),
-            );
+        if !parameters.iter().any(|(name, value)| name == step && value.is_integer()) {
+            report.add(Check::Builds, format!("`{step}` counts steps but is no integer parameter"));
         }
     }
     let unknown = Table::from_iter([("no_such_parameter".to_owned(), Value::Integer(1))]);
     match entry.build(&unknown, &script::scene(10, 100)) {
         Err(PolicyError::UnknownParameter { .. }) => {}
-        Err(error) => report.add(
-            Check::Builds,
-            format!("an unknown parameter gives: {error}"),
-        ),
+        Err(error) => report.add(Check::Builds, format!("an unknown parameter gives: {error}")),
         Ok(_) => report.add(Check::Builds, "an unknown parameter is accepted".to_owned()),
     }
 }

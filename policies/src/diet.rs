@@ -204,16 +204,11 @@ impl DensityPolicy for Diet {
         if self.protected_age > 0.0 {
             signals = signals.with(Signal::Age);
         }
-        Needs {
-            signals,
-            candidates: self.candidate_request(scene),
-        }
+        Needs { signals, candidates: self.candidate_request(scene) }
     }
 
     fn is_due(&self, step: u32) -> bool {
-        [self.grow, self.prune, self.insert]
-            .iter()
-            .any(|window| window.is_due(step))
+        [self.grow, self.prune, self.insert].iter().any(|window| window.is_due(step))
     }
 
     fn plan(
@@ -223,11 +218,7 @@ impl DensityPolicy for Diet {
         plan: &mut EditPlan,
     ) -> Result<(), PolicyError> {
         let grows = self.grow.is_due(now.step);
-        let gradient = if grows {
-            self.gradient(now)?
-        } else {
-            vec![0.0; now.rows()]
-        };
+        let gradient = if grows { self.gradient(now)? } else { vec![0.0; now.rows()] };
         let mut candidates = Vec::new();
         if grows {
             plan.cause("grow");
@@ -275,11 +266,8 @@ impl DensityPolicy for Diet {
     }
 }
 
-const MEAN_GRADIENT: [Signal; 3] = [
-    Signal::MeanGradientX,
-    Signal::MeanGradientY,
-    Signal::MeanGradientZ,
-];
+const MEAN_GRADIENT: [Signal; 3] =
+    [Signal::MeanGradientX, Signal::MeanGradientY, Signal::MeanGradientZ];
 
 /// ⌊`of` · `budget`⌋.
 fn fraction(of: f64, budget: usize) -> usize {
@@ -317,9 +305,7 @@ impl Diet {
             max_scale: if by_size { max_scale } else { f32::INFINITY },
         };
         let is_dead = |row: usize| mortality.is_dead(opacity[row], scale[row]);
-        let dead = (0..now.rows())
-            .filter(|&row| is_dead(row))
-            .map(|row| row as u32);
+        let dead = (0..now.rows()).filter(|&row| is_dead(row)).map(|row| row as u32);
         let mut dead = dead.collect();
         spare_one(&mut dead, opacity);
         Ok(dead)
@@ -347,11 +333,7 @@ impl Diet {
         }
         let importance = now.signal(Signal::WeightMax)?;
         let protects = self.protected_age > 0.0;
-        let age = if protects {
-            now.signal(Signal::Age)?
-        } else {
-            &[]
-        };
+        let age = if protects { now.signal(Signal::Age)? } else { &[] };
         let eligible = (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !spared(row));
         let (mut newborn, grown): (Vec<u32>, Vec<u32>) =
             eligible.partition(|&row| protects && age[row as usize] < self.protected_age);
@@ -361,9 +343,7 @@ impl Diet {
             newborn.sort_unstable_by(|&a, &b| {
                 let (a_row, b_row) = (a as usize, b as usize);
                 let older_first = age[b_row].total_cmp(&age[a_row]);
-                older_first
-                    .then(importance[a_row].total_cmp(&importance[b_row]))
-                    .then(a.cmp(&b))
+                older_first.then(importance[a_row].total_cmp(&importance[b_row])).then(a.cmp(&b))
             });
             victims.extend(newborn.into_iter().take(missing));
         }

@@ -128,8 +128,7 @@ impl Offspring {
     /// How many Gaussians share the parent's opacity: its children, and itself if it becomes one.
     #[must_use]
     pub fn siblings(&self) -> u32 {
-        self.children
-            .saturating_add(u32::from(self.parent == ParentFate::BecomesChild))
+        self.children.saturating_add(u32::from(self.parent == ParentFate::BecomesChild))
     }
 }
 
@@ -192,31 +191,11 @@ mod tests {
             opacity: OpacityRule::Same,
         };
         assert!(clone.is_valid());
-        assert!(
-            !Offspring {
-                children: 0,
-                ..clone
-            }
-            .is_valid()
-        );
+        assert!(!Offspring { children: 0, ..clone }.is_valid());
         for bad in BAD.into_iter().chain([0.0]) {
             assert!(!ScaleRule::Uniform(bad).is_valid(), "{bad}");
-            assert!(
-                !ScaleRule::LongAxis {
-                    long: bad,
-                    other: 1.0
-                }
-                .is_valid(),
-                "{bad}"
-            );
-            assert!(
-                !ScaleRule::LongAxis {
-                    long: 1.0,
-                    other: bad
-                }
-                .is_valid(),
-                "{bad}"
-            );
+            assert!(!ScaleRule::LongAxis { long: bad, other: 1.0 }.is_valid(), "{bad}");
+            assert!(!ScaleRule::LongAxis { long: 1.0, other: bad }.is_valid(), "{bad}");
             assert!(!OpacityRule::Set(bad).is_valid(), "{bad}");
             assert!(!OpacityRule::Scaled(bad).is_valid(), "{bad}");
         }
@@ -233,54 +212,17 @@ mod tests {
 
     #[test]
     fn a_seed_must_be_a_gaussian() {
-        let seed = Seed {
-            position: [0.0; 3],
-            colour: [0.0, 0.5, 1.0],
-            scale: 0.1,
-            opacity: 0.1,
-        };
+        let seed = Seed { position: [0.0; 3], colour: [0.0, 0.5, 1.0], scale: 0.1, opacity: 0.1 };
         assert!(seed.is_valid());
         for bad in BAD {
-            assert!(
-                !Seed {
-                    colour: [bad, 0.0, 0.0],
-                    ..seed
-                }
-                .is_valid(),
-                "{bad}"
-            );
+            assert!(!Seed { colour: [bad, 0.0, 0.0], ..seed }.is_valid(), "{bad}");
             assert!(!Seed { scale: bad, ..seed }.is_valid(), "{bad}");
-            assert!(
-                !Seed {
-                    opacity: bad,
-                    ..seed
-                }
-                .is_valid(),
-                "{bad}"
-            );
+            assert!(!Seed { opacity: bad, ..seed }.is_valid(), "{bad}");
         }
-        assert!(
-            !Seed {
-                position: [0.0, f32::NAN, 0.0],
-                ..seed
-            }
-            .is_valid()
-        );
-        assert!(
-            !Seed {
-                colour: [1.1, 0.0, 0.0],
-                ..seed
-            }
-            .is_valid()
-        );
+        assert!(!Seed { position: [0.0, f32::NAN, 0.0], ..seed }.is_valid());
+        assert!(!Seed { colour: [1.1, 0.0, 0.0], ..seed }.is_valid());
         assert!(!Seed { scale: 0.0, ..seed }.is_valid());
-        assert!(
-            !Seed {
-                opacity: 1.0,
-                ..seed
-            }
-            .is_valid()
-        );
+        assert!(!Seed { opacity: 1.0, ..seed }.is_valid());
     }
 
     #[test]
@@ -291,19 +233,7 @@ mod tests {
             keep_moments: true,
         };
         assert!(update.is_valid());
-        assert!(
-            !Update {
-                opacity: OpacityRule::Conserved,
-                ..update
-            }
-            .is_valid()
-        );
-        assert!(
-            !Update {
-                scale: ScaleRule::Uniform(0.0),
-                ..update
-            }
-            .is_valid()
-        );
+        assert!(!Update { opacity: OpacityRule::Conserved, ..update }.is_valid());
+        assert!(!Update { scale: ScaleRule::Uniform(0.0), ..update }.is_valid());
     }
 }

@@ -38,14 +38,7 @@ impl Event {
             iterations: 30_000,
             white_background: false,
         };
-        Self {
-            step,
-            rows,
-            budget,
-            scene,
-            columns: Vec::new(),
-            candidates: Vec::new(),
-        }
+        Self { step, rows, budget, scene, columns: Vec::new(), candidates: Vec::new() }
     }
 
     pub(crate) fn with(mut self, signal: Signal, column: &[f32]) -> Self {
@@ -84,10 +77,7 @@ impl Event {
 impl Outcome {
     fn of(ops: RowOps) -> Self {
         let grown = |fate| {
-            let of_fate = ops
-                .families
-                .iter()
-                .filter(move |f| f.offspring.parent == fate);
+            let of_fate = ops.families.iter().filter(move |f| f.offspring.parent == fate);
             of_fate.map(|family| family.parent).collect()
         };
         // A slot that is written or moved into was pruned; so was a row of the tail left behind.
@@ -100,9 +90,7 @@ impl Outcome {
             *row as usize >= ops.rows_after && ops.moves.iter().all(|(from, _)| from != row)
         };
         Self {
-            pruned: (0..ops.rows_before as u32)
-                .filter(|r| is_hole(r) || is_left(r))
-                .collect(),
+            pruned: (0..ops.rows_before as u32).filter(|r| is_hole(r) || is_left(r)).collect(),
             cloned: grown(ParentFate::Stays),
             split: grown(ParentFate::BecomesChild),
             ops,

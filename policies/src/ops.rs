@@ -121,16 +121,12 @@ impl RowOps {
         let mut claimed = Slots::new(slots);
         self.check_families(&mut claimed)?;
         for (row, update) in &self.updates {
-            require(update.is_valid(), || {
-                format!("update of row {row} has a bad value")
-            })?;
+            require(update.is_valid(), || format!("update of row {row} has a bad value"))?;
             self.check_live("updated row", *row)?;
             claimed.claim("updated row", *row)?;
         }
         for (slot, seed) in &self.seeds {
-            require(seed.is_valid(), || {
-                format!("seed in slot {slot} has a bad value")
-            })?;
+            require(seed.is_valid(), || format!("seed in slot {slot} has a bad value"))?;
             self.check_birth("seed", *slot)?;
             claimed.claim("seed", *slot)?;
         }
@@ -138,29 +134,18 @@ impl RowOps {
     }
 
     fn check_totals(&self) -> Result<(), BrokenOps> {
-        let Self {
-            rows_before,
-            rows_after,
-            budget,
-            counts,
-            ..
-        } = self;
+        let Self { rows_before, rows_after, budget, counts, .. } = self;
         let born = self.child_slots.len() + self.seeds.len();
-        require(
-            rows_after <= budget || (rows_after <= rows_before && born == 0),
-            || format!("{rows_after} rows after, budget {budget}"),
-        )?;
-        let holds = rows_before
-            .checked_sub(counts.removed)
-            .map(|kept| kept + born);
+        require(rows_after <= budget || (rows_after <= rows_before && born == 0), || {
+            format!("{rows_after} rows after, budget {budget}")
+        })?;
+        let holds = rows_before.checked_sub(counts.removed).map(|kept| kept + born);
         require(holds == Some(*rows_after) && counts.added == born, || {
             format!("{rows_before} rows, {counts:?}, {born} born: not {rows_after} rows after")
         })?;
         let is_child = |family: &&Family| family.offspring.parent == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
-        require(counts.updated == updated, || {
-            format!("{updated} updated, but {counts:?}")
-        })?;
+        require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {
             format!("opacity bound {:?}", self.clamp_opacity)
         })
@@ -170,9 +155,7 @@ impl RowOps {
         let mut first_child = 0;
         for family in &self.families {
             let parent = family.parent;
-            require(family.offspring.is_valid(), || {
-                format!("family of row {parent}: bad value")
-            })?;
+            require(family.offspring.is_valid(), || format!("family of row {parent}: bad value"))?;
             require(family.first_child as usize == first_child, || {
                 format!("family of row {parent} starts at {}", family.first_child)
             })?;
@@ -181,10 +164,7 @@ impl RowOps {
             claimed.claim("parent", parent)?;
         }
         require(self.child_slots.len() == first_child, || {
-            format!(
-                "{} child slots for {first_child} children",
-                self.child_slots.len()
-            )
+            format!("{} child slots for {first_child} children", self.child_slots.len())
         })?;
         for &slot in &self.child_slots {
             self.check_birth("child", slot)?;
@@ -196,20 +176,13 @@ impl RowOps {
     /// Every move ends in a hole; every parent and updated row of the tail is moved; the rows from
     /// `rows_before` upward are all born.
     fn check_moves(&self, claimed: &mut Slots) -> Result<(), BrokenOps> {
-        let Self {
-            rows_before,
-            rows_after,
-            ..
-        } = self;
+        let Self { rows_before, rows_after, .. } = self;
         let mut moved = Slots::new(*rows_before);
         for &(from, to) in &self.moves {
-            require(
-                (*rows_after..*rows_before).contains(&(from as usize)),
-                || format!("move from row {from}, not in the tail {rows_after}..{rows_before}"),
-            )?;
-            require((to as usize) < *rows_after, || {
-                format!("move to row {to} of {rows_after}")
+            require((*rows_after..*rows_before).contains(&(from as usize)), || {
+                format!("move from row {from}, not in the tail {rows_after}..{rows_before}")
             })?;
+            require((to as usize) < *rows_after, || format!("move to row {to} of {rows_after}"))?;
             moved.claim("moved row", from)?;
             claimed.claim("hole", to)?;
         }
@@ -221,9 +194,7 @@ impl RowOps {
         }
         let seeds = self.seeds.iter().map(|seed| &seed.0);
         let births = self.child_slots.iter().chain(seeds);
-        let on_top = births
-            .filter(|&&slot| slot as usize >= *rows_before)
-            .count();
+        let on_top = births.filter(|&&slot| slot as usize >= *rows_before).count();
         require(on_top == rows_after.saturating_sub(*rows_before), || {
             format!("{on_top} rows born on top of {rows_before}, {rows_after} rows after")
         })
@@ -237,20 +208,13 @@ impl RowOps {
 
     fn check_birth(&self, what: &str, slot: u32) -> Result<(), BrokenOps> {
         require((slot as usize) < self.rows_after.min(self.budget), || {
-            format!(
-                "{what} in slot {slot}, {} rows after, budget {}",
-                self.rows_after, self.budget
-            )
+            format!("{what} in slot {slot}, {} rows after, budget {}", self.rows_after, self.budget)
         })
     }
 }
 
 fn require(holds: bool, broken: impl FnOnce() -> String) -> Result<(), BrokenOps> {
-    if holds {
-        Ok(())
-    } else {
-        Err(BrokenOps(broken()))
-    }
+    if holds { Ok(()) } else { Err(BrokenOps(broken())) }
 }
 
 /// A set of slots, one bit each.
@@ -262,9 +226,7 @@ impl Slots {
     }
 
     fn contains(&self, slot: u32) -> bool {
-        self.0
-            .get(slot as usize / 64)
-            .is_some_and(|word| word >> (slot % 64) & 1 == 1)
+        self.0.get(slot as usize / 64).is_some_and(|word| word >> (slot % 64) & 1 == 1)
     }
 
     fn claim(&mut self, what: &str, slot: u32) -> Result<(), BrokenOps> {

@@ -40,10 +40,7 @@ pub fn in_range(
     if must.is_empty() {
         must.push("finite".to_owned());
     }
-    Err(bad(
-        parameter,
-        format!("{value} is out of range; it must be {}", must.join(" and ")),
-    ))
+    Err(bad(parameter, format!("{value} is out of range; it must be {}", must.join(" and "))))
 }
 
 /// A [`PolicyError::BadParameter`]; for [`ConfiguredPolicy::new`]. The registry fills in the
@@ -89,9 +86,7 @@ pub(crate) fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     // A value with a line break could hold further keys; then it is no value.
     let single = parsed.filter(|table| table.len() == 1);
-    single
-        .and_then(|mut table| table.remove("value"))
-        .unwrap_or_else(|| text.into())
+    single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }
 
 /// Multiplies the step counts named in `names` by `iterations` / 30,000: rounded, at least 1, but
@@ -110,12 +105,8 @@ pub(crate) fn scale_steps(table: &mut Table, names: &[&str], iterations: u32) {
 /// The name in `known` most like `name`, if any is like it.
 pub(crate) fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
     // 0.7 lets a missing or a wrong letter of a short name pass, but not another word.
-    let alike = known
-        .into_iter()
-        .map(|k| (strsim::jaro_winkler(name, k), k));
-    let best = alike
-        .filter(|(likeness, _)| *likeness >= 0.7)
-        .max_by(|a, b| a.0.total_cmp(&b.0));
+    let alike = known.into_iter().map(|k| (strsim::jaro_winkler(name, k), k));
+    let best = alike.filter(|(likeness, _)| *likeness >= 0.7).max_by(|a, b| a.0.total_cmp(&b.0));
     best.map(|(_, k)| k.to_owned())
 }
 
@@ -161,9 +152,9 @@ mod tests {
 
     fn reason(result: Result<(), PolicyError>) -> String {
         match result {
-            Err(PolicyError::BadParameter {
-                parameter, reason, ..
-            }) if parameter == "rho" => reason,
+            Err(PolicyError::BadParameter { parameter, reason, .. }) if parameter == "rho" => {
+                reason
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -173,20 +164,11 @@ mod tests {
         assert_eq!(in_range("rho", 1.0, 0.0..=1.0), Ok(()));
         assert_eq!(in_range("rho", -5.0, ..), Ok(()));
         let told = reason(in_range("rho", 1.5, 0.0..=1.0));
-        assert_eq!(
-            told,
-            "1.5 is out of range; it must be at least 0 and at most 1"
-        );
+        assert_eq!(told, "1.5 is out of range; it must be at least 0 and at most 1");
         let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
         let told = reason(in_range("rho", 0.0, open));
-        assert_eq!(
-            told,
-            "0 is out of range; it must be greater than 0 and less than 1"
-        );
-        assert_eq!(
-            reason(in_range("rho", f64::NAN, ..)),
-            "NaN is out of range; it must be finite"
-        );
+        assert_eq!(told, "0 is out of range; it must be greater than 0 and less than 1");
+        assert_eq!(reason(in_range("rho", f64::NAN, ..)), "NaN is out of range; it must be finite");
         reason(in_range("rho", f64::INFINITY, 0.0..));
     }
 
@@ -213,17 +195,9 @@ mod tests {
         assert_eq!(diet["e"], Value::Float(1e-4));
         assert_eq!(tables["vanilla"]["governor"], Value::Boolean(true));
         assert!(parse_overrides(&[""; 0]).unwrap().is_empty());
-        for broken in [
-            "",
-            "diet",
-            "diet.rho",
-            "diet=0.2",
-            ".rho=1",
-            "diet.=1",
-            "diet.rho=",
-            "=",
-            ".",
-        ] {
+        for broken in
+            ["", "diet", "diet.rho", "diet=0.2", ".rho=1", "diet.=1", "diet.rho=", "=", "."]
+        {
             let error = parse_overrides(&[broken]).unwrap_err().to_string();
             assert!(error.contains(&format!("`{broken}`")), "{error}");
         }

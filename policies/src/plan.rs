@@ -94,9 +94,7 @@ impl EditPlan {
     #[must_use]
     pub fn room(&self) -> usize {
         // Slots are u32 on every backend, whatever the budget says.
-        self.budget
-            .min(u32::MAX as usize)
-            .saturating_sub(self.rows() - self.pruned + self.born)
+        self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.born)
     }
 
     /// Rows pruned so far.
@@ -202,30 +200,19 @@ impl EditPlan {
         let is_pruned = |&slot: &usize| self.fates[slot] == Fate::Pruned;
         // Every slot in `0..rows_after` that holds no live row: the first `born` of them are for
         // the newborn, the rest (only where the model shrinks) for rows of the tail.
-        let mut holes = (0..rows_before)
-            .filter(is_pruned)
-            .chain(rows_before..)
-            .map(|s| s as u32);
+        let mut holes = (0..rows_before).filter(is_pruned).chain(rows_before..).map(|s| s as u32);
 
         let born_in_families = self.born - self.seeds.len();
         let child_slots: Vec<u32> = holes.by_ref().take(born_in_families).collect();
         let mut first_child = 0;
         let families = self.families.iter().map(|&(parent, offspring)| {
-            let family = Family {
-                parent,
-                first_child,
-                offspring,
-            };
+            let family = Family { parent, first_child, offspring };
             first_child += offspring.children;
             family
         });
         let families: Vec<Family> = families.collect();
         // Seeds lead the zip: it must not draw a hole when there is no seed left to fill it.
-        let seeds = self
-            .seeds
-            .iter()
-            .zip(holes.by_ref())
-            .map(|(&seed, slot)| (slot, seed));
+        let seeds = self.seeds.iter().zip(holes.by_ref()).map(|(&seed, slot)| (slot, seed));
         let seeds: Vec<(u32, Seed)> = seeds.collect();
         let live_tail = (rows_after..rows_before).filter(|slot| !is_pruned(slot));
         let moves: Vec<(u32, u32)> = live_tail.map(|s| s as u32).zip(holes).collect();

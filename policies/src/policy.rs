@@ -231,19 +231,9 @@ impl Signals {
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
         let columns = Signal::ALL
             .iter()
-            .map(|&s| {
-                if set.contains(s) {
-                    vec![0.0; rows]
-                } else {
-                    Vec::new()
-                }
-            })
+            .map(|&s| if set.contains(s) { vec![0.0; rows] } else { Vec::new() })
             .collect();
-        Self {
-            rows,
-            present: set,
-            columns,
-        }
+        Self { rows, present: set, columns }
     }
 
     /// Number of rows.
@@ -255,16 +245,12 @@ impl Signals {
     /// The column of `signal`, if present. Shape: `[rows]`.
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
-        self.present
-            .contains(signal)
-            .then(|| &self.columns[signal as usize][..])
+        self.present.contains(signal).then(|| &self.columns[signal as usize][..])
     }
 
     /// The column of `signal` for writing, if present. Shape: `[rows]`.
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
-        self.present
-            .contains(signal)
-            .then(|| &mut self.columns[signal as usize][..])
+        self.present.contains(signal).then(|| &mut self.columns[signal as usize][..])
     }
 }
 
@@ -294,9 +280,7 @@ impl<'a> Snapshot<'a> {
     /// # Errors
     /// [`PolicyError::Undeclared`] when the policy's needs did not list it.
     pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
-        self.signals
-            .get(signal)
-            .ok_or(PolicyError::Undeclared { signal })
+        self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
     }
 }
 
@@ -368,9 +352,7 @@ pub fn restore_nothing(state: &PolicyState) -> Result<(), PolicyError> {
     if state.is_null() {
         return Ok(());
     }
-    Err(PolicyError::State(format!(
-        "this policy keeps no state, but the checkpoint holds {state}"
-    )))
+    Err(PolicyError::State(format!("this policy keeps no state, but the checkpoint holds {state}")))
 }
 
 #[cfg(test)]

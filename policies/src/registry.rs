@@ -97,9 +97,7 @@ impl PolicyEntry {
                 Table::try_from(params).map_err(first_line)
             },
             build: |table, scene| {
-                let params = table
-                    .try_into()
-                    .map_err(|e| PolicyError::Other(first_line(e)))?;
+                let params = table.try_into().map_err(|e| PolicyError::Other(first_line(e)))?;
                 Ok(Box::new(P::new(params, scene)?))
             },
         }
@@ -120,11 +118,7 @@ impl PolicyEntry {
             .map_while(|line| line.trim_end().strip_prefix("//!"))
             .map(|line| line.strip_prefix(' ').unwrap_or(line))
             .collect();
-        let text = if block.is_empty() {
-            self.doc.to_owned()
-        } else {
-            block.join("\n")
-        };
+        let text = if block.is_empty() { self.doc.to_owned() } else { block.join("\n") };
         text.trim().to_owned() + "\n"
     }
 
@@ -139,11 +133,7 @@ impl PolicyEntry {
     pub fn parameter_names(&self) -> Vec<String> {
         let known = (self.names)().unwrap_or_default();
         let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
-        let more = self
-            .defaults()
-            .unwrap_or_default()
-            .into_iter()
-            .map(|(name, _)| name);
+        let more = self.defaults().unwrap_or_default().into_iter().map(|(name, _)| name);
         names.extend(more.filter(|name| !known.contains(&name.as_str())));
         names
     }
@@ -196,13 +186,9 @@ impl PolicyEntry {
         scene: &SceneInfo,
     ) -> Result<Box<dyn DensityPolicy>, PolicyError> {
         (self.build)(self.effective(set, scene)?, scene).map_err(|error| match error {
-            PolicyError::BadParameter {
-                parameter, reason, ..
-            } => PolicyError::BadParameter {
-                policy: self.name.to_owned(),
-                parameter,
-                reason,
-            },
+            PolicyError::BadParameter { parameter, reason, .. } => {
+                PolicyError::BadParameter { policy: self.name.to_owned(), parameter, reason }
+            }
             other => other,
         })
     }
@@ -246,13 +232,10 @@ pub fn policies() -> Result<Vec<&'static PolicyEntry>, PolicyError> {
 /// [`PolicyError::UnknownPolicy`] with the nearest name; [`PolicyError::DuplicateName`].
 pub fn find(name: &str) -> Result<&'static PolicyEntry, PolicyError> {
     let all = policies()?;
-    all.iter()
-        .find(|entry| entry.name == name)
-        .copied()
-        .ok_or_else(|| PolicyError::UnknownPolicy {
-            name: name.to_owned(),
-            nearest: nearest(name, all.iter().map(|entry| entry.name)),
-        })
+    all.iter().find(|entry| entry.name == name).copied().ok_or_else(|| PolicyError::UnknownPolicy {
+        name: name.to_owned(),
+        nearest: nearest(name, all.iter().map(|entry| entry.name)),
+    })
 }
 
 fn sorted(mut entries: Vec<&PolicyEntry>) -> Result<Vec<&PolicyEntry>, PolicyError> {
@@ -268,12 +251,7 @@ fn sorted(mut entries: Vec<&PolicyEntry>) -> Result<Vec<&PolicyEntry>, PolicyErr
 }
 
 fn first_line(error: impl ToString) -> String {
-    error
-        .to_string()
-        .lines()
-        .next()
-        .unwrap_or_default()
-        .to_owned()
+    error.to_string().lines().next().unwrap_or_default().to_owned()
 }
 
 #[cfg(test)]

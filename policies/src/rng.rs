@@ -28,10 +28,7 @@ impl PolicyRng {
     #[must_use]
     pub fn new(seed: u64, step: u32) -> Self {
         // Folding keeps both halves of a 64-bit seed significant.
-        Self {
-            seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32,
-            step,
-        }
+        Self { seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32, step }
     }
 
     /// Four independent 32-bit words for (row, purpose, counter). Draws are told apart for
@@ -102,10 +99,7 @@ mod tests {
     /// χ² of counts that should all be equal, in standard deviations from its mean.
     fn deviation(counts: &[u32]) -> f64 {
         let expected = f64::from(counts.iter().sum::<u32>()) / counts.len() as f64;
-        let chi2: f64 = counts
-            .iter()
-            .map(|&n| (f64::from(n) - expected).powi(2) / expected)
-            .sum();
+        let chi2: f64 = counts.iter().map(|&n| (f64::from(n) - expected).powi(2) / expected).sum();
         let freedom = (counts.len() - 1) as f64;
         (chi2 - freedom) / (2.0 * freedom).sqrt()
     }
@@ -162,14 +156,8 @@ mod tests {
         let u = |rng: PolicyRng, row: u32, purpose| rng.uniform(row, purpose);
         let select = Purpose::Select;
         let found = [
-            (
-                "rows",
-                joint(|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select))),
-            ),
-            (
-                "steps",
-                joint(|i| (u(rng, i, select), u(PolicyRng::new(9, 601), i, select))),
-            ),
+            ("rows", joint(|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select)))),
+            ("steps", joint(|i| (u(rng, i, select), u(PolicyRng::new(9, 601), i, select)))),
             (
                 "step by step",
                 joint(|i| {
@@ -177,27 +165,13 @@ mod tests {
                     (at(2 * i), at(2 * i + 1))
                 }),
             ),
-            (
-                "seeds",
-                joint(|i| (u(rng, i, select), u(PolicyRng::new(10, 600), i, select))),
-            ),
+            ("seeds", joint(|i| (u(rng, i, select), u(PolicyRng::new(10, 600), i, select)))),
             (
                 "high halves of seeds",
-                joint(|i| {
-                    (
-                        u(rng, i, select),
-                        u(PolicyRng::new(9 + (1 << 32), 600), i, select),
-                    )
-                }),
+                joint(|i| (u(rng, i, select), u(PolicyRng::new(9 + (1 << 32), 600), i, select))),
             ),
-            (
-                "purposes",
-                joint(|i| (u(rng, i, select), u(rng, i, Purpose::Place))),
-            ),
-            (
-                "purposes",
-                joint(|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place))),
-            ),
+            ("purposes", joint(|i| (u(rng, i, select), u(rng, i, Purpose::Place)))),
+            ("purposes", joint(|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place)))),
             (
                 "counters",
                 joint(|i| {
@@ -220,19 +194,14 @@ mod tests {
                 }),
             ),
         ];
-        let bad: Vec<_> = found
-            .iter()
-            .filter(|(_, deviation)| deviation.abs() > 5.0)
-            .collect();
+        let bad: Vec<_> = found.iter().filter(|(_, deviation)| deviation.abs() > 5.0).collect();
         assert!(bad.is_empty(), "{bad:?}");
     }
 
     #[test]
     fn normals_have_the_moments_of_a_normal() {
         let rng = PolicyRng::new(3, 700);
-        let draws: Vec<[f32; 3]> = (0..DRAWS)
-            .map(|i| rng.normal3(i, Purpose::Place, 1))
-            .collect();
+        let draws: Vec<[f32; 3]> = (0..DRAWS).map(|i| rng.normal3(i, Purpose::Place, 1)).collect();
         let n = f64::from(DRAWS);
         let mean = |f: &dyn Fn(&[f64; 3]) -> f64| {
             draws.iter().map(|d| f(&d.map(f64::from))).sum::<f64>() / n
@@ -243,16 +212,10 @@ mod tests {
             for (power, expected, variance) in moments {
                 let found = mean(&|d| d[axis].powi(power));
                 let bound = 5.0 * f64::sqrt(variance / n);
-                assert!(
-                    (found - expected).abs() < bound,
-                    "axis {axis}, moment {power}: {found}"
-                );
+                assert!((found - expected).abs() < bound, "axis {axis}, moment {power}: {found}");
             }
             let covariance = mean(&|d| d[axis] * d[(axis + 1) % 3]);
-            assert!(
-                covariance.abs() < 5.0 / n.sqrt(),
-                "axis {axis}: {covariance}"
-            );
+            assert!(covariance.abs() < 5.0 / n.sqrt(), "axis {axis}: {covariance}");
         }
     }
 }

@@ -51,16 +51,14 @@ pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
         let u: f64 = rng.uniform_f64(row, Purpose::Select);
         (-u.ln() / f64::from(weight), row)
     });
-    let keyed = first_k(keyed.collect(), k, |a: &(f64, u32), b| {
-        a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
-    });
+    let keyed =
+        first_k(keyed.collect(), k, |a: &(f64, u32), b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     keyed.into_iter().map(|(_, row)| row).collect()
 }
 
 /// Numbers in the direction wanted (−0 equals 0), then NaN of either sign.
 fn nan_last(x: f32, y: f32, direction: impl Fn(Ordering) -> Ordering) -> Ordering {
-    x.partial_cmp(&y)
-        .map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
+    x.partial_cmp(&y).map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
 }
 
 /// The first `k` items in a total order, sorted.
@@ -85,16 +83,7 @@ mod tests {
 
     #[test]
     fn top_k_by_hand() {
-        let values = [
-            1.0,
-            NAN,
-            3.0,
-            -NAN,
-            3.0,
-            f32::INFINITY,
-            -2.0,
-            f32::NEG_INFINITY,
-        ];
+        let values = [1.0, NAN, 3.0, -NAN, 3.0, f32::INFINITY, -2.0, f32::NEG_INFINITY];
         assert_eq!(top_k(&values, 3), [5, 2, 4]);
         assert_eq!(top_k(&values, 100), [5, 2, 4, 0, 6, 7, 1, 3]);
         assert_eq!(top_k(&[-NAN, NAN, 1.0], 3), [2, 0, 1]);
@@ -127,16 +116,7 @@ mod tests {
 
     #[test]
     fn only_positive_weights_are_drawn() {
-        let weights = [
-            0.0,
-            NAN,
-            1.0,
-            -1.0,
-            f32::NEG_INFINITY,
-            1e-40,
-            f32::INFINITY,
-            -0.0,
-        ];
+        let weights = [0.0, NAN, 1.0, -1.0, f32::NEG_INFINITY, 1e-40, f32::INFINITY, -0.0];
         for step in 0..50 {
             let rng = PolicyRng::new(1, step);
             let drawn = weighted(&weights, 8, &rng);
@@ -144,10 +124,7 @@ mod tests {
             assert_eq!(weighted(&weights, 2, &rng), drawn[..2]);
             assert!(weighted(&weights, 0, &rng).is_empty());
         }
-        assert_eq!(
-            weighted(&[f32::INFINITY; 3], 2, &PolicyRng::new(1, 1)),
-            [0, 1]
-        );
+        assert_eq!(weighted(&[f32::INFINITY; 3], 2, &PolicyRng::new(1, 1)), [0, 1]);
     }
 
     #[test]
@@ -164,18 +141,10 @@ mod tests {
         for i in 0..3 {
             for j in 0..3 {
                 let (first, second) = (f64::from(weights[i]), f64::from(weights[j]));
-                let p = if i == j {
-                    0.0
-                } else {
-                    first / 8.0 * second / (8.0 - first)
-                };
+                let p = if i == j { 0.0 } else { first / 8.0 * second / (8.0 - first) };
                 let n = f64::from(trials);
                 let bound = 5.0 * (n * p * (1.0 - p)).sqrt();
-                assert!(
-                    (counts[i][j] - n * p).abs() <= bound,
-                    "{i} {j}: {}",
-                    counts[i][j] / n
-                );
+                assert!((counts[i][j] - n * p).abs() <= bound, "{i} {j}: {}", counts[i][j] / n);
             }
         }
     }

@@ -75,10 +75,7 @@ crate::register_policy!(
 /// Parameters of [`Vanilla`]; its manual page says what they mean.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-#[expect(
-    missing_docs,
-    reason = "the manual page documents every parameter, and a test checks it"
-)]
+#[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
 pub struct VanillaParams {
     pub grow_from: u32,
     pub grow_until: u32,
@@ -145,29 +142,13 @@ impl ConfiguredPolicy for Vanilla {
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
         // As the f32 that the plan will check.
         let reset_opacity = f64::from(params.reset_opacity as f32);
-        in_range(
-            "reset_opacity",
-            reset_opacity,
-            (Excluded(0.0), Excluded(1.0)),
-        )?;
-        let VanillaParams {
-            grow_from: from,
-            grow_until: until,
-            ..
-        } = params;
+        in_range("reset_opacity", reset_opacity, (Excluded(0.0), Excluded(1.0)))?;
+        let VanillaParams { grow_from: from, grow_until: until, .. } = params;
         let white_reset = (scene.white_background && params.white_reset_at < until)
             .then_some(params.white_reset_at);
         Ok(Self {
-            grow: Window {
-                from,
-                until,
-                every: params.grow_every,
-            },
-            reset: Window {
-                from: 0,
-                until,
-                every: params.reset_every,
-            },
+            grow: Window { from, until, every: params.grow_every },
+            reset: Window { from: 0, until, every: params.reset_every },
             white_reset,
             params,
         })
@@ -182,10 +163,7 @@ impl DensityPolicy for Vanilla {
             Signal::Opacity,
             Signal::ScaleMax,
         ]);
-        Needs {
-            signals,
-            candidates: None,
-        }
+        Needs { signals, candidates: None }
     }
 
     fn is_due(&self, step: u32) -> bool {
@@ -238,11 +216,7 @@ impl Vanilla {
 
         let is_small = |row: usize| scale[row] <= small;
         let would_die = |row: usize| {
-            let grown_scale = if is_small(row) {
-                scale[row]
-            } else {
-                scale[row] / factor
-            };
+            let grown_scale = if is_small(row) { scale[row] } else { scale[row] / factor };
             mortality.is_dead(opacity[row], grown_scale)
         };
         let is_wanted = |row: usize| match self.params.governor {
@@ -252,17 +226,12 @@ impl Vanilla {
         let wanted = (0..now.rows()).filter(|&row| is_wanted(row) && !would_die(row));
         let wanted: Vec<u32> = wanted.map(|row| row as u32).collect();
         let most = match self.params.governor {
-            true => self
-                .governed_rows(now.scene, now.step)
-                .saturating_sub(now.rows()),
+            true => self.governed_rows(now.scene, now.step).saturating_sub(now.rows()),
             false => wanted.len(),
         };
         for row in largest(wanted, &gradient, most) {
-            let offspring = if is_small(row as usize) {
-                clone_at([0.0; 3])
-            } else {
-                split_by(factor)
-            };
+            let offspring =
+                if is_small(row as usize) { clone_at([0.0; 3]) } else { split_by(factor) };
             // A refusal is counted by the plan.
             let _ = plan.grow(row, offspring);
         }

@@ -90,8 +90,13 @@ pub enum BackendError {
         /// Its size.
         bytes: u64,
     },
+    /// The worker threads could not be started.
+    #[error("cannot start the worker threads: {0}; lower --threads")]
+    Threads(String),
     /// The image is larger than the backend supports.
-    #[error("an image of {width}x{height} px is too large: sides of at most {max} px; use --resolution to shrink it")]
+    #[error(
+        "an image of {width}x{height} px is too large: sides of at most {max} px; use --resolution to shrink it"
+    )]
     ImageTooLarge {
         /// Its width [px].
         width: u32,

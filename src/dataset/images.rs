@@ -1,13 +1,58 @@
-//! Images on demand: decoded by prefetch threads, held packed in a cache of bounded bytes.
+//! Images on demand: where a view's pixels come from, and how they are decoded.
+//!
+//! Files are untrusted: sides, pixels and decoded bytes are bounded before anything is allocated.
 
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
+
+pub use super::cache::ImageCache;
+use super::error::DatasetError;
+use super::resample;
+use super::undistort::Undistortion;
+
+/// Longest side accepted [px].
+pub const MAX_SIDE: u32 = 16_384;
+/// Most pixels accepted.
+pub const MAX_PIXELS: u64 = 1 << 28;
+/// Most bytes of one image as its decoder yields it.
+const MAX_DECODED_BYTES: u64 = 1 << 30;
+/// As much of a file as almost always holds the header, so that sizes are read cheaply.
+const HEADER_BYTES: u64 = 256 << 10;
 
 /// Where a view's pixels come from and what is done to them on load.
 #[derive(Debug, Clone)]
 pub struct ImageSource {
     /// The image file.
     pub path: PathBuf,
+    /// A greyscale file that says which pixels count in the loss (black: ignored), if any.
+    pub mask: Option<PathBuf>,
+    /// Width after loading [px].
+    pub width: u32,
+    /// Height after loading [px].
+    pub height: u32,
+    /// Resampling from the lens that took the image to a pinhole, at the file's size.
+    pub undistortion: Option<Undistortion>,
+    /// What the image file's header says.
+    pub header: ImageHeader,
+}
+
+/// What an image file's header says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageHeader {
+    /// Width [px].
+    pub width: u32,
+    /// Height [px].
+    pub height: u32,
+    /// Whether pixels have coverage.
+    pub has_alpha: bool,
+    /// Size as the decoder yields it [bytes].
+    pub decoded_bytes: u64,
+    /// Size of the file [bytes].
+    pub file_bytes: u64,
 }
 
 /// A decoded image, packed 8 bits per channel.
@@ -29,3 +74,305 @@ pub struct Image8 {
 
 /// A decoded image shared between cache and user.
 pub type SharedImage = Arc<Image8>;
+
+impl Image8 {
+    /// The pixel's colour over `background`, in [0, 1].
+    #[must_use]
+    pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
+        let pixel = y * self.width as usize + x;
+        let alpha = self.alpha.as_ref().map_or(1.0, |a| f32::from(a[pixel]) / 255.0);
+        std::array::from_fn(|channel| {
+            alpha * f32::from(self.rgb[3 * pixel + channel]) / 255.0
+                + (1.0 - alpha) * background[channel]
+        })
+    }
+
+    /// Size of the pixels [bytes].
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        let length = |channel: &Option<Vec<u8>>| channel.as_ref().map_or(0, Vec::len);
+        (self.rgb.len() + length(&self.alpha) + length(&self.mask)) as u64
+    }
+
+    /// No pixels yet, room for all, and the channels of `like`.
+    pub(super) fn blank(width: u32, height: u32, like: &Self) -> Self {
+        let pixels = width as usize * height as usize;
+        let channel =
+            |channel: &Option<Vec<u8>>| channel.as_ref().map(|_| Vec::with_capacity(pixels));
+        Self {
+            width,
+            height,
+            rgb: Vec::with_capacity(3 * pixels),
+            alpha: channel(&like.alpha),
+            mask: channel(&like.mask),
+        }
+    }
+}
+
+impl ImageSource {
+    /// Most bytes the loaded image takes.
+    #[must_use]
+    pub fn loaded_bytes(&self) -> u64 {
+        u64::from(self.width) * u64::from(self.height) * self.channels()
+    }
+
+    /// Most bytes in use while loading, the result included.
+    #[must_use]
+    pub fn working_bytes(&self) -> u64 {
+        let packed = u64::from(self.header.width) * u64::from(self.header.height) * self.channels();
+        let decode = self.header.file_bytes + self.header.decoded_bytes;
+        let pack = self.header.decoded_bytes + packed;
+        let undistort = if self.undistortion.is_some() { 2 * packed } else { packed };
+        let shrink = if self.shrinks() { packed + self.loaded_bytes() } else { packed };
+        decode.max(pack).max(undistort).max(shrink)
+    }
+
+    fn channels(&self) -> u64 {
+        3 + u64::from(self.header.has_alpha) + u64::from(self.mask.is_some())
+    }
+
+    fn shrinks(&self) -> bool {
+        (self.width, self.height) != (self.header.width, self.header.height)
+    }
+
+    /// Decodes, undistorts and shrinks. A file without a transparent pixel yields no alpha.
+    ///
+    /// # Errors
+    /// When a file is missing, unreadable, over the limits, or not what its header said at first.
+    pub fn load(&self) -> Result<Image8, DatasetError> {
+        let header = self.header;
+        let decoded = decode(&self.path)?;
+        if (decoded.width(), decoded.height()) != (header.width, header.height) {
+            return Err(DatasetError::ImageSize {
+                path: self.path.clone(),
+                width: decoded.width(),
+                height: decoded.height(),
+                camera_width: header.width,
+                camera_height: header.height,
+            });
+        }
+        let mut image = pack(decoded);
+        if let Some(path) = &self.mask {
+            let mask = decode(path)?.into_luma8();
+            image.mask = Some(if mask.dimensions() == (header.width, header.height) {
+                mask.into_raw()
+            } else {
+                let from = mask.dimensions();
+                resample::shrink_channel(mask.as_raw(), from, (header.width, header.height))
+            });
+        }
+        if let Some(undistortion) = &self.undistortion {
+            image = undistortion.apply(&image);
+        }
+        if self.shrinks() {
+            image = resample::shrink(&image, self.width, self.height);
+        }
+        Ok(image)
+    }
+}
+
+/// Packs what the decoder yielded, without a copy where it is RGB already.
+fn pack(decoded: DynamicImage) -> Image8 {
+    let (width, height) = (decoded.width(), decoded.height());
+    if !decoded.color().has_alpha() {
+        return Image8 {
+            width,
+            height,
+            rgb: decoded.into_rgb8().into_raw(),
+            alpha: None,
+            mask: None,
+        };
+    }
+    let rgba = decoded.into_rgba8();
+    let pixels = width as usize * height as usize;
+    let mut rgb = Vec::with_capacity(3 * pixels);
+    let mut alpha = Vec::with_capacity(pixels);
+    for pixel in rgba.as_raw().chunks_exact(4) {
+        rgb.extend_from_slice(&pixel[..3]);
+        alpha.push(pixel[3]);
+    }
+    let opaque = alpha.iter().all(|&a| a == 255);
+    Image8 { width, height, rgb, alpha: (!opaque).then_some(alpha), mask: None }
+}
+
+fn limits() -> Limits {
+    let mut limits = Limits::no_limits();
+    limits.max_image_width = Some(MAX_SIDE);
+    limits.max_image_height = Some(MAX_SIDE);
+    limits.max_alloc = Some(MAX_DECODED_BYTES);
+    limits
+}
+
+fn fault(path: &Path, problem: impl std::fmt::Display) -> DatasetError {
+    DatasetError::Image { path: path.to_owned(), problem: problem.to_string() }
+}
+
+/// Reads the header of an image file, without decoding it, and checks it against the limits.
+pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
+    let mut file = File::open(path).map_err(DatasetError::io(path))?;
+    let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
+    let mut start = Vec::new();
+    file.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
+    let header = header_of(ImageReader::new(Cursor::new(&start)), file_bytes);
+    let header = match header {
+        // A long preamble, such as a preview or a colour profile: read on.
+        Err(_) if file_bytes > HEADER_BYTES => {
+            let file = File::open(path).map_err(DatasetError::io(path))?;
+            header_of(ImageReader::new(BufReader::new(file)), file_bytes)
+        }
+        header => header,
+    }
+    .map_err(|problem| fault(path, problem))?;
+    let pixels = u64::from(header.width) * u64::from(header.height);
+    if pixels == 0 {
+        return Err(fault(path, "it has no pixels"));
+    }
+    if pixels > MAX_PIXELS || header.decoded_bytes > MAX_DECODED_BYTES {
+        return Err(fault(path, format!("{}x{} px are too many", header.width, header.height)));
+    }
+    Ok(header)
+}
+
+fn header_of<R: std::io::BufRead + std::io::Seek>(
+    reader: ImageReader<R>,
+    file_bytes: u64,
+) -> Result<ImageHeader, image::ImageError> {
+    let mut reader = reader.with_guessed_format().map_err(image::ImageError::IoError)?;
+    reader.limits(limits());
+    let decoder = reader.into_decoder()?;
+    let (width, height) = decoder.dimensions();
+    let has_alpha = decoder.color_type().has_alpha();
+    Ok(ImageHeader { width, height, has_alpha, decoded_bytes: decoder.total_bytes(), file_bytes })
+}
+
+fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
+    let file = File::open(path).map_err(DatasetError::io(path))?;
+    let mut reader = ImageReader::new(BufReader::new(file))
+        .with_guessed_format()
+        .map_err(DatasetError::io(path))?;
+    reader.limits(limits());
+    reader.decode().map_err(|problem| fault(path, problem))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn source(path: PathBuf) -> ImageSource {
+        let header = probe(&path).unwrap();
+        ImageSource {
+            path,
+            mask: None,
+            width: header.width,
+            height: header.height,
+            undistortion: None,
+            header,
+        }
+    }
+
+    #[test]
+    fn every_colour_type_packs_to_eight_bits() {
+        let folder = tempfile::tempdir().unwrap();
+        let cases: [(&str, DynamicImage, [u8; 3], Option<u8>); 5] = [
+            (
+                "l8.png",
+                DynamicImage::ImageLuma8(image::ImageBuffer::from_pixel(3, 2, [7].into())),
+                [7; 3],
+                None,
+            ),
+            (
+                "rgb16.png",
+                DynamicImage::ImageRgb16(image::ImageBuffer::from_pixel(
+                    3,
+                    2,
+                    [257, 65535, 0].into(),
+                )),
+                [1, 255, 0],
+                None,
+            ),
+            (
+                "rgba.png",
+                DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(3, 2, [1, 2, 3, 4].into())),
+                [1, 2, 3],
+                Some(4),
+            ),
+            (
+                "opaque.png",
+                DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(
+                    3,
+                    2,
+                    [1, 2, 3, 255].into(),
+                )),
+                [1, 2, 3],
+                None,
+            ),
+            (
+                "rgb.webp",
+                DynamicImage::ImageRgb8(image::ImageBuffer::from_pixel(3, 2, [9, 8, 7].into())),
+                [9, 8, 7],
+                None,
+            ),
+        ];
+        for (name, image, rgb, alpha) in cases {
+            let path = folder.path().join(name);
+            image.save(&path).unwrap();
+            let loaded = source(path).load().unwrap();
+            assert_eq!((loaded.width, loaded.height), (3, 2), "{name}");
+            assert_eq!(loaded.rgb, rgb.repeat(6), "{name}");
+            assert_eq!(loaded.alpha, alpha.map(|a| vec![a; 6]), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_mask_of_another_size_is_fitted_and_shrunk_along() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        let mask = folder.path().join("m.png");
+        image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
+            .save(&mask)
+            .unwrap();
+        let source = ImageSource { mask: Some(mask), width: 2, height: 2, ..source(path) };
+        let loaded = source.load().unwrap();
+        assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
+        assert_eq!(loaded.rgb, [10, 20, 30].repeat(4));
+        assert_eq!(loaded.bytes(), source.loaded_bytes());
+        assert!(source.working_bytes() >= 4 * 4 * 4 + loaded.bytes());
+    }
+
+    #[test]
+    fn broken_and_oversized_files_are_errors_that_name_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let good = folder.path().join("good.png");
+        image::RgbImage::from_fn(64, 64, |x, y| [x as u8, y as u8, (x * y) as u8].into())
+            .save(&good)
+            .unwrap();
+        let bytes = std::fs::read(&good).unwrap();
+        let cut = folder.path().join("cut.png");
+        std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+        let message = source(cut).load().unwrap_err().to_string();
+        assert!(message.contains("cut.png"), "{message}");
+        // A header that promises 100,000 x 100,000 px.
+        let mut huge = bytes.clone();
+        huge[16..24].copy_from_slice(&[0, 1, 0x86, 0xa0, 0, 1, 0x86, 0xa0]);
+        let crc = crc32(&huge[12..29]);
+        huge[29..33].copy_from_slice(&crc.to_be_bytes());
+        for (name, contents) in
+            [("huge.png", huge), ("text.jpg", b"not an image".to_vec()), ("empty.png", vec![])]
+        {
+            let path = folder.path().join(name);
+            std::fs::write(&path, contents).unwrap();
+            let message = probe(&path).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
+        assert!(matches!(probe(&folder.path().join("none.png")), Err(DatasetError::Io { .. })));
+    }
+
+    fn crc32(bytes: &[u8]) -> u32 {
+        !bytes.iter().fold(!0u32, |crc, &byte| {
+            (0..8).fold(crc ^ u32::from(byte), |crc, _| {
+                (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg())
+            })
+        })
+    }
+}

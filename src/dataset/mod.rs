@@ -1,19 +1,47 @@
 //! Posed images as one type, whatever format they come from.
+//!
+//! The format is told by what the folder holds: `transforms_train.json` with
+//! `transforms_test.json`, else a COLMAP model under `sparse/0`, else `transforms.json`.
+//! All files are untrusted: see [`DatasetError`].
 
+mod cache;
+mod colmap;
+mod error;
+mod folders;
 pub mod images;
 pub mod normalise;
+mod options;
+mod paths;
+mod pose;
+mod prepare;
+mod resample;
+mod transforms;
+pub mod undistort;
 
-use std::path::PathBuf;
+#[cfg(test)]
+#[allow(
+    clippy::semicolon_if_nothing_returned,
+    clippy::float_cmp,
+    reason = "tables of one-line edits; exact values"
+)]
+pub(crate) mod tests;
 
-use glam::DVec3;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
 
 use crate::camera::Camera;
+pub use error::DatasetError;
+use folders::Folders;
 use normalise::Normalisation;
+pub use options::{LoadOptions, ParseResolutionError, Resolution, Split};
+use paths::Root;
+use undistort::Lens;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
 #[derive(Debug)]
 pub struct Dataset {
-    /// Folder that holds it; no image lies outside.
+    /// Folder that holds it; no image lies outside, unless `--images` says so.
     pub root: PathBuf,
     /// Views to train on, sorted by name; never empty.
     pub train: Vec<View>,
@@ -45,4 +73,98 @@ pub struct PointCloud {
     pub positions: Vec<DVec3>,
     /// sRGB colours. Shape: [points].
     pub colours: Vec<[u8; 3]>,
+}
+
+impl PointCloud {
+    /// Number of points.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Whether there is no point.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    /// Drops the points whose positions fail `keep`; returns how many.
+    pub(crate) fn retain(&mut self, keep: impl Fn(DVec3) -> bool) -> usize {
+        let before = self.positions.len();
+        let mut kept = self.positions.iter().map(|&p| keep(p));
+        self.colours.retain(|_| kept.next().unwrap_or(false));
+        self.positions.retain(|&p| keep(p));
+        before - self.positions.len()
+    }
+}
+
+/// What a format's reader makes of its files.
+#[derive(Debug, Default)]
+struct Scene {
+    /// The file that lists the frames.
+    listing: PathBuf,
+    frames: Vec<Frame>,
+    points: PointCloud,
+    points_file: Option<PathBuf>,
+    /// Whether the dataset says itself which frames are held out.
+    own_split: bool,
+    notes: Vec<String>,
+}
+
+/// One posed image in the dataset's own coordinates.
+#[derive(Debug)]
+struct Frame {
+    name: String,
+    /// File and frame, for messages.
+    origin: String,
+    image: PathBuf,
+    /// The divisor of the folder `images_K` that the image is in.
+    reduced: Option<u32>,
+    mask: Option<PathBuf>,
+    lens: Lens,
+    rotation: DMat3,
+    translation: DVec3,
+    held_out: bool,
+}
+
+impl Dataset {
+    /// Loads the dataset in the folder `path`. Image files are checked by their headers; pixels
+    /// are read later, through [`images::ImageCache`].
+    ///
+    /// # Errors
+    /// When the format is unknown, a file is missing, unreadable or contradicts itself, or no
+    /// view is left to train on. The message names file, field and remedy.
+    pub fn load(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
+        let root = Root::new(path)?;
+        let scene = read_scene(&root, options)?;
+        if scene.frames.is_empty() {
+            return Err(DatasetError::NoImages { path: scene.listing });
+        }
+        prepare::dataset(path, scene, options)
+    }
+
+    /// The scene's extent [scene units]: 1.1 times the largest distance of a training camera from
+    /// their mean. The unit is chosen so that it is the same for every scene, and stands for the
+    /// points' spread where all cameras are at one place.
+    #[must_use]
+    pub fn extent(&self) -> f64 {
+        normalise::EXTENT
+    }
+}
+
+fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError> {
+    let here = |name: &str| root.path().join(name).is_file();
+    if transforms::PAIR.iter().all(|name| here(name)) {
+        transforms::read_pair(root, &Folders::new(root, options, false)?)
+    } else if let Some(folder) = colmap::find(root.path()) {
+        colmap::read(root, &folder, &Folders::new(root, options, true)?)
+    } else if here(transforms::SINGLE) {
+        transforms::read_single(root, &Folders::new(root, options, false)?)
+    } else {
+        Err(DatasetError::Unrecognised {
+            path: root.path().to_owned(),
+            looked_for: "transforms_train.json with transforms_test.json, nor sparse/0/cameras.bin or .txt, \
+                         nor sparse/cameras.bin or .txt, nor transforms.json",
+        })
+    }
 }

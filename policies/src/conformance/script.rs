@@ -59,11 +59,7 @@ pub(super) struct Scenario {
 
 impl fmt::Display for Scenario {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "{}, statistics {:?}, {} steps",
-            self.name, self.pattern, self.scene.iterations
-        )
+        write!(f, "{}, statistics {:?}, {} steps", self.name, self.pattern, self.scene.iterations)
     }
 }
 
@@ -87,31 +83,12 @@ pub(super) fn scenarios() -> Vec<Scenario> {
         ("one row", scene(1, 16), false),
         ("a full model", scene(24, 24), false),
         ("a model with room", scene(30, 300), false),
-        (
-            "a single view",
-            SceneInfo {
-                train_views: 1,
-                ..scene(30, 300)
-            },
-            false,
-        ),
+        ("a single view", SceneInfo { train_views: 1, ..scene(30, 300) }, false),
         ("plans that refuse growth", scene(20, 200), true),
-        (
-            "full length",
-            SceneInfo {
-                iterations: 30_000,
-                ..scene(20, 60)
-            },
-            false,
-        ),
+        ("full length", SceneInfo { iterations: 30_000, ..scene(20, 60) }, false),
     ];
     let runs = models.into_iter().flat_map(|(name, scene, refuses)| {
-        PATTERNS.map(|pattern| Scenario {
-            name,
-            scene: scene.clone(),
-            refuses,
-            pattern,
-        })
+        PATTERNS.map(|pattern| Scenario { name, scene: scene.clone(), refuses, pattern })
     });
     runs.collect()
 }
@@ -128,28 +105,19 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let scene = &scenario.scene;
     let build = || {
         let built = guarded(|| entry.build(set, scene));
-        built
-            .and_then(|built| built.map_err(|e| e.to_string()))
-            .map_err(|why| (Check::Builds, why))
+        built.and_then(|built| built.map_err(|e| e.to_string())).map_err(|why| (Check::Builds, why))
     };
     let mut policy = build()?;
-    let mut twins: Vec<(Check, Box<dyn DensityPolicy>)> = vec![
-        (Check::Repeats, build()?),
-        (Check::ReadsOnlyWhatItDeclares, build()?),
-    ];
+    let mut twins: Vec<(Check, Box<dyn DensityPolicy>)> =
+        vec![(Check::Repeats, build()?), (Check::ReadsOnlyWhatItDeclares, build()?)];
     refuses_foreign_state(&mut *build()?)?;
 
     let needs = policy.needs(scene);
     if needs != policy.needs(scene) || needs != twins[0].1.needs(scene) {
         return Err((Check::Repeats, "its needs change".to_owned()));
     }
-    let due: Vec<u32> = (1..=scene.iterations)
-        .filter(|&step| policy.is_due(step))
-        .collect();
-    let mut model = Model {
-        rows: scene.initial_rows,
-        candidates: Vec::new(),
-    };
+    let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
+    let mut model = Model { rows: scene.initial_rows, candidates: Vec::new() };
     let events = due.len().min(MOST_EVENTS);
     for (event, &step) in due.iter().take(events).enumerate() {
         let rows = model.rows;
@@ -166,10 +134,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
             let sees_all = *check == Check::ReadsOnlyWhatItDeclares;
             let again = plan(&mut **twin, scenario, &seen, sees_all).map_err(at)?;
             if again != ops {
-                return Err(at((
-                    *check,
-                    format!("{ops:?}, but a copy planned {again:?}"),
-                )));
+                return Err(at((*check, format!("{ops:?}, but a copy planned {again:?}"))));
             }
             if twin.save() != policy.save() {
                 return Err(at((*check, "a copy saves another state".to_owned())));
@@ -258,11 +223,8 @@ fn number(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f
         Pattern::Nan => f32::NAN,
         // Half of them plausible, so that policies act at all.
         Pattern::Mixture => {
-            let pattern = if bits[1].is_multiple_of(2) {
-                0
-            } else {
-                bits[2] as usize % (PATTERNS.len() - 2)
-            };
+            let pattern =
+                if bits[1].is_multiple_of(2) { 0 } else { bits[2] as usize % (PATTERNS.len() - 2) };
             number(PATTERNS[pattern], bits, plausible)
         }
     }
@@ -297,18 +259,10 @@ fn plan(
         step: seen.step,
         scene: &scenario.scene,
         signals,
-        candidates: if has_candidates {
-            &seen.candidates
-        } else {
-            &[]
-        },
+        candidates: if has_candidates { &seen.candidates } else { &[] },
     };
     let rows = now.rows();
-    let budget = if scenario.refuses {
-        rows
-    } else {
-        scenario.scene.budget
-    };
+    let budget = if scenario.refuses { rows } else { scenario.scene.budget };
     let mut plan = EditPlan::new(rows, budget);
     let rng = PolicyRng::new(3, seen.step);
     let planned = guarded(|| policy.plan(&now, &rng, &mut plan));

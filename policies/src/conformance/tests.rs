@@ -24,18 +24,9 @@ fn every_choice_of_the_built_in_policies_conforms() {
     let choices = [
         ("vanilla", "governor = true"),
         ("vanilla", "grow_every = 0"),
-        (
-            "diet",
-            "mixed_gradient = false\nshift = \"none\"\nprotect = 0",
-        ),
-        (
-            "diet",
-            "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\"",
-        ),
-        (
-            "diet",
-            "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 1.0\nrho_c = 1.0",
-        ),
+        ("diet", "mixed_gradient = false\nshift = \"none\"\nprotect = 0"),
+        ("diet", "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\""),
+        ("diet", "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 1.0\nrho_c = 1.0"),
         ("diet", "rho_c = 0.0\nrho = 0.0\ntau = 0.0"),
         // All windows at once.
         ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
@@ -78,10 +69,7 @@ const FAULTS: [(Fault, Option<Check>); 12] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
     (Fault::PeeksIfItCan, Some(Check::ReadsOnlyWhatItDeclares)),
-    (
-        Fault::PeeksAtCandidates,
-        Some(Check::ReadsOnlyWhatItDeclares),
-    ),
+    (Fault::PeeksAtCandidates, Some(Check::ReadsOnlyWhatItDeclares)),
     (Fault::RollsItsOwnDice, Some(Check::Repeats)),
     (Fault::ForgetsItsState, Some(Check::Remembers)),
     (Fault::AcceptsAnyState, Some(Check::RefusesForeignState)),
@@ -131,10 +119,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         if self.has(Fault::NeedsAtWhim) && roll().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
-        Needs {
-            signals,
-            candidates: None,
-        }
+        Needs { signals, candidates: None }
     }
 
     fn is_due(&self, step: u32) -> bool {
@@ -162,15 +147,10 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
             return Ok(());
         }
         if self.has(Fault::FearsNan) {
-            assert!(
-                gradient.iter().all(|g| !g.is_nan()),
-                "a gradient is not a number"
-            );
+            assert!(gradient.iter().all(|g| !g.is_nan()), "a gradient is not a number");
         }
-        let mut by_chance: Vec<f32> = rows
-            .iter()
-            .map(|&row| rng.uniform(row, Purpose::Select))
-            .collect();
+        let mut by_chance: Vec<f32> =
+            rows.iter().map(|&row| rng.uniform(row, Purpose::Select)).collect();
         let mut by_gradient = gradient.to_vec();
         if self.has(Fault::ReadsUndeclared) {
             by_gradient = now.signal(Signal::ScreenGradientAbs)?.to_vec();
@@ -187,10 +167,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
                 *chance = (roll() % 7) as f32;
             }
         }
-        for row in top_k(&by_gradient, 1)
-            .into_iter()
-            .chain(top_k(&by_chance, 1))
-        {
+        for row in top_k(&by_gradient, 1).into_iter().chain(top_k(&by_chance, 1)) {
             let grown = plan.grow(row, clone_at([0.0; 3]));
             if self.has(Fault::GivesUpWhenRefused) {
                 grown.map_err(|refused| PolicyError::Other(refused.to_string()))?;
@@ -255,10 +232,7 @@ fn every_fault_is_found() {
 fn a_report_names_the_policy_and_the_step() {
     let report = check_policy(&faulty::<1>()).unwrap_err().to_string();
     assert!(report.starts_with("policy `faulty` (tests.rs:1) does not conform:\n- it reads only"));
-    assert!(
-        report.contains("an empty model") && report.contains("step 5"),
-        "{report}"
-    );
+    assert!(report.contains("an empty model") && report.contains("step 5"), "{report}");
     assert!(report.contains("ScreenGradientAbs"), "{report}");
 }
 
@@ -310,10 +284,7 @@ impl DensityPolicy for Unbuildable {
 fn building_is_checked() {
     let entry = PolicyEntry::of::<Unbuildable>("x", "", "", "", ("tests.rs", 2));
     let failures = check_policy(&entry).unwrap_err().failures;
-    assert_eq!(
-        failures,
-        [(Check::Builds, "for 7 steps: not seven".to_owned())]
-    );
+    assert_eq!(failures, [(Check::Builds, "for 7 steps: not seven".to_owned())]);
 }
 
 #[test]
@@ -324,14 +295,9 @@ fn manuals_are_checked() {
     };
     let head = "//! | name | default | range | unit | what |\n//! |---|---|---|---|---|\n";
     let with = |rows: &str| -> &'static str { format!("{head}{rows}").leak() };
-    assert_eq!(
-        manual(with("//! | threshold | 0 | | | what |\n//!\n")),
-        Ok(())
-    );
+    assert_eq!(manual(with("//! | threshold | 0 | | | what |\n//!\n")), Ok(()));
     assert_eq!(manual(""), Err("`threshold` is missing".to_owned()));
-    let wrong = manual(with(
-        "//! | threshold | 0.1 | | | what |\n//! | ghost | 1 | | | what |\n",
-    ));
+    let wrong = manual(with("//! | threshold | 0.1 | | | what |\n//! | ghost | 1 | | | what |\n"));
     let told = "`threshold` has the default 0.0, not 0.1, `ghost` is no parameter";
     assert_eq!(wrong, Err(told.to_owned()));
     let short = manual(with("//! | threshold | 0 | what |\n"));

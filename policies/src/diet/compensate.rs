@@ -66,10 +66,7 @@ impl Diet {
 
 /// (Geometric mean)² of the positive, finite values; NaN if there is none.
 fn squared_geometric_mean(values: &[f32]) -> f32 {
-    let logs = values
-        .iter()
-        .filter(|v| v.is_finite() && **v > 0.0)
-        .map(|v| f64::from(*v).ln());
+    let logs = values.iter().filter(|v| v.is_finite() && **v > 0.0).map(|v| f64::from(*v).ln());
     let (count, sum) = logs.fold((0.0, 0.0), |(count, sum), log| (count + 1.0, sum + log));
     (2.0 * sum / count).exp() as f32
 }

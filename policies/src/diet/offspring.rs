@@ -51,11 +51,7 @@ impl Diet {
         };
         let shift = sum.map(|v| factor * v);
         // 0/0 where no view has seen the row.
-        Ok(if shift.iter().all(|v| v.is_finite()) {
-            shift
-        } else {
-            [0.0; 3]
-        })
+        Ok(if shift.iter().all(|v| v.is_finite()) { shift } else { [0.0; 3] })
     }
 }
 
@@ -65,9 +61,5 @@ pub(super) fn conserving_scale(opacity: f32) -> f32 {
     let shared = 1.0 - (1.0 - opacity).sqrt();
     let factor = opacity / (2.0 * shared - shared * shared * std::f32::consts::FRAC_1_SQRT_2);
     // 0/0 where opacity vanishes: the limit is 1.
-    if factor.is_finite() && factor > 0.0 {
-        factor
-    } else {
-        1.0
-    }
+    if factor.is_finite() && factor > 0.0 { factor } else { 1.0 }
 }

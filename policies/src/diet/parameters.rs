@@ -10,10 +10,7 @@ use crate::policy::{DepthMode, ErrorMode, PolicyError};
 /// Parameters of [`Diet`](super::Diet).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-#[expect(
-    missing_docs,
-    reason = "the manual page documents every parameter, and a test checks it"
-)]
+#[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
 pub struct DietParams {
     pub grow_from: u32,
     pub grow_until: u32,
@@ -156,20 +153,12 @@ impl DietParams {
         // `Signal::Age` goes no further.
         in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;
         in_range("rho_c", self.rho_c, 0.0..=1.0)?;
-        in_range(
-            "rows_per_candidate",
-            f64::from(self.rows_per_candidate),
-            1.0..,
-        )?;
+        in_range("rows_per_candidate", f64::from(self.rows_per_candidate), 1.0..)?;
         in_range("min_alpha", self.min_alpha, 0.0..=1.0)?;
         in_range("size_pixels", self.size_pixels, (Excluded(0.0), Unbounded))?;
         // As the f32 that the plan will check.
         let newborn_opacity = f64::from(self.newborn_opacity as f32);
-        in_range(
-            "newborn_opacity",
-            newborn_opacity,
-            (Excluded(0.0), Excluded(1.0)),
-        )?;
+        in_range("newborn_opacity", newborn_opacity, (Excluded(0.0), Excluded(1.0)))?;
         if self.importance == Importance::Fresh {
             return Err(bad(
                 "importance",

@@ -9,10 +9,7 @@ use crate::policy::{Candidate, DepthMode, ErrorMode};
 use crate::registry::find;
 
 fn diet(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
-    find("diet")
-        .unwrap()
-        .build(&set.parse().unwrap(), scene)
-        .unwrap()
+    find("diet").unwrap().build(&set.parse().unwrap(), scene).unwrap()
 }
 
 fn run(event: &Event, set: &str) -> Outcome {
@@ -41,22 +38,14 @@ fn wanting(rows: usize, listed: &[usize]) -> Vec<f32> {
 }
 
 fn candidate(error: f32, pixel_size: f32) -> Candidate {
-    Candidate {
-        position: [error, 0.0, 0.0],
-        colour: [error, 0.5, 1.0],
-        pixel_size,
-        error,
-    }
+    Candidate { position: [error, 0.0, 0.0], colour: [error, 0.5, 1.0], pixel_size, error }
 }
 
 #[test]
 fn the_gradient_mixes_screen_and_colour() {
     // Means: 4.0e-4; 2e-4 + 30·7e-6 = 4.1e-4; 2e-4 + 30·6e-6 = 3.8e-4; 30·1.4e-5 = 4.2e-4; 1.9e-4.
     let event = event(600, 5, 100)
-        .with(
-            Signal::ScreenGradient,
-            &[16.01e-4, 8.01e-4, 8.01e-4, 0.0, 7.6e-4],
-        )
+        .with(Signal::ScreenGradient, &[16.01e-4, 8.01e-4, 8.01e-4, 0.0, 7.6e-4])
         .with(Signal::ColourGradient, &[0.0, 2.8e-5, 2.4e-5, 5.6e-5, 0.0]);
     let done = run(&event, "");
     assert_eq!(done.cloned, [3, 1, 0]);
@@ -73,15 +62,7 @@ fn at_the_budget_a_tenth_is_exchanged() {
     let done = run(&event, "");
     assert_eq!(done.pruned, [1, 3]);
     assert_eq!(done.cloned, [19, 12]);
-    assert_eq!(
-        done.ops.counts,
-        EditCounts {
-            removed: 2,
-            added: 2,
-            updated: 0,
-            denied: 3
-        }
-    );
+    assert_eq!(done.ops.counts, EditCounts { removed: 2, added: 2, updated: 0, denied: 3 });
     assert_eq!(run(&event, "rho = 0.2").pruned, [1, 3, 4, 5]);
     // A product just below the integer that is meant.
     assert_eq!(fraction(0.29, 100), 29);
@@ -99,10 +80,7 @@ fn the_dead_and_the_room_come_first() {
     let mut opacity = [0.5; 19];
     opacity[7] = 0.0049;
     let event = event(600, 19, 20)
-        .with(
-            Signal::ScreenGradient,
-            &wanting(19, &[7, 10, 11, 12, 13, 14]),
-        )
+        .with(Signal::ScreenGradient, &wanting(19, &[7, 10, 11, 12, 13, 14]))
         .with(Signal::Opacity, &opacity);
     let done = run(&event, "");
     assert_eq!(done.pruned, [0, 1, 7]);
@@ -110,13 +88,7 @@ fn the_dead_and_the_room_come_first() {
     assert_eq!(done.ops.counts.denied, 1);
     assert_eq!(done.ops.rows_after, 20);
     // With room for all there is no victim.
-    let roomy = run(
-        &Event {
-            budget: 23,
-            ..event
-        },
-        "",
-    );
+    let roomy = run(&Event { budget: 23, ..event }, "");
     assert_eq!((roomy.pruned, roomy.cloned.len()), (vec![7], 5));
 }
 
@@ -127,25 +99,9 @@ fn huge_rows_die_after_step_3000_at_growth_only() {
         .with(Signal::ScreenGradient, &[0.0, 0.0, 9.0, 8.0]);
     let early = run(&event, "");
     assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
-    let late = run(
-        &Event {
-            step: 3100,
-            ..event.clone()
-        },
-        "",
-    );
+    let late = run(&Event { step: 3100, ..event.clone() }, "");
     assert_eq!((late.pruned, late.split), (vec![1, 3], vec![2]));
-    assert!(
-        run(
-            &Event {
-                step: 3150,
-                ..event
-            },
-            ""
-        )
-        .ops
-        .is_empty()
-    );
+    assert!(run(&Event { step: 3150, ..event }, "").ops.is_empty());
 }
 
 #[test]
@@ -198,21 +154,12 @@ fn clones_shift_by_the_rule() {
             Placement::Offset(offset) => offset,
             other => panic!("{other:?}"),
         };
-        families[..2]
-            .iter()
-            .map(|family| offset(family.offspring.placement))
-            .collect()
+        families[..2].iter().map(|family| offset(family.offspring.placement)).collect()
     };
     let near = |found: &[[f32; 3]], expected: [f32; 3]| {
         for axis in 0..3 {
-            assert!(
-                found[1][axis].abs() < 1e-30,
-                "a row without gradients moved"
-            );
-            assert!(
-                (found[0][axis] - expected[axis]).abs() < 1e-9,
-                "{found:?}, {expected:?}"
-            );
+            assert!(found[1][axis].abs() < 1e-30, "a row without gradients moved");
+            assert!((found[0][axis] - expected[axis]).abs() < 1e-9, "{found:?}, {expected:?}");
         }
     };
     // −0.1 · 0.05 · (0.3, 0, 0.4)
@@ -247,9 +194,7 @@ fn a_conserving_clone_shares_its_opacity() {
     );
     assert_eq!(offspring.siblings(), 2);
     // o′ = 0.5, so 0.75 / (1 − 0.25/√2).
-    let ScaleRule::Uniform(scale) = offspring.scale else {
-        panic!("{offspring:?}")
-    };
+    let ScaleRule::Uniform(scale) = offspring.scale else { panic!("{offspring:?}") };
     assert!((scale - 0.911_053).abs() < 1e-5, "{scale}");
     // The limits given by Kheradmand et al.: hardly smaller when faint, much when opaque.
     assert!((conserving_scale(0.05) - 0.996).abs() < 1e-3);
@@ -289,11 +234,7 @@ fn what_goes_for_the_budget_does_not_grow() {
 fn the_worst_pixels_become_rows() {
     // Budget 40: two rows per insertion. 39 rows: one victim.
     let mut event = event(10_500, 39, 40);
-    event.candidates = vec![
-        candidate(0.1, 0.01),
-        candidate(0.3, 0.02),
-        candidate(0.2, 0.03),
-    ];
+    event.candidates = vec![candidate(0.1, 0.01), candidate(0.3, 0.02), candidate(0.2, 0.03)];
     let done = run(&event, "");
     assert_eq!(done.pruned, [0]);
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
@@ -304,28 +245,10 @@ fn the_worst_pixels_become_rows() {
         opacity: 0.1,
     };
     assert_eq!(seeds, [seed(0.3, 0.04), seed(0.2, 0.06)]);
-    assert_eq!(
-        done.ops.counts,
-        EditCounts {
-            removed: 1,
-            added: 2,
-            updated: 0,
-            denied: 0
-        }
-    );
+    assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 2, updated: 0, denied: 0 });
     assert!(done.ops.reset_candidates && !done.ops.reset_signals);
     assert_eq!(done.ops.cause, "insert");
-    assert_eq!(
-        run(
-            &Event {
-                budget: 41,
-                ..event.clone()
-            },
-            ""
-        )
-        .pruned,
-        [0_u32; 0]
-    );
+    assert_eq!(run(&Event { budget: 41, ..event.clone() }, "").pruned, [0_u32; 0]);
     event.candidates.clear();
     let idle = run(&event, "");
     assert!(!idle.ops.edits_rows() && idle.ops.reset_candidates);
@@ -334,22 +257,11 @@ fn the_worst_pixels_become_rows() {
 #[test]
 fn nobody_dies_for_a_pixel_without_a_point() {
     let mut event = event(10_500, 40, 40);
-    let nowhere = Candidate {
-        position: [f32::NAN; 3],
-        ..candidate(0.9, 0.01)
-    };
+    let nowhere = Candidate { position: [f32::NAN; 3], ..candidate(0.9, 0.01) };
     event.candidates = vec![nowhere, candidate(0.1, 0.0), candidate(0.2, 0.01)];
     let done = run(&event, "");
     assert_eq!(done.pruned, [0]);
-    assert_eq!(
-        done.ops.counts,
-        EditCounts {
-            removed: 1,
-            added: 1,
-            updated: 0,
-            denied: 2
-        }
-    );
+    assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 1, updated: 0, denied: 2 });
 }
 
 #[test]
@@ -378,26 +290,15 @@ fn growth_pruning_and_insertion_can_fall_on_one_step() {
 fn windows_are_those_of_the_paper() {
     let scene = Event::new(1, 1, 1).scene;
     let due = |set: &str, iterations: u32| -> Vec<u32> {
-        let policy = diet(
-            &SceneInfo {
-                iterations,
-                ..scene.clone()
-            },
-            set,
-        );
-        (0..=iterations)
-            .filter(|&step| policy.is_due(step))
-            .collect()
+        let policy = diet(&SceneInfo { iterations, ..scene.clone() }, set);
+        (0..=iterations).filter(|&step| policy.is_due(step)).collect()
     };
     let grow = due("prune_every = 0\ninsert_every = 0", 30_000);
     assert_eq!((grow.len(), grow[0], grow.last()), (94, 600, Some(&9900)));
     let insert = due("prune_every = 0\ngrow_every = 0", 30_000);
     assert_eq!(insert, (10_500..15_000).step_by(500).collect::<Vec<_>>());
     let prune = due("grow_every = 0\ninsert_every = 0", 30_000);
-    assert_eq!(
-        (prune.len(), prune[0], prune.last()),
-        (289, 550, Some(&14_950))
-    );
+    assert_eq!((prune.len(), prune[0], prune.last()), (289, 550, Some(&14_950)));
     let insert = due("prune_every = 0\ngrow_every = 0", 3000);
     assert_eq!(insert, (1050..1500).step_by(50).collect::<Vec<_>>());
 }
@@ -412,42 +313,23 @@ fn only_what_is_used_is_asked_for() {
     assert!(full.signals.contains(Signal::MeanGradientNorm) && full.signals.contains(Signal::Age));
     let request = full.candidates.unwrap();
     // 500 steps of 30,000/3000 pixels.
-    assert_eq!(
-        (request.capacity, request.from, request.until),
-        (5000, 10_000, 15_000)
-    );
-    assert_eq!(
-        (request.error, request.depth),
-        (ErrorMode::L1Dssim, DepthMode::MaxWeight)
-    );
+    assert_eq!((request.capacity, request.from, request.until), (5000, 10_000, 15_000));
+    assert_eq!((request.error, request.depth), (ErrorMode::L1Dssim, DepthMode::MaxWeight));
     assert!(request.spaced && request.rows_per_candidate == 3000);
     assert!((request.min_alpha - 0.5).abs() < 1e-9);
 
     let lean = needs("shift = \"none\"\nmixed_gradient = false\nprotect = 0\nrho_c = 0.0");
     let listed: Vec<Signal> = lean.signals.iter().collect();
     use Signal::{Opacity, ScaleMax, ScreenGradient, VisibleCount, WeightMax};
-    assert_eq!(
-        listed,
-        [VisibleCount, ScreenGradient, WeightMax, Opacity, ScaleMax]
-    );
+    assert_eq!(listed, [VisibleCount, ScreenGradient, WeightMax, Opacity, ScaleMax]);
     assert_eq!(lean.candidates, None);
-    assert!(
-        !needs("shift = \"paper\"")
-            .signals
-            .contains(Signal::MeanGradientNorm)
-    );
+    assert!(!needs("shift = \"paper\"").signals.contains(Signal::MeanGradientNorm));
     let switched =
         needs("error = \"grad\"\ndepth = \"median\"\nnms = false\nrows_per_candidate = 1");
     let request = switched.candidates.unwrap();
-    assert_eq!(
-        (request.error, request.depth),
-        (ErrorMode::Gradient, DepthMode::Median)
-    );
+    assert_eq!((request.error, request.depth), (ErrorMode::Gradient, DepthMode::Median));
     assert_eq!((request.spaced, request.capacity), (false, 30_000));
-    assert_eq!(
-        needs("error = \"l1\"").candidates.unwrap().error,
-        ErrorMode::L1
-    );
+    assert_eq!(needs("error = \"l1\"").candidates.unwrap().error, ErrorMode::L1);
     assert_eq!(needs("compensate_until = 10000").candidates, None);
 }
 
@@ -455,11 +337,7 @@ fn only_what_is_used_is_asked_for() {
 fn ranges_are_checked_and_what_is_missing_is_said() {
     let scene = Event::new(1, 1, 1).scene;
     let refused = |set: &str| match find("diet").unwrap().build(&set.parse().unwrap(), &scene) {
-        Err(PolicyError::BadParameter {
-            policy,
-            parameter,
-            reason,
-        }) => {
+        Err(PolicyError::BadParameter { policy, parameter, reason }) => {
             assert_eq!(
                 (policy.as_str(), parameter.as_str()),
                 ("diet", set.split(' ').next().unwrap())

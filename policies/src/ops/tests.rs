@@ -9,17 +9,9 @@ const SPLIT: Offspring = Offspring {
     scale: ScaleRule::Uniform(0.5),
     opacity: OpacityRule::Same,
 };
-const SEED: Seed = Seed {
-    position: [0.0; 3],
-    colour: [0.5; 3],
-    scale: 1.0,
-    opacity: 0.1,
-};
-const UPDATE: Update = Update {
-    opacity: OpacityRule::Same,
-    scale: ScaleRule::Uniform(2.0),
-    keep_moments: false,
-};
+const SEED: Seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 1.0, opacity: 0.1 };
+const UPDATE: Update =
+    Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(2.0), keep_moments: false };
 
 /// Ten rows: 1, 2, 3, 5 and 8 pruned, 9 split, 7 updated, one seed.
 fn shrinking() -> RowOps {

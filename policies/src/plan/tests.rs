@@ -11,17 +11,9 @@ fn family(children: u32, parent: ParentFate) -> Offspring {
     }
 }
 
-const SEED: Seed = Seed {
-    position: [0.0; 3],
-    colour: [0.5; 3],
-    scale: 1.0,
-    opacity: 0.1,
-};
-const UPDATE: Update = Update {
-    opacity: OpacityRule::Same,
-    scale: ScaleRule::Uniform(1.0),
-    keep_moments: true,
-};
+const SEED: Seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 1.0, opacity: 0.1 };
+const UPDATE: Update =
+    Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(1.0), keep_moments: true };
 
 #[test]
 fn a_row_has_one_fate() {
@@ -32,27 +24,16 @@ fn a_row_has_one_fate() {
     for row in 0..3 {
         assert!(!plan.is_free(row));
         assert_eq!(plan.prune(row), Err(Refused::Taken));
-        assert_eq!(
-            plan.grow(row, family(1, ParentFate::Stays)),
-            Err(Refused::Taken)
-        );
+        assert_eq!(plan.grow(row, family(1, ParentFate::Stays)), Err(Refused::Taken));
         assert_eq!(plan.update(row, UPDATE), Err(Refused::Taken));
     }
     assert!(plan.is_free(3) && !plan.is_free(4));
     assert_eq!(plan.prune(4), Err(Refused::NoSuchRow));
-    assert_eq!(
-        plan.grow(4, family(1, ParentFate::Stays)),
-        Err(Refused::NoSuchRow)
-    );
+    assert_eq!(plan.grow(4, family(1, ParentFate::Stays)), Err(Refused::NoSuchRow));
     assert_eq!(plan.update(u32::MAX, UPDATE), Err(Refused::NoSuchRow));
     assert_eq!(plan.denied(), 12);
     assert_eq!(plan.room(), 4);
-    let counts = EditCounts {
-        removed: 1,
-        added: 1,
-        updated: 1,
-        denied: 12,
-    };
+    let counts = EditCounts { removed: 1, added: 1, updated: 1, denied: 12 };
     assert_eq!(plan.compile().counts, counts);
 }
 
@@ -70,37 +51,17 @@ fn pruned_rows_make_room_in_the_same_plan() {
     assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
     let ops = plan.compile();
     assert_eq!((ops.rows_after, &ops.child_slots[..]), (3, &[1, 2][..]));
-    assert_eq!(
-        ops.counts,
-        EditCounts {
-            removed: 2,
-            added: 2,
-            updated: 1,
-            denied: 3
-        }
-    );
+    assert_eq!(ops.counts, EditCounts { removed: 2, added: 2, updated: 1, denied: 3 });
 }
 
 #[test]
 fn a_refused_value_changes_nothing() {
     let mut plan = EditPlan::new(2, 8);
-    let lone = Offspring {
-        children: 0,
-        ..family(1, ParentFate::Stays)
-    };
+    let lone = Offspring { children: 0, ..family(1, ParentFate::Stays) };
     assert_eq!(plan.grow(0, lone), Err(Refused::BadValue));
-    let nowhere = Update {
-        scale: ScaleRule::Uniform(f32::NAN),
-        ..UPDATE
-    };
+    let nowhere = Update { scale: ScaleRule::Uniform(f32::NAN), ..UPDATE };
     assert_eq!(plan.update(0, nowhere), Err(Refused::BadValue));
-    assert_eq!(
-        plan.append(Seed {
-            opacity: 1.0,
-            ..SEED
-        }),
-        Err(Refused::BadValue)
-    );
+    assert_eq!(plan.append(Seed { opacity: 1.0, ..SEED }), Err(Refused::BadValue));
     assert_eq!(plan.clamp_opacity(0.0), Err(Refused::BadValue));
     assert!(plan.is_free(0) && plan.room() == 6);
     let ops = plan.compile();
@@ -132,10 +93,7 @@ fn above_the_budget_a_plan_only_shrinks() {
     plan.append(SEED).unwrap();
     assert_eq!(plan.append(SEED), Err(Refused::NoRoom));
     let ops = plan.compile();
-    assert_eq!(
-        (ops.rows_after, ops.seeds[0].0, ops.check()),
-        (3, 0, Ok(()))
-    );
+    assert_eq!((ops.rows_after, ops.seeds[0].0, ops.check()), (3, 0, Ok(())));
 }
 
 #[test]
@@ -185,37 +143,22 @@ enum Who {
 /// Executes `ops` on a plain vector, checking every sub-step, and returns who is left.
 fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Who> {
     let slots = ops.rows_before.max(budget);
-    let mut model: Vec<Option<Who>> = (0..slots)
-        .map(|slot| (slot < ops.rows_before).then_some(Who::Row(slot as u32)))
-        .collect();
+    let mut model: Vec<Option<Who>> =
+        (0..slots).map(|slot| (slot < ops.rows_before).then_some(Who::Row(slot as u32))).collect();
     for &row in pruned {
         assert_eq!(model[row as usize].take(), Some(Who::Row(row)));
     }
     let mut live = ops.rows_before - pruned.len();
     let mut bear = |model: &mut [Option<Who>], slot: u32, who: Who| {
-        assert!(
-            (slot as usize) < budget,
-            "slot {slot} is beyond the budget {budget}"
-        );
-        assert_eq!(
-            model[slot as usize].replace(who),
-            None,
-            "slot {slot} was not free"
-        );
+        assert!((slot as usize) < budget, "slot {slot} is beyond the budget {budget}");
+        assert_eq!(model[slot as usize].replace(who), None, "slot {slot} was not free");
         live += 1;
         assert!(live <= budget, "{live} rows, budget {budget}");
     };
     for family in &ops.families {
         assert_eq!(model[family.parent as usize], Some(Who::Row(family.parent)));
         for (number, &slot) in (1..).zip(ops.children(family)) {
-            bear(
-                &mut model,
-                slot,
-                Who::Child {
-                    of: family.parent,
-                    number,
-                },
-            );
+            bear(&mut model, slot, Who::Child { of: family.parent, number });
         }
     }
     for (row, _) in &ops.updates {
@@ -229,14 +172,8 @@ fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Who> {
         assert!(row.is_some() && model[to as usize].is_none());
         model[to as usize] = row;
     }
-    assert!(
-        model[ops.rows_after..].iter().all(Option::is_none),
-        "rows beyond the last"
-    );
-    model[..ops.rows_after]
-        .iter()
-        .map(|slot| slot.expect("rows are dense"))
-        .collect()
+    assert!(model[ops.rows_after..].iter().all(Option::is_none), "rows beyond the last");
+    model[..ops.rows_after].iter().map(|slot| slot.expect("rows are dense")).collect()
 }
 
 proptest! {

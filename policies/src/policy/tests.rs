@@ -5,10 +5,7 @@ fn all_lists_every_signal_in_order() {
     for (index, signal) in Signal::ALL.into_iter().enumerate() {
         assert_eq!(signal as usize, index);
     }
-    assert_eq!(
-        SignalSet::of(&Signal::ALL).iter().collect::<Vec<_>>(),
-        Signal::ALL
-    );
+    assert_eq!(SignalSet::of(&Signal::ALL).iter().collect::<Vec<_>>(), Signal::ALL);
 }
 
 #[test]
@@ -33,20 +30,10 @@ fn only_declared_signals_can_be_read() {
     let mut signals = Signals::zeros(3, SignalSet::of(&[Signal::Opacity]));
     signals.get_mut(Signal::Opacity).unwrap()[1] = 0.5;
     assert!(signals.get_mut(Signal::Age).is_none());
-    let now = Snapshot {
-        step: 1,
-        scene: &scene,
-        signals: &signals,
-        candidates: &[],
-    };
+    let now = Snapshot { step: 1, scene: &scene, signals: &signals, candidates: &[] };
     assert_eq!(now.rows(), 3);
     assert_eq!(now.signal(Signal::Opacity), Ok(&[0.0, 0.5, 0.0][..]));
     let refused = now.signal(Signal::Age).unwrap_err();
-    assert_eq!(
-        refused,
-        PolicyError::Undeclared {
-            signal: Signal::Age
-        }
-    );
+    assert_eq!(refused, PolicyError::Undeclared { signal: Signal::Age });
     assert!(refused.to_string().contains("Age"));
 }

@@ -25,13 +25,7 @@ enum Mode {
 
 impl Default for Params {
     fn default() -> Self {
-        Self {
-            threshold: 0.1,
-            every: 100,
-            from: 500,
-            mode: Mode::First,
-            seldom: None,
-        }
+        Self { threshold: 0.1, every: 100, from: 500, mode: Mode::First, seldom: None }
     }
 }
 
@@ -97,11 +91,7 @@ fn set(text: &str) -> Table {
 #[test]
 fn names_are_sorted_and_unique() {
     let (a, b, c) = (idle("b", 1), idle("a", 2), idle("c", 3));
-    let names: Vec<_> = sorted(vec![&a, &b, &c])
-        .unwrap()
-        .iter()
-        .map(|e| e.name)
-        .collect();
+    let names: Vec<_> = sorted(vec![&a, &b, &c]).unwrap().iter().map(|e| e.name).collect();
     assert_eq!(names, ["a", "b", "c"]);
     let twin = idle("c", 1);
     let error = sorted(vec![&a, &c, &b, &twin]).unwrap_err().to_string();
@@ -112,31 +102,19 @@ fn names_are_sorted_and_unique() {
 #[test]
 fn the_built_in_policies_are_found() {
     let names: Vec<_> = policies().unwrap().iter().map(|entry| entry.name).collect();
-    assert!(
-        names.contains(&"diet") && names.contains(&"vanilla"),
-        "{names:?}"
-    );
+    assert!(names.contains(&"diet") && names.contains(&"vanilla"), "{names:?}");
     let diet = find("diet").unwrap();
     assert!(diet.location().contains("diet.rs:"), "{}", diet.location());
     let error = find("vanila").unwrap_err().to_string();
     assert!(error.contains("did you mean `vanilla`?"), "{error}");
     let error = find("quux").unwrap_err();
-    assert_eq!(
-        error,
-        PolicyError::UnknownPolicy {
-            name: "quux".into(),
-            nearest: None
-        }
-    );
+    assert_eq!(error, PolicyError::UnknownPolicy { name: "quux".into(), nearest: None });
 }
 
 #[test]
 fn the_manual_is_the_leading_block() {
     assert_eq!(idle("idle", 1).manual(), "# Idle\n\nText.\n");
-    let plain = PolicyEntry {
-        doc: "Only text.",
-        ..idle("idle", 1)
-    };
+    let plain = PolicyEntry { doc: "Only text.", ..idle("idle", 1) };
     assert_eq!(plain.manual(), "Only text.\n");
 }
 
@@ -151,9 +129,7 @@ fn parameters_are_listed_as_declared() {
 #[test]
 fn defaults_scale_with_the_run_and_settings_do_not() {
     let idle = idle("idle", 1);
-    let effective = idle
-        .effective(&set("every = 100\nthreshold = 1"), &scene(3_000))
-        .unwrap();
+    let effective = idle.effective(&set("every = 100\nthreshold = 1"), &scene(3_000)).unwrap();
     assert_eq!(effective["every"].as_integer(), Some(100));
     assert_eq!(effective["from"].as_integer(), Some(50));
     assert_eq!(effective["threshold"].as_float(), Some(1.0));
@@ -174,15 +150,9 @@ fn bad_parameters_are_named() {
     assert!(told.contains("no parameter `treshold`"), "{told}");
     assert!(told.contains("did you mean `threshold`?"), "{told}");
     let told = build("threshold = 2");
-    assert!(
-        told.contains("`idle.threshold`: 2 is out of range"),
-        "{told}"
-    );
+    assert!(told.contains("`idle.threshold`: 2 is out of range"), "{told}");
     let told = build("every = \"often\"");
-    assert!(
-        told.contains("`idle.every`: \"often\" does not fit"),
-        "{told}"
-    );
+    assert!(told.contains("`idle.every`: \"often\" does not fit"), "{told}");
     let told = build("every = -1");
     assert!(told.contains("`idle.every`: -1 does not fit"), "{told}");
     let told = build("mode = \"third\"");

@@ -4,10 +4,7 @@ use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule};
 use crate::registry::find;
 
 fn vanilla(event: &Event, set: &str) -> Box<dyn DensityPolicy> {
-    find("vanilla")
-        .unwrap()
-        .build(&set.parse().unwrap(), &event.scene)
-        .unwrap()
+    find("vanilla").unwrap().build(&set.parse().unwrap(), &event.scene).unwrap()
 }
 
 fn run(event: &Event, set: &str) -> Outcome {
@@ -43,29 +40,15 @@ fn small_rows_are_cloned_and_large_ones_split() {
     assert_eq!(done.cloned, [0]);
     assert_eq!(done.split, [2, 1]);
     let split = done.ops.families[0].offspring;
-    assert_eq!(
-        (split.children, split.parent),
-        (1, ParentFate::BecomesChild)
-    );
+    assert_eq!((split.children, split.parent), (1, ParentFate::BecomesChild));
     assert_eq!(split.placement, Placement::Sampled);
     assert_eq!(split.scale, ScaleRule::Uniform(0.625));
     assert_eq!(split.opacity, OpacityRule::Same);
     let clone = done.ops.families[2].offspring;
     assert_eq!((clone.children, clone.parent), (1, ParentFate::Stays));
     assert_eq!(clone.placement, Placement::Offset([0.0; 3]));
-    assert_eq!(
-        (clone.scale, clone.opacity),
-        (ScaleRule::Uniform(1.0), OpacityRule::Same)
-    );
-    assert_eq!(
-        done.ops.counts,
-        EditCounts {
-            removed: 0,
-            added: 3,
-            updated: 2,
-            denied: 0
-        }
-    );
+    assert_eq!((clone.scale, clone.opacity), (ScaleRule::Uniform(1.0), OpacityRule::Same));
+    assert_eq!(done.ops.counts, EditCounts { removed: 0, added: 3, updated: 2, denied: 0 });
 }
 
 #[test]
@@ -85,24 +68,11 @@ fn huge_rows_die_after_step_3000_but_are_split_first() {
     let early = run(&event, "");
     assert!(early.pruned.is_empty());
     assert_eq!(early.split, [2, 3]);
-    let late = run(
-        &Event {
-            step: 3100,
-            ..event.clone()
-        },
-        "",
-    );
+    let late = run(&Event { step: 3100, ..event.clone() }, "");
     assert_eq!(late.pruned, [1, 3]);
     assert_eq!(late.split, [2]);
     // Without room for its split, a huge row is not small enough to live.
-    let full = run(
-        &Event {
-            step: 3100,
-            budget: 4,
-            ..event
-        },
-        "",
-    );
+    let full = run(&Event { step: 3100, budget: 4, ..event }, "");
     assert_eq!(full.pruned, [1, 2, 3]);
     assert_eq!(full.ops.counts.denied, 1);
 }
@@ -113,15 +83,7 @@ fn at_the_budget_growth_stops_and_pruning_goes_on() {
     let done = run(&event, "");
     assert!(done.cloned.is_empty());
     assert_eq!(done.pruned, [2]);
-    assert_eq!(
-        done.ops.counts,
-        EditCounts {
-            removed: 1,
-            added: 0,
-            updated: 0,
-            denied: 2
-        }
-    );
+    assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 0, updated: 0, denied: 2 });
 }
 
 #[test]
@@ -142,44 +104,16 @@ fn the_last_row_lives() {
 fn events_happen_when_the_original_has_them() {
     let scene = Event::new(1, 1, 1).scene;
     let due = |set: &str, white_background, iterations| -> Vec<u32> {
-        let scene = SceneInfo {
-            white_background,
-            iterations,
-            ..scene.clone()
-        };
-        let policy = find("vanilla")
-            .unwrap()
-            .build(&set.parse().unwrap(), &scene)
-            .unwrap();
-        (0..=iterations)
-            .filter(|&step| policy.is_due(step))
-            .collect()
+        let scene = SceneInfo { white_background, iterations, ..scene.clone() };
+        let policy = find("vanilla").unwrap().build(&set.parse().unwrap(), &scene).unwrap();
+        (0..=iterations).filter(|&step| policy.is_due(step)).collect()
     };
     let densify = due("", false, 30_000);
-    assert_eq!(
-        (densify.len(), densify[0], densify.last()),
-        (144, 600, Some(&14_900))
-    );
-    assert_eq!(
-        due("grow_every = 0", false, 30_000),
-        [3000, 6000, 9000, 12_000]
-    );
-    assert_eq!(
-        due("grow_every = 0", true, 30_000),
-        [500, 3000, 6000, 9000, 12_000]
-    );
-    assert_eq!(
-        due("grow_every = 0", true, 3_000),
-        [50, 300, 600, 900, 1200]
-    );
-    assert_eq!(
-        due(
-            "grow_every = 0\nreset_every = 0\nwhite_reset_at = 0",
-            true,
-            30_000
-        ),
-        [0; 0]
-    );
+    assert_eq!((densify.len(), densify[0], densify.last()), (144, 600, Some(&14_900)));
+    assert_eq!(due("grow_every = 0", false, 30_000), [3000, 6000, 9000, 12_000]);
+    assert_eq!(due("grow_every = 0", true, 30_000), [500, 3000, 6000, 9000, 12_000]);
+    assert_eq!(due("grow_every = 0", true, 3_000), [50, 300, 600, 900, 1200]);
+    assert_eq!(due("grow_every = 0\nreset_every = 0\nwhite_reset_at = 0", true, 30_000), [0; 0]);
 }
 
 #[test]
@@ -193,10 +127,7 @@ fn a_reset_bounds_opacity_in_the_event_of_growth() {
     white.scene.white_background = true;
     let reset = run(&white, "");
     assert!(reset.cloned.is_empty() && !reset.ops.reset_signals);
-    assert_eq!(
-        (reset.ops.clamp_opacity, reset.ops.cause.as_str()),
-        (Some(0.01), "reset")
-    );
+    assert_eq!((reset.ops.clamp_opacity, reset.ops.cause.as_str()), (Some(0.01), "reset"));
 }
 
 #[test]
@@ -208,13 +139,7 @@ fn the_governor_follows_the_curve_and_not_the_threshold() {
     // 4 + 145·(2/145 − 1/145²) = 5.993: one more row.
     assert_eq!(run(&event, "governor = true").cloned, [2]);
     // The last event, 144: 4 + 145·(1 − 1/145²) = 148.99.
-    let last = run(
-        &Event {
-            step: 14_900,
-            ..event.clone()
-        },
-        "governor = true",
-    );
+    let last = run(&Event { step: 14_900, ..event.clone() }, "governor = true");
     assert_eq!(last.cloned, [2, 3, 1]);
     let mut ahead = event;
     ahead.scene.initial_rows = 2;
@@ -245,14 +170,8 @@ fn ranges_are_checked() {
         "grow_every = -1",
         "governor = 1",
     ] {
-        let error = find("vanilla")
-            .unwrap()
-            .build(&set.parse().unwrap(), &scene)
-            .err();
-        let Some(PolicyError::BadParameter {
-            policy, parameter, ..
-        }) = error
-        else {
+        let error = find("vanilla").unwrap().build(&set.parse().unwrap(), &scene).err();
+        let Some(PolicyError::BadParameter { policy, parameter, .. }) = error else {
             panic!("{set}: {error:?}");
         };
         assert_eq!(

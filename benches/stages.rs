@@ -1,0 +1,138 @@
+//! Time per training step and stage on random scenes, on one thread and on two.
+//!
+//! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are medians of processor time, so that a
+//! loaded machine distorts them little; the stage columns are wall time of one thread.
+
+use std::time::{Duration, Instant};
+
+use cpu_time::ProcessTime;
+use densify::backend::cpu::{CpuBackend, CpuOptions};
+use densify::backend::{Backend, LearningRates, StepInput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::{Gaussians, sh_coefficients};
+use glam::{DMat3, DVec3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// A random cloud in front of the camera whose splats shrink as their number grows, so that the
+/// number of tile entries per row is that of a trained scene (about 3).
+fn scene(rows: usize, sh_degree: u8) -> Gaussians {
+    let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
+    let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
+    let size = 0.024 * (10_000.0 / rows as f32).powf(0.4);
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
+    for _ in 0..rows {
+        model.means.push([0, 1, 2].map(|_| uniform(-1.0, 1.0)));
+        model.log_scales.push([0, 1, 2].map(|_| (size * uniform(0.3, 1.5)).ln()));
+        model.quats.push([0, 1, 2, 3].map(|_| uniform(-1.0, 1.0)));
+        model.opacity_logits.push(uniform(-2.0, 2.5));
+        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| uniform(-0.3, 0.5)));
+    }
+    model
+}
+
+fn camera(size: u32) -> Camera {
+    let f = f64::from(size);
+    Camera {
+        width: size,
+        height: size,
+        fx: f,
+        fy: f,
+        cx: 0.5 * f,
+        cy: 0.5 * f,
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::new(0.0, 0.0, 3.0),
+    }
+}
+
+fn target(size: u32) -> Image8 {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let rgb = (0..3 * size * size).map(|_| rng.random::<u8>()).collect();
+    Image8 { width: size, height: size, rgb, alpha: None, mask: None }
+}
+
+fn median(mut times: Vec<Duration>) -> f64 {
+    times.sort();
+    times[times.len() / 2].as_secs_f64() * 1e3
+}
+
+fn main() {
+    let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
+    let rates = LearningRates {
+        mean: 1e-6,
+        log_scale: 1e-6,
+        quat: 1e-6,
+        opacity: 1e-6,
+        sh_dc: 1e-6,
+        sh_rest: 1e-6,
+    };
+    println!("   rows  image   entries threads  CPU ms  wall ms  stages [ms]");
+    for (rows, size) in [
+        (10_000, 256),
+        (10_000, 512),
+        (50_000, 256),
+        (50_000, 512),
+        (200_000, 800),
+        (1_000_000, 1024),
+    ] {
+        if !only.is_empty() && !only.contains(&format!("{rows}@{size}")) {
+            continue;
+        }
+        for threads in [1, 2] {
+            let options = CpuOptions {
+                threads: Some(threads),
+                largest_image: (size, size),
+                tile_cap: rows * 8,
+                ..CpuOptions::new(rows)
+            };
+            let mut backend = match CpuBackend::new(&scene(rows, 3), &options) {
+                Ok(backend) => backend,
+                Err(error) => {
+                    println!("{rows} rows: {error}");
+                    continue;
+                }
+            };
+            let (camera, target) = (camera(size), target(size));
+            let (mut cpu, mut wall) = (Vec::new(), Vec::new());
+            let mut stages: Vec<Vec<Duration>> = Vec::new();
+            let steps = (6_000_000 / rows).clamp(7, 60) as u32;
+            let mut entries = 0;
+            for step in 1..=steps {
+                let input = StepInput {
+                    step,
+                    camera: &camera,
+                    target: &target,
+                    background: [0.0; 3],
+                    sh_degree: 3,
+                    rates,
+                };
+                let (start, cpu_start) = (Instant::now(), ProcessTime::now());
+                match backend.train_step(&input) {
+                    Ok(output) => entries = output.entries,
+                    Err(error) => println!("{error}"),
+                }
+                if step > 2 {
+                    cpu.push(cpu_start.elapsed());
+                    wall.push(start.elapsed());
+                    for (i, &(_, time)) in backend.stage_times().iter().enumerate() {
+                        stages.resize(stages.len().max(i + 1), Vec::new());
+                        stages[i].push(time);
+                    }
+                }
+            }
+            let line: Vec<String> = backend
+                .stage_times()
+                .iter()
+                .zip(stages)
+                .map(|(&(name, _), times)| format!("{name} {:.2}", median(times)))
+                .collect();
+            println!(
+                "{rows:7} {size:5}² {entries:9} {threads:7} {:7.2} {:8.2}  {}",
+                median(cpu),
+                median(wall),
+                line.join(", ")
+            );
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
+
+use densify_policies::plan::{Family, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed};
+use densify_policies::rng::{PolicyRng, Purpose};
+
+use super::blocks::{Blocks, plane};
+use super::signals::Accumulators;
+use crate::gaussians::{logit, rgb_to_dc, sigmoid};
+
+/// The buffers that are re-indexed together.
+pub(super) struct Model<'a> {
+    pub(super) params: &'a mut Blocks,
+    pub(super) moments: [&'a mut Blocks; 2],
+    pub(super) ages: &'a mut [u16],
+    pub(super) signals: &'a mut Accumulators,
+}
+
+/// Executes `ops`; the order and the invariants are those of [`RowOps`].
+pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
+    for family in &ops.families {
+        let first = family.first_child as usize;
+        let children = &ops.child_slots[first..first + family.offspring.children as usize];
+        model.breed(family, children, rng);
+    }
+    for &(row, update) in &ops.updates {
+        let row = row as usize;
+        let scales = scales_of(model.params.get_n(row, plane::LOG_SCALE), update.scale);
+        model.params.set_n(row, plane::LOG_SCALE, scales);
+        model.set_opacity(row, update.opacity, 1);
+        if !update.keep_moments {
+            model.reborn(row);
+        }
+    }
+    for &(row, seed) in &ops.seeds {
+        model.sow(row as usize, &seed);
+    }
+    for &(from, to) in &ops.moves {
+        model.relocate(from as usize, to as usize);
+    }
+    if let Some(most) = ops.clamp_opacity {
+        for row in 0..ops.rows_after {
+            let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
+            model.params.set(row, plane::OPACITY, clamped);
+            for moment in &mut model.moments {
+                moment.set(row, plane::OPACITY, 0.0);
+            }
+        }
+    }
+    if ops.reset_signals {
+        model.signals.reset(ops.rows_after);
+    }
+}
+
+impl Model<'_> {
+    /// Writes a parent's children, then the parent itself.
+    fn breed(&mut self, family: &Family, children: &[u32], rng: &PolicyRng) {
+        let parent = family.parent as usize;
+        let offspring = family.offspring;
+        let mean: [f32; 3] = self.params.get_n(parent, plane::MEAN);
+        let log_scale: [f32; 3] = self.params.get_n(parent, plane::LOG_SCALE);
+        let quat: [f32; 4] = self.params.get_n(parent, plane::QUAT);
+        let scales = scales_of(log_scale, offspring.scale);
+        let siblings = offspring.children + u32::from(offspring.parent == ParentFate::BecomesChild);
+        let stand = |child: u32| -> [f32; 3] {
+            let offset = match offspring.placement {
+                Placement::Offset(_) if child == 0 => [0.0; 3],
+                Placement::Offset(offset) => offset,
+                Placement::Sampled => {
+                    let xi = rng.normal3(family.parent, Purpose::Place, child);
+                    let local = [0, 1, 2].map(|i| log_scale[i].exp() * xi[i]);
+                    rotate(quat, local)
+                }
+                Placement::LongAxis { sigmas } => {
+                    let long = longest(log_scale);
+                    let mut local = [0.0; 3];
+                    let sign = if child % 2 == 0 { 1.0 } else { -1.0 };
+                    local[long] = sign * sigmas * log_scale[long].exp();
+                    rotate(quat, local)
+                }
+            };
+            [0, 1, 2].map(|i| mean[i] + offset[i])
+        };
+        for (i, &slot) in children.iter().enumerate() {
+            let slot = slot as usize;
+            self.params.copy_row(parent, slot);
+            self.params.set_n(slot, plane::MEAN, stand(i as u32 + 1));
+            self.params.set_n(slot, plane::LOG_SCALE, scales);
+            self.set_opacity(slot, offspring.opacity, siblings);
+            self.reborn(slot);
+        }
+        if offspring.parent == ParentFate::BecomesChild {
+            self.params.set_n(parent, plane::MEAN, stand(0));
+            self.params.set_n(parent, plane::LOG_SCALE, scales);
+            self.set_opacity(parent, offspring.opacity, siblings);
+            self.reborn(parent);
+        }
+    }
+
+    fn sow(&mut self, row: usize, seed: &Seed) {
+        self.params.clear_row(row);
+        self.params.set_n(row, plane::MEAN, seed.position);
+        self.params.set_n(row, plane::LOG_SCALE, [seed.scale.ln(); 3]);
+        self.params.set_n(row, plane::QUAT, [1.0, 0.0, 0.0, 0.0]);
+        self.params.set(row, plane::OPACITY, logit(seed.opacity));
+        self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
+        self.reborn(row);
+    }
+
+    fn set_opacity(&mut self, row: usize, rule: OpacityRule, siblings: u32) {
+        let was = self.params.get(row, plane::OPACITY);
+        let opacity = sigmoid(was);
+        let logit = match rule {
+            OpacityRule::Same => was,
+            OpacityRule::Set(o) => logit(o),
+            OpacityRule::Scaled(factor) => logit(opacity * factor),
+            // 1 − o from the logit, so that it does not round to 0.
+            OpacityRule::Conserved => logit(1.0 - sigmoid(-was).powf(1.0 / siblings.max(1) as f32)),
+        };
+        self.params.set(row, plane::OPACITY, logit);
+    }
+
+    /// Zero moments, age 0, no past.
+    fn reborn(&mut self, row: usize) {
+        for moment in &mut self.moments {
+            moment.clear_row(row);
+        }
+        self.ages[row] = 0;
+        self.signals.blocks.clear_row(row);
+    }
+
+    fn relocate(&mut self, from: usize, to: usize) {
+        self.params.copy_row(from, to);
+        for moment in &mut self.moments {
+            moment.copy_row(from, to);
+        }
+        self.ages[to] = self.ages[from];
+        self.signals.blocks.copy_row(from, to);
+    }
+}
+
+fn longest(log_scale: [f32; 3]) -> usize {
+    (1..3).fold(0, |best, i| if log_scale[i] > log_scale[best] { i } else { best })
+}
+
+fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {
+    match rule {
+        // A factor of 1 must not change a bit.
+        ScaleRule::Uniform(factor) => log_scale.map(|x| x + factor.ln()),
+        ScaleRule::LongAxis { long, other } => {
+            let longest = longest(log_scale);
+            let mut scales = log_scale.map(|x| x + other.ln());
+            scales[longest] = log_scale[longest] + long.ln();
+            scales
+        }
+    }
+}
+
+/// R(q)·v for a quaternion (w, x, y, z) of any length but 0.
+fn rotate(quat: [f32; 4], v: [f32; 3]) -> [f32; 3] {
+    let [w, x, y, z] = quat;
+    let q = glam::Quat::from_xyzw(x, y, z, w).normalize();
+    (q * glam::Vec3::from(v)).to_array()
+}

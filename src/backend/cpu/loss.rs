@@ -1,0 +1,446 @@
+//! Stage 4: the image loss 0.8·L1 + 0.2·(1 − SSIM) and its gradient (Kerbl et al. 2023, section 5.1;
+//! SSIM of Wang et al. 2004 with an 11×11 Gaussian window of σ = 1.5 and zero padding).
+//!
+//! SSIM is written in terms of the difference e = x − y, by an exact identity:
+//! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
+//! Where the images agree it is 1 to the last bit; the usual form is off by up to 4e-7 there, and
+//! its gradient is noise. The identity holds for any linear window, also where zero padding takes
+//! part of the window's weight.
+//!
+//! The file is one piece because the two passes share their window, their planes and their strips.
+//! Both passes run over strips of rows. A strip convolves its rows and five more on either side
+//! horizontally into its own lines and then vertically; strips write nothing that others read.
+
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::rasterize::{DARK, TileCanvas};
+use super::rasterize_bwd::TileGradient;
+use super::simd::{V, WIDTH};
+use super::tiles::{Grid, TILE};
+use crate::dataset::images::Image8;
+
+const C1: f32 = 0.01 * 0.01;
+const C2: f32 = 0.03 * 0.03;
+/// Weight of 1 − SSIM; L1 has the rest.
+const SSIM_WEIGHT: f32 = 0.2;
+/// Half the window.
+const REACH: usize = 5;
+/// The Gaussian window, normalised: exp(−k²/(2·1.5²))/Σ for k = −5..=5.
+const WINDOW: [f32; 2 * REACH + 1] = [
+    0.001_028_380_2,
+    0.007_598_758,
+    0.036_000_773,
+    0.109_360_69,
+    0.213_005_53,
+    0.266_011_74,
+    0.213_005_53,
+    0.109_360_69,
+    0.036_000_773,
+    0.007_598_758,
+    0.001_028_380_2,
+];
+/// Rows per strip: two rows of tiles.
+const STRIP: usize = 2 * TILE;
+/// Zeros left of a line's first pixel, so that loads stay aligned; as many or more on the right.
+const PAD: usize = WIDTH;
+
+/// Planes of image size that the loss keeps between its passes: e, y, and three derivatives.
+#[derive(Debug)]
+pub(super) struct LossBuffers {
+    /// Shape: [rows, stride] each.
+    planes: [Vec<f32>; 5],
+    /// Error per pixel, summed over channels, if asked for. Shape: [rows, stride].
+    error: Vec<f32>,
+    stride: usize,
+}
+
+/// The scalars of a loss.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct LossValue {
+    pub(super) l1: f64,
+    pub(super) ssim: f64,
+}
+
+impl LossValue {
+    pub(super) fn loss(self) -> f64 {
+        (1.0 - f64::from(SSIM_WEIGHT)) * self.l1 + f64::from(SSIM_WEIGHT) * (1.0 - self.ssim)
+    }
+}
+
+fn line(width: usize) -> usize {
+    width.next_multiple_of(WIDTH) + 2 * PAD
+}
+
+impl LossBuffers {
+    /// Bytes for an image of this size, and for the strips of so many threads.
+    pub(super) fn bytes(width: usize, height: usize, threads: usize) -> u64 {
+        let planes = 6 * line(width) * height;
+        let strips = threads * (3 + 5 * (STRIP + 2 * REACH)) * line(width);
+        ((planes + strips) * size_of::<f32>()) as u64
+    }
+
+    pub(super) fn new() -> Self {
+        Self { planes: Default::default(), error: Vec::new(), stride: 0 }
+    }
+
+    /// Makes room for an image. Images of one size, or smaller ones, allocate nothing more.
+    fn resize(&mut self, grid: &Grid, with_error: bool) {
+        self.stride = line(grid.width);
+        for plane in &mut self.planes {
+            plane.resize(self.stride * grid.height, 0.0);
+        }
+        self.error.clear();
+        if with_error {
+            self.error.resize(self.stride * grid.height, 0.0);
+        }
+    }
+
+    /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
+    /// also the error of each pixel, as the mean over channels of their combination of |e| and
+    /// 1 − SSIM.
+    pub(super) fn run(
+        &mut self,
+        arch: Arch,
+        grid: &Grid,
+        canvas: &[TileCanvas],
+        target: &Image8,
+        background: [f32; 3],
+        gradient: &mut [TileGradient],
+        error_weights: Option<[f32; 2]>,
+    ) -> LossValue {
+        let with_error = error_weights.is_some();
+        self.resize(grid, with_error);
+        let stride = self.stride;
+        let samples = (3 * grid.width * grid.height) as f64;
+        let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
+        for channel in 0..3 {
+            let [e, y, p1, p2, p3] = &mut self.planes;
+            let strip = STRIP * stride;
+            let error_strips: Vec<&mut [f32]> = if with_error {
+                self.error.chunks_mut(strip).collect()
+            } else {
+                (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
+            };
+            let source = Source { grid, canvas, target, background, channel };
+            (e.par_chunks_mut(stride), y.par_chunks_mut(stride))
+                .into_par_iter()
+                .enumerate()
+                .with_min_len(STRIP)
+                .for_each(|(row, (e, y))| source.lines(row, e, y));
+            let parts: Vec<LossValue> = (
+                p1.par_chunks_mut(strip),
+                p2.par_chunks_mut(strip),
+                p3.par_chunks_mut(strip),
+                error_strips,
+            )
+                .into_par_iter()
+                .enumerate()
+                .map_init(Vec::new, |scratch, (i, (p1, p2, p3, error))| {
+                    arch.dispatch(Similarity {
+                        grid,
+                        first: i * STRIP,
+                        stride,
+                        scratch,
+                        e,
+                        y,
+                        derivatives: [p1, p2, p3],
+                        error,
+                        error_weights: error_weights.unwrap_or_default().map(|w| w / 3.0),
+                    })
+                })
+                .collect();
+            for part in parts {
+                l1 += part.l1;
+                ssim += part.ssim;
+            }
+            let [e, y, p1, p2, p3] = &self.planes;
+            gradient.par_chunks_mut(grid.columns * STRIP / TILE).enumerate().for_each_init(
+                Vec::new,
+                |scratch, (i, tiles)| {
+                    arch.dispatch(Gradient {
+                        grid,
+                        channel,
+                        first: i * STRIP,
+                        stride,
+                        scratch,
+                        e,
+                        y,
+                        derivatives: [p1, p2, p3],
+                        scale: 1.0 / samples as f32,
+                        mask: target.mask.as_deref(),
+                        tiles,
+                    });
+                },
+            );
+        }
+        LossValue { l1: l1 / samples, ssim: ssim / samples }
+    }
+
+    /// Error of a pixel after a run with error weights.
+    pub(super) fn error_at(&self, x: usize, y: usize) -> f32 {
+        self.error[y * self.stride + PAD + x]
+    }
+}
+
+/// Multiplies a line by the weights of a mask's row.
+#[inline(always)]
+fn masked(line: &mut [f32], mask: &[u8]) {
+    for (x, &m) in line.iter_mut().zip(mask) {
+        *x *= f32::from(m) * (1.0 / 255.0);
+    }
+}
+
+/// One channel of rendering and target, line by line.
+#[derive(Clone, Copy)]
+struct Source<'a> {
+    grid: &'a Grid,
+    canvas: &'a [TileCanvas],
+    target: &'a Image8,
+    background: [f32; 3],
+    channel: usize,
+}
+
+impl Source<'_> {
+    /// e = rendering − target and y = target of image row `row` (0 where masked and in the pads).
+    #[inline(always)]
+    fn lines(&self, row: usize, e: &mut [f32], y: &mut [f32]) {
+        let Self { grid, canvas, target, background, channel } = *self;
+        e.fill(0.0);
+        y.fill(0.0);
+        let width = grid.width;
+        let pixels = row * width..(row + 1) * width;
+        let inner = PAD..PAD + width;
+        let bytes = &target.rgb[3 * pixels.start..3 * pixels.end];
+        for (y, rgb) in y[inner.clone()].iter_mut().zip(bytes.chunks_exact(3)) {
+            *y = f32::from(rgb[channel]) * (1.0 / 255.0);
+        }
+        if let Some(alpha) = &target.alpha {
+            for (y, &a) in y[inner.clone()].iter_mut().zip(&alpha[pixels.clone()]) {
+                let a = f32::from(a) * (1.0 / 255.0);
+                *y = a * *y + (1.0 - a) * background[channel];
+            }
+        }
+        let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
+        for (tile, e) in tiles.iter().zip(e[PAD..].chunks_exact_mut(TILE)) {
+            e.copy_from_slice(&tile.planes[channel][row % TILE]);
+        }
+        e[PAD + width..].fill(0.0);
+        for (e, &y) in e[inner.clone()].iter_mut().zip(&y[inner.clone()]) {
+            *e -= y;
+        }
+        if let Some(mask) = &target.mask {
+            masked(&mut e[inner], &mask[pixels]);
+        }
+    }
+}
+
+/// Σ_k WINDOW[k]·line[at + k − 5], for one vector. The window is cut out once, so that its eleven
+/// loads need no bounds check each.
+#[inline(always)]
+fn horizontal<S: Simd>(s: S, line: &[f32], at: usize) -> V<S> {
+    let around = &line[at - REACH..at + S::F32_LANES + REACH];
+    let mut sum = V::zero(s);
+    for (k, &w) in WINDOW.iter().enumerate() {
+        sum = V::splat(s, w).mul_add(V::load(s, &around[k..k + S::F32_LANES]), sum);
+    }
+    sum
+}
+
+/// The sums Σ_k WINDOW[k]·(line row + k)[at] of `N` quantities that stand in `blurred` one after
+/// another, `lines` lines each.
+#[inline(always)]
+fn vertical<S: Simd, const N: usize>(
+    s: S,
+    blurred: &[f32],
+    lines: usize,
+    row: usize,
+    stride: usize,
+    at: usize,
+) -> [V<S>; N] {
+    let mut sums = [V::zero(s); N];
+    for (quantity, sum) in sums.iter_mut().enumerate() {
+        let first = (quantity * lines + row) * stride + at;
+        let below = &blurred[first..first + 2 * REACH * stride + S::F32_LANES];
+        for (k, &w) in WINDOW.iter().enumerate() {
+            let line = &below[k * stride..k * stride + S::F32_LANES];
+            *sum = V::splat(s, w).mul_add(V::load(s, line), *sum);
+        }
+    }
+    sums
+}
+
+/// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
+struct Similarity<'a> {
+    grid: &'a Grid,
+    first: usize,
+    stride: usize,
+    scratch: &'a mut Vec<f32>,
+    e: &'a [f32],
+    y: &'a [f32],
+    /// The strip's lines.
+    derivatives: [&'a mut [f32]; 3],
+    /// The strip's lines; empty unless asked for.
+    error: &'a mut [f32],
+    /// Weights of |e| and of 1 − SSIM in it.
+    error_weights: [f32; 2],
+}
+
+impl WithSimd for Similarity<'_> {
+    /// Sums over the strip's pixels.
+    type Output = LossValue;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> LossValue {
+        let Self { grid, first, stride, scratch, e, y, derivatives, error, error_weights } = self;
+        let [p1, p2, p3] = derivatives;
+        let (width, height) = (grid.width, grid.height);
+        let rows = p1.len() / stride;
+        let lines = rows + 2 * REACH;
+        scratch.clear();
+        scratch.resize((3 + 5 * lines) * stride, 0.0);
+        let (products, blurred) = scratch.split_at_mut(3 * stride);
+        let (ee, rest) = products.split_at_mut(stride);
+        let (yy, ey) = rest.split_at_mut(stride);
+        let columns = (PAD..PAD + width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
+        for l in 0..lines {
+            let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < height) else {
+                continue;
+            };
+            let line_e = &e[row * stride..(row + 1) * stride];
+            let line_y = &y[row * stride..(row + 1) * stride];
+            for at in columns.clone() {
+                let (e, y) = (V::load(s, &line_e[at..]), V::load(s, &line_y[at..]));
+                (e * e).store(&mut ee[at..]);
+                (y * y).store(&mut yy[at..]);
+                (e * y).store(&mut ey[at..]);
+            }
+            for at in columns.clone() {
+                for (quantity, line) in [line_e, line_y, &*ee, &*yy, &*ey].iter().enumerate() {
+                    let to = (quantity * lines + l) * stride + at;
+                    horizontal(s, line, at).store(&mut blurred[to..]);
+                }
+            }
+        }
+        let c = |x: f32| V::splat(s, x);
+        let mut total = LossValue::default();
+        for row in 0..rows {
+            let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
+            for at in columns.clone() {
+                let [mu_e, mu_y, mean_ee, mean_yy, mean_ey] =
+                    vertical(s, blurred, lines, row, stride, at);
+                let mu_x = mu_e + mu_y;
+                let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
+                let var_y = (mean_yy - mu_y * mu_y).max(V::zero(s));
+                let cov = mean_ey - mu_e * mu_y;
+                let var_x = (var_y + cov * 2.0 + var_e).max(V::zero(s));
+                let inv_a = c(1.0) / (mu_x * mu_x + mu_y * mu_y + C1);
+                let inv_b = c(1.0) / (var_x + var_y + C2);
+                let luminance = c(1.0) - mu_e * mu_e * inv_a;
+                let contrast = c(1.0) - var_e * inv_b;
+                let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
+                let two_ve_bb = var_e * inv_b * inv_b * 2.0;
+                let by_contrast = mu_e * contrast * inv_b * 2.0 - mu_y * two_ve_bb;
+                let inside = V::load(s, &LANES[..]).lt(c((PAD + width - at) as f32));
+                let to = row * stride + at;
+                inside.keep(contrast * by_luminance + luminance * by_contrast).store(&mut p1[to..]);
+                inside.keep(-(luminance * contrast * inv_b)).store(&mut p2[to..]);
+                inside.keep(luminance * two_ve_bb).store(&mut p3[to..]);
+                let abs = V::load(s, &e[first * stride + to..]).abs();
+                let ssim = inside.keep(luminance * contrast);
+                row_l1 = row_l1 + abs;
+                row_ssim = row_ssim + ssim;
+                if !error.is_empty() {
+                    let dssim = inside.keep(c(1.0) - ssim);
+                    let add = abs * error_weights[0] + dssim * error_weights[1];
+                    (V::load(s, &error[to..]) + add).store(&mut error[to..]);
+                }
+            }
+            total.l1 += f64::from(row_l1.sum());
+            total.ssim += f64::from(row_ssim.sum());
+        }
+        total
+    }
+}
+
+/// 0, 1, 2, …
+const LANES: [f32; WIDTH] = {
+    let mut lanes = [0.0; WIDTH];
+    let mut i = 0;
+    while i < WIDTH {
+        lanes[i] = i as f32;
+        i += 1;
+    }
+    lanes
+};
+
+/// Second pass over one strip of one channel: dL/dpixel.
+struct Gradient<'a> {
+    grid: &'a Grid,
+    channel: usize,
+    first: usize,
+    stride: usize,
+    scratch: &'a mut Vec<f32>,
+    e: &'a [f32],
+    y: &'a [f32],
+    derivatives: [&'a [f32]; 3],
+    /// 1 / number of samples.
+    scale: f32,
+    mask: Option<&'a [u8]>,
+    /// The strip's tiles.
+    tiles: &'a mut [TileGradient],
+}
+
+impl WithSimd for Gradient<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, mask, tiles } =
+            self;
+        let rows = STRIP.min(grid.height - first);
+        let lines = rows + 2 * REACH;
+        scratch.clear();
+        scratch.resize(3 * lines * stride, 0.0);
+        let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
+        for l in 0..lines {
+            let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < grid.height) else {
+                continue;
+            };
+            for at in columns.clone() {
+                for (quantity, plane) in derivatives.iter().enumerate() {
+                    let line = &plane[row * stride..(row + 1) * stride];
+                    let to = (quantity * lines + l) * stride + at;
+                    horizontal(s, line, at).store(&mut scratch[to..]);
+                }
+            }
+        }
+        let (l1_scale, ssim_scale) = ((1.0 - SSIM_WEIGHT) * scale, -SSIM_WEIGHT * scale);
+        let zero = V::zero(s);
+        for tile in tiles.iter_mut() {
+            tile.planes[channel] = DARK;
+        }
+        for row in 0..rows {
+            for at in columns.clone() {
+                let [by_mu_e, by_ee, by_ey] = vertical(s, scratch, lines, row, stride, at);
+                let from = (first + row) * stride + at;
+                let (e, y) = (V::load(s, &e[from..]), V::load(s, &y[from..]));
+                let by_ssim = by_mu_e + e * 2.0 * by_ee + y * by_ey;
+                let positive = zero.lt(e).keep(V::splat(s, l1_scale));
+                let negative = e.lt(zero).keep(V::splat(s, l1_scale));
+                let g = by_ssim * ssim_scale + (positive - negative);
+                let x = at - PAD;
+                let tile = &mut tiles[row / TILE * grid.columns + x / TILE];
+                g.store(&mut tile.planes[channel][row % TILE][x % TILE..]);
+            }
+            // The loss sees e·mask, so the chain rule has the mask once more.
+            if let Some(mask) = mask {
+                let row_of_tiles = row / TILE * grid.columns;
+                let mask = &mask[(first + row) * grid.width..][..grid.width];
+                for (tile, mask) in tiles[row_of_tiles..].iter_mut().zip(mask.chunks(TILE)) {
+                    masked(&mut tile.planes[channel][row % TILE], mask);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! Stages 6–8 together, block by block: parameter gradients, signals, Adam. A block's gradients
+//! live in the cache only; there is no gradient buffer of the model's size.
+
+use pulp::{Simd, WithSimd};
+
+use super::adam::{self, BiasCorrection};
+use super::blocks::{plane, planes};
+use super::project::ViewParams;
+use super::project_bwd::BlockGradient;
+use super::rasterize_bwd::{Detail, field};
+use super::signals::Layout;
+use super::simd::WIDTH;
+use crate::backend::LearningRates;
+use crate::gaussians::sh_coefficients;
+
+/// One optimiser step for a run of whole blocks.
+pub(super) struct Optimise<'a> {
+    pub(super) params: &'a mut [f32],
+    pub(super) moments: [&'a mut [f32]; 2],
+    /// Numbers per block of the three above.
+    pub(super) stride: usize,
+    pub(super) ages: &'a mut [u16],
+    /// Accumulators of these blocks; empty if no sum is requested.
+    pub(super) signals: &'a mut [f32],
+    pub(super) layout: Layout,
+    /// Shape: [rows, detail.stride()].
+    pub(super) sums: &'a [f32],
+    pub(super) detail: Detail,
+    /// Shape: [blocks].
+    pub(super) visible: &'a [u16],
+    pub(super) view: &'a ViewParams,
+    pub(super) rates: &'a LearningRates,
+    pub(super) bias: &'a BiasCorrection,
+}
+
+impl WithSimd for Optimise<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { params, moments: [m, v], stride, ages, signals, layout, sums, .. } = self;
+        let Self { detail, visible, view, rates, bias, .. } = self;
+        let trained = planes(view.sh_degree);
+        let mut gradient = BlockGradient::ZERO;
+        let mut was_zero = true;
+        let signal_stride = signals.len() / visible.len().max(1);
+        for (b, &seen) in visible.iter().enumerate() {
+            let of = b * stride..(b + 1) * stride;
+            let per_block = WIDTH * detail.stride();
+            let sums = &sums[b * per_block..(b + 1) * per_block];
+            if seen != 0 || !was_zero {
+                gradient.compute(s, &params[of.clone()], sums, detail, seen, view);
+                was_zero = seen == 0;
+            }
+            if seen != 0 && signal_stride > 0 {
+                let block = &mut signals[b * signal_stride..(b + 1) * signal_stride];
+                layout.accumulate(s, block, &gradient, detail, view);
+            }
+            adam::step(
+                s,
+                &mut params[of.clone()],
+                [&mut m[of.clone()], &mut v[of]],
+                &mut ages[b * WIDTH..(b + 1) * WIDTH],
+                &gradient.params,
+                trained,
+                rates,
+                bias,
+            );
+        }
+    }
+}
+
+/// Gradients of every parameter and of what signals are made of, for one view.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ModelGradient {
+    /// dL/d(mean). Shape: [rows].
+    pub means: Vec<[f32; 3]>,
+    /// dL/d(log-scale). Shape: [rows].
+    pub log_scales: Vec<[f32; 3]>,
+    /// dL/d(raw quaternion). Shape: [rows].
+    pub quats: Vec<[f32; 4]>,
+    /// dL/d(opacity logit). Shape: [rows].
+    pub opacity_logits: Vec<f32>,
+    /// dL/d(coefficients), coefficient-major, RGB last. Shape: [rows, (degree + 1)², 3].
+    pub sh: Vec<f32>,
+    /// dL/d(projected mean) [1/px]. Shape: [rows].
+    pub mean2d: Vec<[f32; 2]>,
+    /// Σ over pixels of the absolute values of the same [1/px]. Shape: [rows].
+    pub mean2d_abs: Vec<[f32; 2]>,
+    /// dL/d(colour as blended). Shape: [rows].
+    pub colour: Vec<[f32; 3]>,
+    /// Largest blend weight α·T over pixels. Shape: [rows].
+    pub max_weight: Vec<f32>,
+    /// Sum of the blend weights. Shape: [rows].
+    pub sum_weight: Vec<f32>,
+    /// Pixels blended into. Shape: [rows].
+    pub pixel_count: Vec<u32>,
+    /// Whether the row's projection is on screen. Shape: [rows].
+    pub visible: Vec<bool>,
+}
+
+impl ModelGradient {
+    pub(super) fn zeros(rows: usize, sh_degree: u8) -> Self {
+        Self {
+            means: vec![[0.0; 3]; rows],
+            log_scales: vec![[0.0; 3]; rows],
+            quats: vec![[0.0; 4]; rows],
+            opacity_logits: vec![0.0; rows],
+            sh: vec![0.0; rows * 3 * sh_coefficients(sh_degree)],
+            mean2d: vec![[0.0; 2]; rows],
+            mean2d_abs: vec![[0.0; 2]; rows],
+            colour: vec![[0.0; 3]; rows],
+            max_weight: vec![0.0; rows],
+            sum_weight: vec![0.0; rows],
+            pixel_count: vec![0; rows],
+            visible: vec![false; rows],
+        }
+    }
+}
+
+/// The gradients of a whole model, without a step.
+pub(super) struct Differentiate<'a> {
+    pub(super) params: &'a [f32],
+    pub(super) stride: usize,
+    /// Records of [`Detail::All`].
+    pub(super) sums: &'a [f32],
+    pub(super) visible: &'a [u16],
+    pub(super) view: &'a ViewParams,
+    pub(super) out: &'a mut ModelGradient,
+}
+
+impl WithSimd for Differentiate<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { params, stride, sums, visible, view, out } = self;
+        let per_block = WIDTH * Detail::All.stride();
+        let sh_planes = stride / WIDTH - plane::SH;
+        let trained = planes(view.sh_degree) - plane::SH;
+        let mut g = BlockGradient::ZERO;
+        for (b, block) in params.chunks_exact(stride).enumerate() {
+            let sums = &sums[b * per_block..(b + 1) * per_block];
+            g.compute(s, block, sums, Detail::All, visible[b], view);
+            for lane in 0..WIDTH.min(out.means.len() - b * WIDTH) {
+                let row = b * WIDTH + lane;
+                let at = |p: usize| g.params[p * WIDTH + lane];
+                let sum = |f: usize| g.sums[f][lane];
+                out.means[row] = [0, 1, 2].map(|i| at(plane::MEAN + i));
+                out.log_scales[row] = [0, 1, 2].map(|i| at(plane::LOG_SCALE + i));
+                out.quats[row] = [0, 1, 2, 3].map(|i| at(plane::QUAT + i));
+                out.opacity_logits[row] = at(plane::OPACITY);
+                for i in 0..trained {
+                    out.sh[row * sh_planes + i] = at(plane::SH + i);
+                }
+                out.mean2d[row] = g.mean2d.map(|line| line[lane]);
+                out.mean2d_abs[row] = g.mean2d_abs.map(|line| line[lane]);
+                out.colour[row] = [0, 1, 2].map(|i| sum(field::COLOUR + i));
+                out.max_weight[row] = sum(field::WEIGHT_MAX);
+                out.sum_weight[row] = sum(field::WEIGHT_SUM);
+                out.pixel_count[row] = sum(field::PIXELS) as u32;
+                out.visible[row] = g.visible[lane] != 0.0;
+            }
+        }
+    }
+}

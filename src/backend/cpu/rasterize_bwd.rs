@@ -1,0 +1,289 @@
+//! Stage 5: pixel gradients to splat gradients, one record per (row, tile) entry.
+//!
+//! Each tile's list is walked back to front. For pixel x and splat i with blend weight w = α·T,
+//! the derivative of Σ g·C is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
+//! everything behind the splat, background included, normalised by the transmittance there. b is
+//! a running convex combination, b ← b + α(c·g − b): nothing is subtracted from a total, so that
+//! nothing cancels however little light is left. T comes back from the final transmittance as
+//! T ← T/(1 − α), exact to one rounding per splat because α <= 0.99.
+//!
+//! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, all that the parameters need of
+//! a tile are sums of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα (and of w·g for the colour):
+//! the covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments, and it is never
+//! formed; see `project_bwd`.
+//!
+//! Records are summed per row in order of tile number, so the sum does not depend on threads.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+use pulp::{Simd, WithSimd};
+
+use super::project::{LOG2_255, Splat};
+use super::rasterize::{
+    ALPHA_MAX, Aligned, BATCH, CENTRES, DARK, Plane, Rows, TRANSMITTANCE, TileCanvas, TilePlace,
+};
+use super::simd::{V, WIDTH, each};
+use super::tiles::{Entry, TILE};
+
+/// Fields of a record.
+pub(super) mod field {
+    pub(in super::super) const Q: usize = 0;
+    pub(in super::super) const U: usize = 1;
+    pub(in super::super) const Z: usize = 2;
+    pub(in super::super) const UU: usize = 3;
+    pub(in super::super) const UZ: usize = 4;
+    pub(in super::super) const ZZ: usize = 5;
+    pub(in super::super) const COLOUR: usize = 6;
+    /// Σ|q·u| and Σ|q·(l3·z − l1·shear·u)|: the absolute gradients of the projected mean.
+    pub(in super::super) const ABS_X: usize = 9;
+    pub(in super::super) const ABS_Y: usize = 10;
+    /// Σw, number of pixels, Σw·(gradient of depth), max w.
+    pub(in super::super) const WEIGHT_SUM: usize = 11;
+    pub(in super::super) const PIXELS: usize = 12;
+    pub(in super::super) const DEPTH: usize = 13;
+    pub(in super::super) const WEIGHT_MAX: usize = 14;
+    /// Fields that are always there.
+    pub(in super::super) const FEW: usize = 9;
+    /// All fields.
+    pub(in super::super) const ALL: usize = 15;
+}
+
+/// Which fields a record has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Detail {
+    /// What training needs.
+    Gradients,
+    /// That, and the largest blend weight.
+    WeightMax,
+    /// Every field, alpha and depth gradients included.
+    All,
+}
+
+impl Detail {
+    /// Numbers per record: with [`Detail::WeightMax`] the maximum takes the place after colour.
+    pub(super) const fn stride(self) -> usize {
+        match self {
+            Self::Gradients => field::FEW,
+            Self::WeightMax => field::FEW + 1,
+            Self::All => field::ALL,
+        }
+    }
+
+    /// Which field is a maximum; all others are sums.
+    pub(super) const fn maximum(self) -> Option<usize> {
+        match self {
+            Self::Gradients => None,
+            Self::WeightMax => Some(field::FEW),
+            Self::All => Some(field::WEIGHT_MAX),
+        }
+    }
+}
+
+/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are read for
+/// [`Detail::All`] only.
+#[derive(Debug, Clone)]
+#[repr(C, align(64))]
+pub(super) struct TileGradient {
+    pub(super) planes: [Plane; 5],
+}
+
+/// Differentiates one tile.
+pub(super) struct RasterizeBwd<'a> {
+    pub(super) splats: &'a [Splat],
+    /// Sorted.
+    pub(super) list: &'a [AtomicU64],
+    pub(super) place: TilePlace,
+    pub(super) background: [f32; 3],
+    pub(super) canvas: &'a TileCanvas,
+    pub(super) upstream: [&'a Plane; 3],
+    /// Alpha and depth, for [`Detail::All`].
+    pub(super) upstream_more: Option<[&'a Plane; 2]>,
+    pub(super) detail: Detail,
+    /// Bits of one record per slot; this tile writes those of its own entries.
+    /// Shape: [cap, detail.stride()].
+    pub(super) records: &'a [AtomicU32],
+}
+
+impl WithSimd for RasterizeBwd<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        match self.detail {
+            Detail::Gradients => self.run::<S, 0>(s),
+            Detail::WeightMax => self.run::<S, 1>(s),
+            Detail::All => self.run::<S, 2>(s),
+        }
+    }
+}
+
+/// Sums of one entry, lane by lane.
+struct Sums<S: Simd> {
+    few: [V<S>; field::FEW],
+    abs: [V<S>; 2],
+    weight: V<S>,
+    pixels: V<S>,
+    depth: V<S>,
+    weight_max: V<S>,
+}
+
+impl RasterizeBwd<'_> {
+    #[inline(always)]
+    fn run<S: Simd, const DETAIL: u8>(self, s: S) {
+        let Self { splats, list, place, background, canvas, upstream, records, detail, .. } = self;
+        let stride = detail.stride();
+        let c = |x: f32| V::splat(s, x);
+        let [gr, gg, gb] = upstream;
+        let [ga, gd] = self.upstream_more.unwrap_or([&DARK, &DARK]);
+
+        // State per pixel, as it is behind the splat at hand.
+        let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
+        let mut behind = Aligned(DARK);
+        let (light, behind) = (&mut light.0, &mut behind.0);
+        for y in 0..TILE {
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let b = V::load(s, &gr[y][at..]) * background[0]
+                    + V::load(s, &gg[y][at..]) * background[1]
+                    + V::load(s, &gb[y][at..]) * background[2];
+                b.store(&mut behind[y][at..]);
+            }
+        }
+        // One past the last list entry that any pixel of the row takes.
+        let mut row_end = [0_u32; TILE];
+        for (y, end) in row_end.iter_mut().enumerate().take(place.height) {
+            let row = &canvas.stop[y][..place.width];
+            *end = row.iter().copied().max().unwrap_or(0).min(list.len() as u32);
+        }
+        let list_end = row_end.iter().copied().max().unwrap_or(0) as usize;
+        for entry in &list[list_end..] {
+            write(record_of(records, entry, stride), &[0.0; field::ALL]);
+        }
+
+        let mut batch = [Splat::default(); BATCH];
+        let mut rows = Rows::EMPTY;
+        let batches = list_end.div_ceil(BATCH);
+        for n in (0..batches).rev() {
+            let first = n * BATCH;
+            let chunk = &list[first..list_end.min(first + BATCH)];
+            for (splat, entry) in batch.iter_mut().zip(chunk) {
+                *splat = splats[Entry::load(entry).row];
+            }
+            let mut alive = 0_u32;
+            for (y, &end) in row_end.iter().enumerate() {
+                alive |= u32::from(end as usize > first) << y;
+            }
+            for (i, splat) in batch[..chunk.len()].iter().enumerate().rev() {
+                rows.set(s, splat, &place);
+                let mut todo = rows.mask & alive;
+                let l1 = c(splat.l1);
+                let colour = each!(i in 3 => c(splat.colour[i]));
+                let at_depth = c(splat.depth);
+                let here = s.splat_u32s((first + i) as u32);
+                let y2_u = c(-splat.l1 * splat.shear);
+                let zero = V::zero(s);
+                let mut sums = Sums {
+                    few: [zero; field::FEW],
+                    abs: [zero; 2],
+                    weight: zero,
+                    pixels: zero,
+                    depth: zero,
+                    weight_max: zero,
+                };
+                while todo != 0 {
+                    let y = todo.trailing_zeros() as usize % TILE;
+                    todo &= todo - 1;
+                    let (top, offset, z) = (c(rows.top[y]), c(rows.offset[y]), c(rows.z[y]));
+                    for at in (0..WIDTH).step_by(S::F32_LANES) {
+                        let u = l1.mul_add(V::load(s, &CENTRES[at..]), offset);
+                        let e = u.neg_mul_add(u, top);
+                        let stop = S::as_simd_u32s(&canvas.stop[y][at..]).0[0];
+                        let seen = c(-LOG2_255).le(e).and(super::simd::before(s, here, stop));
+                        let unclamped = e.exp2();
+                        let alpha = seen.keep(unclamped.min(c(ALPHA_MAX)));
+                        let t = V::load(s, &light[y][at..]) / (c(1.0) - alpha);
+                        t.store(&mut light[y][at..]);
+                        let w = alpha * t;
+                        let (r, g, b) = (
+                            V::load(s, &gr[y][at..]),
+                            V::load(s, &gg[y][at..]),
+                            V::load(s, &gb[y][at..]),
+                        );
+                        let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
+                        if DETAIL == 2 {
+                            let d = V::load(s, &gd[y][at..]);
+                            own = at_depth.mul_add(d, own + V::load(s, &ga[y][at..]));
+                            sums.depth = w.mul_add(d, sums.depth);
+                        }
+                        let was = V::load(s, &behind[y][at..]);
+                        let ahead = own - was;
+                        alpha.mul_add(ahead, was).store(&mut behind[y][at..]);
+                        // No gradient where alpha is at its clamp.
+                        let q = unclamped.le(c(ALPHA_MAX)).keep(w * ahead);
+                        let qu = q * u;
+                        let qz = q * z;
+                        let few = &mut sums.few;
+                        few[field::Q] = few[field::Q] + q;
+                        few[field::U] = few[field::U] + qu;
+                        few[field::Z] = few[field::Z] + qz;
+                        few[field::UU] = qu.mul_add(u, few[field::UU]);
+                        few[field::UZ] = qu.mul_add(z, few[field::UZ]);
+                        few[field::ZZ] = qz.mul_add(z, few[field::ZZ]);
+                        few[field::COLOUR] = w.mul_add(r, few[field::COLOUR]);
+                        few[field::COLOUR + 1] = w.mul_add(g, few[field::COLOUR + 1]);
+                        few[field::COLOUR + 2] = w.mul_add(b, few[field::COLOUR + 2]);
+                        if DETAIL >= 1 {
+                            sums.weight_max = sums.weight_max.max(w);
+                        }
+                        if DETAIL == 2 {
+                            sums.abs[0] = sums.abs[0] + qu.abs();
+                            let y2 = y2_u.mul_add(qu, qz * splat.l3);
+                            sums.abs[1] = sums.abs[1] + y2.abs();
+                            sums.weight = sums.weight + w;
+                            sums.pixels = sums.pixels + zero.lt(w).keep(c(1.0));
+                        }
+                    }
+                }
+                let mut record = [0.0; field::ALL];
+                for (slot, sum) in record.iter_mut().zip(sums.few) {
+                    *slot = sum.sum();
+                }
+                match DETAIL {
+                    1 => record[field::FEW] = sums.weight_max.max_lane(),
+                    2 => {
+                        record[field::ABS_X] = sums.abs[0].sum();
+                        record[field::ABS_Y] = sums.abs[1].sum();
+                        record[field::WEIGHT_SUM] = sums.weight.sum();
+                        record[field::PIXELS] = sums.pixels.sum();
+                        record[field::DEPTH] = sums.depth.sum();
+                        record[field::WEIGHT_MAX] = sums.weight_max.max_lane();
+                    }
+                    _ => {}
+                }
+                write(record_of(records, &chunk[i], stride), &record);
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn record_of<'a>(records: &'a [AtomicU32], entry: &AtomicU64, stride: usize) -> &'a [AtomicU32] {
+    let slot = Entry::load(entry).slot;
+    &records[slot * stride..(slot + 1) * stride]
+}
+
+#[inline(always)]
+fn write(to: &[AtomicU32], record: &[f32; field::ALL]) {
+    for (to, x) in to.iter().zip(record) {
+        to.store(x.to_bits(), Relaxed);
+    }
+}
+
+/// Adds the records of one row, which lie side by side, to its sums, in order.
+pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
+    for record in records.chunks_exact(detail.stride()) {
+        for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
+            let x = f32::from_bits(x.load(Relaxed));
+            *sum = if detail.maximum() == Some(i) { sum.max(x) } else { *sum + x };
+        }
+    }
+}

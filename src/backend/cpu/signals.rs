@@ -1,0 +1,202 @@
+//! Stage 8: what policies ask for, summed over views. Only requested signals have memory.
+
+use densify_policies::policy::{Signal, SignalSet, Signals};
+use pulp::Simd;
+
+use super::blocks::{Blocks, plane};
+use super::project::{ViewParams, dot, lanes};
+use super::project_bwd::BlockGradient;
+use super::rasterize_bwd::{Detail, field};
+use super::simd::{V, WIDTH, each};
+
+/// Signals that are sums over views, in plane order.
+const SUMS: [Signal; 10] = [
+    Signal::VisibleCount,
+    Signal::ScreenGradient,
+    Signal::ScreenGradientAbs,
+    Signal::ColourGradient,
+    Signal::MeanGradientX,
+    Signal::MeanGradientY,
+    Signal::MeanGradientZ,
+    Signal::MeanGradientNorm,
+    Signal::WeightSum,
+    Signal::PixelCount,
+];
+
+/// The accumulators of the requested signals.
+#[derive(Debug)]
+pub(super) struct Accumulators {
+    requested: SignalSet,
+    layout: Layout,
+    pub(super) blocks: Blocks,
+}
+
+/// Which plane holds which signal.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Layout {
+    sums: [Option<usize>; SUMS.len()],
+    /// Largest weight of the previous epoch, and of the current one.
+    weight_max: Option<[usize; 2]>,
+    planes: usize,
+}
+
+#[inline(always)]
+fn norm2<S: Simd>(x: V<S>, y: V<S>) -> V<S> {
+    (x * x + y * y).sqrt()
+}
+
+#[inline(always)]
+fn norm3<S: Simd>(v: [V<S>; 3]) -> V<S> {
+    dot(v, v).sqrt()
+}
+
+impl Layout {
+    fn new(requested: SignalSet) -> Self {
+        let mut planes = 0;
+        let mut next = |wanted: bool| {
+            planes += usize::from(wanted);
+            wanted.then(|| planes - 1)
+        };
+        let sums = SUMS.map(|signal| next(requested.contains(signal)));
+        let previous = next(requested.contains(Signal::WeightMax));
+        let current = next(requested.contains(Signal::WeightMax));
+        let weight_max = previous.zip(current).map(|(a, b)| [a, b]);
+        Self { sums, weight_max, planes }
+    }
+
+    /// Adds one view's contribution to the accumulators of a block.
+    #[inline(always)]
+    pub(super) fn accumulate<S: Simd>(
+        &self,
+        s: S,
+        block: &mut [f32],
+        g: &BlockGradient,
+        detail: Detail,
+        view: &ViewParams,
+    ) {
+        let half = [V::splat(s, 0.5 * view.width as f32), V::splat(s, 0.5 * view.height as f32)];
+        for at in (0..WIDTH).step_by(S::F32_LANES) {
+            macro_rules! line {
+                ($line:expr) => {
+                    V::load(s, &$line[at..])
+                };
+            }
+            macro_rules! sum {
+                ($field:expr) => {
+                    line!(g.sums[$field])
+                };
+            }
+            let mean = each!(i in 3 => lanes(s, &g.params, plane::MEAN + i, at));
+            for (signal, plane) in SUMS.iter().zip(self.sums) {
+                let Some(plane) = plane else { continue };
+                let x = match signal {
+                    Signal::VisibleCount => line!(g.visible),
+                    Signal::ScreenGradient => {
+                        norm2(line!(g.mean2d[0]) * half[0], line!(g.mean2d[1]) * half[1])
+                    }
+                    Signal::ScreenGradientAbs => {
+                        norm2(line!(g.mean2d_abs[0]) * half[0], line!(g.mean2d_abs[1]) * half[1])
+                    }
+                    Signal::ColourGradient => norm3(each!(i in 3 => sum!(field::COLOUR + i))),
+                    Signal::MeanGradientX => mean[0],
+                    Signal::MeanGradientY => mean[1],
+                    Signal::MeanGradientZ => mean[2],
+                    Signal::MeanGradientNorm => norm3(mean),
+                    Signal::WeightSum => sum!(field::WEIGHT_SUM),
+                    _ => sum!(field::PIXELS),
+                };
+                let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
+                (V::load(s, to) + x).store(to);
+            }
+            if let (Some([_, current]), Some(maximum)) = (self.weight_max, detail.maximum()) {
+                let to = &mut block[current * WIDTH + at..(current + 1) * WIDTH];
+                V::load(s, to).max(sum!(maximum)).store(to);
+            }
+        }
+    }
+}
+
+impl Accumulators {
+    pub(super) fn new(budget: usize, requested: SignalSet) -> Self {
+        let layout = Layout::new(requested);
+        Self { requested, layout, blocks: Blocks::zeros(budget, layout.planes) }
+    }
+
+    pub(super) fn bytes(budget: usize, requested: SignalSet) -> u64 {
+        Blocks::bytes(budget, Layout::new(requested).planes)
+    }
+
+    pub(super) fn layout(&self) -> Layout {
+        self.layout
+    }
+
+    /// Which record fields the requested signals need.
+    pub(super) fn detail(&self) -> Detail {
+        let any = |signals: &[Signal]| signals.iter().any(|&s| self.requested.contains(s));
+        if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
+            Detail::All
+        } else if any(&[Signal::WeightMax]) {
+            Detail::WeightMax
+        } else {
+            Detail::Gradients
+        }
+    }
+
+    /// The current epoch's largest weights become the previous one's.
+    pub(super) fn begin_epoch(&mut self, rows: usize) {
+        if let Some([previous, current]) = self.layout.weight_max {
+            for row in 0..rows {
+                self.blocks.set(row, previous, self.blocks.get(row, current));
+                self.blocks.set(row, current, 0.0);
+            }
+        }
+    }
+
+    /// Sums start anew; the largest weights stay.
+    pub(super) fn reset(&mut self, rows: usize) {
+        for plane in self.layout.sums.into_iter().flatten() {
+            for row in 0..rows {
+                self.blocks.set(row, plane, 0.0);
+            }
+        }
+    }
+
+    /// The requested signals of the first `rows` rows.
+    pub(super) fn take(
+        &self,
+        rows: usize,
+        wanted: SignalSet,
+        params: &Blocks,
+        ages: &[u16],
+    ) -> Signals {
+        let mut signals = Signals::zeros(rows, wanted);
+        for signal in wanted.iter() {
+            let value = |row: usize| -> f32 {
+                match signal {
+                    Signal::WeightMax => {
+                        self.layout.weight_max.map_or(0.0, |[previous, current]| {
+                            self.blocks.get(row, previous).max(self.blocks.get(row, current))
+                        })
+                    }
+                    Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
+                    Signal::ScaleMax => {
+                        let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);
+                        x.max(y).max(z).exp()
+                    }
+                    Signal::Age => f32::from(ages[row]),
+                    sum => SUMS
+                        .iter()
+                        .position(|&s| s == sum)
+                        .and_then(|i| self.layout.sums[i])
+                        .map_or(0.0, |plane| self.blocks.get(row, plane)),
+                }
+            };
+            if let Some(column) = signals.get_mut(signal) {
+                for (row, slot) in column.iter_mut().enumerate() {
+                    *slot = value(row);
+                }
+            }
+        }
+        signals
+    }
+}

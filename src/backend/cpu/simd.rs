@@ -1,0 +1,312 @@
+//! A vector of `f32` lanes with operators, over whatever instruction set the machine has.
+//!
+//! `pulp` dispatches at run time (AVX-512, AVX2, NEON, baseline). Its methods take the token first
+//! and read poorly in formulas; [`V`] carries the token along and overloads the operators. All is
+//! inlined into the dispatched kernel, so the wrapper costs nothing.
+
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+use pulp::Simd;
+
+/// Rows per block, and pixels per tile row: every lane count divides it.
+pub(super) const WIDTH: usize = 16;
+
+/// `[e(0), e(1), …]` without a closure: `each!(k in 3 => e(k))`.
+///
+/// Closures, those given to `array::map` among them, are compiled without the kernel's instruction
+/// set unless they happen to be inlined, and then every operator in them is a call.
+macro_rules! each {
+    ($k:ident in 2 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e)]
+    };
+    ($k:ident in 3 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e), each!(@ $k 2 $e)]
+    };
+    ($k:ident in 4 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e), each!(@ $k 2 $e), each!(@ $k 3 $e)]
+    };
+    (@ $k:ident $value:literal $e:expr) => {{
+        let $k: usize = $value;
+        $e
+    }};
+}
+pub(super) use each;
+
+/// `S::F32_LANES` numbers.
+#[derive(Clone, Copy)]
+pub(super) struct V<S: Simd> {
+    s: S,
+    v: S::f32s,
+}
+
+/// One truth value per lane.
+#[derive(Clone, Copy)]
+pub(super) struct Mask<S: Simd> {
+    s: S,
+    m: S::m32s,
+}
+
+impl<S: Simd> V<S> {
+    #[inline(always)]
+    pub(super) fn splat(s: S, x: f32) -> Self {
+        Self { s, v: s.splat_f32s(x) }
+    }
+
+    /// `x` in every lane, with the token of another vector.
+    #[inline(always)]
+    pub(super) fn splat_like(other: Self, x: f32) -> Self {
+        Self::splat(other.s, x)
+    }
+
+    #[inline(always)]
+    pub(super) fn zero(s: S) -> Self {
+        Self::splat(s, 0.0)
+    }
+
+    /// The lanes `at * LANES ..` of `from`.
+    #[inline(always)]
+    pub(super) fn load(s: S, from: &[f32]) -> Self {
+        Self { s, v: S::as_simd_f32s(from).0[0] }
+    }
+
+    #[inline(always)]
+    pub(super) fn store(self, to: &mut [f32]) {
+        S::as_mut_simd_f32s(to).0[0] = self.v;
+    }
+
+    /// self · b + c.
+    #[inline(always)]
+    pub(super) fn mul_add(self, b: Self, c: Self) -> Self {
+        Self { s: self.s, v: self.s.mul_add_e_f32s(self.v, b.v, c.v) }
+    }
+
+    /// c − self · b.
+    #[inline(always)]
+    pub(super) fn neg_mul_add(self, b: Self, c: Self) -> Self {
+        Self { s: self.s, v: self.s.negate_mul_add_e_f32s(self.v, b.v, c.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn min(self, b: Self) -> Self {
+        Self { s: self.s, v: self.s.min_f32s(self.v, b.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn max(self, b: Self) -> Self {
+        Self { s: self.s, v: self.s.max_f32s(self.v, b.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn abs(self) -> Self {
+        Self { s: self.s, v: self.s.abs_f32s(self.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn sqrt(self) -> Self {
+        Self { s: self.s, v: self.s.sqrt_f32s(self.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn lt(self, b: Self) -> Mask<S> {
+        Mask { s: self.s, m: self.s.less_than_f32s(self.v, b.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn le(self, b: Self) -> Mask<S> {
+        Mask { s: self.s, m: self.s.less_than_or_equal_f32s(self.v, b.v) }
+    }
+
+    #[inline(always)]
+    pub(super) fn sum(self) -> f32 {
+        self.s.reduce_sum_f32s(self.v)
+    }
+
+    #[inline(always)]
+    pub(super) fn max_lane(self) -> f32 {
+        self.s.reduce_max_f32s(self.v)
+    }
+
+    /// 2^self for self in [−126, 126]; relative error below 2e-7. Outside, any value.
+    ///
+    /// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest, in
+    /// [−½, ½], goes through the degree-6 minimax polynomial of 2^f (error 2e-9).
+    #[inline(always)]
+    pub(super) fn exp2(self) -> Self {
+        let s = self.s;
+        let magic = Self::splat(s, 12_582_912.0);
+        let shifted = self + magic;
+        let f = self - (shifted - magic);
+        let c = |x: f32| Self::splat(s, x);
+        let p = c(1.534_581_2e-4)
+            .mul_add(f, c(1.339_993_1e-3))
+            .mul_add(f, c(9.618_489e-3))
+            .mul_add(f, c(5.550_328_8e-2))
+            .mul_add(f, c(2.402_264_7e-1))
+            .mul_add(f, c(6.931_472e-1))
+            .mul_add(f, c(1.0));
+        let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
+        let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
+        Self { s, v: s.transmute_f32s_u32s(bits) }
+    }
+
+    /// e^self, clamped to self in [−87, 88]; relative error below 2e-7.
+    #[inline(always)]
+    pub(super) fn exp(self) -> Self {
+        let s = self.s;
+        let c = |x: f32| Self::splat(s, x);
+        let x = self.max(c(-87.0)).min(c(88.0));
+        let magic = c(12_582_912.0);
+        let shifted = x.mul_add(c(std::f32::consts::LOG2_E), magic);
+        let n = shifted - magic;
+        // ln 2 in two parts (Cody and Waite): the first has few bits, so n · first is exact.
+        let f = n.neg_mul_add(c(0.693_145_75), x);
+        let f = n.neg_mul_add(c(1.428_606_8e-6), f);
+        let p = c(1.984_127e-4)
+            .mul_add(f, c(1.388_888_9e-3))
+            .mul_add(f, c(8.333_333_5e-3))
+            .mul_add(f, c(4.166_666_6e-2))
+            .mul_add(f, c(1.666_666_7e-1))
+            .mul_add(f, c(0.5))
+            .mul_add(f, c(1.0))
+            .mul_add(f, c(1.0));
+        let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
+        let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
+        Self { s, v: s.transmute_f32s_u32s(bits) }
+    }
+
+    /// log₂ of self in [1, 2]; absolute error below 2e-7.
+    ///
+    /// atanh series: ln w = 2·artanh((w − 1)/(w + 1)), argument at most 1/3.
+    #[inline(always)]
+    pub(super) fn log2_of_1_to_2(self) -> Self {
+        let s = self.s;
+        let c = |x: f32| Self::splat(s, x);
+        let t = (self - c(1.0)) / (self + c(1.0));
+        let t2 = t * t;
+        let p = c(1.0 / 13.0)
+            .mul_add(t2, c(1.0 / 11.0))
+            .mul_add(t2, c(1.0 / 9.0))
+            .mul_add(t2, c(1.0 / 7.0))
+            .mul_add(t2, c(1.0 / 5.0))
+            .mul_add(t2, c(1.0 / 3.0))
+            .mul_add(t2, c(1.0));
+        t * p * c(2.0 * std::f32::consts::LOG2_E)
+    }
+}
+
+impl<S: Simd> Mask<S> {
+    #[inline(always)]
+    pub(super) fn and(self, b: Self) -> Self {
+        Self { s: self.s, m: self.s.and_m32s(self.m, b.m) }
+    }
+
+    #[inline(always)]
+    pub(super) fn select(self, yes: V<S>, no: V<S>) -> V<S> {
+        V { s: self.s, v: self.s.select_f32s(self.m, yes.v, no.v) }
+    }
+
+    /// `yes` where true, 0 elsewhere.
+    #[inline(always)]
+    pub(super) fn keep(self, yes: V<S>) -> V<S> {
+        self.select(yes, V::zero(self.s))
+    }
+
+    #[inline(always)]
+    pub(super) fn any(self) -> bool {
+        self.s.first_true_m32s(self.m) < S::F32_LANES
+    }
+}
+
+/// Lane by lane, whether `a < b` as unsigned integers.
+#[inline(always)]
+pub(super) fn before<S: Simd>(s: S, a: S::u32s, b: S::u32s) -> Mask<S> {
+    Mask { s, m: s.less_than_u32s(a, b) }
+}
+
+macro_rules! operator {
+    ($trait:ident, $method:ident, $simd:ident) => {
+        impl<S: Simd> $trait for V<S> {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, b: Self) -> Self {
+                Self { s: self.s, v: self.s.$simd(self.v, b.v) }
+            }
+        }
+        impl<S: Simd> $trait<f32> for V<S> {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, b: f32) -> Self {
+                Self { s: self.s, v: self.s.$simd(self.v, self.s.splat_f32s(b)) }
+            }
+        }
+    };
+}
+operator!(Add, add, add_f32s);
+operator!(Sub, sub, sub_f32s);
+operator!(Mul, mul, mul_f32s);
+operator!(Div, div, div_f32s);
+
+impl<S: Simd> Neg for V<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Self { s: self.s, v: self.s.neg_f32s(self.v) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use pulp::{Arch, WithSimd};
+
+    use super::*;
+
+    struct Each<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
+    #[derive(Clone, Copy)]
+    enum Function {
+        Exp2,
+        Exp,
+        Log2,
+    }
+
+    impl WithSimd for Each<'_> {
+        type Output = f64;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, s: S) -> f64 {
+            let Each(inputs, truth, function, floor) = self;
+            let mut worst = 0.0_f64;
+            for chunk in inputs.chunks_exact(WIDTH) {
+                let mut out = [0.0_f32; WIDTH];
+                for at in (0..WIDTH).step_by(S::F32_LANES) {
+                    let x = V::load(s, &chunk[at..]);
+                    let y = match function {
+                        Function::Exp2 => x.exp2(),
+                        Function::Exp => x.exp(),
+                        Function::Log2 => x.log2_of_1_to_2(),
+                    };
+                    y.store(&mut out[at..]);
+                }
+                for (&x, &y) in chunk.iter().zip(&out) {
+                    let t = truth(x);
+                    worst = worst.max((f64::from(y) - t).abs() / t.abs().max(floor));
+                }
+            }
+            worst
+        }
+    }
+
+    fn grid(from: f32, to: f32) -> Vec<f32> {
+        let n = 16 * 20_000;
+        (0..n).map(|i| from + (to - from) * i as f32 / (n - 1) as f32).collect()
+    }
+
+    #[test]
+    fn elementary_functions_are_accurate() {
+        let arch = Arch::new();
+        let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
+        assert!(arch.dispatch(exp2) < 2e-7);
+        let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
+        assert!(arch.dispatch(exp) < 2e-7);
+        let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
+        assert!(arch.dispatch(log2) < 2e-7);
+    }
+}

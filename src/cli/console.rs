@@ -1,0 +1,125 @@
+//! Standard output and standard error, side by side with a progress bar.
+
+use std::cell::RefCell;
+use std::fmt;
+use std::io::{self, IsTerminal, Write};
+
+use indicatif::MultiProgress;
+use tracing_subscriber::EnvFilter;
+
+use super::failure::{Failure, OTHER};
+
+/// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
+const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
+
+/// Where a command writes.
+#[derive(Debug)]
+pub(super) struct Console {
+    quiet: bool,
+    bars: MultiProgress,
+    /// The first error of standard output, if it is one.
+    broken: RefCell<Option<io::Error>>,
+}
+
+impl Console {
+    /// A console for this process; sets up the log. A quiet one shows only results and errors.
+    pub(super) fn new(quiet: bool) -> Self {
+        let bars = MultiProgress::new();
+        let filter = if quiet {
+            EnvFilter::new("error")
+        } else {
+            EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(LOG_FILTER))
+        };
+        let above = bars.clone();
+        // An outside program may have set up a log of its own; it stays.
+        let _ = tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(move || LogLine(above.clone()))
+            .with_ansi(io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())
+            .with_target(false)
+            .without_time()
+            .try_init();
+        Self {
+            quiet,
+            bars,
+            broken: RefCell::new(None),
+        }
+    }
+
+    /// Whether only results and errors are shown.
+    pub(super) fn is_quiet(&self) -> bool {
+        self.quiet
+    }
+
+    /// The bars that lines go above of.
+    pub(super) fn bars(&self) -> &MultiProgress {
+        &self.bars
+    }
+
+    /// A line of information on standard output; nothing when quiet.
+    pub(super) fn say(&self, line: impl fmt::Display) {
+        if !self.quiet {
+            self.result(line);
+        }
+    }
+
+    /// A result on standard output.
+    pub(super) fn result(&self, line: impl fmt::Display) {
+        let written = self.bars.suspend(|| {
+            let mut out = io::stdout().lock();
+            writeln!(out, "{line}").and_then(|()| out.flush())
+        });
+        match written {
+            // A reader that has gone away wants no more; that is no failure.
+            Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+                self.broken.borrow_mut().get_or_insert(error);
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether everything said could be written.
+    ///
+    /// # Errors
+    /// The first error of standard output, such as a full disk.
+    pub(super) fn finish(&self) -> Result<(), Failure> {
+        match self.broken.take() {
+            None => Ok(()),
+            Some(error) => Err(Failure {
+                code: OTHER,
+                message: format!("cannot write to standard output: {error}"),
+            }),
+        }
+    }
+
+    /// A line of progress on standard error; nothing when quiet.
+    pub(super) fn progress(&self, line: impl fmt::Display) {
+        if !self.quiet {
+            let _ = writeln!(io::stderr().lock(), "{line}");
+        }
+    }
+
+    /// What goes wrong, on standard error.
+    pub(super) fn error(&self, failure: &Failure) {
+        let Failure { message, .. } = failure;
+        self.bars.suspend(|| {
+            let _ = writeln!(io::stderr().lock(), "error: {message}");
+        });
+    }
+}
+
+/// One line of the log, written above the bars.
+struct LogLine(MultiProgress);
+
+impl Write for LogLine {
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        self.0.suspend(|| {
+            let _ = io::stderr().lock().write_all(line);
+        });
+        Ok(line.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}

@@ -1,0 +1,135 @@
+//! Errors as the command line ends with them: a message and an exit code.
+
+use densify_policies::policy::PolicyError;
+
+use crate::backend::BackendError;
+use crate::dataset::DatasetError;
+use crate::evaluate::EvaluateError;
+use crate::init::InitError;
+use crate::output::OutputError;
+use crate::ply::PlyError;
+use crate::trainer::TrainError;
+
+/// Exit code of anything that has no code of its own.
+pub(super) const OTHER: u8 = 1;
+/// Exit code of bad input and usage.
+pub(super) const INPUT: u8 = 2;
+/// Exit code where device or memory do not suffice.
+pub(super) const DEVICE: u8 = 3;
+
+/// Why a command failed.
+#[derive(Debug)]
+pub(super) struct Failure {
+    /// Exit code.
+    pub(super) code: u8,
+    /// One message, with the remedy.
+    pub(super) message: String,
+}
+
+impl Failure {
+    pub(super) fn input(message: impl ToString) -> Self {
+        Self {
+            code: INPUT,
+            message: message.to_string(),
+        }
+    }
+
+    /// The same failure with more to say.
+    pub(super) fn and(self, more: &str) -> Self {
+        Self {
+            message: format!("{}\n{more}", self.message),
+            ..self
+        }
+    }
+}
+
+impl From<DatasetError> for Failure {
+    fn from(error: DatasetError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<PlyError> for Failure {
+    fn from(error: PlyError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<InitError> for Failure {
+    fn from(error: InitError) -> Self {
+        match error {
+            InitError::NoPoints => Self::input(
+                "the scene has no usable point to start from; start from random ones with --init random",
+            ),
+            other => Self::input(other),
+        }
+    }
+}
+
+/// An error before training: the policy's name or parameters are wrong.
+impl From<PolicyError> for Failure {
+    fn from(error: PolicyError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<BackendError> for Failure {
+    fn from(error: BackendError) -> Self {
+        let code = match error {
+            BackendError::ImageTooLarge { .. } => INPUT,
+            _ => DEVICE,
+        };
+        Self {
+            code,
+            message: error.to_string(),
+        }
+    }
+}
+
+impl From<OutputError> for Failure {
+    fn from(error: OutputError) -> Self {
+        let code = match error {
+            OutputError::Io { .. } => OTHER,
+            _ => INPUT,
+        };
+        Self {
+            code,
+            message: error.to_string(),
+        }
+    }
+}
+
+impl From<TrainError> for Failure {
+    fn from(error: TrainError) -> Self {
+        let code = match &error {
+            TrainError::NoViews | TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
+            TrainError::Backend {
+                source: BackendError::ImageTooLarge { .. },
+                ..
+            } => INPUT,
+            TrainError::Backend { .. } => DEVICE,
+            _ => OTHER,
+        };
+        Self {
+            code,
+            message: error.to_string(),
+        }
+    }
+}
+
+impl From<EvaluateError> for Failure {
+    fn from(error: EvaluateError) -> Self {
+        let code = match &error {
+            EvaluateError::Backend {
+                source: BackendError::ImageTooLarge { .. },
+                ..
+            } => INPUT,
+            EvaluateError::Backend { .. } => DEVICE,
+            _ => INPUT,
+        };
+        Self {
+            code,
+            message: error.to_string(),
+        }
+    }
+}

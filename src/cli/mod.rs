@@ -1,0 +1,133 @@
+//! The command line: arguments → validated options → run. The only place that prints.
+//!
+//! One file per subcommand. Exit codes: 0 for success, 2 for bad input or usage, 3 where device or
+//! memory do not suffice, 1 for anything else. An error is one message that names file, field or
+//! flag and the remedy.
+//!
+//! A program that brings policies of its own is two lines:
+//!
+//! ```no_run
+//! // use my_policies as _;   // linked, therefore registered
+//! fn main() -> std::process::ExitCode {
+//!     densify::cli::run()
+//! }
+//! ```
+
+mod console;
+mod eval;
+mod failure;
+mod number;
+mod policies;
+mod progress;
+mod render;
+mod run_files;
+mod scene;
+mod train;
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use console::Console;
+
+/// Trains 3D Gaussian Splatting scenes under a hard memory budget.
+///
+/// A scene is a folder of photographs whose cameras are known: a COLMAP reconstruction, a
+/// NeRF-synthetic scene or a nerfstudio dataset. The result is a .ply that any viewer of Gaussian
+/// splats opens.
+#[derive(Debug, Parser)]
+#[command(name = "densify", version, propagate_version = true, after_help = EXAMPLES)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  densify train data/garden --eval                         train, hold out every 8th photograph
+  densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
+  densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
+  densify render output/garden-diet -o pictures            the same views as PNG files
+  densify policies diet                                    what a policy does, and its parameters
+
+`densify COMMAND --help` explains every option of a command.";
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Train(Box<train::TrainArgs>),
+    Eval(eval::EvalArgs),
+    Render(Box<render::RenderArgs>),
+    Policies(policies::PoliciesArgs),
+}
+
+/// Runs the command line of this process. For `main` functions, here and in other crates.
+#[must_use]
+pub fn run() -> ExitCode {
+    ExitCode::from(run_with(std::env::args_os()))
+}
+
+/// Runs a command line, the program's name first; returns the exit code.
+fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
+    let arguments = match Arguments::try_parse_from(arguments) {
+        Ok(arguments) => arguments,
+        Err(help_or_error) => {
+            // A reader that has gone away is no reason to fail.
+            let _ = help_or_error.print();
+            return u8::try_from(help_or_error.exit_code()).unwrap_or(failure::INPUT);
+        }
+    };
+    let quiet = matches!(&arguments.command, Command::Train(train) if train.quiet);
+    let console = Console::new(quiet);
+    let done = match arguments.command {
+        Command::Train(train) => train::run(&train, &console),
+        Command::Eval(eval) => eval::run(&eval, &console),
+        Command::Render(render) => render::run(&render, &console),
+        Command::Policies(policies) => policies::run(&policies, &console),
+    };
+    match done.and_then(|()| console.finish()) {
+        Ok(()) => 0,
+        Err(failure) => {
+            console.error(&failure);
+            failure.code
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn every_option_is_explained() {
+        for command in Arguments::command().get_subcommands() {
+            for argument in command.get_arguments() {
+                let (id, name) = (argument.get_id(), command.get_name());
+                assert!(argument.get_help().is_some(), "{name}: {id} has no help");
+            }
+        }
+    }
+
+    #[test]
+    fn usage_errors_have_code_2_and_help_0() {
+        assert_eq!(run_with(["densify", "--help"]), 0);
+        assert_eq!(run_with(["densify", "--version"]), 0);
+        assert_eq!(run_with(["densify", "train"]), failure::INPUT);
+        assert_eq!(
+            run_with(["densify", "train", "x", "--budget", "0"]),
+            failure::INPUT
+        );
+        assert_eq!(run_with(["densify", "nonsense"]), failure::INPUT);
+        assert_eq!(
+            run_with(["densify", "eval", "/no/such/run"]),
+            failure::INPUT
+        );
+    }
+}

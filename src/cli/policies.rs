@@ -1,0 +1,54 @@
+//! `densify policies`: what is registered, and the manual pages.
+
+use clap::Args;
+use densify_policies::registry::{find, policies};
+
+use super::console::Console;
+use super::failure::Failure;
+
+/// Lists the density-control policies, or explains one.
+///
+/// A policy decides where Gaussians are born and die while training. Choose one with
+/// `densify train --policy NAME`.
+#[derive(Debug, Args)]
+pub(super) struct PoliciesArgs {
+    /// Policy to explain: what it does, its source and its parameters
+    name: Option<String>,
+}
+
+pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure> {
+    if let Some(name) = &args.name {
+        let entry = find(name)?;
+        console.result(entry.manual().trim_end());
+        let parameters = entry.parameters();
+        if !parameters.is_empty() {
+            console.result(format_args!("\nDefaults, for a run of 30,000 steps:\n"));
+        }
+        for (parameter, value) in parameters {
+            let key = format!("{name}.{parameter}");
+            let scales = entry.step_parameters().contains(&&*parameter);
+            let note = if scales {
+                "   (scales with --iterations)"
+            } else {
+                ""
+            };
+            console.result(format_args!("  --policy-set {key}={value}{note}"));
+        }
+        return Ok(());
+    }
+    let all = policies()?;
+    let width = all.iter().map(|entry| entry.name.len()).max().unwrap_or(0);
+    for entry in all {
+        console.result(format_args!("{:width$}  {}", entry.name, entry.summary));
+        console.result(format_args!(
+            "{:width$}  {} ({})",
+            "",
+            entry.source,
+            entry.location()
+        ));
+    }
+    console.result(format_args!(
+        "\n`densify policies NAME` explains a policy and its parameters."
+    ));
+    Ok(())
+}

@@ -1,0 +1,113 @@
+//! How far training is: a bar on a terminal, a line now and then elsewhere.
+
+use std::io::{IsTerminal, stderr};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::console::Console;
+use super::number::{duration, grouped};
+
+/// Share of the run between two lines where there is no terminal.
+const LINES: u32 = 20;
+/// Time between two redraws of the bar's text.
+const REDRAW: Duration = Duration::from_millis(100);
+/// Weight of the newest step in the loss shown: views differ, so single steps jump.
+const NEWEST: f32 = 0.05;
+
+/// Progress of a run.
+pub(super) struct Progress<'a> {
+    console: &'a Console,
+    bar: Option<ProgressBar>,
+    iterations: u32,
+    budget: usize,
+    started: Instant,
+    drawn: Instant,
+    loss: Option<f32>,
+}
+
+impl<'a> Progress<'a> {
+    /// Progress towards `iterations`; silent on a quiet console.
+    pub(super) fn new(console: &'a Console, iterations: u32, budget: usize) -> Self {
+        let bar = (!console.is_quiet() && stderr().is_terminal()).then(|| {
+            let style = ProgressStyle::with_template(
+                "{bar:24.cyan/dim} {pos}/{len}  {per_sec:>9}  {msg}  {eta} left",
+            )
+            .unwrap_or_else(|_| ProgressStyle::default_bar());
+            let bar = ProgressBar::new(u64::from(iterations)).with_style(style);
+            console.bars().add(bar)
+        });
+        let now = Instant::now();
+        Self {
+            console,
+            bar,
+            iterations,
+            budget,
+            started: now,
+            drawn: now,
+            loss: None,
+        }
+    }
+
+    /// Counts a step.
+    pub(super) fn step(&mut self, step: u32, loss: f32, rows: usize) {
+        let smooth = self
+            .loss
+            .map_or(loss, |before| before + NEWEST * (loss - before));
+        self.loss = Some(smooth);
+        let text = || {
+            format!(
+                "loss {smooth:.4}  rows {} of {}",
+                grouped(rows),
+                grouped(self.budget)
+            )
+        };
+        if let Some(bar) = &self.bar {
+            if self.drawn.elapsed() >= REDRAW || step == self.iterations {
+                bar.set_message(text());
+                bar.set_position(u64::from(step));
+                self.drawn = Instant::now();
+            }
+        } else if is_milestone(step, self.iterations) {
+            let elapsed = self.started.elapsed().as_secs_f64().max(1e-9);
+            let speed = f64::from(step) / elapsed;
+            let left = f64::from(self.iterations - step) / speed;
+            self.console.progress(format_args!(
+                "step {step}/{} ({} %)  {speed:.1} it/s  {}  {} left",
+                self.iterations,
+                u64::from(step) * 100 / u64::from(self.iterations),
+                text(),
+                duration(Duration::from_secs_f64(left)),
+            ));
+        }
+    }
+
+    /// Removes the bar.
+    pub(super) fn finish(self) {
+        if let Some(bar) = self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Whether `step` is the first of the run's next twentieth: 20 lines, or one a step if shorter.
+fn is_milestone(step: u32, iterations: u32) -> bool {
+    let part = |step: u32| u64::from(step) * u64::from(LINES) / u64::from(iterations);
+    step == iterations || part(step) > part(step.saturating_sub(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn twenty_lines_or_one_a_step() {
+        for (iterations, lines) in [(1, 1), (7, 7), (20, 20), (21, 20), (30_000, 20)] {
+            let seen = (1..=iterations)
+                .filter(|&step| is_milestone(step, iterations))
+                .count();
+            assert_eq!(seen, lines, "{iterations}");
+            assert!(is_milestone(iterations, iterations));
+        }
+    }
+}

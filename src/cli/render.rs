@@ -1,0 +1,324 @@
+//! `densify render`.
+
+use std::collections::{BTreeMap, HashSet};
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
+
+use super::console::Console;
+use super::failure::Failure;
+use super::number;
+use super::run_files::{Opened, SplitArg, iteration, open, open_run};
+use super::scene::{NEAR, SceneArgs};
+use crate::backend::Rendering;
+use crate::dataset::images::Image8;
+use crate::output::{OutputError, write_atomically, write_json};
+use crate::views::ViewSource;
+
+/// Renders a trained scene to PNG files.
+///
+/// Renders the views held out, or those trained on, of a run or of any .ply of Gaussian splats
+/// (which needs --scene for the cameras).
+///
+/// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
+/// distance along the optical axis. It is written in 16 bits, 65535 standing for the largest
+/// depth of the picture; depth.json says how much that is.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct RenderArgs {
+    /// Folder that `densify train` wrote, or a .ply of Gaussian splats
+    model: PathBuf,
+    /// Folder of the dataset: needed for a .ply, and for a run whose dataset has moved
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
+    /// Folder for the pictures
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Which views to render
+    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    split: SplitArg,
+    /// Saved iteration of the run [default: the last]
+    #[arg(long, value_name = "N")]
+    iteration: Option<u32>,
+    /// Also write how opaque each pixel is, as NAME.alpha.png
+    #[arg(long)]
+    alpha: bool,
+    /// Also write depth, as NAME.depth.png
+    #[arg(long)]
+    depth: bool,
+    /// Also write photograph and rendering beside each other, as NAME.pair.png
+    #[arg(long)]
+    side_by_side: bool,
+    /// Nearest distance to a camera at which anything of a .ply is drawn, as a fraction of the
+    /// scene's extent
+    #[arg(long, value_name = "FRACTION", help_heading = "Scene", default_value_t = NEAR, value_parser = number::fraction)]
+    near: f64,
+    /// Processor threads to use [default: all]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    #[command(flatten)]
+    data: SceneArgs,
+}
+
+const EXAMPLES: &str = "\
+Options under Scene are for a .ply; a run brings its own.
+
+Examples:
+  densify render output/garden-diet -o pictures --side-by-side
+  densify render others.ply --scene data/garden --eval -o pictures --depth";
+
+pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
+    let mut opened = open_model(args, console)?;
+    let views = opened.views(args.split)?;
+    let background = opened.scene.background.fixed();
+    let units = 1.0 / opened.dataset.normalisation.scale;
+    let names: Vec<&str> = (0..views.count()).map(|view| views.name(view)).collect();
+    let files = file_names(&names);
+    let mut depths = BTreeMap::new();
+    for (view, name) in files.iter().enumerate() {
+        let rendering = opened
+            .backend
+            .render(views.camera(view), background, opened.sh_degree)?;
+        let to = |ending: &str| args.output.join(format!("{name}{ending}"));
+        write_png(&to(".png"), picture(&rendering))?;
+        if args.alpha {
+            write_png(&to(".alpha.png"), alpha(&rendering))?;
+        }
+        if args.depth {
+            let (png, largest) = depth(&rendering);
+            write_png(&to(".depth.png"), png)?;
+            depths.insert(format!("{name}.depth.png"), f64::from(largest) * units);
+        }
+        if args.side_by_side {
+            let image = views.image(view).map_err(Failure::input)?;
+            write_png(&to(".pair.png"), pair(&image, background, &rendering))?;
+        }
+    }
+    if args.depth {
+        let said = serde_json::json!({
+            "what": "depth = value / 65535 * largest, in the dataset's own units",
+            "largest": depths,
+        });
+        write_json(&args.output.join("depth.json"), &said)?;
+    }
+    console.result(format_args!(
+        "{} views in {}",
+        files.len(),
+        args.output.display()
+    ));
+    Ok(())
+}
+
+fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
+    if !args.model.is_file() {
+        crate::output::RunConfig::read(&args.model)?;
+        let iteration = iteration(&args.model, args.iteration)?;
+        return open_run(
+            &args.model,
+            iteration,
+            args.scene.clone(),
+            args.threads,
+            console,
+        );
+    }
+    let Some(scene) = &args.scene else {
+        return Err(Failure::input(format!(
+            "{} is a file, which has no cameras; name a dataset with --scene DIR",
+            args.model.display()
+        )));
+    };
+    if args.iteration.is_some() {
+        return Err(Failure::input(
+            "--iteration is for a run's folder; a file has only one model",
+        ));
+    }
+    open(
+        &args.model,
+        scene,
+        args.data.config(scene),
+        args.near,
+        args.threads,
+        console,
+    )
+}
+
+/// A file name without ending for each view. Names come from data files: no part of one may lead
+/// out of the output folder.
+fn file_names(views: &[&str]) -> Vec<String> {
+    let plain = |name: &str| {
+        let parts = name
+            .split(['/', '\\'])
+            .filter(|part| !matches!(*part, "" | "." | ".."));
+        let parts: Vec<String> = parts.map(|part| part.replace([':', '\0'], "_")).collect();
+        if parts.is_empty() {
+            "view".to_owned()
+        } else {
+            parts.join("/")
+        }
+    };
+    let stem = |name: &str| match name.rsplit_once('.') {
+        Some((stem, ending))
+            if !ending.contains('/') && !stem.is_empty() && !stem.ends_with('/') =>
+        {
+            stem.to_owned()
+        }
+        _ => name.to_owned(),
+    };
+    let full: Vec<String> = views.iter().map(|name| plain(name)).collect();
+    let stems: Vec<String> = full.iter().map(|name| stem(name)).collect();
+    let distinct: HashSet<&String> = stems.iter().collect();
+    if distinct.len() == stems.len() {
+        return stems;
+    }
+    // a.jpg and a.png: keep the endings; and names that differ only in what was left out get
+    // their number as well.
+    let distinct: HashSet<&String> = full.iter().collect();
+    if distinct.len() == full.len() {
+        return full;
+    }
+    full.iter()
+        .enumerate()
+        .map(|(i, name)| format!("{name}-{i}"))
+        .collect()
+}
+
+fn to_u8(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+fn picture(rendering: &Rendering) -> DynamicImage {
+    let Rendering {
+        width, height, rgb, ..
+    } = rendering;
+    let pixel = |x: u32, y: u32| {
+        let at = 3 * (y as usize * *width as usize + x as usize);
+        Rgb([rgb[at], rgb[at + 1], rgb[at + 2]].map(to_u8))
+    };
+    ImageBuffer::from_fn(*width, *height, pixel).into()
+}
+
+fn alpha(rendering: &Rendering) -> DynamicImage {
+    let Rendering {
+        width,
+        height,
+        alpha,
+        ..
+    } = rendering;
+    let pixel = |x: u32, y: u32| Luma([to_u8(alpha[y as usize * *width as usize + x as usize])]);
+    ImageBuffer::from_fn(*width, *height, pixel).into()
+}
+
+/// Depth relative to its largest value, and that value [scene units].
+fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
+    let Rendering {
+        width,
+        height,
+        depth,
+        ..
+    } = rendering;
+    let largest = depth.iter().copied().fold(0.0, f32::max);
+    let scale = if largest > 0.0 {
+        65_535.0 / largest
+    } else {
+        0.0
+    };
+    let pixel = |x: u32, y: u32| {
+        let value = depth[y as usize * *width as usize + x as usize];
+        Luma([(value * scale).round() as u16])
+    };
+    let image: ImageBuffer<Luma<u16>, Vec<u16>> = ImageBuffer::from_fn(*width, *height, pixel);
+    (image.into(), largest)
+}
+
+/// Photograph on the left, rendering on the right.
+fn pair(image: &Image8, background: [f32; 3], rendering: &Rendering) -> DynamicImage {
+    let truth = |x: u32, y: u32| {
+        Rgb(image
+            .composited(x as usize, y as usize, background)
+            .map(to_u8))
+    };
+    let right = picture(rendering).into_rgb8();
+    let (width, height) = right.dimensions();
+    let pixel = |x: u32, y: u32| {
+        if x < width {
+            truth(x, y)
+        } else {
+            *right.get_pixel(x - width, y)
+        }
+    };
+    ImageBuffer::from_fn(2 * width, height, pixel).into()
+}
+
+fn write_png(path: &Path, image: DynamicImage) -> Result<(), OutputError> {
+    write_atomically(path, |out| {
+        let mut encoded = Cursor::new(Vec::new());
+        image
+            .write_to(&mut encoded, ImageFormat::Png)
+            .map_err(std::io::Error::other)?;
+        out.write_all(&encoded.into_inner())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn file_names_stay_in_the_folder_and_apart() {
+        assert_eq!(
+            file_names(&["a.jpg", "sub/b.JPG", "c"]),
+            ["a", "sub/b", "c"]
+        );
+        assert_eq!(file_names(&["a.jpg", "a.png"]), ["a.jpg", "a.png"]);
+        assert_eq!(
+            file_names(&["../../etc/x.png", "/y.png", "C:\\z.png"]),
+            ["etc/x", "y", "C_/z"]
+        );
+        assert_eq!(file_names(&["a.png", "../a.png"]), ["a.png-0", "a.png-1"]);
+        assert_eq!(file_names(&["..", ".hidden"]), ["view", ".hidden"]);
+    }
+
+    fn rendering() -> Rendering {
+        Rendering {
+            width: 2,
+            height: 1,
+            rgb: vec![0.0, 0.5, 1.0, -1.0, 2.0, f32::NAN],
+            alpha: vec![1.0, 0.2],
+            depth: vec![4.0, 1.0],
+        }
+    }
+
+    #[test]
+    fn pixels_are_rounded_and_clamped() {
+        assert_eq!(
+            picture(&rendering()).into_rgb8().into_raw(),
+            [0, 128, 255, 0, 255, 0]
+        );
+        assert_eq!(alpha(&rendering()).into_luma8().into_raw(), [255, 51]);
+        let (png, largest) = depth(&rendering());
+        assert_eq!(png.into_luma16().into_raw(), [65_535, 16_384]);
+        assert!((largest - 4.0).abs() < f32::EPSILON);
+        let empty = Rendering {
+            depth: vec![0.0; 2],
+            ..rendering()
+        };
+        assert_eq!(depth(&empty).0.into_luma16().into_raw(), [0, 0]);
+    }
+
+    #[test]
+    fn a_pair_shows_the_photograph_on_the_background_first() {
+        let image = Image8 {
+            width: 2,
+            height: 1,
+            rgb: vec![10, 20, 30, 200, 200, 200],
+            alpha: Some(vec![255, 0]),
+            mask: None,
+        };
+        let pair = pair(&image, [1.0, 0.0, 0.0], &rendering()).into_rgb8();
+        assert_eq!(pair.dimensions(), (4, 1));
+        assert_eq!(&pair.as_raw()[..6], [10, 20, 30, 255, 0, 0]);
+        assert_eq!(&pair.as_raw()[6..], [0, 128, 255, 0, 255, 0]);
+    }
+}

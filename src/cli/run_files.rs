@@ -1,0 +1,146 @@
+//! A finished run or a bare PLY, opened for looking at it.
+
+use std::path::{Path, PathBuf};
+
+use super::console::Console;
+use super::failure::Failure;
+use super::scene;
+use crate::backend::Backend;
+use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::dataset::{Dataset, View};
+use crate::evaluate::Split;
+use crate::gaussians::Gaussians;
+use crate::output::{RunConfig, SceneConfig, model_path, saved_iterations};
+use crate::ply::read_splats;
+use crate::views::DatasetViews;
+
+/// Spelling of [`Split`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum SplitArg {
+    /// The views held out
+    Test,
+    /// The views trained on
+    Train,
+}
+
+impl From<SplitArg> for Split {
+    fn from(split: SplitArg) -> Self {
+        match split {
+            SplitArg::Test => Self::Test,
+            SplitArg::Train => Self::Train,
+        }
+    }
+}
+
+/// A model with the dataset it belongs to, ready to render.
+pub(super) struct Opened {
+    pub(super) dataset: Dataset,
+    pub(super) scene: SceneConfig,
+    pub(super) sh_degree: u8,
+    pub(super) backend: Box<dyn Backend>,
+}
+
+/// Limits rayon's common pool, which measuring uses, to the threads the user grants.
+pub(super) fn use_threads(threads: Option<u16>) {
+    if let Some(threads) = threads {
+        // It fails only if the pool is in use already; then its size is what it is.
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads));
+        let _ = pool.build_global();
+    }
+}
+
+/// The iteration asked for, or the last one saved.
+pub(super) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
+    let saved = saved_iterations(run)?;
+    let last = saved[saved.len() - 1];
+    match asked {
+        None => Ok(last),
+        Some(n) if saved.contains(&n) => Ok(n),
+        Some(n) => {
+            let list: Vec<String> = saved.iter().map(u32::to_string).collect();
+            Err(Failure::input(format!(
+                "--iteration {n}: {} has saved only {}",
+                run.display(),
+                list.join(", ")
+            )))
+        }
+    }
+}
+
+/// Opens the model of a run with its dataset, or with that dataset at `moved_to`.
+pub(super) fn open_run(
+    run: &Path,
+    iteration: u32,
+    moved_to: Option<PathBuf>,
+    threads: Option<u16>,
+    console: &Console,
+) -> Result<Opened, Failure> {
+    let config = RunConfig::read(run)?;
+    let was_moved = moved_to.is_some();
+    let path = moved_to.unwrap_or_else(|| config.scene_path());
+    let model = model_path(run, iteration);
+    let near = config.train.near;
+    open(&model, &path, config.scene, near, threads, console).map_err(|failure| {
+        if was_moved || path.is_dir() {
+            failure
+        } else {
+            failure.and("if the dataset has moved, say where it is with --scene")
+        }
+    })
+}
+
+/// Opens a model, by whatever program, with a dataset.
+pub(super) fn open(
+    model: &Path,
+    dataset: &Path,
+    config: SceneConfig,
+    near: f64,
+    threads: Option<u16>,
+    console: &Console,
+) -> Result<Opened, Failure> {
+    use_threads(threads);
+    let dataset = scene::load(dataset, &config, console)?;
+    let file = read_splats(model)?;
+    for (number, what) in [
+        (file.dropped, "left out: a value is not finite"),
+        (file.repaired, "with a zero quaternion, read as unrotated"),
+    ] {
+        if number > 0 {
+            console.say(format_args!(
+                "note: {}: {number} rows {what}",
+                model.display()
+            ));
+        }
+    }
+    let model: Gaussians = dataset.normalisation.model_from_world(&file.gaussians);
+    let mut options = CpuOptions::new(model.len().max(1));
+    options.near = (near * dataset.extent()) as f32;
+    options.threads = threads.map(usize::from);
+    options.largest_image = scene::largest_image(&dataset);
+    Ok(Opened {
+        sh_degree: model.sh_degree,
+        backend: Box::new(CpuBackend::new(&model, &options)?),
+        dataset,
+        scene: config,
+    })
+}
+
+impl Opened {
+    /// The views of a split.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub(super) fn views(&self, split: SplitArg) -> Result<DatasetViews, Failure> {
+        let views: &[View] = match split {
+            SplitArg::Train => &self.dataset.train,
+            SplitArg::Test => &self.dataset.test,
+        };
+        if views.is_empty() {
+            return Err(Failure::input(
+                "no view was held out (a run holds views out with --eval or --test-every K); \
+                 use --split train",
+            ));
+        }
+        Ok(DatasetViews::new(views.to_vec(), 0, 1))
+    }
+}

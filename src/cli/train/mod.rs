@@ -1,0 +1,136 @@
+//! `densify train`.
+
+mod session;
+mod setup;
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::console::Console;
+use super::failure::Failure;
+use super::number;
+use super::scene::{NEAR, SceneArgs};
+use crate::output::InitChoice;
+
+/// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
+/// a room or an object; large outdoor scenes want more.
+const DEFAULT_BUDGET: usize = 200_000;
+
+/// Trains a scene.
+///
+/// SCENE is a folder with a COLMAP reconstruction (images/ and sparse/0/), a NeRF-synthetic scene
+/// (transforms_train.json and transforms_test.json) or a nerfstudio dataset (transforms.json).
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct TrainArgs {
+    /// Folder of the dataset
+    #[arg(help_heading = "Scene")]
+    scene: PathBuf,
+    /// Folder to write to [default: output/SCENE-POLICY]
+    #[arg(short, long, value_name = "DIR", help_heading = "Output")]
+    output: Option<PathBuf>,
+
+    #[command(flatten)]
+    data: SceneArgs,
+
+    /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
+    /// [default: 200k]
+    #[arg(short, long, value_name = "ROWS", help_heading = "Memory", value_parser = number::rows)]
+    budget: Option<usize>,
+    /// Most (Gaussian, tile) pairs held at a time; views with more are processed in bands, which
+    /// is exact but slower [default: 16 per Gaussian of the budget]
+    #[arg(long, value_name = "PAIRS", help_heading = "Memory", value_parser = number::rows)]
+    tile_cap: Option<usize>,
+
+    /// What decides where Gaussians are born and die; `densify policies` lists the choices
+    #[arg(
+        short,
+        long,
+        value_name = "NAME",
+        help_heading = "Density control",
+        default_value = "diet"
+    )]
+    policy: String,
+    /// Set a parameter of the policy, such as diet.rho=0.2; may be repeated
+    #[arg(
+        long,
+        value_name = "POLICY.NAME=VALUE",
+        help_heading = "Density control"
+    )]
+    policy_set: Vec<String>,
+    /// TOML file with parameters in a table per policy; --policy-set wins over it
+    #[arg(long, value_name = "FILE", help_heading = "Density control")]
+    policy_config: Option<PathBuf>,
+
+    /// Length of the run; every schedule scales with it
+    #[arg(short, long, value_name = "N", help_heading = "Training", default_value_t = 30_000, value_parser = clap::value_parser!(u32).range(1..))]
+    iterations: u32,
+    /// How colours may depend on the direction of view: 0 not at all, 3 most
+    #[arg(long, value_name = "DEGREE", help_heading = "Training", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
+    sh_degree: u8,
+    /// Where the first Gaussians are placed [default: points where the dataset has any, else
+    /// random]
+    #[arg(long, value_enum, value_name = "HOW", help_heading = "Training")]
+    init: Option<Init>,
+    /// Number of random points to start from [default: half the budget, at most 100k]
+    #[arg(long, value_name = "N", help_heading = "Training", value_parser = number::rows)]
+    init_points: Option<usize>,
+    /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's
+    /// extent
+    #[arg(long, value_name = "FRACTION", help_heading = "Training", default_value_t = NEAR, value_parser = number::fraction)]
+    near: f64,
+    /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc or sh_rest;
+    /// may be repeated
+    #[arg(long, value_name = "NAME=RATE", help_heading = "Training")]
+    lr: Vec<String>,
+    /// Everything random follows from this number; equal numbers give equal results
+    #[arg(long, value_name = "N", help_heading = "Training", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    seed: u64,
+    /// Processor threads to use; the result does not depend on it [default: all]
+    #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+
+    /// Iterations after which to save the model, beside the last
+    #[arg(long, value_name = "N", help_heading = "Output", num_args = 1.., value_delimiter = ',')]
+    save_iterations: Vec<u32>,
+    /// Iterations after which to measure the views held out, beside the last
+    #[arg(long, value_name = "N", help_heading = "Output", num_args = 1.., value_delimiter = ',')]
+    test_iterations: Vec<u32>,
+    /// Replace the run that is in the output folder, once this one is complete
+    #[arg(long, help_heading = "Output")]
+    overwrite: bool,
+    /// Show nothing but errors
+    #[arg(short, long, help_heading = "Output")]
+    pub(super) quiet: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  densify train data/garden
+  densify train data/garden --eval -r 4 --budget 1.5M -o runs/garden
+  densify train data/chair --background white --init-points 50k
+  densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2";
+
+/// Spelling of [`InitChoice`] on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Init {
+    /// On the points of the dataset's reconstruction
+    Points,
+    /// At random, where the cameras look
+    Random,
+}
+
+impl From<Init> for InitChoice {
+    fn from(init: Init) -> Self {
+        match init {
+            Init::Points => Self::Points,
+            Init::Random => Self::Random,
+        }
+    }
+}
+
+pub(super) fn run(args: &TrainArgs, console: &Console) -> Result<(), Failure> {
+    let prepared = setup::prepare(args, console)?;
+    session::train(args, prepared, console)
+}

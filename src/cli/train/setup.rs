@@ -1,0 +1,409 @@
+//! From arguments to a trainer: everything that can fail for reasons of the user's making does so
+//! here, before anything is written.
+
+use std::path::{Path, PathBuf};
+
+use densify_policies::parameters::parse_overrides;
+use densify_policies::policy::{DensityPolicy, SceneInfo};
+use densify_policies::registry::{PolicyEntry, find};
+use toml::Table;
+
+use super::{DEFAULT_BUDGET, TrainArgs};
+use crate::backend::Backend;
+use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::cli::console::Console;
+use crate::cli::failure::Failure;
+use crate::cli::number::grouped;
+use crate::cli::run_files::use_threads;
+use crate::cli::scene;
+use crate::dataset::Dataset;
+use crate::gaussians::{Gaussians, sh_coefficients};
+use crate::init::{initialise, random_points};
+use crate::memory::{Ledger, Section, resident};
+use crate::output::{InitChoice, PolicyConfig, RunConfig, RunFolder, TrainConfig};
+use crate::schedule::{Background, RateOptions};
+use crate::trainer::{TrainOptions, Trainer};
+use crate::views::{DatasetViews, ViewSource};
+
+/// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
+const RANDOM_POINTS: usize = 100_000;
+/// Threads that decode images ahead of the trainer.
+const DECODERS: usize = 2;
+/// Views announced ahead: enough that each decoder has one at work and one waiting.
+const AHEAD: usize = 2 * DECODERS;
+
+/// A run, ready to start.
+pub(super) struct Prepared {
+    pub(super) config: RunConfig,
+    pub(super) output: PathBuf,
+    pub(super) trainer: Trainer<DatasetViews>,
+    /// The views held out.
+    pub(super) test: DatasetViews,
+    /// Everything of the dataset but its points.
+    pub(super) dataset: Dataset,
+    pub(super) ledger: Ledger,
+}
+
+pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, Failure> {
+    let entry = find(&args.policy)?;
+    let parameters = parameters(args, entry)?;
+    let rates = learning_rates(&args.lr)?;
+    check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
+    check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
+    let output = args
+        .output
+        .clone()
+        .unwrap_or_else(|| default_output(&args.scene, &args.policy));
+    RunFolder::check(&output, args.overwrite)?;
+    use_threads(args.threads);
+
+    let scene_config = args.data.config(&args.scene);
+    let mut dataset = scene::load(&args.scene, &scene_config, console)?;
+    if !args.test_iterations.is_empty() && dataset.test.is_empty() {
+        return Err(Failure::input(
+            "--test-iterations: no view is held out to measure; add --eval or --test-every K",
+        ));
+    }
+    console.say(scene::describe(&args.scene, &dataset));
+    let budget = args.budget.unwrap_or(DEFAULT_BUDGET);
+    let (model, init, init_points) = first_model(args, &dataset, budget, console)?;
+    let scene = SceneInfo {
+        extent: dataset.extent() as f32,
+        train_views: u32::try_from(dataset.train.len())
+            .map_err(|_| Failure::input("the scene has more than 4 billion views"))?,
+        budget,
+        initial_rows: model.len(),
+        iterations: args.iterations,
+        white_background: scene_config.background == Background::White,
+    };
+    let policy = entry.build(&parameters, &scene)?;
+    let config = RunConfig {
+        densify: env!("CARGO_PKG_VERSION").to_owned(),
+        train: TrainConfig {
+            budget,
+            iterations: args.iterations,
+            seed: args.seed,
+            sh_degree: args.sh_degree,
+            near: args.near,
+            tile_cap: args.tile_cap,
+            init,
+            init_points,
+            learning_rates: rates,
+        },
+        policy: PolicyConfig {
+            name: entry.name.to_owned(),
+            parameters: entry.effective(&parameters, &scene)?,
+        },
+        scene: scene_config,
+    };
+    announce(args, entry, &config, &output, console);
+
+    let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
+    let test = DatasetViews::new(dataset.test.clone(), 0, 1);
+    dataset.points = crate::dataset::PointCloud::default();
+    let (backend, ledger) = backend(
+        args,
+        &config,
+        &dataset,
+        policy.as_ref(),
+        &scene,
+        model,
+        [&views, &test],
+    )?;
+    console.say(format_args!("memory promised\n{ledger}"));
+    let options = TrainOptions {
+        iterations: args.iterations,
+        seed: args.seed,
+        sh_degree: args.sh_degree,
+        background: config.scene.background,
+        rates,
+        prefetch: AHEAD,
+    };
+    let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
+    Ok(Prepared {
+        config,
+        output,
+        trainer,
+        test,
+        dataset,
+        ledger,
+    })
+}
+
+/// The renderer with the model, and the ledger of the whole run.
+fn backend(
+    args: &TrainArgs,
+    config: &RunConfig,
+    dataset: &Dataset,
+    policy: &dyn DensityPolicy,
+    scene: &SceneInfo,
+    model: Gaussians,
+    [views, test]: [&DatasetViews; 2],
+) -> Result<(Box<dyn Backend>, Ledger), Failure> {
+    let before = resident();
+    let needs = policy.needs(scene);
+    let signals = needs.signals.iter().count() as u64;
+    let candidates = needs.candidates.map_or(0, |request| request.capacity);
+    let mut options = CpuOptions::new(scene.budget);
+    options.near = (config.train.near * f64::from(scene.extent)) as f32;
+    options.tile_cap = args.tile_cap.unwrap_or(options.tile_cap);
+    options.threads = args.threads.map(usize::from);
+    options.largest_image = scene::largest_image(dataset);
+    options.needs = needs;
+    let backend = CpuBackend::new(&model, &options)?;
+    drop(model);
+
+    let mut ledger = backend.ledger().clone();
+    let cache = views.cache();
+    ledger.add_to(
+        Section::Images,
+        "decoded training views",
+        cache.held_bytes(),
+    );
+    ledger.add_to(Section::Images, "decoding", cache.decode_bytes());
+    let budget = scene.budget as u64;
+    let float = size_of::<f32>() as u64;
+    // Signals and candidates on the host; fates, families and slots of the plan.
+    let plan = budget * (signals * float + 64)
+        + (candidates * size_of::<densify_policies::policy::Candidate>()) as u64;
+    ledger.add_to(Section::Passing, "a policy's event", plan);
+    // The model as downloaded and as exported.
+    let row = float * (11 + 3 * sh_coefficients(config.train.sh_degree) as u64);
+    ledger.add_to(Section::Passing, "export of the model", 2 * budget * row);
+    if test.count() > 0 {
+        let (width, height) = options.largest_image;
+        let rendering = u64::from(width) * u64::from(height) * 5 * float;
+        ledger.add_to(
+            Section::Passing,
+            "measuring a test view",
+            rendering + test.cache().bytes_needed(),
+        );
+    }
+    if let Some(bytes) = before {
+        ledger.add_to(Section::Process, "program and dataset", bytes);
+    }
+    Ok((Box::new(backend), ledger))
+}
+
+/// The initial model in the coordinates of training, and how it was made.
+fn first_model(
+    args: &TrainArgs,
+    dataset: &Dataset,
+    budget: usize,
+    console: &Console,
+) -> Result<(Gaussians, InitChoice, Option<usize>), Failure> {
+    let choice = match args.init {
+        Some(init) => init.into(),
+        None if dataset.points.is_empty() || args.init_points.is_some() => InitChoice::Random,
+        None => InitChoice::Points,
+    };
+    let random;
+    let (points, count) = match choice {
+        InitChoice::Points if args.init_points.is_some() => {
+            return Err(Failure::input(
+                "--init-points is for a random start; leave it out, or use --init random",
+            ));
+        }
+        InitChoice::Points => (&dataset.points, None),
+        InitChoice::Random => {
+            let count = args
+                .init_points
+                .unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
+            let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
+            let opaque = !dataset
+                .train
+                .iter()
+                .any(|view| view.source.header.has_alpha);
+            random = random_points(count, &cameras, opaque, args.seed);
+            (&random, Some(count))
+        }
+    };
+    let (model, report) = initialise(points, budget, args.sh_degree, args.seed)?;
+    let left_out = [
+        (report.unusable, "not finite"),
+        (report.duplicates, "at the place of another"),
+        (
+            report.over_budget,
+            "beyond the budget; which ones follows from the seed",
+        ),
+    ];
+    for (number, why) in left_out.into_iter().filter(|(number, _)| *number > 0) {
+        console.say(format_args!(
+            "note: {} points left out: {why}",
+            grouped(number)
+        ));
+    }
+    let what = if count.is_some() {
+        "random points"
+    } else {
+        "points of the scene"
+    };
+    console.say(format_args!(
+        "start    {} rows from {} {what}",
+        grouped(model.len()),
+        grouped(report.points)
+    ));
+    Ok((model, choice, count))
+}
+
+fn announce(
+    args: &TrainArgs,
+    entry: &PolicyEntry,
+    config: &RunConfig,
+    output: &Path,
+    console: &Console,
+) {
+    let default = if args.budget.is_none() {
+        " (default; choose with --budget)"
+    } else {
+        ""
+    };
+    console.say(format_args!(
+        "budget   {} rows{default}",
+        grouped(config.train.budget)
+    ));
+    console.say(format_args!("policy   {}: {}", entry.name, entry.summary));
+    console.say(format_args!(
+        "run      {} iterations, seed {}, degree {}, background {}",
+        grouped(args.iterations as usize),
+        args.seed,
+        args.sh_degree,
+        config.scene.background
+    ));
+    console.say(format_args!("output   {}", output.display()));
+}
+
+/// The policy's parameters as set by file and flags.
+fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table, Failure> {
+    let mut set = Table::new();
+    if let Some(path) = &args.policy_config {
+        let fail = |problem: String| {
+            Failure::input(format!("--policy-config {}: {problem}", path.display()))
+        };
+        let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+        let file: Table = text
+            .parse()
+            .map_err(|e| fail(format!("{e}").trim().to_owned()))?;
+        for (policy, table) in file {
+            // One file may serve several policies; a misspelt name may not pass for another one.
+            let known = find(&policy).map_err(|e| fail(e.to_string()))?;
+            let Ok(table) = table.try_into::<Table>() else {
+                return Err(fail(format!("`{policy}` must be a table: [{policy}]")));
+            };
+            if known.name == entry.name {
+                set = table;
+            }
+        }
+    }
+    for (policy, table) in parse_overrides(&args.policy_set)? {
+        if find(&policy)?.name != entry.name {
+            return Err(Failure::input(format!(
+                "--policy-set sets a parameter of `{policy}`, but the policy of this run is `{}`; \
+                 choose it with --policy {policy}",
+                entry.name
+            )));
+        }
+        set.extend(table);
+    }
+    Ok(set)
+}
+
+/// Default learning rates, overlaid with `NAME=RATE` settings.
+fn learning_rates(settings: &[String]) -> Result<RateOptions, Failure> {
+    let mut table = Table::new();
+    for setting in settings {
+        let value = setting
+            .split_once('=')
+            .and_then(|(name, rate)| Some((name.trim(), rate.trim().parse::<f64>().ok()?)));
+        let Some((name, rate)) = value else {
+            return Err(Failure::input(format!(
+                "--lr {setting} is not of the form NAME=RATE, such as opacity=0.05"
+            )));
+        };
+        table.insert(name.to_owned(), rate.into());
+    }
+    let fail = |problem: &str| Failure::input(format!("--lr: {}", problem.trim()));
+    let rates: RateOptions = table.try_into().map_err(|e| fail(&e.to_string()))?;
+    match rates.invalid() {
+        Some(name) => Err(fail(&format!("{name} must be a positive number"))),
+        None => Ok(rates),
+    }
+}
+
+fn check_iterations(flag: &str, chosen: &[u32], iterations: u32) -> Result<(), Failure> {
+    match chosen.iter().find(|&&n| n == 0 || n > iterations) {
+        None => Ok(()),
+        Some(n) => Err(Failure::input(format!(
+            "{flag} {n} is out of range: the run has iterations 1 to {iterations}"
+        ))),
+    }
+}
+
+/// `output/SCENE-POLICY`, SCENE being the dataset folder's name.
+fn default_output(scene: &Path, policy: &str) -> PathBuf {
+    let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
+    let name = full
+        .file_name()
+        .map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+    Path::new("output").join(format!("{name}-{policy}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn learning_rates_by_name() {
+        let rates = learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()]).unwrap();
+        let expected = RateOptions {
+            opacity: 0.05,
+            mean_end: 1e-5,
+            ..RateOptions::default()
+        };
+        assert_eq!(rates, expected);
+        for (bad, part) in [
+            ("opacity", "NAME=RATE"),
+            ("opacity=x", "NAME=RATE"),
+            ("colour=1", "colour"),
+            ("quat=0", "quat"),
+            ("quat=inf", "quat"),
+        ] {
+            let message = learning_rates(&[bad.into()]).unwrap_err().message;
+            assert!(
+                message.contains(part) && message.contains("--lr"),
+                "{bad}: {message}"
+            );
+        }
+    }
+
+    #[test]
+    fn iterations_outside_the_run_name_the_flag() {
+        assert!(check_iterations("--save-iterations", &[1, 30], 30).is_ok());
+        for bad in [0, 31] {
+            let failure = check_iterations("--save-iterations", &[5, bad], 30).unwrap_err();
+            assert!(
+                failure
+                    .message
+                    .starts_with(&format!("--save-iterations {bad} "))
+            );
+        }
+    }
+
+    #[test]
+    fn the_output_is_named_after_the_scene_and_the_policy() {
+        let root = tempfile::tempdir().unwrap();
+        let scene = root.path().join("garden");
+        std::fs::create_dir(&scene).unwrap();
+        for spelling in [
+            scene.clone(),
+            scene.join(""),
+            scene.join("."),
+            scene.join("../garden"),
+        ] {
+            assert_eq!(
+                default_output(&spelling, "diet"),
+                Path::new("output/garden-diet")
+            );
+        }
+    }
+}

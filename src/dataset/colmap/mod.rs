@@ -1,0 +1,146 @@
+//! COLMAP sparse models: `images/` beside `sparse/0/{cameras,images,points3D}.{bin,txt}`.
+//!
+//! Rigs and frames of newer versions are ignored: images.bin holds the poses still.
+
+mod bin;
+mod model;
+mod txt;
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+
+use super::error::DatasetError;
+use super::folders::Folders;
+use super::paths::{Named, Root, relative};
+use super::pose::{checked_pose, checked_quaternion};
+use super::undistort::Lens;
+use super::{Frame, PointCloud, Scene};
+
+const REMEDY: &str = "export the model again with COLMAP";
+
+/// Most records accepted.
+const MAX_IMAGES: u64 = 1_000_000;
+const MAX_POINTS: u64 = 1 << 28;
+
+/// One registered image.
+#[derive(Debug)]
+struct Image {
+    name: String,
+    camera: u32,
+    rotation: DMat3,
+    translation: DVec3,
+}
+
+impl Image {
+    fn checked(
+        file: &Path,
+        name: String,
+        camera: u32,
+        q: [f64; 4],
+        t: [f64; 3],
+    ) -> Result<Self, DatasetError> {
+        let frame = format!("image {name}");
+        let rotation = checked_quaternion(file, &frame, q)?;
+        let (rotation, translation) = checked_pose(file, &frame, rotation, t.into())?;
+        Ok(Self { name, camera, rotation, translation })
+    }
+}
+
+/// A model as its three files hold it.
+#[derive(Debug, Default)]
+struct Model {
+    cameras: HashMap<u32, Lens>,
+    images: Vec<Image>,
+    points: PointCloud,
+}
+
+/// The folder of the model, if there is one: `sparse/0`, else `sparse`.
+pub(super) fn find(root: &Path) -> Option<PathBuf> {
+    ["sparse/0", "sparse"].iter().map(|folder| root.join(folder)).find(|folder| {
+        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"]
+            .iter()
+            .any(|name| folder.join(name).is_file())
+    })
+}
+
+/// Reads the model in `folder`.
+pub(super) fn read(root: &Root, folder: &Path, folders: &Folders) -> Result<Scene, DatasetError> {
+    let binary = ["cameras.bin", "images.bin"].iter().any(|name| folder.join(name).is_file());
+    let ending = if binary { "bin" } else { "txt" };
+    let file = |name: &str| folder.join(format!("{name}.{ending}"));
+    let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
+    // Links out of the dataset are refused for the model's files too.
+    for path in [&cameras, &images, &points] {
+        let inside = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy();
+        root.existing(Named { file: path, field: "the file", value: &inside })?;
+    }
+    let model = if binary {
+        Model {
+            cameras: bin::cameras(&cameras)?,
+            images: bin::images(&images)?,
+            points: bin::points(&points)?,
+        }
+    } else {
+        Model {
+            cameras: txt::cameras(&cameras)?,
+            images: txt::images(&images)?,
+            points: txt::points(&points)?,
+        }
+    };
+    let mut frames = Vec::with_capacity(model.images.len());
+    let mut reduced_missing = 0;
+    for image in model.images {
+        let field = format!("image {}", image.name);
+        let Some(lens) = model.cameras.get(&image.camera) else {
+            let problem = format!("its camera {} is not in {}", image.camera, cameras.display());
+            return Err(DatasetError::malformed(&images, field, problem, REMEDY));
+        };
+        let named = Named { file: &images, field: &field, value: &image.name };
+        let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
+        reduced_missing += usize::from(found.fell_back);
+        let mask = folders.mask(named)?;
+        frames.push(Frame {
+            name: relative(&image.name),
+            origin: format!("{}: {field}", images.display()),
+            image: found.path,
+            reduced: found.reduced,
+            mask,
+            lens: *lens,
+            rotation: image.rotation,
+            translation: image.translation,
+            held_out: false,
+        });
+    }
+    let mut notes = Vec::new();
+    if reduced_missing > 0 {
+        notes.push(folders.fell_back_note(reduced_missing));
+    }
+    Ok(Scene {
+        listing: images,
+        frames,
+        points: model.points,
+        points_file: Some(points),
+        own_split: false,
+        notes,
+    })
+}
+
+/// A camera's size, if an image can have it.
+fn checked_size(
+    file: &Path,
+    field: &str,
+    width: u64,
+    height: u64,
+) -> Result<(u32, u32), DatasetError> {
+    match (u32::try_from(width), u32::try_from(height)) {
+        (Ok(width), Ok(height)) if width > 0 && height > 0 => Ok((width, height)),
+        _ => Err(DatasetError::malformed(
+            file,
+            field,
+            format!("the size {width}x{height} px is impossible"),
+            REMEDY,
+        )),
+    }
+}

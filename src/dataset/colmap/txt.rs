@@ -1,0 +1,191 @@
+//! COLMAP's text files: a record per line (two per image), `#` for comments.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+use std::str::{FromStr, SplitWhitespace};
+
+use glam::DVec3;
+
+use super::super::error::DatasetError;
+use super::super::paths::MAX_NAME;
+use super::super::undistort::Lens;
+use super::super::{PointCloud, pose};
+use super::model::Model;
+use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, checked_size};
+
+/// Longest line accepted: the observations of one image, about 40 bytes each.
+const MAX_LINE: u64 = 64 << 20;
+
+struct Lines<'a> {
+    path: &'a Path,
+    input: BufReader<File>,
+    number: u64,
+    line: Vec<u8>,
+}
+
+impl<'a> Lines<'a> {
+    fn open(path: &'a Path) -> Result<Self, DatasetError> {
+        let file = File::open(path).map_err(DatasetError::io(path))?;
+        Ok(Self { path, input: BufReader::new(file), number: 0, line: Vec::new() })
+    }
+
+    fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
+        DatasetError::malformed(
+            self.path,
+            format!("line {}: {field}", self.number),
+            problem,
+            REMEDY,
+        )
+    }
+
+    /// Reads the next line, comment or not; false at the end.
+    fn advance(&mut self) -> Result<bool, DatasetError> {
+        self.line.clear();
+        self.number += 1;
+        let read = (&mut self.input).take(MAX_LINE).read_until(b'\n', &mut self.line);
+        let read = read.map_err(DatasetError::io(self.path))?;
+        if read as u64 == MAX_LINE {
+            return Err(self.fault("the line", "it is longer than 64 MiB"));
+        }
+        Ok(read > 0)
+    }
+
+    /// Reads on to the next line that is neither empty nor a comment; false at the end.
+    fn advance_to_record(&mut self) -> Result<bool, DatasetError> {
+        while self.advance()? {
+            let text = self.line.trim_ascii_start();
+            if !text.is_empty() && text[0] != b'#' {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    fn text(&self) -> Result<&str, DatasetError> {
+        std::str::from_utf8(&self.line).map_err(|_| self.fault("the line", "it is not UTF-8"))
+    }
+
+    /// The next word of the line as a number.
+    fn number<T: FromStr>(
+        &self,
+        words: &mut SplitWhitespace<'_>,
+        field: &str,
+    ) -> Result<T, DatasetError> {
+        let word = words.next().ok_or_else(|| self.fault(field, "the line ends before it"))?;
+        word.parse().map_err(|_| {
+            let word: String = word.chars().take(40).collect();
+            self.fault(field, format!("{word:?} is no such number"))
+        })
+    }
+
+    fn numbers<const N: usize>(
+        &self,
+        words: &mut SplitWhitespace<'_>,
+        field: &str,
+    ) -> Result<[f64; N], DatasetError> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.number(words, field)?;
+        }
+        Ok(values)
+    }
+}
+
+/// Reads cameras.txt.
+pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
+    let mut lines = Lines::open(path)?;
+    let mut cameras = HashMap::new();
+    while lines.advance_to_record()? {
+        let mut words = lines.text()?.split_whitespace();
+        let id: u32 = lines.number(&mut words, "camera id")?;
+        let field = format!("camera {id}");
+        let model = words.next().ok_or_else(|| lines.fault(&field, "the model is missing"))?;
+        let model = Model::of_name(path, &field, model)?;
+        let width = lines.number(&mut words, "width")?;
+        let height = lines.number(&mut words, "height")?;
+        let (width, height) = checked_size(path, &field, width, height)?;
+        let mut parameters = [0.0; 8];
+        for value in &mut parameters[..model.parameters()] {
+            *value = lines.number(&mut words, "camera parameters")?;
+        }
+        if words.next().is_some() {
+            return Err(lines.fault(&field, "there are more parameters than the model has"));
+        }
+        let lens = model.lens(width, height, &parameters[..model.parameters()]);
+        let lens = lens.ok_or_else(|| lines.fault(&field, "wrong number of parameters"))?;
+        pose::check_lens(path, &field, &lens)?;
+        if cameras.insert(id, lens).is_some() {
+            return Err(lines.fault(&field, "the id occurs twice"));
+        }
+    }
+    Ok(cameras)
+}
+
+/// Reads images.txt. The line of observations after each image may be empty, so that only
+/// comments may be skipped between the two.
+pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
+    let mut lines = Lines::open(path)?;
+    let mut images = Vec::new();
+    while lines.advance_to_record()? {
+        let text = lines.text()?;
+        let mut words = text.split_whitespace();
+        let id: u32 = lines.number(&mut words, "image id")?;
+        let field = format!("image id {id}");
+        let q = lines.numbers::<4>(&mut words, &field)?;
+        let t = lines.numbers::<3>(&mut words, &field)?;
+        let camera: u32 = lines.number(&mut words, "camera id")?;
+        // The name is the rest of the line: it may hold spaces.
+        let name = after_words(text, 9);
+        if name.is_empty() || name.len() > MAX_NAME {
+            return Err(lines.fault(&field, "the name is missing or longer than 4 KiB"));
+        }
+        images.push(Image::checked(path, name.to_owned(), camera, q, t)?);
+        if images.len() as u64 > MAX_IMAGES {
+            return Err(lines.fault("images", "there are more than a million"));
+        }
+        lines.advance()?;
+        let words = lines.text()?.split_whitespace().take(10).count();
+        if words % 3 != 0 && words < 10 {
+            return Err(lines.fault("observations", "they do not come in triples (X, Y, point id)"));
+        }
+        if words == 10 && lines.text()?.split_whitespace().count() % 3 != 0 {
+            return Err(lines.fault(
+                "observations",
+                "they do not come in triples (X, Y, point id); an image without any needs an empty line",
+            ));
+        }
+    }
+    Ok(images)
+}
+
+/// What follows the first `count` words of a line.
+fn after_words(text: &str, count: usize) -> &str {
+    let mut rest = text.trim();
+    for _ in 0..count {
+        rest = rest.find(char::is_whitespace).map_or("", |end| rest[end..].trim_start());
+    }
+    rest
+}
+
+/// Reads points3D.txt.
+pub(super) fn points(path: &Path) -> Result<PointCloud, DatasetError> {
+    let mut lines = Lines::open(path)?;
+    let mut points = PointCloud::default();
+    while lines.advance_to_record()? {
+        let mut words = lines.text()?.split_whitespace();
+        let _: u64 = lines.number(&mut words, "point id")?;
+        let position = lines.numbers::<3>(&mut words, "position")?;
+        let mut colour = [0u8; 3];
+        for channel in &mut colour {
+            *channel = lines.number(&mut words, "colour")?;
+        }
+        points.positions.push(DVec3::from(position));
+        points.colours.push(colour);
+        if points.positions.len() as u64 > MAX_POINTS {
+            return Err(lines.fault("points", "there are more than 2^28"));
+        }
+    }
+    Ok(points)
+}

@@ -1,0 +1,154 @@
+//! Why a dataset cannot be loaded: each message names the file, the field and the remedy.
+
+use std::path::{Path, PathBuf};
+
+/// Why a dataset, or one of its images, cannot be loaded.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DatasetError {
+    /// A file cannot be opened or read.
+    #[error("cannot read {path}: {source}; check that it exists and is readable")]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The folder is in none of the known formats.
+    #[error(
+        "{path} is no dataset: found neither {looked_for}; name a folder with a COLMAP model or transforms files"
+    )]
+    Unrecognised {
+        /// The folder.
+        path: PathBuf,
+        /// The files that would have told the format.
+        looked_for: &'static str,
+    },
+    /// A file's contents contradict its format or themselves.
+    #[error("{path}: {field}: {problem}; {remedy}")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// Where in the file: a record, a line, a field.
+        field: String,
+        /// What is wrong there.
+        problem: String,
+        /// What to do about it.
+        remedy: &'static str,
+    },
+    /// A path in a data file is not below the dataset's folder, or not a path at all.
+    #[error(
+        "{path}: {field}: the path {value:?} {problem}; only paths below the dataset's folder are followed \
+         (a folder elsewhere can be named with --images)"
+    )]
+    UnsafePath {
+        /// The file that holds the path.
+        path: PathBuf,
+        /// The field that holds it.
+        field: String,
+        /// The path as written, cut after 200 characters.
+        value: String,
+        /// What is wrong with it.
+        problem: &'static str,
+    },
+    /// A camera whose lens cannot be turned into a pinhole.
+    #[error(
+        "{path}: {field}: {problem}; undistort the images first, e.g. with `colmap image_undistorter`"
+    )]
+    Lens {
+        /// The file that holds the camera.
+        path: PathBuf,
+        /// The camera.
+        field: String,
+        /// The model or the parameters that are the matter.
+        problem: String,
+    },
+    /// An image or mask whose size disagrees with its camera.
+    #[error(
+        "{path} is {width}x{height} px, but its camera says {camera_width}x{camera_height} px; \
+         use the images that the cameras were made from, or a proportional rescale of them"
+    )]
+    ImageSize {
+        /// The image.
+        path: PathBuf,
+        /// Its width [px].
+        width: u32,
+        /// Its height [px].
+        height: u32,
+        /// The width expected [px].
+        camera_width: u32,
+        /// The height expected [px].
+        camera_height: u32,
+    },
+    /// An image that cannot be decoded.
+    #[error(
+        "cannot decode {path}: {problem}; convert it to an 8- or 16-bit PNG, JPEG or WebP of at most 16384 px a side"
+    )]
+    Image {
+        /// The image.
+        path: PathBuf,
+        /// What the decoder said.
+        problem: String,
+    },
+    /// An image that the dataset names is not there.
+    #[error(
+        "{path}: {field}: there is no file {image}; restore it, or name the folder that holds the images with --images"
+    )]
+    MissingImage {
+        /// The file that names it.
+        path: PathBuf,
+        /// The field that names it.
+        field: String,
+        /// Where it was looked for.
+        image: PathBuf,
+    },
+    /// There is not one posed image.
+    #[error("{path} lists no image that exists; check the file and the images beside it")]
+    NoImages {
+        /// The file that should list them.
+        path: PathBuf,
+    },
+    /// The test split takes every view.
+    #[error(
+        "no view is left to train on: the test split takes all {views}; use a larger --test-every, or none"
+    )]
+    NoTrainingViews {
+        /// Number of views.
+        views: usize,
+    },
+    /// Too many points are unusable.
+    #[error(
+        "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+    )]
+    BadPoints {
+        /// The file of the points.
+        path: PathBuf,
+        /// Number of unusable points.
+        bad: usize,
+        /// Number of points.
+        total: usize,
+    },
+    /// The point cloud's file is unusable.
+    #[error(transparent)]
+    Ply(#[from] crate::ply::PlyError),
+}
+
+impl DatasetError {
+    pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |source| Self::Io { path: path.to_owned(), source }
+    }
+
+    pub(super) fn malformed(
+        path: &Path,
+        field: impl Into<String>,
+        problem: impl Into<String>,
+        remedy: &'static str,
+    ) -> Self {
+        Self::Malformed {
+            path: path.to_owned(),
+            field: field.into(),
+            problem: problem.into(),
+            remedy,
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! What the user chooses about loading: images, resolution, test split.
+
+use std::num::NonZeroU32;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// How to load a dataset.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct LoadOptions {
+    /// Folder of the images (`--images`), instead of the one the dataset's files say; relative to
+    /// the dataset. The one way to use images outside the dataset's folder.
+    pub images: Option<PathBuf>,
+    /// Size to train at (`--resolution`); the images' own without.
+    pub resolution: Option<Resolution>,
+    /// Which views are held out.
+    pub split: Split,
+}
+
+/// The size to train at. Images are never enlarged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Resolution {
+    /// Sides divided by this: 1, 2, 4 or 8. Uses the folder `images_2`, `images_4` or `images_8`
+    /// where there is one.
+    Divisor(u32),
+    /// Images this wide [px], above 8.
+    Width(u32),
+}
+
+/// Which views are held out for tests.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Split {
+    /// Those of the dataset's own test file, if it has one; else none.
+    #[default]
+    None,
+    /// Those of the dataset's own test file, if it has one; else every 8th by sorted name.
+    Eval,
+    /// Every K-th of all views by sorted name, the first included, whatever the dataset says.
+    Every(NonZeroU32),
+}
+
+impl Split {
+    /// The convention of the field: every 8th view.
+    pub const EVAL_EVERY: u32 = 8;
+}
+
+/// A word that is no resolution.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{0:?} is no resolution: give 1, 2, 4 or 8 to divide the images' sides by, or a width in px above 8"
+)]
+pub struct ParseResolutionError(String);
+
+impl FromStr for Resolution {
+    type Err = ParseResolutionError;
+
+    fn from_str(word: &str) -> Result<Self, Self::Err> {
+        match word.parse() {
+            Ok(k @ (1 | 2 | 4 | 8)) => Ok(Self::Divisor(k)),
+            Ok(width) if width > 8 => Ok(Self::Width(width)),
+            _ => Err(ParseResolutionError(word.to_owned())),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn resolutions_parse() {
+        assert_eq!("4".parse(), Ok(Resolution::Divisor(4)));
+        assert_eq!("640".parse(), Ok(Resolution::Width(640)));
+        for bad in ["0", "3", "-1", "", "1.5", "x"] {
+            assert!(bad.parse::<Resolution>().is_err(), "{bad:?}");
+        }
+    }
+}

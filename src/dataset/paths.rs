@@ -1,0 +1,148 @@
+//! Paths that come from data files: untrusted, and never followed out of the dataset's folder.
+
+use std::path::{Path, PathBuf};
+
+use super::error::DatasetError;
+
+/// Longest name accepted from a data file [bytes].
+pub(super) const MAX_NAME: usize = 4096;
+
+/// A folder that paths from data files may not leave.
+#[derive(Debug, Clone)]
+pub(super) struct Root {
+    /// As the user wrote it, for messages.
+    shown: PathBuf,
+    canonical: PathBuf,
+}
+
+/// A path from a data file, and where it stands, for messages.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Named<'a> {
+    pub(super) file: &'a Path,
+    pub(super) field: &'a str,
+    pub(super) value: &'a str,
+}
+
+impl Root {
+    pub(super) fn new(folder: &Path) -> Result<Self, DatasetError> {
+        let canonical = folder.canonicalize().map_err(DatasetError::io(folder))?;
+        if !canonical.is_dir() {
+            return Err(DatasetError::Io {
+                path: folder.to_owned(),
+                source: std::io::Error::from(std::io::ErrorKind::NotADirectory),
+            });
+        }
+        Ok(Self { shown: folder.to_owned(), canonical })
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.shown
+    }
+
+    /// Where `value` lies, after the checks that need no file system. It need not exist.
+    pub(super) fn join(&self, named: Named<'_>) -> Result<PathBuf, DatasetError> {
+        match lexical_fault(named.value) {
+            None => Ok(self.shown.join(relative(named.value))),
+            Some(problem) => Err(named.fault(problem)),
+        }
+    }
+
+    /// `join`, and the check that no link leads out; `None` where there is no such file.
+    pub(super) fn existing(&self, named: Named<'_>) -> Result<Option<PathBuf>, DatasetError> {
+        let path = self.join(named)?;
+        match path.canonicalize() {
+            Ok(real) if !real.starts_with(&self.canonical) => {
+                Err(named.fault("leads out of the folder through a symbolic link"))
+            }
+            Ok(real) if real.is_file() => Ok(Some(path)),
+            _ => Ok(None),
+        }
+    }
+}
+
+impl Named<'_> {
+    fn fault(self, problem: &'static str) -> DatasetError {
+        DatasetError::UnsafePath {
+            path: self.file.to_owned(),
+            field: self.field.to_owned(),
+            value: self.value.chars().take(200).collect(),
+            problem,
+        }
+    }
+}
+
+/// The path without `./` parts, with `/` as separator: the name of a view.
+pub(super) fn relative(value: &str) -> String {
+    value.split('/').filter(|part| !part.is_empty() && *part != ".").collect::<Vec<_>>().join("/")
+}
+
+fn lexical_fault(value: &str) -> Option<&'static str> {
+    // Both separators count: a file written on another system must not mean something else here.
+    let parts = || value.split(['/', '\\']);
+    if relative(value).is_empty() {
+        Some("is empty")
+    } else if value.len() > MAX_NAME {
+        Some("is longer than 4 KiB")
+    } else if value.contains('\0') {
+        Some("contains a NUL character")
+    } else if value.starts_with(['/', '\\'])
+        || value.as_bytes().get(1) == Some(&b':')
+        || value.starts_with("file:")
+    {
+        Some("is absolute")
+    } else if parts().any(|part| part == "..") {
+        Some("contains `..`")
+    } else {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn named(value: &str) -> Named<'_> {
+        Named { file: Path::new("x.json"), field: "file_path", value }
+    }
+
+    #[test]
+    fn paths_that_leave_the_folder_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = Root::new(folder.path()).unwrap();
+        let long = "a".repeat(5000);
+        for bad in [
+            "",
+            "./",
+            "/etc/passwd",
+            "../a",
+            "a/../../b",
+            "a\\..\\b",
+            "C:\\a",
+            "\\\\host\\a",
+            "file:///a",
+            "a\0b",
+            &long,
+        ] {
+            assert!(
+                matches!(root.join(named(bad)), Err(DatasetError::UnsafePath { .. })),
+                "{bad:?}"
+            );
+        }
+        assert_eq!(root.join(named("./a//b.png")).unwrap(), folder.path().join("a/b.png"));
+        assert_eq!(root.existing(named("a/b.png")).unwrap(), None);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_are_followed_only_inside() {
+        let outside = tempfile::tempdir().unwrap();
+        std::fs::write(outside.path().join("a.png"), b"x").unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("b.png"), b"x").unwrap();
+        std::os::unix::fs::symlink(outside.path(), folder.path().join("out")).unwrap();
+        std::os::unix::fs::symlink("b.png", folder.path().join("c.png")).unwrap();
+        let root = Root::new(folder.path()).unwrap();
+        assert!(matches!(root.existing(named("out/a.png")), Err(DatasetError::UnsafePath { .. })));
+        assert!(root.existing(named("c.png")).unwrap().is_some());
+    }
+}

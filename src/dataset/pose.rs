@@ -1,0 +1,120 @@
+//! Checks on what data files say about cameras: poses and intrinsics.
+
+use std::path::Path;
+
+use glam::{DMat3, DVec2, DVec3};
+
+use super::error::DatasetError;
+use super::undistort::Lens;
+
+/// Fields of view that a pinhole camera can stand for [degrees].
+const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
+
+/// Largest entry of |RᵀR − I| accepted; below it the rotation is made orthonormal.
+const ROTATION_TOLERANCE: f64 = 1e-3;
+
+const POSE_REMEDY: &str = "repair the pose or remove the frame";
+
+/// A rotation and translation of camera_from_world, checked; the rotation made orthonormal.
+pub(super) fn checked_pose(
+    file: &Path,
+    frame: &str,
+    rotation: DMat3,
+    translation: DVec3,
+) -> Result<(DMat3, DVec3), DatasetError> {
+    let fault = |problem: String| Err(DatasetError::malformed(file, frame, problem, POSE_REMEDY));
+    if !rotation.is_finite() || !translation.is_finite() {
+        return fault("the pose is not finite".into());
+    }
+    let error = (rotation.transpose() * rotation - DMat3::IDENTITY).to_cols_array();
+    let error = error.iter().fold(0.0, |largest: f64, e| largest.max(e.abs()));
+    if error > ROTATION_TOLERANCE {
+        return fault(format!(
+            "the rotation is not orthonormal: |RᵀR − I| = {error:.3e} > {ROTATION_TOLERANCE:e}"
+        ));
+    }
+    if rotation.determinant() < 0.0 {
+        return fault("the rotation is a reflection (determinant −1)".into());
+    }
+    // Newton–Schulz converges quadratically to the nearest rotation: 1e-3 → 1e-6 → 1e-12 → 1e-24.
+    let mut r = rotation;
+    for _ in 0..3 {
+        r = r * (3.0 * DMat3::IDENTITY - r.transpose() * r) * 0.5;
+    }
+    Ok((r, translation))
+}
+
+/// The rotation of a quaternion (w, x, y, z) of unit length, checked.
+pub(super) fn checked_quaternion(
+    file: &Path,
+    frame: &str,
+    q: [f64; 4],
+) -> Result<DMat3, DatasetError> {
+    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    if !norm.is_finite() || (norm - 1.0).abs() > ROTATION_TOLERANCE {
+        let problem = format!("the quaternion {q:?} has length {norm} instead of 1");
+        return Err(DatasetError::malformed(file, frame, problem, POSE_REMEDY));
+    }
+    let [w, x, y, z] = q.map(|v| v / norm);
+    Ok(DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w)))
+}
+
+/// Checks a lens's numbers, before anything is derived from them.
+pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), DatasetError> {
+    let fault = |problem: String| {
+        Err(DatasetError::malformed(file, camera, problem, "repair the camera's parameters"))
+    };
+    let size = DVec2::new(f64::from(lens.width), f64::from(lens.height));
+    if lens.width == 0 || lens.height == 0 {
+        return fault(format!("the size {}x{} px is impossible", lens.width, lens.height));
+    }
+    if !lens.principal.is_finite() || lens.distortion.iter().any(|k| !k.is_finite()) {
+        return fault("the principal point or the distortion is not finite".into());
+    }
+    for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
+        if !focal.is_finite() || focal <= 0.0 {
+            return fault(format!("the focal length {name} = {focal} is not above 0"));
+        }
+        let degrees = 2.0 * (0.5 * side / focal).atan().to_degrees();
+        if !FIELD_OF_VIEW.contains(&degrees) {
+            return fault(format!(
+                "the focal length {name} = {focal} px at {side} px means a field of view of {degrees:.2} degrees, \
+                 outside of {FIELD_OF_VIEW:?}"
+            ));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slightly_skewed_rotation_is_repaired_and_a_skewed_one_refused() {
+        let exact = DMat3::from_rotation_y(0.7) * DMat3::from_rotation_x(-0.2);
+        let skew =
+            |amount: f64| exact * DMat3::from_diagonal(DVec3::new(1.0 + amount, 1.0, 1.0 - amount));
+        let check = |r| checked_pose(Path::new("f"), "frame 3", r, DVec3::ZERO);
+        let (repaired, _) = check(skew(4e-4)).unwrap();
+        let left = repaired.transpose() * repaired - DMat3::IDENTITY;
+        assert!(left.to_cols_array().iter().all(|e| e.abs() < 1e-15), "{left}");
+        assert!((repaired - exact).to_cols_array().iter().all(|e| e.abs() < 1e-6));
+        for bad in [skew(1e-3), exact * -1.0, exact * 2.0, DMat3::ZERO, exact * f64::NAN] {
+            let message = check(bad).unwrap_err().to_string();
+            assert!(message.contains("frame 3"), "{message}");
+        }
+        assert!(
+            checked_pose(Path::new("f"), "g", exact, DVec3::new(0.0, f64::INFINITY, 0.0)).is_err()
+        );
+    }
+
+    #[test]
+    fn a_quaternion_that_is_no_rotation_is_refused() {
+        for bad in [[0.0; 4], [2.0, 0.0, 0.0, 0.0], [f64::NAN, 0.0, 0.0, 1.0]] {
+            assert!(checked_quaternion(Path::new("f"), "g", bad).is_err(), "{bad:?}");
+        }
+        let half_turn = checked_quaternion(Path::new("f"), "g", [0.0, 0.0, 0.0, 1.0]).unwrap();
+        assert!((half_turn * DVec3::X + DVec3::X).length() < 1e-15);
+    }
+}

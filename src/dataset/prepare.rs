@@ -1,0 +1,237 @@
+//! From frames as files describe them to views to train on: sizes, lenses, split, coordinates.
+
+use std::path::Path;
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::error::DatasetError;
+use super::images::{self, ImageHeader, ImageSource};
+use super::normalise::Normalisation;
+use super::{Dataset, Frame, LoadOptions, PointCloud, Resolution, Scene, Split, View};
+use crate::camera::Camera;
+
+/// Share of points that may be unusable.
+const MAX_BAD_POINTS: f64 = 0.01;
+
+/// Checks every frame, splits, and moves all into normalised coordinates.
+pub(super) fn dataset(
+    path: &Path,
+    scene: Scene,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let Scene { listing, mut frames, mut points, points_file, own_split, mut notes } = scene;
+    // Bytewise, as the field sorts names for its test splits.
+    frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
+    refuse_duplicates(&listing, &frames)?;
+    // Collected before the first error is looked for, so that it is the same one every time.
+    let views: Vec<Result<View, DatasetError>> =
+        frames.par_iter().map(|frame| view(frame, options.resolution)).collect();
+    let views: Vec<View> = views.into_iter().collect::<Result<_, _>>()?;
+    if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, views.first())
+        && views.iter().any(|view| view.source.header.width < width)
+    {
+        notes.push(format!("images narrower than {width} px are not enlarged ({})", first.name));
+    }
+
+    let every = match options.split {
+        Split::Every(every) => Some(every.get() as usize),
+        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
+        Split::None | Split::Eval => None,
+    };
+    let count = views.len();
+    let (mut train, mut test) = (Vec::new(), Vec::new());
+    for (index, (view, frame)) in views.into_iter().zip(&frames).enumerate() {
+        let held_out = every.map_or(frame.held_out, |every| index % every == 0);
+        if held_out {
+            test.push(view);
+        } else {
+            train.push(view);
+        }
+    }
+    if train.is_empty() {
+        return Err(DatasetError::NoTrainingViews { views: count });
+    }
+
+    let points_path = points_file.as_deref().unwrap_or(path);
+    drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
+    let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
+    let normalisation = Normalisation::fit(&centres, &points.positions);
+    for view in train.iter_mut().chain(&mut test) {
+        view.camera = normalisation.camera(&view.camera);
+        if !view.camera.translation.as_vec3().is_finite() {
+            let problem = "the camera is too far from the others";
+            return Err(DatasetError::malformed(
+                &listing,
+                &view.name,
+                problem,
+                "repair the pose or remove the frame",
+            ));
+        }
+    }
+    for position in &mut points.positions {
+        *position = normalisation.point(*position);
+    }
+    drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
+        p.as_vec3().is_finite()
+    })?;
+    Ok(Dataset { root: path.to_owned(), train, test, points, normalisation, notes })
+}
+
+fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
+    for pair in frames.windows(2) {
+        if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
+            let problem = "the image is listed twice";
+            return Err(DatasetError::malformed(
+                listing,
+                &pair[0].name,
+                problem,
+                "remove one of the two",
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn drop_bad(
+    path: &Path,
+    points: &mut PointCloud,
+    notes: &mut Vec<String>,
+    what: &str,
+    keep: impl Fn(DVec3) -> bool,
+) -> Result<(), DatasetError> {
+    let total = points.len();
+    let bad = points.retain(keep);
+    if bad as f64 > MAX_BAD_POINTS * total as f64 {
+        return Err(DatasetError::BadPoints { path: path.to_owned(), bad, total });
+    }
+    if bad > 0 {
+        notes.push(format!(
+            "{}: {bad} of {total} points are not {what} and are dropped",
+            path.display()
+        ));
+    }
+    Ok(())
+}
+
+/// Checks an image's header against its camera and decides what loading will do.
+fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetError> {
+    let header = images::probe(&frame.image)?;
+    let lens = &frame.lens;
+    let size_fault =
+        |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
+            path: path.to_owned(),
+            width: found.width,
+            height: found.height,
+            camera_width: width,
+            camera_height: height,
+        };
+    let k = frame.reduced.unwrap_or(1);
+    let fits = match frame.reduced {
+        Some(k) => {
+            let near = |side: u32, full: u32| side.abs_diff(divided(full, k)) <= 1;
+            near(header.width, lens.width) && near(header.height, lens.height)
+        }
+        None => proportional((header.width, header.height), (lens.width, lens.height)),
+    };
+    if !fits {
+        return Err(size_fault(
+            &frame.image,
+            header,
+            divided(lens.width, k),
+            divided(lens.height, k),
+        ));
+    }
+    if let Some(mask) = &frame.mask {
+        let found = images::probe(mask)?;
+        if !proportional((found.width, found.height), (header.width, header.height)) {
+            return Err(size_fault(mask, found, header.width, header.height));
+        }
+    }
+    let lens = lens.resized(header.width, header.height);
+    let undistortion = if lens.is_distorted() {
+        Some(lens.undistortion().map_err(|problem| DatasetError::Lens {
+            path: frame.image.clone(),
+            field: frame.origin.clone(),
+            problem: format!("{problem} (k1, k2, p1, p2 = {:?})", lens.distortion),
+        })?)
+    } else {
+        None
+    };
+    let pinhole = undistortion.as_ref().map_or(&lens, |undistortion| undistortion.pinhole());
+    let (width, height) = target_size(&header, resolution, frame.reduced.is_some());
+    let camera = Camera {
+        width: header.width,
+        height: header.height,
+        fx: pinhole.focal.x,
+        fy: pinhole.focal.y,
+        cx: pinhole.principal.x,
+        cy: pinhole.principal.y,
+        rotation: frame.rotation,
+        translation: frame.translation,
+    };
+    Ok(View {
+        name: frame.name.clone(),
+        camera: camera.resized(width, height),
+        source: ImageSource {
+            path: frame.image.clone(),
+            mask: frame.mask.clone(),
+            width,
+            height,
+            undistortion,
+            header,
+        },
+    })
+}
+
+/// The size to train at.
+fn target_size(header: &ImageHeader, resolution: Option<Resolution>, reduced: bool) -> (u32, u32) {
+    match resolution {
+        Some(Resolution::Divisor(k)) if !reduced => {
+            (divided(header.width, k), divided(header.height, k))
+        }
+        Some(Resolution::Width(width)) if width < header.width => {
+            let height = f64::from(header.height) * f64::from(width) / f64::from(header.width);
+            (width.max(1), (height.round() as u32).max(1))
+        }
+        _ => (header.width, header.height),
+    }
+}
+
+/// side / k, rounded as image tools do, at least 1.
+fn divided(side: u32, k: u32) -> u32 {
+    ((f64::from(side) / f64::from(k.max(1))).round() as u32).max(1)
+}
+
+/// Whether one scale brings `of` to within 1 px of `size` along both axes.
+fn proportional(size: (u32, u32), of: (u32, u32)) -> bool {
+    let range = |side: u32, of: u32| {
+        let (side, of) = (f64::from(side), f64::from(of));
+        ((side - 1.0) / of, (side + 1.0) / of)
+    };
+    let ((x0, x1), (y0, y1)) = (range(size.0, of.0), range(size.1, of.1));
+    size == of || x0.max(y0) < x1.min(y1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rescales_are_told_from_other_sizes() {
+        for (size, fits) in [
+            ((1237, 822), true),
+            ((619, 411), true),
+            ((618, 411), true),
+            ((309, 205), true),
+            ((2474, 1644), true),
+            ((822, 1237), false),
+            ((1237, 800), false),
+            ((619, 420), false),
+            ((1280, 822), false),
+        ] {
+            assert_eq!(proportional(size, (1237, 822)), fits, "{size:?}");
+        }
+        assert_eq!((divided(1237, 2), divided(3, 8)), (619, 1));
+    }
+}

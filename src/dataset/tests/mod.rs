@@ -1,0 +1,7 @@
+//! Whole datasets: written here, good and bad, and real ones where they are at hand.
+
+mod bad_input;
+mod formats;
+mod shared;
+mod write;
+pub(crate) use shared::shared;

@@ -1,0 +1,298 @@
+//! `transforms.json` (nerfstudio, instant-ngp) and `transforms_{train,test}.json` (NeRF-synthetic).
+//!
+//! Poses are camera-to-world with OpenGL axes (x right, y up, looking along −z). Intrinsics stand
+//! at the top or, taking precedence, in the frame.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use glam::{DMat3, DVec2, DVec3};
+use serde_json::{Map, Value};
+
+use super::error::DatasetError;
+use super::folders::Folders;
+use super::images;
+use super::paths::{Named, Root, relative};
+use super::pose::{check_lens, checked_pose};
+use super::undistort::Lens;
+use super::{Frame, Scene};
+
+/// Largest JSON file read [bytes]. (serde_json bounds the depth to 128.)
+const MAX_JSON: u64 = 64 << 20;
+const MAX_FRAMES: usize = 1_000_000;
+const REMEDY: &str = "correct the file or export it again";
+/// Names under which programs leave initial points beside the cameras, without saying so in the
+/// file: 3DGS and nerfstudio.
+const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
+/// Camera models that are a pinhole with k1, k2, p1, p2.
+const PINHOLES: [&str; 6] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"];
+
+/// The pair of files that brings its own test split.
+pub(super) const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
+/// The file that does not.
+pub(super) const SINGLE: &str = "transforms.json";
+
+/// Reads `transforms_train.json` and `transforms_test.json`.
+pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
+    let mut scene = read(root, folders, PAIR[0], false)?;
+    let test = read(root, folders, PAIR[1], true)?;
+    scene.frames.extend(test.frames);
+    scene.notes.extend(test.notes);
+    scene.own_split = true;
+    Ok(scene)
+}
+
+/// Reads `transforms.json`.
+pub(super) fn read_single(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
+    read(root, folders, SINGLE, false)
+}
+
+fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
+    let path = root.path().join(name);
+    root.existing(Named { file: &path, field: "the file", value: name })?;
+    let Value::Object(top) = parse(&path)? else {
+        return Err(DatasetError::malformed(&path, "the file", "it holds no JSON object", REMEDY));
+    };
+    let top = Fields { path: &path, place: String::new(), frame: None, top: &top };
+    let Some(Value::Array(list)) = top.top.get("frames") else {
+        return Err(top.fault("frames", "there is no such list"));
+    };
+    if list.len() > MAX_FRAMES {
+        return Err(top.fault("frames", "there are more than a million"));
+    }
+    let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
+    for (index, entry) in list.iter().enumerate() {
+        let place = format!("frames[{index}].");
+        let Value::Object(entry) = entry else {
+            return Err(top.fault(&format!("frames[{index}]"), "it is no object"));
+        };
+        let fields = Fields { path: &path, place, frame: Some(entry), top: top.top };
+        let Some(file) = fields.text("file_path")? else {
+            return Err(fields.fault("file_path", "it is missing"));
+        };
+        let field = fields.full("file_path");
+        let named = Named { file: &path, field: &field, value: file };
+        let Some(found) = folders.image(named)? else {
+            missing.push(file.to_owned());
+            continue;
+        };
+        fell_back += usize::from(found.fell_back);
+        let (rotation, translation) = fields.pose(file)?;
+        let mask = match fields.text("mask_path")? {
+            Some(value) => {
+                let field = fields.full("mask_path");
+                let named = Named { file: &path, field: &field, value };
+                let missing = || DatasetError::MissingImage {
+                    path: path.clone(),
+                    field: field.clone(),
+                    image: root.path().join(relative(value)),
+                };
+                Some(root.existing(named)?.ok_or_else(missing)?)
+            }
+            None => folders.mask(named)?,
+        };
+        let lens = fields.lens(&found.path, found.reduced)?;
+        frames.push(Frame {
+            name: relative(file),
+            origin: format!("{}: frame {file}", path.display()),
+            image: found.path,
+            reduced: found.reduced,
+            mask,
+            lens,
+            rotation,
+            translation,
+            held_out,
+        });
+    }
+    let mut notes = Vec::new();
+    if let Some(first) = missing.first() {
+        let count = missing.len();
+        notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", list.len()));
+    }
+    if fell_back > 0 {
+        notes.push(folders.fell_back_note(fell_back));
+    }
+    let mut points_file = None;
+    if let Some(value) = top.text("ply_file_path")? {
+        let named = Named { file: &path, field: "ply_file_path", value };
+        let found = root.existing(named)?;
+        points_file =
+            Some(found.ok_or_else(|| {
+                top.fault("ply_file_path", format!("there is no file {value:?}"))
+            })?);
+    } else if !held_out {
+        for value in POINT_FILES {
+            if let Some(found) =
+                root.existing(Named { file: &path, field: "initial points", value })?
+            {
+                notes.push(format!("initial points are taken from {value}"));
+                points_file = Some(found);
+                break;
+            }
+        }
+    }
+    let mut scene = Scene { frames, notes, points_file, listing: path.clone(), ..Scene::default() };
+    if !held_out && let Some(file) = &scene.points_file {
+        scene.points = crate::ply::read_points(file)?;
+    }
+    Ok(scene)
+}
+
+fn parse(path: &Path) -> Result<Value, DatasetError> {
+    let file = File::open(path).map_err(DatasetError::io(path))?;
+    let mut text = Vec::new();
+    file.take(MAX_JSON + 1).read_to_end(&mut text).map_err(DatasetError::io(path))?;
+    if text.len() as u64 > MAX_JSON {
+        return Err(DatasetError::malformed(path, "the file", "it is larger than 64 MiB", REMEDY));
+    }
+    // serde_json says line and column.
+    serde_json::from_slice(&text)
+        .map_err(|e| DatasetError::malformed(path, "JSON", e.to_string(), REMEDY))
+}
+
+/// One frame's fields, with those at the top as defaults.
+struct Fields<'a> {
+    path: &'a Path,
+    /// Prefix that tells the frame.
+    place: String,
+    frame: Option<&'a Map<String, Value>>,
+    top: &'a Map<String, Value>,
+}
+
+impl<'a> Fields<'a> {
+    fn full(&self, field: &str) -> String {
+        format!("{}{field}", self.place)
+    }
+
+    fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
+        DatasetError::malformed(self.path, self.full(field), problem, REMEDY)
+    }
+
+    /// A field of the frame itself, or of the top where there is no frame.
+    fn own(&self, field: &str) -> Option<&'a Value> {
+        self.frame.unwrap_or(self.top).get(field).filter(|value| !value.is_null())
+    }
+
+    fn text(&self, field: &str) -> Result<Option<&'a str>, DatasetError> {
+        match self.own(field) {
+            None => Ok(None),
+            Some(Value::String(text)) => Ok(Some(text)),
+            Some(_) => Err(self.fault(field, "it is no string")),
+        }
+    }
+
+    fn inherited(&self, field: &str) -> Option<&'a Value> {
+        self.own(field).or_else(|| self.top.get(field)).filter(|value| !value.is_null())
+    }
+
+    fn number(&self, field: &str) -> Result<Option<f64>, DatasetError> {
+        let Some(value) = self.inherited(field) else {
+            return Ok(None);
+        };
+        value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is no number"))
+    }
+
+    fn side(&self, field: &str) -> Result<Option<u32>, DatasetError> {
+        let Some(value) = self.number(field)? else {
+            return Ok(None);
+        };
+        if value >= 1.0 && value <= f64::from(u32::MAX) && value.fract().abs() < f64::EPSILON {
+            return Ok(Some(value as u32));
+        }
+        Err(self.fault(field, format!("{value} px is no image size")))
+    }
+
+    /// camera_from_world with OpenCV axes.
+    fn pose(&self, file: &str) -> Result<(DMat3, DVec3), DatasetError> {
+        const FIELD: &str = "transform_matrix";
+        let shape = || self.fault(FIELD, "it is no matrix of 3 or 4 rows of 4 numbers");
+        let rows = self.own(FIELD).and_then(Value::as_array).ok_or_else(shape)?;
+        let mut m = [[0.0; 4]; 3];
+        if !(3..=4).contains(&rows.len()) {
+            return Err(shape());
+        }
+        for (row, values) in m.iter_mut().zip(rows) {
+            let values = values.as_array().filter(|values| values.len() == 4).ok_or_else(shape)?;
+            for (entry, value) in row.iter_mut().zip(values) {
+                *entry = value.as_f64().ok_or_else(shape)?;
+            }
+        }
+        // OpenCV's y and z point against OpenGL's.
+        let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
+        let world_from_camera = DMat3::from_cols(column(0), -column(1), -column(2));
+        let frame = format!("{} ({file})", self.full(FIELD));
+        let (rotation, centre) =
+            checked_pose(self.path, &frame, world_from_camera.transpose(), column(3))?;
+        Ok((rotation, -(rotation * centre)))
+    }
+
+    /// The lens, at the size the file states, else at the image's.
+    fn lens(&self, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
+        self.refuse_other_lenses()?;
+        let (width, height) = match (self.side("w")?, self.side("h")?) {
+            (Some(width), Some(height)) => (width, height),
+            _ => {
+                // Without a size, the intrinsics are those of the image at full size.
+                let header = images::probe(image)?;
+                let k = reduced.unwrap_or(1);
+                (header.width * k, header.height * k)
+            }
+        };
+        let from_angle = |side: u32, angle: f64| 0.5 * f64::from(side) / (0.5 * angle).tan();
+        let fx = match (self.number("fl_x")?, self.number("camera_angle_x")?) {
+            (Some(fx), _) => fx,
+            (None, Some(angle)) => from_angle(width, angle),
+            (None, None) => {
+                return Err(self.fault("fl_x", "neither fl_x nor camera_angle_x is there"));
+            }
+        };
+        let fy = match (self.number("fl_y")?, self.number("camera_angle_y")?) {
+            (Some(fy), _) => fy,
+            (None, Some(angle)) if self.inherited("fl_x").is_none() => from_angle(height, angle),
+            _ => fx,
+        };
+        let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
+        let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
+        let mut distortion = [0.0; 4];
+        for (value, field) in distortion.iter_mut().zip(["k1", "k2", "p1", "p2"]) {
+            *value = self.number(field)?.unwrap_or(0.0);
+        }
+        let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
+        let lens = Lens { width, height, focal, principal, distortion };
+        check_lens(self.path, &self.full("intrinsics"), &lens)?;
+        Ok(lens)
+    }
+
+    fn refuse_other_lenses(&self) -> Result<(), DatasetError> {
+        let refusal = |field: &str, problem: String| DatasetError::Lens {
+            path: self.path.to_owned(),
+            field: self.full(field),
+            problem,
+        };
+        if let Some(model) = self.inherited("camera_model") {
+            let model =
+                model.as_str().ok_or_else(|| self.fault("camera_model", "it is no string"))?;
+            if !PINHOLES.contains(&model) {
+                return Err(refusal(
+                    "camera_model",
+                    format!("{model:?} is not one of {}", PINHOLES.join(", ")),
+                ));
+            }
+        }
+        if self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false)) {
+            return Err(refusal("is_fisheye", "fisheye lenses are not supported".into()));
+        }
+        for field in ["k3", "k4", "k5", "k6"] {
+            let value = self.number(field)?.unwrap_or(0.0);
+            if value != 0.0 {
+                return Err(refusal(
+                    field,
+                    format!("{value} is a term that is not supported (k1, k2, p1, p2 are)"),
+                ));
+            }
+        }
+        Ok(())
+    }
+}

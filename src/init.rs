@@ -1,0 +1,168 @@
+//! Points to Gaussians, never more than the budget.
+//!
+//! As in 3DGS (Kerbl et al. 2023, §4 and its code): isotropic, the standard deviation the root
+//! mean square distance to the 3 nearest neighbours, opacity 0.1, colour in band 0. All in f64 and
+//! relative to the scene's size, so that neither far-off nor tiny scenes lose anything.
+
+mod random;
+
+use std::num::NonZeroUsize;
+
+use glam::DVec3;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use rayon::prelude::*;
+
+use crate::dataset::PointCloud;
+use crate::dataset::normalise::EXTENT;
+use crate::gaussians::{Gaussians, rgb_to_dc, sh_coefficients};
+pub use random::random_points;
+
+/// Diameter D of a normalised scene [scene units]; scales and floors are relative to it.
+pub const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
+/// Neighbours whose distances make the scale.
+const NEIGHBOURS: usize = 3;
+/// Smallest root mean square distance used: below 1e-4·D points are one surface sample, and the
+/// original's absolute floor would exceed a whole scene of millimetres.
+const DISTANCE_FLOOR: f64 = 1e-4 * SCENE_DIAMETER;
+/// Standard deviation of a point without neighbours.
+const LONE_SCALE: f64 = 0.01 * SCENE_DIAMETER;
+/// Opacity at the start.
+const OPACITY: f64 = 0.1;
+/// Colours keep half a step of 8 bits from the ends: at 0 the renderer's clamp would leave black
+/// without a gradient.
+const COLOUR_MARGIN: f64 = 1.0 / 510.0;
+
+/// What initialisation did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct InitReport {
+    /// Points given.
+    pub points: usize,
+    /// Points left out because another lies at exactly the same place.
+    pub duplicates: usize,
+    /// Points left out because they are not finite in f32.
+    pub unusable: usize,
+    /// Points left out because the budget is smaller than their number; chosen by the seed.
+    pub over_budget: usize,
+    /// Rows made: what is left.
+    pub rows: usize,
+}
+
+/// Why no model can be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum InitError {
+    /// There is no usable point.
+    #[error("there is no point to start from; start from random points instead")]
+    NoPoints,
+    /// The budget has no room for a row.
+    #[error("a budget of 0 rows has no room for a model; give --budget at least 1")]
+    NoBudget,
+    /// The degree is not supported.
+    #[error("spherical-harmonic degree {0} is not one of 0 to 3; choose --sh-degree accordingly")]
+    ShDegree(u8),
+    /// The neighbours cannot be found.
+    #[error("the points' neighbours cannot be found: {0} points are too many; use fewer")]
+    TooManyPoints(usize),
+}
+
+/// Makes one Gaussian per point, in normalised coordinates, or per point of a seeded subsample
+/// where there are more points than `budget`. Rows keep the order of the points.
+///
+/// # Errors
+/// See [`InitError`].
+pub fn initialise(
+    points: &PointCloud,
+    budget: usize,
+    sh_degree: u8,
+    seed: u64,
+) -> Result<(Gaussians, InitReport), InitError> {
+    if budget == 0 {
+        return Err(InitError::NoBudget);
+    }
+    if sh_degree > crate::gaussians::MAX_SH_DEGREE {
+        return Err(InitError::ShDegree(sh_degree));
+    }
+    let mut report = InitReport { points: points.len(), ..InitReport::default() };
+    let mut chosen: Vec<usize> =
+        (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect();
+    report.unusable = points.len() - chosen.len();
+    let usable = chosen.len();
+    drop_duplicates(&mut chosen, &points.positions);
+    report.duplicates = usable - chosen.len();
+    if chosen.is_empty() {
+        return Err(InitError::NoPoints);
+    }
+    if chosen.len() > budget {
+        report.over_budget = chosen.len() - budget;
+        subsample(&mut chosen, budget, seed);
+    }
+    report.rows = chosen.len();
+
+    let positions: Vec<[f64; 3]> = chosen.iter().map(|&i| points.positions[i].to_array()).collect();
+    let log_scales = log_scales(&positions)?;
+    let rows = chosen.len();
+    let stride = 3 * sh_coefficients(sh_degree);
+    let mut sh = vec![0.0; rows * stride];
+    for (row, &i) in sh.chunks_exact_mut(stride).zip(&chosen) {
+        let rgb = points.colours[i]
+            .map(|v| (f64::from(v) / 255.0).clamp(COLOUR_MARGIN, 1.0 - COLOUR_MARGIN));
+        row[..3].copy_from_slice(&rgb.map(|v| rgb_to_dc(v as f32)));
+    }
+    let gaussians = Gaussians {
+        sh_degree,
+        means: positions.iter().map(|p| p.map(|v| v as f32)).collect(),
+        log_scales: log_scales.into_iter().map(|log| [log; 3]).collect(),
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; rows],
+        opacity_logits: vec![(OPACITY / (1.0 - OPACITY)).ln() as f32; rows],
+        sh,
+    };
+    Ok((gaussians, report))
+}
+
+/// Keeps the first of the points that share a place.
+fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
+    // −0 and 0 are one place.
+    let key = |i: usize| positions[i].to_array().map(|v| (v + 0.0).to_bits());
+    let mut order = chosen.clone();
+    order.par_sort_unstable_by_key(|&i| (key(i), i));
+    order.dedup_by_key(|i| key(*i));
+    order.par_sort_unstable();
+    *chosen = order;
+}
+
+/// Keeps `count` of them, each set equally likely, in their order. A partial Fisher–Yates shuffle
+/// by hand: sampling functions of libraries may change with their versions.
+fn subsample(chosen: &mut Vec<usize>, count: usize, seed: u64) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    for i in 0..count {
+        let span = (chosen.len() - i) as u128;
+        let j = i + ((u128::from(rng.next_u64()) * span) >> 64) as usize;
+        chosen.swap(i, j);
+    }
+    chosen.truncate(count);
+    chosen.sort_unstable();
+}
+
+/// ln of the root mean square distance to the nearest neighbours, of which there may be fewer
+/// than three. The points are distinct.
+fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
+    let neighbours = NEIGHBOURS.min(positions.len() - 1);
+    if neighbours == 0 {
+        return Ok(vec![LONE_SCALE.ln() as f32]);
+    }
+    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(positions)
+        .map_err(|_| InitError::TooManyPoints(positions.len()))?;
+    // One more: the point itself is its own nearest.
+    let wanted = NonZeroUsize::MIN.saturating_add(neighbours);
+    let scale = |position: &[f64; 3]| {
+        let found = tree.query(position).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+        let sum: f64 = found.iter().skip(1).map(|hit| hit.distance).sum();
+        (0.5 * (sum / neighbours as f64).max(DISTANCE_FLOOR * DISTANCE_FLOOR).ln()) as f32
+    };
+    Ok(positions.par_iter().map(scale).collect())
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
+mod tests;

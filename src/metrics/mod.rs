@@ -1,0 +1,114 @@
+//! How like the photograph a render is: PSNR and SSIM.
+//!
+//! Both compare a rendered image with a packed target, both in sRGB encoding, and both accumulate
+//! in `f64`, so that a figure does not depend on the image's size or on the number of threads.
+//! Renders are clamped to [0, 1] first, as a viewer would show them. A target with coverage is
+//! composited on the background the render was made with. A target with a mask is compared where
+//! the mask counts: the render's error is scaled by the mask before windows are taken, so what
+//! lies under the mask cannot leak into its neighbours' SSIM, and pixels are weighted by it.
+
+mod psnr;
+mod ssim;
+
+pub use psnr::psnr;
+pub use ssim::ssim;
+
+use crate::dataset::images::Image8;
+
+/// Why two images cannot be compared.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum MetricError {
+    /// The render does not have the target's size.
+    #[error(
+        "the render has {rendered} values, the target of {width}x{height} px needs {expected}; \
+         render at the size of the target"
+    )]
+    SizeMismatch {
+        /// Values in the render.
+        rendered: usize,
+        /// 3 · width · height.
+        expected: usize,
+        /// The target's width [px].
+        width: u32,
+        /// The target's height [px].
+        height: u32,
+    },
+    /// A part of the target does not have as many values as its width and height say.
+    #[error(
+        "the target's {part} has {found} values, its size of {width}x{height} px needs {expected}"
+    )]
+    BadTarget {
+        /// Which part: colours, coverage or mask.
+        part: &'static str,
+        /// Values it has.
+        found: usize,
+        /// Values it should have.
+        expected: usize,
+        /// The target's width [px].
+        width: u32,
+        /// The target's height [px].
+        height: u32,
+    },
+    /// No pixel counts.
+    #[error("the mask ignores every pixel of the target; remove the mask, or leave this view out")]
+    NothingToCompare,
+}
+
+/// A render and a target whose sizes agree.
+struct Pair<'a> {
+    rendered: &'a [f32],
+    target: &'a Image8,
+    background: [f64; 3],
+    width: usize,
+    height: usize,
+}
+
+impl<'a> Pair<'a> {
+    fn new(
+        rendered: &'a [f32],
+        target: &'a Image8,
+        background: [f32; 3],
+    ) -> Result<Self, MetricError> {
+        let (width, height) = (target.width as usize, target.height as usize);
+        let pixels = width * height;
+        let parts = [
+            ("colours", Some(target.rgb.len()), 3 * pixels),
+            ("coverage", target.alpha.as_ref().map(Vec::len), pixels),
+            ("mask", target.mask.as_ref().map(Vec::len), pixels),
+        ];
+        for (part, found, expected) in parts {
+            if let Some(found) = found.filter(|&found| found != expected) {
+                let (width, height) = (target.width, target.height);
+                return Err(MetricError::BadTarget { part, found, expected, width, height });
+            }
+        }
+        if rendered.len() != 3 * pixels {
+            return Err(MetricError::SizeMismatch {
+                rendered: rendered.len(),
+                expected: 3 * pixels,
+                width: target.width,
+                height: target.height,
+            });
+        }
+        Ok(Self { rendered, target, background: background.map(f64::from), width, height })
+    }
+
+    /// How much pixel `p` counts, in [0, 1].
+    fn weight(&self, p: usize) -> f64 {
+        self.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
+    }
+
+    /// Channel `c` of the target at pixel `p`, on the background.
+    fn truth(&self, p: usize, c: usize) -> f64 {
+        let colour = f64::from(self.target.rgb[3 * p + c]) / 255.0;
+        self.target.alpha.as_ref().map_or(colour, |alpha| {
+            let coverage = f64::from(alpha[p]) / 255.0;
+            coverage * colour + (1.0 - coverage) * self.background[c]
+        })
+    }
+
+    /// Render minus target in channel `c` of pixel `p`; NaN where the render is.
+    fn error(&self, p: usize, c: usize) -> f64 {
+        f64::from(self.rendered[3 * p + c]).clamp(0.0, 1.0) - self.truth(p, c)
+    }
+}

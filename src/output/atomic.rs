@@ -1,0 +1,103 @@
+//! Files that are there in full or not at all.
+
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use super::OutputError;
+
+/// Writes a file under a temporary name in the same folder, syncs it and renames it: whoever looks
+/// sees the old content or the new one, whatever happens in between. Creates missing folders.
+///
+/// # Errors
+/// [`OutputError::Io`], also for an error that `write` returns; a file that was there is then
+/// unchanged and nothing is left behind.
+pub fn write_atomically(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+) -> Result<(), OutputError> {
+    let folder = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    std::fs::create_dir_all(folder).map_err(OutputError::io("create the folder", folder))?;
+    replace(folder, path, write).map_err(OutputError::io("write", path))
+}
+
+fn replace(
+    folder: &Path,
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+) -> io::Result<()> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".densify-");
+    // Temporary files are private by default; a result is as readable as any other new file.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder)?;
+    let mut buffered = BufWriter::with_capacity(1 << 16, file.as_file_mut());
+    write(&mut buffered)?;
+    buffered.flush()?;
+    drop(buffered);
+    file.as_file().sync_all()?;
+    file.persist(path)?;
+    // The rename lasts once the folder is synced; not every file system can do that.
+    #[cfg(unix)]
+    let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = std::fs::read_dir(folder).unwrap();
+        entries
+            .map(|e| e.unwrap().file_name().into_string().unwrap())
+            .collect()
+    }
+
+    #[test]
+    fn a_failed_write_changes_nothing() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("deep/er/file.json");
+        write_atomically(&path, |out| out.write_all(b"first")).unwrap();
+        let error = write_atomically(&path, |out| {
+            out.write_all(&[b'x'; 100_000])?;
+            Err(io::Error::other("disk full"))
+        });
+        let message = error.unwrap_err().to_string();
+        assert!(
+            message.contains("file.json") && message.contains("disk full"),
+            "{message}"
+        );
+        assert_eq!(std::fs::read(&path).unwrap(), b"first");
+        assert_eq!(names(path.parent().unwrap()), ["file.json"]);
+    }
+
+    #[test]
+    fn until_it_is_complete_the_old_file_stands() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("a");
+        write_atomically(&path, |out| out.write_all(b"old")).unwrap();
+        write_atomically(&path, |out| {
+            out.write_all(&[b'x'; 1 << 20])?;
+            assert_eq!(std::fs::read(&path)?, b"old");
+            Ok(())
+        })
+        .unwrap();
+        assert_eq!(std::fs::read(&path).unwrap().len(), 1 << 20);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn others_may_read_as_with_any_new_file() {
+        use std::os::unix::fs::PermissionsExt;
+        let root = tempfile::tempdir().unwrap();
+        let (ours, plain) = (root.path().join("ours"), root.path().join("plain"));
+        write_atomically(&ours, |out| out.write_all(b"1")).unwrap();
+        std::fs::write(&plain, b"1").unwrap();
+        let mode = |path| std::fs::metadata(path).unwrap().permissions().mode();
+        assert_eq!(mode(&ours), mode(&plain));
+    }
+}

@@ -1,0 +1,288 @@
+//! The folder of a run: never mixed with another run's, replaced only as a whole.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+
+use super::OutputError;
+
+/// What a run owns in its folder. Anything else in there is the user's and is left alone.
+const OWNED: [&str; 8] = [
+    "config.toml",
+    "cameras.json",
+    MODELS,
+    "stats",
+    "results.json",
+    "per_view.json",
+    "results_train.json",
+    "per_view_train.json",
+];
+const MODELS: &str = "point_cloud";
+const OWNED_PREFIX: &str = "events.out.tfevents.";
+
+/// Where a run keeps the model of an iteration.
+#[must_use]
+pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
+    run.join(MODELS)
+        .join(format!("iteration_{iteration}"))
+        .join("point_cloud.ply")
+}
+
+/// The iterations whose model a run has saved, in order.
+///
+/// # Errors
+/// [`OutputError::NoRun`] when there is none.
+pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
+    let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
+    let entries = fs::read_dir(run.join(MODELS))
+        .into_iter()
+        .flatten()
+        .flatten();
+    let mut saved: Vec<u32> = entries
+        .filter_map(|entry| iteration(&entry.file_name()))
+        .filter(|&iteration| model_path(run, iteration).is_file())
+        .collect();
+    saved.sort_unstable();
+    if saved.is_empty() {
+        return Err(OutputError::NoRun {
+            path: run.to_owned(),
+            missing: "saved model",
+        });
+    }
+    Ok(saved)
+}
+
+/// The folder that a run writes to.
+///
+/// A new run writes in place. One that replaces another writes beside it, in a hidden folder
+/// inside, and takes its place in [`finish`](Self::finish): until then the old run stays whole.
+#[derive(Debug)]
+pub struct RunFolder {
+    target: PathBuf,
+    staging: Option<TempDir>,
+}
+
+impl RunFolder {
+    /// Checks, without writing anything, that a run may go to `target`.
+    ///
+    /// # Errors
+    /// [`OutputError::Occupied`] when it holds another run that `overwrite` does not give up;
+    /// [`OutputError::NotAFolder`]; [`OutputError::Io`].
+    pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
+        if !target.is_dir() {
+            // A dangling link has no target but is in the way too.
+            return match target.symlink_metadata() {
+                Ok(_) => Err(OutputError::NotAFolder {
+                    path: target.to_owned(),
+                }),
+                Err(_) => Ok(()),
+            };
+        }
+        if !overwrite && !owned_entries(target)?.is_empty() {
+            return Err(OutputError::Occupied {
+                path: target.to_owned(),
+            });
+        }
+        Ok(())
+    }
+
+    /// Creates the folder, or prepares to replace the run that is in it.
+    ///
+    /// # Errors
+    /// As [`check`](Self::check).
+    pub fn create(target: &Path, overwrite: bool) -> Result<Self, OutputError> {
+        Self::check(target, overwrite)?;
+        let fail = |e| OutputError::io("create the folder", target)(e);
+        fs::create_dir_all(target).map_err(fail)?;
+        let occupied = !owned_entries(target)?.is_empty();
+        let staging = occupied
+            .then(|| {
+                tempfile::Builder::new()
+                    .prefix(".densify-")
+                    .tempdir_in(target)
+            })
+            .transpose()
+            .map_err(OutputError::io("create a folder in", target))?;
+        Ok(Self {
+            target: target.to_owned(),
+            staging,
+        })
+    }
+
+    /// Where to write now.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        self.staging
+            .as_ref()
+            .map_or(&self.target, |staging| staging.path())
+    }
+
+    /// Takes the place of the run that was there, if any; returns where the run is.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`]. The new run is then kept in the hidden folder that the error names.
+    pub fn finish(self) -> Result<PathBuf, OutputError> {
+        let Self { target, staging } = self;
+        let Some(staging) = staging else {
+            return Ok(target);
+        };
+        let staging = staging.keep();
+        let aside = tempfile::Builder::new()
+            .prefix(".densify-old-")
+            .tempdir_in(&target)
+            .map_err(OutputError::io("create a folder in", &target))?;
+        let carry = |from: &Path, to: &Path| -> Result<(), OutputError> {
+            for name in owned_entries(from)? {
+                let path = from.join(&name);
+                fs::rename(&path, to.join(&name)).map_err(OutputError::io("move", &path))?;
+            }
+            Ok(())
+        };
+        carry(&target, aside.path())?;
+        carry(&staging, &target)?;
+        fs::remove_dir_all(&staging).map_err(OutputError::io("remove", &staging))?;
+        Ok(target)
+    }
+
+    /// Ends a run that failed: the run that was there stays, and what the failed one has written
+    /// is kept in the folder returned.
+    #[must_use]
+    pub fn abandon(self) -> PathBuf {
+        self.staging.map_or(self.target, TempDir::keep)
+    }
+}
+
+/// Names in `folder` that belong to a run.
+fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, OutputError> {
+    let mut owned = Vec::new();
+    for entry in fs::read_dir(folder).map_err(OutputError::io("read the folder", folder))? {
+        let name = entry
+            .map_err(OutputError::io("read the folder", folder))?
+            .file_name();
+        if is_owned(&name) {
+            owned.push(name);
+        }
+    }
+    Ok(owned)
+}
+
+fn is_owned(name: &OsStr) -> bool {
+    let name = name.to_string_lossy();
+    OWNED.contains(&&*name) || name.starts_with(OWNED_PREFIX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(path: &Path, text: &str) {
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    fn tree(folder: &Path) -> Vec<String> {
+        let mut names: Vec<String> = fs::read_dir(folder)
+            .unwrap()
+            .map(|e| e.unwrap().file_name().into_string().unwrap())
+            .collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_new_run_writes_in_place_beside_foreign_files() {
+        let root = tempfile::tempdir().unwrap();
+        write(&root.path().join("notes.txt"), "mine");
+        let run = RunFolder::create(root.path(), false).unwrap();
+        assert_eq!(run.path(), root.path());
+        write(&run.path().join("config.toml"), "a");
+        assert_eq!(run.finish().unwrap(), root.path());
+        assert_eq!(tree(root.path()), ["config.toml", "notes.txt"]);
+        let message = RunFolder::create(root.path(), false)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("another run") && message.contains("--overwrite"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn replacing_touches_only_what_a_run_owns_and_only_at_the_end() {
+        let root = tempfile::tempdir().unwrap();
+        for name in [
+            "config.toml",
+            "stats/old.jsonl",
+            "events.out.tfevents.1",
+            "notes.txt",
+        ] {
+            write(&root.path().join(name), "old");
+        }
+        let before = tree(root.path());
+        let run = RunFolder::create(root.path(), true).unwrap();
+        write(&run.path().join("config.toml"), "new");
+        write(
+            &run.path().join("point_cloud/iteration_1/point_cloud.ply"),
+            "new",
+        );
+        assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
+        drop(run);
+        assert_eq!(
+            tree(root.path()),
+            before,
+            "a run that is dropped leaves nothing"
+        );
+
+        let run = RunFolder::create(root.path(), true).unwrap();
+        write(&run.path().join("config.toml"), "new");
+        write(
+            &run.path().join("point_cloud/iteration_1/point_cloud.ply"),
+            "new",
+        );
+        run.finish().unwrap();
+        assert_eq!(
+            tree(root.path()),
+            ["config.toml", "notes.txt", "point_cloud"]
+        );
+        assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"new");
+    }
+
+    #[test]
+    fn an_abandoned_run_is_kept_beside_the_old_one() {
+        let root = tempfile::tempdir().unwrap();
+        write(&root.path().join("config.toml"), "old");
+        let run = RunFolder::create(root.path(), true).unwrap();
+        write(&run.path().join("config.toml"), "new");
+        let kept = run.abandon();
+        assert_eq!(fs::read(kept.join("config.toml")).unwrap(), b"new");
+        assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
+    }
+
+    #[test]
+    fn saved_models_are_found_in_numeric_order() {
+        let root = tempfile::tempdir().unwrap();
+        assert!(matches!(
+            saved_iterations(root.path()),
+            Err(OutputError::NoRun { .. })
+        ));
+        for iteration in [1_000, 30, 200] {
+            write(&model_path(root.path(), iteration), "ply");
+        }
+        fs::create_dir_all(root.path().join("point_cloud/iteration_7")).unwrap();
+        fs::create_dir_all(root.path().join("point_cloud/iteration_x")).unwrap();
+        assert_eq!(saved_iterations(root.path()).unwrap(), [30, 200, 1_000]);
+    }
+
+    #[test]
+    fn checking_writes_nothing() {
+        let root = tempfile::tempdir().unwrap();
+        let (absent, file) = (root.path().join("a/b"), root.path().join("file"));
+        RunFolder::check(&absent, false).unwrap();
+        assert!(tree(root.path()).is_empty());
+        write(&file, "x");
+        let message = RunFolder::check(&file, true).unwrap_err().to_string();
+        assert!(message.contains("not a folder"), "{message}");
+    }
+}

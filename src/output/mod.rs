@@ -1,0 +1,89 @@
+//! What a run leaves behind: the folder that people and tools expect, written so that nothing is
+//! ever half there.
+//!
+//! ```text
+//! RUN/
+//!   config.toml                                  everything needed to repeat the run
+//!   cameras.json                                 all cameras, world coordinates
+//!   point_cloud/iteration_N/point_cloud.ply      the model
+//!   stats/train.jsonl  events.jsonl  summary.json
+//!   results.json  per_view.json                  test scores, as the original trainer lays them out
+//!   events.out.tfevents.*                        the same curves for TensorBoard
+//! ```
+//!
+//! A file appears under its name only when it is complete ([`write_atomically`]). The two logs and
+//! the TensorBoard file grow by whole records.
+
+mod atomic;
+mod cameras;
+mod config;
+mod folder;
+mod records;
+mod tensorboard;
+
+pub use atomic::write_atomically;
+pub use cameras::cameras_json;
+pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
+pub use folder::{RunFolder, model_path, saved_iterations};
+pub use records::{Mean, RecordLog, StepRecord, Summary, write_json, write_scores};
+pub use tensorboard::TensorBoard;
+
+use std::path::{Path, PathBuf};
+
+/// Why a run's files cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum OutputError {
+    /// The folder holds another run.
+    #[error(
+        "{path} holds another run; choose another folder with -o, or replace it with --overwrite"
+    )]
+    Occupied {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The folder's name is that of something else.
+    #[error("{path} is not a folder; choose another one with -o")]
+    NotAFolder {
+        /// What was named.
+        path: PathBuf,
+    },
+    /// There is no run in the folder.
+    #[error(
+        "{path} holds no run: there is no {missing}; name the folder that `densify train` wrote"
+    )]
+    NoRun {
+        /// The folder.
+        path: PathBuf,
+        /// What a run would have.
+        missing: &'static str,
+    },
+    /// A file of a run does not say what it should.
+    #[error("{path}: {problem}; this file was written by another version or changed by hand")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, and where.
+        problem: String,
+    },
+    /// Reading or writing failed.
+    #[error("cannot {action} {path}: {source}")]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+}
+
+impl OutputError {
+    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io {
+            action,
+            path,
+            source,
+        }
+    }
+}

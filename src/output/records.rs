@@ -1,0 +1,228 @@
+//! Numbers of a run: the logs that grow, the summary, and the test scores.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use super::{OutputError, write_atomically};
+use crate::evaluate::{Scores, Split, ViewScore};
+use crate::memory::Ledger;
+
+/// A file of JSON records, one a line, that grows by whole lines.
+#[derive(Debug)]
+pub struct RecordLog {
+    file: File,
+    path: PathBuf,
+}
+
+impl RecordLog {
+    /// Starts an empty log; creates the folder.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`].
+    pub fn create(path: &Path) -> Result<Self, OutputError> {
+        if let Some(folder) = path.parent() {
+            std::fs::create_dir_all(folder)
+                .map_err(OutputError::io("create the folder", folder))?;
+        }
+        let mut options = OpenOptions::new();
+        let file = options.create(true).write(true).truncate(true).open(path);
+        Ok(Self {
+            file: file.map_err(OutputError::io("create", path))?,
+            path: path.to_owned(),
+        })
+    }
+
+    /// Adds a line.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`].
+    pub fn append(&mut self, record: &impl Serialize) -> Result<(), OutputError> {
+        let line = serde_json::to_string(record).map_err(std::io::Error::other);
+        // One write a line, so that a reader, or a kill, finds whole lines.
+        line.and_then(|line| self.file.write_all((line + "\n").as_bytes()))
+            .map_err(OutputError::io("write", &self.path))
+    }
+}
+
+/// A line of `stats/train.jsonl`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StepRecord {
+    /// Iteration, 1-based.
+    pub step: u32,
+    /// 0.8·L1 + 0.2·(1 − SSIM), mean over the steps since the last record.
+    pub loss: f32,
+    /// Mean |I − G| over the same steps.
+    pub l1: f32,
+    /// Mean structural similarity over the same steps.
+    pub ssim: f32,
+    /// Rows now.
+    pub rows: usize,
+    /// Wall time since the first step [s].
+    pub seconds: f64,
+}
+
+/// `stats/summary.json`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Version of densify.
+    pub densify: String,
+    /// The policy's name.
+    pub policy: String,
+    /// Whether the run reached its last step.
+    pub finished: bool,
+    /// Steps done.
+    pub iterations: u32,
+    /// Rows at the end.
+    pub rows: usize,
+    /// Most rows at any instant.
+    pub peak_rows: usize,
+    /// Most rows allowed.
+    pub budget: usize,
+    /// Largest resident memory of the process [bytes], where the system says.
+    pub peak_bytes: Option<u64>,
+    /// The ledger's total [bytes].
+    pub ledger_bytes: u64,
+    /// The ledger.
+    pub ledger: Ledger,
+    /// Wall time of all steps [s].
+    pub seconds: f64,
+    /// CPU time of all steps, all threads together [s], where the system says.
+    pub cpu_seconds: Option<f64>,
+    /// Number of views trained on.
+    pub train_views: usize,
+    /// Number of views held out.
+    pub test_views: usize,
+    /// Mean scores of the test views, by iteration.
+    pub test: BTreeMap<u32, Mean>,
+}
+
+/// Mean scores of a set of views.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Mean {
+    /// Peak signal-to-noise ratio [dB].
+    #[serde(rename = "PSNR")]
+    pub psnr: f64,
+    /// Structural similarity.
+    #[serde(rename = "SSIM")]
+    pub ssim: f64,
+}
+
+/// Writes a value as indented JSON.
+///
+/// # Errors
+/// [`OutputError::Io`].
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
+    write_atomically(path, |out| {
+        serde_json::to_writer_pretty(&mut *out, value)?;
+        out.write_all(b"\n")
+    })
+}
+
+/// Enters scores into the files of a split: mean scores into `results.json` as
+/// `{"ours_3000": {"PSNR": …, "SSIM": …}}`, scores by view into `per_view.json` as
+/// `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`. Entries of other iterations stay.
+///
+/// # Errors
+/// [`OutputError`].
+pub fn write_scores(
+    run: &Path,
+    split: Split,
+    iteration: u32,
+    scores: &Scores,
+) -> Result<(), OutputError> {
+    let (results, per_view) = match split {
+        Split::Test => ("results.json", "per_view.json"),
+        Split::Train => ("results_train.json", "per_view_train.json"),
+    };
+    let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
+        scores
+            .views
+            .iter()
+            .map(|view| (view.name.clone(), score(view).into()))
+            .collect()
+    };
+    let views = serde_json::json!({ "PSNR": column(|v| v.psnr), "SSIM": column(|v| v.ssim) });
+    enter(&run.join(per_view), iteration, views)?;
+    let mean = serde_json::to_value(scores.mean()).unwrap_or_default();
+    enter(&run.join(results), iteration, mean)
+}
+
+fn enter(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
+    let mut all: Map<String, Value> = match std::fs::read_to_string(path) {
+        Ok(text) => serde_json::from_str(&text).map_err(|e| OutputError::Malformed {
+            path: path.to_owned(),
+            problem: e.to_string(),
+        })?,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Map::new(),
+        Err(e) => return Err(OutputError::io("read", path)(e)),
+    };
+    all.insert(format!("ours_{iteration}"), entry);
+    write_json(path, &all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scores(psnr: f64) -> Scores {
+        let view = |name: &str, psnr| ViewScore {
+            name: name.into(),
+            psnr,
+            ssim: 0.5,
+        };
+        Scores {
+            views: vec![view("b.png", psnr), view("a/c.png", psnr + 2.0)],
+        }
+    }
+
+    #[test]
+    fn scores_of_several_iterations_share_the_files() {
+        let root = tempfile::tempdir().unwrap();
+        for (iteration, psnr) in [(7, 10.0), (30, 20.0), (7, 30.0)] {
+            write_scores(root.path(), Split::Test, iteration, &scores(psnr)).unwrap();
+        }
+        let read = |name: &str| -> Value {
+            serde_json::from_slice(&std::fs::read(root.path().join(name)).unwrap()).unwrap()
+        };
+        let expected = serde_json::json!({
+            "ours_7": { "PSNR": 31.0, "SSIM": 0.5 },
+            "ours_30": { "PSNR": 21.0, "SSIM": 0.5 },
+        });
+        assert_eq!(read("results.json"), expected);
+        assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);
+        std::fs::write(root.path().join("results.json"), "[").unwrap();
+        write_scores(root.path(), Split::Train, 7, &scores(1.0)).unwrap();
+        let message = write_scores(root.path(), Split::Test, 7, &scores(1.0))
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("results.json"), "{message}");
+    }
+
+    #[test]
+    fn logs_hold_one_record_a_line() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("stats/train.jsonl");
+        let mut log = RecordLog::create(&path).unwrap();
+        let record = StepRecord {
+            step: 1,
+            loss: 0.5,
+            l1: 0.25,
+            ssim: 0.75,
+            rows: 9,
+            seconds: 0.125,
+        };
+        log.append(&record).unwrap();
+        log.append(&StepRecord { step: 2, ..record }).unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        let read: Vec<StepRecord> = text
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect();
+        assert_eq!(read, [record, StepRecord { step: 2, ..record }]);
+    }
+}

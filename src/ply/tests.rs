@@ -1,0 +1,272 @@
+use std::path::PathBuf;
+
+use super::*;
+use crate::gaussians::{Gaussians, sh_coefficients};
+
+fn model(rows: usize, sh_degree: u8) -> Gaussians {
+    // Every value differs, so that a swapped column shows; odd bits, so that a conversion shows.
+    let mut next = 0u32;
+    let mut value = || {
+        next += 1;
+        f32::from_bits(0x3e80_0001 ^ ((next * 7919) & 0x007f_ffff) ^ ((next % 2) << 31))
+    };
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
+    for _ in 0..rows {
+        model.means.push([value(), value(), value()]);
+        model.log_scales.push([value(), value(), value()]);
+        model.quats.push([value(), value(), value(), value()]);
+        model.opacity_logits.push(value());
+        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| value()));
+    }
+    model
+}
+
+fn saved(contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("file.ply");
+    std::fs::write(&path, contents).unwrap();
+    (folder, path)
+}
+
+fn written(model: &Gaussians) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write_splats(model, &mut bytes).unwrap();
+    bytes
+}
+
+#[test]
+fn splats_make_the_round_trip_bit_for_bit() {
+    for degree in 0..=3 {
+        for rows in [0, 1, 255, 256, 700] {
+            let mut model = model(rows, degree);
+            if rows > 0 {
+                model.means[0] = [-0.0, f32::MIN_POSITIVE / 4.0, f32::MAX];
+            }
+            let bytes = written(&model);
+            let (_folder, path) = saved(&bytes);
+            let read = read_splats(&path).unwrap();
+            assert_eq!((read.dropped, read.repaired), (0, 0));
+            assert_eq!(read.gaussians, model, "degree {degree}, {rows} rows");
+            // Bits too: −0 equals 0.
+            assert_eq!(written(&read.gaussians), bytes);
+        }
+    }
+}
+
+#[test]
+fn the_layout_is_the_original_one() {
+    let mut one = model(1, 1);
+    one.sh = (0..12u8).map(f32::from).collect();
+    let bytes = written(&one);
+    let header_end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let header = std::str::from_utf8(&bytes[..header_end]).unwrap();
+    let names: Vec<&str> =
+        header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
+    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
+    let mut expected = vec!["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"];
+    expected.extend(rest.iter().map(String::as_str));
+    expected
+        .extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);
+    assert_eq!(names, expected);
+    let values: Vec<f32> = bytes[header_end..]
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
+        .collect();
+    assert_eq!(values.len(), expected.len());
+    // Coefficient k of channel c is 3 + 3k + c here; the file goes channel by channel.
+    assert_eq!(values[3..18], [0., 0., 0., 0., 1., 2., 3., 6., 9., 4., 7., 10., 5., 8., 11.]);
+}
+
+/// The same splat in ascii and big endian, properties shuffled, of other types, with others
+/// and a list between, behind another element.
+#[test]
+fn other_layouts_read_the_same() {
+    let properties = "property double rot_3\nproperty double rot_0\nproperty list uchar short extra\nproperty double rot_1\n\
+        property double rot_2\nproperty int x\nproperty float label\nproperty double y\nproperty double z\nproperty double opacity\n\
+        property double scale_2\nproperty double scale_1\nproperty double scale_0\nproperty double f_dc_2\n\
+        property double f_dc_1\nproperty double f_dc_0\nend_header\n";
+    let head = |format| {
+        format!(
+            "ply\nformat {format} 1.0\ncomment x\nelement other 2\nproperty list int float l\nelement vertex 1\n{properties}"
+        )
+    };
+    let row =
+        [0.5, 1.0, 0.25, 0.125, 7.0, 9.0, 2.5, 3.5, -1.5, 0.3125, 0.75, 0.625, -2.0, -3.0, -4.0];
+    let ascii = head("ascii")
+        + "2 1 2\n0\n0.5 1 3 5 6 7 0.25\n0.125 7 9 2.5 3.5 -1.5 0.3125 .75 6.25e-1 -2 -3 -4";
+    let mut binary = head("binary_big_endian").into_bytes();
+    binary.extend(2i32.to_be_bytes());
+    binary.extend([0; 8]);
+    binary.extend(0i32.to_be_bytes());
+    for (index, value) in row.iter().enumerate() {
+        match index {
+            4 => binary.extend(7i32.to_be_bytes()),
+            5 => binary.extend(9f32.to_be_bytes()),
+            _ => binary.extend(f64::to_be_bytes(*value)),
+        }
+        if index == 1 {
+            binary.extend([3, 0, 5, 0, 6, 0, 7]);
+        }
+    }
+    for bytes in [ascii.into_bytes(), binary] {
+        let (_folder, path) = saved(bytes);
+        let read = read_splats(&path).unwrap().gaussians;
+        assert_eq!(read.means, [[7.0, 2.5, 3.5]]);
+        assert_eq!(read.quats, [[1.0, 0.25, 0.125, 0.5]]);
+        assert_eq!(read.opacity_logits, [-1.5]);
+        assert_eq!(read.log_scales, [[0.625, 0.75, 0.3125]]);
+        assert_eq!((read.sh_degree, read.sh), (0, vec![-4.0, -3.0, -2.0]));
+    }
+}
+
+#[test]
+fn damaged_rows_are_dropped_up_to_one_percent() {
+    let mut few = model(200, 1);
+    few.means[3][1] = f32::NAN;
+    few.sh[5 * 12 + 4] = f32::INFINITY;
+    few.quats[9] = [0.0; 4];
+    let (_folder, path) = saved(written(&few));
+    let read = read_splats(&path).unwrap();
+    assert_eq!((read.dropped, read.repaired, read.gaussians.len()), (2, 1, 198));
+    assert_eq!(read.gaussians.sh_of(3), few.sh_of(4));
+    assert_eq!(read.gaussians.quats[7], [1.0, 0.0, 0.0, 0.0]);
+    few.opacity_logits[20] = f32::NAN;
+    let (_folder, path) = saved(written(&few));
+    let message = read_splats(&path).unwrap_err().to_string();
+    assert!(message.contains("3 of 200") && message.contains("file.ply"), "{message}");
+}
+
+#[test]
+fn what_cannot_be_splats_is_refused_by_name() {
+    let good = String::from_utf8_lossy(&written(&model(1, 0))).into_owned();
+    let header = |from: &str, to: &str| {
+        assert!(good.contains(from));
+        good.replacen(from, to, 1)
+    };
+    for (case, contents, words) in [
+        ("points", header("property float opacity\n", ""), &["opacity", "point cloud"][..]),
+        ("2-D splats", header("property float scale_2\n", ""), &["scale_2"]),
+        (
+            "degree",
+            header("property float opacity\n", "property float f_rest_0\nproperty float opacity\n"),
+            &["f_rest_*", "9, 24 or 45"],
+        ),
+        ("count", header("vertex 1\n", "vertex 2\n"), &["element vertex", "2 rows"]),
+        ("absurd count", header("vertex 1\n", "vertex 99999999999999999999\n"), &["line 3"]),
+        ("large count", header("vertex 1\n", "vertex 4000000000\n"), &["element vertex"]),
+        ("negative count", header("vertex 1\n", "vertex -1\n"), &["line 3"]),
+        ("no vertices", header("element vertex", "element face"), &["no element \"vertex\""]),
+        (
+            "packed",
+            header("property float x\n", "property uint packed_position\n"),
+            &["compressed", "SuperSplat"],
+        ),
+        ("not PLY", "obj\n".into(), &["no PLY file"]),
+        ("empty", String::new(), &["header"]),
+        ("endless", "ply\n".to_owned() + &"comment\n".repeat(200_000), &["1 MiB"]),
+    ] {
+        let (_folder, path) = saved(contents);
+        let message = read_splats(&path).unwrap_err().to_string();
+        for word in words.iter().chain(&["file.ply"]) {
+            assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
+        }
+    }
+    assert!(matches!(read_splats(std::path::Path::new("/none/x.ply")), Err(PlyError::Io { .. })));
+}
+
+/// Cut or damaged anywhere: an error or a model, never a panic or a huge allocation.
+#[test]
+fn no_damage_makes_it_panic() {
+    let whole = written(&model(3, 1));
+    for at in 0..whole.len() {
+        let (_folder, path) = saved(&whole[..at]);
+        assert!(read_splats(&path).is_err(), "cut at {at}");
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0x95;
+        let (_folder, path) = saved(damaged);
+        let _ = (read_splats(&path), read_points(&path));
+    }
+}
+
+#[test]
+fn colours_of_any_type_are_scaled() {
+    for (kind, colour, expected) in [
+        ("uchar", "0 128 255", [0, 128, 255]),
+        ("ushort", "0 32896 65535", [0, 128, 255]),
+        ("float", "0 0.5 1", [0, 128, 255]),
+        ("double", "-1 nan 7", [0, 0, 255]),
+    ] {
+        let text = format!(
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty {kind} red\nproperty {kind} green\nproperty {kind} blue\n\
+             property short x\nproperty double y\nproperty float z\nend_header\n{colour} 1 2 3\n"
+        );
+        let (_folder, path) = saved(text);
+        let points = read_points(&path).unwrap();
+        assert_eq!(
+            (points.positions, points.colours),
+            (vec![[1.0, 2.0, 3.0].into()], vec![expected]),
+            "{kind}"
+        );
+    }
+    let (_folder, path) = saved(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n1 2",
+    );
+    let message = read_points(&path).unwrap_err().to_string();
+    assert!(message.contains("property z"), "{message}");
+}
+
+fn shared(folder: &str) -> Vec<PathBuf> {
+    let Some(root) = crate::dataset::tests::shared(folder) else {
+        return Vec::new();
+    };
+    let (mut files, mut folders) = (Vec::new(), vec![root]);
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == "ply") {
+                files.push(path);
+            }
+        }
+    }
+    files
+}
+
+#[test]
+fn clouds_of_other_programs_load() {
+    for path in shared("points") {
+        let points = read_points(&path).unwrap_or_else(|e| panic!("{e}"));
+        assert!([8, 24].contains(&points.len()), "{}: {}", path.display(), points.len());
+        let reach = points.positions.iter().map(|p| p.abs().max_element()).fold(0.0, f64::max);
+        assert!((0.4..200.0).contains(&reach), "{}: {reach}", path.display());
+    }
+}
+
+#[test]
+fn splats_of_other_programs_load_or_are_refused_by_name() {
+    for path in shared("splats") {
+        match read_splats(&path) {
+            Err(PlyError::Compressed { .. }) => {
+                assert!(path.to_string_lossy().contains("compressed"));
+            }
+            Err(error) => panic!("{error}"),
+            Ok(file) => {
+                assert!(!path.to_string_lossy().contains("compressed"), "{}", path.display());
+                assert!(file.gaussians.len() >= 3 && file.dropped == 0, "{}", path.display());
+                if path.ends_with("train-1000.ply") {
+                    assert_eq!((file.gaussians.len(), file.gaussians.sh_degree), (1000, 3));
+                    // The original's layout: ours, byte for byte.
+                    assert!(written(&file.gaussians) == std::fs::read(&path).unwrap());
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn malformed_files_do_not_panic() {
+    for path in shared("meshes/malformed") {
+        let _ = (read_points(&path), read_splats(&path));
+    }
+}

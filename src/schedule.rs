@@ -1,0 +1,352 @@
+//! What changes along a run: step sizes, spherical-harmonic degree, view order, background.
+//!
+//! Everything here is a pure function of its arguments, so that a run can be repeated, or resumed
+//! at any step, without replaying what came before. Constants are those of Kerbl et al., *3D
+//! Gaussian Splatting for Real-Time Radiance Field Rendering* (SIGGRAPH 2023), section 5 and its
+//! published code, for a run of 30,000 steps; shorter and longer runs scale them in proportion.
+
+use std::fmt;
+use std::str::FromStr;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::backend::LearningRates;
+use crate::gaussians::MAX_SH_DEGREE;
+
+/// Length of the run for which the published constants were chosen [steps].
+pub const REFERENCE_ITERATIONS: u32 = 30_000;
+
+/// Step sizes of a run. The means' step size is a fraction of the scene's extent and falls
+/// log-linearly over the run; all others are constant.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RateOptions {
+    /// Means, at the start of the run [fraction of the extent per step], > 0.
+    pub mean_start: f64,
+    /// Means, at the end of the run [fraction of the extent per step], > 0.
+    pub mean_end: f64,
+    /// Log-scales, > 0.
+    pub log_scale: f32,
+    /// Quaternions, > 0.
+    pub quat: f32,
+    /// Opacity logits, > 0. The first release used 0.05, those since October 2024 use 0.025.
+    pub opacity: f32,
+    /// Spherical-harmonic coefficients of band 0, > 0.
+    pub sh_dc: f32,
+    /// Spherical-harmonic coefficients of bands 1–3, > 0.
+    pub sh_rest: f32,
+}
+
+impl Default for RateOptions {
+    fn default() -> Self {
+        Self {
+            mean_start: 1.6e-4,
+            mean_end: 1.6e-6,
+            log_scale: 5e-3,
+            quat: 1e-3,
+            opacity: 0.025,
+            sh_dc: 2.5e-3,
+            sh_rest: 1.25e-4,
+        }
+    }
+}
+
+impl RateOptions {
+    /// Step sizes of iteration `step` (1-based) of `iterations`, in a scene of this extent
+    /// [scene units].
+    #[must_use]
+    pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
+        let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
+        let fraction = ((1.0 - t) * self.mean_start.ln() + t * self.mean_end.ln()).exp();
+        LearningRates {
+            mean: (fraction * f64::from(extent)) as f32,
+            log_scale: self.log_scale,
+            quat: self.quat,
+            opacity: self.opacity,
+            sh_dc: self.sh_dc,
+            sh_rest: self.sh_rest,
+        }
+    }
+
+    /// The first step size that is not a positive finite number, by name.
+    #[must_use]
+    pub fn invalid(&self) -> Option<&'static str> {
+        [
+            ("mean_start", self.mean_start),
+            ("mean_end", self.mean_end),
+            ("log_scale", f64::from(self.log_scale)),
+            ("quat", f64::from(self.quat)),
+            ("opacity", f64::from(self.opacity)),
+            ("sh_dc", f64::from(self.sh_dc)),
+            ("sh_rest", f64::from(self.sh_rest)),
+        ]
+        .into_iter()
+        .find_map(|(name, rate)| (!(rate.is_finite() && rate > 0.0)).then_some(name))
+    }
+}
+
+/// A number of steps chosen for a run of [`REFERENCE_ITERATIONS`], scaled to a run of
+/// `iterations`; at least 1.
+#[must_use]
+pub fn scaled(steps: u32, iterations: u32) -> u32 {
+    let exact = u64::from(steps) * u64::from(iterations);
+    let reference = u64::from(REFERENCE_ITERATIONS);
+    let rounded = (exact + reference / 2) / reference;
+    u32::try_from(rounded.max(1)).unwrap_or(u32::MAX)
+}
+
+/// Spherical-harmonic degree of iteration `step`: 0 at first, one more every 1,000 steps of a run
+/// of 30,000, at most `highest`.
+#[must_use]
+pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
+    let reached = step / scaled(1_000, iterations);
+    u8::try_from(reached)
+        .unwrap_or(u8::MAX)
+        .min(highest)
+        .min(MAX_SH_DEGREE)
+}
+
+/// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "String", try_from = "String")]
+pub enum Background {
+    /// (0, 0, 0).
+    Black,
+    /// (1, 1, 1).
+    White,
+    /// This colour, sRGB-encoded.
+    Colour([u8; 3]),
+    /// Another colour at each step, uniform in [0, 1]³.
+    Random,
+}
+
+impl Background {
+    /// The background of a training step.
+    #[must_use]
+    pub fn at(self, seed: u64, step: u32) -> [f32; 3] {
+        match self {
+            Self::Random => {
+                let mut draws = stream(seed, Use::Background, u64::from(step));
+                // The top 24 bits fill an f32's significand exactly.
+                std::array::from_fn(|_| (draws.next_u32() >> 8) as f32 / 16_777_215.0)
+            }
+            fixed => fixed.fixed(),
+        }
+    }
+
+    /// The background of a rendering for evaluation; black where training drew it at random.
+    #[must_use]
+    pub fn fixed(self) -> [f32; 3] {
+        match self {
+            Self::Black | Self::Random => [0.0; 3],
+            Self::White => [1.0; 3],
+            Self::Colour(rgb) => rgb.map(|channel| f32::from(channel) / 255.0),
+        }
+    }
+}
+
+impl fmt::Display for Background {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Black => f.write_str("black"),
+            Self::White => f.write_str("white"),
+            Self::Random => f.write_str("random"),
+            Self::Colour([r, g, b]) => write!(f, "#{r:02x}{g:02x}{b:02x}"),
+        }
+    }
+}
+
+impl FromStr for Background {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let colour = |hex: &str| {
+            let value = u32::from_str_radix(hex, 16).ok()?;
+            let [_, r, g, b] = value.to_be_bytes();
+            // `from_str_radix` takes a sign as well.
+            (hex.len() == 6 && !hex.starts_with('+')).then_some(Self::Colour([r, g, b]))
+        };
+        match text {
+            "black" => Ok(Self::Black),
+            "white" => Ok(Self::White),
+            "random" => Ok(Self::Random),
+            _ => text.strip_prefix('#').and_then(colour).ok_or_else(|| {
+                format!("`{text}` is no background; give black, white, random or a colour such as #808080")
+            }),
+        }
+    }
+}
+
+impl From<Background> for String {
+    fn from(background: Background) -> Self {
+        background.to_string()
+    }
+}
+
+impl TryFrom<String> for Background {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+/// The views of one epoch (0-based) in the order in which they are trained on: a permutation of
+/// `0..views`, drawn from (seed, epoch).
+#[must_use]
+pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..views).collect();
+    let mut draws = stream(seed, Use::Views, u64::from(epoch));
+    // Fisher–Yates. Written out, because a library's shuffle may change with its version and a
+    // run must not.
+    for last in (1..views).rev() {
+        order.swap(last, below(&mut draws, last as u64 + 1) as usize);
+    }
+    order
+}
+
+/// What a stream of random numbers is for; streams for different uses are independent.
+#[derive(Debug, Clone, Copy)]
+enum Use {
+    Views = 1,
+    Background = 2,
+}
+
+/// The stream number `counter` for one use: ChaCha is a hash of (key, stream, position).
+fn stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
+    let mut key = [0_u8; 32];
+    key[..8].copy_from_slice(&seed.to_le_bytes());
+    key[8] = purpose as u8;
+    let mut rng = ChaCha8Rng::from_seed(key);
+    rng.set_stream(counter);
+    rng
+}
+
+/// A number in `0..n`. The high half of a 64 × 64-bit product: no value is favoured by more than
+/// n / 2⁶⁴.
+fn below(rng: &mut ChaCha8Rng, n: u64) -> u64 {
+    ((u128::from(rng.next_u64()) * u128::from(n)) >> 64) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn mean_rate_falls_log_linearly_between_its_ends() {
+        let rates = RateOptions::default();
+        let mean = |step| f64::from(rates.at(step, 1_000, 2.0).mean);
+        let close = |a: f64, b: f64| assert!((a / b - 1.0).abs() < 1e-6, "{a} against {b}");
+        close(mean(0), 3.2e-4);
+        close(mean(500), 3.2e-5);
+        close(mean(1_000), 3.2e-6);
+        close(mean(1_500), 3.2e-6);
+        close(mean(250) * mean(750), mean(500) * mean(500));
+        close(f64::from(rates.at(7, 1_000, 2.0).sh_rest), 1.25e-4);
+    }
+
+    #[test]
+    fn invalid_names_the_rate() {
+        assert_eq!(RateOptions::default().invalid(), None);
+        let rates = RateOptions {
+            quat: f32::NAN,
+            ..RateOptions::default()
+        };
+        assert_eq!(rates.invalid(), Some("quat"));
+        let rates = RateOptions {
+            mean_end: 0.0,
+            ..RateOptions::default()
+        };
+        assert_eq!(rates.invalid(), Some("mean_end"));
+    }
+
+    #[test]
+    fn steps_scale_with_the_run() {
+        assert_eq!(scaled(1_000, 30_000), 1_000);
+        assert_eq!(scaled(1_000, 3_000), 100);
+        assert_eq!(scaled(1_000, 100), 3);
+        assert_eq!(scaled(1_000, 1), 1);
+        assert_eq!(scaled(u32::MAX, u32::MAX), u32::MAX);
+    }
+
+    #[test]
+    fn degree_rises_every_thousand_steps_of_thirty_thousand() {
+        let at = |step| sh_degree(step, 30_000, 3);
+        assert_eq!(
+            [1, 999, 1_000, 1_999, 2_000, 3_000, 30_000].map(at),
+            [0, 0, 1, 1, 2, 3, 3]
+        );
+        assert_eq!(sh_degree(300, 3_000, 3), 3);
+        assert_eq!(sh_degree(300, 3_000, 1), 1);
+        assert_eq!(sh_degree(u32::MAX, 1, 9), MAX_SH_DEGREE);
+    }
+
+    #[test]
+    fn each_epoch_is_another_permutation() {
+        for views in [0, 1, 2, 7, 100] {
+            let mut order = view_order(views, 5, 3);
+            order.sort_unstable();
+            assert_eq!(order, (0..views).collect::<Vec<_>>());
+        }
+        assert_eq!(view_order(50, 5, 3), view_order(50, 5, 3));
+        assert_ne!(view_order(50, 5, 3), view_order(50, 5, 4));
+        assert_ne!(view_order(50, 5, 3), view_order(50, 6, 3));
+        assert_ne!(view_order(50, 5, 3), view_order(50, 5 | 1 << 40, 3));
+    }
+
+    #[test]
+    fn every_view_is_first_equally_often() {
+        let mut first = [0_u32; 5];
+        for epoch in 0..5_000 {
+            first[view_order(5, 1, epoch)[0]] += 1;
+        }
+        // Binomial(5,000, 1/5): mean 1,000, deviation 28; five of them.
+        assert!(first.iter().all(|n| n.abs_diff(1_000) < 142), "{first:?}");
+    }
+
+    #[test]
+    fn backgrounds_as_text() {
+        for text in ["black", "white", "random", "#0a0b0c", "#ffffff"] {
+            assert_eq!(text.parse::<Background>().unwrap().to_string(), text);
+        }
+        assert_eq!("#0A0b0c".parse(), Ok(Background::Colour([10, 11, 12])));
+        for text in [
+            "",
+            "#",
+            "#fff",
+            "#+a0b0c",
+            "#0a0b0g",
+            "#0a0b0c0d",
+            "0a0b0c",
+            "grey",
+            "#äöü",
+        ] {
+            let message = text.parse::<Background>().unwrap_err();
+            assert!(message.contains("#808080"), "{message}");
+        }
+    }
+
+    #[test]
+    fn backgrounds() {
+        let same = |a: [f32; 3], b: [f32; 3]| a.map(f32::to_bits) == b.map(f32::to_bits);
+        assert!(same(Background::White.at(1, 2), [1.0; 3]));
+        assert!(same(Background::Black.at(1, 2), [0.0; 3]));
+        assert!(same(
+            Background::Colour([0, 255, 51]).at(1, 2),
+            [0.0, 1.0, 0.2]
+        ));
+        assert!(same(Background::Random.fixed(), [0.0; 3]));
+        let random = Background::Random.at(1, 2);
+        assert!(same(random, Background::Random.at(1, 2)));
+        assert!(!same(random, Background::Random.at(1, 3)));
+        assert!(!same(random, Background::Random.at(2, 2)));
+        let mean = (0..3_000)
+            .map(|step| f64::from(Background::Random.at(9, step)[1]))
+            .sum::<f64>()
+            / 3_000.0;
+        // Uniform: deviation of the mean 0.29 / √3,000 = 0.005.
+        assert!((mean - 0.5).abs() < 0.025, "{mean}");
+    }
+}

@@ -1,0 +1,457 @@
+//! The training loop. It names no policy and no device: views come from a [`ViewSource`], pixels
+//! and gradients from a [`Backend`], births and deaths from a [`DensityPolicy`].
+//!
+//! One step (Kerbl et al. 2023, section 5): a view in the order of its epoch, forward and backward
+//! pass and optimiser, and then, where the policy is due, one edit of the rows. A policy sees the
+//! model as the optimiser left it.
+
+use densify_policies::plan::{EditPlan, RowOps};
+use densify_policies::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
+use densify_policies::rng::PolicyRng;
+use serde::{Deserialize, Serialize};
+
+use crate::backend::{Backend, BackendError, StepInput, StepOutput};
+use crate::gaussians::Gaussians;
+use crate::schedule::{self, Background, RateOptions};
+use crate::views::{ViewError, ViewSource};
+
+/// How a run goes, beside its scene and its policy.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrainOptions {
+    /// Length of the run in steps, >= 1; schedules scale with it.
+    pub iterations: u32,
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+    /// Highest spherical-harmonic degree trained, <= the model's.
+    pub sh_degree: u8,
+    /// What lies behind the Gaussians.
+    pub background: Background,
+    /// Step sizes.
+    pub rates: RateOptions,
+    /// How many views ahead are announced to the [`ViewSource`].
+    pub prefetch: usize,
+}
+
+/// What one step did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepReport {
+    /// Iteration, 1-based.
+    pub step: u32,
+    /// The view's number.
+    pub view: usize,
+    /// The step's scalars.
+    pub output: StepOutput,
+    /// Rows after the step.
+    pub rows: usize,
+    /// The edit of this step, if the policy was due and had something to do.
+    pub event: Option<EditEvent>,
+}
+
+/// One edit of the rows.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EditEvent {
+    /// Iteration, 1-based.
+    pub step: u32,
+    /// Rows before.
+    pub before: usize,
+    /// Rows pruned.
+    pub removed: usize,
+    /// Rows born.
+    pub added: usize,
+    /// Rows rewritten in place.
+    pub updated: usize,
+    /// Edits that the plan refused: the policy wanted more.
+    pub denied: usize,
+    /// Rows after.
+    pub after: usize,
+    /// Why, in the policy's words.
+    pub cause: String,
+}
+
+impl EditEvent {
+    fn new(step: u32, ops: &RowOps) -> Self {
+        Self {
+            step,
+            before: ops.rows_before,
+            removed: ops.counts.removed,
+            added: ops.counts.added,
+            updated: ops.counts.updated,
+            denied: ops.counts.denied,
+            after: ops.rows_after,
+            cause: ops.cause.clone(),
+        }
+    }
+}
+
+/// Why training cannot go on. The model stays as it was before the step's edit and can still be
+/// [read](Trainer::model); only after [`Diverged`](Self::Diverged) it is worth nothing.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// There is nothing to train on.
+    #[error("there is no training view; use a larger --test-every or add images")]
+    NoViews,
+    /// An option is out of its range.
+    #[error("{0}")]
+    BadOption(String),
+    /// A view's pixels could not be read.
+    #[error("step {step}: view `{view}`: {source}")]
+    View {
+        /// Iteration.
+        step: u32,
+        /// The view's name.
+        view: String,
+        /// What the source of the views says.
+        source: ViewError,
+    },
+    /// The loss is not a finite number.
+    #[error(
+        "step {step}: the loss of view `{view}` is {loss}, so the model is lost; \
+         lower the learning rates, and check the scene's scale and cameras"
+    )]
+    Diverged {
+        /// Iteration.
+        step: u32,
+        /// The view's name.
+        view: String,
+        /// The loss.
+        loss: f32,
+    },
+    /// The policy reported an error.
+    #[error("step {step}: policy `{policy}`: {source}")]
+    Policy {
+        /// Iteration.
+        step: u32,
+        /// The policy's name.
+        policy: String,
+        /// What it reported.
+        source: PolicyError,
+    },
+    /// The policy's plan breaks an invariant of plans.
+    #[error(
+        "step {step}: the plan of policy `{policy}` does not hold: {reason}; this is a bug, please report it"
+    )]
+    BrokenPlan {
+        /// Iteration.
+        step: u32,
+        /// The policy's name.
+        policy: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The backend cannot go on.
+    #[error("step {step}: {source}")]
+    Backend {
+        /// Iteration.
+        step: u32,
+        /// What the backend says.
+        source: BackendError,
+    },
+}
+
+/// A run in progress.
+pub struct Trainer<V> {
+    views: V,
+    backend: Box<dyn Backend>,
+    policy: Box<dyn DensityPolicy>,
+    policy_name: String,
+    needs: Needs,
+    scene: SceneInfo,
+    options: TrainOptions,
+    step: u32,
+    order: Vec<usize>,
+    next_order: Vec<usize>,
+    peak_rows: usize,
+    events: Vec<EditEvent>,
+}
+
+impl<V: ViewSource> Trainer<V> {
+    /// A run at its start. `backend` holds the initial model; `policy_name` is for messages only.
+    ///
+    /// # Errors
+    /// [`TrainError::NoViews`], and [`TrainError::BadOption`] where `scene` or `options` disagree
+    /// with the views or the backend.
+    pub fn new(
+        views: V,
+        backend: Box<dyn Backend>,
+        (policy_name, policy): (&str, Box<dyn DensityPolicy>),
+        scene: SceneInfo,
+        options: TrainOptions,
+    ) -> Result<Self, TrainError> {
+        let count = views.count();
+        check(&scene, &options, count, backend.as_ref())?;
+        Ok(Self {
+            needs: policy.needs(&scene),
+            policy_name: policy_name.to_owned(),
+            order: Vec::new(),
+            next_order: schedule::view_order(count, options.seed, 0),
+            peak_rows: backend.rows(),
+            views,
+            backend,
+            policy,
+            scene,
+            options,
+            step: 0,
+            events: Vec::new(),
+        })
+    }
+
+    /// One iteration: a view, a gradient step, and the policy's edit where one is due.
+    ///
+    /// May be called beyond [`TrainOptions::iterations`]; step sizes then stay at their end.
+    ///
+    /// # Errors
+    /// [`TrainError`]. After one, the run is over; the model can still be read.
+    pub fn step(&mut self) -> Result<StepReport, TrainError> {
+        let step = self.step + 1;
+        let view = self.next_view();
+        let image = self.views.image(view).map_err(|source| TrainError::View {
+            step,
+            view: self.views.name(view).to_owned(),
+            source,
+        })?;
+        let TrainOptions {
+            iterations,
+            seed,
+            sh_degree,
+            background,
+            rates,
+            ..
+        } = self.options;
+        let input = StepInput {
+            step,
+            camera: self.views.camera(view),
+            target: &image,
+            background: background.at(seed, step),
+            sh_degree: schedule::sh_degree(step, iterations, sh_degree),
+            rates: rates.at(step, iterations, self.scene.extent),
+        };
+        let output = self
+            .backend
+            .train_step(&input)
+            .map_err(|e| self.stopped(step, e))?;
+        self.step = step;
+        if !output.loss.is_finite() {
+            let view = self.views.name(view).to_owned();
+            return Err(TrainError::Diverged {
+                step,
+                view,
+                loss: output.loss,
+            });
+        }
+        let event = if self.policy.is_due(step) {
+            self.edit(step)?
+        } else {
+            None
+        };
+        Ok(StepReport {
+            step,
+            view,
+            output,
+            rows: self.backend.rows(),
+            event,
+        })
+    }
+
+    /// The view of the coming step; announces those after it, and epochs to the backend.
+    fn next_view(&mut self) -> usize {
+        let count = self.views.count();
+        let place = self.step as usize % count;
+        if place == 0 {
+            let epoch = self.step / count as u32;
+            self.order = std::mem::take(&mut self.next_order);
+            self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
+            self.backend.begin_epoch();
+        }
+        let last = self.options.iterations.saturating_sub(self.step + 1) as usize;
+        let upcoming: Vec<usize> = self.order[place + 1..]
+            .iter()
+            .chain(&self.next_order)
+            .copied()
+            .take(self.options.prefetch.min(last))
+            .collect();
+        self.views.prefetch(&upcoming);
+        self.order[place]
+    }
+
+    /// Asks the policy for a plan and executes it. A plan that changes no row and was refused
+    /// nothing is no event: policies may be due at steps at which they find nothing to do.
+    fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
+        let (signals, candidates) = self
+            .backend
+            .take_signals(&self.needs)
+            .map_err(|e| self.stopped(step, e))?;
+        let now = Snapshot {
+            step,
+            scene: &self.scene,
+            signals: &signals,
+            candidates: &candidates,
+        };
+        let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
+        let rng = PolicyRng::new(self.options.seed, step);
+        self.policy
+            .plan(&now, &rng, &mut plan)
+            .map_err(|source| TrainError::Policy {
+                step,
+                policy: self.policy_name.clone(),
+                source,
+            })?;
+        let ops = plan.compile();
+        self.check_plan(step, &ops)?;
+        self.backend
+            .apply(&ops, self.options.seed, step)
+            .map_err(|e| self.stopped(step, e))?;
+        self.peak_rows = self
+            .peak_rows
+            .max(rows_within(&ops))
+            .max(self.backend.rows());
+        if !ops.edits_rows() && ops.counts.denied == 0 {
+            return Ok(None);
+        }
+        let event = EditEvent::new(step, &ops);
+        let EditEvent {
+            before,
+            removed,
+            added,
+            updated,
+            denied,
+            after,
+            ..
+        } = event;
+        let cause = &event.cause;
+        tracing::info!(step, before, removed, added, updated, denied, after, %cause, "edit");
+        self.events.push(event.clone());
+        Ok(Some(event))
+    }
+
+    /// A plan compiles only from accepted calls; this is the second lock on the budget, and it
+    /// turns a plan that slipped through the first into an error instead of a panic in the backend.
+    fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
+        let (rows, budget) = (self.backend.rows(), self.backend.budget());
+        let reason = if ops.rows_before != rows || ops.budget != budget {
+            let RowOps {
+                rows_before,
+                budget: planned,
+                ..
+            } = ops;
+            Some(format!(
+                "made for {rows_before} rows of {planned}, but the model has {rows} of {budget}"
+            ))
+        } else {
+            ops.check().err().map(|broken| broken.to_string())
+        };
+        reason.map_or(Ok(()), |reason| {
+            Err(TrainError::BrokenPlan {
+                step,
+                policy: self.policy_name.clone(),
+                reason,
+            })
+        })
+    }
+
+    fn stopped(&self, step: u32, source: BackendError) -> TrainError {
+        TrainError::Backend { step, source }
+    }
+
+    /// Steps done so far.
+    #[must_use]
+    pub fn steps_done(&self) -> u32 {
+        self.step
+    }
+
+    /// Rows now.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.backend.rows()
+    }
+
+    /// Most rows there have been at any instant, inside edits too.
+    #[must_use]
+    pub fn peak_rows(&self) -> usize {
+        self.peak_rows
+    }
+
+    /// All edits so far.
+    #[must_use]
+    pub fn events(&self) -> &[EditEvent] {
+        &self.events
+    }
+
+    /// The scene and the run as the policy sees them.
+    #[must_use]
+    pub fn scene(&self) -> &SceneInfo {
+        &self.scene
+    }
+
+    /// The views that are trained on.
+    #[must_use]
+    pub fn views(&self) -> &V {
+        &self.views
+    }
+
+    /// A copy of the model as it is now, in the coordinates of training.
+    #[must_use]
+    pub fn model(&self) -> Gaussians {
+        self.backend.download()
+    }
+
+    /// The backend, for rendering and its ledger.
+    pub fn backend(&mut self) -> &mut dyn Backend {
+        self.backend.as_mut()
+    }
+}
+
+/// Most rows in use at any instant of an edit: children and seeds stand in their slots before the
+/// moves shorten the model.
+fn rows_within(ops: &RowOps) -> usize {
+    let born = ops
+        .child_slots
+        .iter()
+        .copied()
+        .chain(ops.seeds.iter().map(|(slot, _)| *slot));
+    let highest = born.max().map_or(0, |slot| slot as usize + 1);
+    highest.max(ops.rows_before).max(ops.rows_after)
+}
+
+fn check(
+    scene: &SceneInfo,
+    options: &TrainOptions,
+    views: usize,
+    backend: &dyn Backend,
+) -> Result<(), TrainError> {
+    let bad = |reason: String| Err(TrainError::BadOption(reason));
+    if views == 0 {
+        return Err(TrainError::NoViews);
+    }
+    if u32::try_from(views) != Ok(scene.train_views) {
+        return bad(format!(
+            "{views} views, but the scene tells of {}",
+            scene.train_views
+        ));
+    }
+    if options.iterations == 0 || options.iterations != scene.iterations {
+        let (here, there) = (options.iterations, scene.iterations);
+        return bad(format!(
+            "--iterations is {here} (scene: {there}); both must be equal, >= 1"
+        ));
+    }
+    if !(scene.extent.is_finite() && scene.extent > 0.0) {
+        return bad(format!(
+            "the scene's extent is {}; it must be positive",
+            scene.extent
+        ));
+    }
+    if let Some(rate) = options.rates.invalid() {
+        return bad(format!("learning rate `{rate}` must be a positive number"));
+    }
+    let (rows, budget) = (backend.rows(), backend.budget());
+    if budget != scene.budget || rows > budget {
+        return bad(format!(
+            "{rows} rows, budget {budget} (scene: {})",
+            scene.budget
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,439 @@
+//! The loop against a backend that only counts and a policy that does as it is told.
+
+use std::sync::{Arc, Mutex};
+
+use densify_policies::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
+use densify_policies::policy::{Candidate, PolicyState, Signal, SignalSet, Signals};
+use glam::{DMat3, DVec3};
+
+use super::*;
+use crate::backend::Rendering;
+use crate::camera::Camera;
+use crate::dataset::images::{Image8, SharedImage};
+use crate::memory::Ledger;
+
+/// Everything that was asked of the fakes, in order.
+type Diary = Arc<Mutex<Vec<String>>>;
+
+fn note(diary: &Diary, what: String) {
+    diary.lock().unwrap().push(what);
+}
+
+struct CountingBackend {
+    rows: usize,
+    budget: usize,
+    lost_at: u32,
+    diary: Diary,
+    ledger: Ledger,
+}
+
+impl Backend for CountingBackend {
+    fn rows(&self) -> usize {
+        self.rows
+    }
+    fn budget(&self) -> usize {
+        self.budget
+    }
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+    fn begin_epoch(&mut self) {
+        note(&self.diary, "epoch".into());
+    }
+    fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        note(
+            &self.diary,
+            format!("step {} view {}", input.step, input.target.rgb[0]),
+        );
+        let loss = if input.step == self.lost_at {
+            f32::NAN
+        } else {
+            0.5
+        };
+        Ok(StepOutput {
+            loss,
+            ..StepOutput::default()
+        })
+    }
+    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
+        Ok((Signals::zeros(self.rows, needs.signals), Vec::new()))
+    }
+    fn apply(&mut self, ops: &RowOps, _seed: u64, step: u32) -> Result<(), BackendError> {
+        note(&self.diary, format!("apply {step}"));
+        assert_eq!(ops.rows_before, self.rows);
+        self.rows = ops.rows_after;
+        Ok(())
+    }
+    fn render(
+        &mut self,
+        camera: &Camera,
+        _background: [f32; 3],
+        _sh_degree: u8,
+    ) -> Result<Rendering, BackendError> {
+        Err(BackendError::ImageTooLarge {
+            width: camera.width,
+            height: camera.height,
+            max: 0,
+        })
+    }
+    fn download(&self) -> Gaussians {
+        Gaussians {
+            means: vec![[0.0; 3]; self.rows],
+            ..Gaussians::default()
+        }
+    }
+}
+
+/// Splits as many rows as it can at every multiple of `every`, or prunes half, or fails.
+struct ToldPolicy {
+    every: u32,
+    what: Told,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Told {
+    Split,
+    Halve,
+    Nothing,
+    Fail,
+    ReadUndeclared,
+}
+
+impl DensityPolicy for ToldPolicy {
+    fn needs(&self, _scene: &SceneInfo) -> Needs {
+        Needs {
+            signals: SignalSet::of(&[Signal::Opacity]),
+            candidates: None,
+        }
+    }
+    fn is_due(&self, step: u32) -> bool {
+        step.is_multiple_of(self.every)
+    }
+    fn plan(
+        &mut self,
+        now: &Snapshot<'_>,
+        _rng: &PolicyRng,
+        plan: &mut EditPlan,
+    ) -> Result<(), PolicyError> {
+        let rows = now.signal(Signal::Opacity)?.len() as u32;
+        plan.cause("told");
+        match self.what {
+            Told::Split => {
+                let split = Offspring {
+                    children: 1,
+                    parent: ParentFate::BecomesChild,
+                    placement: Placement::Sampled,
+                    scale: ScaleRule::Uniform(0.5),
+                    opacity: OpacityRule::Same,
+                };
+                for row in 0..rows {
+                    // A refusal is counted by the plan.
+                    let _ = plan.grow(row, split);
+                }
+            }
+            Told::Halve => {
+                for row in 0..rows / 2 {
+                    plan.prune(row)
+                        .map_err(|e| PolicyError::Other(e.to_string()))?;
+                }
+            }
+            Told::Nothing => {}
+            Told::Fail => return Err(PolicyError::Other("out of ideas".into())),
+            Told::ReadUndeclared => {
+                now.signal(Signal::Age)?;
+            }
+        }
+        Ok(())
+    }
+    fn save(&self) -> PolicyState {
+        PolicyState::Null
+    }
+    fn restore(&mut self, _state: PolicyState) -> Result<(), PolicyError> {
+        Ok(())
+    }
+}
+
+struct FakeViews {
+    cameras: Vec<Camera>,
+    unreadable: Option<usize>,
+    announced: Diary,
+}
+
+impl ViewSource for FakeViews {
+    fn count(&self) -> usize {
+        self.cameras.len()
+    }
+    fn name(&self, view: usize) -> &str {
+        ["a.png", "b.png", "c.png"][view]
+    }
+    fn camera(&self, view: usize) -> &Camera {
+        &self.cameras[view]
+    }
+    fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
+        if self.unreadable == Some(view) {
+            return Err("file is gone".into());
+        }
+        let rgb = vec![view as u8; 3];
+        Ok(Arc::new(Image8 {
+            width: 1,
+            height: 1,
+            rgb,
+            alpha: None,
+            mask: None,
+        }))
+    }
+    fn prefetch(&self, upcoming: &[usize]) {
+        note(&self.announced, format!("{upcoming:?}"));
+    }
+}
+
+struct Case {
+    rows: usize,
+    budget: usize,
+    what: Told,
+    every: u32,
+    lost_at: u32,
+    unreadable: Option<usize>,
+}
+
+const CASE: Case = Case {
+    rows: 3,
+    budget: 10,
+    what: Told::Split,
+    every: 2,
+    lost_at: 0,
+    unreadable: None,
+};
+
+fn scene(case: &Case, views: usize) -> SceneInfo {
+    SceneInfo {
+        extent: 1.0,
+        train_views: views as u32,
+        budget: case.budget,
+        initial_rows: case.rows,
+        iterations: 9,
+        white_background: false,
+    }
+}
+
+const OPTIONS: TrainOptions = TrainOptions {
+    iterations: 9,
+    seed: 7,
+    sh_degree: 3,
+    background: Background::Black,
+    rates: RateOptions {
+        mean_start: 1e-4,
+        mean_end: 1e-6,
+        log_scale: 1.0,
+        quat: 1.0,
+        opacity: 1.0,
+        sh_dc: 1.0,
+        sh_rest: 1.0,
+    },
+    prefetch: 2,
+};
+
+fn build(
+    case: &Case,
+    views: usize,
+    scene: SceneInfo,
+    options: TrainOptions,
+) -> Result<(Trainer<FakeViews>, Diary, Diary), TrainError> {
+    let camera = Camera {
+        width: 1,
+        height: 1,
+        fx: 1.0,
+        fy: 1.0,
+        cx: 0.5,
+        cy: 0.5,
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::ZERO,
+    };
+    let (diary, announced) = (Diary::default(), Diary::default());
+    let backend = CountingBackend {
+        rows: case.rows,
+        budget: case.budget,
+        lost_at: case.lost_at,
+        diary: diary.clone(),
+        ledger: Ledger::default(),
+    };
+    let views = FakeViews {
+        cameras: vec![camera; views],
+        unreadable: case.unreadable,
+        announced: announced.clone(),
+    };
+    let policy = ToldPolicy {
+        every: case.every,
+        what: case.what,
+    };
+    let policy = ("told", Box::new(policy) as Box<dyn DensityPolicy>);
+    let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
+    Ok((trainer, diary, announced))
+}
+
+fn trainer(case: &Case) -> (Trainer<FakeViews>, Diary, Diary) {
+    build(case, 3, scene(case, 3), OPTIONS).unwrap()
+}
+
+fn failure(case: &Case) -> (String, usize, Vec<String>) {
+    let (mut trainer, diary, _) = trainer(case);
+    let error = (0..9)
+        .find_map(|_| trainer.step().err())
+        .expect("an error within 9 steps");
+    let done = diary.lock().unwrap().clone();
+    (error.to_string(), trainer.model().len(), done)
+}
+
+#[test]
+fn every_epoch_shows_every_view_once_and_is_announced() {
+    let (mut trainer, diary, announced) = trainer(&Case { every: 100, ..CASE });
+    let shown: Vec<usize> = (0..9).map(|_| trainer.step().unwrap().view).collect();
+    for (epoch, views) in shown.chunks(3).enumerate() {
+        assert_eq!(views, schedule::view_order(3, 7, epoch as u32));
+    }
+    let diary = diary.lock().unwrap();
+    let epochs: Vec<usize> = (0..diary.len()).filter(|&i| diary[i] == "epoch").collect();
+    assert_eq!(epochs, [0, 4, 8]);
+    // The right pixels reached the backend.
+    let steps: Vec<String> = shown
+        .iter()
+        .enumerate()
+        .map(|(i, view)| format!("step {} view {view}", i + 1))
+        .collect();
+    assert_eq!(
+        diary
+            .iter()
+            .filter(|d| *d != "epoch")
+            .cloned()
+            .collect::<Vec<_>>(),
+        steps
+    );
+    // Each announcement is what comes next, and nothing beyond the end of the run.
+    for (i, said) in announced.lock().unwrap().iter().enumerate() {
+        assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
+    }
+}
+
+#[test]
+fn edits_are_reported_and_the_budget_holds() {
+    let (mut trainer, ..) = trainer(&CASE);
+    let events: Vec<EditEvent> = (0..9)
+        .filter_map(|_| trainer.step().unwrap().event)
+        .collect();
+    let short: Vec<_> = events
+        .iter()
+        .map(|e| (e.step, e.before, e.added, e.denied, e.after))
+        .collect();
+    assert_eq!(
+        short,
+        [
+            (2, 3, 3, 0, 6),
+            (4, 6, 4, 2, 10),
+            (6, 10, 0, 10, 10),
+            (8, 10, 0, 10, 10)
+        ]
+    );
+    assert_eq!(
+        (events[0].updated, events[0].removed, &*events[0].cause),
+        (3, 0, "told")
+    );
+    assert_eq!(trainer.events(), events);
+    assert_eq!(
+        (trainer.peak_rows(), trainer.rows(), trainer.steps_done()),
+        (10, 10, 9)
+    );
+}
+
+#[test]
+fn a_plan_that_does_nothing_is_no_event() {
+    let (mut trainer, diary, _) = trainer(&Case {
+        what: Told::Nothing,
+        ..CASE
+    });
+    assert!((0..9).all(|_| trainer.step().unwrap().event.is_none()));
+    assert!(trainer.events().is_empty());
+    // It may reset statistics and is executed all the same.
+    assert!(diary.lock().unwrap().contains(&"apply 2".to_owned()));
+}
+
+#[test]
+fn the_peak_outlives_a_prune() {
+    let (mut trainer, ..) = trainer(&Case {
+        rows: 8,
+        what: Told::Halve,
+        ..CASE
+    });
+    for _ in 0..4 {
+        trainer.step().unwrap();
+    }
+    assert_eq!((trainer.rows(), trainer.peak_rows()), (2, 8));
+}
+
+#[test]
+fn slots_written_before_the_moves_count_for_the_peak() {
+    let ops = RowOps {
+        rows_before: 4,
+        rows_after: 3,
+        child_slots: vec![1, 5],
+        ..RowOps::default()
+    };
+    assert_eq!(rows_within(&ops), 6);
+}
+
+#[test]
+fn a_policy_error_stops_before_the_edit() {
+    let (message, rows, done) = failure(&Case {
+        what: Told::Fail,
+        ..CASE
+    });
+    assert_eq!(message, "step 2: policy `told`: out of ideas");
+    assert_eq!(rows, 3);
+    assert!(!done.iter().any(|d| d.starts_with("apply")), "{done:?}");
+    let (message, ..) = failure(&Case {
+        what: Told::ReadUndeclared,
+        ..CASE
+    });
+    assert!(
+        message.contains("Age") && message.contains("not declared"),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_lost_model_and_an_unreadable_view_are_named() {
+    let (message, _, done) = failure(&Case {
+        lost_at: 4,
+        every: 4,
+        ..CASE
+    });
+    let view = ["a.png", "b.png", "c.png"][schedule::view_order(3, 7, 1)[0]];
+    assert!(
+        message.starts_with(&format!("step 4: the loss of view `{view}` is NaN")),
+        "{message}"
+    );
+    assert!(!done.contains(&"apply 4".to_owned()), "{done:?}");
+    let (message, ..) = failure(&Case {
+        unreadable: Some(1),
+        ..CASE
+    });
+    assert!(message.contains("view `b.png`: file is gone"), "{message}");
+}
+
+#[test]
+fn options_that_disagree_are_refused() {
+    let refused = |views, change: fn(&mut SceneInfo, &mut TrainOptions)| {
+        let (mut scene, mut options) = (scene(&CASE, 3), OPTIONS);
+        change(&mut scene, &mut options);
+        build(&CASE, views, scene, options)
+            .err()
+            .expect("refused")
+            .to_string()
+    };
+    assert!(refused(0, |_, _| ()).contains("no training view"));
+    assert!(refused(2, |_, _| ()).contains("2 views"));
+    assert!(refused(3, |_, o| o.iterations = 8).contains("--iterations"));
+    assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
+    assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
+    assert!(refused(3, |_, o| o.rates.quat = 0.0).contains("`quat`"));
+    assert!(build(&CASE, 3, scene(&CASE, 3), OPTIONS).is_ok());
+}

@@ -1,0 +1,202 @@
+//! Reads the cases: `*.safetensors` with an `index.json` beside them.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use densify::camera::Camera;
+use densify::gaussians::Gaussians;
+use glam::{DMat3, DVec3};
+use safetensors::{Dtype, SafeTensors};
+
+use crate::reference::Upstream;
+
+/// One scene with everything that is stored about it.
+#[derive(Debug)]
+pub(crate) struct Case {
+    pub(crate) name: String,
+    pub(crate) sh_degree: u8,
+    pub(crate) model: Gaussians,
+    pub(crate) cameras: Vec<Camera>,
+    pub(crate) background: [f32; 3],
+    /// What the same arithmetic loses in `f32`, by quantity, relative to the largest value.
+    floors: BTreeMap<String, f64>,
+    arrays: BTreeMap<String, Vec<f64>>,
+}
+
+/// Which images a stored loss weighs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Part {
+    Colour,
+    Alpha,
+    Depth,
+    Full,
+}
+
+impl Part {
+    pub(crate) const ALL: [Self; 4] = [Self::Colour, Self::Alpha, Self::Depth, Self::Full];
+
+    /// The part's name in the names of arrays.
+    pub(crate) fn key(self) -> &'static str {
+        match self {
+            Self::Colour => "color",
+            Self::Alpha => "alpha",
+            Self::Depth => "depth",
+            Self::Full => "full",
+        }
+    }
+}
+
+/// The folder of data shared between projects: `DENSIFY_SHARED`, else `shared` beside the
+/// workspace.
+pub(crate) fn shared() -> PathBuf {
+    std::env::var_os("DENSIFY_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from)
+}
+
+/// All cases, or `None` (said aloud) where the data is absent.
+#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
+pub(crate) fn cases() -> Option<Vec<Case>> {
+    let folder = shared().join("oracle");
+    let index = folder.join("index.json");
+    let Ok(text) = std::fs::read_to_string(&index) else {
+        eprintln!("skipped: {} is absent; set DENSIFY_SHARED", index.display());
+        return None;
+    };
+    let index: serde_json::Value = serde_json::from_str(&text).expect("index.json is JSON");
+    let cases = index["cases"].as_object().expect("index.json lists cases");
+    assert!(!cases.is_empty(), "index.json lists no case");
+    Some(cases.iter().map(|(name, entry)| Case::read(&folder, name, entry)).collect())
+}
+
+impl Case {
+    fn read(folder: &Path, name: &str, entry: &serde_json::Value) -> Self {
+        let file = folder.join(entry["file"].as_str().expect("a case names its file"));
+        let bytes = std::fs::read(&file).expect("a case's file can be read");
+        let tensors = SafeTensors::deserialize(&bytes).expect("a case's file is safetensors");
+        let mut arrays = BTreeMap::new();
+        for (key, tensor) in tensors.tensors() {
+            arrays.insert(key, numbers(tensor.dtype(), tensor.data()));
+        }
+        let number = |key: &str| entry[key].as_u64().expect("a size") as u32;
+        let (width, height) = (number("width"), number("height"));
+        let sh_degree = number("sh_degree_active") as u8;
+        let floors = &entry["conventions"]["gsplat"]["f32_floor"];
+        let floors = floors.as_object().expect("a case has floors");
+        Self {
+            name: name.into(),
+            sh_degree,
+            model: model(&arrays, sh_degree),
+            cameras: cameras(&arrays, width, height),
+            background: std::array::from_fn(|c| arrays["in.background"][c] as f32),
+            floors: floors
+                .iter()
+                .map(|(key, value)| (key.clone(), value.as_f64().expect("a floor is a number")))
+                .collect(),
+            arrays,
+        }
+    }
+
+    /// A stored array of our convention.
+    pub(crate) fn expected(&self, key: &str) -> &[f64] {
+        self.array(&format!("gsplat.{key}"))
+    }
+
+    fn array(&self, key: &str) -> &[f64] {
+        self.arrays.get(key).unwrap_or_else(|| panic!("{}: no array {key}", self.name))
+    }
+
+    /// One camera's part of a stored array whose first axis is the camera.
+    pub(crate) fn of_camera(&self, key: &str, camera: usize) -> &[f64] {
+        self.split(self.expected(key), camera)
+    }
+
+    fn split<'a>(&self, values: &'a [f64], camera: usize) -> &'a [f64] {
+        let n = values.len() / self.cameras.len();
+        &values[camera * n..(camera + 1) * n]
+    }
+
+    /// Whether no decision in a pixel is close. Shape: [height, width].
+    pub(crate) fn decided(&self, camera: usize) -> Vec<bool> {
+        self.split(self.array("pixel_ok"), camera).iter().map(|&ok| ok > 0.0).collect()
+    }
+
+    /// The weights of a stored loss.
+    pub(crate) fn upstream(&self, camera: usize, part: Part) -> Upstream {
+        let take = |key: &str, of: Part| -> Vec<f64> {
+            let weights = self.split(self.array(&format!("loss_weight.{key}")), camera);
+            let on = part == of || part == Part::Full;
+            weights.iter().map(|w| if on { *w } else { 0.0 }).collect()
+        };
+        Upstream {
+            rgb: take("rgb", Part::Colour),
+            alpha: take("alpha", Part::Alpha),
+            depth: take("depth", Part::Depth),
+        }
+    }
+
+    /// Ten times what `f32` loses in this quantity. Where that was not measured, the largest
+    /// loss of the same parameter class, of another loss, or else of any gradient, stands in.
+    pub(crate) fn tolerance(&self, key: &str) -> f64 {
+        let class = key.rsplit('.').next().unwrap_or(key);
+        let largest = |of: &dyn Fn(&str) -> bool| {
+            let floors = self.floors.iter().filter(|(k, _)| !k.contains(':') && of(k));
+            floors.map(|(_, &floor)| floor).reduce(f64::max)
+        };
+        let floor = self.floors.get(key).copied();
+        let floor = floor.or_else(|| largest(&|k| k.ends_with(&format!(".{class}"))));
+        10.0 * floor.or_else(|| largest(&|k| k.starts_with("grad_"))).expect("a case has floors")
+    }
+}
+
+fn numbers(dtype: Dtype, data: &[u8]) -> Vec<f64> {
+    fn each<const N: usize>(data: &[u8], read: impl Fn([u8; N]) -> f64) -> Vec<f64> {
+        let (chunks, rest) = data.as_chunks::<N>();
+        assert!(rest.is_empty(), "a tensor ends within a number");
+        chunks.iter().map(|&bytes| read(bytes)).collect()
+    }
+    match dtype {
+        Dtype::F64 => each(data, f64::from_le_bytes),
+        Dtype::F32 => each(data, |b| f64::from(f32::from_le_bytes(b))),
+        Dtype::I32 => each(data, |b| f64::from(i32::from_le_bytes(b))),
+        Dtype::U8 => each(data, |[b]| f64::from(b)),
+        other => panic!("no case holds {other:?}"),
+    }
+}
+
+/// Inputs are stored as `f32`, so nothing is lost here.
+fn model(arrays: &BTreeMap<String, Vec<f64>>, sh_degree: u8) -> Gaussians {
+    let values = |key: &str| -> Vec<f32> { arrays[key].iter().map(|&v| v as f32).collect() };
+    fn rows<const N: usize>(values: &[f32]) -> Vec<[f32; N]> {
+        values.as_chunks::<N>().0.to_vec()
+    }
+    Gaussians {
+        sh_degree,
+        means: rows(&values("in.means")),
+        log_scales: rows(&values("in.log_scales")),
+        quats: rows(&values("in.quats")),
+        opacity_logits: values("in.opacity_logits"),
+        sh: values("in.sh"),
+    }
+}
+
+fn cameras(arrays: &BTreeMap<String, Vec<f64>>, width: u32, height: u32) -> Vec<Camera> {
+    let poses = arrays["in.viewmats"].as_chunks::<16>().0;
+    let intrinsics = arrays["in.Ks"].as_chunks::<9>().0;
+    poses
+        .iter()
+        .zip(intrinsics)
+        .map(|(m, k)| Camera {
+            width,
+            height,
+            fx: k[0],
+            fy: k[4],
+            cx: k[2],
+            cy: k[5],
+            rotation: DMat3::from_cols_array(&[
+                m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10],
+            ])
+            .transpose(),
+            translation: DVec3::new(m[3], m[7], m[11]),
+        })
+        .collect()
+}

@@ -1,0 +1,197 @@
+//! Blending front to back, every pixel against every row, and its derivative.
+
+use super::project::Splat;
+use super::{Image, Rules, ScreenGradient, Upstream, View};
+
+/// A row blended into a pixel.
+struct Contribution {
+    row: usize,
+    /// Pixel centre minus projected mean [px].
+    offset: [f64; 2],
+    /// exp(−½ dᵀQd).
+    falloff: f64,
+    alpha: f64,
+    clamped: bool,
+    /// Transmittance in front of it.
+    transmittance: f64,
+}
+
+/// What happens in one pixel.
+struct Pixel {
+    contributions: Vec<Contribution>,
+    transmittance: f64,
+    /// Some decision was close.
+    boundary: bool,
+}
+
+/// Decisions this close are not held against `f32`: alpha to its least value and to its clamp,
+/// relative; transmittance to its least value, relative; depths of neighbours in the order,
+/// relative. What f32 loses is smaller by two orders of magnitude.
+const CLOSE_ALPHA: f64 = 1e-3;
+const CLOSE_TRANSMITTANCE: f64 = 1e-2;
+const CLOSE_DEPTH: f64 = 1e-6;
+
+fn trace(splats: &[Splat], order: &[usize], x: u32, y: u32, rules: &Rules) -> Pixel {
+    let mut pixel = Pixel { contributions: Vec::new(), transmittance: 1.0, boundary: false };
+    let mut last_depth = f64::NEG_INFINITY;
+    for &row in order {
+        let splat = &splats[row];
+        let offset = [f64::from(x) + 0.5 - splat.mean[0], f64::from(y) + 0.5 - splat.mean[1]];
+        let [dx, dy] = offset;
+        let [a, b, c] = splat.conic;
+        let falloff = (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp();
+        let raw = splat.opacity * falloff;
+        let close = |value: f64, to: f64, share: f64| (value - to).abs() < share * to;
+        pixel.boundary |= close(raw, rules.alpha_min, CLOSE_ALPHA);
+        if raw < rules.alpha_min {
+            continue;
+        }
+        pixel.boundary |= close(raw, rules.alpha_max, CLOSE_ALPHA);
+        pixel.boundary |= close(splat.depth, last_depth, CLOSE_DEPTH);
+        last_depth = splat.depth;
+        let alpha = raw.min(rules.alpha_max);
+        let after = pixel.transmittance * (1.0 - alpha);
+        pixel.boundary |= close(after, rules.transmittance_min, CLOSE_TRANSMITTANCE);
+        if after <= rules.transmittance_min {
+            break;
+        }
+        pixel.contributions.push(Contribution {
+            row,
+            offset,
+            falloff,
+            alpha,
+            clamped: raw > rules.alpha_max,
+            transmittance: pixel.transmittance,
+        });
+        pixel.transmittance = after;
+    }
+    pixel
+}
+
+fn visible_colour(splat: &Splat) -> [f64; 3] {
+    splat.colour.map(|c| c.max(0.0))
+}
+
+/// Renders splats in the given order.
+pub(crate) fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
+    let pixels = (view.camera.width * view.camera.height) as usize;
+    let mut image = Image {
+        rgb: Vec::with_capacity(3 * pixels),
+        alpha: Vec::with_capacity(pixels),
+        depth: Vec::with_capacity(pixels),
+        transmittance: Vec::with_capacity(pixels),
+        blended: Vec::with_capacity(pixels),
+        boundary: Vec::with_capacity(pixels),
+    };
+    for y in 0..view.camera.height {
+        for x in 0..view.camera.width {
+            let pixel = trace(splats, order, x, y, rules);
+            let mut rgb = view.background.map(|b| b * pixel.transmittance);
+            let mut depth = 0.0;
+            for hit in &pixel.contributions {
+                let weight = hit.alpha * hit.transmittance;
+                let colour = visible_colour(&splats[hit.row]);
+                for c in 0..3 {
+                    rgb[c] += weight * colour[c];
+                }
+                depth += weight * splats[hit.row].depth;
+            }
+            image.rgb.extend(rgb);
+            image.alpha.push(1.0 - pixel.transmittance);
+            image.depth.push(depth);
+            image.transmittance.push(pixel.transmittance);
+            image.blended.push(pixel.contributions.len() as u32);
+            image.boundary.push(pixel.boundary);
+        }
+    }
+    image
+}
+
+/// Gradients of Σ image · upstream with respect to the splats. Shape: [rows].
+pub(crate) fn backward(
+    splats: &[Splat],
+    order: &[usize],
+    view: View<'_>,
+    rules: &Rules,
+    upstream: &Upstream,
+) -> Vec<ScreenGradient> {
+    let mut gradient = vec![ScreenGradient::default(); splats.len()];
+    for y in 0..view.camera.height {
+        for x in 0..view.camera.width {
+            let p = (y * view.camera.width + x) as usize;
+            let pixel = trace(splats, order, x, y, rules);
+            let d_rgb = [0, 1, 2].map(|c| upstream.rgb[3 * p + c]);
+            let (d_alpha_out, d_depth) = (upstream.alpha[p], upstream.depth[p]);
+            // What lies behind, as this pixel's loss values it; at first the background.
+            let mut behind: f64 =
+                pixel.transmittance * (0..3).map(|c| view.background[c] * d_rgb[c]).sum::<f64>();
+            for hit in pixel.contributions.iter().rev() {
+                let splat = &splats[hit.row];
+                let colour = visible_colour(splat);
+                let weight = hit.alpha * hit.transmittance;
+                let value = (0..3).map(|c| colour[c] * d_rgb[c]).sum::<f64>()
+                    + splat.depth * d_depth
+                    + d_alpha_out;
+                let d_alpha = hit.transmittance * value - behind / (1.0 - hit.alpha);
+                behind += weight * value;
+
+                let sum = &mut gradient[hit.row];
+                for (colour, d) in sum.colour.iter_mut().zip(d_rgb) {
+                    *colour += weight * d;
+                }
+                sum.depth += weight * d_depth;
+                sum.max_weight = sum.max_weight.max(weight);
+                sum.sum_weight += weight;
+                sum.pixels += 1;
+                if !hit.clamped {
+                    sum.opacity += d_alpha * hit.falloff;
+                    add_exponent(sum, splat, hit, -d_alpha * hit.alpha);
+                }
+            }
+        }
+    }
+    gradient
+}
+
+/// Adds the gradient that arrives at the exponent p of alpha = opacity · exp(−p).
+fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_exponent: f64) {
+    let [dx, dy] = hit.offset;
+    let [a, b, c] = splat.conic;
+    let d_mean = [-d_exponent * (a * dx + b * dy), -d_exponent * (b * dx + c * dy)];
+    for (axis, d) in d_mean.into_iter().enumerate() {
+        sum.mean[axis] += d;
+        sum.mean_abs[axis] += d.abs();
+    }
+    sum.conic[0] += d_exponent * 0.5 * dx * dx;
+    sum.conic[1] += d_exponent * dx * dy;
+    sum.conic[2] += d_exponent * 0.5 * dy * dy;
+}
+
+/// Per row, what pixels outside `counted` may add to its statistics if every close decision in
+/// them fell in the row's favour: largest weight, sum of weights, pixels.
+pub(crate) fn leeway(
+    splats: &[Splat],
+    order: &[usize],
+    view: View<'_>,
+    counted: &[bool],
+) -> Vec<(f64, f64, u32)> {
+    // Without the two steps nothing is skipped; 10 % below the step nothing can be blended.
+    let rules = Rules { alpha_min: 0.9 / 255.0, ..Rules::SMOOTH };
+    let mut most = vec![(0.0, 0.0, 0); splats.len()];
+    for y in 0..view.camera.height {
+        for x in 0..view.camera.width {
+            if counted[(y * view.camera.width + x) as usize] {
+                continue;
+            }
+            for hit in trace(splats, order, x, y, &rules).contributions {
+                // A row in front that is skipped lets 1/255 more through.
+                let weight = 1.01 * hit.alpha * hit.transmittance;
+                let (largest, sum, pixels) = &mut most[hit.row];
+                *largest = weight.max(*largest);
+                *sum += weight;
+                *pixels += 1;
+            }
+        }
+    }
+    most
+}

@@ -1,0 +1,126 @@
+//! The reference against central differences of itself: step 1e-6, in `f64`, without the steps
+//! that make a render discontinuous, and with the order of the rows held fixed.
+
+use densify::camera::Camera;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::loss::loss;
+use super::project::{by_depth, project};
+use super::{CLASSES, Model, Rules, Upstream, View, blend, differentiate};
+use crate::compare::Table;
+use crate::scenes;
+
+/// Half the distance between the two evaluations.
+const STEP: f64 = 1e-6;
+/// Against the largest gradient of the class. Rounding leaves eps·|L| / STEP ≈ 1e-16·10 / 1e-6,
+/// truncation STEP²; both stay below this for losses around 1 with gradients around 1.
+const TOLERANCE: f64 = 1e-6;
+
+/// Compares every gradient of Σ image · upstream with differences; reports the worst per class.
+fn check(table: &mut Table, what: &str, model: &Model, view: View<'_>, upstream: &Upstream) {
+    let order = by_depth(&project(model, view, &Rules::SMOOTH));
+    let value = |model: &Model| {
+        let splats = project(model, view, &Rules::SMOOTH);
+        blend::render(&splats, &order, view, &Rules::SMOOTH).dot(upstream)
+    };
+    let (_, analytic) = differentiate(model, view, &Rules::SMOOTH, upstream);
+    for class in CLASSES {
+        let expected = analytic.model.class(class);
+        let largest = expected.iter().fold(0.0_f64, |m, g| m.max(g.abs()));
+        let mut moved = model.clone();
+        let mut worst = 0.0_f64;
+        for (i, analytic) in expected.iter().enumerate() {
+            let at = model.class(class)[i];
+            moved.class_mut(class)[i] = at + STEP;
+            let above = value(&moved);
+            moved.class_mut(class)[i] = at - STEP;
+            let below = value(&moved);
+            moved.class_mut(class)[i] = at;
+            let difference = ((above - below) / (2.0 * STEP) - analytic).abs();
+            worst = if difference.is_nan() { f64::NAN } else { worst.max(difference) };
+        }
+        table.check(what, class, worst / largest.max(1e-3), TOLERANCE);
+    }
+}
+
+fn view(camera: &Camera, sh_degree: u8) -> View<'_> {
+    View { camera, background: [0.2, 0.9, 0.5], sh_degree }
+}
+
+#[test]
+fn gradients_of_every_class_at_every_degree() {
+    let mut table = Table::new("reference against central differences");
+    for degree in 0..=3 {
+        let camera = scenes::camera(13, 11, 40 + u64::from(degree));
+        let model = Model::of(&scenes::cloud(7, degree, &camera, 70 + u64::from(degree)));
+        let upstream = scenes::upstream(&camera, 3);
+        check(&mut table, &format!("degree {degree}"), &model, view(&camera, degree), &upstream);
+        if degree > 0 {
+            // Fewer harmonics evaluated than stored: the rest gets no gradient.
+            let what = format!("degree {} of {degree}", degree - 1);
+            check(&mut table, &what, &model, view(&camera, degree - 1), &upstream);
+        }
+    }
+    table.finish();
+}
+
+#[test]
+fn gradients_where_the_jacobian_is_clamped() {
+    // Centres far outside the image, wide enough to be seen: the slope is clamped in x, in y,
+    // and in both.
+    let camera = Camera { cx: 2.0, cy: 9.5, fx: 9.0, fy: 14.0, ..scenes::camera(12, 10, 5) };
+    let mut table = Table::new("reference beyond the frustum");
+    for (what, local) in
+        [("x", [4.0, 0.2, 2.0]), ("y", [0.1, -3.5, 2.2]), ("both", [-2.6, 2.0, 2.1])]
+    {
+        let model = Model::of(&scenes::one_at(&camera, local, [1.1, 0.9, 1.3]));
+        let seen =
+            differentiate(&model, view(&camera, 1), &Rules::SMOOTH, &scenes::upstream(&camera, 9))
+                .0
+                .alpha
+                .iter()
+                .fold(0.0_f64, |m, &a| m.max(a));
+        assert!(seen > 0.01, "{what}: the row is not seen, largest alpha {seen:e}");
+        check(&mut table, what, &model, view(&camera, 1), &scenes::upstream(&camera, 9));
+    }
+    table.finish();
+}
+
+#[test]
+fn gradient_of_the_loss() {
+    let mut table = Table::new("reference loss against central differences");
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    for (width, height) in [(1, 1), (1, 17), (17, 1), (7, 5), (14, 12)] {
+        let n = 3 * width * height;
+        let target: Vec<f64> = (0..n).map(|_| rng.random::<f64>()).collect();
+        // Away from equality, where L1 has no derivative.
+        let rendered: Vec<f64> = target
+            .iter()
+            .map(|t| t + rng.random_range(0.01..0.3) * if rng.random() { 1.0 } else { -1.0 })
+            .collect();
+        let analytic = loss(&rendered, &target, width, height);
+        let largest = analytic.gradient.iter().fold(0.0_f64, |m, g| m.max(g.abs()));
+        let mut moved = rendered.clone();
+        let mut worst = 0.0_f64;
+        for i in 0..n {
+            moved[i] = rendered[i] + STEP;
+            let above = loss(&moved, &target, width, height).loss;
+            moved[i] = rendered[i] - STEP;
+            let below = loss(&moved, &target, width, height).loss;
+            moved[i] = rendered[i];
+            let difference = (above - below) / (2.0 * STEP) - analytic.gradient[i];
+            worst = worst.max(difference.abs());
+        }
+        table.check(&format!("{width}x{height}"), "rendered", worst / largest, TOLERANCE);
+    }
+    table.finish();
+}
+
+#[test]
+fn equal_images_have_no_loss_and_no_gradient() {
+    let image: Vec<f64> = (0..3 * 12 * 9).map(|i| f64::from(i % 7) / 7.0).collect();
+    let same = loss(&image, &image, 12, 9);
+    assert!(same.loss.abs() < 1e-15 && (same.ssim - 1.0).abs() < 1e-15, "{}", same.loss);
+    assert!(same.gradient.iter().all(|g| g.abs() < 1e-15));
+}

@@ -1,0 +1,173 @@
+//! The signals that training accumulates, against the reference's loss gradient.
+
+use densify::backend::cpu::CpuBackend;
+use densify::backend::{Backend, LearningRates, StepInput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::Gaussians;
+use densify_policies::policy::{Needs, Signal, SignalSet};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::compare::{Table, relative_error};
+use crate::reference::loss::loss;
+use crate::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
+use crate::scenes;
+use crate::subject::{self, Resources};
+
+/// A quarter of the loss's gradient jumps with the sign of render − target, and a few pixels are
+/// near a step, so this is the tolerance of gradients, doubled.
+const TOLERANCE: f64 = 2e-4;
+/// The share of its pixels that a row may gain or lose at the step of alpha.
+const FLIPPED: f64 = 1e-3;
+const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
+/// Steps of length zero: every view sees the same model.
+const STILL: LearningRates =
+    LearningRates { mean: 0.0, log_scale: 0.0, quat: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
+
+struct Views {
+    model: Gaussians,
+    cameras: Vec<Camera>,
+    targets: Vec<Image8>,
+}
+
+/// Two views of one cloud, of different size.
+fn views() -> Views {
+    let first = scenes::camera(45, 37, 61);
+    let mut second = Camera { width: 38, height: 50, ..first };
+    second.translation.x += 0.3;
+    let cameras = vec![first, scenes::rounded(&second)];
+    let mut model = scenes::cloud(21, 2, &first, 62);
+    // Rounded where training would round: a step of length zero normalises quaternions.
+    for quat in &mut model.quats {
+        let norm = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
+        *quat = quat.map(|v| v / norm);
+    }
+    let mut rng = ChaCha8Rng::seed_from_u64(63);
+    let targets = cameras
+        .iter()
+        .map(|c| {
+            let n = 3 * (c.width * c.height) as usize;
+            let rgb = (0..n).map(|_| rng.random()).collect();
+            Image8 { width: c.width, height: c.height, rgb, alpha: None, mask: None }
+        })
+        .collect();
+    Views { model, cameras, targets }
+}
+
+/// The reference's gradient of the training loss of one view.
+fn reference(views: &Views, v: usize) -> Gradient {
+    let (camera, target) = (&views.cameras[v], &views.targets[v]);
+    let view = View { camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
+    let model = Model::of(&views.model);
+    let image = render(&model, view, &Rules::STANDARD);
+    let truth: Vec<f64> = target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
+    let rgb = loss(&image.rgb, &truth, camera.width as usize, camera.height as usize).gradient;
+    let nothing = vec![0.0; image.alpha.len()];
+    let upstream = Upstream { rgb, alpha: nothing.clone(), depth: nothing };
+    differentiate(&model, view, &Rules::STANDARD, &upstream).1
+}
+
+fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
+    values.into_iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+/// One view's contribution to a signal. Shape: [rows].
+fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64> {
+    let ndc = [0.5 * f64::from(camera.width), 0.5 * f64::from(camera.height)];
+    let rows = gradient.screen.iter().zip(&gradient.model.means);
+    rows.map(|(s, mean)| match signal {
+        Signal::VisibleCount => f64::from(u8::from(s.pixels > 0)),
+        Signal::ScreenGradient => norm([0, 1].map(|i| s.mean[i] * ndc[i])),
+        Signal::ScreenGradientAbs => norm([0, 1].map(|i| s.mean_abs[i] * ndc[i])),
+        Signal::ColourGradient => norm(s.colour),
+        Signal::MeanGradientX => mean[0],
+        Signal::MeanGradientY => mean[1],
+        Signal::MeanGradientZ => mean[2],
+        Signal::MeanGradientNorm => norm(*mean),
+        Signal::WeightMax => s.max_weight,
+        Signal::WeightSum => s.sum_weight,
+        Signal::PixelCount => f64::from(s.pixels),
+        other => panic!("{other:?} is no sum over views"),
+    })
+    .collect()
+}
+
+/// Runs one step per view and takes the signals.
+fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
+    let needs = Needs { signals: SignalSet::of(wanted), candidates: None };
+    let mut options = subject::options(views.model.len(), Resources::default());
+    options.needs = needs.clone();
+    let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
+    for (v, (camera, target)) in views.cameras.iter().zip(&views.targets).enumerate() {
+        let input = StepInput {
+            step: v as u32 + 1,
+            camera,
+            target,
+            background: BACKGROUND,
+            sh_degree: 2,
+            rates: STILL,
+        };
+        backend.train_step(&input).expect("a small image is rendered");
+    }
+    let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+    let columns =
+        wanted.iter().map(|&s| signals.get(s).expect("a requested signal").to_vec()).collect();
+    (backend, columns)
+}
+
+#[test]
+fn every_signal_whatever_else_is_asked_for() {
+    let views = views();
+    let gradients: Vec<Gradient> = (0..views.cameras.len()).map(|v| reference(&views, v)).collect();
+    let gradient_sums = [
+        Signal::VisibleCount,
+        Signal::ScreenGradient,
+        Signal::ColourGradient,
+        Signal::MeanGradientX,
+        Signal::MeanGradientY,
+        Signal::MeanGradientZ,
+        Signal::MeanGradientNorm,
+    ];
+    let weights = [Signal::WeightMax, Signal::WeightSum, Signal::PixelCount];
+    let everything = [&gradient_sums[..], &[Signal::ScreenGradientAbs], &weights].concat();
+    let few = [&gradient_sums[..], &[Signal::WeightMax]].concat();
+    let mut requests = vec![gradient_sums.to_vec(), few, everything.clone()];
+    // Each alone: a backend keeps only what is asked for, and must not lose its place.
+    requests.extend(everything.iter().map(|&s| vec![s]));
+
+    let mut table = Table::new("signals");
+    for request in requests {
+        let (_, columns) = collect(&views, &request);
+        for (&signal, column) in request.iter().zip(columns) {
+            let mut expected = vec![0.0; views.model.len()];
+            for (gradient, camera) in gradients.iter().zip(&views.cameras) {
+                let parts = contribution(signal, gradient, camera);
+                for (sum, part) in expected.iter_mut().zip(parts) {
+                    *sum = if signal == Signal::WeightMax { part.max(*sum) } else { *sum + part };
+                }
+            }
+            let what = format!("{} signals", request.len());
+            let error = relative_error(&column, &expected);
+            let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
+            table.check(&what, &format!("{signal:?}"), error, TOLERANCE + flips);
+        }
+    }
+    table.finish();
+}
+
+#[test]
+fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
+    let views = views();
+    let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
+    let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), candidates: None };
+    let now = |backend: &mut CpuBackend| {
+        let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+        signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
+    };
+    assert!(columns[0].iter().any(|&w| w > 0.1));
+    backend.begin_epoch();
+    assert!(now(&mut backend) == columns[0], "the previous epoch counts");
+    backend.begin_epoch();
+    assert!(now(&mut backend).iter().all(|&w| w.to_bits() == 0), "the one before does not");
+}

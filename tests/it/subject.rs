@@ -1,0 +1,80 @@
+//! The backend under test, behind one door: tests name what they vary, and nothing else.
+
+use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
+use densify::backend::{Rendering, StepOutput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::Gaussians;
+
+use crate::reference::Upstream;
+
+/// What must not change the outcome.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Resources {
+    /// Most (row, tile) entries at a time; `None` is the default.
+    pub(crate) tile_cap: Option<usize>,
+    /// Worker threads; `None` takes all cores.
+    pub(crate) threads: Option<usize>,
+}
+
+pub(crate) fn options(rows: usize, resources: Resources) -> CpuOptions {
+    let mut options = CpuOptions::new(rows.max(1));
+    options.near = 0.01;
+    options.threads = resources.threads;
+    if let Some(cap) = resources.tile_cap {
+        options.tile_cap = cap;
+    }
+    options
+}
+
+pub(crate) fn backend(model: &Gaussians, resources: Resources) -> CpuBackend {
+    CpuBackend::new(model, &options(model.len(), resources)).expect("a small model fits")
+}
+
+/// Renders a view and differentiates Σ image · upstream.
+pub(crate) fn differentiate(
+    backend: &mut CpuBackend,
+    camera: &Camera,
+    background: [f32; 3],
+    sh_degree: u8,
+    upstream: &Upstream,
+) -> (Rendering, ModelGradient) {
+    let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
+    let upstream = ImageGradient {
+        rgb: narrow(&upstream.rgb),
+        alpha: narrow(&upstream.alpha),
+        depth: narrow(&upstream.depth),
+    };
+    let outcome = backend.differentiate(camera, background, sh_degree, &upstream);
+    outcome.expect("a small image is rendered")
+}
+
+/// The training loss of an image of the target's size, and its gradient.
+pub(crate) fn loss(
+    rendered: &[f32],
+    target: &Image8,
+    background: [f32; 3],
+) -> (StepOutput, Vec<f32>) {
+    let pixels = rendered.len() / 3;
+    let rendering = Rendering {
+        width: target.width,
+        height: target.height,
+        rgb: rendered.to_vec(),
+        alpha: vec![1.0; pixels],
+        depth: vec![1.0; pixels],
+    };
+    let empty = Gaussians::default();
+    backend(&empty, Resources::default()).loss(&rendering, target, background)
+}
+
+/// All values of a parameter class of a gradient, row after row.
+pub(crate) fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
+    match name {
+        "means" => gradient.means.as_flattened(),
+        "log_scales" => gradient.log_scales.as_flattened(),
+        "quats" => gradient.quats.as_flattened(),
+        "opacity_logits" => &gradient.opacity_logits,
+        "sh" => &gradient.sh,
+        _ => panic!("no parameter class is called {name}"),
+    }
+}
