@@ -163,7 +163,7 @@ impl DensityPolicy for Vanilla {
             Signal::Opacity,
             Signal::ScaleMax,
         ]);
-        Needs { signals, candidates: None }
+        Needs { signals, ..Needs::default() }
     }
 
     fn is_due(&self, step: u32) -> bool {
