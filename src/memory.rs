@@ -70,11 +70,7 @@ impl Ledger {
 
     /// Adds a buffer to a section.
     pub fn add_to(&mut self, section: Section, what: impl Into<String>, bytes: u64) {
-        self.lines.push(LedgerLine {
-            section,
-            what: what.into(),
-            bytes,
-        });
+        self.lines.push(LedgerLine { section, what: what.into(), bytes });
     }
 
     /// Adds all lines of another ledger.
@@ -86,13 +82,9 @@ impl Ledger {
     /// are never held together.
     #[must_use]
     pub fn total(&self) -> u64 {
-        let (passing, lasting): (Vec<_>, Vec<_>) = self
-            .lines
-            .iter()
-            .partition(|line| line.section == Section::Passing);
-        let lasting = lasting
-            .iter()
-            .fold(0_u64, |sum, line| sum.saturating_add(line.bytes));
+        let (passing, lasting): (Vec<_>, Vec<_>) =
+            self.lines.iter().partition(|line| line.section == Section::Passing);
+        let lasting = lasting.iter().fold(0_u64, |sum, line| sum.saturating_add(line.bytes));
         lasting.saturating_add(passing.iter().map(|line| line.bytes).max().unwrap_or(0))
     }
 }
@@ -102,26 +94,14 @@ impl fmt::Display for Ledger {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut lines: Vec<_> = self.lines.iter().collect();
         lines.sort_by_key(|line| line.section);
-        let what_width = lines
-            .iter()
-            .map(|line| line.what.chars().count())
-            .max()
-            .unwrap_or(0)
-            .max(5);
+        let what_width =
+            lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(5);
         let mut previous = None;
         for line in lines {
-            let name = if previous == Some(line.section) {
-                ""
-            } else {
-                line.section.name()
-            };
+            let name = if previous == Some(line.section) { "" } else { line.section.name() };
             previous = Some(line.section);
             let LedgerLine { what, bytes, .. } = line;
-            writeln!(
-                f,
-                "  {name:<11} {what:<what_width$} {:>12}",
-                Bytes(*bytes).to_string()
-            )?;
+            writeln!(f, "  {name:<11} {what:<what_width$} {:>12}", Bytes(*bytes).to_string())?;
         }
         let total = Bytes(self.total()).to_string();
         write!(f, "  {:<11} {:<what_width$} {total:>12}", "total", "")
@@ -214,9 +194,7 @@ mod tests {
         let shown = |n| Bytes(n).to_string();
         assert_eq!(
             [0, 1023, 1024, 1536, (1 << 20) - 1, 1 << 20, 1 << 30].map(shown),
-            [
-                "0 B", "1023 B", "1.0 KiB", "1.5 KiB", "1.0 MiB", "1.0 MiB", "1.0 GiB"
-            ]
+            ["0 B", "1023 B", "1.0 KiB", "1.5 KiB", "1.0 MiB", "1.0 MiB", "1.0 GiB"]
         );
     }
 

@@ -102,10 +102,7 @@ pub fn scaled(steps: u32, iterations: u32) -> u32 {
 #[must_use]
 pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
     let reached = step / scaled(1_000, iterations);
-    u8::try_from(reached)
-        .unwrap_or(u8::MAX)
-        .min(highest)
-        .min(MAX_SH_DEGREE)
+    u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
 }
 
 /// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
@@ -250,15 +247,9 @@ mod tests {
     #[test]
     fn invalid_names_the_rate() {
         assert_eq!(RateOptions::default().invalid(), None);
-        let rates = RateOptions {
-            quat: f32::NAN,
-            ..RateOptions::default()
-        };
+        let rates = RateOptions { quat: f32::NAN, ..RateOptions::default() };
         assert_eq!(rates.invalid(), Some("quat"));
-        let rates = RateOptions {
-            mean_end: 0.0,
-            ..RateOptions::default()
-        };
+        let rates = RateOptions { mean_end: 0.0, ..RateOptions::default() };
         assert_eq!(rates.invalid(), Some("mean_end"));
     }
 
@@ -274,10 +265,7 @@ mod tests {
     #[test]
     fn degree_rises_every_thousand_steps_of_thirty_thousand() {
         let at = |step| sh_degree(step, 30_000, 3);
-        assert_eq!(
-            [1, 999, 1_000, 1_999, 2_000, 3_000, 30_000].map(at),
-            [0, 0, 1, 1, 2, 3, 3]
-        );
+        assert_eq!([1, 999, 1_000, 1_999, 2_000, 3_000, 30_000].map(at), [0, 0, 1, 1, 2, 3, 3]);
         assert_eq!(sh_degree(300, 3_000, 3), 3);
         assert_eq!(sh_degree(300, 3_000, 1), 1);
         assert_eq!(sh_degree(u32::MAX, 1, 9), MAX_SH_DEGREE);
@@ -312,17 +300,8 @@ mod tests {
             assert_eq!(text.parse::<Background>().unwrap().to_string(), text);
         }
         assert_eq!("#0A0b0c".parse(), Ok(Background::Colour([10, 11, 12])));
-        for text in [
-            "",
-            "#",
-            "#fff",
-            "#+a0b0c",
-            "#0a0b0g",
-            "#0a0b0c0d",
-            "0a0b0c",
-            "grey",
-            "#äöü",
-        ] {
+        for text in ["", "#", "#fff", "#+a0b0c", "#0a0b0g", "#0a0b0c0d", "0a0b0c", "grey", "#äöü"]
+        {
             let message = text.parse::<Background>().unwrap_err();
             assert!(message.contains("#808080"), "{message}");
         }
@@ -333,18 +312,13 @@ mod tests {
         let same = |a: [f32; 3], b: [f32; 3]| a.map(f32::to_bits) == b.map(f32::to_bits);
         assert!(same(Background::White.at(1, 2), [1.0; 3]));
         assert!(same(Background::Black.at(1, 2), [0.0; 3]));
-        assert!(same(
-            Background::Colour([0, 255, 51]).at(1, 2),
-            [0.0, 1.0, 0.2]
-        ));
+        assert!(same(Background::Colour([0, 255, 51]).at(1, 2), [0.0, 1.0, 0.2]));
         assert!(same(Background::Random.fixed(), [0.0; 3]));
         let random = Background::Random.at(1, 2);
         assert!(same(random, Background::Random.at(1, 2)));
         assert!(!same(random, Background::Random.at(1, 3)));
         assert!(!same(random, Background::Random.at(2, 2)));
-        let mean = (0..3_000)
-            .map(|step| f64::from(Background::Random.at(9, step)[1]))
-            .sum::<f64>()
+        let mean = (0..3_000).map(|step| f64::from(Background::Random.at(9, step)[1])).sum::<f64>()
             / 3_000.0;
         // Uniform: deviation of the mean 0.29 / √3,000 = 0.005.
         assert!((mean - 0.5).abs() < 0.025, "{mean}");

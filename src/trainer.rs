@@ -5,15 +5,18 @@
 //! pass and optimiser, and then, where the policy is due, one edit of the rows. A policy sees the
 //! model as the optimiser left it.
 
+mod error;
+
 use densify_policies::plan::{EditPlan, RowOps};
-use densify_policies::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
+use densify_policies::policy::{DensityPolicy, Needs, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 use serde::{Deserialize, Serialize};
 
 use crate::backend::{Backend, BackendError, StepInput, StepOutput};
 use crate::gaussians::Gaussians;
 use crate::schedule::{self, Background, RateOptions};
-use crate::views::{ViewError, ViewSource};
+use crate::views::ViewSource;
+pub use error::TrainError;
 
 /// How a run goes, beside its scene and its policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,71 +86,6 @@ impl EditEvent {
     }
 }
 
-/// Why training cannot go on. The model stays as it was before the step's edit and can still be
-/// [read](Trainer::model); only after [`Diverged`](Self::Diverged) it is worth nothing.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainError {
-    /// There is nothing to train on.
-    #[error("there is no training view; use a larger --test-every or add images")]
-    NoViews,
-    /// An option is out of its range.
-    #[error("{0}")]
-    BadOption(String),
-    /// A view's pixels could not be read.
-    #[error("step {step}: view `{view}`: {source}")]
-    View {
-        /// Iteration.
-        step: u32,
-        /// The view's name.
-        view: String,
-        /// What the source of the views says.
-        source: ViewError,
-    },
-    /// The loss is not a finite number.
-    #[error(
-        "step {step}: the loss of view `{view}` is {loss}, so the model is lost; \
-         lower the learning rates, and check the scene's scale and cameras"
-    )]
-    Diverged {
-        /// Iteration.
-        step: u32,
-        /// The view's name.
-        view: String,
-        /// The loss.
-        loss: f32,
-    },
-    /// The policy reported an error.
-    #[error("step {step}: policy `{policy}`: {source}")]
-    Policy {
-        /// Iteration.
-        step: u32,
-        /// The policy's name.
-        policy: String,
-        /// What it reported.
-        source: PolicyError,
-    },
-    /// The policy's plan breaks an invariant of plans.
-    #[error(
-        "step {step}: the plan of policy `{policy}` does not hold: {reason}; this is a bug, please report it"
-    )]
-    BrokenPlan {
-        /// Iteration.
-        step: u32,
-        /// The policy's name.
-        policy: String,
-        /// What is wrong.
-        reason: String,
-    },
-    /// The backend cannot go on.
-    #[error("step {step}: {source}")]
-    Backend {
-        /// Iteration.
-        step: u32,
-        /// What the backend says.
-        source: BackendError,
-    },
-}
-
 /// A run in progress.
 pub struct Trainer<V> {
     views: V,
@@ -209,14 +147,7 @@ impl<V: ViewSource> Trainer<V> {
             view: self.views.name(view).to_owned(),
             source,
         })?;
-        let TrainOptions {
-            iterations,
-            seed,
-            sh_degree,
-            background,
-            rates,
-            ..
-        } = self.options;
+        let TrainOptions { iterations, seed, sh_degree, background, rates, .. } = self.options;
         let input = StepInput {
             step,
             camera: self.views.camera(view),
@@ -225,31 +156,14 @@ impl<V: ViewSource> Trainer<V> {
             sh_degree: schedule::sh_degree(step, iterations, sh_degree),
             rates: rates.at(step, iterations, self.scene.extent),
         };
-        let output = self
-            .backend
-            .train_step(&input)
-            .map_err(|e| self.stopped(step, e))?;
+        let output = self.backend.train_step(&input).map_err(|e| self.stopped(step, e))?;
         self.step = step;
         if !output.loss.is_finite() {
             let view = self.views.name(view).to_owned();
-            return Err(TrainError::Diverged {
-                step,
-                view,
-                loss: output.loss,
-            });
+            return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
-        let event = if self.policy.is_due(step) {
-            self.edit(step)?
-        } else {
-            None
-        };
-        Ok(StepReport {
-            step,
-            view,
-            output,
-            rows: self.backend.rows(),
-            event,
-        })
+        let event = if self.policy.is_due(step) { self.edit(step)? } else { None };
+        Ok(StepReport { step, view, output, rows: self.backend.rows(), event })
     }
 
     /// The view of the coming step; announces those after it, and epochs to the backend.
@@ -276,47 +190,25 @@ impl<V: ViewSource> Trainer<V> {
     /// Asks the policy for a plan and executes it. A plan that changes no row and was refused
     /// nothing is no event: policies may be due at steps at which they find nothing to do.
     fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
-        let (signals, candidates) = self
-            .backend
-            .take_signals(&self.needs)
-            .map_err(|e| self.stopped(step, e))?;
-        let now = Snapshot {
-            step,
-            scene: &self.scene,
-            signals: &signals,
-            candidates: &candidates,
-        };
+        let (signals, candidates) =
+            self.backend.take_signals(&self.needs).map_err(|e| self.stopped(step, e))?;
+        let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };
         let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
         let rng = PolicyRng::new(self.options.seed, step);
-        self.policy
-            .plan(&now, &rng, &mut plan)
-            .map_err(|source| TrainError::Policy {
-                step,
-                policy: self.policy_name.clone(),
-                source,
-            })?;
+        self.policy.plan(&now, &rng, &mut plan).map_err(|source| TrainError::Policy {
+            step,
+            policy: self.policy_name.clone(),
+            source,
+        })?;
         let ops = plan.compile();
         self.check_plan(step, &ops)?;
-        self.backend
-            .apply(&ops, self.options.seed, step)
-            .map_err(|e| self.stopped(step, e))?;
-        self.peak_rows = self
-            .peak_rows
-            .max(rows_within(&ops))
-            .max(self.backend.rows());
+        self.backend.apply(&ops, self.options.seed, step).map_err(|e| self.stopped(step, e))?;
+        self.peak_rows = self.peak_rows.max(rows_within(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
             return Ok(None);
         }
         let event = EditEvent::new(step, &ops);
-        let EditEvent {
-            before,
-            removed,
-            added,
-            updated,
-            denied,
-            after,
-            ..
-        } = event;
+        let EditEvent { before, removed, added, updated, denied, after, .. } = event;
         let cause = &event.cause;
         tracing::info!(step, before, removed, added, updated, denied, after, %cause, "edit");
         self.events.push(event.clone());
@@ -328,11 +220,7 @@ impl<V: ViewSource> Trainer<V> {
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
         let reason = if ops.rows_before != rows || ops.budget != budget {
-            let RowOps {
-                rows_before,
-                budget: planned,
-                ..
-            } = ops;
+            let RowOps { rows_before, budget: planned, .. } = ops;
             Some(format!(
                 "made for {rows_before} rows of {planned}, but the model has {rows} of {budget}"
             ))
@@ -340,11 +228,7 @@ impl<V: ViewSource> Trainer<V> {
             ops.check().err().map(|broken| broken.to_string())
         };
         reason.map_or(Ok(()), |reason| {
-            Err(TrainError::BrokenPlan {
-                step,
-                policy: self.policy_name.clone(),
-                reason,
-            })
+            Err(TrainError::BrokenPlan { step, policy: self.policy_name.clone(), reason })
         })
     }
 
@@ -403,11 +287,7 @@ impl<V: ViewSource> Trainer<V> {
 /// Most rows in use at any instant of an edit: children and seeds stand in their slots before the
 /// moves shorten the model.
 fn rows_within(ops: &RowOps) -> usize {
-    let born = ops
-        .child_slots
-        .iter()
-        .copied()
-        .chain(ops.seeds.iter().map(|(slot, _)| *slot));
+    let born = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
     let highest = born.max().map_or(0, |slot| slot as usize + 1);
     highest.max(ops.rows_before).max(ops.rows_after)
 }
@@ -423,32 +303,21 @@ fn check(
         return Err(TrainError::NoViews);
     }
     if u32::try_from(views) != Ok(scene.train_views) {
-        return bad(format!(
-            "{views} views, but the scene tells of {}",
-            scene.train_views
-        ));
+        return bad(format!("{views} views, but the scene tells of {}", scene.train_views));
     }
     if options.iterations == 0 || options.iterations != scene.iterations {
         let (here, there) = (options.iterations, scene.iterations);
-        return bad(format!(
-            "--iterations is {here} (scene: {there}); both must be equal, >= 1"
-        ));
+        return bad(format!("--iterations is {here} (scene: {there}); both must be equal, >= 1"));
     }
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
-        return bad(format!(
-            "the scene's extent is {}; it must be positive",
-            scene.extent
-        ));
+        return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
     }
     if let Some(rate) = options.rates.invalid() {
         return bad(format!("learning rate `{rate}` must be a positive number"));
     }
     let (rows, budget) = (backend.rows(), backend.budget());
     if budget != scene.budget || rows > budget {
-        return bad(format!(
-            "{rows} rows, budget {budget} (scene: {})",
-            scene.budget
-        ));
+        return bad(format!("{rows} rows, budget {budget} (scene: {})", scene.budget));
     }
     Ok(())
 }

@@ -43,10 +43,7 @@ impl DatasetViews {
     #[must_use]
     pub fn new(views: Vec<View>, cache_bytes: u64, threads: usize) -> Self {
         let sources = views.iter().map(|view| view.source.clone()).collect();
-        Self {
-            cache: ImageCache::new(sources, cache_bytes, threads),
-            views,
-        }
+        Self { cache: ImageCache::new(sources, cache_bytes, threads), views }
     }
 
     /// The images and what is needed to decode them [bytes].

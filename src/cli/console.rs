@@ -39,11 +39,7 @@ impl Console {
             .with_target(false)
             .without_time()
             .try_init();
-        Self {
-            quiet,
-            bars,
-            broken: RefCell::new(None),
-        }
+        Self { quiet, bars, broken: RefCell::new(None) }
     }
 
     /// Whether only results and errors are shown.

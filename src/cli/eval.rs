@@ -48,24 +48,11 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let views = opened.views(args.split)?;
     let background = opened.scene.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
-    let width = width
-        .map(|view| view.name.chars().count())
-        .max()
-        .unwrap_or(0)
-        .max(4);
+    let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
     console.result(format_args!("{:width$}  PSNR [dB]    SSIM", "view"));
-    let scores = evaluate(
-        opened.backend.as_mut(),
-        &views,
-        background,
-        opened.sh_degree,
-        |view| {
-            console.result(format_args!(
-                "{:width$}  {:9.3}  {:.4}",
-                view.name, view.psnr, view.ssim
-            ));
-        },
-    )?;
+    let scores = evaluate(opened.backend.as_mut(), &views, background, opened.sh_degree, |view| {
+        console.result(format_args!("{:width$}  {:9.3}  {:.4}", view.name, view.psnr, view.ssim));
+    })?;
     let Mean { psnr, ssim } = scores.mean();
     console.result(format_args!("{:width$}  {psnr:9.3}  {ssim:.4}", "mean"));
     write_scores(run, args.split.into(), iteration, &scores)?;

@@ -28,18 +28,12 @@ pub(super) struct Failure {
 
 impl Failure {
     pub(super) fn input(message: impl ToString) -> Self {
-        Self {
-            code: INPUT,
-            message: message.to_string(),
-        }
+        Self { code: INPUT, message: message.to_string() }
     }
 
     /// The same failure with more to say.
     pub(super) fn and(self, more: &str) -> Self {
-        Self {
-            message: format!("{}\n{more}", self.message),
-            ..self
-        }
+        Self { message: format!("{}\n{more}", self.message), ..self }
     }
 }
 
@@ -79,10 +73,7 @@ impl From<BackendError> for Failure {
             BackendError::ImageTooLarge { .. } => INPUT,
             _ => DEVICE,
         };
-        Self {
-            code,
-            message: error.to_string(),
-        }
+        Self { code, message: error.to_string() }
     }
 }
 
@@ -92,10 +83,7 @@ impl From<OutputError> for Failure {
             OutputError::Io { .. } => OTHER,
             _ => INPUT,
         };
-        Self {
-            code,
-            message: error.to_string(),
-        }
+        Self { code, message: error.to_string() }
     }
 }
 
@@ -103,33 +91,21 @@ impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
             TrainError::NoViews | TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
-            TrainError::Backend {
-                source: BackendError::ImageTooLarge { .. },
-                ..
-            } => INPUT,
+            TrainError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
             TrainError::Backend { .. } => DEVICE,
             _ => OTHER,
         };
-        Self {
-            code,
-            message: error.to_string(),
-        }
+        Self { code, message: error.to_string() }
     }
 }
 
 impl From<EvaluateError> for Failure {
     fn from(error: EvaluateError) -> Self {
         let code = match &error {
-            EvaluateError::Backend {
-                source: BackendError::ImageTooLarge { .. },
-                ..
-            } => INPUT,
+            EvaluateError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
             EvaluateError::Backend { .. } => DEVICE,
             _ => INPUT,
         };
-        Self {
-            code,
-            message: error.to_string(),
-        }
+        Self { code, message: error.to_string() }
     }
 }

@@ -120,14 +120,8 @@ mod tests {
         assert_eq!(run_with(["densify", "--help"]), 0);
         assert_eq!(run_with(["densify", "--version"]), 0);
         assert_eq!(run_with(["densify", "train"]), failure::INPUT);
-        assert_eq!(
-            run_with(["densify", "train", "x", "--budget", "0"]),
-            failure::INPUT
-        );
+        assert_eq!(run_with(["densify", "train", "x", "--budget", "0"]), failure::INPUT);
         assert_eq!(run_with(["densify", "nonsense"]), failure::INPUT);
-        assert_eq!(
-            run_with(["densify", "eval", "/no/such/run"]),
-            failure::INPUT
-        );
+        assert_eq!(run_with(["densify", "eval", "/no/such/run"]), failure::INPUT);
     }
 }

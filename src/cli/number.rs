@@ -24,9 +24,7 @@ pub(super) fn rows(text: &str) -> Result<usize, String> {
         return Err(wrong());
     }
     if !(1.0..=MOST_ROWS).contains(&whole) {
-        return Err(format!(
-            "`{text}` is out of range; a model has between 1 and 4 billion rows"
-        ));
+        return Err(format!("`{text}` is out of range; a model has between 1 and 4 billion rows"));
     }
     Ok(whole as usize)
 }
@@ -45,9 +43,7 @@ pub(super) fn bytes(text: &str) -> Result<u64, String> {
     ];
     let wrong =
         || format!("`{text}` is no number of bytes; write it as 1GiB, 512MiB, 800MB or 1000000");
-    let unit = UNITS
-        .iter()
-        .find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, *factor)));
+    let unit = UNITS.iter().find_map(|(unit, factor)| Some((text.strip_suffix(unit)?, *factor)));
     let (number, factor) = unit.unwrap_or((text, 1.0));
     let number = number.trim();
     if !number.starts_with(|c: char| c.is_ascii_digit()) {
@@ -67,9 +63,7 @@ pub(super) fn fraction(text: &str) -> Result<f64, String> {
     if value > 0.0 && value < 1.0 {
         Ok(value)
     } else {
-        Err(format!(
-            "`{text}` is out of range; it must be greater than 0 and less than 1"
-        ))
+        Err(format!("`{text}` is out of range; it must be greater than 0 and less than 1"))
     }
 }
 
@@ -117,9 +111,8 @@ mod tests {
         for (text, number) in good {
             assert_eq!(rows(text), Ok(number), "{text}");
         }
-        for text in [
-            "", "k", "-1", "+5", "0.5", "1.0001k5", "28 k", "28kk", "inf", "NaN", "1e3é",
-        ] {
+        for text in ["", "k", "-1", "+5", "0.5", "1.0001k5", "28 k", "28kk", "inf", "NaN", "1e3é"]
+        {
             assert!(rows(text).unwrap_err().contains("200k"), "{text}");
         }
         for text in ["0", "0k", "4294967296", "1e30", "5000M"] {
@@ -155,22 +148,11 @@ mod tests {
 
     #[test]
     fn shown_numbers() {
-        assert_eq!(
-            [0, 999, 1_000, 1_234_567].map(grouped),
-            ["0", "999", "1,000", "1,234,567"]
-        );
+        assert_eq!([0, 999, 1_000, 1_234_567].map(grouped), ["0", "999", "1,000", "1,234,567"]);
         let shown = |seconds| duration(Duration::from_secs_f64(seconds));
         assert_eq!(
             [0.04, 9.94, 9.96, 59.4, 59.6, 125.0, 10_800.0].map(shown),
-            [
-                "0.0 s",
-                "9.9 s",
-                "10 s",
-                "59 s",
-                "1 min 0 s",
-                "2 min 5 s",
-                "3 h 0 min"
-            ]
+            ["0.0 s", "9.9 s", "10 s", "59 s", "1 min 0 s", "2 min 5 s", "3 h 0 min"]
         );
     }
 }

@@ -27,11 +27,7 @@ pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure>
         for (parameter, value) in parameters {
             let key = format!("{name}.{parameter}");
             let scales = entry.step_parameters().contains(&&*parameter);
-            let note = if scales {
-                "   (scales with --iterations)"
-            } else {
-                ""
-            };
+            let note = if scales { "   (scales with --iterations)" } else { "" };
             console.result(format_args!("  --policy-set {key}={value}{note}"));
         }
         return Ok(());
@@ -40,15 +36,8 @@ pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure>
     let width = all.iter().map(|entry| entry.name.len()).max().unwrap_or(0);
     for entry in all {
         console.result(format_args!("{:width$}  {}", entry.name, entry.summary));
-        console.result(format_args!(
-            "{:width$}  {} ({})",
-            "",
-            entry.source,
-            entry.location()
-        ));
+        console.result(format_args!("{:width$}  {} ({})", "", entry.source, entry.location()));
     }
-    console.result(format_args!(
-        "\n`densify policies NAME` explains a policy and its parameters."
-    ));
+    console.result(format_args!("\n`densify policies NAME` explains a policy and its parameters."));
     Ok(())
 }

@@ -1,9 +1,10 @@
 //! How far training is: a bar on a terminal, a line now and then elsewhere.
 
+use std::fmt;
 use std::io::{IsTerminal, stderr};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use super::console::Console;
 use super::number::{duration, grouped};
@@ -31,37 +32,26 @@ impl<'a> Progress<'a> {
     pub(super) fn new(console: &'a Console, iterations: u32, budget: usize) -> Self {
         let bar = (!console.is_quiet() && stderr().is_terminal()).then(|| {
             let style = ProgressStyle::with_template(
-                "{bar:24.cyan/dim} {pos}/{len}  {per_sec:>9}  {msg}  {eta} left",
+                "{bar:24.cyan/dim} {pos}/{len}  {speed}  {msg}  {eta} left",
             )
-            .unwrap_or_else(|_| ProgressStyle::default_bar());
+            .unwrap_or_else(|_| ProgressStyle::default_bar())
+            .with_key("speed", |state: &ProgressState, out: &mut dyn fmt::Write| {
+                // The bar's own buffer; writing to it does not fail.
+                let _ = write!(out, "{:.1} it/s", state.per_sec());
+            });
             let bar = ProgressBar::new(u64::from(iterations)).with_style(style);
             console.bars().add(bar)
         });
         let now = Instant::now();
-        Self {
-            console,
-            bar,
-            iterations,
-            budget,
-            started: now,
-            drawn: now,
-            loss: None,
-        }
+        Self { console, bar, iterations, budget, started: now, drawn: now, loss: None }
     }
 
     /// Counts a step.
     pub(super) fn step(&mut self, step: u32, loss: f32, rows: usize) {
-        let smooth = self
-            .loss
-            .map_or(loss, |before| before + NEWEST * (loss - before));
+        let smooth = self.loss.map_or(loss, |before| before + NEWEST * (loss - before));
         self.loss = Some(smooth);
-        let text = || {
-            format!(
-                "loss {smooth:.4}  rows {} of {}",
-                grouped(rows),
-                grouped(self.budget)
-            )
-        };
+        let text =
+            || format!("loss {smooth:.4}  rows {} of {}", grouped(rows), grouped(self.budget));
         if let Some(bar) = &self.bar {
             if self.drawn.elapsed() >= REDRAW || step == self.iterations {
                 bar.set_message(text());
@@ -103,9 +93,7 @@ mod tests {
     #[test]
     fn twenty_lines_or_one_a_step() {
         for (iterations, lines) in [(1, 1), (7, 7), (20, 20), (21, 20), (30_000, 20)] {
-            let seen = (1..=iterations)
-                .filter(|&step| is_milestone(step, iterations))
-                .count();
+            let seen = (1..=iterations).filter(|&step| is_milestone(step, iterations)).count();
             assert_eq!(seen, lines, "{iterations}");
             assert!(is_milestone(iterations, iterations));
         }

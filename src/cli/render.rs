@@ -78,9 +78,7 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     let files = file_names(&names);
     let mut depths = BTreeMap::new();
     for (view, name) in files.iter().enumerate() {
-        let rendering = opened
-            .backend
-            .render(views.camera(view), background, opened.sh_degree)?;
+        let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
         let to = |ending: &str| args.output.join(format!("{name}{ending}"));
         write_png(&to(".png"), picture(&rendering))?;
         if args.alpha {
@@ -103,11 +101,7 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
         });
         write_json(&args.output.join("depth.json"), &said)?;
     }
-    console.result(format_args!(
-        "{} views in {}",
-        files.len(),
-        args.output.display()
-    ));
+    console.result(format_args!("{} views in {}", files.len(), args.output.display()));
     Ok(())
 }
 
@@ -115,13 +109,7 @@ fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
     if !args.model.is_file() {
         crate::output::RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;
-        return open_run(
-            &args.model,
-            iteration,
-            args.scene.clone(),
-            args.threads,
-            console,
-        );
+        return open_run(&args.model, iteration, args.scene.clone(), args.threads, console);
     }
     let Some(scene) = &args.scene else {
         return Err(Failure::input(format!(
@@ -130,33 +118,18 @@ fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
         )));
     };
     if args.iteration.is_some() {
-        return Err(Failure::input(
-            "--iteration is for a run's folder; a file has only one model",
-        ));
+        return Err(Failure::input("--iteration is for a run's folder; a file has only one model"));
     }
-    open(
-        &args.model,
-        scene,
-        args.data.config(scene),
-        args.near,
-        args.threads,
-        console,
-    )
+    open(&args.model, scene, args.data.config(scene), args.near, args.threads, console)
 }
 
 /// A file name without ending for each view. Names come from data files: no part of one may lead
 /// out of the output folder.
 fn file_names(views: &[&str]) -> Vec<String> {
     let plain = |name: &str| {
-        let parts = name
-            .split(['/', '\\'])
-            .filter(|part| !matches!(*part, "" | "." | ".."));
+        let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
         let parts: Vec<String> = parts.map(|part| part.replace([':', '\0'], "_")).collect();
-        if parts.is_empty() {
-            "view".to_owned()
-        } else {
-            parts.join("/")
-        }
+        if parts.is_empty() { "view".to_owned() } else { parts.join("/") }
     };
     let stem = |name: &str| match name.rsplit_once('.') {
         Some((stem, ending))
@@ -178,10 +151,7 @@ fn file_names(views: &[&str]) -> Vec<String> {
     if distinct.len() == full.len() {
         return full;
     }
-    full.iter()
-        .enumerate()
-        .map(|(i, name)| format!("{name}-{i}"))
-        .collect()
+    full.iter().enumerate().map(|(i, name)| format!("{name}-{i}")).collect()
 }
 
 fn to_u8(value: f32) -> u8 {
@@ -189,9 +159,7 @@ fn to_u8(value: f32) -> u8 {
 }
 
 fn picture(rendering: &Rendering) -> DynamicImage {
-    let Rendering {
-        width, height, rgb, ..
-    } = rendering;
+    let Rendering { width, height, rgb, .. } = rendering;
     let pixel = |x: u32, y: u32| {
         let at = 3 * (y as usize * *width as usize + x as usize);
         Rgb([rgb[at], rgb[at + 1], rgb[at + 2]].map(to_u8))
@@ -200,30 +168,16 @@ fn picture(rendering: &Rendering) -> DynamicImage {
 }
 
 fn alpha(rendering: &Rendering) -> DynamicImage {
-    let Rendering {
-        width,
-        height,
-        alpha,
-        ..
-    } = rendering;
+    let Rendering { width, height, alpha, .. } = rendering;
     let pixel = |x: u32, y: u32| Luma([to_u8(alpha[y as usize * *width as usize + x as usize])]);
     ImageBuffer::from_fn(*width, *height, pixel).into()
 }
 
 /// Depth relative to its largest value, and that value [scene units].
 fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
-    let Rendering {
-        width,
-        height,
-        depth,
-        ..
-    } = rendering;
+    let Rendering { width, height, depth, .. } = rendering;
     let largest = depth.iter().copied().fold(0.0, f32::max);
-    let scale = if largest > 0.0 {
-        65_535.0 / largest
-    } else {
-        0.0
-    };
+    let scale = if largest > 0.0 { 65_535.0 / largest } else { 0.0 };
     let pixel = |x: u32, y: u32| {
         let value = depth[y as usize * *width as usize + x as usize];
         Luma([(value * scale).round() as u16])
@@ -234,19 +188,12 @@ fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
 
 /// Photograph on the left, rendering on the right.
 fn pair(image: &Image8, background: [f32; 3], rendering: &Rendering) -> DynamicImage {
-    let truth = |x: u32, y: u32| {
-        Rgb(image
-            .composited(x as usize, y as usize, background)
-            .map(to_u8))
-    };
+    let truth =
+        |x: u32, y: u32| Rgb(image.composited(x as usize, y as usize, background).map(to_u8));
     let right = picture(rendering).into_rgb8();
     let (width, height) = right.dimensions();
     let pixel = |x: u32, y: u32| {
-        if x < width {
-            truth(x, y)
-        } else {
-            *right.get_pixel(x - width, y)
-        }
+        if x < width { truth(x, y) } else { *right.get_pixel(x - width, y) }
     };
     ImageBuffer::from_fn(2 * width, height, pixel).into()
 }
@@ -254,9 +201,7 @@ fn pair(image: &Image8, background: [f32; 3], rendering: &Rendering) -> DynamicI
 fn write_png(path: &Path, image: DynamicImage) -> Result<(), OutputError> {
     write_atomically(path, |out| {
         let mut encoded = Cursor::new(Vec::new());
-        image
-            .write_to(&mut encoded, ImageFormat::Png)
-            .map_err(std::io::Error::other)?;
+        image.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
         out.write_all(&encoded.into_inner())
     })
 }
@@ -267,15 +212,9 @@ mod tests {
 
     #[test]
     fn file_names_stay_in_the_folder_and_apart() {
-        assert_eq!(
-            file_names(&["a.jpg", "sub/b.JPG", "c"]),
-            ["a", "sub/b", "c"]
-        );
+        assert_eq!(file_names(&["a.jpg", "sub/b.JPG", "c"]), ["a", "sub/b", "c"]);
         assert_eq!(file_names(&["a.jpg", "a.png"]), ["a.jpg", "a.png"]);
-        assert_eq!(
-            file_names(&["../../etc/x.png", "/y.png", "C:\\z.png"]),
-            ["etc/x", "y", "C_/z"]
-        );
+        assert_eq!(file_names(&["../../etc/x.png", "/y.png", "C:\\z.png"]), ["etc/x", "y", "C_/z"]);
         assert_eq!(file_names(&["a.png", "../a.png"]), ["a.png-0", "a.png-1"]);
         assert_eq!(file_names(&["..", ".hidden"]), ["view", ".hidden"]);
     }
@@ -292,18 +231,12 @@ mod tests {
 
     #[test]
     fn pixels_are_rounded_and_clamped() {
-        assert_eq!(
-            picture(&rendering()).into_rgb8().into_raw(),
-            [0, 128, 255, 0, 255, 0]
-        );
+        assert_eq!(picture(&rendering()).into_rgb8().into_raw(), [0, 128, 255, 0, 255, 0]);
         assert_eq!(alpha(&rendering()).into_luma8().into_raw(), [255, 51]);
         let (png, largest) = depth(&rendering());
         assert_eq!(png.into_luma16().into_raw(), [65_535, 16_384]);
         assert!((largest - 4.0).abs() < f32::EPSILON);
-        let empty = Rendering {
-            depth: vec![0.0; 2],
-            ..rendering()
-        };
+        let empty = Rendering { depth: vec![0.0; 2], ..rendering() };
         assert_eq!(depth(&empty).0.into_luma16().into_raw(), [0, 0]);
     }
 

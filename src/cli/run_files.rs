@@ -106,10 +106,7 @@ pub(super) fn open(
         (file.repaired, "with a zero quaternion, read as unrotated"),
     ] {
         if number > 0 {
-            console.say(format_args!(
-                "note: {}: {number} rows {what}",
-                model.display()
-            ));
+            console.say(format_args!("note: {}: {number} rows {what}", model.display()));
         }
     }
     let model: Gaussians = dataset.normalisation.model_from_world(&file.gaussians);

@@ -38,19 +38,13 @@ pub(super) struct SceneArgs {
     pub(super) image_cache: u64,
     /// What lies behind the scene, and behind transparent images: black, white, random (another
     /// colour at every step) or #rrggbb
-    #[arg(
-        long,
-        value_name = "COLOUR",
-        help_heading = "Scene",
-        default_value = "black"
-    )]
+    #[arg(long, value_name = "COLOUR", help_heading = "Scene", default_value = "black")]
     pub(super) background: Background,
 }
 
 fn resolution(text: &str) -> Result<u32, String> {
     text.parse::<Resolution>().map_err(|e| e.to_string())?;
-    text.parse()
-        .map_err(|_| format!("`{text}` is no whole number"))
+    text.parse().map_err(|_| format!("`{text}` is no whole number"))
 }
 
 impl SceneArgs {
@@ -75,9 +69,7 @@ pub(super) fn load(
     config: &SceneConfig,
     console: &Console,
 ) -> Result<Dataset, Failure> {
-    let resolution = config
-        .resolution
-        .map(|number| number.to_string().parse::<Resolution>());
+    let resolution = config.resolution.map(|number| number.to_string().parse::<Resolution>());
     let split = match config.test_every.map(NonZeroU32::new) {
         Some(Some(every)) => Split::Every(every),
         Some(None) => return Err(Failure::input("test_every is 0; it must be at least 1")),
@@ -98,24 +90,14 @@ pub(super) fn load(
 
 /// Width and height that hold every view of the dataset [px].
 pub(super) fn largest_image(dataset: &Dataset) -> (u32, u32) {
-    let cameras = dataset
-        .train
-        .iter()
-        .chain(&dataset.test)
-        .map(|view| &view.camera);
-    cameras.fold((1, 1), |(w, h), camera| {
-        (w.max(camera.width), h.max(camera.height))
-    })
+    let cameras = dataset.train.iter().chain(&dataset.test).map(|view| &view.camera);
+    cameras.fold((1, 1), |(w, h), camera| (w.max(camera.width), h.max(camera.height)))
 }
 
 /// A line about the dataset.
 pub(super) fn describe(path: &Path, dataset: &Dataset) -> String {
     let (width, height) = largest_image(dataset);
-    let decoded: u64 = dataset
-        .train
-        .iter()
-        .map(|view| view.source.loaded_bytes())
-        .sum();
+    let decoded: u64 = dataset.train.iter().map(|view| view.source.loaded_bytes()).sum();
     format!(
         "scene    {}: {} views to train on ({} decoded), {} held out, up to {width}x{height} px, {} points",
         path.display(),

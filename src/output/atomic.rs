@@ -52,9 +52,7 @@ mod tests {
 
     fn names(folder: &Path) -> Vec<String> {
         let entries = std::fs::read_dir(folder).unwrap();
-        entries
-            .map(|e| e.unwrap().file_name().into_string().unwrap())
-            .collect()
+        entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect()
     }
 
     #[test]
@@ -67,10 +65,7 @@ mod tests {
             Err(io::Error::other("disk full"))
         });
         let message = error.unwrap_err().to_string();
-        assert!(
-            message.contains("file.json") && message.contains("disk full"),
-            "{message}"
-        );
+        assert!(message.contains("file.json") && message.contains("disk full"), "{message}");
         assert_eq!(std::fs::read(&path).unwrap(), b"first");
         assert_eq!(names(path.parent().unwrap()), ["file.json"]);
     }

@@ -112,17 +112,12 @@ impl RunConfig {
         let text = match std::fs::read_to_string(&path) {
             Ok(text) => text,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-                return Err(OutputError::NoRun {
-                    path: run.to_owned(),
-                    missing: CONFIG_FILE,
-                });
+                return Err(OutputError::NoRun { path: run.to_owned(), missing: CONFIG_FILE });
             }
             Err(e) => return Err(OutputError::io("read", &path)(e)),
         };
-        toml::from_str(&text).map_err(|e| OutputError::Malformed {
-            path,
-            problem: e.to_string().trim().to_owned(),
-        })
+        toml::from_str(&text)
+            .map_err(|e| OutputError::Malformed { path, problem: e.to_string().trim().to_owned() })
     }
 
     /// The dataset's folder: as given where that exists from here, else from the folder in which
@@ -130,11 +125,7 @@ impl RunConfig {
     #[must_use]
     pub fn scene_path(&self) -> PathBuf {
         let given = &self.scene.path;
-        let from_there = self
-            .scene
-            .working_directory
-            .as_ref()
-            .map(|folder| folder.join(given));
+        let from_there = self.scene.working_directory.as_ref().map(|folder| folder.join(given));
         match from_there {
             Some(path) if path.exists() => path,
             _ => given.clone(),
@@ -170,10 +161,7 @@ mod tests {
                 init_points: None,
                 learning_rates: RateOptions::default(),
             },
-            policy: PolicyConfig {
-                name: "diet".into(),
-                parameters: toml::toml! { rho = 0.2 },
-            },
+            policy: PolicyConfig { name: "diet".into(), parameters: toml::toml! { rho = 0.2 } },
         }
     }
 
@@ -190,16 +178,10 @@ mod tests {
     fn a_missing_or_broken_file_is_named() {
         let root = tempfile::tempdir().unwrap();
         let message = RunConfig::read(root.path()).unwrap_err().to_string();
-        assert!(
-            message.contains("holds no run") && message.contains("config.toml"),
-            "{message}"
-        );
+        assert!(message.contains("holds no run") && message.contains("config.toml"), "{message}");
         std::fs::write(root.path().join(CONFIG_FILE), "densify = 3").unwrap();
         let message = RunConfig::read(root.path()).unwrap_err().to_string();
-        assert!(
-            message.contains("config.toml") && message.contains("string"),
-            "{message}"
-        );
+        assert!(message.contains("config.toml") && message.contains("string"), "{message}");
     }
 
     #[test]

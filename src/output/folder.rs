@@ -25,9 +25,7 @@ const OWNED_PREFIX: &str = "events.out.tfevents.";
 /// Where a run keeps the model of an iteration.
 #[must_use]
 pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
-    run.join(MODELS)
-        .join(format!("iteration_{iteration}"))
-        .join("point_cloud.ply")
+    run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
 }
 
 /// The iterations whose model a run has saved, in order.
@@ -36,20 +34,14 @@ pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
 /// [`OutputError::NoRun`] when there is none.
 pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
     let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
-    let entries = fs::read_dir(run.join(MODELS))
-        .into_iter()
-        .flatten()
-        .flatten();
+    let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
     let mut saved: Vec<u32> = entries
         .filter_map(|entry| iteration(&entry.file_name()))
         .filter(|&iteration| model_path(run, iteration).is_file())
         .collect();
     saved.sort_unstable();
     if saved.is_empty() {
-        return Err(OutputError::NoRun {
-            path: run.to_owned(),
-            missing: "saved model",
-        });
+        return Err(OutputError::NoRun { path: run.to_owned(), missing: "saved model" });
     }
     Ok(saved)
 }
@@ -74,16 +66,12 @@ impl RunFolder {
         if !target.is_dir() {
             // A dangling link has no target but is in the way too.
             return match target.symlink_metadata() {
-                Ok(_) => Err(OutputError::NotAFolder {
-                    path: target.to_owned(),
-                }),
+                Ok(_) => Err(OutputError::NotAFolder { path: target.to_owned() }),
                 Err(_) => Ok(()),
             };
         }
         if !overwrite && !owned_entries(target)?.is_empty() {
-            return Err(OutputError::Occupied {
-                path: target.to_owned(),
-            });
+            return Err(OutputError::Occupied { path: target.to_owned() });
         }
         Ok(())
     }
@@ -98,25 +86,16 @@ impl RunFolder {
         fs::create_dir_all(target).map_err(fail)?;
         let occupied = !owned_entries(target)?.is_empty();
         let staging = occupied
-            .then(|| {
-                tempfile::Builder::new()
-                    .prefix(".densify-")
-                    .tempdir_in(target)
-            })
+            .then(|| tempfile::Builder::new().prefix(".densify-").tempdir_in(target))
             .transpose()
             .map_err(OutputError::io("create a folder in", target))?;
-        Ok(Self {
-            target: target.to_owned(),
-            staging,
-        })
+        Ok(Self { target: target.to_owned(), staging })
     }
 
     /// Where to write now.
     #[must_use]
     pub fn path(&self) -> &Path {
-        self.staging
-            .as_ref()
-            .map_or(&self.target, |staging| staging.path())
+        self.staging.as_ref().map_or(&self.target, |staging| staging.path())
     }
 
     /// Takes the place of the run that was there, if any; returns where the run is.
@@ -158,9 +137,7 @@ impl RunFolder {
 fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, OutputError> {
     let mut owned = Vec::new();
     for entry in fs::read_dir(folder).map_err(OutputError::io("read the folder", folder))? {
-        let name = entry
-            .map_err(OutputError::io("read the folder", folder))?
-            .file_name();
+        let name = entry.map_err(OutputError::io("read the folder", folder))?.file_name();
         if is_owned(&name) {
             owned.push(name);
         }
@@ -200,52 +177,29 @@ mod tests {
         write(&run.path().join("config.toml"), "a");
         assert_eq!(run.finish().unwrap(), root.path());
         assert_eq!(tree(root.path()), ["config.toml", "notes.txt"]);
-        let message = RunFolder::create(root.path(), false)
-            .unwrap_err()
-            .to_string();
-        assert!(
-            message.contains("another run") && message.contains("--overwrite"),
-            "{message}"
-        );
+        let message = RunFolder::create(root.path(), false).unwrap_err().to_string();
+        assert!(message.contains("another run") && message.contains("--overwrite"), "{message}");
     }
 
     #[test]
     fn replacing_touches_only_what_a_run_owns_and_only_at_the_end() {
         let root = tempfile::tempdir().unwrap();
-        for name in [
-            "config.toml",
-            "stats/old.jsonl",
-            "events.out.tfevents.1",
-            "notes.txt",
-        ] {
+        for name in ["config.toml", "stats/old.jsonl", "events.out.tfevents.1", "notes.txt"] {
             write(&root.path().join(name), "old");
         }
         let before = tree(root.path());
         let run = RunFolder::create(root.path(), true).unwrap();
         write(&run.path().join("config.toml"), "new");
-        write(
-            &run.path().join("point_cloud/iteration_1/point_cloud.ply"),
-            "new",
-        );
+        write(&run.path().join("point_cloud/iteration_1/point_cloud.ply"), "new");
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
         drop(run);
-        assert_eq!(
-            tree(root.path()),
-            before,
-            "a run that is dropped leaves nothing"
-        );
+        assert_eq!(tree(root.path()), before, "a run that is dropped leaves nothing");
 
         let run = RunFolder::create(root.path(), true).unwrap();
         write(&run.path().join("config.toml"), "new");
-        write(
-            &run.path().join("point_cloud/iteration_1/point_cloud.ply"),
-            "new",
-        );
+        write(&run.path().join("point_cloud/iteration_1/point_cloud.ply"), "new");
         run.finish().unwrap();
-        assert_eq!(
-            tree(root.path()),
-            ["config.toml", "notes.txt", "point_cloud"]
-        );
+        assert_eq!(tree(root.path()), ["config.toml", "notes.txt", "point_cloud"]);
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"new");
     }
 
@@ -263,10 +217,7 @@ mod tests {
     #[test]
     fn saved_models_are_found_in_numeric_order() {
         let root = tempfile::tempdir().unwrap();
-        assert!(matches!(
-            saved_iterations(root.path()),
-            Err(OutputError::NoRun { .. })
-        ));
+        assert!(matches!(saved_iterations(root.path()), Err(OutputError::NoRun { .. })));
         for iteration in [1_000, 30, 200] {
             write(&model_path(root.path(), iteration), "ply");
         }

@@ -31,10 +31,7 @@ impl RecordLog {
         }
         let mut options = OpenOptions::new();
         let file = options.create(true).write(true).truncate(true).open(path);
-        Ok(Self {
-            file: file.map_err(OutputError::io("create", path))?,
-            path: path.to_owned(),
-        })
+        Ok(Self { file: file.map_err(OutputError::io("create", path))?, path: path.to_owned() })
     }
 
     /// Adds a line.
@@ -140,11 +137,7 @@ pub fn write_scores(
         Split::Train => ("results_train.json", "per_view_train.json"),
     };
     let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
-        scores
-            .views
-            .iter()
-            .map(|view| (view.name.clone(), score(view).into()))
-            .collect()
+        scores.views.iter().map(|view| (view.name.clone(), score(view).into())).collect()
     };
     let views = serde_json::json!({ "PSNR": column(|v| v.psnr), "SSIM": column(|v| v.ssim) });
     enter(&run.join(per_view), iteration, views)?;
@@ -170,14 +163,8 @@ mod tests {
     use super::*;
 
     fn scores(psnr: f64) -> Scores {
-        let view = |name: &str, psnr| ViewScore {
-            name: name.into(),
-            psnr,
-            ssim: 0.5,
-        };
-        Scores {
-            views: vec![view("b.png", psnr), view("a/c.png", psnr + 2.0)],
-        }
+        let view = |name: &str, psnr| ViewScore { name: name.into(), psnr, ssim: 0.5 };
+        Scores { views: vec![view("b.png", psnr), view("a/c.png", psnr + 2.0)] }
     }
 
     #[test]
@@ -197,9 +184,8 @@ mod tests {
         assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);
         std::fs::write(root.path().join("results.json"), "[").unwrap();
         write_scores(root.path(), Split::Train, 7, &scores(1.0)).unwrap();
-        let message = write_scores(root.path(), Split::Test, 7, &scores(1.0))
-            .unwrap_err()
-            .to_string();
+        let message =
+            write_scores(root.path(), Split::Test, 7, &scores(1.0)).unwrap_err().to_string();
         assert!(message.contains("results.json"), "{message}");
     }
 
@@ -208,21 +194,13 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("stats/train.jsonl");
         let mut log = RecordLog::create(&path).unwrap();
-        let record = StepRecord {
-            step: 1,
-            loss: 0.5,
-            l1: 0.25,
-            ssim: 0.75,
-            rows: 9,
-            seconds: 0.125,
-        };
+        let record =
+            StepRecord { step: 1, loss: 0.5, l1: 0.25, ssim: 0.75, rows: 9, seconds: 0.125 };
         log.append(&record).unwrap();
         log.append(&StepRecord { step: 2, ..record }).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
-        let read: Vec<StepRecord> = text
-            .lines()
-            .map(|line| serde_json::from_str(line).unwrap())
-            .collect();
+        let read: Vec<StepRecord> =
+            text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         assert_eq!(read, [record, StepRecord { step: 2, ..record }]);
     }
 }

@@ -47,17 +47,13 @@ impl TensorBoard {
 
     fn append(&mut self, event: &[u8]) -> Result<(), OutputError> {
         // One write a record, so that a reader, or a kill, finds whole records.
-        self.file
-            .write_all(&record(event))
-            .map_err(OutputError::io("write", &self.path))
+        self.file.write_all(&record(event)).map_err(OutputError::io("write", &self.path))
     }
 }
 
 /// Seconds since 1970.
 fn wall_time() -> f64 {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0.0, |since| since.as_secs_f64())
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
 
 /// A TFRecord: length, its checksum, data, its checksum (little-endian).
@@ -74,9 +70,7 @@ fn record(data: &[u8]) -> Vec<u8> {
 /// TFRecord's checksum: CRC-32C, rotated and offset, so that a record within a record does not
 /// check itself.
 fn masked_crc(data: &[u8]) -> u32 {
-    crc32c::crc32c(data)
-        .rotate_right(15)
-        .wrapping_add(0xa282_ead8)
+    crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
 /// `Event { wall_time = 1, file_version = 3 }`, the first of a file.

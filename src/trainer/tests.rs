@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use densify_policies::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
-use densify_policies::policy::{Candidate, PolicyState, Signal, SignalSet, Signals};
+use densify_policies::policy::{Candidate, PolicyError, PolicyState, Signal, SignalSet, Signals};
 use glam::{DMat3, DVec3};
 
 use super::*;
@@ -11,6 +11,7 @@ use crate::backend::Rendering;
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
+use crate::views::ViewError;
 
 /// Everything that was asked of the fakes, in order.
 type Diary = Arc<Mutex<Vec<String>>>;
@@ -41,19 +42,9 @@ impl Backend for CountingBackend {
         note(&self.diary, "epoch".into());
     }
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        note(
-            &self.diary,
-            format!("step {} view {}", input.step, input.target.rgb[0]),
-        );
-        let loss = if input.step == self.lost_at {
-            f32::NAN
-        } else {
-            0.5
-        };
-        Ok(StepOutput {
-            loss,
-            ..StepOutput::default()
-        })
+        note(&self.diary, format!("step {} view {}", input.step, input.target.rgb[0]));
+        let loss = if input.step == self.lost_at { f32::NAN } else { 0.5 };
+        Ok(StepOutput { loss, ..StepOutput::default() })
     }
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
         Ok((Signals::zeros(self.rows, needs.signals), Vec::new()))
@@ -70,17 +61,10 @@ impl Backend for CountingBackend {
         _background: [f32; 3],
         _sh_degree: u8,
     ) -> Result<Rendering, BackendError> {
-        Err(BackendError::ImageTooLarge {
-            width: camera.width,
-            height: camera.height,
-            max: 0,
-        })
+        Err(BackendError::ImageTooLarge { width: camera.width, height: camera.height, max: 0 })
     }
     fn download(&self) -> Gaussians {
-        Gaussians {
-            means: vec![[0.0; 3]; self.rows],
-            ..Gaussians::default()
-        }
+        Gaussians { means: vec![[0.0; 3]; self.rows], ..Gaussians::default() }
     }
 }
 
@@ -101,10 +85,7 @@ enum Told {
 
 impl DensityPolicy for ToldPolicy {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        Needs {
-            signals: SignalSet::of(&[Signal::Opacity]),
-            candidates: None,
-        }
+        Needs { signals: SignalSet::of(&[Signal::Opacity]), candidates: None }
     }
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.every)
@@ -133,8 +114,7 @@ impl DensityPolicy for ToldPolicy {
             }
             Told::Halve => {
                 for row in 0..rows / 2 {
-                    plan.prune(row)
-                        .map_err(|e| PolicyError::Other(e.to_string()))?;
+                    plan.prune(row).map_err(|e| PolicyError::Other(e.to_string()))?;
                 }
             }
             Told::Nothing => {}
@@ -174,13 +154,7 @@ impl ViewSource for FakeViews {
             return Err("file is gone".into());
         }
         let rgb = vec![view as u8; 3];
-        Ok(Arc::new(Image8 {
-            width: 1,
-            height: 1,
-            rgb,
-            alpha: None,
-            mask: None,
-        }))
+        Ok(Arc::new(Image8 { width: 1, height: 1, rgb, alpha: None, mask: None }))
     }
     fn prefetch(&self, upcoming: &[usize]) {
         note(&self.announced, format!("{upcoming:?}"));
@@ -196,14 +170,8 @@ struct Case {
     unreadable: Option<usize>,
 }
 
-const CASE: Case = Case {
-    rows: 3,
-    budget: 10,
-    what: Told::Split,
-    every: 2,
-    lost_at: 0,
-    unreadable: None,
-};
+const CASE: Case =
+    Case { rows: 3, budget: 10, what: Told::Split, every: 2, lost_at: 0, unreadable: None };
 
 fn scene(case: &Case, views: usize) -> SceneInfo {
     SceneInfo {
@@ -262,10 +230,7 @@ fn build(
         unreadable: case.unreadable,
         announced: announced.clone(),
     };
-    let policy = ToldPolicy {
-        every: case.every,
-        what: case.what,
-    };
+    let policy = ToldPolicy { every: case.every, what: case.what };
     let policy = ("told", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, diary, announced))
@@ -277,9 +242,7 @@ fn trainer(case: &Case) -> (Trainer<FakeViews>, Diary, Diary) {
 
 fn failure(case: &Case) -> (String, usize, Vec<String>) {
     let (mut trainer, diary, _) = trainer(case);
-    let error = (0..9)
-        .find_map(|_| trainer.step().err())
-        .expect("an error within 9 steps");
+    let error = (0..9).find_map(|_| trainer.step().err()).expect("an error within 9 steps");
     let done = diary.lock().unwrap().clone();
     (error.to_string(), trainer.model().len(), done)
 }
@@ -295,19 +258,9 @@ fn every_epoch_shows_every_view_once_and_is_announced() {
     let epochs: Vec<usize> = (0..diary.len()).filter(|&i| diary[i] == "epoch").collect();
     assert_eq!(epochs, [0, 4, 8]);
     // The right pixels reached the backend.
-    let steps: Vec<String> = shown
-        .iter()
-        .enumerate()
-        .map(|(i, view)| format!("step {} view {view}", i + 1))
-        .collect();
-    assert_eq!(
-        diary
-            .iter()
-            .filter(|d| *d != "epoch")
-            .cloned()
-            .collect::<Vec<_>>(),
-        steps
-    );
+    let steps: Vec<String> =
+        shown.iter().enumerate().map(|(i, view)| format!("step {} view {view}", i + 1)).collect();
+    assert_eq!(diary.iter().filter(|d| *d != "epoch").cloned().collect::<Vec<_>>(), steps);
     // Each announcement is what comes next, and nothing beyond the end of the run.
     for (i, said) in announced.lock().unwrap().iter().enumerate() {
         assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
@@ -317,39 +270,18 @@ fn every_epoch_shows_every_view_once_and_is_announced() {
 #[test]
 fn edits_are_reported_and_the_budget_holds() {
     let (mut trainer, ..) = trainer(&CASE);
-    let events: Vec<EditEvent> = (0..9)
-        .filter_map(|_| trainer.step().unwrap().event)
-        .collect();
-    let short: Vec<_> = events
-        .iter()
-        .map(|e| (e.step, e.before, e.added, e.denied, e.after))
-        .collect();
-    assert_eq!(
-        short,
-        [
-            (2, 3, 3, 0, 6),
-            (4, 6, 4, 2, 10),
-            (6, 10, 0, 10, 10),
-            (8, 10, 0, 10, 10)
-        ]
-    );
-    assert_eq!(
-        (events[0].updated, events[0].removed, &*events[0].cause),
-        (3, 0, "told")
-    );
+    let events: Vec<EditEvent> = (0..9).filter_map(|_| trainer.step().unwrap().event).collect();
+    let short: Vec<_> =
+        events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
+    assert_eq!(short, [(2, 3, 3, 0, 6), (4, 6, 4, 2, 10), (6, 10, 0, 10, 10), (8, 10, 0, 10, 10)]);
+    assert_eq!((events[0].updated, events[0].removed, &*events[0].cause), (3, 0, "told"));
     assert_eq!(trainer.events(), events);
-    assert_eq!(
-        (trainer.peak_rows(), trainer.rows(), trainer.steps_done()),
-        (10, 10, 9)
-    );
+    assert_eq!((trainer.peak_rows(), trainer.rows(), trainer.steps_done()), (10, 10, 9));
 }
 
 #[test]
 fn a_plan_that_does_nothing_is_no_event() {
-    let (mut trainer, diary, _) = trainer(&Case {
-        what: Told::Nothing,
-        ..CASE
-    });
+    let (mut trainer, diary, _) = trainer(&Case { what: Told::Nothing, ..CASE });
     assert!((0..9).all(|_| trainer.step().unwrap().event.is_none()));
     assert!(trainer.events().is_empty());
     // It may reset statistics and is executed all the same.
@@ -358,11 +290,7 @@ fn a_plan_that_does_nothing_is_no_event() {
 
 #[test]
 fn the_peak_outlives_a_prune() {
-    let (mut trainer, ..) = trainer(&Case {
-        rows: 8,
-        what: Told::Halve,
-        ..CASE
-    });
+    let (mut trainer, ..) = trainer(&Case { rows: 8, what: Told::Halve, ..CASE });
     for _ in 0..4 {
         trainer.step().unwrap();
     }
@@ -371,51 +299,28 @@ fn the_peak_outlives_a_prune() {
 
 #[test]
 fn slots_written_before_the_moves_count_for_the_peak() {
-    let ops = RowOps {
-        rows_before: 4,
-        rows_after: 3,
-        child_slots: vec![1, 5],
-        ..RowOps::default()
-    };
+    let ops =
+        RowOps { rows_before: 4, rows_after: 3, child_slots: vec![1, 5], ..RowOps::default() };
     assert_eq!(rows_within(&ops), 6);
 }
 
 #[test]
 fn a_policy_error_stops_before_the_edit() {
-    let (message, rows, done) = failure(&Case {
-        what: Told::Fail,
-        ..CASE
-    });
+    let (message, rows, done) = failure(&Case { what: Told::Fail, ..CASE });
     assert_eq!(message, "step 2: policy `told`: out of ideas");
     assert_eq!(rows, 3);
     assert!(!done.iter().any(|d| d.starts_with("apply")), "{done:?}");
-    let (message, ..) = failure(&Case {
-        what: Told::ReadUndeclared,
-        ..CASE
-    });
-    assert!(
-        message.contains("Age") && message.contains("not declared"),
-        "{message}"
-    );
+    let (message, ..) = failure(&Case { what: Told::ReadUndeclared, ..CASE });
+    assert!(message.contains("Age") && message.contains("not declared"), "{message}");
 }
 
 #[test]
 fn a_lost_model_and_an_unreadable_view_are_named() {
-    let (message, _, done) = failure(&Case {
-        lost_at: 4,
-        every: 4,
-        ..CASE
-    });
+    let (message, _, done) = failure(&Case { lost_at: 4, every: 4, ..CASE });
     let view = ["a.png", "b.png", "c.png"][schedule::view_order(3, 7, 1)[0]];
-    assert!(
-        message.starts_with(&format!("step 4: the loss of view `{view}` is NaN")),
-        "{message}"
-    );
+    assert!(message.starts_with(&format!("step 4: the loss of view `{view}` is NaN")), "{message}");
     assert!(!done.contains(&"apply 4".to_owned()), "{done:?}");
-    let (message, ..) = failure(&Case {
-        unreadable: Some(1),
-        ..CASE
-    });
+    let (message, ..) = failure(&Case { unreadable: Some(1), ..CASE });
     assert!(message.contains("view `b.png`: file is gone"), "{message}");
 }
 
@@ -424,10 +329,7 @@ fn options_that_disagree_are_refused() {
     let refused = |views, change: fn(&mut SceneInfo, &mut TrainOptions)| {
         let (mut scene, mut options) = (scene(&CASE, 3), OPTIONS);
         change(&mut scene, &mut options);
-        build(&CASE, views, scene, options)
-            .err()
-            .expect("refused")
-            .to_string()
+        build(&CASE, views, scene, options).err().expect("refused").to_string()
     };
     assert!(refused(0, |_, _| ()).contains("no training view"));
     assert!(refused(2, |_, _| ()).contains("2 views"));

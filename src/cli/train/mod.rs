@@ -1,5 +1,6 @@
 //! `densify train`.
 
+mod choices;
 mod session;
 mod setup;
 
@@ -53,11 +54,7 @@ pub(super) struct TrainArgs {
     )]
     policy: String,
     /// Set a parameter of the policy, such as diet.rho=0.2; may be repeated
-    #[arg(
-        long,
-        value_name = "POLICY.NAME=VALUE",
-        help_heading = "Density control"
-    )]
+    #[arg(long, value_name = "POLICY.NAME=VALUE", help_heading = "Density control")]
     policy_set: Vec<String>,
     /// TOML file with parameters in a table per policy; --policy-set wins over it
     #[arg(long, value_name = "FILE", help_heading = "Density control")]

@@ -81,10 +81,7 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
             let _ = session.write_summary(false);
             drop(session);
             let path = folder.abandon();
-            Err(failure.and(&format!(
-                "what was written until then is in {}",
-                path.display()
-            )))
+            Err(failure.and(&format!("what was written until then is in {}", path.display())))
         }
     }
 }
@@ -152,12 +149,7 @@ impl<'a> Session<'a> {
         window.ssim += report.output.ssim;
         let step = report.step;
         if step.is_multiple_of(RECORD_EVERY) || step == self.run.config.train.iterations {
-            let Window {
-                steps,
-                loss,
-                l1,
-                ssim,
-            } = std::mem::take(window);
+            let Window { steps, loss, l1, ssim } = std::mem::take(window);
             let mean = |sum: f32| sum / steps as f32;
             let record = StepRecord {
                 step,
@@ -168,19 +160,14 @@ impl<'a> Session<'a> {
                 seconds: self.wall.as_secs_f64(),
             };
             self.steps.append(&record)?;
-            self.board
-                .scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
+            self.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
         }
         Ok(())
     }
 
     /// Writes the model in the dataset's own coordinates; returns where.
     fn save(&mut self, step: u32) -> Result<PathBuf, OutputError> {
-        let model = self
-            .run
-            .dataset
-            .normalisation
-            .model_to_world(&self.run.trainer.model());
+        let model = self.run.dataset.normalisation.model_to_world(&self.run.trainer.model());
         let path = model_path(&self.folder, step);
         write_atomically(&path, |mut out| write_splats(&model, &mut out))?;
         Ok(path)
@@ -188,12 +175,7 @@ impl<'a> Session<'a> {
 
     /// Measures the views held out, if there are any.
     fn test(&mut self, step: u32, is_last: bool) -> Result<(), Failure> {
-        let Prepared {
-            trainer,
-            test,
-            config,
-            ..
-        } = &mut self.run;
+        let Prepared { trainer, test, config, .. } = &mut self.run;
         if test.count() == 0 {
             return Ok(());
         }
@@ -202,31 +184,18 @@ impl<'a> Session<'a> {
         let scores = evaluate(trainer.backend(), test, background, degree, |_| ())?;
         let mean = scores.mean();
         write_scores(&self.folder, Split::Test, step, &scores)?;
-        self.board.scalars(
-            step,
-            &[
-                ("test/psnr", mean.psnr as f32),
-                ("test/ssim", mean.ssim as f32),
-            ],
-        )?;
+        self.board
+            .scalars(step, &[("test/psnr", mean.psnr as f32), ("test/ssim", mean.ssim as f32)])?;
         self.tested.insert(step, mean);
         if !is_last {
             let Mean { psnr, ssim } = mean;
-            self.console.say(format_args!(
-                "step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}"
-            ));
+            self.console.say(format_args!("step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}"));
         }
         Ok(())
     }
 
     fn write_summary(&self, finished: bool) -> Result<(), OutputError> {
-        let Prepared {
-            config,
-            trainer,
-            test,
-            ledger,
-            ..
-        } = &self.run;
+        let Prepared { config, trainer, test, ledger, .. } = &self.run;
         let summary = Summary {
             densify: config.densify.clone(),
             policy: config.policy.name.clone(),
@@ -249,13 +218,7 @@ impl<'a> Session<'a> {
 
     /// What came of it, in a few lines.
     fn report(&self, path: &Path) {
-        let Prepared {
-            config,
-            trainer,
-            test,
-            ledger,
-            ..
-        } = &self.run;
+        let Prepared { config, trainer, test, ledger, .. } = &self.run;
         let steps = trainer.steps_done();
         if let Some(Mean { psnr, ssim }) = self.tested.get(&steps) {
             let views = test.count();
@@ -272,23 +235,13 @@ impl<'a> Session<'a> {
         let promised = Bytes(ledger.total());
         if let Some(peak) = peak_resident() {
             let peak = Bytes(peak);
-            self.console.say(format_args!(
-                "memory   {peak} at its peak, {promised} promised"
-            ));
+            self.console.say(format_args!("memory   {peak} at its peak, {promised} promised"));
         }
         let cpu = self.cpu.map_or_else(String::new, |cpu| {
-            format!(
-                ", {:.4} CPU-seconds per iteration",
-                cpu.as_secs_f64() / f64::from(steps)
-            )
+            format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
         });
-        self.console
-            .say(format_args!("time     {}{cpu}", duration(self.wall)));
-        self.console.say(format_args!(
-            "model    {}",
-            model_path(path, steps).display()
-        ));
-        self.console
-            .say(format_args!("numbers  {}", path.join("stats").display()));
+        self.console.say(format_args!("time     {}{cpu}", duration(self.wall)));
+        self.console.say(format_args!("model    {}", model_path(path, steps).display()));
+        self.console.say(format_args!("numbers  {}", path.join("stats").display()));
     }
 }

@@ -3,11 +3,10 @@
 
 use std::path::{Path, PathBuf};
 
-use densify_policies::parameters::parse_overrides;
 use densify_policies::policy::{DensityPolicy, SceneInfo};
 use densify_policies::registry::{PolicyEntry, find};
-use toml::Table;
 
+use super::choices::{check_iterations, default_output, learning_rates, parameters};
 use super::{DEFAULT_BUDGET, TrainArgs};
 use crate::backend::Backend;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
@@ -21,7 +20,7 @@ use crate::gaussians::{Gaussians, sh_coefficients};
 use crate::init::{initialise, random_points};
 use crate::memory::{Ledger, Section, resident};
 use crate::output::{InitChoice, PolicyConfig, RunConfig, RunFolder, TrainConfig};
-use crate::schedule::{Background, RateOptions};
+use crate::schedule::Background;
 use crate::trainer::{TrainOptions, Trainer};
 use crate::views::{DatasetViews, ViewSource};
 
@@ -50,10 +49,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let rates = learning_rates(&args.lr)?;
     check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
     check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
-    let output = args
-        .output
-        .clone()
-        .unwrap_or_else(|| default_output(&args.scene, &args.policy));
+    let output = args.output.clone().unwrap_or_else(|| default_output(&args.scene, &args.policy));
     RunFolder::check(&output, args.overwrite)?;
     use_threads(args.threads);
 
@@ -101,15 +97,8 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, 1);
     dataset.points = crate::dataset::PointCloud::default();
-    let (backend, ledger) = backend(
-        args,
-        &config,
-        &dataset,
-        policy.as_ref(),
-        &scene,
-        model,
-        [&views, &test],
-    )?;
+    let (backend, ledger) =
+        backend(args, &config, &dataset, policy.as_ref(), &scene, model, [&views, &test])?;
     console.say(format_args!("memory promised\n{ledger}"));
     let options = TrainOptions {
         iterations: args.iterations,
@@ -120,14 +109,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
         prefetch: AHEAD,
     };
     let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
-    Ok(Prepared {
-        config,
-        output,
-        trainer,
-        test,
-        dataset,
-        ledger,
-    })
+    Ok(Prepared { config, output, trainer, test, dataset, ledger })
 }
 
 /// The renderer with the model, and the ledger of the whole run.
@@ -155,11 +137,7 @@ fn backend(
 
     let mut ledger = backend.ledger().clone();
     let cache = views.cache();
-    ledger.add_to(
-        Section::Images,
-        "decoded training views",
-        cache.held_bytes(),
-    );
+    ledger.add_to(Section::Images, "decoded training views", cache.held_bytes());
     ledger.add_to(Section::Images, "decoding", cache.decode_bytes());
     let budget = scene.budget as u64;
     let float = size_of::<f32>() as u64;
@@ -206,14 +184,9 @@ fn first_model(
         }
         InitChoice::Points => (&dataset.points, None),
         InitChoice::Random => {
-            let count = args
-                .init_points
-                .unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
+            let count = args.init_points.unwrap_or((budget / 2).clamp(1, RANDOM_POINTS));
             let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
-            let opaque = !dataset
-                .train
-                .iter()
-                .any(|view| view.source.header.has_alpha);
+            let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
             random = random_points(count, &cameras, opaque, args.seed);
             (&random, Some(count))
         }
@@ -222,22 +195,12 @@ fn first_model(
     let left_out = [
         (report.unusable, "not finite"),
         (report.duplicates, "at the place of another"),
-        (
-            report.over_budget,
-            "beyond the budget; which ones follows from the seed",
-        ),
+        (report.over_budget, "beyond the budget; which ones follows from the seed"),
     ];
     for (number, why) in left_out.into_iter().filter(|(number, _)| *number > 0) {
-        console.say(format_args!(
-            "note: {} points left out: {why}",
-            grouped(number)
-        ));
+        console.say(format_args!("note: {} points left out: {why}", grouped(number)));
     }
-    let what = if count.is_some() {
-        "random points"
-    } else {
-        "points of the scene"
-    };
+    let what = if count.is_some() { "random points" } else { "points of the scene" };
     console.say(format_args!(
         "start    {} rows from {} {what}",
         grouped(model.len()),
@@ -253,15 +216,8 @@ fn announce(
     output: &Path,
     console: &Console,
 ) {
-    let default = if args.budget.is_none() {
-        " (default; choose with --budget)"
-    } else {
-        ""
-    };
-    console.say(format_args!(
-        "budget   {} rows{default}",
-        grouped(config.train.budget)
-    ));
+    let default = if args.budget.is_none() { " (default; choose with --budget)" } else { "" };
+    console.say(format_args!("budget   {} rows{default}", grouped(config.train.budget)));
     console.say(format_args!("policy   {}: {}", entry.name, entry.summary));
     console.say(format_args!(
         "run      {} iterations, seed {}, degree {}, background {}",
@@ -271,139 +227,4 @@ fn announce(
         config.scene.background
     ));
     console.say(format_args!("output   {}", output.display()));
-}
-
-/// The policy's parameters as set by file and flags.
-fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table, Failure> {
-    let mut set = Table::new();
-    if let Some(path) = &args.policy_config {
-        let fail = |problem: String| {
-            Failure::input(format!("--policy-config {}: {problem}", path.display()))
-        };
-        let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-        let file: Table = text
-            .parse()
-            .map_err(|e| fail(format!("{e}").trim().to_owned()))?;
-        for (policy, table) in file {
-            // One file may serve several policies; a misspelt name may not pass for another one.
-            let known = find(&policy).map_err(|e| fail(e.to_string()))?;
-            let Ok(table) = table.try_into::<Table>() else {
-                return Err(fail(format!("`{policy}` must be a table: [{policy}]")));
-            };
-            if known.name == entry.name {
-                set = table;
-            }
-        }
-    }
-    for (policy, table) in parse_overrides(&args.policy_set)? {
-        if find(&policy)?.name != entry.name {
-            return Err(Failure::input(format!(
-                "--policy-set sets a parameter of `{policy}`, but the policy of this run is `{}`; \
-                 choose it with --policy {policy}",
-                entry.name
-            )));
-        }
-        set.extend(table);
-    }
-    Ok(set)
-}
-
-/// Default learning rates, overlaid with `NAME=RATE` settings.
-fn learning_rates(settings: &[String]) -> Result<RateOptions, Failure> {
-    let mut table = Table::new();
-    for setting in settings {
-        let value = setting
-            .split_once('=')
-            .and_then(|(name, rate)| Some((name.trim(), rate.trim().parse::<f64>().ok()?)));
-        let Some((name, rate)) = value else {
-            return Err(Failure::input(format!(
-                "--lr {setting} is not of the form NAME=RATE, such as opacity=0.05"
-            )));
-        };
-        table.insert(name.to_owned(), rate.into());
-    }
-    let fail = |problem: &str| Failure::input(format!("--lr: {}", problem.trim()));
-    let rates: RateOptions = table.try_into().map_err(|e| fail(&e.to_string()))?;
-    match rates.invalid() {
-        Some(name) => Err(fail(&format!("{name} must be a positive number"))),
-        None => Ok(rates),
-    }
-}
-
-fn check_iterations(flag: &str, chosen: &[u32], iterations: u32) -> Result<(), Failure> {
-    match chosen.iter().find(|&&n| n == 0 || n > iterations) {
-        None => Ok(()),
-        Some(n) => Err(Failure::input(format!(
-            "{flag} {n} is out of range: the run has iterations 1 to {iterations}"
-        ))),
-    }
-}
-
-/// `output/SCENE-POLICY`, SCENE being the dataset folder's name.
-fn default_output(scene: &Path, policy: &str) -> PathBuf {
-    let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
-    let name = full
-        .file_name()
-        .map_or_else(|| "scene".into(), |name| name.to_string_lossy());
-    Path::new("output").join(format!("{name}-{policy}"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn learning_rates_by_name() {
-        let rates = learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()]).unwrap();
-        let expected = RateOptions {
-            opacity: 0.05,
-            mean_end: 1e-5,
-            ..RateOptions::default()
-        };
-        assert_eq!(rates, expected);
-        for (bad, part) in [
-            ("opacity", "NAME=RATE"),
-            ("opacity=x", "NAME=RATE"),
-            ("colour=1", "colour"),
-            ("quat=0", "quat"),
-            ("quat=inf", "quat"),
-        ] {
-            let message = learning_rates(&[bad.into()]).unwrap_err().message;
-            assert!(
-                message.contains(part) && message.contains("--lr"),
-                "{bad}: {message}"
-            );
-        }
-    }
-
-    #[test]
-    fn iterations_outside_the_run_name_the_flag() {
-        assert!(check_iterations("--save-iterations", &[1, 30], 30).is_ok());
-        for bad in [0, 31] {
-            let failure = check_iterations("--save-iterations", &[5, bad], 30).unwrap_err();
-            assert!(
-                failure
-                    .message
-                    .starts_with(&format!("--save-iterations {bad} "))
-            );
-        }
-    }
-
-    #[test]
-    fn the_output_is_named_after_the_scene_and_the_policy() {
-        let root = tempfile::tempdir().unwrap();
-        let scene = root.path().join("garden");
-        std::fs::create_dir(&scene).unwrap();
-        for spelling in [
-            scene.clone(),
-            scene.join(""),
-            scene.join("."),
-            scene.join("../garden"),
-        ] {
-            assert_eq!(
-                default_output(&spelling, "diet"),
-                Path::new("output/garden-diet")
-            );
-        }
-    }
 }
