@@ -8,7 +8,7 @@ use toml::{Table, Value};
 
 use crate::policy::PolicyError;
 
-/// Length of the run for which the defaults of schedules are written [steps].
+/// Length of the run for which the defaults of schedules are written `[steps]`.
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
 /// Checks that a parameter is finite and in its range; for [`ConfiguredPolicy::new`]. The
