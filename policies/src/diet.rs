@@ -108,8 +108,8 @@
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted rows |
 //! | reinit_at | 0 | 0 | step | not available yet; 0: never |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, but for `protect`,
-//! which counts views.
+//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
+//! down to 100 steps at most, and `protect`, which counts views, not at all.
 
 use crate::adc::{Mortality, Window, mean_over_views, spare_one};
 use crate::plan::{EditPlan, Reset};

@@ -47,7 +47,8 @@
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | follow a growth curve rather than `tau` |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length.
+//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
+//! down to 100 steps at most.
 
 use std::ops::Bound::{Excluded, Unbounded};
 

@@ -1,3 +1,5 @@
+//! The registered policies conform; policies with one fault each are caught.
+
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::{Deserialize, Serialize};

@@ -1,3 +1,5 @@
+//! Sets of signals, and what a policy may not read.
+
 use super::*;
 
 #[test]
