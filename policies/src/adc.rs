@@ -10,11 +10,11 @@ use crate::sample::top_k;
 /// Steps at which something happens: `from` < step < `until`, multiples of `every` (0: never).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Window {
-    /// Start (exclusive) [steps].
+    /// Start (exclusive) `[steps]`.
     pub from: u32,
-    /// End (exclusive) [steps].
+    /// End (exclusive) `[steps]`.
     pub until: u32,
-    /// Interval [steps].
+    /// Interval `[steps]`.
     pub every: u32,
 }
 
@@ -27,7 +27,7 @@ impl Window {
 }
 
 /// Mean per visible view of a signal that is summed over views; 0 for a row that no view saw, and
-/// where the mean is not finite. Shape: [rows].
+/// where the mean is not finite. Shape: `[rows]`.
 #[must_use]
 pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     let mean = |(&sum, &views): (&f32, &f32)| {

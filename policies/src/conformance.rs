@@ -35,6 +35,8 @@ pub enum Check {
     /// It reads no signal and no candidates that its needs do not list, not even when they are
     /// there.
     ReadsOnlyWhatItDeclares,
+    /// It asks for fresh views if and only if it asks for the signal that is measured in them.
+    AsksForWhole,
     /// It plans without error or panic, whatever the signals hold and whatever the plan refuses.
     GoesOn,
     /// Its plan is the one that it was given, for these rows and this budget.
@@ -57,6 +59,7 @@ impl fmt::Display for Check {
         f.write_str(match self {
             Self::Builds => "can be built from its defaults",
             Self::ReadsOnlyWhatItDeclares => "reads only what it declares",
+            Self::AsksForWhole => "asks for fresh views and their signal together",
             Self::GoesOn => "goes on whatever it sees",
             Self::KeepsItsPlan => "keeps the plan that it is given",
             Self::LeavesARow => "leaves at least one row",

@@ -8,15 +8,15 @@
 //!
 //! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. Candidates are rows
 //! with g >= `tau`, where g = g_p + `colour_weight` · g_c; g_p and g_c are the means, over the views
-//! that saw the row, of the norms of the loss gradient by its mean on screen [NDC] and by its
+//! that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
 //! colour. Dead rows (less opaque than `min_opacity`; after step `max_scale_from` also larger than
 //! `max_scale` · scene extent) are pruned; they are no candidates. If there are more candidates than
 //! room, up to `rho` · budget of them are paid for by as many victims. Then the candidates grow, the
 //! largest g first: small ones (up to `small` · scene extent) are cloned, the others split in two,
 //! smaller by `split_factor`. What is left over is counted as denied. The statistics start anew.
 //!
-//! **Victims** are the least important rows: those with the smallest of their largest blend weights
-//! α·T over the previous and the current epoch, candidates excepted. Newborns are protected until
+//! **Victims** are the least important rows, candidates excepted: those whose largest blend weight
+//! α·T, over all pixels of the views of `importance`, is smallest. Newborns are protected until
 //! they are as old as an epoch is long, or `protect` steps if that is less. If there are not enough
 //! others, newborns fall too, the oldest first.
 //!
@@ -51,11 +51,14 @@
 //! - `clone_opacity = "conserve"`: parent and clone both get 1 − √(1 − o), and scales multiplied by
 //!   o / (2o′ − o′²/√2), so that together they are as opaque as the parent was (*3D Gaussian Splatting
 //!   as Markov Chain Monte Carlo*, Kheradmand et al. 2024, equation 9). Both start with zero moments.
-//! - `importance = "epochs"`: as above, free of cost. `fresh`, which renders random training views
-//!   anew for each decision, as the code does, is **not available yet**: policies cannot ask for
-//!   renders.
+//! - `importance`: the views in which the importance of a row is measured.
+//!   - `epochs`: the training renders of the previous and the current epoch, free of cost.
+//!   - `fresh`: `fresh_views` training views, drawn at random and rendered anew for each event at
+//!     which victims may be needed, as in the code. It costs so many passes, up to a hundred for
+//!     each growth, and a row that only other views show counts as unimportant.
 //! - `reinit_at`: the code's replacement of the whole model by points from depth maps, at step 5000 of
-//!   outdoor scenes, is **not available yet** for the same reason. Only 0 (never) is accepted.
+//!   outdoor scenes, is **not available yet**: policies cannot ask for depth maps. Only 0 (never) is
+//!   accepted.
 //! - `error`: `l1-dssim` (0.8 · L1 + 0.2 · (1 − SSIM)), `l1`, or `grad`, the norm of the loss gradient
 //!   by the pixel's colour, as in the code: it ranks blurred structure and is blind to a constant
 //!   offset of colour.
@@ -87,7 +90,8 @@
 //! | min_opacity | 0.005 | 0 to 1 | | opacity below which a row is dead |
 //! | max_scale | 0.1 | > 0 | scene extent | size beyond which a row is dead |
 //! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
-//! | importance | "epochs" | epochs | | how the importance of a row is measured |
+//! | importance | "epochs" | epochs, fresh | | views in which the importance of a row is measured |
+//! | fresh_views | 100 | >= 1 | views | random views per event, for `fresh`; all if there are fewer |
 //! | protect | 100 | >= 0 | steps | longest protection of newborns; 0: none |
 //! | prune_every | 50 | >= 0 | steps | interval of pruning; 0: never |
 //! | compensate_from | 10000 | >= 0 | step | start of compensation (exclusive) |
@@ -104,8 +108,8 @@
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted rows |
 //! | reinit_at | 0 | 0 | step | not available yet; 0: never |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, but for `protect`,
-//! which counts views.
+//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
+//! down to 100 steps at most, and `protect`, which counts views, not at all.
 
 use crate::adc::{Mortality, Window, mean_over_views, spare_one};
 use crate::plan::{EditPlan, Reset};
@@ -138,7 +142,7 @@ pub struct Diet {
     grow: Window,
     prune: Window,
     insert: Window,
-    /// Age below which a row is protected [steps].
+    /// Age below which a row is protected `[steps]`.
     protected_age: f32,
 }
 
@@ -188,7 +192,7 @@ impl DensityPolicy for Diet {
             Signal::ScreenGradient,
             Signal::Opacity,
             Signal::ScaleMax,
-            Signal::WeightMax,
+            self.importance(),
         ]);
         if self.params.mixed_gradient {
             signals = signals.with(Signal::ColourGradient);
@@ -204,11 +208,24 @@ impl DensityPolicy for Diet {
         if self.protected_age > 0.0 {
             signals = signals.with(Signal::Age);
         }
-        Needs { signals, candidates: self.candidate_request(scene) }
+        let fresh_views = match self.params.importance {
+            Importance::Epochs => 0,
+            Importance::Fresh => self.params.fresh_views,
+        };
+        Needs { signals, candidates: self.candidate_request(scene), fresh_views }
     }
 
     fn is_due(&self, step: u32) -> bool {
         [self.grow, self.prune, self.insert].iter().any(|window| window.is_due(step))
+    }
+
+    /// Victims fall only where rows, those that may grow and those that may be inserted are
+    /// together more than the budget.
+    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
+        let grown = if self.grow.is_due(step) { rows } else { 0 };
+        let inserted =
+            if self.insert.is_due(step) { fraction(self.params.rho_c, budget) } else { 0 };
+        rows + grown + inserted > budget
     }
 
     fn plan(
@@ -276,7 +293,15 @@ fn fraction(of: f64, budget: usize) -> usize {
 }
 
 impl Diet {
-    /// g of every row. Shape: [rows].
+    /// The signal that says how important a row is.
+    fn importance(&self) -> Signal {
+        match self.params.importance {
+            Importance::Epochs => Signal::WeightMax,
+            Importance::Fresh => Signal::FreshWeightMax,
+        }
+    }
+
+    /// g of every row. Shape: `[rows]`.
     fn gradient(&self, now: &Snapshot<'_>) -> Result<Vec<f32>, PolicyError> {
         let views = now.signal(Signal::VisibleCount)?;
         let mut gradient = mean_over_views(now.signal(Signal::ScreenGradient)?, views);
@@ -331,7 +356,7 @@ impl Diet {
         if count == 0 {
             return Ok(());
         }
-        let importance = now.signal(Signal::WeightMax)?;
+        let importance = now.signal(self.importance())?;
         let protects = self.protected_age > 0.0;
         let age = if protects { now.signal(Signal::Age)? } else { &[] };
         let eligible = (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !spared(row));

@@ -55,7 +55,10 @@ impl Event {
 
     /// Lets the policy plan, with exactly the signals it asks for.
     pub(crate) fn run(&self, policy: &mut dyn DensityPolicy) -> Result<Outcome, PolicyError> {
-        let set: SignalSet = policy.needs(&self.scene).signals;
+        let mut set: SignalSet = policy.needs(&self.scene).signals;
+        if !policy.wants_fresh(self.step, self.rows, self.budget) {
+            set = set.without(Signal::FreshWeightMax);
+        }
         let mut signals = Signals::zeros(self.rows, set);
         for (signal, values) in &self.columns {
             if let Some(column) = signals.get_mut(*signal) {

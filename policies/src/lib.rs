@@ -15,7 +15,9 @@
 //!    named in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS) follow the run's
 //!    length.
 //! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and
-//!    reading another is an error.
+//!    reading another is an error. What is measured in training costs nothing more;
+//!    [`Signal::FreshWeightMax`](policy::Signal::FreshWeightMax) costs renders of training views, so
+//!    say [when it is wanted](policy::DensityPolicy::wants_fresh).
 //! 4. **A plan**: at the steps for which it is due, the policy reads the
 //!    [`Snapshot`](policy::Snapshot) and calls [`EditPlan`](plan::EditPlan). It never touches a
 //!    parameter or a device, so that it runs unchanged on every backend.
@@ -83,7 +85,7 @@
 //! impl DensityPolicy for Fade {
 //!     fn needs(&self, _scene: &SceneInfo) -> Needs {
 //!         let signals = SignalSet::of(&[Signal::Opacity, Signal::WeightSum]);
-//!         Needs { signals, candidates: None }
+//!         Needs { signals, ..Needs::default() }
 //!     }
 //!
 //!     fn is_due(&self, step: u32) -> bool {

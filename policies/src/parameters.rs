@@ -8,7 +8,7 @@ use toml::{Table, Value};
 
 use crate::policy::PolicyError;
 
-/// Length of the run for which the defaults of schedules are written [steps].
+/// Length of the run for which the defaults of schedules are written `[steps]`.
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
 /// Checks that a parameter is finite and in its range; for [`ConfiguredPolicy::new`]. The
@@ -89,15 +89,22 @@ pub(crate) fn parse_value(text: &str) -> Value {
     single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }
 
+/// Shortest interval that scaling leaves [steps]. Between two events rows must be seen from many
+/// views, and those just born must find their place: that takes as many steps in a short run as in
+/// a long one.
+pub(crate) const LEAST_INTERVAL: i64 = 100;
+
 /// Multiplies the step counts named in `names` by `iterations` / 30,000: rounded, at least 1, but
-/// 0 (which switches something off) stays 0.
+/// 0 (which switches something off) stays 0. Intervals, whose names end in `_every`, stop shrinking
+/// at [`LEAST_INTERVAL`].
 pub(crate) fn scale_steps(table: &mut Table, names: &[&str], iterations: u32) {
     for name in names {
         if let Some(Value::Integer(steps)) = table.get_mut(*name)
             && *steps > 0
         {
             let factor = f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
-            *steps = ((*steps as f64 * factor).round() as i64).max(1);
+            let least = if name.ends_with("_every") { (*steps).min(LEAST_INTERVAL) } else { 1 };
+            *steps = ((*steps as f64 * factor).round() as i64).max(least);
         }
     }
 }

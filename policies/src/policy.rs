@@ -20,6 +20,15 @@ pub trait DensityPolicy: Send {
     /// Whether this policy edits after the optimiser step of iteration `step` (1-based).
     fn is_due(&self, step: u32) -> bool;
 
+    /// Whether the plan of iteration `step`, at which the policy is due, may read the signals of
+    /// [fresh views](Needs::fresh_views), for a model of `rows` rows and this budget. Where not, no
+    /// view is rendered, and reading them is a [`PolicyError::Undeclared`]. Means nothing to a
+    /// policy without such needs.
+    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
+        let _ = (step, rows, budget);
+        true
+    }
+
     /// Writes this event's edits into `plan`. Pure in its arguments and the policy's own state:
     /// no device, no I/O, no other source of randomness than `rng`.
     ///
@@ -77,7 +86,8 @@ pub enum Signal {
     ScreenGradient,
     /// Sum over views of ‖Σ over pixels |dL/d(mean in NDC)|‖₂ (absolute per axis, AbsGS), >= 0.
     ScreenGradientAbs,
-    /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour before its clamp at 0, >= 0.
+    /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. The
+    /// gradient is taken before the mask of the colour's clamp at 0: a row clamped to black has one.
     ColourGradient,
     /// x of the sum over views of dL/d(mean) [1 / scene units].
     MeanGradientX,
@@ -89,6 +99,10 @@ pub enum Signal {
     MeanGradientNorm,
     /// Largest blend weight α·T over all pixels of the previous and the current epoch, in [0, 1].
     WeightMax,
+    /// Largest blend weight α·T over all pixels of freshly rendered training views, in [0, 1]. They
+    /// are chosen at random for this event, [`Needs::fresh_views`] of them, and rendered as the
+    /// model is now. 0 for a row that none of them shows.
+    FreshWeightMax,
     /// Sum of the blend weights α·T over all pixels, >= 0.
     WeightSum,
     /// Number of pixels the row was blended into, >= 0.
@@ -103,7 +117,7 @@ pub enum Signal {
 
 impl Signal {
     /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::VisibleCount,
         Self::ScreenGradient,
         Self::ScreenGradientAbs,
@@ -113,6 +127,7 @@ impl Signal {
         Self::MeanGradientZ,
         Self::MeanGradientNorm,
         Self::WeightMax,
+        Self::FreshWeightMax,
         Self::WeightSum,
         Self::PixelCount,
         Self::Opacity,
@@ -138,6 +153,12 @@ impl SignalSet {
         Self(self.0 | 1 << signal as u32)
     }
 
+    /// This set but for `signal`.
+    #[must_use]
+    pub fn without(self, signal: Signal) -> Self {
+        Self(self.0 & !(1 << signal as u32))
+    }
+
     /// Whether `signal` is in the set.
     #[must_use]
     pub fn contains(self, signal: Signal) -> bool {
@@ -157,6 +178,10 @@ pub struct Needs {
     pub signals: SignalSet,
     /// Per-pixel candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
+    /// Training views, drawn at random without replacement, that are rendered anew for each event
+    /// that [wants them](DensityPolicy::wants_fresh): all of them if there are fewer. Goes with
+    /// [`Signal::FreshWeightMax`]; 0 without it.
+    pub fresh_views: u32,
 }
 
 /// Which pixels of the training views to collect as places for new rows.
@@ -242,13 +267,13 @@ impl Signals {
         self.rows
     }
 
-    /// The column of `signal`, if present. Shape: [rows].
+    /// The column of `signal`, if present. Shape: `[rows]`.
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
         self.present.contains(signal).then(|| &self.columns[signal as usize][..])
     }
 
-    /// The column of `signal` for writing, if present. Shape: [rows].
+    /// The column of `signal` for writing, if present. Shape: `[rows]`.
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
         self.present.contains(signal).then(|| &mut self.columns[signal as usize][..])
     }
@@ -275,10 +300,11 @@ impl<'a> Snapshot<'a> {
         self.signals.rows()
     }
 
-    /// The values of `signal`. Shape: [rows].
+    /// The values of `signal`. Shape: `[rows]`.
     ///
     /// # Errors
-    /// [`PolicyError::Undeclared`] when the policy's needs did not list it.
+    /// [`PolicyError::Undeclared`] when the policy's needs did not list it, or when it is a fresh
+    /// one that the policy [did not want](DensityPolicy::wants_fresh) at this event.
     pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
         self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
     }
@@ -287,8 +313,9 @@ impl<'a> Snapshot<'a> {
 /// Why a policy cannot be built or cannot go on.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PolicyError {
-    /// A signal was read that [`DensityPolicy::needs`] did not list.
-    #[error("signal {signal:?} was read but not declared; list it in `needs`")]
+    /// A signal was read that [`DensityPolicy::needs`] did not list, or that
+    /// [`DensityPolicy::wants_fresh`] did not want at this event.
+    #[error("signal {signal:?} was read but not declared; list it in `needs`{}", and_ask(*.signal))]
     Undeclared {
         /// The signal in question.
         signal: Signal,
@@ -337,6 +364,13 @@ pub enum PolicyError {
     /// Anything else that makes going on pointless.
     #[error("{0}")]
     Other(String),
+}
+
+fn and_ask(signal: Signal) -> &'static str {
+    match signal {
+        Signal::FreshWeightMax => " with `fresh_views`, and want it at this event (`wants_fresh`)",
+        _ => "",
+    }
 }
 
 fn did_you_mean(nearest: Option<&str>) -> String {

@@ -21,7 +21,9 @@ pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
     type Params: Serialize + DeserializeOwned + Default;
 
     /// Integer parameters that count steps. Their defaults are written for a run of 30,000 and
-    /// scale with its length; what the user sets is taken as given.
+    /// scale with its length; what the user sets is taken as given. Those whose names end in
+    /// `_every` are intervals: they do not shrink below 100 steps (or below their default, if that
+    /// is less).
     const STEP_PARAMETERS: &'static [&'static str] = &[];
 
     /// Makes the policy. Check ranges here, with [`in_range`](crate::parameters::in_range).

@@ -8,7 +8,7 @@
 //! After every `grow_every` steps, between `grow_from` and `grow_until`:
 //!
 //! 1. Rows whose screen gradient g (mean over the views that saw them of the norm of the loss
-//!    gradient with respect to their mean on screen [NDC]) is at least `tau` need detail. Small ones
+//!    gradient with respect to their mean on screen (NDC)) is at least `tau` need detail. Small ones
 //!    (largest standard deviation at most `small` · scene extent) are cloned: an exact copy, at the
 //!    same place. Larger ones are split into two samples of themselves, smaller by `split_factor`.
 //! 2. Rows less opaque than `min_opacity` are pruned; after step `max_scale_from` also rows larger
@@ -47,7 +47,8 @@
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
 //! | governor | false | | | follow a growth curve rather than `tau` |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length.
+//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
+//! down to 100 steps at most.
 
 use std::ops::Bound::{Excluded, Unbounded};
 
@@ -118,7 +119,7 @@ pub struct Vanilla {
     params: VanillaParams,
     grow: Window,
     reset: Window,
-    /// The extra reset, if there is one [step].
+    /// The extra reset, if there is one `[step]`.
     white_reset: Option<u32>,
 }
 
@@ -163,7 +164,7 @@ impl DensityPolicy for Vanilla {
             Signal::Opacity,
             Signal::ScaleMax,
         ]);
-        Needs { signals, candidates: None }
+        Needs { signals, ..Needs::default() }
     }
 
     fn is_due(&self, step: u32) -> bool {

@@ -1,3 +1,5 @@
+//! Scales, colours and numbers of the first rows; where random points lie.
+
 use super::*;
 use crate::camera::Camera;
 use crate::sh::C0;

@@ -1,3 +1,5 @@
+//! Round trips, layouts of other programs, damaged files.
+
 use std::path::PathBuf;
 
 use super::*;

@@ -3,14 +3,18 @@
 //! `reference` is a second renderer in `f64` that shares no arithmetic with the backends;
 //! `oracle` holds both against stored float64 renders; `gradients`, `loss`, `signals` and
 //! `extremes` hold the backend against the reference on scenes of their own; `sameness` compares
-//! bits; `invariants` keeps the walls of ARCHITECTURE.md standing.
+//! bits; `edits` applies any plan to the backend and to a plain vector; `cli` runs the program on
+//! photographs of a small scene; `invariants` keeps the walls of ARCHITECTURE.md standing.
 
+mod cli;
 mod compare;
+mod edits;
 mod extremes;
 mod gradients;
 mod invariants;
 mod loss;
 mod oracle;
+mod photographs;
 mod reference;
 mod sameness;
 mod scenes;

@@ -95,7 +95,7 @@ fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64
 
 /// Runs one step per view and takes the signals.
 fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
-    let needs = Needs { signals: SignalSet::of(wanted), candidates: None };
+    let needs = Needs { signals: SignalSet::of(wanted), ..Needs::default() };
     let mut options = subject::options(views.model.len(), Resources::default());
     options.needs = needs.clone();
     let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
@@ -160,7 +160,7 @@ fn every_signal_whatever_else_is_asked_for() {
 fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let views = views();
     let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
-    let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), candidates: None };
+    let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), ..Needs::default() };
     let now = |backend: &mut CpuBackend| {
         let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
         signals.get(Signal::WeightMax).expect("a requested signal").to_vec()

@@ -57,6 +57,13 @@ pub(super) struct Scenario {
     pattern: Pattern,
 }
 
+impl Scenario {
+    /// The budget of the plan for a model of `rows` rows.
+    fn budget(&self, rows: usize) -> usize {
+        if self.refuses { rows } else { self.scene.budget }
+    }
+}
+
 impl fmt::Display for Scenario {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}, statistics {:?}, {} steps", self.name, self.pattern, self.scene.iterations)
@@ -116,6 +123,13 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     if needs != policy.needs(scene) || needs != twins[0].1.needs(scene) {
         return Err((Check::Repeats, "its needs change".to_owned()));
     }
+    let has_fresh_signal = needs.signals.contains(Signal::FreshWeightMax);
+    if has_fresh_signal != (needs.fresh_views > 0) {
+        let (views, verb) =
+            (needs.fresh_views, if has_fresh_signal { "asks" } else { "does not ask" });
+        let why = format!("it {verb} for FreshWeightMax, but for {views} fresh views");
+        return Err((Check::AsksForWhole, why));
+    }
     let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
     let mut model = Model { rows: scene.initial_rows, candidates: Vec::new() };
     let events = due.len().min(MOST_EVENTS);
@@ -125,11 +139,17 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
         if event == events / 3 || event == 2 * events / 3 {
             twins.push((Check::Remembers, restored(&*policy, build()?).map_err(at)?));
         }
-        let seen = model.observe(scenario, step, &needs);
+        let wants_fresh =
+            |policy: &dyn DensityPolicy| policy.wants_fresh(step, rows, scenario.budget(rows));
+        let fresh = wants_fresh(&*policy);
+        let seen = model.observe(scenario, step, &needs, fresh);
         let ops = plan(&mut *policy, scenario, &seen, false).map_err(at)?;
         for (check, twin) in &mut twins {
             if !twin.is_due(step) {
                 return Err(at((*check, "a copy is not due at this step".to_owned())));
+            }
+            if wants_fresh(&**twin) != fresh {
+                return Err(at((*check, "a copy does not agree on fresh views".to_owned())));
             }
             let sees_all = *check == Check::ReadsOnlyWhatItDeclares;
             let again = plan(&mut **twin, scenario, &seen, sees_all).map_err(at)?;
@@ -161,7 +181,7 @@ struct Seen {
 }
 
 impl Model {
-    fn observe(&mut self, scenario: &Scenario, step: u32, needs: &Needs) -> Seen {
+    fn observe(&mut self, scenario: &Scenario, step: u32, needs: &Needs, fresh: bool) -> Seen {
         let rng = PolicyRng::new(7, step);
         let pattern = match scenario.pattern {
             Pattern::Changing => PATTERNS[step as usize % (PATTERNS.len() - 1)],
@@ -177,7 +197,9 @@ impl Model {
             }
             signals
         };
-        let (declared, all) = (fill(needs.signals), fill(SignalSet::of(&Signal::ALL)));
+        let unwanted = needs.signals.without(Signal::FreshWeightMax);
+        let declared = fill(if fresh { needs.signals } else { unwanted });
+        let all = fill(SignalSet::of(&Signal::ALL));
         let capacity = needs.candidates.map_or(5, |request| request.capacity);
         for index in 0..capacity.saturating_sub(self.candidates.len()).min(5) as u32 {
             let values = |part: u32| {
@@ -238,7 +260,7 @@ fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
         Signal::ColourGradient => 1e-3 * u.powi(3),
         Signal::MeanGradientX | Signal::MeanGradientY | Signal::MeanGradientZ => 1e-3 * (u - 0.5),
         Signal::MeanGradientNorm => 2e-3 * u,
-        Signal::WeightMax => u,
+        Signal::WeightMax | Signal::FreshWeightMax => u,
         Signal::WeightSum | Signal::PixelCount => (1000.0 * u).floor(),
         Signal::Opacity => 0.99 * u.powi(3) + 1e-3,
         Signal::ScaleMax => 0.15 * scene.extent * u.powi(3) + 1e-6,
@@ -262,7 +284,7 @@ fn plan(
         candidates: if has_candidates { &seen.candidates } else { &[] },
     };
     let rows = now.rows();
-    let budget = if scenario.refuses { rows } else { scenario.scene.budget };
+    let budget = scenario.budget(rows);
     let mut plan = EditPlan::new(rows, budget);
     let rng = PolicyRng::new(3, seen.step);
     let planned = guarded(|| policy.plan(&now, &rng, &mut plan));

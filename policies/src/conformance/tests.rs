@@ -1,3 +1,5 @@
+//! The registered policies conform; policies with one fault each are caught.
+
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::{Deserialize, Serialize};
@@ -30,6 +32,9 @@ fn every_choice_of_the_built_in_policies_conforms() {
         ("diet", "rho_c = 0.0\nrho = 0.0\ntau = 0.0"),
         // All windows at once.
         ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
+        ("diet", "importance = \"fresh\""),
+        ("diet", "importance = \"fresh\"\ncompensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
+        ("diet", "importance = \"fresh\"\ngrowth = \"all\"\nrho_c = 1.0\nfresh_views = 1"),
     ];
     for (name, set) in choices {
         let entry = crate::registry::find(name).unwrap();
@@ -63,9 +68,13 @@ enum Fault {
     PrunesAll,
     SwapsItsPlan,
     NeedsAtWhim,
+    ReadsFreshUnasked,
+    RendersNothing,
+    RendersForNothing,
+    WantsFreshAtWhim,
 }
 
-const FAULTS: [(Fault, Option<Check>); 12] = [
+const FAULTS: [(Fault, Option<Check>); 16] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
     (Fault::PeeksIfItCan, Some(Check::ReadsOnlyWhatItDeclares)),
@@ -78,6 +87,10 @@ const FAULTS: [(Fault, Option<Check>); 12] = [
     (Fault::PrunesAll, Some(Check::LeavesARow)),
     (Fault::SwapsItsPlan, Some(Check::KeepsItsPlan)),
     (Fault::NeedsAtWhim, Some(Check::Repeats)),
+    (Fault::ReadsFreshUnasked, Some(Check::ReadsOnlyWhatItDeclares)),
+    (Fault::RendersNothing, Some(Check::AsksForWhole)),
+    (Fault::RendersForNothing, Some(Check::AsksForWhole)),
+    (Fault::WantsFreshAtWhim, Some(Check::Repeats)),
 ];
 
 /// Randomness that belongs to nobody.
@@ -119,11 +132,21 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         if self.has(Fault::NeedsAtWhim) && roll().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
-        Needs { signals, candidates: None }
+        let fresh = [Fault::None, Fault::ReadsFreshUnasked].contains(&FAULTS[FAULT].0);
+        if fresh || self.has(Fault::RendersNothing) {
+            signals = signals.with(Signal::FreshWeightMax);
+        }
+        let fresh_views = if fresh || self.has(Fault::RendersForNothing) { 3 } else { 0 };
+        Needs { signals, fresh_views, candidates: None }
     }
 
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(5)
+    }
+
+    fn wants_fresh(&self, step: u32, _rows: usize, _budget: usize) -> bool {
+        let at_whim = self.has(Fault::WantsFreshAtWhim) && roll().is_multiple_of(2);
+        at_whim || step.is_multiple_of(15)
     }
 
     fn plan(
@@ -134,6 +157,14 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     ) -> Result<(), PolicyError> {
         self.events += 1;
         let opacity = now.signal(Signal::Opacity)?;
+        let reads_fresh = match FAULTS[FAULT].0 {
+            Fault::None => now.step.is_multiple_of(15),
+            Fault::ReadsFreshUnasked => now.step.is_multiple_of(10),
+            _ => false,
+        };
+        if reads_fresh {
+            now.signal(Signal::FreshWeightMax)?;
+        }
         let gradient = now.signal(Signal::ScreenGradient)?;
         let rows: Vec<u32> = (0..now.rows() as u32).collect();
         if self.has(Fault::SwapsItsPlan) {
@@ -212,6 +243,10 @@ fn every_fault_is_found() {
         faulty::<9>(),
         faulty::<10>(),
         faulty::<11>(),
+        faulty::<12>(),
+        faulty::<13>(),
+        faulty::<14>(),
+        faulty::<15>(),
     ];
     let mut missed = Vec::new();
     for (entry, (fault, expected)) in entries.iter().zip(FAULTS) {

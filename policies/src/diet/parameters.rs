@@ -29,6 +29,7 @@ pub struct DietParams {
     pub max_scale: f64,
     pub max_scale_from: u32,
     pub importance: Importance,
+    pub fresh_views: u32,
     pub protect: u32,
     pub prune_every: u32,
     pub compensate_from: u32,
@@ -86,7 +87,7 @@ pub enum CloneOpacity {
 pub enum Importance {
     /// Largest blend weight in the training renders of the previous and the current epoch.
     Epochs,
-    /// Largest blend weight in fresh renders of random training views; not available yet.
+    /// Largest blend weight in fresh renders of `fresh_views` random training views.
     Fresh,
 }
 
@@ -120,6 +121,7 @@ impl Default for DietParams {
             max_scale: 0.1,
             max_scale_from: 3000,
             importance: Importance::Epochs,
+            fresh_views: 100,
             protect: 100,
             prune_every: 50,
             compensate_from: 10_000,
@@ -150,6 +152,7 @@ impl DietParams {
         in_range("kappa", self.kappa, 0.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", self.max_scale, (Excluded(0.0), Unbounded))?;
+        in_range("fresh_views", f64::from(self.fresh_views), 1.0..)?;
         // `Signal::Age` goes no further.
         in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;
         in_range("rho_c", self.rho_c, 0.0..=1.0)?;
@@ -159,13 +162,6 @@ impl DietParams {
         // As the f32 that the plan will check.
         let newborn_opacity = f64::from(self.newborn_opacity as f32);
         in_range("newborn_opacity", newborn_opacity, (Excluded(0.0), Excluded(1.0)))?;
-        if self.importance == Importance::Fresh {
-            return Err(bad(
-                "importance",
-                "`fresh` is not available yet: it needs renders of training views, for which a \
-                 policy cannot ask; use `epochs`",
-            ));
-        }
         if self.reinit_at != 0 {
             return Err(bad(
                 "reinit_at",

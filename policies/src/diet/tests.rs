@@ -111,6 +111,37 @@ fn the_last_row_lives() {
 }
 
 #[test]
+fn importance_may_be_that_of_fresh_views() {
+    // By epochs rows 0 and 1 matter least; in the fresh views row 4, a candidate, then 6 and 2.
+    let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
+    let event = event(600, 8, 8)
+        .with(Signal::ScreenGradient, &wanting(8, &[4, 7]))
+        .with(Signal::FreshWeightMax, &fresh);
+    assert_eq!(run(&event, "rho = 0.25").pruned, [0, 1]);
+    assert_eq!(run(&event, "rho = 0.25\nimportance = \"fresh\"").pruned, [2, 6]);
+    let over = Event { budget: 5, ..event.clone() };
+    assert_eq!(run(&over, "rho = 0\nimportance = \"fresh\"").pruned, [2, 4, 6]);
+    let mut inserting = Event { step: 10_500, ..event };
+    inserting.candidates = vec![candidate(0.1, 0.01), candidate(0.2, 0.01)];
+    assert_eq!(run(&inserting, "rho_c = 0.25\nimportance = \"fresh\"").pruned, [4, 6]);
+}
+
+#[test]
+fn fresh_views_are_wanted_where_victims_may_fall() {
+    let scene = Event::new(1, 1, 100).scene;
+    let policy = diet(&scene, "importance = \"fresh\"");
+    let wants = |step, rows| policy.wants_fresh(step, rows, 100);
+    // Growth may double the rows.
+    assert_eq!([50, 51, 100].map(|rows| wants(600, rows)), [false, true, true]);
+    // An insertion adds up to 5.
+    assert_eq!([95, 96, 100].map(|rows| wants(10_500, rows)), [false, true, true]);
+    // Pruning is for models that are too large.
+    assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
+    let both = diet(&scene, "importance = \"fresh\"\ncompensate_from = 500");
+    assert_eq!([47, 48].map(|rows| both.wants_fresh(1000, rows, 100)), [false, true]);
+}
+
+#[test]
 fn newborns_are_protected_for_an_epoch() {
     let mut age = [1000.0; 20];
     age[..5].copy_from_slice(&[0.0, 99.0, 100.0, 29.0, 30.0]);
@@ -323,6 +354,15 @@ fn only_what_is_used_is_asked_for() {
     use Signal::{Opacity, ScaleMax, ScreenGradient, VisibleCount, WeightMax};
     assert_eq!(listed, [VisibleCount, ScreenGradient, WeightMax, Opacity, ScaleMax]);
     assert_eq!(lean.candidates, None);
+    let fresh = |needs: &Needs| (needs.fresh_views, needs.signals.contains(Signal::FreshWeightMax));
+    assert_eq!(fresh(&full), (0, false));
+    let renders = needs("importance = \"fresh\"");
+    assert_eq!(fresh(&renders), (100, true));
+    assert!(!renders.signals.contains(WeightMax));
+    assert_eq!(fresh(&needs("importance = \"fresh\"\nfresh_views = 7")), (7, true));
+    // Views are no steps: a shorter run renders as many.
+    let short = SceneInfo { iterations: 3000, ..scene.clone() };
+    assert_eq!(fresh(&diet(&short, "importance = \"fresh\"").needs(&short)), (100, true));
     assert!(!needs("shift = \"paper\"").signals.contains(Signal::MeanGradientNorm));
     let switched =
         needs("error = \"grad\"\ndepth = \"median\"\nnms = false\nrows_per_candidate = 1");
@@ -356,6 +396,8 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
         "min_opacity = -1",
         "max_scale = 0",
         "protect = 65536",
+        "fresh_views = 0",
+        "importance = \"views\"",
         "rho_c = 2",
         "rows_per_candidate = 0",
         "min_alpha = 1.5",
@@ -368,6 +410,5 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
     ] {
         refused(set);
     }
-    assert!(refused("importance = \"fresh\"").contains("not available yet"));
     assert!(refused("reinit_at = 5000").contains("5000 is not available yet"));
 }

@@ -1,3 +1,5 @@
+//! Compiled edits that hold, and every way in which one may be corrupt.
+
 use super::*;
 use crate::edit::{OpacityRule, Placement, ScaleRule};
 use crate::plan::EditPlan;

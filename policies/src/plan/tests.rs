@@ -1,3 +1,5 @@
+//! Fates, room and refusals of a plan; any plan against a plain vector.
+
 use super::*;
 use proptest::prelude::*;
 

@@ -1,3 +1,5 @@
+//! Sets of signals, and what a policy may not read.
+
 use super::*;
 
 #[test]
@@ -14,6 +16,8 @@ fn a_set_holds_what_was_put_in() {
     let listed: Vec<Signal> = set.iter().collect();
     assert_eq!(listed, [Signal::VisibleCount, Signal::Opacity, Signal::Age]);
     assert_eq!(set.with(Signal::Age), set);
+    assert_eq!(set.without(Signal::Age), SignalSet::of(&[Signal::VisibleCount, Signal::Opacity]));
+    assert_eq!(set.without(Signal::WeightMax), set);
     assert!(!set.contains(Signal::WeightMax) && !SignalSet::default().contains(Signal::Age));
 }
 

@@ -1,3 +1,5 @@
+//! Names, manuals and parameters of registered policies.
+
 use serde::Deserialize;
 
 use super::*;

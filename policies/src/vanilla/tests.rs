@@ -1,3 +1,5 @@
+//! The rules of the original, one event at a time.
+
 use super::*;
 use crate::event::{Event, Outcome};
 use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule};

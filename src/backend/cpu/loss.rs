@@ -270,6 +270,14 @@ fn vertical<S: Simd, const N: usize>(
     sums
 }
 
+/// Zeros for line `l`, outside the image, of `N` quantities. The scratch holds another strip's.
+fn clear_line<const N: usize>(blurred: &mut [f32], lines: usize, l: usize, stride: usize) {
+    for quantity in 0..N {
+        let first = (quantity * lines + l) * stride;
+        blurred[first..first + stride].fill(0.0);
+    }
+}
+
 /// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
 struct Similarity<'a> {
     grid: &'a Grid,
@@ -297,7 +305,6 @@ impl WithSimd for Similarity<'_> {
         let (width, height) = (grid.width, grid.height);
         let rows = p1.len() / stride;
         let lines = rows + 2 * REACH;
-        scratch.clear();
         scratch.resize((3 + 5 * lines) * stride, 0.0);
         let (products, blurred) = scratch.split_at_mut(3 * stride);
         let (ee, rest) = products.split_at_mut(stride);
@@ -305,6 +312,7 @@ impl WithSimd for Similarity<'_> {
         let columns = (PAD..PAD + width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         for l in 0..lines {
             let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < height) else {
+                clear_line::<5>(blurred, lines, l, stride);
                 continue;
             };
             let line_e = &e[row * stride..(row + 1) * stride];
@@ -400,11 +408,11 @@ impl WithSimd for Gradient<'_> {
             self;
         let rows = STRIP.min(grid.height - first);
         let lines = rows + 2 * REACH;
-        scratch.clear();
         scratch.resize(3 * lines * stride, 0.0);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         for l in 0..lines {
             let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < grid.height) else {
+                clear_line::<3>(scratch, lines, l, stride);
                 continue;
             };
             for at in columns.clone() {

@@ -91,18 +91,19 @@ impl Rows {
     pub(super) fn set<S: Simd>(&mut self, s: S, splat: &Splat, place: &TilePlace) {
         let c = |x: f32| V::splat(s, x);
         let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
-        // Rows whose centre y + ½ lies in my ± half_height, with slack for rounding.
-        let first = (my - splat.half_height * 1.0001 - 0.52).ceil().max(0.0) as u32;
-        let last = (my + splat.half_height * 1.0001 - 0.48).floor().min(15.0);
-        let end = if last < 0.0 { 0 } else { last as u32 + 1 };
-        self.mask = if first < end { (1 << end) - (1 << first) } else { 0 };
+        self.mask = 0;
         for at in (0..WIDTH).step_by(S::F32_LANES) {
             let dy = V::load(s, &CENTRES[at..]) - my;
             let z = dy * splat.l3;
-            z.store(&mut self.z[at..]);
-            z.neg_mul_add(z, c(splat.log2_opacity)).store(&mut self.top[at..]);
+            let top = z.neg_mul_add(z, c(splat.log2_opacity));
             let shift = c(splat.shear).mul_add(dy, c(mx));
+            z.store(&mut self.z[at..]);
+            top.store(&mut self.top[at..]);
             (shift * -splat.l1).store(&mut self.offset[at..]);
+            // Least |x − shift| of the tile's pixel centres, ½ … 15½, with slack for rounding.
+            let nearest = ((shift - 8.0).abs() * 0.9999 - 7.51).max(V::zero(s)) * splat.l1;
+            let reached = (nearest * nearest).le(top + (LOG2_255 + 1e-3));
+            self.mask |= reached.bits() << at;
         }
     }
 }

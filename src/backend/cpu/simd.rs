@@ -211,6 +211,20 @@ impl<S: Simd> Mask<S> {
         self.select(yes, V::zero(self.s))
     }
 
+    /// Bit i: lane i. AVX-512 masks are bits already; others have all bits of a lane set or none.
+    #[inline(always)]
+    pub(super) fn bits(self) -> u32 {
+        let bytes = pulp::bytemuck::bytes_of(&self.m);
+        if let [low, high] = *bytes {
+            return u32::from(u16::from_le_bytes([low, high]));
+        }
+        let mut bits = 0;
+        for (lane, bytes) in bytes.chunks_exact(size_of::<f32>()).enumerate() {
+            bits |= u32::from(bytes[0] & 1) << lane;
+        }
+        bits
+    }
+
     #[inline(always)]
     pub(super) fn any(self) -> bool {
         self.s.first_true_m32s(self.m) < S::F32_LANES

@@ -30,7 +30,9 @@ pub(super) fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table,
             }
         }
     }
-    for (policy, table) in parse_overrides(&args.policy_set)? {
+    let overrides = parse_overrides(&args.policy_set)
+        .map_err(|error| Failure::input(format!("--policy-set: {error}")))?;
+    for (policy, table) in overrides {
         if find(&policy)?.name != entry.name {
             return Err(Failure::input(format!(
                 "--policy-set sets a parameter of `{policy}`, but the policy of this run is `{}`; \
@@ -43,9 +45,11 @@ pub(super) fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table,
     Ok(set)
 }
 
-/// Default learning rates, overlaid with `NAME=RATE` settings.
-pub(super) fn learning_rates(settings: &[String]) -> Result<RateOptions, Failure> {
-    let mut table = Table::new();
+/// Default learning rates for so many iterations, overlaid with `NAME=RATE` settings, which are
+/// taken as given.
+pub(super) fn learning_rates(settings: &[String], iterations: u32) -> Result<RateOptions, Failure> {
+    let defaults = Table::try_from(RateOptions::for_run(iterations));
+    let mut table = defaults.map_err(|e| Failure::input(format!("--lr: {e}")))?;
     for setting in settings {
         let value = setting
             .split_once('=')
@@ -87,7 +91,8 @@ mod tests {
 
     #[test]
     fn learning_rates_by_name() {
-        let rates = learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()]).unwrap();
+        let rates =
+            learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()], 30_000).unwrap();
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
         assert_eq!(rates, expected);
         for (bad, part) in [
@@ -97,7 +102,7 @@ mod tests {
             ("quat=0", "quat"),
             ("quat=inf", "quat"),
         ] {
-            let message = learning_rates(&[bad.into()]).unwrap_err().message;
+            let message = learning_rates(&[bad.into()], 30_000).unwrap_err().message;
             assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
         }
     }

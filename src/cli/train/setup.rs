@@ -46,7 +46,7 @@ pub(super) struct Prepared {
 pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, Failure> {
     let entry = find(&args.policy)?;
     let parameters = parameters(args, entry)?;
-    let rates = learning_rates(&args.lr)?;
+    let rates = learning_rates(&args.lr, args.iterations)?;
     check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
     check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
     let output = args.output.clone().unwrap_or_else(|| default_output(&args.scene, &args.policy));

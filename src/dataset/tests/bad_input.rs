@@ -1,5 +1,5 @@
-//! Every fault is an error that names the file, the place and a remedy; never a panic. One file,
-//! although long: a table row per fault reads best beside the others.
+//! Every fault is an error that names the file, the place and a remedy; never a panic.
+//! The file is one piece because a table row per fault reads best beside the others.
 
 use std::num::NonZeroU32;
 

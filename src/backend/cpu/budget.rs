@@ -1,0 +1,70 @@
+//! The memory of the native backend: bytes per buffer, and the reservation before training.
+
+use super::CpuOptions;
+use super::adam::BiasCorrection;
+use super::blocks::{Blocks, planes};
+use super::candidates::Candidates;
+use super::loss::LossBuffers;
+use super::project::Splat;
+use super::rasterize::TileCanvas;
+use super::rasterize_bwd::TileGradient;
+use super::signals::Accumulators;
+use super::simd::WIDTH;
+use super::tiles::{Grid, TileLists};
+use crate::backend::BackendError;
+use crate::memory::{Ledger, Section};
+
+/// A single tile's list holds each row at most once, so that the budget is always enough.
+pub(super) fn tile_cap(options: &CpuOptions) -> usize {
+    options.tile_cap.max(options.budget).max(1).min(u32::MAX as usize)
+}
+
+/// Bytes per buffer for these options.
+pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
+    let budget = options.budget.max(1);
+    let cap = tile_cap(options) as u64;
+    let needs = &options.needs;
+    let stride = Accumulators::new(1, needs.signals).detail().stride();
+    let per_row = planes(sh_degree);
+    let padded = budget.next_multiple_of(WIDTH) as u64;
+    let (width, height) = options.largest_image;
+    let grid = Grid::new(width, height);
+    let float = size_of::<f32>() as u64;
+    let mut ledger = Ledger::default();
+    ledger.add_to(Section::Model, "parameters", Blocks::bytes(budget, per_row));
+    ledger.add_to(Section::Model, "optimiser moments", 2 * Blocks::bytes(budget, per_row));
+    ledger.add_to(
+        Section::Model,
+        "optimiser ages and bias tables",
+        padded * 2 + BiasCorrection::bytes(),
+    );
+    ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs.signals));
+    ledger.add_to(
+        Section::Policy,
+        "candidates",
+        Candidates::bytes(needs.candidates, grid.width * grid.height),
+    );
+    ledger.add_to(
+        Section::Renderer,
+        "projected splats",
+        budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
+    );
+    ledger.add_to(Section::Gradients, "splat gradients", padded * stride as u64 * float);
+    ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
+    ledger.add_to(Section::Tiles, "gradients per entry", cap * stride as u64 * float);
+    let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
+    ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
+    ledger.add_to(Section::Renderer, "loss", LossBuffers::bytes(grid.width, grid.height, threads));
+    ledger
+}
+
+/// Asks for all of the ledger at once and gives it back, so that a refusal is an error before
+/// training and not an abort within it.
+pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
+    let bytes = ledger.total();
+    let failed = BackendError::OutOfMemory { what: "the training buffers", bytes };
+    let Ok(size) = usize::try_from(bytes) else {
+        return Err(failed);
+    };
+    Vec::<u8>::new().try_reserve_exact(size).map_err(|_| failed)
+}

@@ -1,0 +1,311 @@
+//! The passes over a view: forward, image loss, backward, optimiser and candidates. They cut the
+//! work into tasks for the pool, at fixed places, and run the stages' kernels on them.
+
+use std::ops::Range;
+
+use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
+use rayon::prelude::*;
+
+use super::candidates;
+use super::loss::LossValue;
+use super::optimise::Optimise;
+use super::project::{Project, ViewParams};
+use super::rasterize::{
+    CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
+};
+use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
+use super::simd::WIDTH;
+use super::tiles::{Grid, TILE, Visible};
+use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
+use crate::backend::{BackendError, Rendering, StepInput, StepOutput};
+use crate::camera::Camera;
+use crate::dataset::images::Image8;
+
+/// One view between its forward and its backward pass.
+pub(super) struct Frame {
+    pub(super) view: ViewParams,
+    pub(super) grid: Grid,
+    pub(super) background: [f32; 3],
+    pub(super) bands: Vec<Range<usize>>,
+    pub(super) entries: u64,
+    pub(super) visible: usize,
+}
+
+impl CpuBackend {
+    pub(super) fn resize_images(&mut self, grid: &Grid) {
+        self.canvas.resize(grid.tiles(), TileCanvas::EMPTY);
+        self.gradient.resize(grid.tiles(), TileGradient { planes: [DARK; 5] });
+    }
+
+    pub(super) fn image_loss(
+        &mut self,
+        grid: &Grid,
+        target: &Image8,
+        background: [f32; 3],
+        error_weights: Option<[f32; 2]>,
+    ) -> LossValue {
+        let Self { pool, loss, arch, canvas, gradient, clock, .. } = self;
+        let value = pool
+            .install(|| loss.run(*arch, grid, canvas, target, background, gradient, error_weights));
+        clock.lap("loss");
+        value
+    }
+
+    /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band only, the
+    /// lists hold its entries.
+    pub(super) fn forward(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        with_depth: bool,
+    ) -> Result<Frame, BackendError> {
+        if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
+            return Err(BackendError::ImageTooLarge {
+                width: camera.width,
+                height: camera.height,
+                max: MAX_SIDE,
+            });
+        }
+        let grid = Grid::new(camera.width, camera.height);
+        self.resize_images(&grid);
+        let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
+        let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, clock, .. } =
+            self;
+        clock.start();
+        let (rows, arch) = (*rows, *arch);
+        let stride = params.stride();
+        pool.install(|| {
+            (
+                params.of_rows(rows).par_chunks(stride * BLOCKS_PER_TASK),
+                splats[..rows].par_chunks_mut(ROWS_PER_TASK),
+                seen.par_chunks_mut(BLOCKS_PER_TASK),
+            )
+                .into_par_iter()
+                .for_each(|(params, splats, seen)| {
+                    let rows = splats.len();
+                    arch.dispatch(Project { view: &view, params, stride, rows, splats, seen });
+                });
+            clock.lap("project");
+            let visible = Visible { splats: &splats[..rows], seen };
+            let (bands, entries) = lists.bands(visible, &grid);
+            for band in &bands {
+                lists.fill(visible, &grid, band.clone(), bands.len() == 1);
+                clock.lap("tiles");
+                let tiles = canvas[band.clone()].par_iter_mut().enumerate();
+                tiles.for_each_init(Vec::new, |scratch, (i, canvas)| {
+                    lists.sort(i, scratch);
+                    arch.dispatch(Rasterize {
+                        splats,
+                        list: lists.of_tile(i),
+                        place: TilePlace::new(&grid, band.start + i),
+                        background,
+                        with_depth,
+                        canvas,
+                    });
+                });
+                clock.lap("rasterize");
+            }
+            let visible =
+                seen[..rows.div_ceil(WIDTH)].iter().map(|s| s.count_ones() as usize).sum();
+            Ok(Frame { view, grid, background, bands, entries, visible })
+        })
+    }
+
+    /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
+    pub(super) fn backward(&mut self, frame: &Frame, detail: Detail) {
+        let Frame { grid, background, bands, .. } = frame;
+        let Self {
+            pool,
+            arch,
+            lists,
+            splats,
+            records,
+            sums,
+            visible,
+            canvas,
+            gradient,
+            clock,
+            rows,
+            ..
+        } = self;
+        let stride = detail.stride();
+        pool.install(|| {
+            for band in bands {
+                if bands.len() > 1 {
+                    lists.refill(Visible { splats: &splats[..*rows], seen: visible }, grid, band);
+                }
+                (0..band.len()).into_par_iter().for_each(|i| {
+                    let tile = band.start + i;
+                    let [r, g, b, alpha, depth] = &gradient[tile].planes;
+                    arch.dispatch(RasterizeBwd {
+                        splats,
+                        list: lists.of_tile(i),
+                        place: TilePlace::new(grid, tile),
+                        background: *background,
+                        canvas: &canvas[tile],
+                        upstream: [r, g, b],
+                        upstream_more: (detail == Detail::All).then_some([alpha, depth]),
+                        detail,
+                        records,
+                    });
+                });
+                clock.lap("rasterize_bwd");
+                let first = band.start == 0;
+                let records = &records[..];
+                sums.par_chunks_mut(stride * WIDTH).zip(&visible[..]).enumerate().for_each(
+                    |(block, (sums, &seen))| {
+                        for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
+                            if first {
+                                sum.fill(0.0);
+                            }
+                            if seen >> lane & 1 == 1 {
+                                let slots = lists.slots_of_row(block * WIDTH + lane);
+                                let mine = &records[slots.start * stride..slots.end * stride];
+                                gather(sum, detail, mine);
+                            }
+                        }
+                    },
+                );
+                clock.lap("gather");
+            }
+        });
+    }
+
+    /// Adds the worst pixels of the view to the candidates.
+    pub(super) fn collect_candidates(
+        &mut self,
+        frame: &Frame,
+        target: &Image8,
+        request: &CandidateRequest,
+        count: usize,
+    ) {
+        let Frame { grid, bands, background, view, .. } = frame;
+        let Self { lists, splats, params, canvas, gradient, loss, candidates, visible, .. } = self;
+        let visible = Visible { splats: &splats[..self.rows], seen: visible };
+        let place = |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, y % TILE, x % TILE);
+        let error = |x: usize, y: usize| {
+            let (tile, y_in, x_in) = place(x, y);
+            let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][y_in][x_in];
+            (alpha >= request.min_alpha).then(|| match request.error {
+                ErrorMode::Gradient => {
+                    let g = |channel: usize| gradient[tile].planes[channel][y_in][x_in];
+                    (g(0) * g(0) + g(1) * g(1) + g(2) * g(2)).sqrt()
+                }
+                ErrorMode::L1 | ErrorMode::L1Dssim => loss.error_at(x, y),
+            })
+        };
+        let worst = candidates.worst(grid.width, grid.height, count, request.spaced, error);
+        let focal = 0.5 * (view.focal[0] + view.focal[1]);
+        for band in bands {
+            let here = |&&(x, y, _): &&(usize, usize, f32)| band.contains(&place(x, y).0);
+            if worst.iter().find(here).is_some() && bands.len() > 1 {
+                lists.refill(visible, grid, band);
+            }
+            for &(x, y, error) in worst.iter().filter(here) {
+                let at = [x as f32 + 0.5, y as f32 + 0.5];
+                let list = lists.of_tile(place(x, y).0 - band.start);
+                let surface = candidates::surface_row(splats, list, at, request.depth)
+                    .and_then(|row| candidates::closest_approach(params, row, view, at));
+                if let Some((position, depth)) = surface {
+                    candidates.push(Candidate {
+                        position: position.to_array(),
+                        colour: target.composited(x, y, *background),
+                        pixel_size: depth / focal,
+                        error,
+                    });
+                }
+            }
+        }
+    }
+
+    pub(super) fn rendering(&self, frame: &Frame) -> Rendering {
+        let grid = &frame.grid;
+        let pixels = grid.width * grid.height;
+        let mut out = Rendering {
+            width: grid.width as u32,
+            height: grid.height as u32,
+            rgb: vec![0.0; 3 * pixels],
+            alpha: vec![0.0; pixels],
+            depth: vec![0.0; pixels],
+        };
+        for (tile, canvas) in self.canvas.iter().enumerate() {
+            for_each_pixel(grid, tile, |y, x, at| {
+                for channel in 0..3 {
+                    out.rgb[3 * at + channel] = canvas.planes[channel][y][x];
+                }
+                out.alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][y][x];
+                out.depth[at] = canvas.planes[DEPTH][y][x];
+            });
+        }
+        out
+    }
+
+    /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
+    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>, detail: Detail) {
+        let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
+            self;
+        let (rows, arch) = (*rows, *arch);
+        let [m, v] = moments;
+        let layout = signals.layout();
+        let (stride, signal_stride) = (params.stride(), signals.blocks.stride());
+        let blocks = rows.div_ceil(WIDTH);
+        let mut signal_blocks: Vec<&mut [f32]> = if signal_stride == 0 {
+            (0..blocks.div_ceil(BLOCKS_PER_TASK)).map(|_| Default::default()).collect()
+        } else {
+            let per_task = signal_stride * BLOCKS_PER_TASK;
+            signals.blocks.of_rows_mut(rows).chunks_mut(per_task).collect()
+        };
+        pool.install(|| {
+            (
+                params.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
+                m.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
+                v.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
+                ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
+                signal_blocks.par_iter_mut(),
+                sums[..blocks * WIDTH * detail.stride()]
+                    .par_chunks(ROWS_PER_TASK * detail.stride()),
+                visible[..blocks].par_chunks(BLOCKS_PER_TASK),
+            )
+                .into_par_iter()
+                .for_each(|(params, m, v, ages, signals, sums, visible)| {
+                    arch.dispatch(Optimise {
+                        params,
+                        moments: [m, v],
+                        stride,
+                        ages,
+                        signals,
+                        layout,
+                        sums,
+                        detail,
+                        visible,
+                        view: &frame.view,
+                        rates: &input.rates,
+                        bias,
+                    });
+                });
+        });
+    }
+}
+
+/// Calls `f(y, x within the tile, pixel of the image)` for every pixel of a tile inside the image.
+pub(super) fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize, usize)) {
+    let place = TilePlace::new(grid, tile);
+    for y in 0..place.height {
+        for x in 0..place.width {
+            let at = (place.y as usize + y) * grid.width + place.x as usize + x;
+            f(y, x, at);
+        }
+    }
+}
+
+pub(super) fn scalars(value: LossValue) -> StepOutput {
+    StepOutput {
+        loss: value.loss() as f32,
+        l1: value.l1 as f32,
+        ssim: value.ssim as f32,
+        ..StepOutput::default()
+    }
+}
+
+const _: () = assert!(CANVAS_PLANES == 5, "a tile's gradient mirrors its canvas");

@@ -1,0 +1,132 @@
+//! `densify eval`, `render` and `policies`: looking at what was trained.
+
+use std::path::Path;
+
+use super::{densify, files, json, scratch, text, train};
+use crate::photographs::{Photographs, SIZE, VIEWS, name};
+
+const ITERATIONS: u32 = 40;
+
+fn run_of(scene: &Photographs, run: &Path) {
+    train(scene.path(), run, ITERATIONS, "--budget 320 --eval --quiet").ok();
+}
+
+/// Fails unless all numbers of two JSON documents agree to `tolerance`, and all else is equal.
+fn agree(a: &serde_json::Value, b: &serde_json::Value, tolerance: f64) {
+    use serde_json::Value::{Number, Object};
+    match (a, b) {
+        (Object(a), Object(b)) => {
+            assert!(a.keys().eq(b.keys()), "{a:?} has other keys than {b:?}");
+            a.values().zip(b.values()).for_each(|(a, b)| agree(a, b, tolerance));
+        }
+        (Number(a), Number(b)) => {
+            let [a, b] = [a, b].map(|n| n.as_f64().expect("a number"));
+            assert!((a - b).abs() <= tolerance, "{a} is not {b}");
+        }
+        _ => assert_eq!(a, b),
+    }
+}
+
+#[test]
+fn eval_repeats_what_training_measured() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    run_of(&scene, &run);
+    let paths = ["results.json", "per_view.json"].map(|name| run.join(name));
+    let trained = paths.clone().map(|path| json(&path));
+    paths.iter().for_each(|path| std::fs::remove_file(path).expect("it was there"));
+    let outcome = densify(&["eval", text(&run)]).ok();
+    // The model went through its file, in the dataset's own coordinates.
+    for (path, trained) in paths.iter().zip(&trained) {
+        agree(&json(path), trained, 2e-3);
+    }
+    for view in [0, 8] {
+        assert!(outcome.stdout.contains(&name(view)), "{}", outcome.stdout);
+    }
+    assert!(outcome.stdout.contains("mean"), "{}", outcome.stdout);
+
+    densify(&["eval", text(&run), "--split", "train"]).ok();
+    let views = &json(&run.join("per_view_train.json"))["ours_40"]["PSNR"];
+    assert_eq!(views.as_object().map(serde_json::Map::len), Some(VIEWS - 2));
+    agree(&json(&run.join("results.json")), &trained[0], 2e-3);
+}
+
+/// Size of a picture [px].
+fn size(folder: &Path, name: &str) -> (u32, u32) {
+    let path = folder.join(name);
+    image::image_dimensions(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+#[test]
+fn render_writes_pictures_of_the_views() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let pictures = root.path().join("pictures");
+    let all = ["--alpha", "--depth", "--side-by-side"];
+    densify(&[&["render", text(&run), "-o", text(&pictures)][..], &all].concat()).ok();
+    let names: Vec<String> = files(&pictures).into_keys().collect();
+    let of = |view: &str| {
+        ["alpha", "depth", "pair"].map(|kind| format!("{view}.{kind}.png")).into_iter()
+    };
+    let mut expected: Vec<String> = of("view_00").chain(of("view_08")).collect();
+    expected.extend(["view_00.png", "view_08.png", "depth.json"].map(str::to_owned));
+    expected.sort();
+    assert_eq!(names, expected);
+    for kind in ["png", "alpha.png", "depth.png"] {
+        assert_eq!(size(&pictures, &format!("view_00.{kind}")), SIZE, "{kind}");
+    }
+    assert_eq!(size(&pictures, "view_08.pair.png"), (2 * SIZE.0, SIZE.1));
+    let open = |name: &str| image::open(pictures.join(name)).expect("a picture");
+    assert!(matches!(open("view_00.depth.png"), image::DynamicImage::ImageLuma16(_)));
+    // Opaque blobs four units away, in the dataset's own units.
+    let depth = json(&pictures.join("depth.json"));
+    let largest = depth["largest"]["view_00.depth.png"].as_f64().expect("a number");
+    assert!((3.0..6.0).contains(&largest), "{largest}");
+    // The pair is photograph and rendering, and they resemble each other.
+    let pair = open("view_00.pair.png").into_rgb8();
+    let (photograph, rendering) = (
+        image::open(scene.file("images/view_00.png")).unwrap().into_rgb8(),
+        open("view_00.png").into_rgb8(),
+    );
+    for (x, y, pixel) in pair.enumerate_pixels() {
+        let (image, x) = if x < SIZE.0 { (&photograph, x) } else { (&rendering, x - SIZE.0) };
+        assert_eq!(pixel, image.get_pixel(x, y));
+    }
+
+    let train = root.path().join("train");
+    densify(&["render", text(&run), "-o", text(&train), "--split", "train"]).ok();
+    assert_eq!(files(&train).len(), VIEWS - 2);
+}
+
+#[test]
+fn a_bare_model_renders_as_its_run() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let [from_run, from_file] = ["a", "b"].map(|name| root.path().join(name));
+    densify(&["render", text(&run), "-o", text(&from_run)]).ok();
+    let ply = densify::output::model_path(&run, ITERATIONS);
+    let (ply, dataset) = (text(&ply), text(scene.path()));
+    densify(&["render", ply, "--scene", dataset, "--eval", "-o", text(&from_file)]).ok();
+    assert!(files(&from_run) == files(&from_file));
+
+    let nowhere = root.path().join("c");
+    densify(&["render", ply, "-o", text(&nowhere)]).refused("no cameras", &["--scene"]);
+    assert!(!nowhere.exists());
+}
+
+#[test]
+fn policies_are_listed_and_explained() {
+    let list = densify(&["policies"]).ok().stdout;
+    for entry in densify_policies::registry::policies().expect("the registry is sound") {
+        assert!(list.contains(entry.name) && list.contains(entry.summary), "{list}");
+        let manual = densify(&["policies", entry.name]).ok().stdout;
+        for (parameter, _) in entry.parameters() {
+            let set = format!("--policy-set {}.{parameter}=", entry.name);
+            assert!(manual.contains(&set), "{set} is not in {manual}");
+        }
+        assert!(manual.contains(entry.manual().lines().next().unwrap_or("?")), "{manual}");
+    }
+    densify(&["policies", "diett"]).refused("misspelt", &["diett", "diet"]);
+}

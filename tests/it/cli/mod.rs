@@ -1,0 +1,112 @@
+//! The program as its users meet it: arguments in, exit code, messages and files out.
+
+mod faults;
+mod looking;
+mod same;
+mod training;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use assert_cmd::Command;
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// What a call of the program did.
+#[derive(Debug)]
+struct Outcome {
+    code: Option<i32>,
+    stdout: String,
+    stderr: String,
+}
+
+impl Outcome {
+    /// The same outcome, if the call succeeded.
+    #[track_caller]
+    fn ok(self) -> Self {
+        assert_eq!(self.code, Some(0), "{}{}", self.stdout, self.stderr);
+        self
+    }
+
+    /// Fails unless the call ended as bad input must: code 2 and one message, with these words.
+    #[track_caller]
+    fn refused(&self, case: &str, words: &[&str]) {
+        let Self { code, stderr, .. } = self;
+        assert_eq!(*code, Some(2), "{case}: {self:?}");
+        assert!(stderr.starts_with("error: "), "{case}: {stderr}");
+        assert_eq!(stderr.matches("error:").count(), 1, "{case}: {stderr}");
+        assert!(!stderr.contains("panicked") && !stderr.contains("RUST_"), "{case}: {stderr}");
+        for word in words {
+            assert!(stderr.contains(word), "{case}: {word:?} is not in: {stderr}");
+        }
+    }
+}
+
+/// Calls the program.
+fn densify(arguments: &[&str]) -> Outcome {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
+    let output = command.args(arguments).env_remove("RUST_LOG").output().expect("it starts");
+    let text = |bytes| String::from_utf8(bytes).expect("messages are UTF-8");
+    Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
+}
+
+/// A short run with a small budget. `flags` are words separated by spaces; later ones win nothing
+/// over the fixed ones, so that they must not repeat them.
+fn train(scene: &Path, output: &Path, iterations: u32, flags: &str) -> Outcome {
+    let iterations = iterations.to_string();
+    let mut arguments = vec!["train", text(scene), "-o", text(output), "--sh-degree", "1"];
+    arguments.extend(["--iterations", &iterations]);
+    arguments.extend(flags.split_whitespace());
+    densify(&arguments)
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("temporary paths are UTF-8")
+}
+
+/// A place for the output of a test.
+fn scratch() -> (TempDir, PathBuf) {
+    let root = tempfile::tempdir().expect("a temporary folder");
+    let run = root.path().join("run");
+    (root, run)
+}
+
+fn read(path: &Path) -> Vec<u8> {
+    std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// The records of a log.
+fn records(path: &Path) -> Vec<Value> {
+    let text = String::from_utf8(read(path)).expect("logs are UTF-8");
+    assert!(text.is_empty() || text.ends_with('\n'), "{}: its last line is cut", path.display());
+    let line = |line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{line}: {e}"));
+    text.lines().map(line).collect()
+}
+
+/// All files below a folder with their contents, by path from there.
+fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    let mut open = vec![folder.to_owned()];
+    while let Some(here) = open.pop() {
+        let entries =
+            std::fs::read_dir(&here).unwrap_or_else(|e| panic!("{}: {e}", here.display()));
+        for path in entries.map(|entry| entry.expect("a folder's entry").path()) {
+            if path.is_dir() {
+                open.push(path);
+            } else {
+                let name = path.strip_prefix(folder).expect("found below it");
+                found.insert(text(name).replace('\\', "/"), read(&path));
+            }
+        }
+    }
+    found
+}
+
+/// The model that a run saved after its last iteration.
+fn model(run: &Path, iterations: u32) -> Vec<u8> {
+    read(&densify::output::model_path(run, iterations))
+}

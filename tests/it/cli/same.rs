@@ -1,0 +1,45 @@
+//! What must not change a byte of the model: threads, the time of day, room for photographs.
+
+use densify_policies::registry::policies;
+
+use super::{model, scratch, train};
+use crate::photographs::{Photographs, SIZE};
+
+const ITERATIONS: u32 = 60;
+
+fn trained(scene: &Photographs, flags: &str) -> Vec<u8> {
+    let (_root, run) = scratch();
+    let flags = format!("--budget 330 --quiet {flags}");
+    train(scene.path(), &run, ITERATIONS, &flags).ok();
+    model(&run, ITERATIONS)
+}
+
+#[test]
+fn every_policy_gives_the_same_model_at_any_number_of_threads() {
+    let scene = Photographs::colmap_text();
+    let registered = policies().expect("the registry is sound");
+    assert!(registered.len() >= 2);
+    for policy in registered.iter().map(|entry| entry.name) {
+        let with = |flags: &str| trained(&scene, &format!("--policy {policy} {flags}"));
+        let first = with("--threads 1");
+        for threads in ["--threads 1", "--threads 2", "--threads 5", ""] {
+            assert!(with(threads) == first, "{policy}: {threads:?} changes the model");
+        }
+        assert!(with("--seed 1") != first, "{policy}: the seed changes nothing");
+    }
+}
+
+#[test]
+fn a_cache_of_two_photographs_is_enough() {
+    let scene = Photographs::colmap_text();
+    let two = 2 * 3 * SIZE.0 * SIZE.1 + 100;
+    let small = trained(&scene, &format!("--image-cache {two}"));
+    assert!(small == trained(&scene, "--image-cache 1GiB"));
+    assert!(small == trained(&scene, "--image-cache 0"));
+}
+
+#[test]
+fn text_and_binary_reconstructions_give_the_same_model() {
+    let [a, b] = [Photographs::colmap_text(), Photographs::colmap_binary()];
+    assert!(trained(&a, "") == trained(&b, ""));
+}

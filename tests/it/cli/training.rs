@@ -1,0 +1,165 @@
+//! `densify train`: what a run leaves behind, and that its numbers hold.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::{Outcome, files, json, read, records, scratch, train};
+use crate::photographs::{POINTS, Photographs, VIEWS};
+
+const ITERATIONS: u32 = 100;
+const BUDGET: u64 = 360;
+
+fn number(value: &Value, key: &str) -> f64 {
+    value[key].as_f64().unwrap_or_else(|| panic!("no number {key} in {value}"))
+}
+
+fn count(value: &Value, key: &str) -> u64 {
+    value[key].as_u64().unwrap_or_else(|| panic!("no count {key} in {value}"))
+}
+
+/// Fails unless every file is there that DESIGN and users expect, and nothing else.
+fn check_tree(run: &Path) {
+    let mut names: Vec<String> = files(run).into_keys().collect();
+    let board = names.iter().position(|name| name.starts_with("events.out.tfevents."));
+    names.remove(board.expect("a TensorBoard file"));
+    let ply = format!("point_cloud/iteration_{ITERATIONS}/point_cloud.ply");
+    let expected = [
+        "cameras.json",
+        "config.toml",
+        "per_view.json",
+        &ply,
+        "results.json",
+        "stats/events.jsonl",
+        "stats/summary.json",
+        "stats/train.jsonl",
+    ];
+    assert_eq!(names, expected);
+    let cameras = json(&run.join("cameras.json"));
+    assert_eq!(cameras.as_array().map(Vec::len), Some(VIEWS));
+    let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
+    let config: toml::Table = config.parse().expect("config.toml is TOML");
+    assert_eq!(config["train"]["budget"].as_integer(), Some(BUDGET as i64));
+}
+
+/// Fails unless rows stay within the budget in every event, and follow from one to the next.
+fn check_events(run: &Path, summary: &Value) {
+    let events = records(&run.join("stats/events.jsonl"));
+    assert!(!events.is_empty(), "the policy did nothing in {ITERATIONS} steps");
+    let mut rows = None;
+    let mut step = 0;
+    for event in &events {
+        let [before, removed, added, after] =
+            ["before", "removed", "added", "after"].map(|key| count(event, key));
+        assert!(count(event, "step") > step, "{event}");
+        step = count(event, "step");
+        assert!(before.max(after) <= BUDGET, "{event}");
+        assert_eq!(before + added - removed, after, "{event}");
+        assert!(rows.is_none_or(|rows| rows == before), "{event} does not follow {rows:?}");
+        assert!(count(event, "updated") <= after, "{event}");
+        assert!(event["denied"].is_u64(), "{event}");
+        assert!(event["cause"].as_str().is_some_and(|cause| !cause.is_empty()), "{event}");
+        rows = Some(after);
+    }
+    assert_eq!(rows, Some(count(summary, "rows")));
+    assert!(step <= u64::from(ITERATIONS));
+}
+
+fn check_summary(run: &Path, policy: &str, held_out: u64) -> Value {
+    let summary = json(&run.join("stats/summary.json"));
+    assert_eq!(summary["finished"], true);
+    assert_eq!(summary["policy"], policy);
+    assert_eq!(count(&summary, "iterations"), u64::from(ITERATIONS));
+    assert_eq!(count(&summary, "test_views"), held_out);
+    assert_eq!(count(&summary, "train_views"), VIEWS as u64 - held_out);
+    assert_eq!(count(&summary, "budget"), BUDGET);
+    assert!(count(&summary, "rows") <= count(&summary, "peak_rows"));
+    assert!(count(&summary, "peak_rows") <= BUDGET);
+    if cfg!(target_os = "linux") {
+        let (peak, ledger) = (number(&summary, "peak_bytes"), number(&summary, "ledger_bytes"));
+        assert!(peak <= 1.15 * ledger, "peak of {peak} bytes, {ledger} promised");
+    }
+    summary
+}
+
+/// Fails unless the run has learned, the test views too.
+fn check_loss(run: &Path, least_psnr: f64) {
+    let log = records(&run.join("stats/train.jsonl"));
+    assert_eq!(log.len(), ITERATIONS as usize / 10);
+    assert_eq!(count(&log[log.len() - 1], "step"), u64::from(ITERATIONS));
+    let loss = |at: usize| number(&log[at], "loss");
+    let (first, last) = (loss(0), loss(log.len() - 1));
+    // `vanilla` has reset opacities in between, so that it has little time to recover.
+    assert!(last < 0.9 * first, "the loss went from {first} to {last}");
+    assert!(log.iter().all(|record| count(record, "rows") <= BUDGET));
+    let scores = json(&run.join("results.json"));
+    let psnr = number(&scores[format!("ours_{ITERATIONS}")], "PSNR");
+    assert!(psnr > least_psnr, "test PSNR {psnr} dB");
+}
+
+fn check(scene: &Photographs, policy: &str, flags: &str, least_psnr: f64) -> Outcome {
+    let (_root, run) = scratch();
+    let flags = format!("--budget {BUDGET} --policy {policy} --eval {flags}");
+    let outcome = train(scene.path(), &run, ITERATIONS, &flags).ok();
+    check_tree(&run);
+    let summary = check_summary(&run, policy, 2);
+    check_events(&run, &summary);
+    check_loss(&run, least_psnr);
+    outcome
+}
+
+#[test]
+fn photographs_of_colmap_are_trained_on() {
+    let scene = Photographs::colmap_text();
+    for (policy, least_psnr) in [("diet", 26.0), ("vanilla", 22.0)] {
+        let outcome = check(&scene, policy, "", least_psnr);
+        for said in ["memory promised", "360 rows", "test     PSNR", "300 points"] {
+            assert!(outcome.stdout.contains(said), "{policy}: {said:?} in {}", outcome.stdout);
+        }
+        // An edit is one line of the log.
+        let edits = outcome.stderr.lines().filter(|line| line.contains("denied="));
+        assert!(edits.clone().count() > 0, "{}", outcome.stderr);
+        for key in ["step=", "before=", "removed=", "added=", "after=", "cause="] {
+            assert!(edits.clone().all(|line| line.contains(key)), "{key} in {}", outcome.stderr);
+        }
+    }
+}
+
+#[test]
+fn transparent_photographs_without_points_are_trained_on() {
+    let scene = Photographs::transforms();
+    for (policy, least_psnr) in [("diet", 18.0), ("vanilla", 16.0)] {
+        let quiet = check(&scene, policy, "--background white --quiet", least_psnr);
+        assert_eq!((&*quiet.stdout, &*quiet.stderr), ("", ""));
+    }
+}
+
+#[test]
+fn more_points_than_the_budget_are_subsampled_and_it_is_said() {
+    let scene = Photographs::colmap_binary();
+    let (_root, run) = scratch();
+    let outcome = train(scene.path(), &run, 3, "--budget 100").ok();
+    let told = format!("{} points left out: beyond the budget", POINTS - 100);
+    assert!(outcome.stdout.contains(&told), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("100 rows from 300 points"), "{}", outcome.stdout);
+    let summary = json(&run.join("stats/summary.json"));
+    assert_eq!(count(&summary, "peak_rows"), 100);
+}
+
+#[test]
+fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
+    let scene = Photographs::colmap_binary();
+    let (_root, run) = scratch();
+    train(scene.path(), &run, 2, "--budget 300").ok();
+    std::fs::write(run.join("notes.txt"), "mine").expect("a note");
+    let before = files(&run);
+    train(scene.path(), &run, 3, "--budget 300")
+        .refused("occupied", &["another run", "--overwrite"]);
+    assert!(files(&run) == before, "the refused run touched the first one");
+    train(scene.path(), &run, 3, "--budget 300 --overwrite").ok();
+    let after = files(&run);
+    assert!(after.contains_key("point_cloud/iteration_3/point_cloud.ply"));
+    assert!(!after.contains_key("point_cloud/iteration_2/point_cloud.ply"));
+    assert_eq!(after["notes.txt"], b"mine");
+    assert!(after.keys().all(|name| !name.starts_with('.')), "{:?}", after.keys());
+}

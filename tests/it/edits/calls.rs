@@ -1,0 +1,88 @@
+//! Any calls of a plan, sensible or not.
+
+use densify_policies::plan::{
+    EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, Update,
+};
+use proptest::prelude::*;
+
+use super::ROWS;
+
+/// One call.
+#[derive(Debug, Clone)]
+pub(super) enum Call {
+    Prune(u32),
+    Grow(u32, Offspring),
+    Update(u32, Update),
+    Append(Seed),
+    Clamp(f32),
+    Reset,
+}
+
+fn opacity_rule() -> impl Strategy<Value = OpacityRule> {
+    prop_oneof![
+        Just(OpacityRule::Same),
+        (0.01_f32..0.99).prop_map(OpacityRule::Set),
+        (0.2_f32..=1.0).prop_map(OpacityRule::Scaled),
+        Just(OpacityRule::Conserved),
+    ]
+}
+
+fn scale_rule() -> impl Strategy<Value = ScaleRule> {
+    let factor = || 0.4_f32..1.6;
+    prop_oneof![
+        factor().prop_map(ScaleRule::Uniform),
+        (factor(), factor()).prop_map(|(long, other)| ScaleRule::LongAxis { long, other }),
+    ]
+}
+
+fn offspring() -> impl Strategy<Value = Offspring> {
+    let placement = prop_oneof![
+        prop::array::uniform3(-0.3_f32..0.3).prop_map(Placement::Offset),
+        Just(Placement::Sampled),
+        (0.0_f32..2.0).prop_map(|sigmas| Placement::LongAxis { sigmas }),
+    ];
+    let parent = prop_oneof![Just(ParentFate::Stays), Just(ParentFate::BecomesChild)];
+    (0..4_u32, parent, placement, scale_rule(), opacity_rule()).prop_map(
+        |(children, parent, placement, scale, opacity)| Offspring {
+            children,
+            parent,
+            placement,
+            scale,
+            opacity,
+        },
+    )
+}
+
+pub(super) fn call() -> impl Strategy<Value = Call> {
+    // Some beyond the last row, whatever the plan before has left.
+    let row = || 0..ROWS as u32 + 12;
+    let update = (opacity_rule(), scale_rule(), any::<bool>())
+        .prop_map(|(opacity, scale, keep_moments)| Update { opacity, scale, keep_moments });
+    let unit = || prop::array::uniform3(0.0_f32..1.0);
+    let seed = (unit(), unit(), 0.01_f32..0.3, 0.01_f32..0.99)
+        .prop_map(|(position, colour, scale, opacity)| Seed { position, colour, scale, opacity });
+    prop_oneof![
+        8 => row().prop_map(Call::Prune),
+        8 => (row(), offspring()).prop_map(|(row, how)| Call::Grow(row, how)),
+        4 => (row(), update).prop_map(|(row, how)| Call::Update(row, how)),
+        4 => seed.prop_map(Call::Append),
+        1 => (0.05_f32..0.9).prop_map(Call::Clamp),
+        1 => Just(Call::Reset),
+    ]
+}
+
+/// Enters a call; returns whether the plan took it.
+pub(super) fn enter(plan: &mut EditPlan, call: &Call) -> bool {
+    let done = match *call {
+        Call::Prune(row) => plan.prune(row),
+        Call::Grow(row, how) => plan.grow(row, how),
+        Call::Update(row, how) => plan.update(row, how),
+        Call::Append(seed) => plan.append(seed),
+        Call::Clamp(max) => plan.clamp_opacity(max),
+        Call::Reset => {
+            plan.reset(Reset::Signals);
+            Ok(())
+        }
+    };
+    done.is_ok()
+}

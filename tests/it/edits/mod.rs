@@ -1,0 +1,246 @@
+//! Any plans, one after the other, on the backend and on a plain vector of Gaussians that follows
+//! the words of the plan's documentation: parameters, moments, ages and signals go where they
+//! should, and the rows never exceed the budget.
+//!
+//! Moments cannot be read. They show in a step that sees nothing: without a gradient a row moves by
+//! what its moments still hold, and by its age. A twin that is not edited tells how far.
+
+mod calls;
+mod plain;
+
+use std::sync::OnceLock;
+
+use densify::backend::cpu::{CpuBackend, CpuOptions};
+use densify::backend::{Backend, LearningRates, StepInput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::Gaussians;
+use densify_policies::plan::{EditPlan, OpacityRule, RowOps, ScaleRule, Seed, Update};
+use densify_policies::policy::{Needs, Signal, SignalSet};
+use densify_policies::rng::PolicyRng;
+use glam::{DMat3, DVec3};
+use proptest::prelude::*;
+
+use crate::scenes;
+use calls::{Call, call, enter};
+use plain::{Row, execute};
+
+const ROWS: usize = 37;
+const SEED: u64 = 9;
+const RATES: LearningRates = LearningRates {
+    mean: 1e-3,
+    log_scale: 5e-3,
+    quat: 1e-3,
+    opacity: 0.025,
+    sh_dc: 2.5e-3,
+    sh_rest: 1.25e-4,
+};
+/// Signals whose sums are carried along, and age.
+const SIGNALS: [Signal; 3] = [Signal::ScreenGradient, Signal::WeightMax, Signal::Age];
+const SAME: Update =
+    Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(1.0), keep_moments: false };
+
+fn view() -> Camera {
+    scenes::camera(33, 25, 71)
+}
+
+/// The camera turned around and far off: it sees nothing of the model, whatever the plans did.
+fn away() -> Camera {
+    let turn = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
+    let view = view();
+    let translation = turn * view.translation - DVec3::new(0.0, 0.0, 1000.0);
+    Camera { rotation: turn * view.rotation, translation, ..view }
+}
+
+fn needs() -> Needs {
+    let signals = SignalSet::of(&SIGNALS);
+    Needs { signals, ..Needs::default() }
+}
+
+fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
+    let n = (3 * camera.width * camera.height) as usize;
+    let target = Image8 {
+        width: camera.width,
+        height: camera.height,
+        rgb: (0..n).map(|i| (i * 37 % 251) as u8).collect(),
+        alpha: None,
+        mask: None,
+    };
+    let input = StepInput {
+        step,
+        camera,
+        target: &target,
+        background: [0.2; 3],
+        sh_degree: 1,
+        rates: RATES,
+    };
+    backend.train_step(&input).expect("a small image is rendered").visible
+}
+
+/// A backend with a past: moments, signals, and rows of different ages.
+fn trained(budget: usize) -> CpuBackend {
+    let model = scenes::cloud(ROWS, 1, &view(), 72);
+    let mut options = CpuOptions::new(budget);
+    options.threads = Some(1);
+    options.needs = needs();
+    let mut backend = CpuBackend::new(&model, &options).expect("a small model fits");
+    step(&mut backend, &view(), 1);
+    step(&mut backend, &view(), 2);
+    let mut plan = EditPlan::new(ROWS, budget);
+    for row in (0..ROWS as u32).step_by(3) {
+        plan.update(row, SAME).expect("the row is free");
+    }
+    backend.apply(&plan.compile(), SEED, 2).expect("a plan is applied");
+    step(&mut backend, &view(), 3);
+    backend
+}
+
+fn rows(backend: &mut CpuBackend) -> Vec<Row> {
+    let model = backend.download();
+    let (signals, _) = backend.take_signals(&needs()).expect("signals are there");
+    let of = |signal, row: usize| signals.get(signal).expect("it was asked for")[row];
+    let row = |row: usize| Row {
+        mean: model.means[row],
+        log_scale: model.log_scales[row],
+        quat: model.quats[row],
+        logit: model.opacity_logits[row],
+        sh: model.sh_of(row).to_vec(),
+        signals: SIGNALS.map(|signal| of(signal, row)),
+        moments: Some(row),
+        opacity_rests: false,
+    };
+    (0..model.len()).map(row).collect()
+}
+
+/// The twin before and after a step that sees nothing.
+fn twin() -> &'static [Vec<Row>; 2] {
+    static TWIN: OnceLock<[Vec<Row>; 2]> = OnceLock::new();
+    TWIN.get_or_init(|| {
+        let mut backend = trained(ROWS);
+        let before = rows(&mut backend);
+        assert_eq!(step(&mut backend, &away(), 4), 0, "the camera sees something");
+        [before, rows(&mut backend)]
+    })
+}
+
+// --- The comparison -----------------------------------------------------------------------------
+
+/// Fails unless two values agree but for the rounding of a few operations.
+fn near(what: &str, row: usize, found: &[f32], expected: &[f32]) {
+    let close = |(a, b): (&f32, &f32)| (a - b).abs() <= 2e-6 * (1.0 + a.abs().max(b.abs()));
+    let agree = found.len() == expected.len() && found.iter().zip(expected).all(close);
+    assert!(agree, "{what} of row {row}: {found:?}, expected {expected:?}");
+}
+
+fn check_rows(found: &[Row], expected: &[Row]) {
+    assert_eq!(found.len(), expected.len());
+    for (i, (found, expected)) in found.iter().zip(expected).enumerate() {
+        assert_eq!(found.quat, expected.quat, "quat of row {i}");
+        assert_eq!(found.signals, expected.signals, "{SIGNALS:?} of row {i}");
+        near("mean", i, &found.mean, &expected.mean);
+        near("log-scale", i, &found.log_scale, &expected.log_scale);
+        near("logit", i, &[found.logit], &[expected.logit]);
+        near("sh", i, &found.sh, &expected.sh);
+    }
+}
+
+/// Fails unless a step that sees nothing moves each row as it moves the row of the twin that has
+/// the same moments and age, and no other row at all.
+fn check_movement(before: &[Row], after: &[Row], expected: &[Row]) {
+    let [twin_before, twin_after] = twin();
+    for (i, expected) in expected.iter().enumerate() {
+        let (from, to) = (&before[i], &after[i]);
+        assert_eq!(to.signals[2], from.signals[2] + 1.0, "age of row {i}");
+        let Some(same) = expected.moments else {
+            assert_eq!((from.mean, from.log_scale), (to.mean, to.log_scale), "newborn row {i}");
+            assert_eq!((from.logit, &from.sh), (to.logit, &to.sh), "newborn row {i}");
+            near("quat", i, &to.quat, &from.quat);
+            continue;
+        };
+        let (was, is) = (&twin_before[same], &twin_after[same]);
+        assert!(was.mean != is.mean, "row {same} has no moments, so that it shows nothing");
+        assert_eq!((to.mean, to.quat, &to.sh), (is.mean, is.quat, &is.sh), "row {i}, once {same}");
+        let moved = |x: f32, was: f32, is: f32| x + (is - was);
+        let scale = |a: usize| moved(from.log_scale[a], was.log_scale[a], is.log_scale[a]);
+        near("log-scale", i, &to.log_scale, &[0, 1, 2].map(scale));
+        let logit = moved(from.logit, was.logit, is.logit);
+        near("logit", i, &[to.logit], &[if expected.opacity_rests { from.logit } else { logit }]);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector(
+        spare in 0..14_usize,
+        plans in prop::collection::vec(prop::collection::vec(call(), 0..40), 1..4),
+    ) {
+        let budget = ROWS + spare;
+        let mut backend = trained(budget);
+        let mut expected = rows(&mut backend);
+        for (number, calls) in plans.iter().enumerate() {
+            let event = 4 + number as u32;
+            let mut plan = EditPlan::new(backend.rows(), budget);
+            let taken: Vec<Call> =
+                calls.iter().filter(|call| enter(&mut plan, call)).cloned().collect();
+            let ops = plan.compile();
+            backend.apply(&ops, SEED, event).expect("a plan is applied");
+            prop_assert!(backend.rows() <= backend.budget());
+            expected = execute(expected, &taken, budget, &PolicyRng::new(SEED, event));
+            check_rows(&rows(&mut backend), &expected);
+        }
+        let before = rows(&mut backend);
+        prop_assert_eq!(step(&mut backend, &away(), 9), 0);
+        check_movement(&before, &rows(&mut backend), &expected);
+    }
+}
+
+// --- Plans that must not be applied -------------------------------------------------------------
+
+fn apply_corrupted(corrupt: impl FnOnce(&mut RowOps)) {
+    let mut backend = trained(ROWS + 2);
+    let mut plan = EditPlan::new(ROWS, ROWS + 2);
+    plan.append(Seed { position: [0.0; 3], colour: [0.5; 3], scale: 0.1, opacity: 0.1 })
+        .expect("there is room");
+    let mut ops = plan.compile();
+    corrupt(&mut ops);
+    let _ = backend.apply(&ops, SEED, 5);
+}
+
+#[test]
+#[should_panic(expected = "another number of rows")]
+fn a_plan_for_other_rows_stops_the_run() {
+    apply_corrupted(|ops| ops.rows_before -= 1);
+}
+
+#[test]
+#[should_panic(expected = "another budget")]
+fn a_plan_for_another_budget_stops_the_run() {
+    apply_corrupted(|ops| ops.budget += 100);
+}
+
+#[test]
+#[should_panic(expected = "over the budget")]
+fn a_plan_over_the_budget_stops_the_run() {
+    apply_corrupted(|ops| ops.rows_after = ROWS + 3);
+}
+
+#[test]
+#[should_panic(expected = "breaks its own rules")]
+fn a_plan_that_writes_a_live_row_stops_the_run() {
+    apply_corrupted(|ops| ops.seeds[0].0 = 1);
+}
+
+#[test]
+fn budget_one_row_is_kept() {
+    let model = Gaussians { sh_degree: 1, ..scenes::cloud(1, 1, &view(), 73) };
+    let mut backend = CpuBackend::new(&model, &CpuOptions::new(1)).expect("one row fits");
+    let mut plan = EditPlan::new(1, 1);
+    let seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 0.1, opacity: 0.1 };
+    assert!(plan.append(seed).is_err());
+    plan.prune(0).expect("the row is free");
+    plan.append(seed).expect("its slot is free now");
+    backend.apply(&plan.compile(), SEED, 1).expect("a plan is applied");
+    assert_eq!((backend.rows(), backend.download().means[0]), (1, [0.0; 3]));
+}

@@ -1,0 +1,166 @@
+//! The plain vector: one struct per row, executed by the words of the plan's documentation.
+
+use densify_policies::plan::{Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
+use densify_policies::rng::{PolicyRng, Purpose};
+use glam::{DQuat, DVec3};
+
+use super::SIGNALS;
+use super::calls::Call;
+
+/// One row as the plain vector has it.
+#[derive(Debug, Clone)]
+pub(super) struct Row {
+    pub(super) mean: [f32; 3],
+    pub(super) log_scale: [f32; 3],
+    pub(super) quat: [f32; 4],
+    pub(super) logit: f32,
+    pub(super) sh: Vec<f32>,
+    pub(super) signals: [f32; SIGNALS.len()],
+    /// The row of the twin that has the same moments; `None` if they are zero.
+    pub(super) moments: Option<usize>,
+    /// Whether the opacity's moments are zero, whatever the others are.
+    pub(super) opacity_rests: bool,
+}
+
+fn sigmoid(logit: f32) -> f64 {
+    1.0 / (1.0 + (-f64::from(logit)).exp())
+}
+
+fn logit(opacity: f64) -> f32 {
+    (opacity / (1.0 - opacity)).ln() as f32
+}
+
+fn longest(log_scale: [f32; 3]) -> usize {
+    (1..3).fold(0, |best, axis| if log_scale[axis] > log_scale[best] { axis } else { best })
+}
+
+impl Row {
+    fn rescale(&mut self, rule: ScaleRule) {
+        let long_axis = longest(self.log_scale);
+        for (axis, scale) in self.log_scale.iter_mut().enumerate() {
+            let factor = match rule {
+                ScaleRule::Uniform(factor) => factor,
+                ScaleRule::LongAxis { long, .. } if axis == long_axis => long,
+                ScaleRule::LongAxis { other, .. } => other,
+            };
+            *scale = (f64::from(*scale) + f64::from(factor).ln()) as f32;
+        }
+    }
+
+    fn cover(&mut self, rule: OpacityRule, siblings: u32) {
+        let opacity = sigmoid(self.logit);
+        self.logit = match rule {
+            OpacityRule::Same => return,
+            OpacityRule::Set(opacity) => logit(f64::from(opacity)),
+            OpacityRule::Scaled(factor) => logit(opacity * f64::from(factor)),
+            OpacityRule::Conserved => logit(1.0 - (1.0 - opacity).powf(1.0 / f64::from(siblings))),
+        };
+    }
+
+    /// Zero moments, age 0, no past.
+    fn reborn(mut self) -> Self {
+        self.moments = None;
+        self.signals = [0.0; SIGNALS.len()];
+        self
+    }
+
+    /// The child of this number of a parent in the slot `slot`.
+    fn child(&self, slot: u32, number: u32, how: &Offspring, rng: &PolicyRng) -> Self {
+        let mut child = self.clone().reborn();
+        let axis = longest(self.log_scale);
+        let offset = match how.placement {
+            Placement::Offset(_) if number == 0 => DVec3::ZERO,
+            Placement::Offset(offset) => offset.map(f64::from).into(),
+            Placement::Sampled => {
+                let xi = rng.normal3(slot, Purpose::Place, number);
+                self.turned(
+                    [0, 1, 2].map(|i| f64::from(self.log_scale[i]).exp() * f64::from(xi[i])),
+                )
+            }
+            Placement::LongAxis { sigmas } => {
+                let sign = if number % 2 == 0 { 1.0 } else { -1.0 };
+                let mut local = [0.0; 3];
+                local[axis] = sign * f64::from(sigmas) * f64::from(self.log_scale[axis]).exp();
+                self.turned(local)
+            }
+        };
+        child.mean = [0, 1, 2].map(|i| (f64::from(self.mean[i]) + offset[i]) as f32);
+        child.rescale(how.scale);
+        child.cover(how.opacity, how.siblings());
+        child
+    }
+
+    fn turned(&self, local: [f64; 3]) -> DVec3 {
+        let [w, x, y, z] = self.quat.map(f64::from);
+        DQuat::from_xyzw(x, y, z, w).normalize() * DVec3::from(local)
+    }
+
+    fn sown(seed: &Seed) -> Self {
+        let dc = |colour: f32| (colour - 0.5) / densify::sh::C0;
+        let mut sh = vec![0.0; 12];
+        sh[..3].copy_from_slice(&seed.colour.map(dc));
+        Self {
+            mean: seed.position,
+            log_scale: [seed.scale.ln(); 3],
+            quat: [1.0, 0.0, 0.0, 0.0],
+            logit: logit(f64::from(seed.opacity)),
+            sh,
+            signals: [0.0; SIGNALS.len()],
+            moments: None,
+            opacity_rests: false,
+        }
+    }
+}
+
+/// Executes accepted calls on the plain vector.
+pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &PolicyRng) -> Vec<Row> {
+    let before = model;
+    let mut slots: Vec<Option<Row>> = before.iter().cloned().map(Some).collect();
+    let (mut children, mut seeds) = (Vec::new(), Vec::new());
+    let mut clamp = f32::INFINITY;
+    let mut reset = false;
+    for call in calls {
+        match call {
+            Call::Prune(row) => slots[*row as usize] = None,
+            Call::Grow(row, how) => {
+                let parent = &before[*row as usize];
+                children.extend((1..=how.children).map(|n| parent.child(*row, n, how, rng)));
+                if how.parent == ParentFate::BecomesChild {
+                    slots[*row as usize] = Some(parent.child(*row, 0, how, rng));
+                }
+            }
+            Call::Update(row, how) => {
+                let mut updated = before[*row as usize].clone();
+                updated.rescale(how.scale);
+                updated.cover(how.opacity, 1);
+                slots[*row as usize] =
+                    Some(if how.keep_moments { updated } else { updated.reborn() });
+            }
+            Call::Append(seed) => seeds.push(Row::sown(seed)),
+            Call::Clamp(max) => clamp = clamp.min(*max),
+            Call::Reset => reset = true,
+        }
+    }
+    for newborn in children.into_iter().chain(seeds) {
+        match slots.iter_mut().find(|slot| slot.is_none()) {
+            Some(hole) => *hole = Some(newborn),
+            None => slots.push(Some(newborn)),
+        }
+        assert!(slots.len() <= budget.max(before.len()), "a slot beyond the budget");
+    }
+    let live = slots.iter().flatten().count();
+    assert!(live <= budget, "{live} rows, budget {budget}");
+    let mut tail = slots.split_off(live).into_iter().flatten();
+    let dense = slots.into_iter().map(|slot| slot.or_else(|| tail.next()));
+    let mut model: Vec<Row> = dense.map(|row| row.expect("as many rows as holes")).collect();
+    for row in &mut model {
+        if clamp < 1.0 {
+            row.logit = row.logit.min(logit(f64::from(clamp)));
+            row.opacity_rests = true;
+        }
+        if reset {
+            row.signals[0] = 0.0;
+        }
+    }
+    model
+}
