@@ -85,7 +85,7 @@ enum Told {
 
 impl DensityPolicy for ToldPolicy {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        Needs { signals: SignalSet::of(&[Signal::Opacity]), candidates: None }
+        Needs { signals: SignalSet::of(&[Signal::Opacity]), ..Needs::default() }
     }
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.every)

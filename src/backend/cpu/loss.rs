@@ -99,6 +99,7 @@ impl LossBuffers {
     /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
     /// also the error of each pixel, as the mean over channels of their combination of |e| and
     /// 1 − SSIM.
+    #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
         arch: Arch,

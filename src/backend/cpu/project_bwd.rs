@@ -9,6 +9,7 @@
 //!   around; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
 //!   is orthogonal to q,
 //! - dL/dV = L·M·W leads on to J and the mean.
+//!
 //! Derived from Σ = V·Vᵀ + 0.3·I, dL/dV = 2·G·V; checked against the float64 reference.
 
 use pulp::Simd;

@@ -202,7 +202,12 @@ impl Rasterize<'_> {
                                 stops.keep(c(1.0)),
                                 place_in_list,
                             );
-                            if light[y] == [0.0; WIDTH] {
+                            #[expect(
+                                clippy::float_cmp,
+                                reason = "who has stopped has exactly none"
+                            )]
+                            let all_stopped = light[y] == [0.0; WIDTH];
+                            if all_stopped {
                                 alive &= !(1 << y);
                             }
                         }

@@ -163,7 +163,7 @@ impl<S: Simd> V<S> {
         let f = n.neg_mul_add(c(1.428_606_8e-6), f);
         let p = c(1.984_127e-4)
             .mul_add(f, c(1.388_888_9e-3))
-            .mul_add(f, c(8.333_333_5e-3))
+            .mul_add(f, c(8.333_334e-3))
             .mul_add(f, c(4.166_666_6e-2))
             .mul_add(f, c(1.666_666_7e-1))
             .mul_add(f, c(0.5))
