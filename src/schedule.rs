@@ -227,11 +227,27 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     order
 }
 
+/// `count` of the training views, or all of them if there are fewer, drawn at random without
+/// replacement from (seed, step), for a policy that asks for fresh views.
+#[must_use]
+pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
+    let mut chosen: Vec<usize> = (0..views).collect();
+    let mut draws = stream(seed, Use::FreshViews, u64::from(step));
+    let count = count.min(views);
+    // The first places of a Fisher–Yates shuffle.
+    for place in 0..count {
+        chosen.swap(place, place + below(&mut draws, (views - place) as u64) as usize);
+    }
+    chosen.truncate(count);
+    chosen
+}
+
 /// What a stream of random numbers is for; streams for different uses are independent.
 #[derive(Debug, Clone, Copy)]
 enum Use {
     Views = 1,
     Background = 2,
+    FreshViews = 3,
 }
 
 /// The stream number `counter` for one use: ChaCha is a hash of (key, stream, position).
@@ -326,6 +342,29 @@ mod tests {
         }
         // Binomial(5,000, 1/5): mean 1,000, deviation 28; five of them.
         assert!(first.iter().all(|n| n.abs_diff(1_000) < 142), "{first:?}");
+    }
+
+    #[test]
+    fn fresh_views_are_a_fair_choice() {
+        let mut times = [0_u32; 7];
+        for step in 0..7_000 {
+            let mut chosen = fresh_views(7, 3, 5, step);
+            assert_eq!(chosen, fresh_views(7, 3, 5, step));
+            chosen.sort_unstable();
+            chosen.dedup();
+            assert_eq!(chosen.len(), 3, "a view was drawn twice");
+            for view in chosen {
+                times[view] += 1;
+            }
+        }
+        // Binomial(7,000, 3/7): mean 3,000, deviation 41; five of them.
+        assert!(times.iter().all(|n| n.abs_diff(3_000) < 207), "{times:?}");
+        assert_ne!(fresh_views(50, 10, 5, 3), fresh_views(50, 10, 6, 3));
+        assert_ne!(fresh_views(50, 50, 5, 0), view_order(50, 5, 0));
+        let mut all = fresh_views(4, 100, 5, 3);
+        all.sort_unstable();
+        assert_eq!(all, [0, 1, 2, 3]);
+        assert!(fresh_views(4, 0, 5, 3).is_empty() && fresh_views(0, 4, 5, 3).is_empty());
     }
 
     #[test]

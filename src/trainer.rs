@@ -6,6 +6,7 @@
 //! model as the optimiser left it.
 
 mod error;
+mod fresh;
 
 use densify_policies::plan::{EditPlan, RowOps};
 use densify_policies::policy::{DensityPolicy, Needs, SceneInfo, Snapshot};
@@ -99,6 +100,7 @@ pub struct Trainer<V> {
     order: Vec<usize>,
     next_order: Vec<usize>,
     peak_rows: usize,
+    extra_forwards: u64,
     events: Vec<EditEvent>,
 }
 
@@ -123,6 +125,7 @@ impl<V: ViewSource> Trainer<V> {
             order: Vec::new(),
             next_order: schedule::view_order(count, options.seed, 0),
             peak_rows: backend.rows(),
+            extra_forwards: 0,
             views,
             backend,
             policy,
@@ -190,8 +193,9 @@ impl<V: ViewSource> Trainer<V> {
     /// Asks the policy for a plan and executes it. A plan that changes no row and was refused
     /// nothing is no event: policies may be due at steps at which they find nothing to do.
     fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
+        let needs = self.measure_fresh(step)?;
         let (signals, candidates) =
-            self.backend.take_signals(&self.needs).map_err(|e| self.stopped(step, e))?;
+            self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
         let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };
         let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
         let rng = PolicyRng::new(self.options.seed, step);
@@ -252,6 +256,12 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn peak_rows(&self) -> usize {
         self.peak_rows
+    }
+
+    /// Training views rendered for the policy's decisions so far, beside one per step.
+    #[must_use]
+    pub fn extra_forwards(&self) -> u64 {
+        self.extra_forwards
     }
 
     /// All edits so far.

@@ -127,7 +127,17 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError>;
 
+    /// Renders a view as the model is now and takes note of the largest blend weight of each row:
+    /// that over the views measured since signals were last taken is their `FreshWeightMax`. Does
+    /// nothing where this signal is not among those that the backend was made for. Changes nothing
+    /// of the model, of the optimiser, or of the other signals.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError>;
+
     /// Copies the signals named in `needs` and the candidates collected so far to the host.
+    /// `FreshWeightMax` starts anew, whether it was named or not.
     ///
     /// # Errors
     /// See [`BackendError`].

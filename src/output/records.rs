@@ -80,6 +80,8 @@ pub struct Summary {
     pub peak_rows: usize,
     /// Most rows allowed.
     pub budget: usize,
+    /// Training views rendered for the policy's decisions, beside one per step.
+    pub extra_forwards: u64,
     /// Largest resident memory of the process [bytes], where the system says.
     pub peak_bytes: Option<u64>,
     /// The ledger's total [bytes].

@@ -1,4 +1,5 @@
-//! The loop against a backend that only counts and a policy that does as it is told.
+//! The loop against a backend that only counts and a policy that does as it is told. The file is one
+//! piece, as every test needs both.
 
 use std::sync::{Arc, Mutex};
 
@@ -46,6 +47,10 @@ impl Backend for CountingBackend {
         let loss = if input.step == self.lost_at { f32::NAN } else { 0.5 };
         Ok(StepOutput { loss, ..StepOutput::default() })
     }
+    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
+        note(&self.diary, format!("measure {} at degree {sh_degree}", camera.translation.x));
+        Ok(())
+    }
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
         Ok((Signals::zeros(self.rows, needs.signals), Vec::new()))
     }
@@ -71,6 +76,7 @@ impl Backend for CountingBackend {
 /// Splits as many rows as it can at every multiple of `every`, or prunes half, or fails.
 struct ToldPolicy {
     every: u32,
+    fresh_views: u32,
     what: Told,
 }
 
@@ -81,11 +87,18 @@ enum Told {
     Nothing,
     Fail,
     ReadUndeclared,
+    ReadFresh,
 }
 
 impl DensityPolicy for ToldPolicy {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        Needs { signals: SignalSet::of(&[Signal::Opacity]), ..Needs::default() }
+        let (signals, fresh_views) = (SignalSet::of(&[Signal::Opacity]), self.fresh_views);
+        let fresh = if fresh_views > 0 { signals.with(Signal::FreshWeightMax) } else { signals };
+        Needs { signals: fresh, fresh_views, candidates: None }
+    }
+    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
+        assert!(self.is_due(step) && rows <= budget);
+        2 * rows > budget
     }
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.every)
@@ -121,6 +134,9 @@ impl DensityPolicy for ToldPolicy {
             Told::Fail => return Err(PolicyError::Other("out of ideas".into())),
             Told::ReadUndeclared => {
                 now.signal(Signal::Age)?;
+            }
+            Told::ReadFresh => {
+                now.signal(Signal::FreshWeightMax)?;
             }
         }
         Ok(())
@@ -166,12 +182,20 @@ struct Case {
     budget: usize,
     what: Told,
     every: u32,
+    fresh_views: u32,
     lost_at: u32,
     unreadable: Option<usize>,
 }
 
-const CASE: Case =
-    Case { rows: 3, budget: 10, what: Told::Split, every: 2, lost_at: 0, unreadable: None };
+const CASE: Case = Case {
+    rows: 3,
+    budget: 10,
+    what: Told::Split,
+    every: 2,
+    fresh_views: 0,
+    lost_at: 0,
+    unreadable: None,
+};
 
 fn scene(case: &Case, views: usize) -> SceneInfo {
     SceneInfo {
@@ -226,11 +250,14 @@ fn build(
         ledger: Ledger::default(),
     };
     let views = FakeViews {
-        cameras: vec![camera; views],
+        cameras: (0..views)
+            .map(|view| Camera { translation: DVec3::X * view as f64, ..camera })
+            .collect(),
         unreadable: case.unreadable,
         announced: announced.clone(),
     };
-    let policy = ToldPolicy { every: case.every, what: case.what };
+    let Case { every, fresh_views, what, .. } = *case;
+    let policy = ToldPolicy { every, fresh_views, what };
     let policy = ("told", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, diary, announced))
@@ -277,6 +304,49 @@ fn edits_are_reported_and_the_budget_holds() {
     assert_eq!((events[0].updated, events[0].removed, &*events[0].cause), (3, 0, "told"));
     assert_eq!(trainer.events(), events);
     assert_eq!((trainer.peak_rows(), trainer.rows(), trainer.steps_done()), (10, 10, 9));
+}
+
+#[test]
+fn fresh_views_are_measured_where_they_are_wanted() {
+    let run = |fresh_views: u32, seed: u64| {
+        let case = Case { fresh_views, ..CASE };
+        let options = TrainOptions { seed, ..OPTIONS };
+        let (mut trainer, diary, _) = build(&case, 3, scene(&case, 3), options).unwrap();
+        for _ in 0..9 {
+            trainer.step().unwrap();
+        }
+        let diary = diary.lock().unwrap().clone();
+        let is_edit = |d: &String| d.starts_with("measure") || d.starts_with("apply");
+        (diary.into_iter().filter(is_edit).collect::<Vec<_>>(), trainer.extra_forwards())
+    };
+    // 3 rows of 10 at step 2, where none is wanted, then 6, 10, 10.
+    let expected = |count: usize, seed: u64| -> Vec<String> {
+        let event = |step: u32| {
+            let count = if step == 2 { 0 } else { count };
+            let degree = schedule::sh_degree(step, 9, 3);
+            let views = schedule::fresh_views(3, count, seed, step).into_iter();
+            let measured = views.map(move |view| format!("measure {view} at degree {degree}"));
+            measured.chain([format!("apply {step}")])
+        };
+        [2, 4, 6, 8].into_iter().flat_map(event).collect()
+    };
+    assert_eq!(run(2, 7), (expected(2, 7), 6));
+    assert_eq!(run(2, 7), run(2, 7));
+    assert_eq!(run(2, 8), (expected(2, 8), 6));
+    assert_ne!(run(2, 7), run(2, 8));
+    // There are no more than three.
+    assert_eq!(run(100, 7), (expected(3, 7), 9));
+    assert_eq!(run(0, 7), (expected(0, 7), 0));
+}
+
+#[test]
+fn fresh_signals_are_there_only_where_they_are_wanted() {
+    let case = Case { what: Told::ReadFresh, fresh_views: 2, ..CASE };
+    let (message, ..) = failure(&case);
+    assert!(message.contains("FreshWeightMax was read but not declared"), "{message}");
+    assert!(message.starts_with("step 2") && message.contains("`wants_fresh`"), "{message}");
+    let (mut trainer, ..) = trainer(&Case { rows: 6, ..case });
+    assert!((0..9).all(|_| trainer.step().is_ok()));
 }
 
 #[test]

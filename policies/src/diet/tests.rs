@@ -112,7 +112,7 @@ fn the_last_row_lives() {
 
 #[test]
 fn importance_may_be_that_of_fresh_views() {
-    // By epochs row 0 matters least, in the fresh views the rows 6, 2 and then, unseen, 4.
+    // By epochs rows 0 and 1 matter least; in the fresh views row 4, a candidate, then 6 and 2.
     let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
     let event = event(600, 8, 8)
         .with(Signal::ScreenGradient, &wanting(8, &[4, 7]))

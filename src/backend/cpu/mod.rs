@@ -11,6 +11,7 @@ mod apply;
 mod blocks;
 mod budget;
 mod candidates;
+mod fresh;
 mod loss;
 mod optimise;
 mod passes;
@@ -332,8 +333,13 @@ impl Backend for CpuBackend {
         })
     }
 
+    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
+        self.measure(camera, sh_degree)
+    }
+
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
         let signals = self.signals.take(self.rows, needs.signals, &self.params, &self.ages);
+        self.signals.forget_measured(self.rows);
         Ok((signals, self.candidates.list().to_vec()))
     }
 

@@ -2,6 +2,7 @@
 
 use densify_policies::policy::{Signal, SignalSet, Signals};
 use pulp::Simd;
+use rayon::prelude::*;
 
 use super::blocks::{Blocks, plane};
 use super::project::{ViewParams, dot, lanes};
@@ -37,6 +38,8 @@ pub(super) struct Layout {
     sums: [Option<usize>; SUMS.len()],
     /// Largest weight of the previous epoch, and of the current one.
     weight_max: Option<[usize; 2]>,
+    /// Largest weight of the views measured since signals were last taken.
+    fresh_weight_max: Option<usize>,
     planes: usize,
 }
 
@@ -61,7 +64,8 @@ impl Layout {
         let previous = next(requested.contains(Signal::WeightMax));
         let current = next(requested.contains(Signal::WeightMax));
         let weight_max = previous.zip(current).map(|(a, b)| [a, b]);
-        Self { sums, weight_max, planes }
+        let fresh_weight_max = next(requested.contains(Signal::FreshWeightMax));
+        Self { sums, weight_max, fresh_weight_max, planes }
     }
 
     /// Adds one view's contribution to the accumulators of a block.
@@ -135,10 +139,50 @@ impl Accumulators {
         let any = |signals: &[Signal]| signals.iter().any(|&s| self.requested.contains(s));
         if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
             Detail::All
-        } else if any(&[Signal::WeightMax]) {
+        } else if any(&[Signal::WeightMax, Signal::FreshWeightMax]) {
             Detail::WeightMax
         } else {
             Detail::Gradients
+        }
+    }
+
+    /// Whether views are to be measured.
+    pub(super) fn measures(&self) -> bool {
+        self.layout.fresh_weight_max.is_some()
+    }
+
+    /// Counts one more view for the largest weight of fresh views.
+    ///
+    /// `sums` has one record per row. Shape: [rows, self.detail().stride()].
+    pub(super) fn measure(&mut self, rows: usize, sums: &[f32], visible: &[u16]) {
+        let detail = self.detail();
+        let (Some(plane), Some(field)) = (self.layout.fresh_weight_max, detail.maximum()) else {
+            return;
+        };
+        let per_block = self.blocks.stride();
+        (
+            self.blocks.of_rows_mut(rows).par_chunks_mut(per_block),
+            sums.par_chunks(WIDTH * detail.stride()),
+            visible,
+        )
+            .into_par_iter()
+            .for_each(|(block, sums, &seen)| {
+                let line = &mut block[plane * WIDTH..(plane + 1) * WIDTH];
+                let records = sums.chunks_exact(detail.stride());
+                for (lane, (most, record)) in line.iter_mut().zip(records).enumerate() {
+                    if seen >> lane & 1 == 1 {
+                        *most = most.max(record[field]);
+                    }
+                }
+            });
+    }
+
+    /// Forgets the views measured so far.
+    pub(super) fn forget_measured(&mut self, rows: usize) {
+        if let Some(plane) = self.layout.fresh_weight_max {
+            for row in 0..rows {
+                self.blocks.set(row, plane, 0.0);
+            }
         }
     }
 
@@ -178,6 +222,10 @@ impl Accumulators {
                             self.blocks.get(row, previous).max(self.blocks.get(row, current))
                         })
                     }
+                    Signal::FreshWeightMax => self
+                        .layout
+                        .fresh_weight_max
+                        .map_or(0.0, |plane| self.blocks.get(row, plane)),
                     Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
                     Signal::ScaleMax => {
                         let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);

@@ -210,6 +210,7 @@ impl<'a> Session<'a> {
             rows: trainer.rows(),
             peak_rows: trainer.peak_rows(),
             budget: config.train.budget,
+            extra_forwards: trainer.extra_forwards(),
             peak_bytes: peak_resident(),
             ledger_bytes: ledger.total(),
             ledger: ledger.clone(),
