@@ -77,7 +77,8 @@ pub(super) struct TrainArgs {
     /// extent
     #[arg(long, value_name = "FRACTION", help_heading = "Training", default_value_t = NEAR, value_parser = number::fraction)]
     near: f64,
-    /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc or sh_rest;
+    /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc,
+    /// sh_rest, or boost (factor of them all at the start; 1 for runs of 30,000);
     /// may be repeated
     #[arg(long, value_name = "NAME=RATE", help_heading = "Training")]
     lr: Vec<String>,
