@@ -3,6 +3,8 @@
 //! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are medians of processor time, so that a
 //! loaded machine distorts them little; the stage columns are wall time of one thread.
 
+#![expect(clippy::print_stdout, reason = "its output is a table")]
+
 use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;

@@ -6,21 +6,21 @@ use serde::{Deserialize, Serialize};
 /// A pinhole camera with its pose.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
-    /// Image width [px], >= 1.
+    /// Image width `[px]`, >= 1.
     pub width: u32,
-    /// Image height [px], >= 1.
+    /// Image height `[px]`, >= 1.
     pub height: u32,
-    /// Focal length along x [px], > 0.
+    /// Focal length along x `[px]`, > 0.
     pub fx: f64,
-    /// Focal length along y [px], > 0.
+    /// Focal length along y `[px]`, > 0.
     pub fy: f64,
-    /// Principal point's x [px]; the image's left edge is 0.
+    /// Principal point's x `[px]`; the image's left edge is 0.
     pub cx: f64,
-    /// Principal point's y [px]; the image's upper edge is 0.
+    /// Principal point's y `[px]`; the image's upper edge is 0.
     pub cy: f64,
     /// Rotation part of camera_from_world, orthonormal, determinant +1.
     pub rotation: DMat3,
-    /// Translation part of camera_from_world [scene units].
+    /// Translation part of camera_from_world `[scene units]`.
     pub translation: DVec3,
 }
 

@@ -19,7 +19,7 @@ pub enum Split {
 pub struct ViewScore {
     /// The view's name.
     pub name: String,
-    /// Peak signal-to-noise ratio [dB].
+    /// Peak signal-to-noise ratio `[dB]`.
     pub psnr: f64,
     /// Structural similarity.
     pub ssim: f64,

@@ -18,15 +18,15 @@ pub const MAX_SH_DEGREE: u8 = 3;
 pub struct Gaussians {
     /// Spherical-harmonic degree, 0..=3; decides the length of `sh`.
     pub sh_degree: u8,
-    /// Means [scene units]. Shape: [rows].
+    /// Means `[scene units]`. Shape: `[rows]`.
     pub means: Vec<[f32; 3]>,
-    /// Natural logarithm of the standard deviations [ln scene units]. Shape: [rows].
+    /// Natural logarithm of the standard deviations `[ln scene units]`. Shape: `[rows]`.
     pub log_scales: Vec<[f32; 3]>,
-    /// Orientations (w, x, y, z). Shape: [rows].
+    /// Orientations (w, x, y, z). Shape: `[rows]`.
     pub quats: Vec<[f32; 4]>,
-    /// Opacity logits; opacity = 1 / (1 + exp(−logit)). Shape: [rows].
+    /// Opacity logits; opacity = 1 / (1 + exp(−logit)). Shape: `[rows]`.
     pub opacity_logits: Vec<f32>,
-    /// Coefficient-major, RGB last. Shape: [rows, (degree + 1)², 3].
+    /// Coefficient-major, RGB last. Shape: `[rows, (degree + 1)², 3]`.
     pub sh: Vec<f32>,
 }
 
@@ -43,7 +43,7 @@ impl Gaussians {
         self.means.is_empty()
     }
 
-    /// The coefficients of one row. Shape: [(degree + 1)², 3].
+    /// The coefficients of one row. Shape: `[(degree + 1)², 3]`.
     #[must_use]
     pub fn sh_of(&self, row: usize) -> &[f32] {
         let n = 3 * sh_coefficients(self.sh_degree);

@@ -19,7 +19,7 @@ use crate::dataset::normalise::EXTENT;
 use crate::gaussians::{Gaussians, rgb_to_dc, sh_coefficients};
 pub use random::random_points;
 
-/// Diameter D of a normalised scene [scene units]; scales and floors are relative to it.
+/// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
 pub const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
 /// Neighbours whose distances make the scale.
 const NEIGHBOURS: usize = 3;

@@ -21,7 +21,7 @@ pub struct LedgerLine {
     pub section: Section,
     /// What it holds.
     pub what: String,
-    /// Its size [bytes].
+    /// Its size `[bytes]`.
     pub bytes: u64,
 }
 
@@ -78,7 +78,7 @@ impl Ledger {
         self.lines.extend_from_slice(&other.lines);
     }
 
-    /// Sum of all lines [bytes]; of the lines held in passing only the largest counts, as they
+    /// Sum of all lines `[bytes]`; of the lines held in passing only the largest counts, as they
     /// are never held together.
     #[must_use]
     pub fn total(&self) -> u64 {
@@ -129,13 +129,13 @@ impl fmt::Display for Bytes {
     }
 }
 
-/// Resident memory of this process now [bytes]; `None` where the system does not say.
+/// Resident memory of this process now `[bytes]`; `None` where the system does not say.
 #[must_use]
 pub fn resident() -> Option<u64> {
     status_line("VmRSS:")
 }
 
-/// Largest resident memory of this process so far [bytes]; `None` where the system does not say.
+/// Largest resident memory of this process so far `[bytes]`; `None` where the system does not say.
 #[must_use]
 pub fn peak_resident() -> Option<u64> {
     status_line("VmHWM:")

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::backend::LearningRates;
 use crate::gaussians::MAX_SH_DEGREE;
 
-/// Length of the run for which the published constants were chosen [steps].
+/// Length of the run for which the published constants were chosen `[steps]`.
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
 /// Step sizes of a run. The means' step size is a fraction of the scene's extent and falls
@@ -23,9 +23,9 @@ pub const REFERENCE_ITERATIONS: u32 = 30_000;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateOptions {
-    /// Means, at the start of the run [fraction of the extent per step], > 0.
+    /// Means, at the start of the run `[fraction of the extent per step]`, > 0.
     pub mean_start: f64,
-    /// Means, at the end of the run [fraction of the extent per step], > 0.
+    /// Means, at the end of the run `[fraction of the extent per step]`, > 0.
     pub mean_end: f64,
     /// Log-scales, > 0.
     pub log_scale: f32,
@@ -78,7 +78,7 @@ impl RateOptions {
     }
 
     /// Step sizes of iteration `step` (1-based) of `iterations`, in a scene of this extent
-    /// [scene units].
+    /// `[scene units]`.
     #[must_use]
     pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
         let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
@@ -138,7 +138,7 @@ pub enum Background {
     White,
     /// This colour, sRGB-encoded.
     Colour([u8; 3]),
-    /// Another colour at each step, uniform in [0, 1]³.
+    /// Another colour at each step, uniform in `[0, 1]`³.
     Random,
 }
 

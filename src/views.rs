@@ -46,7 +46,7 @@ impl DatasetViews {
         Self { cache: ImageCache::new(sources, cache_bytes, threads), views }
     }
 
-    /// The images and what is needed to decode them [bytes].
+    /// The images and what is needed to decode them `[bytes]`.
     #[must_use]
     pub fn cache(&self) -> &ImageCache {
         &self.cache

@@ -37,7 +37,7 @@ pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     sum.iter().zip(views).map(mean).collect()
 }
 
-/// A copy beside a parent that stays as it is, at `offset` from it [scene units].
+/// A copy beside a parent that stays as it is, at `offset` from it `[scene units]`.
 #[must_use]
 pub fn clone_at(offset: [f32; 3]) -> Offspring {
     Offspring {
@@ -66,12 +66,12 @@ pub fn split_by(factor: f32) -> Offspring {
 pub struct Mortality {
     /// Rows less opaque than this are dead.
     pub min_opacity: f32,
-    /// Rows larger than this are dead [scene units].
+    /// Rows larger than this are dead `[scene units]`.
     pub max_scale: f32,
 }
 
 impl Mortality {
-    /// Whether a row of this opacity and largest standard deviation [scene units] is dead. Numbers
+    /// Whether a row of this opacity and largest standard deviation `[scene units]` is dead. Numbers
     /// that are not finite are: no gradient will ever mend them.
     #[must_use]
     pub fn is_dead(&self, opacity: f32, scale: f32) -> bool {

@@ -30,7 +30,7 @@ pub enum ParentFate {
 /// a parent that stays, the new rows are also numbered from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Placement {
-    /// New rows at the parent's mean + this offset [scene units]; a rewritten parent does not move.
+    /// New rows at the parent's mean + this offset `[scene units]`; a rewritten parent does not move.
     Offset([f32; 3]),
     /// Every child at mean + R·diag(s)·ξ, ξ ~ N(0, I), s the parent's scales
     /// (original adaptive density control, Kerbl et al. 2023, section 5.2).
@@ -84,11 +84,11 @@ pub struct Update {
 /// A row born without a parent: isotropic, unrotated, view-independent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Seed {
-    /// Mean [scene units].
+    /// Mean `[scene units]`.
     pub position: [f32; 3],
-    /// Colour, sRGB-encoded in [0, 1].
+    /// Colour, sRGB-encoded in `[0, 1]`.
     pub colour: [f32; 3],
-    /// Standard deviation of all three axes [scene units], > 0.
+    /// Standard deviation of all three axes `[scene units]`, > 0.
     pub scale: f32,
     /// Opacity, in (0, 1).
     pub opacity: f32,

@@ -89,7 +89,7 @@ pub(crate) fn parse_value(text: &str) -> Value {
     single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }
 
-/// Shortest interval that scaling leaves [steps]. Between two events rows must be seen from many
+/// Shortest interval that scaling leaves `[steps]`. Between two events rows must be seen from many
 /// views, and those just born must find their place: that takes as many steps in a short run as in
 /// a long one.
 pub(crate) const LEAST_INTERVAL: i64 = 100;

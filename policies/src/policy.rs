@@ -58,7 +58,7 @@ pub type PolicyState = serde_json::Value;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneInfo {
     /// Size of the scene E = 1.1 · max distance of a training camera to their mean
-    /// [scene units], > 0. Size thresholds are fractions of it.
+    /// `[scene units]`, > 0. Size thresholds are fractions of it.
     pub extent: f32,
     /// Number of training views, >= 1; also the length of an epoch in steps.
     pub train_views: u32,
@@ -89,17 +89,17 @@ pub enum Signal {
     /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. The
     /// gradient is taken before the mask of the colour's clamp at 0: a row clamped to black has one.
     ColourGradient,
-    /// x of the sum over views of dL/d(mean) [1 / scene units].
+    /// x of the sum over views of dL/d(mean) `[1 / scene units]`.
     MeanGradientX,
-    /// y of the sum over views of dL/d(mean) [1 / scene units].
+    /// y of the sum over views of dL/d(mean) `[1 / scene units]`.
     MeanGradientY,
-    /// z of the sum over views of dL/d(mean) [1 / scene units].
+    /// z of the sum over views of dL/d(mean) `[1 / scene units]`.
     MeanGradientZ,
-    /// Sum over views of ‖dL/d(mean)‖₂ [1 / scene units], >= 0.
+    /// Sum over views of ‖dL/d(mean)‖₂ `[1 / scene units]`, >= 0.
     MeanGradientNorm,
-    /// Largest blend weight α·T over all pixels of the previous and the current epoch, in [0, 1].
+    /// Largest blend weight α·T over all pixels of the previous and the current epoch, in `[0, 1]`.
     WeightMax,
-    /// Largest blend weight α·T over all pixels of freshly rendered training views, in [0, 1]. They
+    /// Largest blend weight α·T over all pixels of freshly rendered training views, in `[0, 1]`. They
     /// are chosen at random for this event, [`Needs::fresh_views`] of them, and rendered as the
     /// model is now. 0 for a row that none of them shows.
     FreshWeightMax,
@@ -109,7 +109,7 @@ pub enum Signal {
     PixelCount,
     /// Opacity now, in (0, 1).
     Opacity,
-    /// Largest of the three standard deviations now [scene units], > 0.
+    /// Largest of the three standard deviations now `[scene units]`, > 0.
     ScaleMax,
     /// Optimiser steps since the row was born or rewritten, saturating at 65,535.
     Age,
@@ -232,11 +232,11 @@ pub enum DepthMode {
 /// A pixel that is badly explained, with its surface point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Candidate {
-    /// Surface point [scene units].
+    /// Surface point `[scene units]`.
     pub position: [f32; 3],
-    /// Ground-truth colour, sRGB-encoded in [0, 1].
+    /// Ground-truth colour, sRGB-encoded in `[0, 1]`.
     pub colour: [f32; 3],
-    /// Width of one pixel at that depth, z / f [scene units], > 0.
+    /// Width of one pixel at that depth, z / f `[scene units]`, > 0.
     pub pixel_size: f32,
     /// Error of the pixel in the requested mode, > 0.
     pub error: f32,

@@ -16,9 +16,9 @@ use crate::memory::Ledger;
 /// Step sizes of one iteration, one per parameter class.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearningRates {
-    /// Means [scene units per step].
+    /// Means `[scene units per step]`.
     pub mean: f32,
-    /// Log-scales [ln scene units per step].
+    /// Log-scales `[ln scene units per step]`.
     pub log_scale: f32,
     /// Quaternions.
     pub quat: f32,
@@ -39,7 +39,7 @@ pub struct StepInput<'a> {
     pub camera: &'a Camera,
     /// The view's image, of the camera's size.
     pub target: &'a Image8,
-    /// Background colour, sRGB-encoded in [0, 1]; a target with alpha is composited on it too.
+    /// Background colour, sRGB-encoded in `[0, 1]`; a target with alpha is composited on it too.
     pub background: [f32; 3],
     /// Spherical-harmonic degree evaluated and trained now, <= the model's.
     pub sh_degree: u8,
@@ -67,15 +67,15 @@ pub struct StepOutput {
 /// A rendered view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rendering {
-    /// Width [px].
+    /// Width `[px]`.
     pub width: u32,
-    /// Height [px].
+    /// Height `[px]`.
     pub height: u32,
-    /// Background included, not clamped. Shape: [height, width, 3].
+    /// Background included, not clamped. Shape: `[height, width, 3]`.
     pub rgb: Vec<f32>,
-    /// 1 − final transmittance, in [0, 1]. Shape: [height, width].
+    /// 1 − final transmittance, in `[0, 1]`. Shape: `[height, width]`.
     pub alpha: Vec<f32>,
-    /// Σ α·T·z, camera z [scene units], without a background term. Shape: [height, width].
+    /// Σ α·T·z, camera z `[scene units]`, without a background term. Shape: `[height, width]`.
     pub depth: Vec<f32>,
 }
 
@@ -98,11 +98,11 @@ pub enum BackendError {
         "an image of {width}x{height} px is too large: sides of at most {max} px; use --resolution to shrink it"
     )]
     ImageTooLarge {
-        /// Its width [px].
+        /// Its width `[px]`.
         width: u32,
-        /// Its height [px].
+        /// Its height `[px]`.
         height: u32,
-        /// The largest side supported [px].
+        /// The largest side supported `[px]`.
         max: u32,
     },
 }

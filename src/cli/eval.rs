@@ -20,7 +20,7 @@ use crate::output::{Mean, write_scores};
 pub(super) struct EvalArgs {
     /// Folder that `densify train` wrote
     run: PathBuf,
-    /// Saved iteration to measure [default: the last]
+    /// Saved iteration to measure `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
     /// Which views to measure
@@ -29,7 +29,7 @@ pub(super) struct EvalArgs {
     /// Folder of the dataset, where it is no longer where it was
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
-    /// Processor threads to use [default: all]
+    /// Processor threads to use `[default: all]`
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 }

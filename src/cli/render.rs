@@ -39,7 +39,7 @@ pub(super) struct RenderArgs {
     /// Which views to render
     #[arg(long, value_enum, default_value_t = SplitArg::Test)]
     split: SplitArg,
-    /// Saved iteration of the run [default: the last]
+    /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
     /// Also write how opaque each pixel is, as NAME.alpha.png
@@ -55,7 +55,7 @@ pub(super) struct RenderArgs {
     /// scene's extent
     #[arg(long, value_name = "FRACTION", help_heading = "Scene", default_value_t = NEAR, value_parser = number::fraction)]
     near: f64,
-    /// Processor threads to use [default: all]
+    /// Processor threads to use `[default: all]`
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     #[command(flatten)]
@@ -173,7 +173,7 @@ fn alpha(rendering: &Rendering) -> DynamicImage {
     ImageBuffer::from_fn(*width, *height, pixel).into()
 }
 
-/// Depth relative to its largest value, and that value [scene units].
+/// Depth relative to its largest value, and that value `[scene units]`.
 fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
     let Rendering { width, height, depth, .. } = rendering;
     let largest = depth.iter().copied().fold(0.0, f32::max);

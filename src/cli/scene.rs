@@ -88,7 +88,7 @@ pub(super) fn load(
     Ok(dataset)
 }
 
-/// Width and height that hold every view of the dataset [px].
+/// Width and height that hold every view of the dataset `[px]`.
 pub(super) fn largest_image(dataset: &Dataset) -> (u32, u32) {
     let cameras = dataset.train.iter().chain(&dataset.test).map(|view| &view.camera);
     cameras.fold((1, 1), |(w, h), camera| (w.max(camera.width), h.max(camera.height)))

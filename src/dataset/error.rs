@@ -71,13 +71,13 @@ pub enum DatasetError {
     ImageSize {
         /// The image.
         path: PathBuf,
-        /// Its width [px].
+        /// Its width `[px]`.
         width: u32,
-        /// Its height [px].
+        /// Its height `[px]`.
         height: u32,
-        /// The width expected [px].
+        /// The width expected `[px]`.
         camera_width: u32,
-        /// The height expected [px].
+        /// The height expected `[px]`.
         camera_height: u32,
     },
     /// An image that cannot be decoded.

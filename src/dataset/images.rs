@@ -14,7 +14,7 @@ use super::error::DatasetError;
 use super::resample;
 use super::undistort::Undistortion;
 
-/// Longest side accepted [px].
+/// Longest side accepted `[px]`.
 pub const MAX_SIDE: u32 = 16_384;
 /// Most pixels accepted.
 pub const MAX_PIXELS: u64 = 1 << 28;
@@ -30,9 +30,9 @@ pub struct ImageSource {
     pub path: PathBuf,
     /// A greyscale file that says which pixels count in the loss (black: ignored), if any.
     pub mask: Option<PathBuf>,
-    /// Width after loading [px].
+    /// Width after loading `[px]`.
     pub width: u32,
-    /// Height after loading [px].
+    /// Height after loading `[px]`.
     pub height: u32,
     /// Resampling from the lens that took the image to a pinhole, at the file's size.
     pub undistortion: Option<Undistortion>,
@@ -43,32 +43,32 @@ pub struct ImageSource {
 /// What an image file's header says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageHeader {
-    /// Width [px].
+    /// Width `[px]`.
     pub width: u32,
-    /// Height [px].
+    /// Height `[px]`.
     pub height: u32,
     /// Whether pixels have coverage.
     pub has_alpha: bool,
-    /// Size as the decoder yields it [bytes].
+    /// Size as the decoder yields it `[bytes]`.
     pub decoded_bytes: u64,
-    /// Size of the file [bytes].
+    /// Size of the file `[bytes]`.
     pub file_bytes: u64,
 }
 
 /// A decoded image, packed 8 bits per channel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image8 {
-    /// Width [px].
+    /// Width `[px]`.
     pub width: u32,
-    /// Height [px].
+    /// Height `[px]`.
     pub height: u32,
-    /// sRGB-encoded, row-major, RGB interleaved. Shape: [height, width, 3].
+    /// sRGB-encoded, row-major, RGB interleaved. Shape: `[height, width, 3]`.
     pub rgb: Vec<u8>,
     /// Coverage for compositing on the background (straight alpha), if the file has any.
-    /// Shape: [height, width].
+    /// Shape: `[height, width]`.
     pub alpha: Option<Vec<u8>>,
     /// Weight of each pixel in the loss: 0 = ignored, 255 = counted, if there is a mask.
-    /// Shape: [height, width].
+    /// Shape: `[height, width]`.
     pub mask: Option<Vec<u8>>,
 }
 
@@ -76,7 +76,7 @@ pub struct Image8 {
 pub type SharedImage = Arc<Image8>;
 
 impl Image8 {
-    /// The pixel's colour over `background`, in [0, 1].
+    /// The pixel's colour over `background`, in `[0, 1]`.
     #[must_use]
     pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
         let pixel = y * self.width as usize + x;
@@ -87,7 +87,7 @@ impl Image8 {
         })
     }
 
-    /// Size of the pixels [bytes].
+    /// Size of the pixels `[bytes]`.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let length = |channel: &Option<Vec<u8>>| channel.as_ref().map_or(0, Vec::len);

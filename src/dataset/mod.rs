@@ -69,9 +69,9 @@ pub struct View {
 /// A coloured point cloud in structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
-    /// Positions. Shape: [points].
+    /// Positions. Shape: `[points]`.
     pub positions: Vec<DVec3>,
-    /// sRGB colours. Shape: [points].
+    /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
 }
 

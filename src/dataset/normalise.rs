@@ -12,7 +12,7 @@ use crate::gaussians::Gaussians;
 
 /// The margin of the scene's extent around the cameras (3DGS, `getNerfppNorm`).
 const EXTENT_MARGIN: f64 = 1.1;
-/// Extent of every normalised scene [scene units].
+/// Extent of every normalised scene `[scene units]`.
 pub const EXTENT: f64 = EXTENT_MARGIN;
 /// Rigs smaller than this share of their distance from the origin are one place: f64 has
 /// 2.2e-16, of which poses computed elsewhere keep a few digits less.

@@ -22,7 +22,7 @@ pub enum Resolution {
     /// Sides divided by this: 1, 2, 4 or 8. Uses the folder `images_2`, `images_4` or `images_8`
     /// where there is one.
     Divisor(u32),
-    /// Images this wide [px], above 8.
+    /// Images this wide `[px]`, above 8.
     Width(u32),
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::error::DatasetError;
 
-/// Longest name accepted from a data file [bytes].
+/// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
 
 /// A folder that paths from data files may not leave.

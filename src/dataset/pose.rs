@@ -7,7 +7,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::error::DatasetError;
 use super::undistort::Lens;
 
-/// Fields of view that a pinhole camera can stand for [degrees].
+/// Fields of view that a pinhole camera can stand for `[degrees]`.
 const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
 
 /// Largest entry of |RᵀR − I| accepted; below it the rotation is made orthonormal.

@@ -18,7 +18,7 @@ use super::pose::{check_lens, checked_pose};
 use super::undistort::Lens;
 use super::{Frame, Scene};
 
-/// Largest JSON file read [bytes]. (serde_json bounds the depth to 128.)
+/// Largest JSON file read `[bytes]`. (serde_json bounds the depth to 128.)
 const MAX_JSON: u64 = 64 << 20;
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";

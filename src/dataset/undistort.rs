@@ -11,13 +11,13 @@ use super::resample::Mix;
 /// A pinhole with lens distortion. The image's left upper corner is (0, 0), pixel centres at +0.5.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
-    /// Image width [px].
+    /// Image width `[px]`.
     pub width: u32,
-    /// Image height [px].
+    /// Image height `[px]`.
     pub height: u32,
-    /// Focal lengths [px].
+    /// Focal lengths `[px]`.
     pub focal: DVec2,
-    /// Principal point [px].
+    /// Principal point `[px]`.
     pub principal: DVec2,
     /// k1, k2, p1, p2: radial of orders 3 and 5, then tangential; 0 without distortion.
     pub distortion: [f64; 4],
@@ -163,7 +163,7 @@ impl Undistortion {
         &self.to
     }
 
-    /// Where in the distorted image the pinhole's `pixel` is seen [px].
+    /// Where in the distorted image the pinhole's `pixel` is seen `[px]`.
     #[must_use]
     pub fn source_of(&self, pixel: DVec2) -> DVec2 {
         let p = (pixel - self.to.principal) / self.to.focal;

@@ -12,7 +12,7 @@ use crate::dataset::PointCloud;
 const CUBE: f64 = 1.0 / 3.0;
 /// Depths of the surroundings, in distances of the cameras from their focus.
 const BEYOND: (f64, f64) = (2.0 / 3.0, 4.0);
-/// Depths in scenes without a focus [scene units]; the rig's radius is 1.
+/// Depths in scenes without a focus `[scene units]`; the rig's radius is 1.
 const AROUND: (f64, f64) = (0.25, 5.0);
 /// Colours are drawn from the middle half, where no channel is near its clamp.
 const COLOURS: (u8, u8) = (64, 128);

@@ -2,7 +2,7 @@
 //!
 //! Both compare a rendered image with a packed target, both in sRGB encoding, and both accumulate
 //! in `f64`, so that a figure does not depend on the image's size or on the number of threads.
-//! Renders are clamped to [0, 1] first, as a viewer would show them. A target with coverage is
+//! Renders are clamped to `[0, 1]` first, as a viewer would show them. A target with coverage is
 //! composited on the background the render was made with. A target with a mask is compared where
 //! the mask counts: the render's error is scaled by the mask before windows are taken, so what
 //! lies under the mask cannot leak into its neighbours' SSIM, and pixels are weighted by it.
@@ -28,9 +28,9 @@ pub enum MetricError {
         rendered: usize,
         /// 3 · width · height.
         expected: usize,
-        /// The target's width [px].
+        /// The target's width `[px]`.
         width: u32,
-        /// The target's height [px].
+        /// The target's height `[px]`.
         height: u32,
     },
     /// A part of the target does not have as many values as its width and height say.
@@ -44,9 +44,9 @@ pub enum MetricError {
         found: usize,
         /// Values it should have.
         expected: usize,
-        /// The target's width [px].
+        /// The target's width `[px]`.
         width: u32,
-        /// The target's height [px].
+        /// The target's height `[px]`.
         height: u32,
     },
     /// No pixel counts.
@@ -93,7 +93,7 @@ impl<'a> Pair<'a> {
         Ok(Self { rendered, target, background: background.map(f64::from), width, height })
     }
 
-    /// How much pixel `p` counts, in [0, 1].
+    /// How much pixel `p` counts, in `[0, 1]`.
     fn weight(&self, p: usize) -> f64 {
         self.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
     }

@@ -5,9 +5,9 @@ use rayon::prelude::*;
 use super::{MetricError, Pair};
 use crate::dataset::images::Image8;
 
-/// PSNR [dB] of a render against a target: one mean over all pixels and channels of the image.
+/// PSNR `[dB]` of a render against a target: one mean over all pixels and channels of the image.
 ///
-/// `rendered`: shape [height, width, 3], clamped to [0, 1] here. `background` in [0, 1] is what
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is what
 /// a target with coverage is composited on. Infinite when both are equal, NaN when the render
 /// holds a NaN.
 ///

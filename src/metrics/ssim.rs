@@ -19,7 +19,7 @@ use crate::dataset::images::Image8;
 
 /// Pixels from the window's centre to its edge.
 const REACH: usize = 5;
-/// Standard deviation of the window [px].
+/// Standard deviation of the window `[px]`.
 const SIGMA: f64 = 1.5;
 /// (0.01 · peak)², peak = 1.
 const C1: f64 = 0.01 * 0.01;
@@ -31,7 +31,7 @@ const BLOCK: usize = 32;
 
 /// Mean SSIM of a render against a target, <= 1.
 ///
-/// `rendered`: shape [height, width, 3], clamped to [0, 1] here. `background` in [0, 1] is what
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is what
 /// a target with coverage is composited on. Images smaller than the window need no special case:
 /// the window then sees zeros of both. NaN when the render holds a NaN.
 ///
@@ -80,7 +80,7 @@ fn window() -> [f64; 2 * REACH + 1] {
 /// What is averaged over the window: e, y, e², x² + y².
 type Moments = [f64; 4];
 
-/// SSIM of rows `first..last`. Shape: [last − first, width, 3].
+/// SSIM of rows `first..last`. Shape: `[last − first, width, 3]`.
 fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<f64> {
     let values = 3 * pair.width;
     let above = first.saturating_sub(REACH);

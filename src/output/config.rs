@@ -34,7 +34,7 @@ pub struct SceneConfig {
     pub working_directory: Option<PathBuf>,
     /// Folder of the images, where not the dataset's own (`--images`).
     pub images: Option<PathBuf>,
-    /// 1, 2, 4 or 8: images are so many times smaller. Other numbers: their width [px].
+    /// 1, 2, 4 or 8: images are so many times smaller. Other numbers: their width `[px]`.
     pub resolution: Option<u32>,
     /// Whether a test split was asked for (`--eval` or `--test-every`).
     pub eval: bool,

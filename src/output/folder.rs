@@ -53,6 +53,8 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
+    /// Whether this run made the folder.
+    is_new: bool,
     staging: Option<TempDir>,
 }
 
@@ -82,6 +84,7 @@ impl RunFolder {
     /// As [`check`](Self::check).
     pub fn create(target: &Path, overwrite: bool) -> Result<Self, OutputError> {
         Self::check(target, overwrite)?;
+        let is_new = !target.exists();
         let fail = |e| OutputError::io("create the folder", target)(e);
         fs::create_dir_all(target).map_err(fail)?;
         let occupied = !owned_entries(target)?.is_empty();
@@ -89,7 +92,7 @@ impl RunFolder {
             .then(|| tempfile::Builder::new().prefix(".densify-").tempdir_in(target))
             .transpose()
             .map_err(OutputError::io("create a folder in", target))?;
-        Ok(Self { target: target.to_owned(), staging })
+        Ok(Self { target: target.to_owned(), is_new, staging })
     }
 
     /// Where to write now.
@@ -103,7 +106,7 @@ impl RunFolder {
     /// # Errors
     /// [`OutputError::Io`]. The new run is then kept in the hidden folder that the error names.
     pub fn finish(self) -> Result<PathBuf, OutputError> {
-        let Self { target, staging } = self;
+        let Self { target, staging, .. } = self;
         let Some(staging) = staging else {
             return Ok(target);
         };
@@ -130,6 +133,27 @@ impl RunFolder {
     #[must_use]
     pub fn abandon(self) -> PathBuf {
         self.staging.map_or(self.target, TempDir::keep)
+    }
+
+    /// Ends a run that has nothing to show: removes what it has written. The run that was there,
+    /// and files that are no run's, stay.
+    pub fn discard(self) {
+        // What is staged goes with its folder.
+        if self.staging.is_none() {
+            remove_owned(&self.target);
+            if self.is_new {
+                // It stays if the user has put something there meanwhile.
+                let _ = fs::remove_dir(&self.target);
+            }
+        }
+    }
+}
+
+/// Removes what belongs to a run, as far as the system lets it.
+fn remove_owned(folder: &Path) {
+    for name in owned_entries(folder).unwrap_or_default() {
+        let path = folder.join(name);
+        let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
     }
 }
 
@@ -212,6 +236,27 @@ mod tests {
         let kept = run.abandon();
         assert_eq!(fs::read(kept.join("config.toml")).unwrap(), b"new");
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
+    }
+
+    #[test]
+    fn a_discarded_run_leaves_what_was_there() {
+        let root = tempfile::tempdir().unwrap();
+        let target = root.path().join("run");
+        let discard = |overwrite| {
+            let run = RunFolder::create(&target, overwrite).unwrap();
+            write(&run.path().join("config.toml"), "new");
+            write(&run.path().join("stats/train.jsonl"), "new");
+            run.discard();
+        };
+        discard(false);
+        assert!(!target.exists());
+        write(&target.join("notes.txt"), "mine");
+        discard(false);
+        assert_eq!(tree(&target), ["notes.txt"]);
+        write(&target.join("config.toml"), "old");
+        discard(true);
+        assert_eq!(tree(&target), ["config.toml", "notes.txt"]);
+        assert_eq!(fs::read(target.join("config.toml")).unwrap(), b"old");
     }
 
     #[test]

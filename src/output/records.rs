@@ -59,7 +59,7 @@ pub struct StepRecord {
     pub ssim: f32,
     /// Rows now.
     pub rows: usize,
-    /// Wall time since the first step [s].
+    /// Wall time since the first step `[s]`.
     pub seconds: f64,
 }
 
@@ -82,15 +82,15 @@ pub struct Summary {
     pub budget: usize,
     /// Training views rendered for the policy's decisions, beside one per step.
     pub extra_forwards: u64,
-    /// Largest resident memory of the process [bytes], where the system says.
+    /// Largest resident memory of the process `[bytes]`, where the system says.
     pub peak_bytes: Option<u64>,
-    /// The ledger's total [bytes].
+    /// The ledger's total `[bytes]`.
     pub ledger_bytes: u64,
     /// The ledger.
     pub ledger: Ledger,
-    /// Wall time of all steps [s].
+    /// Wall time of all steps `[s]`.
     pub seconds: f64,
-    /// CPU time of all steps, all threads together [s], where the system says.
+    /// CPU time of all steps, all threads together `[s]`, where the system says.
     pub cpu_seconds: Option<f64>,
     /// Number of views trained on.
     pub train_views: usize,
@@ -103,7 +103,7 @@ pub struct Summary {
 /// Mean scores of a set of views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Mean {
-    /// Peak signal-to-noise ratio [dB].
+    /// Peak signal-to-noise ratio `[dB]`.
     #[serde(rename = "PSNR")]
     pub psnr: f64,
     /// Structural similarity.

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::PlyError;
 
-/// Longest header accepted [bytes].
+/// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 1 << 20;
 /// Most rows accepted of one element.
 const MAX_ROWS: u64 = 1 << 32;
@@ -68,7 +68,7 @@ impl Scalar {
         })
     }
 
-    /// Size in a binary file [bytes].
+    /// Size in a binary file `[bytes]`.
     pub(super) fn size(self) -> usize {
         match self {
             Self::I8 | Self::U8 => 1,

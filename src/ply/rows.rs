@@ -8,7 +8,7 @@ use std::path::Path;
 use super::PlyError;
 use super::header::{Element, Encoding, Header, Scalar};
 
-/// Longest number accepted in an ascii file [bytes].
+/// Longest number accepted in an ascii file `[bytes]`.
 const MAX_WORD: usize = 128;
 
 /// A PLY file with its header read.

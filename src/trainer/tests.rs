@@ -1,4 +1,6 @@
 //! The loop against a backend that only counts and a policy that does as it is told.
+//!
+//! One piece: every test here drives the same counting backend and scripted policy.
 
 use std::sync::{Arc, Mutex};
 

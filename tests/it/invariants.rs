@@ -70,6 +70,7 @@ fn is_production(path: &str) -> bool {
     ["src/", "policies/src/", "scenegen/src/"].iter().any(|p| path.starts_with(p))
         && path.ends_with(".rs")
         && !path.ends_with("/tests.rs")
+        && !path.contains("/tests/")
 }
 
 // --- What depends on what ---------------------------------------------------------------------

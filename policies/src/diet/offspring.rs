@@ -30,7 +30,7 @@ impl Diet {
         }
     }
 
-    /// Offset of a clone from its parent [scene units].
+    /// Offset of a clone from its parent `[scene units]`.
     fn shift(&self, now: &Snapshot<'_>, row: usize) -> Result<[f32; 3], PolicyError> {
         let read = |signal| now.signal(signal).map(|column| column[row]);
         if self.params.shift == Shift::None {

@@ -67,6 +67,7 @@ fn rate(rates: &LearningRates, p: usize) -> f32 {
 ///
 /// `gradient` has `trained` planes, the first of the block's; the others rest.
 #[inline(always)]
+#[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
 pub(super) fn step<S: Simd>(
     s: S,
     params: &mut [f32],

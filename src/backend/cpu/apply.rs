@@ -73,7 +73,7 @@ impl Model<'_> {
                 Placement::LongAxis { sigmas } => {
                     let long = longest(log_scale);
                     let mut local = [0.0; 3];
-                    let sign = if child % 2 == 0 { 1.0 } else { -1.0 };
+                    let sign = if child.is_multiple_of(2) { 1.0 } else { -1.0 };
                     local[long] = sign * sigmas * log_scale[long].exp();
                     rotate(quat, local)
                 }

@@ -132,8 +132,7 @@ pub(super) fn surface_row(
         let u = splat.l1 * (dx - splat.shear * dy);
         let z = splat.l3 * dy;
         let alpha = (splat.log2_opacity - u * u - z * z).exp2().min(ALPHA_MAX);
-        // Also false for NaN.
-        if !(alpha >= ALPHA_MIN) {
+        if alpha.is_nan() || alpha < ALPHA_MIN {
             continue;
         }
         let weight = alpha * light;

@@ -48,9 +48,9 @@ const PAD: usize = WIDTH;
 /// Planes of image size that the loss keeps between its passes: e, y, and three derivatives.
 #[derive(Debug)]
 pub(super) struct LossBuffers {
-    /// Shape: [rows, stride] each.
+    /// Shape: `[rows, stride]` each.
     planes: [Vec<f32>; 5],
-    /// Error per pixel, summed over channels, if asked for. Shape: [rows, stride].
+    /// Error per pixel, summed over channels, if asked for. Shape: `[rows, stride]`.
     error: Vec<f32>,
     stride: usize,
 }
@@ -99,6 +99,7 @@ impl LossBuffers {
     /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
     /// also the error of each pixel, as the mean over channels of their combination of |e| and
     /// 1 − SSIM.
+    #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
         arch: Arch,

@@ -64,14 +64,14 @@ const ROWS_PER_TASK: usize = BLOCKS_PER_TASK * WIDTH;
 pub struct CpuOptions {
     /// Most rows there may ever be, >= 1 and >= the model's.
     pub budget: usize,
-    /// Near plane [scene units], > 0: rows nearer to the camera are not rendered.
+    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
     pub near: f32,
     /// Most (row, tile) entries held at a time; beyond it the image is processed in bands.
     /// At least one tile's list must fit, so it is raised to the budget.
     pub tile_cap: usize,
     /// Worker threads; `None` takes all cores.
     pub threads: Option<usize>,
-    /// Largest image that will be rendered (width, height) [px]. Larger ones still work, with more
+    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
     /// memory than the ledger says.
     pub largest_image: (u32, u32),
     /// Signals and candidates to collect.
@@ -96,11 +96,11 @@ impl CpuOptions {
 /// dL/dpixel for [`CpuBackend::differentiate`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageGradient {
-    /// Shape: [height, width, 3].
+    /// Shape: `[height, width, 3]`.
     pub rgb: Vec<f32>,
-    /// Shape: [height, width].
+    /// Shape: `[height, width]`.
     pub alpha: Vec<f32>,
-    /// Shape: [height, width].
+    /// Shape: `[height, width]`.
     pub depth: Vec<f32>,
 }
 
@@ -120,19 +120,19 @@ pub struct CpuBackend {
     bias: BiasCorrection,
     signals: Accumulators,
     candidates: Candidates,
-    /// Shape: [budget].
+    /// Shape: `[budget]`.
     splats: Vec<Splat>,
-    /// Bit per lane: on screen in the view at hand. Shape: [blocks].
+    /// Bit per lane: on screen in the view at hand. Shape: `[blocks]`.
     visible: Vec<u16>,
     lists: TileLists,
-    /// Shape: [tiles].
+    /// Shape: `[tiles]`.
     canvas: Vec<TileCanvas>,
-    /// Shape: [tiles].
+    /// Shape: `[tiles]`.
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// Bits of one record per slot. Shape: [tile cap, stride of the signals' detail].
+    /// Bits of one record per slot. Shape: `[tile cap, stride of the signals' detail]`.
     records: Vec<AtomicU32>,
-    /// One record per row. Shape: [budget, stride of the signals' detail].
+    /// One record per row. Shape: `[budget, stride of the signals' detail]`.
     sums: Vec<f32>,
     clock: StageClock,
 }
@@ -249,7 +249,7 @@ impl CpuBackend {
     }
 
     /// The training loss of a rendering against a target and its gradient by the rendering's
-    /// pixels. Shape of the gradient: [height, width, 3].
+    /// pixels. Shape of the gradient: `[height, width, 3]`.
     ///
     /// # Panics
     /// When rendering and target differ in size.

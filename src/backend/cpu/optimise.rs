@@ -23,10 +23,10 @@ pub(super) struct Optimise<'a> {
     /// Accumulators of these blocks; empty if no sum is requested.
     pub(super) signals: &'a mut [f32],
     pub(super) layout: Layout,
-    /// Shape: [rows, detail.stride()].
+    /// Shape: `[rows, detail.stride()]`.
     pub(super) sums: &'a [f32],
     pub(super) detail: Detail,
-    /// Shape: [blocks].
+    /// Shape: `[blocks]`.
     pub(super) visible: &'a [u16],
     pub(super) view: &'a ViewParams,
     pub(super) rates: &'a LearningRates,
@@ -73,29 +73,29 @@ impl WithSimd for Optimise<'_> {
 /// Gradients of every parameter and of what signals are made of, for one view.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ModelGradient {
-    /// dL/d(mean). Shape: [rows].
+    /// dL/d(mean). Shape: `[rows]`.
     pub means: Vec<[f32; 3]>,
-    /// dL/d(log-scale). Shape: [rows].
+    /// dL/d(log-scale). Shape: `[rows]`.
     pub log_scales: Vec<[f32; 3]>,
-    /// dL/d(raw quaternion). Shape: [rows].
+    /// dL/d(raw quaternion). Shape: `[rows]`.
     pub quats: Vec<[f32; 4]>,
-    /// dL/d(opacity logit). Shape: [rows].
+    /// dL/d(opacity logit). Shape: `[rows]`.
     pub opacity_logits: Vec<f32>,
-    /// dL/d(coefficients), coefficient-major, RGB last. Shape: [rows, (degree + 1)², 3].
+    /// dL/d(coefficients), coefficient-major, RGB last. Shape: `[rows, (degree + 1)², 3]`.
     pub sh: Vec<f32>,
-    /// dL/d(projected mean) [1/px]. Shape: [rows].
+    /// dL/d(projected mean) `[1/px]`. Shape: `[rows]`.
     pub mean2d: Vec<[f32; 2]>,
-    /// Σ over pixels of the absolute values of the same [1/px]. Shape: [rows].
+    /// Σ over pixels of the absolute values of the same `[1/px]`. Shape: `[rows]`.
     pub mean2d_abs: Vec<[f32; 2]>,
-    /// dL/d(colour as blended). Shape: [rows].
+    /// dL/d(colour as blended). Shape: `[rows]`.
     pub colour: Vec<[f32; 3]>,
-    /// Largest blend weight α·T over pixels. Shape: [rows].
+    /// Largest blend weight α·T over pixels. Shape: `[rows]`.
     pub max_weight: Vec<f32>,
-    /// Sum of the blend weights. Shape: [rows].
+    /// Sum of the blend weights. Shape: `[rows]`.
     pub sum_weight: Vec<f32>,
-    /// Pixels blended into. Shape: [rows].
+    /// Pixels blended into. Shape: `[rows]`.
     pub pixel_count: Vec<u32>,
-    /// Whether the row's projection is on screen. Shape: [rows].
+    /// Whether the row's projection is on screen. Shape: `[rows]`.
     pub visible: Vec<bool>,
 }
 

@@ -5,7 +5,7 @@
 //! - Its determinant comes from the Lagrange identity |v₀ × v₁|² + 0.3(|v₀|² + |v₁|²) + 0.09: all
 //!   terms positive, where a·c − b² loses everything from 1,000:1 needles on.
 //! - Its inverse is kept as the Cholesky factor L, Σ⁻¹ = L·Lᵀ: with (u, z) = Lᵀ·d the exponent is
-//!   −½(u² + z²), never positive. L = [[l₁, 0], [−l₁·r, l₃]], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
+//!   −½(u² + z²), never positive. L = [[l₁, 0], `[−l₁·r, l₃]`], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
 //!   Inside a splat's footprint the error of u does not depend on which axis is eliminated, so
 //!   the one that makes z constant along an image row is taken.
 
@@ -18,7 +18,7 @@ use crate::camera::Camera;
 use crate::gaussians::sh_coefficients;
 use crate::sh;
 
-/// Variance added to both diagonal entries of a projected covariance [px²].
+/// Variance added to both diagonal entries of a projected covariance `[px²]`.
 pub(super) const BLUR: f32 = 0.3;
 /// Alpha below this is not blended.
 pub(super) const ALPHA_MIN: f32 = 1.0 / 255.0;
@@ -77,27 +77,27 @@ impl ViewParams {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub(super) struct Splat {
-    /// Projected mean [px].
+    /// Projected mean `[px]`.
     pub(super) mean: [f32; 2],
-    /// Folded conic factor: l₁·FOLD [1/px], >= 0.
+    /// Folded conic factor: l₁·FOLD `[1/px]`, >= 0.
     pub(super) l1: f32,
     /// Shear r = Σ₀₁/Σ₁₁.
     pub(super) shear: f32,
-    /// Folded conic factor: l₃·FOLD [1/px], > 0.
+    /// Folded conic factor: l₃·FOLD `[1/px]`, > 0.
     pub(super) l3: f32,
     /// log₂ of the opacity, <= 0.
     pub(super) log2_opacity: f32,
     /// Colour, >= 0.
     pub(super) colour: [f32; 3],
-    /// Camera z [scene units].
+    /// Camera z `[scene units]`.
     pub(super) depth: f32,
-    /// Half the height of the region where alpha >= 1/255 [px].
+    /// Half the height of the region where alpha >= 1/255 `[px]`.
     pub(super) half_height: f32,
-    /// Half the width of that region [px].
+    /// Half the width of that region `[px]`.
     pub(super) half_width: f32,
-    /// 1/l1 [px].
+    /// 1/l1 `[px]`.
     pub(super) inv_l1: f32,
-    /// How far below the mean that region's rightmost point is [px].
+    /// How far below the mean that region's rightmost point is `[px]`.
     pub(super) peak: f32,
     /// A splat fills one cache line.
     pub(super) unused: [f32; 2],
@@ -287,9 +287,9 @@ pub(super) struct Project<'a> {
     pub(super) stride: usize,
     /// Number of rows (the last block may be partly empty).
     pub(super) rows: usize,
-    /// Shape: [rows].
+    /// Shape: `[rows]`.
     pub(super) splats: &'a mut [Splat],
-    /// Bit per lane of each block: on screen. Shape: [blocks].
+    /// Bit per lane of each block: on screen. Shape: `[blocks]`.
     pub(super) seen: &'a mut [u16],
 }
 

@@ -9,6 +9,7 @@
 //!   around; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
 //!   is orthogonal to q,
 //! - dL/dV = L·M·W leads on to J and the mean.
+//!
 //! Derived from Σ = V·Vᵀ + 0.3·I, dL/dV = 2·G·V; checked against the float64 reference.
 
 use pulp::Simd;
@@ -28,7 +29,7 @@ use crate::sh;
 pub(super) struct BlockGradient {
     /// dL/d(parameter), in the planes of the block.
     pub(super) params: [f32; plane::MOST * WIDTH],
-    /// dL/d(projected mean) [1/px], and the sum over pixels of its absolute value.
+    /// dL/d(projected mean) `[1/px]`, and the sum over pixels of its absolute value.
     pub(super) mean2d: [[f32; WIDTH]; 2],
     pub(super) mean2d_abs: [[f32; WIDTH]; 2],
     /// The record sums, field after field.
@@ -48,7 +49,7 @@ impl BlockGradient {
 
     /// Differentiates the rows of `block` that are set in `visible`; the others get 0.
     ///
-    /// `sums` has one record per row. Shape: [WIDTH, detail.stride()].
+    /// `sums` has one record per row. Shape: `[WIDTH, detail.stride()]`.
     #[inline(always)]
     pub(super) fn compute<S: Simd>(
         &mut self,

@@ -50,7 +50,7 @@ impl TileCanvas {
 /// Where a tile lies in the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TilePlace {
-    /// Its upper left corner [px].
+    /// Its upper left corner `[px]`.
     pub(super) x: f32,
     pub(super) y: f32,
     /// Its pixels inside the image.
@@ -202,7 +202,12 @@ impl Rasterize<'_> {
                                 stops.keep(c(1.0)),
                                 place_in_list,
                             );
-                            if light[y] == [0.0; WIDTH] {
+                            #[expect(
+                                clippy::float_cmp,
+                                reason = "who has stopped has exactly none"
+                            )]
+                            let all_stopped = light[y] == [0.0; WIDTH];
+                            if all_stopped {
                                 alive &= !(1 << y);
                             }
                         }

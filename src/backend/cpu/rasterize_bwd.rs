@@ -100,7 +100,7 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) upstream_more: Option<[&'a Plane; 2]>,
     pub(super) detail: Detail,
     /// Bits of one record per slot; this tile writes those of its own entries.
-    /// Shape: [cap, detail.stride()].
+    /// Shape: `[cap, detail.stride()]`.
     pub(super) records: &'a [AtomicU32],
 }
 

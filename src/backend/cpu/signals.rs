@@ -153,7 +153,7 @@ impl Accumulators {
 
     /// Counts one more view for the largest weight of fresh views.
     ///
-    /// `sums` has one record per row. Shape: [rows, self.detail().stride()].
+    /// `sums` has one record per row. Shape: `[rows, self.detail().stride()]`.
     pub(super) fn measure(&mut self, rows: usize, sums: &[f32], visible: &[u16]) {
         let detail = self.detail();
         let (Some(plane), Some(field)) = (self.layout.fresh_weight_max, detail.maximum()) else {

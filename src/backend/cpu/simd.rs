@@ -126,10 +126,10 @@ impl<S: Simd> V<S> {
         self.s.reduce_max_f32s(self.v)
     }
 
-    /// 2^self for self in [−126, 126]; relative error below 2e-7. Outside, any value.
+    /// 2^self for self in `[−126, 126]`; relative error below 2e-7. Outside, any value.
     ///
     /// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest, in
-    /// [−½, ½], goes through the degree-6 minimax polynomial of 2^f (error 2e-9).
+    /// `[−½, ½]`, goes through the degree-6 minimax polynomial of 2^f (error 2e-9).
     #[inline(always)]
     pub(super) fn exp2(self) -> Self {
         let s = self.s;
@@ -149,7 +149,7 @@ impl<S: Simd> V<S> {
         Self { s, v: s.transmute_f32s_u32s(bits) }
     }
 
-    /// e^self, clamped to self in [−87, 88]; relative error below 2e-7.
+    /// e^self, clamped to self in `[−87, 88]`; relative error below 2e-7.
     #[inline(always)]
     pub(super) fn exp(self) -> Self {
         let s = self.s;
@@ -163,7 +163,7 @@ impl<S: Simd> V<S> {
         let f = n.neg_mul_add(c(1.428_606_8e-6), f);
         let p = c(1.984_127e-4)
             .mul_add(f, c(1.388_888_9e-3))
-            .mul_add(f, c(8.333_333_5e-3))
+            .mul_add(f, c(8.333_334e-3))
             .mul_add(f, c(4.166_666_6e-2))
             .mul_add(f, c(1.666_666_7e-1))
             .mul_add(f, c(0.5))
@@ -174,7 +174,7 @@ impl<S: Simd> V<S> {
         Self { s, v: s.transmute_f32s_u32s(bits) }
     }
 
-    /// log₂ of self in [1, 2]; absolute error below 2e-7.
+    /// log₂ of self in `[1, 2]`; absolute error below 2e-7.
     ///
     /// atanh series: ln w = 2·artanh((w − 1)/(w + 1)), argument at most 1/3.
     #[inline(always)]

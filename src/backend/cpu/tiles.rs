@@ -25,7 +25,7 @@ use rayon::prelude::*;
 use super::project::{LOG2_255, Splat};
 use super::simd::WIDTH;
 
-/// Side of a tile [px].
+/// Side of a tile `[px]`.
 pub(super) const TILE: usize = WIDTH;
 /// Bound for (chunks of rows) × (tiles) counters: 4 MiB of them.
 const MOST_COUNTERS: usize = 1 << 20;
@@ -69,9 +69,9 @@ impl Entry {
 /// The rows that are projected now, and which of them are on screen.
 #[derive(Clone, Copy)]
 pub(super) struct Visible<'a> {
-    /// Shape: [rows].
+    /// Shape: `[rows]`.
     pub(super) splats: &'a [Splat],
-    /// Bit per lane of each block. Shape: [blocks].
+    /// Bit per lane of each block. Shape: `[blocks]`.
     pub(super) seen: &'a [u16],
 }
 
@@ -92,14 +92,14 @@ impl Visible<'_> {
 /// The tile lists of one band at a time. All buffers are allocated once.
 #[derive(Debug)]
 pub(super) struct TileLists {
-    /// Tile after tile: (depth bits, slot) until the tile is sorted, then (row, slot). Shape: [cap].
+    /// Tile after tile: (depth bits, slot) until the tile is sorted, then (row, slot). Shape: `[cap]`.
     entries: Vec<AtomicU64>,
-    /// The row of each slot. Shape: [cap].
+    /// The row of each slot. Shape: `[cap]`.
     row_of_slot: Vec<u32>,
     /// First slot and number of slots of each row; meaningless for rows not visible.
-    /// Shape: [budget].
+    /// Shape: `[budget]`.
     slots: Vec<[u32; 2]>,
-    /// First entry of each tile of the band. Shape: [tiles of the band + 1].
+    /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
     /// Entries per (chunk of rows, tile).
     counters: Vec<u32>,

@@ -28,7 +28,7 @@ pub(super) struct TrainArgs {
     /// Folder of the dataset
     #[arg(help_heading = "Scene")]
     scene: PathBuf,
-    /// Folder to write to [default: output/SCENE-POLICY]
+    /// Folder to write to `[default: output/SCENE-POLICY]`
     #[arg(short, long, value_name = "DIR", help_heading = "Output")]
     output: Option<PathBuf>,
 
@@ -36,11 +36,11 @@ pub(super) struct TrainArgs {
     data: SceneArgs,
 
     /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
-    /// [default: 200k]
+    /// `[default: 200k]`
     #[arg(short, long, value_name = "ROWS", help_heading = "Memory", value_parser = number::rows)]
     budget: Option<usize>,
     /// Most (Gaussian, tile) pairs held at a time; views with more are processed in bands, which
-    /// is exact but slower [default: 16 per Gaussian of the budget]
+    /// is exact but slower `[default: 16 per Gaussian of the budget]`
     #[arg(long, value_name = "PAIRS", help_heading = "Memory", value_parser = number::rows)]
     tile_cap: Option<usize>,
 
@@ -70,7 +70,7 @@ pub(super) struct TrainArgs {
     /// random]
     #[arg(long, value_enum, value_name = "HOW", help_heading = "Training")]
     init: Option<Init>,
-    /// Number of random points to start from [default: half the budget, at most 100k]
+    /// Number of random points to start from `[default: half the budget, at most 100k]`
     #[arg(long, value_name = "N", help_heading = "Training", value_parser = number::rows)]
     init_points: Option<usize>,
     /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's
@@ -84,7 +84,7 @@ pub(super) struct TrainArgs {
     /// Everything random follows from this number; equal numbers give equal results
     #[arg(long, value_name = "N", help_heading = "Training", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     seed: u64,
-    /// Processor threads to use; the result does not depend on it [default: all]
+    /// Processor threads to use; the result does not depend on it `[default: all]`
     #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 

@@ -9,14 +9,14 @@ use cpu_time::ProcessTime;
 use super::TrainArgs;
 use super::setup::Prepared;
 use crate::cli::console::Console;
-use crate::cli::failure::Failure;
+use crate::cli::failure::{Failure, INPUT};
 use crate::cli::number::{duration, grouped};
 use crate::cli::progress::Progress;
 use crate::evaluate::{Split, evaluate};
 use crate::memory::{Bytes, peak_resident};
 use crate::output::{
     Mean, OutputError, RecordLog, RunFolder, StepRecord, Summary, TensorBoard, cameras_json,
-    model_path, write_atomically, write_json, write_scores,
+    model_path, saved_iterations, write_atomically, write_json, write_scores,
 };
 use crate::ply::write_splats;
 use crate::trainer::{StepReport, TrainError};
@@ -75,6 +75,12 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
             let path = folder.finish()?;
             session.report(&path);
             Ok(())
+        }
+        // Such as a photograph that cannot be decoded: nothing was learned that is worth keeping.
+        Err(failure) if failure.code == INPUT && saved_iterations(folder.path()).is_err() => {
+            drop(session);
+            folder.discard();
+            Err(failure)
         }
         // What led here is told first; what cannot be written besides is no news.
         Err(failure) => {

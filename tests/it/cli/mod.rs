@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
+use densify_policies::registry::PolicyEntry;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -58,6 +59,17 @@ fn train(scene: &Path, output: &Path, iterations: u32, flags: &str) -> Outcome {
     arguments.extend(["--iterations", &iterations]);
     arguments.extend(flags.split_whitespace());
     densify(&arguments)
+}
+
+/// Flags that make a policy act often in a run of some dozen steps. Intervals do not shrink with
+/// the run, so that a policy would do little.
+fn often(policy: &PolicyEntry) -> String {
+    let intervals = policy.parameters().into_iter().filter_map(|(name, default)| {
+        let default =
+            default.as_integer().filter(|&steps| steps > 0 && name.ends_with("_every"))?;
+        Some(format!("--policy-set {}.{name}={} ", policy.name, (default / 100).max(5)))
+    });
+    intervals.collect()
 }
 
 fn text(path: &Path) -> &str {

@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
+use densify_policies::registry::find;
 use serde_json::Value;
 
-use super::{Outcome, files, json, read, records, scratch, train};
+use super::{Outcome, files, json, often, read, records, scratch, train};
 use crate::photographs::{POINTS, Photographs, VIEWS};
 
 const ITERATIONS: u32 = 100;
@@ -99,7 +100,8 @@ fn check_loss(run: &Path, least_psnr: f64) {
 
 fn check(scene: &Photographs, policy: &str, flags: &str, least_psnr: f64) -> Outcome {
     let (_root, run) = scratch();
-    let flags = format!("--budget {BUDGET} --policy {policy} --eval {flags}");
+    let often = often(find(policy).expect("it is registered"));
+    let flags = format!("--budget {BUDGET} --policy {policy} {often} --eval {flags}");
     let outcome = train(scene.path(), &run, ITERATIONS, &flags).ok();
     check_tree(&run);
     let summary = check_summary(&run, policy, 2);

@@ -5,6 +5,8 @@
 //! Moments cannot be read. They show in a step that sees nothing: without a gradient a row moves by
 //! what its moments still hold, and by its age. A twin that is not edited tells how far.
 
+#![expect(clippy::float_cmp, reason = "rows are carried to the last bit")]
+
 mod calls;
 mod plain;
 

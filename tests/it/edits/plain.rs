@@ -78,7 +78,7 @@ impl Row {
                 )
             }
             Placement::LongAxis { sigmas } => {
-                let sign = if number % 2 == 0 { 1.0 } else { -1.0 };
+                let sign = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
                 let mut local = [0.0; 3];
                 local[axis] = sign * f64::from(sigmas) * f64::from(self.log_scale[axis]).exp();
                 self.turned(local)
