@@ -215,6 +215,7 @@ const OPTIONS: TrainOptions = TrainOptions {
     sh_degree: 3,
     background: Background::Black,
     rates: RateOptions {
+        boost: 1.0,
         mean_start: 1e-4,
         mean_end: 1e-6,
         log_scale: 1.0,
