@@ -29,6 +29,9 @@
 //! **Pruning**, every `prune_every` steps until both have ended: rows above the budget are pruned,
 //! the least important first. (There are none, unless a model was loaded that is too large.)
 //!
+//! The default of `rho` is 0.03. With 0.1, ten events replace a whole model, and runs of 3,000 steps
+//! ended 0.1 to 0.5 dB lower on two scenes of photographs (two pairs of runs each, one seed).
+//!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;
 //! this is not offered. Opacities are never reset. The published settings also use a learning rate
@@ -81,7 +84,7 @@
 //! | mixed_gradient | true | | | g = g_p + colour_weight · g_c rather than 2 g_p |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient |
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
-//! | rho | 0.1 | 0 to 1 | budget | most rows that one growth exchanges |
+//! | rho | 0.03 | 0 to 1 | budget | most rows that one growth exchanges |
 //! | small | 0.01 | >= 0 | scene extent | up to this size a row is cloned, beyond it split |
 //! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales |
 //! | shift | "descent" | descent, paper, code, none | | where clones stand |

@@ -13,8 +13,10 @@ use crate::memory::Bytes;
 use crate::output::SceneConfig;
 use crate::schedule::Background;
 
-/// Near plane as a fraction of the scene's extent, where none is given.
-pub(super) const NEAR: f64 = 0.01;
+/// Near plane as a fraction of the scene's extent, where none is given. That is the original's 0.2
+/// for an extent of 5. Nearer rows are fog before one camera: with 0.01, views held out lost up to
+/// 10 dB to it.
+pub(super) const NEAR: f64 = 0.04;
 
 /// How to read a dataset.
 #[derive(Debug, Args)]

@@ -111,7 +111,7 @@ impl Default for DietParams {
             mixed_gradient: true,
             colour_weight: 30.0,
             growth: Growth::Turnover,
-            rho: 0.1,
+            rho: 0.03,
             small: 0.01,
             split_factor: 1.6,
             shift: Shift::Descent,

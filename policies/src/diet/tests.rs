@@ -59,7 +59,7 @@ fn the_gradient_mixes_screen_and_colour() {
 fn at_the_budget_a_tenth_is_exchanged() {
     // Budget 20, so two victims: of rows 0, 1, 2, … the least important that are no candidates.
     let event = event(600, 20, 20).with(Signal::ScreenGradient, &wanting(20, &[0, 2, 9, 12, 19]));
-    let done = run(&event, "");
+    let done = run(&event, "rho = 0.1");
     assert_eq!(done.pruned, [1, 3]);
     assert_eq!(done.cloned, [19, 12]);
     assert_eq!(done.ops.counts, EditCounts { removed: 2, added: 2, updated: 0, denied: 3 });
@@ -82,7 +82,7 @@ fn the_dead_and_the_room_come_first() {
     let event = event(600, 19, 20)
         .with(Signal::ScreenGradient, &wanting(19, &[7, 10, 11, 12, 13, 14]))
         .with(Signal::Opacity, &opacity);
-    let done = run(&event, "");
+    let done = run(&event, "rho = 0.1");
     assert_eq!(done.pruned, [0, 1, 7]);
     assert_eq!(done.cloned, [14, 13, 12, 11]);
     assert_eq!(done.ops.counts.denied, 1);
@@ -149,11 +149,11 @@ fn newborns_are_protected_for_an_epoch() {
         .with(Signal::ScreenGradient, &wanting(20, &[18, 19]))
         .with(Signal::Age, &age);
     event.scene.train_views = 300;
-    assert_eq!(run(&event, "").pruned, [2, 5]);
-    assert_eq!(run(&event, "protect = 0").pruned, [0, 1]);
-    assert_eq!(run(&event, "protect = 30").pruned, [1, 2]);
+    assert_eq!(run(&event, "rho = 0.1").pruned, [2, 5]);
+    assert_eq!(run(&event, "rho = 0.1\nprotect = 0").pruned, [0, 1]);
+    assert_eq!(run(&event, "rho = 0.1\nprotect = 30").pruned, [1, 2]);
     event.scene.train_views = 30;
-    assert_eq!(run(&event, "").pruned, [1, 2]);
+    assert_eq!(run(&event, "rho = 0.1").pruned, [1, 2]);
 }
 
 #[test]
@@ -309,7 +309,7 @@ fn growth_pruning_and_insertion_can_fall_on_one_step() {
     // 44 rows, budget 40: four go; three candidates want room, two rows are to be inserted.
     let mut event = event(1000, 44, 40).with(Signal::ScreenGradient, &wanting(44, &[5, 40, 41]));
     event.candidates = (1..9).map(|i| candidate(i as f32 / 10.0, 0.01)).collect();
-    let done = run(&event, "compensate_from = 500");
+    let done = run(&event, "rho = 0.1\ncompensate_from = 500");
     assert_eq!(done.ops.cause, "grow+prune+insert");
     assert_eq!(done.pruned, [0, 1, 2, 3, 4, 6, 7, 8, 9]);
     assert_eq!(done.cloned, [41, 40, 5]);
