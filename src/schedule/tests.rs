@@ -1,0 +1,135 @@
+//! Rates, degrees, view order and backgrounds along a run.
+
+use super::*;
+
+#[test]
+fn short_runs_start_with_longer_steps_and_end_with_the_published() {
+    let published = RateOptions::default();
+    assert_eq!(RateOptions::for_run(30_000), published);
+    assert_eq!(RateOptions::for_run(100_000), published);
+    let short = RateOptions::for_run(3_000);
+    let close = |a: f32, b: f32| assert!((a / b - 1.0).abs() < 1e-5, "{a} against {b}");
+    let (start, end) = (short.at(0, 3_000, 1.0), short.at(3_000, 3_000, 1.0));
+    let factor = 10_f32.powf(0.6);
+    close(start.mean, 1.6e-4 * factor);
+    close(start.opacity, published.opacity * factor);
+    close(short.at(1_500, 3_000, 1.0).quat, published.quat * factor.sqrt());
+    close(end.mean, 1.6e-6);
+    close(end.sh_rest, published.sh_rest);
+    close(RateOptions::for_run(1).boost as f32, 5.0);
+}
+
+#[test]
+fn mean_rate_falls_log_linearly_between_its_ends() {
+    let rates = RateOptions::default();
+    let mean = |step| f64::from(rates.at(step, 1_000, 2.0).mean);
+    let close = |a: f64, b: f64| assert!((a / b - 1.0).abs() < 1e-6, "{a} against {b}");
+    close(mean(0), 3.2e-4);
+    close(mean(500), 3.2e-5);
+    close(mean(1_000), 3.2e-6);
+    close(mean(1_500), 3.2e-6);
+    close(mean(250) * mean(750), mean(500) * mean(500));
+    close(f64::from(rates.at(7, 1_000, 2.0).sh_rest), 1.25e-4);
+}
+
+#[test]
+fn invalid_names_the_rate() {
+    assert_eq!(RateOptions::default().invalid(), None);
+    let rates = RateOptions { quat: f32::NAN, ..RateOptions::default() };
+    assert_eq!(rates.invalid(), Some("quat"));
+    let rates = RateOptions { mean_end: 0.0, ..RateOptions::default() };
+    assert_eq!(rates.invalid(), Some("mean_end"));
+}
+
+#[test]
+fn steps_scale_with_the_run() {
+    assert_eq!(scaled(1_000, 30_000), 1_000);
+    assert_eq!(scaled(1_000, 3_000), 100);
+    assert_eq!(scaled(1_000, 100), 3);
+    assert_eq!(scaled(1_000, 1), 1);
+    assert_eq!(scaled(u32::MAX, u32::MAX), u32::MAX);
+}
+
+#[test]
+fn degree_rises_every_thousand_steps_of_thirty_thousand() {
+    let at = |step| sh_degree(step, 30_000, 3);
+    assert_eq!([1, 999, 1_000, 1_999, 2_000, 3_000, 30_000].map(at), [0, 0, 1, 1, 2, 3, 3]);
+    assert_eq!(sh_degree(300, 3_000, 3), 3);
+    assert_eq!(sh_degree(300, 3_000, 1), 1);
+    assert_eq!(sh_degree(u32::MAX, 1, 9), MAX_SH_DEGREE);
+}
+
+#[test]
+fn each_epoch_is_another_permutation() {
+    for views in [0, 1, 2, 7, 100] {
+        let mut order = view_order(views, 5, 3);
+        order.sort_unstable();
+        assert_eq!(order, (0..views).collect::<Vec<_>>());
+    }
+    assert_eq!(view_order(50, 5, 3), view_order(50, 5, 3));
+    assert_ne!(view_order(50, 5, 3), view_order(50, 5, 4));
+    assert_ne!(view_order(50, 5, 3), view_order(50, 6, 3));
+    assert_ne!(view_order(50, 5, 3), view_order(50, 5 | 1 << 40, 3));
+}
+
+#[test]
+fn every_view_is_first_equally_often() {
+    let mut first = [0_u32; 5];
+    for epoch in 0..5_000 {
+        first[view_order(5, 1, epoch)[0]] += 1;
+    }
+    // Binomial(5,000, 1/5): mean 1,000, deviation 28; five of them.
+    assert!(first.iter().all(|n| n.abs_diff(1_000) < 142), "{first:?}");
+}
+
+#[test]
+fn fresh_views_are_a_fair_choice() {
+    let mut times = [0_u32; 7];
+    for step in 0..7_000 {
+        let mut chosen = fresh_views(7, 3, 5, step);
+        assert_eq!(chosen, fresh_views(7, 3, 5, step));
+        chosen.sort_unstable();
+        chosen.dedup();
+        assert_eq!(chosen.len(), 3, "a view was drawn twice");
+        for view in chosen {
+            times[view] += 1;
+        }
+    }
+    // Binomial(7,000, 3/7): mean 3,000, deviation 41; five of them.
+    assert!(times.iter().all(|n| n.abs_diff(3_000) < 207), "{times:?}");
+    assert_ne!(fresh_views(50, 10, 5, 3), fresh_views(50, 10, 6, 3));
+    assert_ne!(fresh_views(50, 50, 5, 0), view_order(50, 5, 0));
+    let mut all = fresh_views(4, 100, 5, 3);
+    all.sort_unstable();
+    assert_eq!(all, [0, 1, 2, 3]);
+    assert!(fresh_views(4, 0, 5, 3).is_empty() && fresh_views(0, 4, 5, 3).is_empty());
+}
+
+#[test]
+fn backgrounds_as_text() {
+    for text in ["black", "white", "random", "#0a0b0c", "#ffffff"] {
+        assert_eq!(text.parse::<Background>().unwrap().to_string(), text);
+    }
+    assert_eq!("#0A0b0c".parse(), Ok(Background::Colour([10, 11, 12])));
+    for text in ["", "#", "#fff", "#+a0b0c", "#0a0b0g", "#0a0b0c0d", "0a0b0c", "grey", "#äöü"] {
+        let message = text.parse::<Background>().unwrap_err();
+        assert!(message.contains("#808080"), "{message}");
+    }
+}
+
+#[test]
+fn backgrounds() {
+    let same = |a: [f32; 3], b: [f32; 3]| a.map(f32::to_bits) == b.map(f32::to_bits);
+    assert!(same(Background::White.at(1, 2), [1.0; 3]));
+    assert!(same(Background::Black.at(1, 2), [0.0; 3]));
+    assert!(same(Background::Colour([0, 255, 51]).at(1, 2), [0.0, 1.0, 0.2]));
+    assert!(same(Background::Random.fixed(), [0.0; 3]));
+    let random = Background::Random.at(1, 2);
+    assert!(same(random, Background::Random.at(1, 2)));
+    assert!(!same(random, Background::Random.at(1, 3)));
+    assert!(!same(random, Background::Random.at(2, 2)));
+    let mean =
+        (0..3_000).map(|step| f64::from(Background::Random.at(9, step)[1])).sum::<f64>() / 3_000.0;
+    // Uniform: deviation of the mean 0.29 / √3,000 = 0.005.
+    assert!((mean - 0.5).abs() < 0.025, "{mean}");
+}
