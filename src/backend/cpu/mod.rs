@@ -188,13 +188,6 @@ impl CpuBackend {
         })
     }
 
-    /// Wall time of each stage of the last training step, in order. Bands add up under one name
-    /// only as far as they follow one another.
-    #[must_use]
-    pub fn stage_times(&self) -> &[(&'static str, Duration)] {
-        &self.clock.laps
-    }
-
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
     /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
     ///
@@ -377,5 +370,9 @@ impl Backend for CpuBackend {
 
     fn download(&self) -> Gaussians {
         self.params.unpack(self.rows, self.sh_degree)
+    }
+
+    fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.clock.laps
     }
 }
