@@ -15,7 +15,7 @@
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::rasterize::{DARK, TileCanvas};
+use super::rasterize::{DARK, TileCanvas, row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
 use super::tiles::{Grid, TILE};
@@ -241,7 +241,7 @@ impl WithSimd for Lines<'_> {
             }
             let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
             for (tile, e) in tiles.iter().zip(e[PAD..].as_chunks_mut::<TILE>().0) {
-                *e = tile.planes[channel][row % TILE];
+                *e = row_of_plane(&tile.planes[channel], row % TILE);
             }
             e[PAD + width..].fill(0.0);
             for (e, &y) in e[inner.clone()].iter_mut().zip(&y[inner.clone()]) {
@@ -419,7 +419,7 @@ impl WithSimd for Gradient<'_> {
         let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, mask, tiles } =
             self;
         let rows = STRIP.min(grid.height - first);
-        let lines: [&mut [f32]; 3] = lines_of(scratch, stride);
+        let lines: [&mut [f32]; 4] = lines_of(scratch, stride);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         let (l1_scale, ssim_scale) = ((1.0 - SSIM_WEIGHT) * scale, -SSIM_WEIGHT * scale);
         let zero = V::zero(s);
@@ -448,17 +448,16 @@ impl WithSimd for Gradient<'_> {
                 let positive = zero.lt(e).keep(V::splat(s, l1_scale));
                 let negative = e.lt(zero).keep(V::splat(s, l1_scale));
                 let g = by_ssim * ssim_scale + (positive - negative);
-                let x = at - PAD;
-                let tile = &mut tiles[row / TILE * grid.columns + x / TILE];
-                g.store(&mut tile.planes[channel][row % TILE][x % TILE..]);
+                g.store(&mut lines[3][at..]);
             }
             // The loss sees e·mask, so the chain rule has the mask once more.
             if let Some(mask) = mask {
-                let row_of_tiles = row / TILE * grid.columns;
                 let mask = &mask[(first + row) * grid.width..][..grid.width];
-                for (tile, mask) in tiles[row_of_tiles..].iter_mut().zip(mask.chunks(TILE)) {
-                    masked(&mut tile.planes[channel][row % TILE], mask);
-                }
+                masked(&mut lines[3][PAD..PAD + grid.width], mask);
+            }
+            let tiles = &mut tiles[row / TILE * grid.columns..][..grid.columns];
+            for (tile, g) in tiles.iter_mut().zip(lines[3][PAD..].as_chunks::<TILE>().0) {
+                set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
             }
         }
     }

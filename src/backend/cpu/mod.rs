@@ -220,12 +220,12 @@ impl CpuBackend {
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient.iter_mut().enumerate() {
             gradient.planes = [DARK; 5];
-            for_each_pixel(&frame.grid, tile, |y, x, at| {
+            for_each_pixel(&frame.grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    gradient.planes[channel][y][x] = upstream.rgb[3 * at + channel];
+                    gradient.planes[channel][patch][lane] = upstream.rgb[3 * at + channel];
                 }
-                gradient.planes[3][y][x] = upstream.alpha[at];
-                gradient.planes[4][y][x] = upstream.depth[at];
+                gradient.planes[3][patch][lane] = upstream.alpha[at];
+                gradient.planes[4][patch][lane] = upstream.depth[at];
             });
         }
         self.backward(&frame, detail);
@@ -260,18 +260,18 @@ impl CpuBackend {
         let grid = Grid::new(rendering.width, rendering.height);
         self.resize_images(&grid);
         for (tile, canvas) in self.canvas.iter_mut().enumerate() {
-            for_each_pixel(&grid, tile, |y, x, at| {
+            for_each_pixel(&grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    canvas.planes[channel][y][x] = rendering.rgb[3 * at + channel];
+                    canvas.planes[channel][patch][lane] = rendering.rgb[3 * at + channel];
                 }
             });
         }
         let value = self.image_loss(&grid, target, background, None);
         let mut gradient = vec![0.0; rendering.rgb.len()];
         for (tile, from) in self.gradient.iter().enumerate() {
-            for_each_pixel(&grid, tile, |y, x, at| {
+            for_each_pixel(&grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    gradient[3 * at + channel] = from.planes[channel][y][x];
+                    gradient[3 * at + channel] = from.planes[channel][patch][lane];
                 }
             });
         }
