@@ -22,7 +22,7 @@ use super::project::{LOG2_255, Splat};
 use super::rasterize::{
     ALPHA_MAX, Aligned, BATCH, DARK, Patches, Plane, TRANSMITTANCE, TileCanvas, TilePlace, Within,
 };
-use super::simd::{V, WIDTH, each};
+use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 
 /// Fields of a record.
@@ -243,9 +243,10 @@ impl RasterizeBwd<'_> {
                     }
                 }
                 let mut record = [0.0; field::ALL];
-                for (slot, sum) in record.iter_mut().zip(sums.few) {
-                    *slot = sum.sum();
-                }
+                let [q, u, z, uu, uz, zz, red, green, blue] = sums.few;
+                record[..4].copy_from_slice(&sums_of_four([q, u, z, uu]));
+                record[4..8].copy_from_slice(&sums_of_four([uz, zz, red, green]));
+                record[field::COLOUR + 2] = blue.sum();
                 match DETAIL {
                     1 => record[field::FEW] = sums.weight_max.max_lane(),
                     2 => {
@@ -277,12 +278,25 @@ fn write(to: &[AtomicU32], record: &[f32; field::ALL]) {
     }
 }
 
-/// Adds the records of one row, which lie side by side, to its sums, in order.
+/// The sums over the records of one row, which lie side by side, in order. `sums` has the shape of a
+/// record.
 pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
-    for record in records.chunks_exact(detail.stride()) {
-        for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
-            let x = f32::from_bits(x.load(Relaxed));
-            *sum = if detail.maximum() == Some(i) { sum.max(x) } else { *sum + x };
+    match detail {
+        Detail::Gradients => gather_all::<{ Detail::Gradients.stride() }>(sums, detail, records),
+        Detail::WeightMax => gather_all::<{ Detail::WeightMax.stride() }>(sums, detail, records),
+        Detail::All => gather_all::<{ Detail::All.stride() }>(sums, detail, records),
+    }
+}
+
+/// Adds to what `sums` holds.
+#[inline(always)]
+fn gather_all<const STRIDE: usize>(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
+    let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
+    for record in records.as_chunks::<STRIDE>().0 {
+        for i in 0..STRIDE {
+            let x = f32::from_bits(record[i].load(Relaxed));
+            total[i] = if detail.maximum() == Some(i) { total[i].max(x) } else { total[i] + x };
         }
     }
+    sums.copy_from_slice(&total);
 }
