@@ -127,9 +127,12 @@ impl LossBuffers {
                 (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
             };
             let source = Source { grid, canvas, target, background, channel };
-            (e.par_chunks_mut(strip), y.par_chunks_mut(strip)).into_par_iter().enumerate().for_each(
-                |(i, (e, y))| arch.dispatch(Lines { source, first: i * STRIP, stride, e, y }),
-            );
+            (e.par_chunks_mut(strip), y.par_chunks_mut(strip))
+                .into_par_iter()
+                .enumerate()
+                .for_each(|(i, (e, y))| {
+                    arch.dispatch(Lines { source, first: i * STRIP, stride, e, y })
+                });
             let parts: Vec<LossValue> = (
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),

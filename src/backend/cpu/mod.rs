@@ -11,6 +11,7 @@ mod apply;
 mod blocks;
 mod budget;
 mod candidates;
+mod footprint;
 mod fresh;
 mod loss;
 mod optimise;

@@ -183,9 +183,8 @@ impl CpuBackend {
         let Frame { grid, bands, background, view, .. } = frame;
         let Self { lists, splats, params, canvas, gradient, loss, candidates, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
-        let place = |x: usize, y: usize| {
-            (y / TILE * grid.columns + x / TILE, in_plane(x % TILE, y % TILE))
-        };
+        let place =
+            |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, in_plane(x % TILE, y % TILE));
         let error = |x: usize, y: usize| {
             let (tile, (patch, lane)) = place(x, y);
             let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][patch][lane];
