@@ -215,7 +215,12 @@ impl DensityPolicy for Diet {
             Importance::Epochs => 0,
             Importance::Fresh => self.params.fresh_views,
         };
-        Needs { signals, candidates: self.candidate_request(scene), fresh_views }
+        Needs {
+            signals,
+            candidates: self.candidate_request(scene),
+            fresh_views,
+            ..Needs::default()
+        }
     }
 
     fn is_due(&self, step: u32) -> bool {

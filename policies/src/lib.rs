@@ -152,6 +152,8 @@ pub mod diet;
 mod edit;
 #[cfg(test)]
 mod event;
+pub mod mcmc;
+mod needs;
 mod ops;
 pub mod parameters;
 pub mod plan;

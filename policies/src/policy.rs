@@ -8,13 +8,17 @@
 
 use serde::{Deserialize, Serialize};
 
+pub use crate::needs::{
+    AuxColumn, AuxRequest, AuxView, Cadence, LossTerms, Needs, NoiseTerm, PixelMap, RateOverrides,
+    StartRule,
+};
 use crate::plan::EditPlan;
 use crate::rng::PolicyRng;
 
 /// A density-control policy.
 pub trait DensityPolicy: Send {
-    /// Signals and per-pixel candidates that this policy reads. Only these are accumulated and
-    /// allocated; reading anything else is a [`PolicyError::Undeclared`].
+    /// What this policy reads, and how it wants the model to be started and trained. Only this is
+    /// computed and allocated; reading anything else is a [`PolicyError::Undeclared`].
     fn needs(&self, scene: &SceneInfo) -> Needs;
 
     /// Whether this policy edits after the optimiser step of iteration `step` (1-based).
@@ -27,6 +31,31 @@ pub trait DensityPolicy: Send {
     fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
         let _ = (step, rows, budget);
         true
+    }
+
+    /// How often the optimiser steps at iteration `step`; no longer than
+    /// [declared](Needs::cadence). Gradients not yet used when it changes are used at the next step.
+    fn cadence(&self, step: u32) -> Cadence {
+        let _ = step;
+        Cadence::default()
+    }
+
+    /// How many training views, drawn at random without replacement, are to be rendered and
+    /// [observed](Self::observe) before the plan of `step`, at which the policy is due; all of them
+    /// if there are fewer. 0 for a policy that declares no [`Needs::aux`].
+    fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
+        let _ = (step, rows, budget);
+        0
+    }
+
+    /// Takes note of one auxiliary view, before the plan of the same step. The views come one after
+    /// another, and each is gone when the next one comes.
+    ///
+    /// # Errors
+    /// As for [`plan`](Self::plan).
+    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+        let _ = view;
+        Ok(())
     }
 
     /// Writes this event's edits into `plan`. Pure in its arguments and the policy's own state:
@@ -111,13 +140,15 @@ pub enum Signal {
     Opacity,
     /// Largest of the three standard deviations now `[scene units]`, > 0.
     ScaleMax,
+    /// Product of the three standard deviations now `[scene units³]`, >= 0.
+    ScaleProduct,
     /// Optimiser steps since the row was born or rewritten, saturating at 65,535.
     Age,
 }
 
 impl Signal {
     /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::VisibleCount,
         Self::ScreenGradient,
         Self::ScreenGradientAbs,
@@ -132,6 +163,7 @@ impl Signal {
         Self::PixelCount,
         Self::Opacity,
         Self::ScaleMax,
+        Self::ScaleProduct,
         Self::Age,
     ];
 }
@@ -169,19 +201,6 @@ impl SignalSet {
     pub fn iter(self) -> impl Iterator<Item = Signal> {
         Signal::ALL.into_iter().filter(move |&s| self.contains(s))
     }
-}
-
-/// What a policy reads.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Needs {
-    /// Per-row statistics.
-    pub signals: SignalSet,
-    /// Per-pixel candidates for new rows, if any.
-    pub candidates: Option<CandidateRequest>,
-    /// Training views, drawn at random without replacement, that are rendered anew for each event
-    /// that [wants them](DensityPolicy::wants_fresh): all of them if there are fewer. Goes with
-    /// [`Signal::FreshWeightMax`]; 0 without it.
-    pub fresh_views: u32,
 }
 
 /// Which pixels of the training views to collect as places for new rows.
@@ -319,6 +338,12 @@ pub enum PolicyError {
     Undeclared {
         /// The signal in question.
         signal: Signal,
+    },
+    /// A column of an auxiliary view was read that [`Needs::aux`] did not list.
+    #[error("column {column:?} was read but not declared; list it in `needs` under `aux`")]
+    UndeclaredColumn {
+        /// The column in question.
+        column: AuxColumn,
     },
     /// No policy has this name.
     #[error("unknown policy `{name}`{}; `densify policies` lists them", did_you_mean(.nearest.as_deref()))]
