@@ -29,6 +29,10 @@ fn every_choice_of_the_built_in_policies_conforms() {
     let choices = [
         ("vanilla", "governor = true"),
         ("vanilla", "grow_every = 0"),
+        ("igs", "views = 1\nfinal_from = 1\ntau = 0.0"),
+        ("igs", "tau = 0.0\nrecovery_share = 1.0\nresets = 99\nfirst_prune_opacity = 1.0"),
+        ("taming", "tau = 0.0\nviews = 0\nprune_share = 1.0"),
+        ("taming", "prune = \"published\"\nmultiplier = 2.0\ntau = 0.0"),
         ("mcmc", "growth = 1.0\nnoise = 0.0"),
         ("mcmc", "min_opacity = 0.5\nmost_shares = 2"),
         ("diet", "mixed_gradient = false\nshift = \"none\"\nprotect = 0"),
@@ -38,6 +42,8 @@ fn every_choice_of_the_built_in_policies_conforms() {
         // All windows at once.
         ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
         ("diet", "importance = \"fresh\""),
+        ("diet", "reinit_at = 100\nprune_every = 1"),
+        ("diet", "reinit_at = 300\nreinit_share = 1.0\nimportance = \"fresh\""),
         ("diet", "importance = \"fresh\"\ncompensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
         ("diet", "importance = \"fresh\"\ngrowth = \"all\"\nrho_c = 1.0\nfresh_views = 1"),
     ];
