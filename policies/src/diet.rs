@@ -130,8 +130,8 @@
 use crate::adc::{Mortality, Window, mean_over_views, spare_one};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxView, Candidate, DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet,
-    Snapshot, restore_nothing,
+    AuxView, Candidate, DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal,
+    SignalSet, Snapshot, restore_nothing,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;

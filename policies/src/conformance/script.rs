@@ -221,7 +221,9 @@ fn observe(
     for view in views {
         let declared = |column: &AuxColumn| sees_all || request.columns.contains(column);
         let columns: Vec<_> = view.columns.iter().filter(|c| declared(&c.0)).cloned().collect();
-        let most = if sees_all { view.points.len() } else { request.points as usize };
+        // As many as were asked for, or any where none was.
+        let most =
+            if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
         let points = &view.points[..most.min(view.points.len())];
         let view = AuxView { step, rows, loss: view.loss, columns: &columns, points };
         let seen = guarded(|| policy.observe(&view)).map_err(|why| (Check::GoesOn, why))?;
@@ -263,8 +265,7 @@ impl Model {
             let rows = 0..self.rows as u32;
             (column, rows.map(|row| value(row, i as u32, &|u| (40.0 * u).floor())).collect())
         });
-        // One more than asked for, for the copy that sees everything.
-        let points = (0..request.points.min(4) + 1).map(|index| Candidate {
+        let points = (0..request.points.clamp(1, 4)).map(|index| Candidate {
             position: [0, 1, 2].map(|i| value(index, 20 + i, &|u| u)),
             colour: [3, 4, 5].map(|i| value(index, 20 + i, &|u| u)),
             pixel_size: value(index, 26, &|u| 0.01 * u),

@@ -165,7 +165,8 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         let mut needs = Needs { signals, fresh_views, ..Needs::default() };
         if !self.has(Fault::WantsViewsUndeclared) {
             let columns = vec![AuxColumn::Depth];
-            needs.aux = Some(AuxRequest { columns, points: 2, ..AuxRequest::default() });
+            let points = if self.has(Fault::PeeksAtPoints) { 0 } else { 2 };
+            needs.aux = Some(AuxRequest { columns, points, ..AuxRequest::default() });
         }
         if self.has(Fault::DeclaresNan) {
             needs.loss_terms.opacity = f32::NAN;
@@ -196,8 +197,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         let depths = view.column(AuxColumn::Depth)?;
         let sum = depths.iter().fold(of(view.loss), |sum, &x| sum.rotate_left(5) ^ of(x));
         self.seen = self.seen.rotate_left(9) ^ sum;
-        let most = if self.has(Fault::PeeksAtPoints) { 9 } else { 2 };
-        for point in view.points.iter().take(most) {
+        for point in view.points {
             self.seen = self.seen.rotate_left(9) ^ of(point.error);
         }
         Ok(())

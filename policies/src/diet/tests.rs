@@ -415,7 +415,8 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
 
 /// A view that shows surface points in a row, one unit apart from `from` on.
 fn surface(from: f32, count: u32) -> View {
-    let point = |i: u32| Candidate { position: [from + i as f32, 0.0, 0.0], ..candidate(0.5, 0.01) };
+    let point =
+        |i: u32| Candidate { position: [from + i as f32, 0.0, 0.0], ..candidate(0.5, 0.01) };
     View { points: (0..count).map(point).collect(), ..View::default() }
 }
 
