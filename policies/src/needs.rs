@@ -142,12 +142,14 @@ impl Cadence {
         [step.is_multiple_of(all), step.is_multiple_of(self.sh_rest.max(all))]
     }
 
-    /// Whether this cadence needs no more memory than `longest`.
+    /// Whether a backend that was made for `longest` keeps all that this cadence needs: sums of all
+    /// gradients or of those of bands 1–3, and a count of steps for these.
     #[must_use]
     pub fn is_within(self, longest: Self) -> bool {
-        let summed = |c: Self| [c.all > 1, c.all.max(c.sh_rest) > 1];
-        let (mine, most) = (summed(self), summed(longest));
-        self.all > 0 && self.sh_rest > 0 && (most[0] || !mine[0]) && (most[1] || !mine[1])
+        let is_sound = self.all > 0 && self.sh_rest > 0;
+        let all = self.all == 1 || longest.all > 1;
+        let apart = self.sh_rest <= self.all || longest.sh_rest > 1;
+        is_sound && all && apart
     }
 }
 
@@ -307,7 +309,9 @@ mod tests {
         let all = Cadence { all: 5, sh_rest: 1 };
         assert_eq!((due(all, 0), due(all, 1)), (vec![5, 10], vec![5, 10]));
         assert!(sh.is_within(sh) && !sh.is_within(Cadence::default()));
-        assert!(sh.is_within(all) && !all.is_within(sh));
+        assert!(!sh.is_within(all) && !all.is_within(sh));
+        assert!(Cadence::default().is_within(all) && all.is_within(Cadence { all: 2, sh_rest: 1 }));
+        assert!(Cadence { all: 4, sh_rest: 3 }.is_within(all));
         assert!(!Cadence { all: 0, sh_rest: 1 }.is_within(all));
     }
 
