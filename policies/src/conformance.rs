@@ -34,6 +34,7 @@ use crate::parameters::parse_value;
 use crate::policy::{PolicyError, SceneInfo};
 use crate::registry::PolicyEntry;
 
+mod pattern;
 mod script;
 
 /// What must hold of a policy.

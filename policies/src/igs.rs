@@ -73,12 +73,7 @@
 //! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
 //! down to 100 steps at most; `recover` and the sums do not.
 
-use std::ops::Bound::{Excluded, Included, Unbounded};
-
-use serde::{Deserialize, Serialize};
-
 use crate::adc::{Mortality, Window, mean_over_views, spare_one, split_long_axis};
-use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyError,
@@ -88,6 +83,10 @@ use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::{smallest, weighted};
 
+mod parameters;
+
+pub use parameters::IgsParams;
+
 crate::register_policy!(
     "igs",
     Igs,
@@ -95,70 +94,6 @@ crate::register_policy!(
     source: "Improved-GS, Deng et al. 2025, arXiv 2508.12313",
     doc: include_str!("igs.rs"),
 );
-
-/// Parameters of [`Igs`]; its manual page says what they mean.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-#[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
-pub struct IgsParams {
-    pub grow_from: u32,
-    pub grow_until: u32,
-    pub grow_every: u32,
-    pub curve_until: u32,
-    pub tau: f64,
-    pub views: u32,
-    pub split_share: f64,
-    pub child_opacity: f64,
-    pub final_from: u32,
-    pub final_divisor: f64,
-    pub min_opacity: f64,
-    pub first_prune_at: u32,
-    pub first_prune_opacity: f64,
-    pub reset_every: u32,
-    pub resets: u32,
-    pub reset_opacity: f64,
-    pub recover: u32,
-    pub recovery_share: f64,
-    pub sum_from: u32,
-    pub sum: u32,
-    pub sum_more_from: u32,
-    pub sum_more: u32,
-    pub mean_start: f64,
-    pub mean_end: f64,
-    pub sh_rest: f64,
-}
-
-impl Default for IgsParams {
-    fn default() -> Self {
-        Self {
-            grow_from: 500,
-            grow_until: 15_000,
-            grow_every: 100,
-            curve_until: 14_500,
-            tau: 3e-4,
-            views: 10,
-            split_share: 0.45,
-            child_opacity: 0.6,
-            final_from: 14_500,
-            final_divisor: 1.5,
-            min_opacity: 0.005,
-            first_prune_at: 300,
-            first_prune_opacity: 0.02,
-            reset_every: 3000,
-            resets: 2,
-            reset_opacity: 0.05,
-            recover: 300,
-            recovery_share: 0.2,
-            sum_from: 15_000,
-            sum: 5,
-            sum_more_from: 22_500,
-            sum_more: 20,
-            mean_start: 4e-5,
-            mean_end: 2e-6,
-            sh_rest: 2.5e-4,
-        }
-    }
-}
 
 /// Long-axis splits by edge score.
 #[derive(Debug)]
@@ -193,25 +128,7 @@ impl ConfiguredPolicy for Igs {
     ];
 
     fn new(params: IgsParams, _scene: &SceneInfo) -> Result<Self, PolicyError> {
-        let positive = (Excluded(0.0), Unbounded);
-        let inside = (Excluded(0.0), Excluded(1.0));
-        // As the f32 that the plan will check.
-        let unit = |value: f64| f64::from(value as f32);
-        in_range("tau", params.tau, 0.0..)?;
-        in_range("views", params.views.into(), 1.0..)?;
-        in_range("split_share", unit(params.split_share), inside)?;
-        in_range("child_opacity", unit(params.child_opacity), (Excluded(0.0), Included(1.0)))?;
-        in_range("final_divisor", params.final_divisor, 1.0..)?;
-        in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
-        in_range("first_prune_opacity", params.first_prune_opacity, 0.0..=1.0)?;
-        in_range("reset_opacity", unit(params.reset_opacity), inside)?;
-        in_range("recover", params.recover.into(), 1.0..)?;
-        in_range("recovery_share", params.recovery_share, 0.0..=1.0)?;
-        in_range("sum", params.sum.into(), 1.0..=1000.0)?;
-        in_range("sum_more", params.sum_more.into(), 1.0..=1000.0)?;
-        in_range("mean_start", params.mean_start, positive)?;
-        in_range("mean_end", params.mean_end, positive)?;
-        in_range("sh_rest", params.sh_rest, positive)?;
+        params.check()?;
         let IgsParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
         Ok(Self {
             grow: Window { from, until, every },

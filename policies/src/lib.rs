@@ -154,6 +154,7 @@ pub mod adc;
 pub mod conformance;
 pub mod diet;
 mod edit;
+mod error;
 #[cfg(test)]
 mod event;
 pub mod igs;

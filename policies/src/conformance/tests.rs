@@ -1,4 +1,5 @@
-//! The registered policies conform; policies with one fault each are caught.
+//! The registered policies conform; policies with one fault each are caught. One piece, as all
+//! faults are those of one policy.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 

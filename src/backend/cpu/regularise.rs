@@ -91,3 +91,81 @@ impl Noise {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use pulp::{Arch, WithSimd};
+
+    use super::*;
+    use crate::backend::cpu::blocks::Blocks;
+    use crate::gaussians::Gaussians;
+
+    struct Add<'a>(Terms, &'a [f32], &'a mut [f32]);
+
+    impl WithSimd for Add<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, s: S) {
+            self.0.add(s, self.1, self.2);
+        }
+    }
+
+    /// Opacities and scales from one end of their range to the other.
+    fn model() -> Gaussians {
+        let rows = 16;
+        let at = |row: usize, low: f32, high: f32| low + (high - low) * row as f32 / 15.0;
+        Gaussians {
+            sh_degree: 0,
+            means: vec![[0.0; 3]; rows],
+            log_scales: (0..rows)
+                .map(|row| [0.0, 1.0, -1.0].map(|x| x + at(row, -7.0, 1.0)))
+                .collect(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; rows],
+            opacity_logits: (0..rows).map(|row| at(row, -9.0, 9.0)).collect(),
+            sh: vec![0.0; 3 * rows],
+        }
+    }
+
+    fn term(model: &Gaussians, terms: LossTerms) -> f64 {
+        let opacity = |x: &f32| 1.0 / (1.0 + (-f64::from(*x)).exp());
+        let opacities: f64 = model.opacity_logits.iter().map(opacity).sum();
+        let scales: f64 = model.log_scales.as_flattened().iter().map(|x| f64::from(*x).exp()).sum();
+        let n = model.len() as f64;
+        f64::from(terms.opacity) * opacities / n + f64::from(terms.scale) * scales / (3.0 * n)
+    }
+
+    #[test]
+    fn gradients_are_those_of_the_terms() {
+        let terms = LossTerms { opacity: 0.7, scale: 1.3 };
+        let model = model();
+        let mut blocks = Blocks::zeros(16, 14);
+        blocks.pack(&model);
+        let mut gradient = vec![1.0; 14 * WIDTH];
+        let per_row = Terms::new(terms, 16).unwrap();
+        Arch::new().dispatch(Add(per_row, blocks.of_rows(16), &mut gradient));
+        let h = 1e-2_f32;
+        let central = |change: &dyn Fn(&mut Gaussians, f32)| {
+            let [mut low, mut high] = [model.clone(), model.clone()];
+            change(&mut low, -h);
+            change(&mut high, h);
+            (term(&high, terms) - term(&low, terms)) / (2.0 * f64::from(h))
+        };
+        for row in 0..16 {
+            let check = |plane: usize, expected: f64| {
+                // It is added to what was there.
+                let found = f64::from(gradient[plane * WIDTH + row] - 1.0);
+                let error = (found - expected).abs();
+                assert!(error < 1e-4 * expected + 2e-7, "{row} {plane}: {found} {expected}");
+            };
+            check(plane::OPACITY, central(&|m, h| m.opacity_logits[row] += h));
+            for axis in 0..3 {
+                check(plane::LOG_SCALE + axis, central(&|m, h| m.log_scales[row][axis] += h));
+            }
+            for rest in [plane::MEAN, plane::QUAT, plane::SH] {
+                assert_eq!(gradient[rest * WIDTH + row].to_bits(), 1.0_f32.to_bits());
+            }
+        }
+        assert!(Terms::new(LossTerms::default(), 16).is_none());
+    }
+}
