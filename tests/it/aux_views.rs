@@ -32,6 +32,10 @@ struct Scene {
 fn scene() -> Scene {
     let camera = scenes::camera(45, 37, 91);
     let mut model = scenes::cloud(40, 2, &camera, 92);
+    // Some of them end the light of their pixels.
+    for logit in model.opacity_logits.iter_mut().skip(3).step_by(2) {
+        *logit = 6.0;
+    }
     // Behind the camera.
     model.means[..3].fill(scenes::world(&camera, [0.1, 0.2, -3.0]));
     let mut rng = ChaCha8Rng::seed_from_u64(93);

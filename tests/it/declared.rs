@@ -6,8 +6,8 @@ use densify::backend::{Backend, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::plan::EditPlan;
-use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm};
+use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
+use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -336,6 +336,31 @@ fn sums_move_with_their_rows_and_end_with_them() {
 }
 
 #[test]
+fn a_row_that_starts_anew_steps_as_a_newborn() {
+    let cadence = Cadence { all: 1, sh_rest: 2 };
+    let mut backend = backend(&model(20), Needs { cadence, ..Needs::default() }, 1);
+    for number in 1..=6 {
+        step(&mut backend, &view(number % 3), number, RATES, cadence);
+    }
+    let mut plan = EditPlan::new(20, 20);
+    let opacity = OpacityRule::Same;
+    let update = Update { opacity, scale: ScaleRule::Uniform(1.0), keep_moments: false };
+    plan.update(11, update).expect("the row is free");
+    backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
+    let before = backend.download();
+    step(&mut backend, &view(0), 7, RATES, cadence);
+    step(&mut backend, &view(1), 8, RATES, cadence);
+    let after = backend.download();
+    // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
+    let moved = |row: usize| -> Vec<f32> {
+        let pairs = after.sh_of(row).iter().zip(before.sh_of(row));
+        pairs.skip(3).map(|(a, b)| (a - b).abs() / RATES.sh_rest).collect()
+    };
+    assert!(moved(11).iter().all(|rates| (rates - 1.0).abs() < 1e-2), "{:?}", moved(11));
+    assert!(moved(12).iter().any(|rates| (rates - 1.0).abs() > 0.1), "{:?}", moved(12));
+}
+
+#[test]
 fn what_is_declared_is_in_the_ledger() {
     let model = model(20);
     let bytes = |needs: Needs| backend(&model, needs, 1).ledger().total();
@@ -351,4 +376,27 @@ fn what_is_declared_is_in_the_ledger() {
     let mut backend = backend(&model, with(5, 1), 1);
     step(&mut backend, &view(0), 5, STILL, Cadence { all: 5, sh_rest: 1 });
     assert_eq!(backend.download().means, model.means);
+}
+
+#[test]
+fn present_values_are_those_of_the_model() {
+    let model = model(20);
+    let wanted = [Signal::Opacity, Signal::ScaleMax, Signal::ScaleProduct];
+    let needs = Needs { signals: SignalSet::of(&wanted), ..Needs::default() };
+    let mut backend = backend(&model, needs.clone(), 1);
+    let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+    let of = |signal| signals.get(signal).expect("a requested signal");
+    for row in 0..20 {
+        let scales = model.log_scales[row].map(|x| f64::from(x).exp());
+        let largest = scales.into_iter().fold(0.0, f64::max);
+        let expected = [
+            1.0 / (1.0 + (-f64::from(model.opacity_logits[row])).exp()),
+            largest,
+            scales.into_iter().product(),
+        ];
+        for (signal, expected) in wanted.into_iter().zip(expected) {
+            let found = f64::from(of(signal)[row]);
+            assert!((found / expected - 1.0).abs() < 1e-5, "{signal:?}: {found} {expected}");
+        }
+    }
 }

@@ -139,6 +139,9 @@ fn fresh_views_are_wanted_where_victims_may_fall() {
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
     let both = diet(&scene, "importance = \"fresh\"\ncompensate_from = 500");
     assert_eq!([47, 48].map(|rows| both.wants_fresh(1000, rows, 100)), [false, true]);
+    // Where all rows are replaced nobody has to fall.
+    let replaces = diet(&scene, "importance = \"fresh\"\nreinit_at = 600");
+    assert!(!replaces.wants_fresh(600, 100, 100) && replaces.wants_fresh(700, 100, 100));
 }
 
 #[test]
