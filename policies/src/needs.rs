@@ -195,7 +195,8 @@ pub struct AuxRequest {
 
 /// M(p) = `error`·n(e) + `edge`·n(g), with n(·) the map brought to 0..1 by its least and its largest
 /// value in the view (0 where they are equal), e(p) the mean over channels of |I − G|, and g(p) the
-/// 8-neighbour Laplacian of the 8-bit luma of the ground truth, clipped to 0..255.
+/// 8-neighbour Laplacian of the 8-bit luma of the ground truth, clipped to 0..255, its border
+/// repeated. Where the image is masked, e and g count by the mask.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PixelMap {
     /// Weight of the error, >= 0.

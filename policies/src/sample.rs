@@ -198,5 +198,6 @@ mod tests {
         assert!(with_replacement(&[1.0], 0, &rng).is_empty());
         assert_eq!(with_replacement(&[0.0, 1e-40, 0.0], 3, &rng), [(1, 3)]);
         assert_eq!(with_replacement(&[1.0, f32::INFINITY], 3, &rng), [(1, 3)]);
+        assert_eq!(with_replacement(&[f32::INFINITY; 3], 99, &rng).len(), 3);
     }
 }

@@ -165,13 +165,17 @@ fn noise_has_the_declared_covariance() {
 }
 
 #[test]
-fn opaque_rows_are_not_disturbed() {
+fn rows_opaque_enough_are_not_disturbed() {
     let mut model = alike(64);
-    model.opacity_logits.fill(1.0);
-    let noise = NoiseTerm { strength: 1e6, sharpness: 100.0, opacity: 0.005 };
+    // Opacities 0.16 and 0.18: shares of 1.9e-7 and 2.5e-8, on either side of 6e-8.
+    for (row, logit) in model.opacity_logits.iter_mut().enumerate() {
+        *logit = if row < 32 { -1.658_23 } else { -1.516_35 };
+    }
+    let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
     let mut backend = backend(&model, Needs { noise: Some(noise), ..Needs::default() }, 1);
     step(&mut backend, &away(), 1, RATES, EVERY);
-    assert_eq!(backend.download().means, model.means);
+    let moved: Vec<bool> = backend.download().means.iter().map(|mean| *mean != [0.5; 3]).collect();
+    assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
 }
 
 /// The gradient of the image's loss, without a step.
@@ -295,6 +299,37 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                 let what = format!("{longest:?}, step {number}, {}", class.class);
                 assert!(error < 0.01, "{what}: {error} learning rates");
             }
+        }
+    }
+}
+
+#[test]
+fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
+    const ROWS: usize = 40;
+    let terms = LossTerms { opacity: 0.01, scale: 0.02 };
+    let mut backend = backend(&model(ROWS), Needs { loss_terms: terms, ..Needs::default() }, 2);
+    let mut classes = [
+        Adam::new("means", RATES.mean, 0..3, 3, ROWS),
+        Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
+        Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
+    ];
+    for number in 1..=8 {
+        let camera = if number % 2 == 0 { away() } else { view(number % 3) };
+        let before = backend.download();
+        let mut gradient = gradient(&before, &camera, number.into());
+        for row in 0..ROWS {
+            let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
+            gradient.opacity_logits[row] += 0.01 / ROWS as f32 * opacity * (1.0 - opacity);
+            for axis in 0..3 {
+                let scale = before.log_scales[row][axis].exp();
+                gradient.log_scales[row][axis] += 0.02 / (3 * ROWS) as f32 * scale;
+            }
+        }
+        step(&mut backend, &camera, number, RATES, EVERY);
+        let after = backend.download();
+        for class in &mut classes {
+            let error = class.check(&before, &after, &gradient, true);
+            assert!(error < 0.01, "step {number}, {}: {error} learning rates", class.class);
         }
     }
 }

@@ -100,7 +100,10 @@ fn the_faint_are_pruned_at_each_event_and_earlier_at_step_300() {
     let first = run(&event, "");
     assert_eq!((first.pruned, first.ops.cause.as_str()), (vec![0, 2, 3], "first-prune"));
     assert!(first.split.is_empty() && !first.ops.reset_signals);
-    assert_eq!(run(&Event { step: 600, ..event.clone() }, "").pruned, [2, 3]);
+    let growing = run(&Event { step: 600, ..event.clone() }, "");
+    assert_eq!(growing.pruned, [2, 3]);
+    // Who is pruned is not drawn.
+    assert_eq!((growing.split.len(), growing.ops.counts.denied), (2, 0));
     let all = event.with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
     assert_eq!(run(&all, "").pruned, [0, 2, 3]);
 }

@@ -93,6 +93,8 @@ fn growth_is_five_percent_up_to_the_budget() {
     // A model that is too large loses its dead, and gets nothing for them.
     let over = run(&event(&[0.001, 0.5, 0.5, 0.001], 2), "");
     assert_eq!((over.pruned, over.ops.rows_after), (vec![0, 3], 2));
+    // Nobody is drawn in vain.
+    assert_eq!(over.ops.counts.denied, 0);
 }
 
 #[test]
