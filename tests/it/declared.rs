@@ -1,5 +1,6 @@
 //! What policies declare beside signals: terms of the loss, noise on the means, and the optimiser's
-//! cadence. Each is held to its formula, worked out here in f64.
+//! cadence. Each is held to its formula, worked out here in f64. One piece, as all train the same
+//! small model in the same way.
 
 use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
 use densify::backend::{Backend, LearningRates, StepInput};
