@@ -13,6 +13,7 @@ use densify::backend::{Backend, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
+use densify_policies::policy::Cadence;
 use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -109,6 +110,8 @@ fn main() {
                     background: [0.0; 3],
                     sh_degree: 3,
                     rates,
+                    cadence: Cadence::default(),
+                    seed: 1,
                 };
                 let (start, cpu_start) = (Instant::now(), ProcessTime::now());
                 match backend.train_step(&input) {

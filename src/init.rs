@@ -8,6 +8,7 @@ mod random;
 
 use std::num::NonZeroUsize;
 
+use densify_policies::policy::StartRule;
 use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand_chacha::ChaCha8Rng;
@@ -16,7 +17,7 @@ use rayon::prelude::*;
 
 use crate::dataset::PointCloud;
 use crate::dataset::normalise::EXTENT;
-use crate::gaussians::{Gaussians, rgb_to_dc, sh_coefficients};
+use crate::gaussians::{Gaussians, logit, rgb_to_dc, sh_coefficients};
 pub use random::random_points;
 
 /// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
@@ -118,6 +119,17 @@ pub fn initialise(
         sh,
     };
     Ok((gaussians, report))
+}
+
+/// Changes initial rows as a policy wants them.
+pub fn restart(model: &mut Gaussians, rule: &StartRule) {
+    if let Some(opacity) = rule.opacity {
+        model.opacity_logits.fill(logit(opacity));
+    }
+    let grown = rule.scale.ln();
+    for log_scale in model.log_scales.as_flattened_mut() {
+        *log_scale += grown;
+    }
 }
 
 /// Keeps the first of the points that share a place.

@@ -37,6 +37,7 @@
 //!     sh_degree,
 //!     background: Background::Black,
 //!     rates: RateOptions::default(),
+//!     sh_every: None,
 //!     prefetch: 4,
 //! };
 //! let mut trainer = Trainer::new(views, Box::new(backend), ("diet", policy), scene, options)?;

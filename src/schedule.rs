@@ -8,6 +8,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use densify_policies::policy::RateOverrides;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -68,6 +69,17 @@ impl RateOptions {
     pub fn for_run(iterations: u32) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
         Self { boost: shortage.powf(0.6).clamp(1.0, 5.0), ..Self::default() }
+    }
+
+    /// These step sizes, but for those that a policy is published with.
+    #[must_use]
+    pub fn with(self, overrides: &RateOverrides) -> Self {
+        Self {
+            mean_start: overrides.mean_start.unwrap_or(self.mean_start),
+            mean_end: overrides.mean_end.unwrap_or(self.mean_end),
+            sh_rest: overrides.sh_rest.unwrap_or(self.sh_rest),
+            ..self
+        }
     }
 
     /// Step sizes of iteration `step` (1-based) of `iterations`, in a scene of this extent

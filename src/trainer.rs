@@ -9,11 +9,12 @@ mod error;
 mod fresh;
 
 use densify_policies::plan::{EditPlan, RowOps};
-use densify_policies::policy::{DensityPolicy, Needs, SceneInfo, Snapshot};
+use densify_policies::policy::{Cadence, DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 use serde::{Deserialize, Serialize};
 
 use crate::backend::{Backend, BackendError, StepInput, StepOutput};
+use crate::dataset::images::SharedImage;
 use crate::gaussians::Gaussians;
 use crate::schedule::{self, Background, RateOptions};
 use crate::views::ViewSource;
@@ -32,8 +33,22 @@ pub struct TrainOptions {
     pub background: Background,
     /// Step sizes.
     pub rates: RateOptions,
+    /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, if not the
+    /// policy's choice; >= 1.
+    pub sh_every: Option<u32>,
     /// How many views ahead are announced to the [`ViewSource`].
     pub prefetch: usize,
+}
+
+/// What a run with this policy needs of its backend: the policy's needs, and room for the options'
+/// cadence.
+#[must_use]
+pub fn needs(policy: &dyn DensityPolicy, scene: &SceneInfo, options: &TrainOptions) -> Needs {
+    let mut needs = policy.needs(scene);
+    if let Some(every) = options.sh_every {
+        needs.cadence.sh_rest = every;
+    }
+    needs
 }
 
 /// What one step did.
@@ -121,7 +136,7 @@ impl<V: ViewSource> Trainer<V> {
         let count = views.count();
         check(&scene, &options, count, backend.as_ref())?;
         Ok(Self {
-            needs: policy.needs(&scene),
+            needs: checked_needs(policy_name, policy.as_ref(), &scene, &options)?,
             policy_name: policy_name.to_owned(),
             order: Vec::new(),
             next_order: schedule::view_order(count, options.seed, 0),
@@ -146,11 +161,8 @@ impl<V: ViewSource> Trainer<V> {
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let step = self.step + 1;
         let view = self.next_view();
-        let image = self.views.image(view).map_err(|source| TrainError::View {
-            step,
-            view: self.views.name(view).to_owned(),
-            source,
-        })?;
+        let image = self.image(step, view)?;
+        let cadence = self.cadence(step)?;
         let TrainOptions { iterations, seed, sh_degree, background, rates, .. } = self.options;
         let input = StepInput {
             step,
@@ -159,6 +171,8 @@ impl<V: ViewSource> Trainer<V> {
             background: background.at(seed, step),
             sh_degree: schedule::sh_degree(step, iterations, sh_degree),
             rates: rates.at(step, iterations, self.scene.extent),
+            cadence,
+            seed,
         };
         let output = self.backend.train_step(&input).map_err(|e| self.stopped(step, e))?;
         self.step = step;
@@ -168,6 +182,31 @@ impl<V: ViewSource> Trainer<V> {
         }
         let event = if self.policy.is_due(step) { self.edit(step)? } else { None };
         Ok(StepReport { step, view, output, rows: self.backend.rows(), event })
+    }
+
+    fn image(&self, step: u32, view: usize) -> Result<SharedImage, TrainError> {
+        self.views.image(view).map_err(|source| TrainError::View {
+            step,
+            view: self.views.name(view).to_owned(),
+            source,
+        })
+    }
+
+    /// How often the optimiser steps now: as the options say, else as the policy does.
+    fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
+        let wanted = self.policy.cadence(step);
+        let cadence =
+            Cadence { sh_rest: self.options.sh_every.unwrap_or(wanted.sh_rest), ..wanted };
+        let declared = self.needs.cadence;
+        if cadence.is_within(declared) {
+            return Ok(cadence);
+        }
+        let why = format!("it wants {cadence:?}, but declared {declared:?}");
+        Err(self.refused(step, PolicyError::Other(why)))
+    }
+
+    fn refused(&self, step: u32, source: PolicyError) -> TrainError {
+        TrainError::Policy { step, policy: self.policy_name.clone(), source }
     }
 
     /// The view of the coming step; announces those after it, and epochs to the backend.
@@ -195,16 +234,14 @@ impl<V: ViewSource> Trainer<V> {
     /// nothing is no event: policies may be due at steps at which they find nothing to do.
     fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let needs = self.measure_fresh(step)?;
+        self.show_views(step)?;
         let (signals, candidates) =
             self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
         let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };
         let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
         let rng = PolicyRng::new(self.options.seed, step);
-        self.policy.plan(&now, &rng, &mut plan).map_err(|source| TrainError::Policy {
-            step,
-            policy: self.policy_name.clone(),
-            source,
-        })?;
+        let planned = self.policy.plan(&now, &rng, &mut plan);
+        planned.map_err(|source| self.refused(step, source))?;
         let ops = plan.compile();
         self.check_plan(step, &ops)?;
         self.backend.apply(&ops, self.options.seed, step).map_err(|e| self.stopped(step, e))?;
@@ -259,7 +296,8 @@ impl<V: ViewSource> Trainer<V> {
         self.peak_rows
     }
 
-    /// Training views rendered for the policy's decisions so far, beside one per step.
+    /// Training views rendered for the policy's decisions so far, beside one per step: fresh and
+    /// auxiliary ones.
     #[must_use]
     pub fn extra_forwards(&self) -> u64 {
         self.extra_forwards
@@ -301,6 +339,19 @@ fn rows_within(ops: &RowOps) -> usize {
     let born = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
     let highest = born.max().map_or(0, |slot| slot as usize + 1);
     highest.max(ops.rows_before).max(ops.rows_after)
+}
+
+/// The needs of a run, if a backend can work with them.
+fn checked_needs(
+    name: &str,
+    policy: &dyn DensityPolicy,
+    scene: &SceneInfo,
+    options: &TrainOptions,
+) -> Result<Needs, TrainError> {
+    let needs = needs(policy, scene, options);
+    let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
+    needs.check().map_err(bad)?;
+    Ok(needs)
 }
 
 fn check(

@@ -26,6 +26,22 @@ impl Window {
     }
 }
 
+/// Rows that a concave curve allows at the event of `step`: N(x) = S + (B − S)(2x/M − (x/M)²) at event
+/// x of M, from `start` rows S before the first event to B = `end` after the last (*Taming 3DGS*,
+/// Mallick et al. 2024, equation 2). Its slope vanishes at the end.
+#[must_use]
+pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usize {
+    let Window { from, until, every } = window;
+    if every == 0 {
+        return start;
+    }
+    let events = (until.saturating_sub(from) / every).max(1);
+    let event = (step / every).saturating_sub(from / every);
+    let x = (f64::from(event) / f64::from(events)).min(1.0);
+    let (start, end) = (start as f64, end as f64);
+    (start + (end - start) * (2.0 * x - x * x)).floor() as usize
+}
+
 /// Mean per visible view of a signal that is summed over views; 0 for a row that no view saw, and
 /// where the mean is not finite. Shape: `[rows]`.
 #[must_use]
@@ -58,6 +74,23 @@ pub fn split_by(factor: f32) -> Offspring {
         placement: Placement::Sampled,
         scale: ScaleRule::Uniform(1.0 / factor),
         opacity: OpacityRule::Same,
+    }
+}
+
+/// Two halves of the parent along its longest axis, in its place: the parent's slot and one more.
+///
+/// With d = `share`, the children stand at ±3d standard deviations, their longest axis is (1 − d)
+/// times the parent's, the others √(1 − d²) times: 3d + 3(1 − d) = 3, so that both ends stay where
+/// they were (*Improving Densification in 3D Gaussian Splatting*, 2025). Opacities are multiplied by
+/// `opacity`.
+#[must_use]
+pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
+    Offspring {
+        children: 1,
+        parent: ParentFate::BecomesChild,
+        placement: Placement::LongAxis { sigmas: 3.0 * share },
+        scale: ScaleRule::LongAxis { long: 1.0 - share, other: (1.0 - share * share).sqrt() },
+        opacity: OpacityRule::Scaled(opacity),
     }
 }
 
@@ -100,6 +133,37 @@ mod tests {
         let due: Vec<u32> = (0..2000).filter(|&step| window.is_due(step)).collect();
         assert_eq!(due, [600, 700, 800, 900]);
         assert!((0..2000).all(|step| !Window { every: 0, ..window }.is_due(step)));
+    }
+
+    #[test]
+    fn the_curve_is_that_of_taming() {
+        // M = 29, 28 events at 1000..14500; the last ends 1/29² below the end.
+        let window = Window { from: 500, until: 15_000, every: 500 };
+        let at = |step| concave_curve(window, step, 1000, 85_100);
+        // x = 1: 84,100·(2/29 − 1/841) = 84,100·57/841 = 5,700.
+        assert_eq!([at(500), at(1000), at(1500)], [1000, 6700, 12_200]);
+        assert_eq!([at(14_500), at(15_000), at(90_000)], [85_000, 85_100, 85_100]);
+        let big = Window { every: 100, ..window };
+        assert_eq!(concave_curve(big, 14_900, 0, 145 * 145), 145 * 145 - 1);
+        assert_eq!(concave_curve(Window { every: 0, ..window }, 900, 7, 9), 7);
+        // Nothing grows where the end is below the start.
+        assert!(concave_curve(window, 1000, 100, 50) < 100);
+    }
+
+    #[test]
+    fn halves_keep_the_ends_of_their_parent() {
+        let half = split_long_axis(0.45, 0.6);
+        let (Placement::LongAxis { sigmas }, ScaleRule::LongAxis { long, other }) =
+            (half.placement, half.scale)
+        else {
+            panic!("{half:?}")
+        };
+        assert!((sigmas - 1.35).abs() < 1e-6 && (long - 0.55).abs() < 1e-6);
+        assert!((sigmas + 3.0 * long - 3.0).abs() < 1e-6);
+        // √(1 − 0.45²) = 0.893.
+        assert!((other - 0.893_029).abs() < 1e-6);
+        assert_eq!((half.opacity, half.siblings()), (OpacityRule::Scaled(0.6), 2));
+        assert!(half.is_valid() && split_long_axis(0.0, 1.0).is_valid());
     }
 
     #[test]

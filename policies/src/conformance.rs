@@ -12,8 +12,19 @@
 //!
 //! The suite builds the policy from its defaults and leads it through scripted runs: models that
 //! are empty, have one row, are full, or have room, and plans that refuse all growth; statistics
-//! that are plausible, zero, all equal, negative, infinite, NaN, or a mixture. [`Check`] lists what
-//! must hold.
+//! that are plausible, zero, all equal, negative, infinite, NaN, or a mixture; auxiliary views with
+//! the same. [`Check`] lists what must hold, for every plan:
+//!
+//! - the rows never exceed the budget, nor does the plan become another; one row is left;
+//! - the same input gives the same plan, and a policy saved and restored in mid-run has the same
+//!   future;
+//! - nothing is read that was not declared, and what is declared is sound;
+//! - any statistic, none at all, and every refusal are taken in stride;
+//! - the manual page is complete.
+//!
+//! What the suite cannot know is whether a rule is the published one: identities of single policies
+//! (shares that conserve opacity, splits that keep their end points, curves that end at the budget)
+//! are tests of these.
 
 use std::fmt;
 
@@ -23,6 +34,7 @@ use crate::parameters::parse_value;
 use crate::policy::{PolicyError, SceneInfo};
 use crate::registry::PolicyEntry;
 
+mod pattern;
 mod script;
 
 /// What must hold of a policy.
@@ -32,11 +44,15 @@ pub enum Check {
     /// It can be built from its defaults for a run of any length, its step parameters are integer
     /// parameters, and an unknown parameter is refused.
     Builds,
-    /// It reads no signal and no candidates that its needs do not list, not even when they are
-    /// there.
+    /// It reads no signal, no candidates, and no column or point of an auxiliary view that its needs
+    /// do not list, not even when they are there.
     ReadsOnlyWhatItDeclares,
-    /// It asks for fresh views if and only if it asks for the signal that is measured in them.
+    /// It asks for fresh views if and only if it asks for the signal that is measured in them, and
+    /// for auxiliary views only if its needs say what is to be measured there.
     AsksForWhole,
+    /// Every number in its needs is one that a backend can work with, and at no step is its cadence
+    /// longer than declared.
+    DeclaresSoundly,
     /// It plans without error or panic, whatever the signals hold and whatever the plan refuses.
     GoesOn,
     /// Its plan is the one that it was given, for these rows and this budget.
@@ -59,7 +75,8 @@ impl fmt::Display for Check {
         f.write_str(match self {
             Self::Builds => "can be built from its defaults",
             Self::ReadsOnlyWhatItDeclares => "reads only what it declares",
-            Self::AsksForWhole => "asks for fresh views and their signal together",
+            Self::AsksForWhole => "asks for views and what is measured in them together",
+            Self::DeclaresSoundly => "declares numbers that can be worked with",
             Self::GoesOn => "goes on whatever it sees",
             Self::KeepsItsPlan => "keeps the plan that it is given",
             Self::LeavesARow => "leaves at least one row",

@@ -59,9 +59,13 @@
 //!   - `fresh`: `fresh_views` training views, drawn at random and rendered anew for each event at
 //!     which victims may be needed, as in the code. It costs so many passes, up to a hundred for
 //!     each growth, and a row that only other views show counts as unimportant.
-//! - `reinit_at`: the code's replacement of the whole model by points from depth maps, at step 5000 of
-//!   outdoor scenes, is **not available yet**: policies cannot ask for depth maps. Only 0 (never) is
-//!   accepted.
+//! - `reinit_at`: at this step, which may be any, the whole model is replaced, as the code does at
+//!   step 5000 of outdoor scenes (after Mini-Splatting). All training views are rendered; in each,
+//!   ⌊`reinit_share` · budget / views⌋ pixels (at least 1) are drawn without replacement in proportion
+//!   to their accumulated alpha; each becomes a row of the pixel's ground-truth colour, where its ray
+//!   passes most closely by the Gaussian with the largest blend weight there. Its size is the root mean
+//!   square distance to its three nearest neighbours, its opacity `newborn_opacity`; moments and age
+//!   are zero. Learning rates and spherical-harmonic degree go on. Nothing else happens at that step.
 //! - `error`: `l1-dssim` (0.8 · L1 + 0.2 · (1 − SSIM)), `l1`, or `grad`, the norm of the loss gradient
 //!   by the pixel's colour, as in the code: it ranks blurred structure and is blind to a constant
 //!   offset of colour.
@@ -109,7 +113,16 @@
 //! | newborn_size | "pixel" | pixel, code | | size of inserted rows |
 //! | size_pixels | 2.0 | > 0 | pixels | size of inserted rows, for `pixel` |
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted rows |
-//! | reinit_at | 0 | 0 | step | not available yet; 0: never |
+//! | reinit_at | 0 | >= 0 | step | replacement of the whole model; 0: never |
+//! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | most rows after it |
+//!
+//! ## Switching ingredients off
+//!
+//! For an ablation, each ingredient has a value without it: the colour gradient
+//! `mixed_gradient = false`, the shift `shift = "none"`, the error map `error = "grad"`, the guard of
+//! depths `min_alpha = 0`, the size rule `newborn_size = "code"`, the protection of newborns
+//! `protect = 0`, exact importance `importance = "epochs"` (the default), turnover `rho = 0`,
+//! compensation `rho_c = 0`, spacing `nms = false`, re-initialisation `reinit_at = 0` (the default).
 //!
 //! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
 //! down to 100 steps at most, and `protect`, which counts views, not at all.
@@ -117,16 +130,18 @@
 use crate::adc::{Mortality, Window, mean_over_views, spare_one};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet, Snapshot,
-    restore_nothing,
+    AuxView, Candidate, DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal,
+    SignalSet, Snapshot, restore_nothing,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
-use crate::sample::{largest, smallest};
+use crate::sample::largest;
 
 mod compensate;
 mod offspring;
 mod parameters;
+mod reinit;
+mod victims;
 
 pub use parameters::{CloneOpacity, DietParams, Growth, Importance, NewbornSize, Shift};
 
@@ -147,6 +162,8 @@ pub struct Diet {
     insert: Window,
     /// Age below which a row is protected `[steps]`.
     protected_age: f32,
+    /// Surface points of the re-initialisation at hand. No state: they are gone with the event.
+    surface: Vec<Candidate>,
 }
 
 impl ConfiguredPolicy for Diet {
@@ -161,6 +178,7 @@ impl ConfiguredPolicy for Diet {
         "compensate_from",
         "compensate_until",
         "insert_every",
+        "reinit_at",
     ];
 
     fn new(params: DietParams, scene: &SceneInfo) -> Result<Self, PolicyError> {
@@ -183,6 +201,7 @@ impl ConfiguredPolicy for Diet {
                 every: if compensates { params.insert_every } else { 0 },
             },
             protected_age: params.protect.min(scene.train_views) as f32,
+            surface: Vec::new(),
             params,
         })
     }
@@ -215,20 +234,39 @@ impl DensityPolicy for Diet {
             Importance::Epochs => 0,
             Importance::Fresh => self.params.fresh_views,
         };
-        Needs { signals, candidates: self.candidate_request(scene), fresh_views }
+        Needs {
+            signals,
+            candidates: self.candidate_request(scene),
+            fresh_views,
+            aux: self.surface_request(scene),
+            ..Needs::default()
+        }
     }
 
     fn is_due(&self, step: u32) -> bool {
         [self.grow, self.prune, self.insert].iter().any(|window| window.is_due(step))
+            || self.replaces_at(step)
     }
 
     /// Victims fall only where rows, those that may grow and those that may be inserted are
     /// together more than the budget.
     fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
+        if self.replaces_at(step) {
+            return false;
+        }
         let grown = if self.grow.is_due(step) { rows } else { 0 };
         let inserted =
             if self.insert.is_due(step) { fraction(self.params.rho_c, budget) } else { 0 };
         rows + grown + inserted > budget
+    }
+
+    fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
+        if self.replaces_at(step) { u32::MAX } else { 0 }
+    }
+
+    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+        self.surface.extend_from_slice(view.points);
+        Ok(())
     }
 
     fn plan(
@@ -237,6 +275,10 @@ impl DensityPolicy for Diet {
         _rng: &PolicyRng,
         plan: &mut EditPlan,
     ) -> Result<(), PolicyError> {
+        if self.replaces_at(now.step) {
+            self.replace(now.scene.extent, plan);
+            return Ok(());
+        }
         let grows = self.grow.is_due(now.step);
         let gradient = if grows { self.gradient(now)? } else { vec![0.0; now.rows()] };
         let mut candidates = Vec::new();
@@ -296,14 +338,6 @@ fn fraction(of: f64, budget: usize) -> usize {
 }
 
 impl Diet {
-    /// The signal that says how important a row is.
-    fn importance(&self) -> Signal {
-        match self.params.importance {
-            Importance::Epochs => Signal::WeightMax,
-            Importance::Fresh => Signal::FreshWeightMax,
-        }
-    }
-
     /// g of every row. Shape: `[rows]`.
     fn gradient(&self, now: &Snapshot<'_>) -> Result<Vec<f32>, PolicyError> {
         let views = now.signal(Signal::VisibleCount)?;
@@ -345,40 +379,6 @@ impl Diet {
         let rows = (0..gradient.len() as u32)
             .filter(|&row| gradient[row as usize] >= tau && dead.binary_search(&row).is_err());
         largest(rows.collect(), gradient, gradient.len())
-    }
-
-    /// Prunes the `count` least important rows that have no fate yet and are not `spared`; as many
-    /// as there are, if they are fewer.
-    fn prune_victims(
-        &self,
-        now: &Snapshot<'_>,
-        plan: &mut EditPlan,
-        count: usize,
-        spared: &dyn Fn(u32) -> bool,
-    ) -> Result<(), PolicyError> {
-        if count == 0 {
-            return Ok(());
-        }
-        let importance = now.signal(self.importance())?;
-        let protects = self.protected_age > 0.0;
-        let age = if protects { now.signal(Signal::Age)? } else { &[] };
-        let eligible = (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !spared(row));
-        let (mut newborn, grown): (Vec<u32>, Vec<u32>) =
-            eligible.partition(|&row| protects && age[row as usize] < self.protected_age);
-        let mut victims = smallest(grown, importance, count);
-        let missing = count - victims.len();
-        if missing > 0 {
-            newborn.sort_unstable_by(|&a, &b| {
-                let (a_row, b_row) = (a as usize, b as usize);
-                let older_first = age[b_row].total_cmp(&age[a_row]);
-                older_first.then(importance[a_row].total_cmp(&importance[b_row])).then(a.cmp(&b))
-            });
-            victims.extend(newborn.into_iter().take(missing));
-        }
-        for row in victims {
-            let _ = plan.prune(row);
-        }
-        Ok(())
     }
 
     fn scene_units(&self, fraction: f64, scene: &SceneInfo) -> f32 {

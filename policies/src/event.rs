@@ -2,7 +2,8 @@
 
 use crate::plan::{EditPlan, ParentFate, RowOps};
 use crate::policy::{
-    Candidate, DensityPolicy, PolicyError, SceneInfo, Signal, SignalSet, Signals, Snapshot,
+    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyError, SceneInfo, Signal, SignalSet,
+    Signals, Snapshot,
 };
 use crate::rng::PolicyRng;
 
@@ -15,6 +16,15 @@ pub(crate) struct Event {
     pub(crate) scene: SceneInfo,
     pub(crate) columns: Vec<(Signal, Vec<f32>)>,
     pub(crate) candidates: Vec<Candidate>,
+    pub(crate) views: Vec<View>,
+}
+
+/// An auxiliary view.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct View {
+    pub(crate) loss: f32,
+    pub(crate) columns: Vec<(AuxColumn, Vec<f32>)>,
+    pub(crate) points: Vec<Candidate>,
 }
 
 /// What a policy did. Rows are those before the edit, ascending, unless stated otherwise.
@@ -38,7 +48,15 @@ impl Event {
             iterations: 30_000,
             white_background: false,
         };
-        Self { step, rows, budget, scene, columns: Vec::new(), candidates: Vec::new() }
+        Self {
+            step,
+            rows,
+            budget,
+            scene,
+            columns: Vec::new(),
+            candidates: Vec::new(),
+            views: Vec::new(),
+        }
     }
 
     pub(crate) fn with(mut self, signal: Signal, column: &[f32]) -> Self {
@@ -53,8 +71,21 @@ impl Event {
         self.with(signal, &column)
     }
 
-    /// Lets the policy plan, with exactly the signals it asks for.
+    /// Lets the policy plan, with exactly the signals and as many of the views as it asks for.
     pub(crate) fn run(&self, policy: &mut dyn DensityPolicy) -> Result<Outcome, PolicyError> {
+        let request = policy.needs(&self.scene).aux.unwrap_or_default();
+        let wanted = policy.aux_views(self.step, self.rows, self.budget) as usize;
+        for view in self.views.iter().take(wanted) {
+            let asked = |c: &AuxColumn| request.columns.contains(c);
+            let columns: Vec<_> = view.columns.iter().filter(|c| asked(&c.0)).cloned().collect();
+            policy.observe(&AuxView {
+                step: self.step,
+                rows: self.rows,
+                loss: view.loss,
+                columns: &columns,
+                points: &view.points[..view.points.len().min(request.points as usize)],
+            })?;
+        }
         let mut set: SignalSet = policy.needs(&self.scene).signals;
         if !policy.wants_fresh(self.step, self.rows, self.budget) {
             set = set.without(Signal::FreshWeightMax);

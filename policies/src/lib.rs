@@ -2,8 +2,9 @@
 //!
 //! This crate holds the interface ([`policy`], [`plan`]), the registry ([`registry`]), a
 //! conformance suite for any policy ([`conformance`]), and the built-in policies: [`vanilla`], the
-//! original adaptive density control, and [`diet`], growth by turnover and compensation. It knows no
-//! renderer, no image and no device.
+//! original adaptive density control; [`taming`], growth by score along a curve; [`diet`], growth by
+//! turnover and compensation; [`mcmc`], relocation and noise; [`igs`], long-axis splits by edges. It
+//! knows no renderer, no image and no device.
 //!
 //! # Writing a policy
 //!
@@ -17,7 +18,10 @@
 //! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and
 //!    reading another is an error. What is measured in training costs nothing more;
 //!    [`Signal::FreshWeightMax`](policy::Signal::FreshWeightMax) costs renders of training views, so
-//!    say [when it is wanted](policy::DensityPolicy::wants_fresh).
+//!    say [when it is wanted](policy::DensityPolicy::wants_fresh). So do auxiliary views
+//!    ([`Needs::aux`](policy::Needs::aux)), which the policy
+//!    [observes](policy::DensityPolicy::observe) one by one. Terms of the loss, noise, the optimiser's
+//!    cadence, step sizes and the start are declared there too.
 //! 4. **A plan**: at the steps for which it is due, the policy reads the
 //!    [`Snapshot`](policy::Snapshot) and calls [`EditPlan`](plan::EditPlan). It never touches a
 //!    parameter or a device, so that it runs unchanged on every backend.
@@ -150,8 +154,13 @@ pub mod adc;
 pub mod conformance;
 pub mod diet;
 mod edit;
+mod error;
 #[cfg(test)]
 mod event;
+pub mod igs;
+pub mod mcmc;
+mod needs;
+mod neighbours;
 mod ops;
 pub mod parameters;
 pub mod plan;
@@ -159,4 +168,5 @@ pub mod policy;
 pub mod registry;
 pub mod rng;
 pub mod sample;
+pub mod taming;
 pub mod vanilla;

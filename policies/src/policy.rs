@@ -8,13 +8,18 @@
 
 use serde::{Deserialize, Serialize};
 
+pub use crate::error::PolicyError;
+pub use crate::needs::{
+    AuxColumn, AuxRequest, AuxView, Cadence, LossTerms, Needs, NoiseTerm, PixelMap, RateOverrides,
+    StartRule,
+};
 use crate::plan::EditPlan;
 use crate::rng::PolicyRng;
 
 /// A density-control policy.
 pub trait DensityPolicy: Send {
-    /// Signals and per-pixel candidates that this policy reads. Only these are accumulated and
-    /// allocated; reading anything else is a [`PolicyError::Undeclared`].
+    /// What this policy reads, and how it wants the model to be started and trained. Only this is
+    /// computed and allocated; reading anything else is a [`PolicyError::Undeclared`].
     fn needs(&self, scene: &SceneInfo) -> Needs;
 
     /// Whether this policy edits after the optimiser step of iteration `step` (1-based).
@@ -27,6 +32,31 @@ pub trait DensityPolicy: Send {
     fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
         let _ = (step, rows, budget);
         true
+    }
+
+    /// How often the optimiser steps at iteration `step`; no longer than
+    /// [declared](Needs::cadence). Gradients not yet used when it changes are used at the next step.
+    fn cadence(&self, step: u32) -> Cadence {
+        let _ = step;
+        Cadence::default()
+    }
+
+    /// How many training views, drawn at random without replacement, are to be rendered and
+    /// [observed](Self::observe) before the plan of `step`, at which the policy is due; all of them
+    /// if there are fewer. 0 for a policy that declares no [`Needs::aux`].
+    fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
+        let _ = (step, rows, budget);
+        0
+    }
+
+    /// Takes note of one auxiliary view, before the plan of the same step. The views come one after
+    /// another, and each is gone when the next one comes.
+    ///
+    /// # Errors
+    /// As for [`plan`](Self::plan).
+    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+        let _ = view;
+        Ok(())
     }
 
     /// Writes this event's edits into `plan`. Pure in its arguments and the policy's own state:
@@ -111,13 +141,15 @@ pub enum Signal {
     Opacity,
     /// Largest of the three standard deviations now `[scene units]`, > 0.
     ScaleMax,
+    /// Product of the three standard deviations now `[scene units³]`, >= 0.
+    ScaleProduct,
     /// Optimiser steps since the row was born or rewritten, saturating at 65,535.
     Age,
 }
 
 impl Signal {
     /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::VisibleCount,
         Self::ScreenGradient,
         Self::ScreenGradientAbs,
@@ -132,6 +164,7 @@ impl Signal {
         Self::PixelCount,
         Self::Opacity,
         Self::ScaleMax,
+        Self::ScaleProduct,
         Self::Age,
     ];
 }
@@ -169,19 +202,6 @@ impl SignalSet {
     pub fn iter(self) -> impl Iterator<Item = Signal> {
         Signal::ALL.into_iter().filter(move |&s| self.contains(s))
     }
-}
-
-/// What a policy reads.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Needs {
-    /// Per-row statistics.
-    pub signals: SignalSet,
-    /// Per-pixel candidates for new rows, if any.
-    pub candidates: Option<CandidateRequest>,
-    /// Training views, drawn at random without replacement, that are rendered anew for each event
-    /// that [wants them](DensityPolicy::wants_fresh): all of them if there are fewer. Goes with
-    /// [`Signal::FreshWeightMax`]; 0 without it.
-    pub fresh_views: u32,
 }
 
 /// Which pixels of the training views to collect as places for new rows.
@@ -308,73 +328,6 @@ impl<'a> Snapshot<'a> {
     pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
         self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
     }
-}
-
-/// Why a policy cannot be built or cannot go on.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum PolicyError {
-    /// A signal was read that [`DensityPolicy::needs`] did not list, or that
-    /// [`DensityPolicy::wants_fresh`] did not want at this event.
-    #[error("signal {signal:?} was read but not declared; list it in `needs`{}", and_ask(*.signal))]
-    Undeclared {
-        /// The signal in question.
-        signal: Signal,
-    },
-    /// No policy has this name.
-    #[error("unknown policy `{name}`{}; `densify policies` lists them", did_you_mean(.nearest.as_deref()))]
-    UnknownPolicy {
-        /// The name asked for.
-        name: String,
-        /// The registered name most like it.
-        nearest: Option<String>,
-    },
-    /// The policy has no such parameter.
-    #[error("policy `{policy}` has no parameter `{parameter}`{}; `densify policies {policy}` lists them", did_you_mean(.nearest.as_deref()))]
-    UnknownParameter {
-        /// The policy.
-        policy: String,
-        /// The parameter asked for.
-        parameter: String,
-        /// Its parameter most like it.
-        nearest: Option<String>,
-    },
-    /// A parameter's value has the wrong type or is out of its range.
-    #[error("parameter `{policy}.{parameter}`: {reason}")]
-    BadParameter {
-        /// The policy.
-        policy: String,
-        /// The parameter.
-        parameter: String,
-        /// What is wrong, and what would be right.
-        reason: String,
-    },
-    /// Two policies are registered under one name.
-    #[error("policy `{name}` is registered twice: {first} and {second}; rename one")]
-    DuplicateName {
-        /// The name.
-        name: String,
-        /// Where the first is (file:line).
-        first: String,
-        /// Where the second is (file:line).
-        second: String,
-    },
-    /// A saved state is not this policy's.
-    #[error("saved state does not fit: {0}")]
-    State(String),
-    /// Anything else that makes going on pointless.
-    #[error("{0}")]
-    Other(String),
-}
-
-fn and_ask(signal: Signal) -> &'static str {
-    match signal {
-        Signal::FreshWeightMax => " with `fresh_views`, and want it at this event (`wants_fresh`)",
-        _ => "",
-    }
-}
-
-fn did_you_mean(nearest: Option<&str>) -> String {
-    nearest.map_or_else(String::new, |n| format!(" (did you mean `{n}`?)"))
 }
 
 /// [`DensityPolicy::restore`] for a policy without state of its own, whose

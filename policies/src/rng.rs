@@ -14,6 +14,8 @@ pub enum Purpose {
     Place = 2,
     /// Noise on parameters.
     Noise = 3,
+    /// Drawing with replacement: the row is the number of the draw.
+    Draw = 4,
 }
 
 /// Draws of one policy event.
@@ -93,7 +95,7 @@ fn pcg4d(v: [u32; 4]) -> [u32; 4] {
 mod tests {
     use super::*;
 
-    const PURPOSES: [Purpose; 3] = [Purpose::Select, Purpose::Place, Purpose::Noise];
+    const PURPOSES: [Purpose; 4] = [Purpose::Select, Purpose::Place, Purpose::Noise, Purpose::Draw];
     const DRAWS: u32 = 1 << 16;
 
     /// χ² of counts that should all be equal, in standard deviations from its mean.

@@ -56,6 +56,36 @@ pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     keyed.into_iter().map(|(_, row)| row).collect()
 }
 
+/// Draws `k` rows with replacement, each with a probability in proportion to its weight: the rows
+/// drawn, ascending, and how often; nothing when no weight is positive.
+///
+/// Weights that are zero, negative or NaN are never drawn; infinite ones count as `f32::MAX`.
+#[must_use]
+pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32, u32)> {
+    let mut total = 0.0_f64;
+    let sums: Vec<f64> = weights
+        .iter()
+        .map(|&weight| {
+            // Also turns NaN into 0.
+            total += f64::from(if weight > 0.0 { weight.min(f32::MAX) } else { 0.0 });
+            total
+        })
+        .collect();
+    if total <= 0.0 {
+        return Vec::new();
+    }
+    let mut drawn: Vec<u32> = (0..k as u32)
+        .map(|draw| {
+            let at = rng.uniform_f64(draw, Purpose::Draw) * total;
+            let row = sums.partition_point(|&sum| sum <= at);
+            // The product may round up to the total itself: then the last row that adds to it.
+            row.min(sums.partition_point(|&sum| sum < total)) as u32
+        })
+        .collect();
+    drawn.sort_unstable();
+    drawn.chunk_by(|a, b| a == b).map(|same| (same[0], same.len() as u32)).collect()
+}
+
 /// Numbers in the direction wanted (−0 equals 0), then NaN of either sign.
 fn nan_last(x: f32, y: f32, direction: impl Fn(Ordering) -> Ordering) -> Ordering {
     x.partial_cmp(&y).map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
@@ -147,5 +177,27 @@ mod tests {
                 assert!((counts[i][j] - n * p).abs() <= bound, "{i} {j}: {}", counts[i][j] / n);
             }
         }
+    }
+
+    #[test]
+    fn draws_with_replacement_follow_the_weights() {
+        let weights = [0.0, 1.0, NAN, 3.0, -1.0, 4.0, 0.0];
+        let trials = 40_000_usize;
+        let drawn = with_replacement(&weights, trials, &PolicyRng::new(5, 9));
+        let rows: Vec<u32> = drawn.iter().map(|(row, _)| *row).collect();
+        assert_eq!(rows, [1, 3, 5]);
+        assert_eq!(drawn.iter().map(|(_, n)| *n as usize).sum::<usize>(), trials);
+        for (row, count) in drawn {
+            let p = f64::from(weights[row as usize]) / 8.0;
+            let n = trials as f64;
+            let bound = 5.0 * (n * p * (1.0 - p)).sqrt();
+            assert!((f64::from(count) - n * p).abs() < bound, "{row}: {count}");
+        }
+        let rng = PolicyRng::new(1, 1);
+        assert!(with_replacement(&[0.0, NAN, -2.0], 9, &rng).is_empty());
+        assert!(with_replacement(&[1.0], 0, &rng).is_empty());
+        assert_eq!(with_replacement(&[0.0, 1e-40, 0.0], 3, &rng), [(1, 3)]);
+        assert_eq!(with_replacement(&[1.0, f32::INFINITY], 3, &rng), [(1, 3)]);
+        assert_eq!(with_replacement(&[f32::INFINITY; 3], 99, &rng).len(), 3);
     }
 }

@@ -54,7 +54,9 @@ use std::ops::Bound::{Excluded, Unbounded};
 
 use serde::{Deserialize, Serialize};
 
-use crate::adc::{Mortality, Window, clone_at, mean_over_views, spare_one, split_by};
+use crate::adc::{
+    Mortality, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
+};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
@@ -258,12 +260,7 @@ impl Vanilla {
 
     /// Rows that the growth curve allows at the growth event of this step.
     fn governed_rows(&self, scene: &SceneInfo, step: u32) -> usize {
-        let Window { from, until, every } = self.grow;
-        let events = (until.saturating_sub(from) / every).max(1);
-        let event = step / every - from / every;
-        let x = (f64::from(event) / f64::from(events)).min(1.0);
-        let (start, budget) = (scene.initial_rows as f64, scene.budget as f64);
-        (start + (budget - start) * (2.0 * x - x * x)).floor() as usize
+        concave_curve(self.grow, step, scene.initial_rows, scene.budget)
     }
 }
 

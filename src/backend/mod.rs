@@ -8,7 +8,7 @@ pub mod cpu;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Candidate, Needs, Signals};
+use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, Needs, Signals};
 
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -47,12 +47,48 @@ pub struct StepInput<'a> {
     pub sh_degree: u8,
     /// Step sizes.
     pub rates: LearningRates,
+    /// How often the optimiser steps, no longer than the backend was made for.
+    pub cadence: Cadence,
+    /// Seed of the run, for noise on the means.
+    pub seed: u64,
+}
+
+/// A training view to be measured for a policy's event.
+#[derive(Debug, Clone, Copy)]
+pub struct AuxInput<'a> {
+    /// Iteration just finished, 1-based.
+    pub step: u32,
+    /// The view's number, for random draws.
+    pub view: usize,
+    /// Seed of the run, for random draws.
+    pub seed: u64,
+    /// The view's camera.
+    pub camera: &'a Camera,
+    /// The view's image, of the camera's size.
+    pub target: &'a Image8,
+    /// Background colour, sRGB-encoded in `[0, 1]`.
+    pub background: [f32; 3],
+    /// Spherical-harmonic degree evaluated now, <= the model's.
+    pub sh_degree: u8,
+    /// What to measure.
+    pub request: &'a AuxRequest,
+}
+
+/// What was measured in a view.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct AuxOutput {
+    /// 0.8·L1 + 0.2·(1 − SSIM).
+    pub loss: f32,
+    /// The columns asked for, in their order. Shape of each: `[rows]`.
+    pub columns: Vec<(AuxColumn, Vec<f32>)>,
+    /// Surface points; their error is the pixel's alpha.
+    pub points: Vec<Candidate>,
 }
 
 /// The scalars of one training step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepOutput {
-    /// 0.8·L1 + 0.2·(1 − SSIM).
+    /// 0.8·L1 + 0.2·(1 − SSIM), without the terms that a policy adds.
     pub loss: f32,
     /// Mean over pixels and channels of |I − G|.
     pub l1: f32,
@@ -137,6 +173,13 @@ pub trait Backend: Send {
     /// # Errors
     /// See [`BackendError`].
     fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError>;
+
+    /// Renders a view as the model is now and measures what is asked for. Changes nothing of the
+    /// model, of the optimiser, or of the signals.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError>;
 
     /// Copies the signals named in `needs` and the candidates collected so far to the host.
     /// `FreshWeightMax` starts anew, whether it was named or not.

@@ -172,3 +172,19 @@ fn random_points_are_where_cameras_look() {
     assert_eq!(random_points(10, &[], true, 0).len(), 10);
     assert_eq!(random_points(10, &inward[..1], true, 0).len(), 10);
 }
+
+#[test]
+fn a_policy_may_start_otherwise() {
+    let mut model = Gaussians {
+        log_scales: vec![[0.0, 1.0, -2.0]; 2],
+        opacity_logits: vec![-3.0, 2.0],
+        ..Gaussians::default()
+    };
+    let before = model.clone();
+    restart(&mut model, &StartRule::default());
+    assert_eq!(model, before);
+    restart(&mut model, &StartRule { opacity: Some(0.5), scale: 0.1 });
+    assert_eq!(model.opacity_logits, [0.0, 0.0]);
+    let tenth = 0.1_f32.ln();
+    assert_eq!(model.log_scales[1], [tenth, 1.0 + tenth, -2.0 + tenth]);
+}

@@ -66,6 +66,8 @@ pub struct TrainConfig {
     pub init: InitChoice,
     /// Number of points of a random initialisation.
     pub init_points: Option<usize>,
+    /// Iterations per optimiser step of spherical-harmonic bands 1–3; `None`: as the policy says.
+    pub sh_every: Option<u32>,
     /// Step sizes.
     pub learning_rates: RateOptions,
 }
@@ -158,6 +160,7 @@ mod tests {
                 near: 0.01,
                 tile_cap: None,
                 init: InitChoice::Points,
+                sh_every: Some(16),
                 init_points: None,
                 learning_rates: RateOptions::default(),
             },

@@ -1,8 +1,10 @@
-//! Fresh signals: training views that are rendered for a decision of the policy.
+//! Training views that are rendered for a decision of the policy: fresh signals, and auxiliary
+//! views.
 
-use densify_policies::policy::{Needs, Signal};
+use densify_policies::policy::{AuxView, Needs, Signal};
 
 use super::{TrainError, Trainer};
+use crate::backend::AuxInput;
 use crate::schedule;
 use crate::views::ViewSource;
 
@@ -28,5 +30,34 @@ impl<V: ViewSource> Trainer<V> {
             self.extra_forwards += 1;
         }
         Ok(needs)
+    }
+
+    /// Shows the policy the auxiliary views that it wants for its event after `step`, one by one.
+    pub(super) fn show_views(&mut self, step: u32) -> Result<(), TrainError> {
+        let (rows, budget) = (self.backend.rows(), self.backend.budget());
+        let wanted = self.policy.aux_views(step, rows, budget) as usize;
+        let Some(request) = self.needs.aux.clone().filter(|_| wanted > 0) else {
+            return Ok(());
+        };
+        let options = self.options;
+        for view in schedule::fresh_views(self.views.count(), wanted, options.seed, step) {
+            let image = self.image(step, view)?;
+            let measured = self.backend.observe(&AuxInput {
+                step,
+                view,
+                seed: options.seed,
+                camera: self.views.camera(view),
+                target: &image,
+                background: options.background.at(options.seed, step),
+                sh_degree: schedule::sh_degree(step, options.iterations, options.sh_degree),
+                request: &request,
+            });
+            let measured = measured.map_err(|e| self.stopped(step, e))?;
+            self.extra_forwards += 1;
+            let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
+            let seen = self.policy.observe(&AuxView { step, rows, loss, columns, points });
+            seen.map_err(|source| self.refused(step, source))?;
+        }
+        Ok(())
     }
 }

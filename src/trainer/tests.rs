@@ -5,11 +5,13 @@
 use std::sync::{Arc, Mutex};
 
 use densify_policies::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
-use densify_policies::policy::{Candidate, PolicyError, PolicyState, Signal, SignalSet, Signals};
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, AuxView, Candidate, PolicyError, PolicyState, Signal, SignalSet, Signals,
+};
 use glam::{DMat3, DVec3};
 
 use super::*;
-use crate::backend::Rendering;
+use crate::backend::{AuxInput, AuxOutput, Rendering};
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
@@ -45,12 +47,23 @@ impl Backend for CountingBackend {
     }
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         note(&self.diary, format!("step {} view {}", input.step, input.target.rgb[0]));
+        if input.cadence != Cadence::default() {
+            let Cadence { all, sh_rest } = input.cadence;
+            note(&self.diary, format!("cadence {all} {sh_rest}"));
+        }
         let loss = if input.step == self.lost_at { f32::NAN } else { 0.5 };
         Ok(StepOutput { loss, ..StepOutput::default() })
     }
     fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
         note(&self.diary, format!("measure {} at degree {sh_degree}", camera.translation.x));
         Ok(())
+    }
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        let (x, degree) = (input.camera.translation.x, input.sh_degree);
+        note(&self.diary, format!("observe {x}, pixel {}, degree {degree}", input.target.rgb[0]));
+        assert_eq!((input.view as f64, input.seed), (x, 7));
+        let columns = input.request.columns.iter().map(|&c| (c, vec![x as f32; self.rows]));
+        Ok(AuxOutput { loss: 0.5, columns: columns.collect(), points: Vec::new() })
     }
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
         Ok((Signals::zeros(self.rows, needs.signals), Vec::new()))
@@ -82,6 +95,9 @@ impl Backend for CountingBackend {
 struct ToldPolicy {
     every: u32,
     fresh_views: u32,
+    aux_views: u32,
+    cadence: Cadence,
+    seen: Vec<f32>,
     what: Told,
 }
 
@@ -99,7 +115,10 @@ impl DensityPolicy for ToldPolicy {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let (signals, fresh_views) = (SignalSet::of(&[Signal::Opacity]), self.fresh_views);
         let fresh = if fresh_views > 0 { signals.with(Signal::FreshWeightMax) } else { signals };
-        Needs { signals: fresh, fresh_views, candidates: None }
+        let aux = (self.aux_views > 0)
+            .then(|| AuxRequest { columns: vec![AuxColumn::Depth], ..AuxRequest::default() });
+        let cadence = Cadence { all: 4, sh_rest: 1 };
+        Needs { signals: fresh, fresh_views, aux, cadence, ..Needs::default() }
     }
     fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
         assert!(self.is_due(step) && rows <= budget);
@@ -108,12 +127,31 @@ impl DensityPolicy for ToldPolicy {
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.every)
     }
+    fn cadence(&self, step: u32) -> Cadence {
+        if step > 5 { self.cadence } else { Cadence::default() }
+    }
+    fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
+        assert!(self.is_due(step) && rows <= budget);
+        if step == 4 { self.aux_views } else { 0 }
+    }
+    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+        assert_eq!((view.step, view.loss, view.points.len()), (4, 0.5, 0));
+        assert_eq!(view.column(AuxColumn::Depth)?.len(), view.rows);
+        self.seen.push(view.column(AuxColumn::Depth)?[0]);
+        if self.what == Told::ReadUndeclared {
+            view.column(AuxColumn::Radius)?;
+        }
+        Ok(())
+    }
     fn plan(
         &mut self,
         now: &Snapshot<'_>,
         _rng: &PolicyRng,
         plan: &mut EditPlan,
     ) -> Result<(), PolicyError> {
+        if !self.seen.is_empty() {
+            plan.cause(&format!("saw {:?}", std::mem::take(&mut self.seen)));
+        }
         let rows = now.signal(Signal::Opacity)?.len() as u32;
         plan.cause("told");
         match self.what {
@@ -188,6 +226,8 @@ struct Case {
     what: Told,
     every: u32,
     fresh_views: u32,
+    aux_views: u32,
+    cadence: Cadence,
     lost_at: u32,
     unreadable: Option<usize>,
 }
@@ -198,6 +238,8 @@ const CASE: Case = Case {
     what: Told::Split,
     every: 2,
     fresh_views: 0,
+    aux_views: 0,
+    cadence: Cadence { all: 1, sh_rest: 1 },
     lost_at: 0,
     unreadable: None,
 };
@@ -228,6 +270,7 @@ const OPTIONS: TrainOptions = TrainOptions {
         sh_dc: 1.0,
         sh_rest: 1.0,
     },
+    sh_every: None,
     prefetch: 2,
 };
 
@@ -262,8 +305,8 @@ fn build(
         unreadable: case.unreadable,
         announced: announced.clone(),
     };
-    let Case { every, fresh_views, what, .. } = *case;
-    let policy = ToldPolicy { every, fresh_views, what };
+    let Case { every, fresh_views, aux_views, cadence, what, .. } = *case;
+    let policy = ToldPolicy { every, fresh_views, aux_views, cadence, seen: Vec::new(), what };
     let policy = ("told", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, diary, announced))
@@ -414,4 +457,63 @@ fn options_that_disagree_are_refused() {
     assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
     assert!(refused(3, |_, o| o.rates.quat = 0.0).contains("`quat`"));
     assert!(build(&CASE, 3, scene(&CASE, 3), OPTIONS).is_ok());
+}
+
+#[test]
+fn auxiliary_views_are_shown_before_the_plan() {
+    let case = Case { aux_views: 2, ..CASE };
+    let (mut trainer, diary, _) = trainer(&case);
+    let events: Vec<EditEvent> = (0..9).filter_map(|_| trainer.step().unwrap().event).collect();
+    let views = schedule::fresh_views(3, 2, 7, 4);
+    let degree = schedule::sh_degree(4, 9, 3);
+    let shown = |view: &usize| format!("observe {view}, pixel {view}, degree {degree}");
+    let diary = diary.lock().unwrap();
+    let first = diary.iter().position(|d| d.starts_with("observe")).unwrap();
+    let expected: Vec<String> = views.iter().map(shown).chain(["apply 4".to_owned()]).collect();
+    assert_eq!(diary[first..first + 3], expected);
+    assert_eq!(diary.iter().filter(|d| d.starts_with("observe")).count(), 2);
+    assert_eq!(trainer.extra_forwards(), 2);
+    let saw: Vec<f32> = views.iter().map(|&view| view as f32).collect();
+    assert_eq!(events[1].cause, format!("saw {saw:?}+told"));
+    assert_eq!(events[2].cause, "told");
+    // All of them, where more are wanted than there are.
+    let (mut trainer, ..) = self::trainer(&Case { aux_views: u32::MAX, ..CASE });
+    (0..9).for_each(|_| drop(trainer.step().unwrap()));
+    assert_eq!(trainer.extra_forwards(), 3);
+}
+
+#[test]
+fn what_an_auxiliary_view_does_not_have_stops_the_run() {
+    let case = Case { aux_views: 1, what: Told::ReadUndeclared, every: 4, ..CASE };
+    let (message, rows, done) = failure(&case);
+    assert!(message.contains("step 4: policy `told`: column Radius"), "{message}");
+    assert!(rows == 3 && done.iter().all(|d| !d.starts_with("apply")));
+}
+
+#[test]
+fn the_cadence_is_the_policys_unless_the_options_say_otherwise() {
+    let noted = |cadence: Cadence, sh_every: Option<u32>| {
+        let case = Case { cadence, every: 100, ..CASE };
+        let options = TrainOptions { sh_every, ..OPTIONS };
+        let (mut trainer, diary, _) = build(&case, 3, scene(&case, 3), options)?;
+        for _ in 0..9 {
+            trainer.step()?;
+        }
+        let diary = diary.lock().unwrap().clone();
+        Ok::<_, TrainError>(
+            diary.into_iter().filter(|d| d.starts_with("cadence")).collect::<Vec<_>>(),
+        )
+    };
+    let (every, fourth) = (Cadence::default(), Cadence { all: 4, sh_rest: 1 });
+    assert_eq!(noted(every, None).unwrap(), [""; 0]);
+    assert_eq!(noted(fourth, None).unwrap(), ["cadence 4 1"; 4]);
+    assert_eq!(noted(every, Some(16)).unwrap(), ["cadence 1 16"; 9]);
+    assert_eq!(
+        noted(fourth, Some(16)).unwrap()[4..],
+        ["cadence 1 16", "cadence 4 16", "cadence 4 16", "cadence 4 16", "cadence 4 16"]
+    );
+    let undeclared = noted(Cadence { all: 1, sh_rest: 9 }, None).unwrap_err().to_string();
+    assert!(undeclared.starts_with("step 6: policy `told`: it wants"), "{undeclared}");
+    let senseless = noted(every, Some(0)).unwrap_err().to_string();
+    assert!(senseless.contains("cadence.sh_rest is 0"), "{senseless}");
 }

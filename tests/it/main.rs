@@ -3,11 +3,13 @@
 //! `reference` is a second renderer in `f64` that shares no arithmetic with the backends;
 //! `oracle` holds both against stored float64 renders; `gradients`, `loss`, `signals` and
 //! `extremes` hold the backend against the reference on scenes of their own; `sameness` compares
-//! bits; `edits` applies any plan to the backend and to a plain vector; `cli` runs the program on
+//! bits; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan to the backend and to a plain vector; `cli` runs the program on
 //! photographs of a small scene; `invariants` keeps the walls of ARCHITECTURE.md standing.
 
+mod aux_views;
 mod cli;
 mod compare;
+mod declared;
 mod edits;
 mod extremes;
 mod gradients;

@@ -6,6 +6,7 @@ use densify::backend::{Backend, LearningRates, Rendering, StepInput, StepOutput}
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
+use densify_policies::policy::Cadence;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -67,6 +68,8 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
                 background: GREY,
                 sh_degree: model.sh_degree,
                 rates: RATES,
+                cadence: Cadence::default(),
+                seed: 1,
             };
             backend.train_step(&input).expect("a small image is rendered")
         })

@@ -5,7 +5,7 @@ use densify::backend::{Backend, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::policy::{Needs, Signal, SignalSet};
+use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -107,6 +107,8 @@ fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
             background: BACKGROUND,
             sh_degree: 2,
             rates: STILL,
+            cadence: Cadence::default(),
+            seed: 1,
         };
         backend.train_step(&input).expect("a small image is rendered");
     }

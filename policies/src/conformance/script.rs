@@ -7,45 +7,14 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use toml::Table;
 
 use super::Check;
+use super::pattern::{PATTERNS, Pattern, number, plausible};
 use crate::plan::{EditPlan, RowOps};
 use crate::policy::{
-    Candidate, DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet,
-    Signals, Snapshot,
+    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PolicyError, PolicyState,
+    SceneInfo, Signal, SignalSet, Signals, Snapshot,
 };
 use crate::registry::PolicyEntry;
 use crate::rng::{PolicyRng, Purpose};
-
-/// What the statistics of a run hold.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Pattern {
-    Plausible,
-    Zero,
-    Equal,
-    Negative,
-    Huge,
-    Denormal,
-    Infinite,
-    MinusInfinite,
-    Nan,
-    /// Each number after another of the patterns above.
-    Mixture,
-    /// Each event after another of the patterns above.
-    Changing,
-}
-
-const PATTERNS: [Pattern; 11] = [
-    Pattern::Plausible,
-    Pattern::Zero,
-    Pattern::Equal,
-    Pattern::Negative,
-    Pattern::Huge,
-    Pattern::Denormal,
-    Pattern::Infinite,
-    Pattern::MinusInfinite,
-    Pattern::Nan,
-    Pattern::Mixture,
-    Pattern::Changing,
-];
 
 /// One run.
 #[derive(Debug, Clone)]
@@ -61,6 +30,16 @@ impl Scenario {
     /// The budget of the plan for a model of `rows` rows.
     fn budget(&self, rows: usize) -> usize {
         if self.refuses { rows } else { self.scene.budget }
+    }
+}
+
+impl Scenario {
+    /// What the statistics of an event hold.
+    fn pattern_at(&self, step: u32) -> Pattern {
+        match self.pattern {
+            Pattern::Changing => PATTERNS[step as usize % (PATTERNS.len() - 1)],
+            pattern => pattern,
+        }
     }
 }
 
@@ -120,6 +99,8 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     refuses_foreign_state(&mut *build()?)?;
 
     let needs = policy.needs(scene);
+    let sound = |why| (Check::DeclaresSoundly, why);
+    needs.check().map_err(sound)?;
     if needs != policy.needs(scene) || needs != twins[0].1.needs(scene) {
         return Err((Check::Repeats, "its needs change".to_owned()));
     }
@@ -129,6 +110,12 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
             (needs.fresh_views, if has_fresh_signal { "asks" } else { "does not ask" });
         let why = format!("it {verb} for FreshWeightMax, but for {views} fresh views");
         return Err((Check::AsksForWhole, why));
+    }
+    if let Some(step) =
+        (1..=scene.iterations).find(|&step| !policy.cadence(step).is_within(needs.cadence))
+    {
+        let (cadence, longest) = (policy.cadence(step), needs.cadence);
+        return Err(sound(format!("at step {step} {cadence:?}, but {longest:?} was declared")));
     }
     let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
     let mut model = Model { rows: scene.initial_rows, candidates: Vec::new() };
@@ -143,6 +130,16 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
             |policy: &dyn DensityPolicy| policy.wants_fresh(step, rows, scenario.budget(rows));
         let fresh = wants_fresh(&*policy);
         let seen = model.observe(scenario, step, &needs, fresh);
+        let aux = policy.aux_views(step, rows, scenario.budget(rows));
+        if aux > 0 && needs.aux.is_none() {
+            let why = "it wants auxiliary views, but its needs do not say what of".to_owned();
+            return Err(at((Check::AsksForWhole, why)));
+        }
+        let request = needs.aux.clone().unwrap_or_default();
+        let views: Vec<Observed> = (0..aux.min(scene.train_views).min(MOST_VIEWS))
+            .map(|view| model.view(scenario, step, view, &request))
+            .collect();
+        observe(&mut *policy, step, rows, &views, &request, false).map_err(at)?;
         let ops = plan(&mut *policy, scenario, &seen, false).map_err(at)?;
         for (check, twin) in &mut twins {
             if !twin.is_due(step) {
@@ -151,7 +148,13 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
             if wants_fresh(&**twin) != fresh {
                 return Err(at((*check, "a copy does not agree on fresh views".to_owned())));
             }
+            if twin.aux_views(step, rows, scenario.budget(rows)) != aux
+                || twin.cadence(step) != policy.cadence(step)
+            {
+                return Err(at((*check, "a copy wants other views or another cadence".to_owned())));
+            }
             let sees_all = *check == Check::ReadsOnlyWhatItDeclares;
+            observe(&mut **twin, step, rows, &views, &request, sees_all).map_err(at)?;
             let again = plan(&mut **twin, scenario, &seen, sees_all).map_err(at)?;
             if again != ops {
                 return Err(at((*check, format!("{ops:?}, but a copy planned {again:?}"))));
@@ -161,6 +164,45 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
             }
         }
         model.apply(&ops);
+    }
+    Ok(())
+}
+
+/// Most auxiliary views that an event shows.
+const MOST_VIEWS: u32 = 3;
+
+/// What there is to see in an auxiliary view, whether it was asked for or not.
+struct Observed {
+    loss: f32,
+    columns: Vec<(AuxColumn, Vec<f32>)>,
+    points: Vec<Candidate>,
+}
+
+/// Shows the views to a copy: what it declared, or everything.
+fn observe(
+    policy: &mut dyn DensityPolicy,
+    step: u32,
+    rows: usize,
+    views: &[Observed],
+    request: &AuxRequest,
+    sees_all: bool,
+) -> Result<(), Failure> {
+    for view in views {
+        let declared = |column: &AuxColumn| sees_all || request.columns.contains(column);
+        let columns: Vec<_> = view.columns.iter().filter(|c| declared(&c.0)).cloned().collect();
+        // As many as were asked for, or any where none was.
+        let most =
+            if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
+        let points = &view.points[..most.min(view.points.len())];
+        let view = AuxView { step, rows, loss: view.loss, columns: &columns, points };
+        let seen = guarded(|| policy.observe(&view)).map_err(|why| (Check::GoesOn, why))?;
+        seen.map_err(|error| match error {
+            PolicyError::UndeclaredColumn { column } => {
+                let why = format!("{column:?} was read but not declared");
+                (Check::ReadsOnlyWhatItDeclares, why)
+            }
+            error => (Check::GoesOn, error.to_string()),
+        })?;
     }
     Ok(())
 }
@@ -181,12 +223,33 @@ struct Seen {
 }
 
 impl Model {
+    /// One auxiliary view.
+    fn view(&self, scenario: &Scenario, step: u32, view: u32, request: &AuxRequest) -> Observed {
+        let rng = PolicyRng::new(11 + u64::from(view), step);
+        let pattern = scenario.pattern_at(step);
+        let value = |row: u32, part: u32, plausible: &dyn Fn(f32) -> f32| {
+            number(pattern, rng.bits(row, Purpose::Noise, 200 + part), plausible)
+        };
+        let columns = AuxColumn::ALL.into_iter().enumerate().map(|(i, column)| {
+            let rows = 0..self.rows as u32;
+            (column, rows.map(|row| value(row, i as u32, &|u| (40.0 * u).floor())).collect())
+        });
+        let points = (0..request.points.clamp(1, 4)).map(|index| Candidate {
+            position: [0, 1, 2].map(|i| value(index, 20 + i, &|u| u)),
+            colour: [3, 4, 5].map(|i| value(index, 20 + i, &|u| u)),
+            pixel_size: value(index, 26, &|u| 0.01 * u),
+            error: value(index, 27, &|u| u),
+        });
+        Observed {
+            loss: value(0, 30, &|u| u),
+            columns: columns.collect(),
+            points: points.collect(),
+        }
+    }
+
     fn observe(&mut self, scenario: &Scenario, step: u32, needs: &Needs, fresh: bool) -> Seen {
         let rng = PolicyRng::new(7, step);
-        let pattern = match scenario.pattern {
-            Pattern::Changing => PATTERNS[step as usize % (PATTERNS.len() - 1)],
-            pattern => pattern,
-        };
+        let pattern = scenario.pattern_at(step);
         let fill = |set: SignalSet| {
             let mut signals = Signals::zeros(self.rows, set);
             for signal in set.iter() {
@@ -227,44 +290,6 @@ impl Model {
         if ops.reset_candidates {
             self.candidates.clear();
         }
-    }
-}
-
-/// A number after the pattern, from four random words.
-fn number(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f32 {
-    let u = (bits[0] >> 9) as f32 / 8_388_608.0;
-    match pattern {
-        Pattern::Plausible | Pattern::Changing => plausible(u),
-        Pattern::Zero => 0.0,
-        Pattern::Equal => 0.5,
-        Pattern::Negative => -plausible(u),
-        Pattern::Huge => f32::MAX,
-        Pattern::Denormal => f32::from_bits(1),
-        Pattern::Infinite => f32::INFINITY,
-        Pattern::MinusInfinite => f32::NEG_INFINITY,
-        Pattern::Nan => f32::NAN,
-        // Half of them plausible, so that policies act at all.
-        Pattern::Mixture => {
-            let pattern =
-                if bits[1].is_multiple_of(2) { 0 } else { bits[2] as usize % (PATTERNS.len() - 2) };
-            number(PATTERNS[pattern], bits, plausible)
-        }
-    }
-}
-
-/// A value such as a training may show, for u in [0, 1).
-fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
-    match signal {
-        Signal::VisibleCount => (20.0 * u).floor(),
-        Signal::ScreenGradient | Signal::ScreenGradientAbs => 0.02 * u.powi(3),
-        Signal::ColourGradient => 1e-3 * u.powi(3),
-        Signal::MeanGradientX | Signal::MeanGradientY | Signal::MeanGradientZ => 1e-3 * (u - 0.5),
-        Signal::MeanGradientNorm => 2e-3 * u,
-        Signal::WeightMax | Signal::FreshWeightMax => u,
-        Signal::WeightSum | Signal::PixelCount => (1000.0 * u).floor(),
-        Signal::Opacity => 0.99 * u.powi(3) + 1e-3,
-        Signal::ScaleMax => 0.15 * scene.extent * u.powi(3) + 1e-6,
-        Signal::Age => (300.0 * u).floor(),
     }
 }
 

@@ -1,4 +1,5 @@
-//! The registered policies conform; policies with one fault each are caught.
+//! The registered policies conform; policies with one fault each are caught. One piece, as all
+//! faults are those of one policy.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -7,7 +8,10 @@ use serde::{Deserialize, Serialize};
 use super::*;
 use crate::adc::clone_at;
 use crate::plan::EditPlan;
-use crate::policy::{DensityPolicy, Needs, PolicyState, Signal, SignalSet, Snapshot};
+use crate::policy::{
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PolicyState, Signal, SignalSet,
+    Snapshot,
+};
 use crate::registry::{ConfiguredPolicy, policies};
 use crate::rng::{PolicyRng, Purpose};
 use crate::sample::{smallest, top_k};
@@ -26,6 +30,12 @@ fn every_choice_of_the_built_in_policies_conforms() {
     let choices = [
         ("vanilla", "governor = true"),
         ("vanilla", "grow_every = 0"),
+        ("igs", "views = 1\nfinal_from = 1\ntau = 0.0"),
+        ("igs", "tau = 0.0\nrecovery_share = 1.0\nresets = 99\nfirst_prune_opacity = 1.0"),
+        ("taming", "tau = 0.0\nviews = 0\nprune_share = 1.0"),
+        ("taming", "prune = \"published\"\nmultiplier = 2.0\ntau = 0.0"),
+        ("mcmc", "growth = 1.0\nnoise = 0.0"),
+        ("mcmc", "min_opacity = 0.5\nmost_shares = 2"),
         ("diet", "mixed_gradient = false\nshift = \"none\"\nprotect = 0"),
         ("diet", "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\""),
         ("diet", "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 1.0\nrho_c = 1.0"),
@@ -33,6 +43,8 @@ fn every_choice_of_the_built_in_policies_conforms() {
         // All windows at once.
         ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
         ("diet", "importance = \"fresh\""),
+        ("diet", "reinit_at = 100\nprune_every = 1"),
+        ("diet", "reinit_at = 300\nreinit_share = 1.0\nimportance = \"fresh\""),
         ("diet", "importance = \"fresh\"\ncompensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),
         ("diet", "importance = \"fresh\"\ngrowth = \"all\"\nrho_c = 1.0\nfresh_views = 1"),
     ];
@@ -72,9 +84,15 @@ enum Fault {
     RendersNothing,
     RendersForNothing,
     WantsFreshAtWhim,
+    WantsViewsUndeclared,
+    ReadsColumnUndeclared,
+    PeeksAtPoints,
+    ForgetsWhatItSaw,
+    DeclaresNan,
+    StepsTooSeldom,
 }
 
-const FAULTS: [(Fault, Option<Check>); 16] = [
+const FAULTS: [(Fault, Option<Check>); 22] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
     (Fault::PeeksIfItCan, Some(Check::ReadsOnlyWhatItDeclares)),
@@ -91,6 +109,12 @@ const FAULTS: [(Fault, Option<Check>); 16] = [
     (Fault::RendersNothing, Some(Check::AsksForWhole)),
     (Fault::RendersForNothing, Some(Check::AsksForWhole)),
     (Fault::WantsFreshAtWhim, Some(Check::Repeats)),
+    (Fault::WantsViewsUndeclared, Some(Check::AsksForWhole)),
+    (Fault::ReadsColumnUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
+    (Fault::PeeksAtPoints, Some(Check::ReadsOnlyWhatItDeclares)),
+    (Fault::ForgetsWhatItSaw, Some(Check::Remembers)),
+    (Fault::DeclaresNan, Some(Check::DeclaresSoundly)),
+    (Fault::StepsTooSeldom, Some(Check::DeclaresSoundly)),
 ];
 
 /// Randomness that belongs to nobody.
@@ -110,13 +134,15 @@ struct Params {
 /// others it clones two rows, one by gradient and one by chance. Sound, but for its fault.
 struct Faulty<const FAULT: usize> {
     events: u64,
+    /// Bits of the numbers seen in the auxiliary views of its life.
+    seen: u64,
 }
 
 impl<const FAULT: usize> ConfiguredPolicy for Faulty<FAULT> {
     type Params = Params;
     const STEP_PARAMETERS: &'static [&'static str] = &["every"];
     fn new(_params: Params, _scene: &SceneInfo) -> Result<Self, PolicyError> {
-        Ok(Self { events: 0 })
+        Ok(Self { events: 0, seen: 0 })
     }
 }
 
@@ -137,11 +163,45 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
             signals = signals.with(Signal::FreshWeightMax);
         }
         let fresh_views = if fresh || self.has(Fault::RendersForNothing) { 3 } else { 0 };
-        Needs { signals, fresh_views, candidates: None }
+        let mut needs = Needs { signals, fresh_views, ..Needs::default() };
+        if !self.has(Fault::WantsViewsUndeclared) {
+            let columns = vec![AuxColumn::Depth];
+            let points = if self.has(Fault::PeeksAtPoints) { 0 } else { 2 };
+            needs.aux = Some(AuxRequest { columns, points, ..AuxRequest::default() });
+        }
+        if self.has(Fault::DeclaresNan) {
+            needs.loss_terms.opacity = f32::NAN;
+        }
+        needs.cadence.all = 3;
+        needs
     }
 
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(5)
+    }
+
+    fn cadence(&self, step: u32) -> Cadence {
+        let all = if step > 100 { 3 } else { 1 };
+        let sh_rest = if self.has(Fault::StepsTooSeldom) && step > 90 { 2 } else { 1 };
+        Cadence { all: if sh_rest > 1 { 0 } else { all }, sh_rest }
+    }
+
+    fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
+        u32::from(step.is_multiple_of(10)) * 2
+    }
+
+    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+        if self.has(Fault::ReadsColumnUndeclared) {
+            view.column(AuxColumn::Radius)?;
+        }
+        let of = |x: f32| u64::from(x.to_bits());
+        let depths = view.column(AuxColumn::Depth)?;
+        let sum = depths.iter().fold(of(view.loss), |sum, &x| sum.rotate_left(5) ^ of(x));
+        self.seen = self.seen.rotate_left(9) ^ sum;
+        for point in view.points {
+            self.seen = self.seen.rotate_left(9) ^ of(point.error);
+        }
+        Ok(())
     }
 
     fn wants_fresh(&self, step: u32, _rows: usize, _budget: usize) -> bool {
@@ -181,7 +241,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
             assert!(gradient.iter().all(|g| !g.is_nan()), "a gradient is not a number");
         }
         let mut by_chance: Vec<f32> =
-            rows.iter().map(|&row| rng.uniform(row, Purpose::Select)).collect();
+            rows.iter().map(|&row| rng.uniform(row ^ self.seen as u32, Purpose::Select)).collect();
         let mut by_gradient = gradient.to_vec();
         if self.has(Fault::ReadsUndeclared) {
             by_gradient = now.signal(Signal::ScreenGradientAbs)?.to_vec();
@@ -208,7 +268,10 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     }
 
     fn save(&self) -> PolicyState {
-        serde_json::json!({ "events": self.events })
+        if self.has(Fault::ForgetsWhatItSaw) {
+            return serde_json::json!({ "events": self.events, "seen": 0 });
+        }
+        serde_json::json!({ "events": self.events, "seen": self.seen })
     }
 
     fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
@@ -220,6 +283,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
             None if self.has(Fault::AcceptsAnyState) => {}
             None => return Err(PolicyError::State("no `events`".to_owned())),
         }
+        self.seen = state["seen"].as_u64().unwrap_or_default();
         Ok(())
     }
 }
@@ -247,6 +311,12 @@ fn every_fault_is_found() {
         faulty::<13>(),
         faulty::<14>(),
         faulty::<15>(),
+        faulty::<16>(),
+        faulty::<17>(),
+        faulty::<18>(),
+        faulty::<19>(),
+        faulty::<20>(),
+        faulty::<21>(),
     ];
     let mut missed = Vec::new();
     for (entry, (fault, expected)) in entries.iter().zip(FAULTS) {

@@ -1,10 +1,10 @@
 //! The parameters of `diet`. Its manual page says what they mean.
 
-use std::ops::Bound::{Excluded, Unbounded};
+use std::ops::Bound::{Excluded, Included, Unbounded};
 
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::{bad, in_range};
+use crate::parameters::in_range;
 use crate::policy::{DepthMode, ErrorMode, PolicyError};
 
 /// Parameters of [`Diet`](super::Diet).
@@ -45,6 +45,7 @@ pub struct DietParams {
     pub size_pixels: f64,
     pub newborn_opacity: f64,
     pub reinit_at: u32,
+    pub reinit_share: f64,
 }
 
 /// How many candidates grow.
@@ -137,12 +138,13 @@ impl Default for DietParams {
             size_pixels: 2.0,
             newborn_opacity: 0.1,
             reinit_at: 0,
+            reinit_share: 0.8,
         }
     }
 }
 
 impl DietParams {
-    /// Checks ranges, and refuses what is not available yet.
+    /// Checks ranges.
     pub(super) fn check(&self) -> Result<(), PolicyError> {
         in_range("tau", self.tau, 0.0..)?;
         in_range("colour_weight", self.colour_weight, 0.0..)?;
@@ -162,16 +164,7 @@ impl DietParams {
         // As the f32 that the plan will check.
         let newborn_opacity = f64::from(self.newborn_opacity as f32);
         in_range("newborn_opacity", newborn_opacity, (Excluded(0.0), Excluded(1.0)))?;
-        if self.reinit_at != 0 {
-            return Err(bad(
-                "reinit_at",
-                format!(
-                    "{} is not available yet: it needs depth maps of all training views, for \
-                     which a policy cannot ask; leave it at 0 (never)",
-                    self.reinit_at
-                ),
-            ));
-        }
+        in_range("reinit_share", self.reinit_share, (Excluded(0.0), Included(1.0)))?;
         Ok(())
     }
 }

@@ -3,7 +3,7 @@
 use super::offspring::conserving_scale;
 use super::*;
 use crate::adc::{clone_at, split_by};
-use crate::event::{Event, Outcome};
+use crate::event::{Event, Outcome, View};
 use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
 use crate::registry::find;
@@ -139,6 +139,9 @@ fn fresh_views_are_wanted_where_victims_may_fall() {
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
     let both = diet(&scene, "importance = \"fresh\"\ncompensate_from = 500");
     assert_eq!([47, 48].map(|rows| both.wants_fresh(1000, rows, 100)), [false, true]);
+    // Where all rows are replaced nobody has to fall.
+    let replaces = diet(&scene, "importance = \"fresh\"\nreinit_at = 600");
+    assert!(!replaces.wants_fresh(600, 100, 100) && replaces.wants_fresh(700, 100, 100));
 }
 
 #[test]
@@ -411,5 +414,99 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
     ] {
         refused(set);
     }
-    assert!(refused("reinit_at = 5000").contains("5000 is not available yet"));
+}
+
+/// A view that shows surface points in a row, one unit apart from `from` on.
+fn surface(from: f32, count: u32) -> View {
+    let point =
+        |i: u32| Candidate { position: [from + i as f32, 0.0, 0.0], ..candidate(0.5, 0.01) };
+    View { points: (0..count).map(point).collect(), ..View::default() }
+}
+
+#[test]
+fn the_model_is_replaced_by_surface_points() {
+    // Budget 10, two views: ⌊8/2⌋ = 4 points of each.
+    let mut event = event(5000, 9, 10);
+    event.scene.train_views = 2;
+    event.views = vec![surface(0.0, 9), surface(100.0, 9)];
+    let policy = diet(&event.scene, "reinit_at = 5000");
+    assert_eq!(policy.needs(&event.scene).aux.unwrap().points, 4);
+    assert_eq!([policy.aux_views(5000, 9, 10), policy.aux_views(5100, 9, 10)], [u32::MAX, 0]);
+    let done = run(&event, "reinit_at = 5000");
+    assert_eq!(done.ops.counts, EditCounts { removed: 9, added: 8, updated: 0, denied: 0 });
+    assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (8, "reinit"));
+    assert!(done.ops.reset_signals && done.ops.reset_candidates);
+    // Neighbours of 0: 1, 2, 3; of 1: 1, 1, 2.
+    let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
+    let sizes = [(14.0_f32 / 3.0).sqrt(), 2.0_f32.sqrt()];
+    for (seed, size) in seeds.iter().zip(sizes) {
+        assert!((seed.scale - size).abs() < 1e-5, "{seed:?} {size}");
+    }
+    assert_eq!((seeds[1].position, seeds[1].colour), ([1.0, 0.0, 0.0], [0.5, 0.5, 1.0]));
+    assert!(seeds.iter().all(|seed| (seed.opacity - 0.1).abs() < 1e-6));
+    assert_eq!(seeds[4].position, [100.0, 0.0, 0.0]);
+    // Never more than its share of the budget, however many points there are.
+    event.views = vec![surface(0.0, 9); 3];
+    event.scene.train_views = 1;
+    assert_eq!(run(&event, "reinit_at = 5000\nreinit_share = 0.4").ops.rows_after, 4);
+    // At other steps, and without points, all is as usual.
+    assert!(run(&Event { step: 5050, ..event.clone() }, "reinit_at = 5000").ops.is_empty());
+    event.views.clear();
+    assert!(run(&event, "reinit_at = 5000").ops.is_empty());
+    assert!(diet(&event.scene, "").needs(&event.scene).aux.is_none());
+}
+
+#[test]
+fn points_that_coincide_and_points_alone_have_a_size() {
+    let mut event = event(5000, 3, 10);
+    event.scene.train_views = 1;
+    let twice = Candidate { position: [1.0, 2.0, 3.0], ..candidate(0.5, 0.01) };
+    let nowhere = Candidate { position: [f32::NAN; 3], ..twice };
+    let scales = |points: Vec<Candidate>| -> Vec<f32> {
+        let views = vec![View { points, ..View::default() }];
+        let done = run(&Event { views, ..event.clone() }, "reinit_at = 5000");
+        done.ops.seeds.iter().map(|(_, seed)| seed.scale).collect()
+    };
+    // The extent is 10.
+    assert_eq!(scales(vec![twice, twice]), [2e-3, 2e-3]);
+    assert_eq!(scales(vec![twice, nowhere]), [0.2]);
+}
+
+#[test]
+fn every_ingredient_can_be_switched_off() {
+    let mut growing = event(600, 20, 20)
+        .with(Signal::ScreenGradient, &wanting(20, &[18, 19]))
+        .with_all(Signal::MeanGradientX, 1.0)
+        .with_all(Signal::MeanGradientNorm, 1.0);
+    // Row 17 grows for its colour; the least important row is newborn.
+    let mut colour = [0.0; 20];
+    colour[17] = 1.0;
+    let mut age = [1000.0; 20];
+    age[0] = 0.0;
+    growing = growing.with(Signal::ColourGradient, &colour).with(Signal::Age, &age);
+    growing.scene.budget = 30_000;
+    let mut inserting = event(10_500, 39, 40);
+    inserting.candidates = vec![candidate(0.3, 0.02)];
+    let rho = "rho = 0.1";
+    let switches = [
+        (&growing, "mixed_gradient = false"),
+        (&growing, "shift = \"none\""),
+        (&growing, "protect = 0"),
+        (&growing, "importance = \"fresh\""),
+        (&growing, "rho = 0"),
+        (&inserting, "rho_c = 0"),
+        (&inserting, "error = \"grad\""),
+        (&inserting, "min_alpha = 0"),
+        (&inserting, "nms = false"),
+        (&inserting, "newborn_size = \"code\""),
+    ];
+    let outcome = |event: &Event, set: &str| {
+        let mut policy = diet(&event.scene, set);
+        let needs = policy.needs(&event.scene);
+        (event.run(&mut *policy).unwrap().ops, needs)
+    };
+    for (event, off) in switches {
+        let full = if off.starts_with("rho = ") { off.to_owned() } else { format!("{rho}\n{off}") };
+        assert_ne!(outcome(event, &full), outcome(event, rho), "{off}");
+    }
 }

@@ -7,6 +7,8 @@
 //! After the step parameters are brought back to where the renderer's arithmetic is safe: unit
 //! quaternions, and opacities and scales beyond which nothing visible changes.
 
+use std::ops::Range;
+
 use pulp::Simd;
 
 use super::blocks::plane;
@@ -63,9 +65,7 @@ fn rate(rates: &LearningRates, p: usize) -> f32 {
     }
 }
 
-/// One step for the sixteen rows of a block.
-///
-/// `gradient` has `trained` planes, the first of the block's; the others rest.
+/// One step for the sixteen rows of a block, and for the parameters in `planes`; the others rest.
 #[inline(always)]
 #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
 pub(super) fn step<S: Simd>(
@@ -74,7 +74,7 @@ pub(super) fn step<S: Simd>(
     moments: [&mut [f32]; 2],
     ages: &mut [u16],
     gradient: &[f32],
-    trained: usize,
+    planes: Range<usize>,
     rates: &LearningRates,
     bias: &BiasCorrection,
 ) {
@@ -87,7 +87,7 @@ pub(super) fn step<S: Simd>(
         correction[1][lane] = second;
     }
     let [m, v] = moments;
-    for p in 0..trained {
+    for p in planes {
         let rate = rate(rates, p);
         for lane in (0..WIDTH).step_by(S::F32_LANES) {
             let at = p * WIDTH + lane;
@@ -102,6 +102,12 @@ pub(super) fn step<S: Simd>(
             (V::load(s, &params[at..]) - step).store(&mut params[at..]);
         }
     }
+}
+
+/// Brings the parameters of a block back to where they are safe.
+#[inline(always)]
+pub(super) fn confine<S: Simd>(s: S, params: &mut [f32]) {
+    let c = |x: f32| V::splat(s, x);
     for lane in (0..WIDTH).step_by(S::F32_LANES) {
         let at = |p: usize| p * WIDTH + lane;
         let q = each!(i in 4 => V::load(s, &params[at(plane::QUAT + i)..]));

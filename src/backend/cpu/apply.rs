@@ -5,6 +5,7 @@ use densify_policies::rng::{PolicyRng, Purpose};
 
 use super::blocks::{Blocks, plane};
 use super::signals::Accumulators;
+use super::summed::Summed;
 use crate::gaussians::{logit, rgb_to_dc, sigmoid};
 
 /// The buffers that are re-indexed together.
@@ -13,6 +14,7 @@ pub(super) struct Model<'a> {
     pub(super) moments: [&'a mut Blocks; 2],
     pub(super) ages: &'a mut [u16],
     pub(super) signals: &'a mut Accumulators,
+    pub(super) summed: &'a mut Summed,
 }
 
 /// Executes `ops`; the order and the invariants are those of [`RowOps`].
@@ -44,6 +46,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
             for moment in &mut model.moments {
                 moment.set(row, plane::OPACITY, 0.0);
             }
+            model.summed.forget_opacity(row);
         }
     }
     if ops.reset_signals {
@@ -126,6 +129,7 @@ impl Model<'_> {
         }
         self.ages[row] = 0;
         self.signals.blocks.clear_row(row);
+        self.summed.clear_row(row);
     }
 
     fn relocate(&mut self, from: usize, to: usize) {
@@ -135,6 +139,7 @@ impl Model<'_> {
         }
         self.ages[to] = self.ages[from];
         self.signals.blocks.copy_row(from, to);
+        self.summed.copy_row(from, to);
     }
 }
 

@@ -15,6 +15,8 @@ pub(super) mod plane {
     pub(in super::super) const OPACITY: usize = 10;
     /// Coefficient k of channel c is plane SH + 3k + c.
     pub(in super::super) const SH: usize = 11;
+    /// First plane of bands 1–3.
+    pub(in super::super) const SH_REST: usize = SH + 3;
     /// Planes at degree 3.
     pub(in super::super) const MOST: usize = 59;
 }

@@ -5,11 +5,13 @@ use super::adam::BiasCorrection;
 use super::blocks::{Blocks, planes};
 use super::candidates::Candidates;
 use super::loss::LossBuffers;
+use super::observe;
 use super::project::Splat;
 use super::rasterize::TileCanvas;
 use super::rasterize_bwd::TileGradient;
 use super::signals::Accumulators;
 use super::simd::WIDTH;
+use super::summed::Summed;
 use super::tiles::{Grid, TileLists};
 use crate::backend::BackendError;
 use crate::memory::{Ledger, Section};
@@ -38,6 +40,14 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
         "optimiser ages and bias tables",
         padded * 2 + BiasCorrection::bytes(),
     );
+    if Summed::is_wanted(needs.cadence) {
+        let bytes = Summed::bytes(budget, per_row, needs.cadence);
+        ledger.add_to(Section::Gradients, "gradients summed between steps", bytes);
+    }
+    if let Some(request) = &needs.aux {
+        let bytes = observe::bytes(request, grid.width * grid.height);
+        ledger.add_to(Section::Policy, "auxiliary views", bytes);
+    }
     ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs.signals));
     ledger.add_to(
         Section::Policy,

@@ -31,7 +31,7 @@ impl CpuBackend {
 
 #[cfg(test)]
 mod tests {
-    use densify_policies::policy::{Needs, Signal, SignalSet};
+    use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
     use densify_policies::rng::{PolicyRng, Purpose};
     use glam::{DMat3, DVec3};
 
@@ -114,8 +114,16 @@ mod tests {
             sh_rest: rate,
         };
         let background = [0.2; 3];
-        let input =
-            StepInput { step, camera: &camera, target: &target, background, sh_degree: 0, rates };
+        let input = StepInput {
+            step,
+            camera: &camera,
+            target: &target,
+            background,
+            sh_degree: 0,
+            rates,
+            cadence: Cadence::default(),
+            seed: 1,
+        };
         backend.train_step(&input).unwrap();
     }
 

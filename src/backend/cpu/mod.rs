@@ -14,26 +14,29 @@ mod candidates;
 mod footprint;
 mod fresh;
 mod loss;
+mod observe;
 mod optimise;
 mod passes;
 mod project;
 mod project_bwd;
 mod rasterize;
 mod rasterize_bwd;
+mod regularise;
 mod signals;
 mod simd;
 mod stage_clock;
+mod summed;
 mod tiles;
 
 use std::sync::atomic::AtomicU32;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Candidate, Needs, Signals};
+use densify_policies::policy::{Candidate, LossTerms, Needs, NoiseTerm, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
-use super::{Backend, BackendError, Rendering, StepInput, StepOutput};
+use super::{AuxInput, AuxOutput, Backend, BackendError, Rendering, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
@@ -50,6 +53,7 @@ use rasterize_bwd::{Detail, TileGradient};
 use signals::Accumulators;
 use simd::WIDTH;
 use stage_clock::StageClock;
+use summed::Summed;
 use tiles::{Grid, TileLists};
 
 pub use optimise::ModelGradient;
@@ -119,6 +123,9 @@ pub struct CpuBackend {
     moments: [Blocks; 2],
     ages: Vec<u16>,
     bias: BiasCorrection,
+    summed: Summed,
+    terms: LossTerms,
+    noise: Option<NoiseTerm>,
     signals: Accumulators,
     candidates: Candidates,
     /// Shape: `[budget]`.
@@ -175,6 +182,9 @@ impl CpuBackend {
             moments: [Blocks::zeros(budget, per_row), Blocks::zeros(budget, per_row)],
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
+            summed: Summed::new(budget, per_row, options.needs.cadence),
+            terms: options.needs.loss_terms,
+            noise: options.needs.noise,
             signals,
             candidates: Candidates::new(options.needs.candidates),
             splats: vec![Splat::default(); budget],
@@ -331,6 +341,10 @@ impl Backend for CpuBackend {
         self.measure(camera, sh_degree)
     }
 
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        self.observe_view(input)
+    }
+
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
         let signals = self.signals.take(self.rows, needs.signals, &self.params, &self.ages);
         self.signals.forget_measured(self.rows);
@@ -350,6 +364,7 @@ impl Backend for CpuBackend {
             moments: self.moments.each_mut(),
             ages: &mut self.ages,
             signals: &mut self.signals,
+            summed: &mut self.summed,
         };
         apply::apply(&mut model, ops, &PolicyRng::new(seed, step));
         self.rows = ops.rows_after;

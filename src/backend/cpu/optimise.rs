@@ -1,5 +1,6 @@
 //! Stages 6–8 together, block by block: parameter gradients, signals, Adam. A block's gradients
-//! live in the cache only; there is no gradient buffer of the model's size.
+//! live in the cache only; there is no gradient buffer of the model's size, unless a policy wants
+//! gradients summed between optimiser steps.
 
 use pulp::{Simd, WithSimd};
 
@@ -8,8 +9,10 @@ use super::blocks::{plane, planes};
 use super::project::ViewParams;
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::{Detail, field};
+use super::regularise::{Noise, Terms};
 use super::signals::Layout;
 use super::simd::WIDTH;
+use super::summed::{Due, TaskSums};
 use crate::backend::LearningRates;
 use crate::gaussians::sh_coefficients;
 
@@ -31,6 +34,17 @@ pub(super) struct Optimise<'a> {
     pub(super) view: &'a ViewParams,
     pub(super) rates: &'a LearningRates,
     pub(super) bias: &'a BiasCorrection,
+    /// Gradients kept for a later step.
+    pub(super) summed: TaskSums<'a>,
+    /// Who steps now.
+    pub(super) due: Due,
+    /// Terms of the loss that concern every row, if there are any.
+    pub(super) terms: Option<Terms>,
+    /// Noise on the means, if there is any.
+    pub(super) noise: Option<Noise>,
+    /// Row of the first block's first lane, and number of rows from there on.
+    pub(super) first_row: usize,
+    pub(super) rows: usize,
 }
 
 impl WithSimd for Optimise<'_> {
@@ -39,7 +53,7 @@ impl WithSimd for Optimise<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params, moments: [m, v], stride, ages, signals, layout, sums, .. } = self;
-        let Self { detail, visible, view, rates, bias, .. } = self;
+        let Self { detail, visible, view, rates, bias, mut summed, due, terms, noise, .. } = self;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
@@ -56,16 +70,39 @@ impl WithSimd for Optimise<'_> {
                 let block = &mut signals[b * signal_stride..(b + 1) * signal_stride];
                 layout.accumulate(s, block, &gradient, detail, view);
             }
-            adam::step(
-                s,
-                &mut params[of.clone()],
-                [&mut m[of.clone()], &mut v[of]],
-                &mut ages[b * WIDTH..(b + 1) * WIDTH],
-                &gradient.params,
-                trained,
-                rates,
-                bias,
-            );
+            if let Some(terms) = &terms {
+                terms.add(s, &params[of.clone()], &mut gradient.params);
+                was_zero = false;
+            }
+            if due.sums_matter() {
+                was_zero &= !summed.exchange(b, &mut gradient.params, trained, due);
+            }
+            let lanes = b * WIDTH..(b + 1) * WIDTH;
+            let params = &mut params[of.clone()];
+            let (m, v) = (&mut m[of.clone()], &mut v[of]);
+            let ages = &mut ages[lanes.clone()];
+            let (main, rest) = (0..trained.min(plane::SH_REST), plane::SH_REST..trained);
+            let g = &gradient.params;
+            match summed.rest_ages(lanes) {
+                // Bands 1–3 step with the others.
+                None if due.main => adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias),
+                None => {}
+                Some(rest_ages) => {
+                    if due.main {
+                        adam::step(s, params, [&mut *m, &mut *v], ages, g, main, rates, bias);
+                    }
+                    if due.rest {
+                        adam::step(s, params, [m, v], rest_ages, g, rest, rates, bias);
+                    }
+                }
+            }
+            if due.main {
+                adam::confine(s, params);
+                if let Some(noise) = &noise {
+                    let first = self.first_row + b * WIDTH;
+                    noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
+                }
+            }
         }
     }
 }

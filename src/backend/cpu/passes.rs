@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
+use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
 use rayon::prelude::*;
 
 use super::candidates;
@@ -14,6 +14,7 @@ use super::rasterize::{
     CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
 use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
+use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
 use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
@@ -180,9 +181,8 @@ impl CpuBackend {
         request: &CandidateRequest,
         count: usize,
     ) {
-        let Frame { grid, bands, background, view, .. } = frame;
-        let Self { lists, splats, params, canvas, gradient, loss, candidates, visible, .. } = self;
-        let visible = Visible { splats: &splats[..self.rows], seen: visible };
+        let Frame { grid, .. } = frame;
+        let Self { canvas, gradient, loss, candidates, .. } = self;
         let place =
             |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, in_plane(x % TILE, y % TILE));
         let error = |x: usize, y: usize| {
@@ -197,27 +197,46 @@ impl CpuBackend {
             })
         };
         let worst = candidates.worst(grid.width, grid.height, count, request.spaced, error);
+        for candidate in self.surface_points(frame, target, &worst, request.depth) {
+            self.candidates.push(candidate);
+        }
+    }
+
+    /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel
+    /// that shows no surface.
+    pub(super) fn surface_points(
+        &mut self,
+        frame: &Frame,
+        target: &Image8,
+        pixels: &[(usize, usize, f32)],
+        mode: DepthMode,
+    ) -> Vec<Candidate> {
+        let Frame { grid, bands, background, view, .. } = frame;
+        let Self { lists, splats, params, visible, .. } = self;
+        let visible = Visible { splats: &splats[..self.rows], seen: visible };
+        let tile = |x: usize, y: usize| y / TILE * grid.columns + x / TILE;
         let focal = 0.5 * (view.focal[0] + view.focal[1]);
+        let mut found: Vec<Option<Candidate>> = vec![None; pixels.len()];
         for band in bands {
-            let here = |&&(x, y, _): &&(usize, usize, f32)| band.contains(&place(x, y).0);
-            if worst.iter().find(here).is_some() && bands.len() > 1 {
+            let here = |x: usize, y: usize| band.contains(&tile(x, y));
+            if bands.len() > 1 && pixels.iter().any(|&(x, y, _)| here(x, y)) {
                 lists.refill(visible, grid, band);
             }
-            for &(x, y, error) in worst.iter().filter(here) {
+            let of_band = found.iter_mut().zip(pixels).filter(|(_, (x, y, _))| here(*x, *y));
+            for (slot, &(x, y, error)) in of_band {
                 let at = [x as f32 + 0.5, y as f32 + 0.5];
-                let list = lists.of_tile(place(x, y).0 - band.start);
-                let surface = candidates::surface_row(splats, list, at, request.depth)
+                let list = lists.of_tile(tile(x, y) - band.start);
+                let surface = candidates::surface_row(splats, list, at, mode)
                     .and_then(|row| candidates::closest_approach(params, row, view, at));
-                if let Some((position, depth)) = surface {
-                    candidates.push(Candidate {
-                        position: position.to_array(),
-                        colour: target.composited(x, y, *background),
-                        pixel_size: depth / focal,
-                        error,
-                    });
-                }
+                *slot = surface.map(|(position, depth)| Candidate {
+                    position: position.to_array(),
+                    colour: target.composited(x, y, *background),
+                    pixel_size: depth / focal,
+                    error,
+                });
             }
         }
+        found.into_iter().flatten().collect()
     }
 
     pub(super) fn rendering(&self, frame: &Frame) -> Rendering {
@@ -247,16 +266,17 @@ impl CpuBackend {
         let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
             self;
         let (rows, arch) = (*rows, *arch);
+        let terms = Terms::new(self.terms, rows);
+        let noise = self.noise.map(|term| Noise::new(term, input));
+        let due = self.summed.advance(input);
         let [m, v] = moments;
         let layout = signals.layout();
         let (stride, signal_stride) = (params.stride(), signals.blocks.stride());
         let blocks = rows.div_ceil(WIDTH);
-        let mut signal_blocks: Vec<&mut [f32]> = if signal_stride == 0 {
-            (0..blocks.div_ceil(BLOCKS_PER_TASK)).map(|_| Default::default()).collect()
-        } else {
-            let per_task = signal_stride * BLOCKS_PER_TASK;
-            signals.blocks.of_rows_mut(rows).chunks_mut(per_task).collect()
-        };
+        let tasks = blocks.div_ceil(BLOCKS_PER_TASK);
+        let per_task = signal_stride * BLOCKS_PER_TASK;
+        let mut signal_blocks = parts(signals.blocks.of_rows_mut(rows), per_task, tasks);
+        let mut summed = self.summed.tasks(rows, tasks);
         pool.install(|| {
             (
                 params.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
@@ -267,26 +287,43 @@ impl CpuBackend {
                 sums[..blocks * WIDTH * detail.stride()]
                     .par_chunks(ROWS_PER_TASK * detail.stride()),
                 visible[..blocks].par_chunks(BLOCKS_PER_TASK),
+                summed.par_iter_mut().enumerate(),
             )
                 .into_par_iter()
-                .for_each(|(params, m, v, ages, signals, sums, visible)| {
-                    arch.dispatch(Optimise {
-                        params,
-                        moments: [m, v],
-                        stride,
-                        ages,
-                        signals,
-                        layout,
-                        sums,
-                        detail,
-                        visible,
-                        view: &frame.view,
-                        rates: &input.rates,
-                        bias,
-                    });
-                });
+                .for_each(
+                    |(params, m, v, ages, signals, sums, visible, (task, summed))| {
+                        arch.dispatch(Optimise {
+                            params,
+                            moments: [m, v],
+                            stride,
+                            ages,
+                            signals,
+                            layout,
+                            sums,
+                            detail,
+                            visible,
+                            view: &frame.view,
+                            rates: &input.rates,
+                            bias,
+                            summed: summed.reborrow(),
+                            due,
+                            terms,
+                            noise,
+                            first_row: task * ROWS_PER_TASK,
+                            rows: rows - task * ROWS_PER_TASK,
+                        });
+                    },
+                );
         });
     }
+}
+
+/// Cuts a buffer for so many tasks; a buffer of nothing has nothing for each.
+pub(super) fn parts<T>(buffer: &mut [T], per_task: usize, tasks: usize) -> Vec<&mut [T]> {
+    if buffer.is_empty() {
+        return (0..tasks).map(|_| Default::default()).collect();
+    }
+    buffer.chunks_mut(per_task).collect()
 }
 
 /// Calls `f(patch, lane, pixel of the image)` for every pixel of a tile inside the image.

@@ -19,7 +19,7 @@ use super::tiles::{Entry, Grid, TILE};
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
 pub(super) const ALPHA_MAX: f32 = 0.99;
 /// A pixel stops before its transmittance reaches this.
-const TRANSMITTANCE_MIN: f32 = 1e-4;
+pub(super) const TRANSMITTANCE_MIN: f32 = 1e-4;
 /// Splats copied side by side before use, so that their cache misses overlap.
 pub(super) const BATCH: usize = 32;
 
@@ -33,7 +33,7 @@ const PATCH: usize = 4;
 /// Patches along a tile's side, and, as it happens, in a vector: a tile has as many patches as a
 /// patch has pixels.
 const ACROSS: usize = TILE / PATCH;
-const PATCHES: usize = ACROSS * ACROSS;
+pub(super) const PATCHES: usize = ACROSS * ACROSS;
 const _: () = assert!(PATCH * PATCH == WIDTH && PATCHES == WIDTH);
 
 /// The pixels of one tile, patch by patch, both row by row; see [`in_plane`].
@@ -105,6 +105,22 @@ impl TilePlace {
             height: TILE.min(grid.height - y),
         }
     }
+
+    /// 1 for the pixels inside the image, 0 for others, and a bit for each patch that has any.
+    pub(super) fn inside(&self) -> (Plane, u32) {
+        if self.width == TILE && self.height == TILE {
+            return ([[1.0; WIDTH]; PATCHES], (1 << PATCHES) - 1);
+        }
+        let (mut plane, mut patches) = (DARK, 0);
+        for y in 0..self.height {
+            for x in 0..self.width {
+                let (patch, lane) = in_plane(x, y);
+                plane[patch][lane] = 1.0;
+                patches |= 1 << patch;
+            }
+        }
+        (plane, patches)
+    }
 }
 
 /// A splat in one tile: everything that is constant over a patch.
@@ -174,10 +190,10 @@ impl Patches {
 }
 
 /// Pixel centres within a patch, and corners of a tile's patches.
-const LANE_X: [f32; WIDTH] = grid(true, 1.0, 0.5);
-const LANE_Y: [f32; WIDTH] = grid(false, 1.0, 0.5);
-const CORNER_X: [f32; PATCHES] = grid(true, PATCH as f32, 0.0);
-const CORNER_Y: [f32; PATCHES] = grid(false, PATCH as f32, 0.0);
+pub(super) const LANE_X: [f32; WIDTH] = grid(true, 1.0, 0.5);
+pub(super) const LANE_Y: [f32; WIDTH] = grid(false, 1.0, 0.5);
+pub(super) const CORNER_X: [f32; PATCHES] = grid(true, PATCH as f32, 0.0);
+pub(super) const CORNER_Y: [f32; PATCHES] = grid(false, PATCH as f32, 0.0);
 
 /// One coordinate of the points of a 4×4 grid, row by row.
 const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
@@ -221,25 +237,13 @@ impl Rasterize<'_> {
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
             *plane = DARK;
         }
-        *stop = [[u32::MAX; WIDTH]; PATCHES];
         // Transmittance while the pixel takes light; 0 once it has stopped (its last value is then
         // in `finished`) and from the start outside the image.
-        let mut light = Aligned(DARK);
+        let (inside, mut alive) = place.inside();
+        let mut light = Aligned(inside);
         let light = &mut light.0;
-        let mut alive = 0_u32;
-        if place.width == TILE && place.height == TILE {
-            *light = [[1.0; WIDTH]; PATCHES];
-            alive = (1 << PATCHES) - 1;
-        } else {
-            *stop = [[0; WIDTH]; PATCHES];
-            for y in 0..place.height {
-                for x in 0..place.width {
-                    let (patch, lane) = in_plane(x, y);
-                    light[patch][lane] = 1.0;
-                    stop[patch][lane] = u32::MAX;
-                    alive |= 1 << patch;
-                }
-            }
+        for (stop, light) in stop.as_flattened_mut().iter_mut().zip(light.as_flattened()) {
+            *stop = if *light > 0.0 { u32::MAX } else { 0 };
         }
         let mut batch = [Splat::default(); BATCH];
         let mut patches = Patches::EMPTY;

@@ -231,6 +231,10 @@ impl Accumulators {
                         let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);
                         x.max(y).max(z).exp()
                     }
+                    Signal::ScaleProduct => {
+                        let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);
+                        (x + y + z).exp()
+                    }
                     Signal::Age => f32::from(ages[row]),
                     sum => SUMS
                         .iter()

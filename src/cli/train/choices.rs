@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use densify_policies::parameters::parse_overrides;
+use densify_policies::policy::RateOverrides;
 use densify_policies::registry::{PolicyEntry, find};
 use toml::Table;
 
@@ -45,10 +46,14 @@ pub(super) fn parameters(args: &TrainArgs, entry: &PolicyEntry) -> Result<Table,
     Ok(set)
 }
 
-/// Default learning rates for so many iterations, overlaid with `NAME=RATE` settings, which are
-/// taken as given.
-pub(super) fn learning_rates(settings: &[String], iterations: u32) -> Result<RateOptions, Failure> {
-    let defaults = Table::try_from(RateOptions::for_run(iterations));
+/// Default learning rates for so many iterations, overlaid with the policy's, and these with
+/// `NAME=RATE` settings, which are taken as given.
+pub(super) fn learning_rates(
+    settings: &[String],
+    iterations: u32,
+    of_policy: &RateOverrides,
+) -> Result<RateOptions, Failure> {
+    let defaults = Table::try_from(RateOptions::for_run(iterations).with(of_policy));
     let mut table = defaults.map_err(|e| Failure::input(format!("--lr: {e}")))?;
     for setting in settings {
         let value = setting
@@ -89,12 +94,20 @@ pub(super) fn default_output(scene: &Path, policy: &str) -> PathBuf {
 mod tests {
     use super::*;
 
+    const PLAIN: RateOverrides = RateOverrides { mean_start: None, mean_end: None, sh_rest: None };
+
     #[test]
     fn learning_rates_by_name() {
         let rates =
-            learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()], 30_000).unwrap();
+            learning_rates(&["opacity=0.05".into(), "mean_end = 1e-5".into()], 30_000, &PLAIN)
+                .unwrap();
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
         assert_eq!(rates, expected);
+        let of_policy =
+            RateOverrides { mean_end: Some(3e-6), sh_rest: Some(2e-4), ..RateOverrides::default() };
+        let both = learning_rates(&["mean_end=1e-5".into()], 30_000, &of_policy).unwrap();
+        let expected = RateOptions { mean_end: 1e-5, sh_rest: 2e-4, ..RateOptions::default() };
+        assert_eq!(both, expected);
         for (bad, part) in [
             ("opacity", "NAME=RATE"),
             ("opacity=x", "NAME=RATE"),
@@ -102,7 +115,7 @@ mod tests {
             ("quat=0", "quat"),
             ("quat=inf", "quat"),
         ] {
-            let message = learning_rates(&[bad.into()], 30_000).unwrap_err().message;
+            let message = learning_rates(&[bad.into()], 30_000, &PLAIN).unwrap_err().message;
             assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
         }
     }

@@ -82,6 +82,10 @@ pub(super) struct TrainArgs {
     /// may be repeated
     #[arg(long, value_name = "NAME=RATE", help_heading = "Training")]
     lr: Vec<String>,
+    /// Iterations per optimiser step of view-dependent colour; gradients are summed in between
+    /// `[default: the policy's choice, mostly 1]`
+    #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    sh_every: Option<u32>,
     /// Everything random follows from this number; equal numbers give equal results
     #[arg(long, value_name = "N", help_heading = "Training", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     seed: u64,

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use densify_policies::policy::{DensityPolicy, SceneInfo};
+use densify_policies::policy::{Needs, RateOverrides, SceneInfo};
 use densify_policies::registry::{PolicyEntry, find};
 
 use super::choices::{check_iterations, default_output, learning_rates, parameters};
@@ -17,11 +17,11 @@ use crate::cli::run_files::use_threads;
 use crate::cli::scene;
 use crate::dataset::Dataset;
 use crate::gaussians::{Gaussians, sh_coefficients};
-use crate::init::{initialise, random_points};
+use crate::init::{initialise, random_points, restart};
 use crate::memory::{Ledger, Section, resident};
 use crate::output::{InitChoice, PolicyConfig, RunConfig, RunFolder, TrainConfig};
 use crate::schedule::Background;
-use crate::trainer::{TrainOptions, Trainer};
+use crate::trainer::{TrainOptions, Trainer, needs};
 use crate::views::{DatasetViews, ViewSource};
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
@@ -46,7 +46,8 @@ pub(super) struct Prepared {
 pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, Failure> {
     let entry = find(&args.policy)?;
     let parameters = parameters(args, entry)?;
-    let rates = learning_rates(&args.lr, args.iterations)?;
+    // Before anything is loaded, so that a slip is told at once.
+    learning_rates(&args.lr, args.iterations, &RateOverrides::default())?;
     check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
     check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
     let output = args.output.clone().unwrap_or_else(|| default_output(&args.scene, &args.policy));
@@ -62,7 +63,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     }
     console.say(scene::describe(&args.scene, &dataset));
     let budget = args.budget.unwrap_or(DEFAULT_BUDGET);
-    let (model, init, init_points) = first_model(args, &dataset, budget, console)?;
+    let (mut model, init, init_points) = first_model(args, &dataset, budget, console)?;
     let scene = SceneInfo {
         extent: dataset.extent() as f32,
         train_views: u32::try_from(dataset.train.len())
@@ -73,6 +74,9 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
         white_background: scene_config.background == Background::White,
     };
     let policy = entry.build(&parameters, &scene)?;
+    let declared = policy.needs(&scene);
+    restart(&mut model, &declared.start);
+    let rates = learning_rates(&args.lr, args.iterations, &declared.rates)?;
     let config = RunConfig {
         densify: env!("CARGO_PKG_VERSION").to_owned(),
         train: TrainConfig {
@@ -84,6 +88,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
             tile_cap: args.tile_cap,
             init,
             init_points,
+            sh_every: args.sh_every,
             learning_rates: rates,
         },
         policy: PolicyConfig {
@@ -97,17 +102,19 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, 1);
     dataset.points = crate::dataset::PointCloud::default();
-    let (backend, ledger) =
-        backend(args, &config, &dataset, policy.as_ref(), &scene, model, [&views, &test])?;
-    console.say(format_args!("memory promised\n{ledger}"));
     let options = TrainOptions {
         iterations: args.iterations,
         seed: args.seed,
         sh_degree: args.sh_degree,
         background: config.scene.background,
         rates,
+        sh_every: args.sh_every,
         prefetch: AHEAD,
     };
+    let needs = needs(policy.as_ref(), &scene, &options);
+    let (backend, ledger) =
+        backend(args, &config, &dataset, needs, &scene, model, [&views, &test])?;
+    console.say(format_args!("memory promised\n{ledger}"));
     let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
     Ok(Prepared { config, output, trainer, test, dataset, ledger })
 }
@@ -117,15 +124,18 @@ fn backend(
     args: &TrainArgs,
     config: &RunConfig,
     dataset: &Dataset,
-    policy: &dyn DensityPolicy,
+    needs: Needs,
     scene: &SceneInfo,
     model: Gaussians,
     [views, test]: [&DatasetViews; 2],
 ) -> Result<(Box<dyn Backend>, Ledger), Failure> {
     let before = resident();
-    let needs = policy.needs(scene);
     let signals = needs.signals.iter().count() as u64;
     let candidates = needs.candidates.map_or(0, |request| request.capacity);
+    // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
+    let aux = needs.aux.as_ref();
+    let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
+    let points = aux.map_or(0, |r| u64::from(r.points) * u64::from(scene.train_views));
     let mut options = CpuOptions::new(scene.budget);
     options.near = (config.train.near * f64::from(scene.extent)) as f32;
     options.tile_cap = args.tile_cap.unwrap_or(options.tile_cap);
@@ -142,8 +152,12 @@ fn backend(
     let budget = scene.budget as u64;
     let float = size_of::<f32>() as u64;
     // Signals and candidates on the host; fates, families and slots of the plan.
-    let plan = budget * (signals * float + 64)
-        + (candidates * size_of::<densify_policies::policy::Candidate>()) as u64;
+    let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
+    let seed = size_of::<densify_policies::plan::Seed>() as u64;
+    // A point is kept by the policy, becomes a seed, and is compiled.
+    let plan = budget * ((signals + columns) * float + 64)
+        + candidates as u64 * candidate
+        + points * (candidate + 3 * seed);
     ledger.add_to(Section::Passing, "a policy's event", plan);
     // The model as downloaded and as exported.
     let row = float * (11 + 3 * sh_coefficients(config.train.sh_degree) as u64);

@@ -18,7 +18,7 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::plan::{EditPlan, OpacityRule, RowOps, ScaleRule, Seed, Update};
-use densify_policies::policy::{Needs, Signal, SignalSet};
+use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
 use densify_policies::rng::PolicyRng;
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
@@ -75,6 +75,8 @@ fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
         background: [0.2; 3],
         sh_degree: 1,
         rates: RATES,
+        cadence: Cadence::default(),
+        seed: 1,
     };
     backend.train_step(&input).expect("a small image is rendered").visible
 }

@@ -107,6 +107,26 @@ pub(crate) fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &
     image
 }
 
+/// Calls `f(pixel, row, weight, distance of the pixel's centre to the projected mean [px])` for every
+/// row blended into a pixel.
+pub(crate) fn each_blended(
+    splats: &[Splat],
+    order: &[usize],
+    view: View<'_>,
+    rules: &Rules,
+    mut f: impl FnMut(usize, usize, f64, f64),
+) {
+    for y in 0..view.camera.height {
+        for x in 0..view.camera.width {
+            let p = (y * view.camera.width + x) as usize;
+            for hit in trace(splats, order, x, y, rules).contributions {
+                let [dx, dy] = hit.offset;
+                f(p, hit.row, hit.alpha * hit.transmittance, dx.hypot(dy));
+            }
+        }
+    }
+}
+
 /// Gradients of Σ image · upstream with respect to the splats. Shape: [rows].
 pub(crate) fn backward(
     splats: &[Splat],

@@ -1,0 +1,98 @@
+//! The parameters of `igs`. Its manual page says what they mean.
+
+use std::ops::Bound::{Excluded, Included, Unbounded};
+
+use serde::{Deserialize, Serialize};
+
+use crate::parameters::in_range;
+use crate::policy::PolicyError;
+
+/// Parameters of [`Igs`](super::Igs); its manual page says what they mean.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+#[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
+pub struct IgsParams {
+    pub grow_from: u32,
+    pub grow_until: u32,
+    pub grow_every: u32,
+    pub curve_until: u32,
+    pub tau: f64,
+    pub views: u32,
+    pub split_share: f64,
+    pub child_opacity: f64,
+    pub final_from: u32,
+    pub final_divisor: f64,
+    pub min_opacity: f64,
+    pub first_prune_at: u32,
+    pub first_prune_opacity: f64,
+    pub reset_every: u32,
+    pub resets: u32,
+    pub reset_opacity: f64,
+    pub recover: u32,
+    pub recovery_share: f64,
+    pub sum_from: u32,
+    pub sum: u32,
+    pub sum_more_from: u32,
+    pub sum_more: u32,
+    pub mean_start: f64,
+    pub mean_end: f64,
+    pub sh_rest: f64,
+}
+
+impl Default for IgsParams {
+    fn default() -> Self {
+        Self {
+            grow_from: 500,
+            grow_until: 15_000,
+            grow_every: 100,
+            curve_until: 14_500,
+            tau: 3e-4,
+            views: 10,
+            split_share: 0.45,
+            child_opacity: 0.6,
+            final_from: 14_500,
+            final_divisor: 1.5,
+            min_opacity: 0.005,
+            first_prune_at: 300,
+            first_prune_opacity: 0.02,
+            reset_every: 3000,
+            resets: 2,
+            reset_opacity: 0.05,
+            recover: 300,
+            recovery_share: 0.2,
+            sum_from: 15_000,
+            sum: 5,
+            sum_more_from: 22_500,
+            sum_more: 20,
+            mean_start: 4e-5,
+            mean_end: 2e-6,
+            sh_rest: 2.5e-4,
+        }
+    }
+}
+
+impl IgsParams {
+    /// Checks ranges.
+    pub(super) fn check(&self) -> Result<(), PolicyError> {
+        let positive = (Excluded(0.0), Unbounded);
+        let inside = (Excluded(0.0), Excluded(1.0));
+        // As the f32 that the plan will check.
+        let unit = |value: f64| f64::from(value as f32);
+        in_range("tau", self.tau, 0.0..)?;
+        in_range("views", self.views.into(), 1.0..)?;
+        in_range("split_share", unit(self.split_share), inside)?;
+        in_range("child_opacity", unit(self.child_opacity), (Excluded(0.0), Included(1.0)))?;
+        in_range("final_divisor", self.final_divisor, 1.0..)?;
+        in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
+        in_range("first_prune_opacity", self.first_prune_opacity, 0.0..=1.0)?;
+        in_range("reset_opacity", unit(self.reset_opacity), inside)?;
+        in_range("recover", self.recover.into(), 1.0..)?;
+        in_range("recovery_share", self.recovery_share, 0.0..=1.0)?;
+        in_range("sum", self.sum.into(), 1.0..=1000.0)?;
+        in_range("sum_more", self.sum_more.into(), 1.0..=1000.0)?;
+        in_range("mean_start", self.mean_start, positive)?;
+        in_range("mean_end", self.mean_end, positive)?;
+        in_range("sh_rest", self.sh_rest, positive)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,181 @@
+//! The rules of `mcmc`, each worked out by hand.
+
+use super::*;
+use crate::event::{Event, Outcome};
+use crate::plan::EditCounts;
+use crate::registry::find;
+
+fn mcmc(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
+    find("mcmc").unwrap().build(&set.parse().unwrap(), scene).unwrap()
+}
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run(&mut *mcmc(&event.scene, set)).unwrap()
+}
+
+fn event(opacity: &[f32], budget: usize) -> Event {
+    Event::new(600, opacity.len(), budget).with(Signal::Opacity, opacity)
+}
+
+/// The double sum of the paper as printed.
+fn denominator(share: f64, members: u32) -> f64 {
+    let binomial =
+        |n: u32, k: u32| (0..k).fold(1.0, |c, i| c * f64::from(n - i) / f64::from(i + 1));
+    (1..=members)
+        .flat_map(|i| (0..i).map(move |k| (i, k)))
+        .map(|(i, k)| {
+            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+            binomial(i - 1, k) * sign * share.powi(k as i32 + 1) / f64::from(k + 1).sqrt()
+        })
+        .sum()
+}
+
+#[test]
+fn shares_conserve_opacity() {
+    for opacity in [0.01, 0.3, 0.75, 0.99] {
+        for members in [2, 3, 7, 51] {
+            let (share, scale) = share(opacity, members, 1e-9);
+            let together = 1.0 - (1.0 - share).powi(members as i32);
+            assert!((together / opacity - 1.0).abs() < 1e-12, "{opacity} {members}: {together}");
+            let expected = opacity / denominator(share, members);
+            assert!((scale / expected - 1.0).abs() < 1e-9, "{opacity} {members}: {scale}");
+        }
+    }
+}
+
+#[test]
+fn two_shares_by_hand() {
+    // o = 0.75: o′ = 0.5, 0.75/(1 − 0.25/√2) = 0.911053.
+    let (half, scale) = share(0.75, 2, 0.005);
+    assert!((half - 0.5).abs() < 1e-12 && (scale - 0.911_053).abs() < 1e-6, "{half} {scale}");
+    // The limits given with the formula: 0.996 at 0.05, 0.81 at 0.99.
+    assert!((share(0.05, 2, 0.005).1 - 0.996).abs() < 1e-3);
+    assert!((share(0.99, 2, 0.005).1 - 0.81).abs() < 5e-3);
+    // Clamped from below: 1 − 0.994^½ = 0.003 becomes 0.005.
+    let (least, scale) = share(0.006, 2, 0.005);
+    let by_hand = 0.006 / (0.01 - 0.005 * 0.005 / 2.0_f64.sqrt());
+    assert!((least - 0.005).abs() < 1e-12 && (scale - by_hand).abs() < 1e-9);
+    let (most, scale) = share(1.0, 2, 0.005);
+    assert!(most < 1.0 && scale.is_finite());
+}
+
+#[test]
+fn the_dead_are_relocated_to_the_only_living() {
+    let done = run(&event(&[0.005, 0.5, f32::NAN, 0.001], 4), "");
+    // Three copies of row 1, in the slots of the dead.
+    assert_eq!((done.pruned, done.split), (vec![0, 2, 3], vec![1]));
+    let family = done.ops.families[0].offspring;
+    assert_eq!((family.children, family.siblings()), (3, 4));
+    assert_eq!(
+        (family.placement, family.opacity),
+        (Placement::Offset([0.0; 3]), OpacityRule::Conserved)
+    );
+    let ScaleRule::Uniform(scale) = family.scale else { panic!("{family:?}") };
+    assert!((f64::from(scale) - share(0.5, 4, 0.005).1).abs() < 1e-6);
+    assert_eq!(done.ops.counts, EditCounts { removed: 3, added: 3, updated: 1, denied: 0 });
+    assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (4, "relocate"));
+    // Opacity 0.0051 is alive.
+    assert_eq!(run(&event(&[0.0051, 0.5], 2), "").pruned, [0_u32; 0]);
+}
+
+#[test]
+fn growth_is_five_percent_up_to_the_budget() {
+    let opacity = [0.5; 100];
+    let after =
+        |rows: usize, budget: usize| run(&event(&opacity[..rows], budget), "").ops.rows_after;
+    assert_eq!([after(100, 1000), after(100, 103), after(100, 100)], [105, 103, 100]);
+    // ⌊1.05 · 39⌋ = 40, ⌊1.05 · 19⌋ = 19.
+    assert_eq!([after(39, 1000), after(20, 1000), after(19, 1000)], [40, 21, 19]);
+    let both = run(&event(&[0.001, 0.5], 9), "growth = 0.5");
+    assert_eq!(both.ops.cause, "relocate+grow");
+    assert_eq!((both.ops.rows_after, both.ops.families[0].offspring.children), (3, 2));
+    assert!(!run(&event(&opacity, 200), "growth = 0.0").ops.edits_rows());
+    // A model that is too large loses its dead, and gets nothing for them.
+    let over = run(&event(&[0.001, 0.5, 0.5, 0.001], 2), "");
+    assert_eq!((over.pruned, over.ops.rows_after), (vec![0, 3], 2));
+    // Nobody is drawn in vain.
+    assert_eq!(over.ops.counts.denied, 0);
+}
+
+#[test]
+fn the_opaque_are_drawn_more_often() {
+    let opacity: Vec<f32> = (0..2000).map(|row| if row % 2 == 0 { 0.1 } else { 0.4 }).collect();
+    let done = run(&event(&opacity, 4000), "growth = 1.0");
+    let (mut faint, mut strong) = (0, 0);
+    for family in &done.ops.families {
+        let of = if family.parent % 2 == 0 { &mut faint } else { &mut strong };
+        *of += family.offspring.children;
+    }
+    assert_eq!(faint + strong, 2000);
+    // 400 of 2000, within five standard deviations (18 each).
+    assert!((310..490).contains(&faint), "{faint}");
+}
+
+#[test]
+fn many_copies_count_as_most_shares() {
+    let mut opacity = [0.001; 80];
+    opacity[7] = 0.5;
+    let family = run(&event(&opacity, 80), "").ops.families[0].offspring;
+    assert_eq!(family.children, 79);
+    let (share, scale) = share(0.5, 51, 0.005);
+    assert_eq!(family.opacity, OpacityRule::Set(share as f32));
+    assert_eq!(family.scale, ScaleRule::Uniform(scale as f32));
+}
+
+#[test]
+fn without_the_living_nothing_is_done() {
+    for opacity in [&[0.001, 0.002][..], &[f32::NAN], &[]] {
+        assert!(run(&event(opacity, 9), "").ops.is_empty());
+    }
+}
+
+#[test]
+fn the_window_is_that_of_the_paper() {
+    let scene = Event::new(1, 1, 1).scene;
+    let policy = mcmc(&scene, "");
+    let due: Vec<u32> = (0..=30_000).filter(|&step| policy.is_due(step)).collect();
+    assert_eq!((due.len(), due[0], due.last()), (244, 600, Some(&24_900)));
+}
+
+#[test]
+fn terms_and_noise_are_declared_in_the_unit_of_the_cameras() {
+    let scene = Event::new(1, 1, 1).scene;
+    let close = |a: f32, b: f32| (a / b - 1.0).abs() < 1e-5;
+    for extent in [1.1, 11.0] {
+        let scene = SceneInfo { extent, ..scene.clone() };
+        let needs = mcmc(&scene, "").needs(&scene);
+        let radius = extent / 1.1;
+        assert_eq!(needs.check(), Ok(()));
+        assert!(close(needs.loss_terms.opacity, 0.01));
+        assert!(close(needs.loss_terms.scale * radius, 0.01));
+        let noise = needs.noise.unwrap();
+        assert!(close(noise.strength * radius * radius, 5e5));
+        assert!(close(noise.sharpness, 100.0) && close(noise.opacity, 0.005));
+        assert_eq!(needs.start, StartRule { opacity: Some(0.5), scale: 0.1 });
+        assert_eq!(needs.signals, SignalSet::of(&[Signal::Opacity]));
+    }
+    let off = mcmc(&scene, "noise = 0\nopacity_term = 0\nscale_term = 0").needs(&scene);
+    assert!(off.noise.is_none() && off.loss_terms.is_none());
+}
+
+#[test]
+fn ranges_are_checked() {
+    let scene = Event::new(1, 1, 1).scene;
+    for set in [
+        "min_opacity = 0",
+        "growth = -0.1",
+        "most_shares = 1",
+        "most_shares = 52",
+        "noise = -1",
+        "start_opacity = 1",
+        "start_scale = 0",
+        "opacity_term = inf",
+    ] {
+        match find("mcmc").unwrap().build(&set.parse().unwrap(), &scene) {
+            Err(PolicyError::BadParameter { parameter, .. }) => {
+                assert_eq!(parameter, set.split(' ').next().unwrap());
+            }
+            other => panic!("{set}: {:?}", other.err()),
+        }
+    }
+}

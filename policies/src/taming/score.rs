@@ -1,0 +1,120 @@
+//! The score of `taming`: how much a row matters where the views are badly explained.
+//!
+//! Terms of the row itself (gradient, opacity, size) are the same in all views, so that of each view
+//! only Σ 50·L over those that show the row is kept for them.
+
+use super::TamingParams;
+use crate::policy::{AuxColumn, AuxView, PolicyError, Signal, Snapshot};
+
+/// What is measured in each view.
+pub(super) const COLUMNS: [AuxColumn; 6] = [
+    AuxColumn::MapSum,
+    AuxColumn::PixelCount,
+    AuxColumn::WeightSum,
+    AuxColumn::DistanceSum,
+    AuxColumn::Depth,
+    AuxColumn::Radius,
+];
+/// Factor of a view's loss in the published code. Only the 10⁻⁶ of pruning knows of it.
+const VIEW_WEIGHT: f32 = 50.0;
+
+/// Sums over the views of the event at hand. Shape: `[rows]` each.
+#[derive(Debug, Default)]
+pub(super) struct Score {
+    step: u32,
+    /// Σ 50·L·(terms of the view).
+    of_views: Vec<f32>,
+    /// Σ 50·L.
+    losses: Vec<f32>,
+}
+
+impl Score {
+    /// Adds one view.
+    pub(super) fn add(
+        &mut self,
+        view: &AuxView<'_>,
+        params: &TamingParams,
+    ) -> Result<(), PolicyError> {
+        if self.step != view.step || self.losses.len() != view.rows {
+            let zeros = vec![0.0; view.rows];
+            *self = Self { step: view.step, of_views: zeros.clone(), losses: zeros };
+        }
+        let terms = [
+            (params.depth_weight, AuxColumn::Depth),
+            (params.radius_weight, AuxColumn::Radius),
+            (params.distance_weight, AuxColumn::DistanceSum),
+            (params.map_weight, AuxColumn::MapSum),
+            (params.count_weight, AuxColumn::PixelCount),
+            (params.blend_weight, AuxColumn::WeightSum),
+        ];
+        let mut sum = vec![0.0; view.rows];
+        for (weight, column) in terms {
+            add_term(&mut sum, weight as f32, view.column(column)?);
+        }
+        let weight = VIEW_WEIGHT * view.loss;
+        let shown = view.column(AuxColumn::Radius)?.iter().map(|radius| *radius > 0.0);
+        let scores = self.of_views.iter_mut().zip(&mut self.losses);
+        for ((is_shown, sum), (of_views, losses)) in shown.zip(sum).zip(scores) {
+            if is_shown {
+                *of_views += weight * sum;
+                *losses += weight;
+            }
+        }
+        Ok(())
+    }
+
+    /// The score of every row; 0 where no view was added at this step.
+    pub(super) fn total(
+        self,
+        now: &Snapshot<'_>,
+        gradient: &[f32],
+        params: &TamingParams,
+    ) -> Result<Vec<f32>, PolicyError> {
+        if self.step != now.step || self.losses.len() != now.rows() {
+            return Ok(vec![0.0; now.rows()]);
+        }
+        let mut own = vec![0.0; now.rows()];
+        add_term(&mut own, params.gradient_weight as f32, gradient);
+        add_term(&mut own, params.opacity_weight as f32, now.signal(Signal::Opacity)?);
+        add_term(&mut own, params.scale_weight as f32, now.signal(Signal::ScaleProduct)?);
+        let parts = self.of_views.iter().zip(&self.losses).zip(own);
+        Ok(parts.map(|((of_views, losses), own)| of_views + losses * own).collect())
+    }
+}
+
+/// Adds `weight` · x / median of the positive x; nothing where x is not positive.
+fn add_term(sums: &mut [f32], weight: f32, values: &[f32]) {
+    let Some(median) = median_of_positive(values) else { return };
+    for (sum, &x) in sums.iter_mut().zip(values) {
+        let term = weight * (x / median);
+        if x > 0.0 && term.is_finite() {
+            *sum += term;
+        }
+    }
+}
+
+/// The lower median of the positive values.
+fn median_of_positive(values: &[f32]) -> Option<f32> {
+    let mut positive: Vec<f32> = values.iter().copied().filter(|x| *x > 0.0).collect();
+    let middle = positive.len().checked_sub(1)? / 2;
+    Some(*positive.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn terms_are_relative_to_the_median_of_the_positive() {
+        // Positive: 1, 2, 4, 8; the lower median is 2.
+        let mut sums = vec![1.0; 7];
+        add_term(&mut sums, 10.0, &[8.0, -1.0, 1.0, 0.0, 4.0, f32::NAN, 2.0]);
+        assert_eq!(sums, [41.0, 1.0, 6.0, 1.0, 21.0, 1.0, 11.0]);
+        let before = sums.clone();
+        add_term(&mut sums, 10.0, &[0.0; 7]);
+        add_term(&mut sums, 10.0, &[f32::INFINITY; 7]);
+        assert_eq!(sums, before);
+        assert_eq!(median_of_positive(&[]), None);
+        assert_eq!(median_of_positive(&[5.0, 3.0, 9.0]), Some(5.0));
+    }
+}

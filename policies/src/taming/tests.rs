@@ -1,0 +1,286 @@
+//! The rules of `taming`, each worked out by hand.
+
+use super::*;
+use crate::event::{Event, Outcome, View};
+use crate::plan::EditCounts;
+use crate::policy::AuxColumn;
+use crate::registry::find;
+
+fn taming(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
+    find("taming").unwrap().build(&set.parse().unwrap(), scene).unwrap()
+}
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run(&mut *taming(&event.scene, set)).unwrap()
+}
+
+/// Small rows of opacity 0.5 with a screen gradient of 1 in four views, all alike in the one
+/// auxiliary view, of loss 0.02.
+fn event(step: u32, rows: usize, budget: usize) -> Event {
+    let mut event = Event::new(step, rows, budget)
+        .with_all(Signal::VisibleCount, 4.0)
+        .with_all(Signal::ScreenGradient, 4.0)
+        .with_all(Signal::Opacity, 0.5)
+        .with_all(Signal::ScaleMax, 0.05)
+        .with_all(Signal::ScaleProduct, 1e-4);
+    event.views = vec![View { loss: 0.02, columns: alike(rows), points: Vec::new() }];
+    event
+}
+
+fn alike(rows: usize) -> Vec<(AuxColumn, Vec<f32>)> {
+    AuxColumn::ALL.map(|column| (column, vec![2.0; rows])).to_vec()
+}
+
+fn set(view: &mut View, column: AuxColumn, values: &[f32]) {
+    for (name, old) in &mut view.columns {
+        if *name == column {
+            *old = values.to_vec();
+        }
+    }
+}
+
+/// The score of every row of an event.
+fn score(event: &Event, set: &str) -> Vec<f32> {
+    let params: TamingParams = toml::from_str(set).unwrap();
+    let mut score = Score::default();
+    for view in &event.views {
+        let columns = &view.columns;
+        let (step, rows, loss) = (event.step, event.rows, view.loss);
+        score.add(&AuxView { step, rows, loss, columns, points: &[] }, &params).unwrap();
+    }
+    let mut signals = crate::policy::Signals::zeros(event.rows, SignalSet::of(&Signal::ALL));
+    for (signal, values) in &event.columns {
+        signals.get_mut(*signal).unwrap().copy_from_slice(values);
+    }
+    let now =
+        Snapshot { step: event.step, scene: &event.scene, signals: &signals, candidates: &[] };
+    let gradient: Vec<f32> =
+        signals.get(Signal::ScreenGradient).unwrap().iter().map(|g| g / 4.0).collect();
+    score.total(&now, &gradient, &params).unwrap()
+}
+
+#[test]
+fn the_score_by_hand() {
+    // All terms at their medians: 50·0.02·(25 + 100 + 5 + 10 + 25 + 50 + 10 + 0.1 + 50) = 275.1.
+    let mut event = event(1000, 3, 9);
+    for found in score(&event, "") {
+        assert!((found - 275.1).abs() < 1e-3, "{found}");
+    }
+    // One column at a time is doubled in row 1, which adds its coefficient.
+    let coefficients = [
+        (AuxColumn::MapSum, 10.0),
+        (AuxColumn::PixelCount, 0.1),
+        (AuxColumn::WeightSum, 50.0),
+        (AuxColumn::DistanceSum, 50.0),
+        (AuxColumn::Depth, 5.0),
+        (AuxColumn::Radius, 10.0),
+    ];
+    for (column, coefficient) in coefficients {
+        let mut doubled = event.clone();
+        set(&mut doubled.views[0], column, &[2.0, 4.0, 2.0]);
+        let found = score(&doubled, "");
+        assert!((found[1] - 275.1 - coefficient).abs() < 1e-3, "{column:?}: {}", found[1]);
+    }
+    let of_rows =
+        [(Signal::ScreenGradient, 25.0), (Signal::Opacity, 100.0), (Signal::ScaleProduct, 25.0)];
+    for (signal, coefficient) in of_rows {
+        let doubled = event.clone().with(signal, &[0.25, 0.5, 0.25]);
+        let found = score(&doubled, "");
+        assert!((found[1] - 275.1 - coefficient).abs() < 1e-3, "{signal:?}: {}", found[1]);
+    }
+    // A second view of half the loss, which does not show row 0.
+    let mut second = event.views[0].clone();
+    second.loss = 0.01;
+    set(&mut second, AuxColumn::Radius, &[0.0, 2.0, 2.0]);
+    event.views.push(second);
+    let found = score(&event, "");
+    assert!((found[0] - 275.1).abs() < 1e-3 && (found[1] - 1.5 * 275.1).abs() < 1e-3, "{found:?}");
+}
+
+#[test]
+fn the_score_does_not_depend_on_the_unit_of_a_term() {
+    let mut event = event(1000, 4, 9).with(Signal::ScaleProduct, &[1e-4, 3e-4, 2e-5, 0.0]);
+    set(&mut event.views[0], AuxColumn::Depth, &[1.0, 2.0, 3.0, 0.5]);
+    let expected = score(&event, "");
+    let mut scaled = event.clone().with(Signal::ScaleProduct, &[1e-1, 3e-1, 2e-2, 0.0]);
+    set(&mut scaled.views[0], AuxColumn::Depth, &[10.0, 20.0, 30.0, 5.0]);
+    for (found, expected) in score(&scaled, "").iter().zip(expected) {
+        assert!((found / expected - 1.0).abs() < 1e-5, "{found} {expected}");
+    }
+}
+
+#[test]
+fn scores_of_another_event_are_forgotten() {
+    let late = Event { views: Vec::new(), ..event(1500, 3, 9) };
+    let mut policy = taming(&late.scene, "");
+    let observed = &event(1000, 3, 9).views[0];
+    let (columns, points) = (&observed.columns, &[][..]);
+    policy.observe(&AuxView { step: 1000, rows: 3, loss: 1.0, columns, points }).unwrap();
+    // Without a score nobody is drawn.
+    assert!(late.run(&mut *policy).unwrap().cloned.is_empty());
+}
+
+#[test]
+fn the_curve_and_the_qualified_bound_growth() {
+    // S = 100, B = 942: at the first event ⌊842·57/841⌋ = 57 more.
+    let event = event(1000, 100, 942);
+    let done = run(&event, "");
+    assert_eq!((done.ops.rows_after, done.cloned.len()), (157, 57));
+    assert!(done.ops.reset_signals);
+    assert_eq!(done.ops.cause, "densify");
+    // 30 qualify.
+    let gradient: Vec<f32> = (0..100).map(|row| if row < 30 { 8.01e-4 } else { 7.9e-4 }).collect();
+    let few = event.clone().with(Signal::ScreenGradient, &gradient);
+    assert_eq!(run(&few, "").ops.rows_after, 130);
+    // The budget is the plan's, whatever the curve says; the multiplier is below it.
+    assert_eq!(run(&event, "multiplier = 3.0").ops.rows_after, 113);
+    assert_eq!(run(&Event { budget: 120, ..event.clone() }, "multiplier = 9").ops.rows_after, 101);
+    assert!(!run(&event, "multiplier = 0.5").ops.edits_rows());
+}
+
+#[test]
+fn small_and_large_have_their_shares() {
+    // 57 births for 30 small and 70 large: ⌊57·0.3⌋ = 17 clones, ⌊57·0.7⌋ = 39 splits.
+    let scale: Vec<f32> = (0..100).map(|row| if row < 30 { 0.1 } else { 0.101 }).collect();
+    let done = run(&event(1000, 100, 942).with(Signal::ScaleMax, &scale), "");
+    assert_eq!((done.cloned.len(), done.split.len()), (17, 39));
+    assert!(done.cloned.iter().all(|row| *row < 30) && done.split.iter().all(|row| *row >= 30));
+    let of = |row: u32| done.ops.families.iter().find(|f| f.parent == row).unwrap().offspring;
+    assert_eq!((of(done.cloned[0]), of(done.split[0])), (clone_at([0.0; 3]), split_by(1.6)));
+}
+
+#[test]
+fn draws_follow_the_score() {
+    // Blend weights 2 and 202: scores 275.1 − … ; the rows with none of the terms are never drawn.
+    let mut event = event(1000, 100, 942);
+    let shown: Vec<f32> = (0..100).map(|row| if row % 2 == 0 { 2.0 } else { 0.0 }).collect();
+    set(&mut event.views[0], AuxColumn::Radius, &shown);
+    let done = run(&event, "");
+    // 50 rows have a score, and all of them grow, though 57 might.
+    assert_eq!(done.cloned.len(), 50);
+    assert!(done.cloned.iter().all(|row| row % 2 == 0));
+}
+
+#[test]
+fn half_of_the_dead_are_pruned() {
+    let mut opacity = [0.5; 20];
+    opacity[..5].fill(0.004);
+    let event = event(1000, 20, 20).with(Signal::Opacity, &opacity);
+    let done = run(&event, "");
+    // ⌊5/2⌋ = 2 of the five.
+    assert_eq!(done.ops.counts, EditCounts { removed: 2, added: 0, updated: 0, denied: 0 });
+    assert!(done.pruned.iter().all(|row| *row < 5));
+    assert_eq!(run(&event, "prune_share = 1").pruned, [0, 1, 2, 3, 4]);
+    // Not at the last event.
+    assert!(run(&Event { step: 14_500, ..event.clone() }, "").pruned.is_empty());
+    assert_eq!(run(&Event { step: 14_000, ..event.clone() }, "").pruned.len(), 2);
+    // Those of high score are spared: row 0 has nearly none, so that it is drawn.
+    let mut scored = event.clone();
+    let mut shown = vec![2.0; 20];
+    shown[0] = 0.0;
+    set(&mut scored.views[0], AuxColumn::Radius, &shown);
+    assert!(run(&scored, "").pruned.contains(&0));
+    // Death by size after step 3000.
+    let mut scale = [0.05; 20];
+    scale[5..9].fill(1.01);
+    let huge = event.with(Signal::ScaleMax, &scale);
+    assert_eq!(run(&Event { step: 3000, ..huge.clone() }, "").ops.counts.removed, 2);
+    assert_eq!(run(&Event { step: 3500, ..huge }, "").ops.counts.removed, 4);
+}
+
+#[test]
+fn the_dead_do_not_grow() {
+    let event = event(14_500, 4, 1000).with(Signal::Opacity, &[0.5, 0.004, 0.5, f32::NAN]);
+    let mut cloned = run(&event, "").cloned;
+    cloned.sort_unstable();
+    assert_eq!(cloned, [0, 2]);
+}
+
+#[test]
+fn the_published_draw_hits_few_and_others() {
+    // 4 dead of 400: of ⌊4/2⌋ = 2 rows drawn among all, hardly one is dead.
+    let mut opacity = [0.5; 400];
+    opacity[..4].fill(0.004);
+    let mut event = event(1000, 400, 400).with(Signal::Opacity, &opacity);
+    assert_eq!(run(&event, "").pruned.len(), 2);
+    assert!(run(&event, "prune = \"published\"").pruned.is_empty());
+    // Rows 0 and 1 are split; only place 2 has nearly no score, so that it is drawn for sure. Of the
+    // survivors 2, 3, 4, … place 2 is row 4: it dies, though the score is that of row 2.
+    let mut scale = [0.05; 400];
+    scale[..2].fill(0.5);
+    let mut gradient = [0.0; 400];
+    gradient[..2].fill(4.0);
+    let mut opacity = [0.5; 400];
+    opacity[4] = 0.004;
+    opacity[9] = 0.004;
+    let mut shown = vec![2.0; 400];
+    shown[2] = 0.0;
+    set(&mut event.views[0], AuxColumn::Radius, &shown);
+    let mut event = Event { budget: 1000, ..event }
+        .with(Signal::Opacity, &opacity)
+        .with(Signal::ScreenGradient, &gradient)
+        .with(Signal::ScaleMax, &scale);
+    event.scene.budget = 1000;
+    let done = run(&event, "prune = \"published\"");
+    assert_eq!((done.split.len(), done.pruned), (2, vec![4]));
+}
+
+#[test]
+fn one_row_is_left() {
+    let event = event(1000, 2, 2).with(Signal::Opacity, &[0.001, 0.002]);
+    assert_eq!(run(&event, "prune_share = 1").pruned, [0]);
+}
+
+#[test]
+fn opacities_are_reset_as_in_the_original() {
+    let scene = |white_background| SceneInfo { white_background, ..Event::new(1, 1, 1).scene };
+    let resets = |white| -> Vec<u32> {
+        let policy = taming(&scene(white), "grow_every = 0");
+        (0..=30_000).filter(|&step| policy.is_due(step)).collect()
+    };
+    assert_eq!(resets(false), [3000, 6000, 9000, 12_000]);
+    assert_eq!(resets(true), [500, 3000, 6000, 9000, 12_000]);
+    let done = run(&event(3000, 3, 9), "");
+    assert_eq!((done.ops.clamp_opacity, done.ops.cause.as_str()), (Some(0.01), "densify+reset"));
+}
+
+#[test]
+fn events_and_views_are_those_of_the_code() {
+    let scene = Event::new(1, 1, 1).scene;
+    let policy = taming(&scene, "reset_every = 0");
+    let due: Vec<u32> = (0..=30_000).filter(|&step| policy.is_due(step)).collect();
+    assert_eq!((due.len(), due[0], due.last()), (28, 1000, Some(&14_500)));
+    assert_eq!([policy.aux_views(1000, 1, 9), policy.aux_views(3001, 1, 9)], [10, 0]);
+    assert_eq!(taming(&scene, "views = 0").aux_views(1000, 1, 9), u32::MAX);
+    let needs = policy.needs(&scene);
+    assert_eq!(policy.cadence(1), Cadence { all: 1, sh_rest: 16 });
+    assert_eq!(needs.cadence, policy.cadence(1));
+    assert_eq!(needs.rates, RateOverrides { sh_rest: Some(2.5e-4), ..RateOverrides::default() });
+    let aux = needs.aux.unwrap();
+    assert_eq!(aux.map, PixelMap { error: 50.0, edge: 50.0 });
+    assert_eq!(aux.columns, AuxColumn::ALL);
+}
+
+#[test]
+fn ranges_are_checked() {
+    let scene = Event::new(1, 1, 1).scene;
+    for set in [
+        "multiplier = -1",
+        "tau = -1",
+        "split_factor = 0",
+        "edge_weight = -1",
+        "map_weight = nan",
+        "prune_share = 2",
+        "reset_opacity = 0",
+        "sh_every = 0",
+        "sh_rest = 0",
+        "prune = \"all\"",
+    ] {
+        match find("taming").unwrap().build(&set.parse().unwrap(), &scene) {
+            Err(PolicyError::BadParameter { parameter, .. }) => {
+                assert_eq!(parameter, set.split(' ').next().unwrap());
+            }
+            other => panic!("{set}: {:?}", other.err()),
+        }
+    }
+}

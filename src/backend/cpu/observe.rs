@@ -1,0 +1,324 @@
+//! Auxiliary views: training views that are rendered for a policy's event, and measured row by row.
+//!
+//! Blending is replayed front to back, with the arithmetic of the forward pass, and each row's sums
+//! over the pixels that it is blended into are written to one record per (row, tile); these are
+//! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
+//! map the plane of the image gradient that belongs to alpha.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, PixelMap};
+use densify_policies::rng::PolicyRng;
+use densify_policies::sample::weighted;
+use pulp::{Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::passes::{Frame, for_each_pixel, scalars};
+use super::project::{LOG2_255, Splat};
+use super::rasterize::{
+    ALPHA_MAX, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane, TRANSMITTANCE,
+    TRANSMITTANCE_MIN, TilePlace, Within,
+};
+use super::simd::{V, WIDTH};
+use super::tiles::{Entry, Grid, Visible};
+use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
+use crate::dataset::images::Image8;
+
+/// Numbers per record: sums of the map, of pixels, of weights, of distances.
+const STRIDE: usize = 4;
+/// The plane of a tile's gradient that holds the pixel map meanwhile.
+const MAP: usize = 3;
+
+/// Bytes for an image of so many pixels: error, edge and luma, and the drawing of points.
+pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
+    let drawing =
+        if request.points > 0 { 2 * size_of::<f32>() + size_of::<(f64, u32)>() } else { 0 };
+    (pixels * (2 * size_of::<f32>() + 1 + drawing)) as u64
+        + u64::from(request.points) * size_of::<Candidate>() as u64
+}
+
+impl CpuBackend {
+    /// Measures one view.
+    pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        let AuxInput { camera, target, background, request, .. } = *input;
+        assert_eq!(
+            (camera.width, camera.height),
+            (target.width, target.height),
+            "camera and image differ in size"
+        );
+        // Stage times stay those of training.
+        let clock = std::mem::take(&mut self.clock);
+        let frame = self.forward(camera, background, input.sh_degree, false);
+        let measured = frame.map(|frame| {
+            let loss = scalars(self.image_loss(&frame.grid, target, background, None)).loss;
+            let points = self.draw_points(&frame, input);
+            let columns = if request.columns.is_empty() {
+                Vec::new()
+            } else {
+                self.write_map(&frame.grid, target, background, request.map);
+                let columns = self.columns(&frame, &request.columns);
+                for gradient in &mut self.gradient {
+                    gradient.planes[MAP] = DARK;
+                }
+                columns
+            };
+            AuxOutput { loss, columns, points }
+        });
+        self.clock = clock;
+        measured
+    }
+
+    /// Surface points of pixels drawn in proportion to their alpha.
+    fn draw_points(&mut self, frame: &Frame, input: &AuxInput<'_>) -> Vec<Candidate> {
+        if input.request.points == 0 {
+            return Vec::new();
+        }
+        let grid = &frame.grid;
+        let mut alpha = vec![0.0; grid.width * grid.height];
+        for (tile, canvas) in self.canvas.iter().enumerate() {
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
+            });
+        }
+        // Views of one step draw apart from each other.
+        let of_view = (input.view as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        let rng = PolicyRng::new(input.seed ^ of_view, input.step);
+        let drawn = weighted(&alpha, input.request.points as usize, &rng);
+        let pixel = |at: u32| {
+            let at = at as usize;
+            (at % grid.width, at / grid.width, alpha[at])
+        };
+        let pixels: Vec<_> = drawn.into_iter().map(pixel).collect();
+        self.surface_points(frame, input.target, &pixels, DepthMode::MaxWeight)
+    }
+
+    /// Writes the pixel map to its plane.
+    fn write_map(&mut self, grid: &Grid, target: &Image8, background: [f32; 3], map: PixelMap) {
+        let pixels = grid.width * grid.height;
+        let weight = |at: usize| target.mask.as_ref().map_or(1.0, |m| f32::from(m[at]) / 255.0);
+        let mut error = vec![0.0; pixels];
+        for (tile, canvas) in self.canvas.iter().enumerate() {
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                let truth = target.composited(at % grid.width, at / grid.width, background);
+                let difference = |i: usize| (canvas.planes[i][patch][lane] - truth[i]).abs();
+                error[at] = weight(at) * (difference(0) + difference(1) + difference(2)) / 3.0;
+            });
+        }
+        let mut edge = edges(target, background);
+        for (at, edge) in edge.iter_mut().enumerate() {
+            *edge *= weight(at);
+        }
+        stretch(&mut error);
+        stretch(&mut edge);
+        for (tile, gradient) in self.gradient.iter_mut().enumerate() {
+            gradient.planes[MAP] = DARK;
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                gradient.planes[MAP][patch][lane] = map.error * error[at] + map.edge * edge[at];
+            });
+        }
+    }
+
+    /// The columns of the view at hand.
+    fn columns(&mut self, frame: &Frame, wanted: &[AuxColumn]) -> Vec<(AuxColumn, Vec<f32>)> {
+        let Frame { grid, bands, .. } = frame;
+        let Self { pool, arch, lists, splats, records, sums, visible, gradient, rows, .. } = self;
+        let rows = *rows;
+        let sums = &mut sums[..rows * STRIDE];
+        sums.fill(0.0);
+        let is_seen = |row: usize| visible[row / WIDTH] >> (row % WIDTH) & 1 == 1;
+        pool.install(|| {
+            for band in bands {
+                if bands.len() > 1 {
+                    lists.refill(Visible { splats: &splats[..rows], seen: visible }, grid, band);
+                }
+                (0..band.len()).into_par_iter().for_each(|i| {
+                    let tile = band.start + i;
+                    arch.dispatch(Replay {
+                        splats,
+                        list: lists.of_tile(i),
+                        place: TilePlace::new(grid, tile),
+                        map: &gradient[tile].planes[MAP],
+                        records,
+                    });
+                });
+                let records = &records[..];
+                sums.par_chunks_mut(STRIDE).enumerate().for_each(|(row, sums)| {
+                    if is_seen(row) {
+                        let slots = lists.slots_of_row(row);
+                        let mine = &records[slots.start * STRIDE..slots.end * STRIDE];
+                        for record in mine.chunks_exact(STRIDE) {
+                            for (sum, x) in sums.iter_mut().zip(record) {
+                                *sum += f32::from_bits(x.load(Relaxed));
+                            }
+                        }
+                    }
+                });
+            }
+        });
+        let value = |column: AuxColumn, row: usize| match column {
+            _ if !is_seen(row) => 0.0,
+            AuxColumn::MapSum => sums[row * STRIDE],
+            AuxColumn::PixelCount => sums[row * STRIDE + 1],
+            AuxColumn::WeightSum => sums[row * STRIDE + 2],
+            AuxColumn::DistanceSum => sums[row * STRIDE + 3],
+            AuxColumn::Depth => splats[row].depth,
+            AuxColumn::Radius => radius(&splats[row]),
+        };
+        wanted.iter().map(|&c| (c, (0..rows).map(|row| value(c, row)).collect())).collect()
+    }
+}
+
+/// Three standard deviations along the longer axis of a projected covariance, rounded up `[px]`.
+fn radius(splat: &Splat) -> f32 {
+    let unfold = super::project::FOLD;
+    // Of the factor l1 = √(c/det), l3 = 1/√c, r = b/c of the covariance [a b; b c].
+    let (inv_l1, inv_l3) = (unfold / splat.l1, unfold / splat.l3);
+    let c = inv_l3 * inv_l3;
+    let b = splat.shear * c;
+    let a = inv_l1 * inv_l1 + splat.shear * b;
+    let mid = 0.5 * (a + c);
+    // The root of mid² − det without its cancellation.
+    let root = (0.5 * (a - c)).hypot(b);
+    (3.0 * (mid + root).sqrt()).ceil()
+}
+
+/// 8-neighbour Laplacian of the 8-bit luma, clipped to 0..255; borders are repeated.
+/// Shape: `[height, width]`.
+fn edges(target: &Image8, background: [f32; 3]) -> Vec<f32> {
+    let (width, height) = (target.width as usize, target.height as usize);
+    let luma: Vec<u8> = (0..width * height)
+        .map(|at| {
+            let rgb = target.composited(at % width, at / width, background);
+            let [r, g, b] = rgb.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u32);
+            // ITU-R 601-2 in 16 bits: 0.299, 0.587, 0.114.
+            ((19_595 * r + 38_470 * g + 7_471 * b + 32_768) >> 16) as u8
+        })
+        .collect();
+    let at = |x: usize, y: usize| i32::from(luma[y * width + x]);
+    (0..width * height)
+        .map(|pixel| {
+            let (x, y) = (pixel % width, pixel / width);
+            let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
+            let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
+            let sum: i32 = rows.iter().flat_map(|&y| columns.map(|x| at(x, y))).sum();
+            (9 * at(x, y) - sum).clamp(0, 255) as f32
+        })
+        .collect()
+}
+
+/// Brings values to 0..1 by their least and their largest; all 0 where they are equal.
+fn stretch(values: &mut [f32]) {
+    let range = values
+        .iter()
+        .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), &x| (low.min(x), high.max(x)));
+    let (low, width) = (range.0, range.1 - range.0);
+    for x in values {
+        *x = if width > 0.0 { (*x - low) / width } else { 0.0 };
+    }
+}
+
+/// Replays the blending of one tile.
+struct Replay<'a> {
+    splats: &'a [Splat],
+    /// Sorted.
+    list: &'a [AtomicU64],
+    place: TilePlace,
+    map: &'a Plane,
+    /// Bits of one record per slot; this tile writes those of its own entries.
+    records: &'a [AtomicU32],
+}
+
+impl WithSimd for Replay<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) {
+        let Self { splats, list, place, map, records } = self;
+        let c = |x: f32| V::splat(s, x);
+        let zero = V::zero(s);
+        // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
+        let (mut light, mut alive) = place.inside();
+        let mut patches = Patches::EMPTY;
+        for entry in list {
+            let entry = Entry::load(entry);
+            let splat = &splats[entry.row];
+            let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
+            patches.set(s, splat, &place);
+            let within = Within::new(s, splat);
+            let mut todo = patches.mask & alive;
+            let mut sums = [zero; STRIDE];
+            while todo != 0 {
+                let p = todo.trailing_zeros() as usize % PATCHES;
+                todo &= todo - 1;
+                let (to_u, to_z) = (c(patches.u[p]), c(patches.z[p]));
+                for at in (0..WIDTH).step_by(S::F32_LANES) {
+                    let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
+                    let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                    let seen = c(-LOG2_255).le(e);
+                    let alpha = e.exp2().min(c(ALPHA_MAX));
+                    let t = V::load(s, &light[p][at..]);
+                    let next = alpha.neg_mul_add(t, t);
+                    let blends = c(TRANSMITTANCE_MIN).lt(next).and(seen);
+                    let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
+                    let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
+                    let distance = (dx * dx + dy * dy).sqrt();
+                    sums[0] = sums[0] + blends.keep(V::load(s, &map[p][at..]));
+                    sums[1] = sums[1] + blends.keep(c(1.0));
+                    sums[2] = sums[2] + blends.keep(alpha * t);
+                    sums[3] = sums[3] + blends.keep(distance);
+                    let stopped = next.le(c(TRANSMITTANCE_MIN)).and(seen);
+                    let left = stopped.select(zero, blends.select(next, t));
+                    left.store(&mut light[p][at..]);
+                }
+                #[expect(clippy::float_cmp, reason = "who has stopped has exactly none")]
+                let all_stopped = light[p] == [0.0; WIDTH];
+                if all_stopped {
+                    alive &= !(1 << p);
+                }
+            }
+            let record = &records[entry.slot * STRIDE..(entry.slot + 1) * STRIDE];
+            for (to, sum) in record.iter().zip(sums) {
+                to.store(sum.sum().to_bits(), Relaxed);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(width: u32, grey: &[u8]) -> Image8 {
+        let height = grey.len() as u32 / width;
+        let rgb = grey.iter().flat_map(|&v| [v; 3]).collect();
+        Image8 { width, height, rgb, alpha: None, mask: None }
+    }
+
+    #[test]
+    fn edges_are_the_laplacian_of_the_luma() {
+        // A step from 10 to 30: 8·30 − (5·30 + 3·10) = 60 on the bright side, clipped to 0 on the dark.
+        let step = image(4, &[10, 10, 30, 30, 10, 10, 30, 30, 10, 10, 30, 30]);
+        let row = [0.0, 0.0, 60.0, 0.0];
+        assert_eq!(edges(&step, [0.0; 3]), [row, row, row].concat());
+        // A bright pixel: 8·200, clipped to 255. Its dark neighbours have none.
+        let dot = image(3, &[0, 0, 0, 0, 200, 0, 0, 0, 0]);
+        assert_eq!(edges(&dot, [0.0; 3])[4], 255.0);
+        assert_eq!(edges(&dot, [0.0; 3]).iter().sum::<f32>(), 255.0);
+        // Green counts most: 0.587·100 = 58.7.
+        let green = Image8 { rgb: vec![0, 0, 0, 0, 100, 0], ..image(2, &[0, 0]) };
+        assert_eq!(edges(&green, [0.0; 3]), [0.0, 177.0]);
+        let mut clear = image(2, &[0, 200]);
+        clear.alpha = Some(vec![255, 0]);
+        assert_eq!(edges(&clear, [0.0; 3]), [0.0, 0.0]);
+    }
+
+    #[test]
+    fn maps_are_stretched_to_one() {
+        let mut values = [3.0, 1.0, 2.0];
+        stretch(&mut values);
+        assert_eq!(values, [1.0, 0.0, 0.5]);
+        let mut flat = [4.0; 3];
+        stretch(&mut flat);
+        assert_eq!(flat, [0.0; 3]);
+    }
+}

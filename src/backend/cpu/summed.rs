@@ -1,0 +1,184 @@
+//! Gradients summed between optimiser steps, where a policy wants steps less often than every
+//! iteration ([`Cadence`]). Without such a policy there is no buffer, and nothing of this costs
+//! anything.
+//!
+//! A step then takes the sum of the gradients of all views since the last one. Bands 1–3 of the
+//! colour can step less often than all others; they then have ages of their own, as Adam's bias
+//! correction counts steps.
+
+use std::ops::Range;
+
+use densify_policies::policy::Cadence;
+
+use super::blocks::{Blocks, plane};
+use super::passes::parts;
+use super::simd::WIDTH;
+use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
+use crate::backend::StepInput;
+
+/// The sums of all rows.
+#[derive(Debug)]
+pub(super) struct Summed {
+    longest: Cadence,
+    /// First parameter plane that is summed.
+    first: usize,
+    sums: Blocks,
+    /// Steps of bands 1–3, where they may differ from the others'. Shape: `[rows]`.
+    rest_ages: Vec<u16>,
+    /// Whether sums of bands 1–3, and of all others, wait for a step.
+    pending: Due,
+}
+
+/// Which parameters step, or wait.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Due {
+    /// All but bands 1–3.
+    pub(super) main: bool,
+    /// Bands 1–3.
+    pub(super) rest: bool,
+    /// Whether sums waited before this step, for the main parameters and bands 1–3.
+    waited: [bool; 2],
+}
+
+/// The sums of one task's rows.
+pub(super) struct TaskSums<'a> {
+    first: usize,
+    /// Numbers per block.
+    stride: usize,
+    sums: &'a mut [f32],
+    rest_ages: &'a mut [u16],
+}
+
+/// The first plane that sums for this cadence must hold; `planes` where none must.
+fn first_plane(planes: usize, longest: Cadence) -> usize {
+    match longest {
+        Cadence { all: 2.., .. } => 0,
+        Cadence { sh_rest: 2.., .. } => plane::SH_REST.min(planes),
+        _ => planes,
+    }
+}
+
+impl Summed {
+    pub(super) fn new(budget: usize, planes: usize, longest: Cadence) -> Self {
+        let first = first_plane(planes, longest);
+        let rows = if longest.sh_rest > 1 { budget.next_multiple_of(WIDTH) } else { 0 };
+        Self {
+            longest,
+            first,
+            sums: Blocks::zeros(budget, planes - first),
+            rest_ages: vec![0; rows],
+            pending: Due::default(),
+        }
+    }
+
+    pub(super) fn is_wanted(longest: Cadence) -> bool {
+        longest.all > 1 || longest.sh_rest > 1
+    }
+
+    pub(super) fn bytes(budget: usize, planes: usize, longest: Cadence) -> u64 {
+        let rows = if longest.sh_rest > 1 { budget.next_multiple_of(WIDTH) } else { 0 };
+        let sums = Blocks::bytes(budget, planes - first_plane(planes, longest));
+        sums + (rows * size_of::<u16>()) as u64
+    }
+
+    /// Who steps now. Remembers who waits afterwards.
+    ///
+    /// # Panics
+    /// When the cadence needs sums that were not declared: a bug in the caller, and going on would
+    /// lose gradients.
+    pub(super) fn advance(&mut self, input: &StepInput<'_>) -> Due {
+        let (step, cadence) = (input.step, input.cadence);
+        assert!(cadence.is_within(self.longest), "step {step}: {cadence:?} was not declared");
+        let [main, rest] = cadence.steps_at(step);
+        let due = Due { main, rest, waited: [self.pending.main, self.pending.rest] };
+        self.pending = Due { main: !main, rest: !rest, waited: [false; 2] };
+        due
+    }
+
+    /// The sums, cut for the optimiser's tasks.
+    pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<TaskSums<'_>> {
+        let stride = self.sums.stride();
+        let sums = parts(self.sums.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
+        let aged = self.rest_ages.len().min(rows.next_multiple_of(WIDTH));
+        let ages = parts(&mut self.rest_ages[..aged], ROWS_PER_TASK, tasks);
+        let first = self.first;
+        sums.into_iter()
+            .zip(ages)
+            .map(|(sums, rest_ages)| TaskSums { first, stride, sums, rest_ages })
+            .collect()
+    }
+
+    pub(super) fn clear_row(&mut self, row: usize) {
+        self.sums.clear_row(row);
+        if let Some(age) = self.rest_ages.get_mut(row) {
+            *age = 0;
+        }
+    }
+
+    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
+        self.sums.copy_row(from, to);
+        if !self.rest_ages.is_empty() {
+            self.rest_ages[to] = self.rest_ages[from];
+        }
+    }
+
+    /// As the opacity's moments are forgotten.
+    pub(super) fn forget_opacity(&mut self, row: usize) {
+        if self.first == 0 && self.sums.stride() > 0 {
+            self.sums.set(row, plane::OPACITY, 0.0);
+        }
+    }
+}
+
+impl Due {
+    /// Whether gradients go into the sums, or come out of them.
+    pub(super) fn sums_matter(self) -> bool {
+        !self.main || !self.rest || self.waited != [false; 2]
+    }
+}
+
+impl TaskSums<'_> {
+    pub(super) fn reborrow(&mut self) -> TaskSums<'_> {
+        let Self { first, stride, sums, rest_ages } = self;
+        TaskSums { first: *first, stride: *stride, sums, rest_ages }
+    }
+
+    /// Ages of bands 1–3 in these lanes, if they have their own.
+    pub(super) fn rest_ages(&mut self, lanes: Range<usize>) -> Option<&mut [u16]> {
+        self.rest_ages.get_mut(lanes)
+    }
+
+    /// Adds the gradient of a block to the sums of those who wait, and the sums of those who step to
+    /// the gradient. Whether the gradient has changed.
+    pub(super) fn exchange(
+        &mut self,
+        block: usize,
+        gradient: &mut [f32],
+        trained: usize,
+        due: Due,
+    ) -> bool {
+        let sums = &mut self.sums[block * self.stride..(block + 1) * self.stride];
+        let classes = [
+            (0..trained.min(plane::SH_REST), due.main, due.waited[0]),
+            (plane::SH_REST..trained, due.rest, due.waited[1]),
+        ];
+        let mut changed = false;
+        for (planes, steps, waited) in classes {
+            if planes.start < self.first || planes.is_empty() || (steps && !waited) {
+                continue;
+            }
+            let values = &mut gradient[planes.start * WIDTH..planes.end * WIDTH];
+            let offset = (planes.start - self.first) * WIDTH;
+            let sums = &mut sums[offset..offset + values.len()];
+            for (g, sum) in values.iter_mut().zip(sums) {
+                if steps {
+                    *g += std::mem::take(sum);
+                } else {
+                    *sum += *g;
+                }
+            }
+            changed |= steps;
+        }
+        changed
+    }
+}

@@ -1,0 +1,293 @@
+//! Auxiliary views against the reference: every column, the pixel map, the loss, surface points.
+
+use densify::backend::cpu::{CpuBackend, CpuOptions};
+use densify::backend::{AuxInput, AuxOutput, Backend, LearningRates, StepInput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::Gaussians;
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, Cadence, Needs, PixelMap, Signal, SignalSet,
+};
+use glam::DVec3;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::compare::{Table, relative_error};
+use crate::reference::blend::each_blended;
+use crate::reference::loss::loss;
+use crate::reference::project::{by_depth, project};
+use crate::reference::{Image, Model, Rules, View, render};
+use crate::scenes;
+
+const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
+/// That of sums over pixels in `signals`; a pixel at the step of alpha may be gained or lost.
+const TOLERANCE: f64 = 1e-3;
+
+struct Scene {
+    camera: Camera,
+    model: Gaussians,
+    target: Image8,
+}
+
+fn scene() -> Scene {
+    let camera = scenes::camera(45, 37, 91);
+    let mut model = scenes::cloud(40, 2, &camera, 92);
+    // Some of them end the light of their pixels.
+    for logit in model.opacity_logits.iter_mut().skip(3).step_by(2) {
+        *logit = 6.0;
+    }
+    // Behind the camera.
+    model.means[..3].fill(scenes::world(&camera, [0.1, 0.2, -3.0]));
+    let mut rng = ChaCha8Rng::seed_from_u64(93);
+    let n = (camera.width * camera.height) as usize;
+    let rgb = (0..3 * n).map(|_| rng.random()).collect();
+    // Half of the pixels count in full, the others by half or not at all.
+    let mask = (0..n).map(|i| if i % 2 == 0 { 255 } else { (i % 3) as u8 * 64 }).collect();
+    let target =
+        Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: Some(mask) };
+    Scene { camera, model, target }
+}
+
+fn request(map: PixelMap) -> AuxRequest {
+    AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }
+}
+
+fn backend(scene: &Scene, request: &AuxRequest, tile_cap: usize, threads: usize) -> CpuBackend {
+    let mut options = CpuOptions::new(scene.model.len() + 3);
+    options.threads = Some(threads);
+    options.tile_cap = tile_cap;
+    options.needs = Needs {
+        signals: SignalSet::of(&[Signal::ScreenGradient, Signal::WeightSum, Signal::WeightMax]),
+        aux: Some(request.clone()),
+        ..Needs::default()
+    };
+    CpuBackend::new(&scene.model, &options).expect("a small model fits")
+}
+
+fn observe(
+    backend: &mut CpuBackend,
+    scene: &Scene,
+    request: &AuxRequest,
+    view: usize,
+) -> AuxOutput {
+    let input = AuxInput {
+        step: 7,
+        view,
+        seed: 3,
+        camera: &scene.camera,
+        target: &scene.target,
+        background: BACKGROUND,
+        sh_degree: 2,
+        request,
+    };
+    backend.observe(&input).expect("a small image is rendered")
+}
+
+fn weight(scene: &Scene, pixel: usize) -> f64 {
+    scene.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[pixel]) / 255.0)
+}
+
+/// 0..1 by the least and the largest.
+fn stretched(values: &[f64]) -> Vec<f64> {
+    let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    values.iter().map(|v| (v - low) / (high - low)).collect()
+}
+
+fn map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
+    let (width, height) = (scene.camera.width as i64, scene.camera.height as i64);
+    let rgb = |pixel: usize| [0, 1, 2].map(|c| f64::from(scene.target.rgb[3 * pixel + c]));
+    let error: Vec<f64> = (0..(width * height) as usize)
+        .map(|p| {
+            let truth = rgb(p);
+            let sum: f64 = (0..3).map(|c| (image.rgb[3 * p + c] - truth[c] / 255.0).abs()).sum();
+            weight(scene, p) * sum / 3.0
+        })
+        .collect();
+    let luma = |x: i64, y: i64| {
+        let pixel = y.clamp(0, height - 1) * width + x.clamp(0, width - 1);
+        let [r, g, b] = rgb(pixel as usize);
+        (0.299 * r + 0.587 * g + 0.114 * b).round()
+    };
+    let edge: Vec<f64> = (0..width * height)
+        .map(|p| {
+            let (x, y) = (p % width, p / width);
+            let around = |(dx, dy): (i64, i64)| luma(x + dx, y + dy);
+            let neighbours = [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
+            let sum: f64 = neighbours.into_iter().map(around).sum();
+            weight(scene, p as usize) * (8.0 * luma(x, y) - sum).clamp(0.0, 255.0)
+        })
+        .collect();
+    let parts = stretched(&error).into_iter().zip(stretched(&edge));
+    parts.map(|(e, g)| f64::from(weights.error) * e + f64::from(weights.edge) * g).collect()
+}
+
+#[test]
+fn every_column_is_that_of_the_reference() {
+    let scene = scene();
+    let model = Model::of(&scene.model);
+    let view = View { camera: &scene.camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
+    let image = render(&model, view, &Rules::STANDARD);
+    let splats = project(&model, view, &Rules::STANDARD);
+    let order = by_depth(&splats);
+    let mut table = Table::new("auxiliary views");
+    let maps = [(50.0, 50.0), (1.0, 0.0), (0.0, 1.0)].map(|(error, edge)| PixelMap { error, edge });
+    // The smaller cap takes several bands.
+    for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
+        let pixels = map(&scene, &image, weights);
+        let mut sums = vec![[0.0; 4]; scene.model.len()];
+        each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, distance| {
+            for (sum, x) in sums[row].iter_mut().zip([pixels[p], 1.0, weight, distance]) {
+                *sum += x;
+            }
+        });
+        let request = request(weights);
+        let found = observe(&mut backend(&scene, &request, cap, 2), &scene, &request, 0);
+        assert_eq!(found.columns.len(), 6);
+        for (column, values) in &found.columns {
+            let is_shown = |row: usize| sums[row][1] > 0.0;
+            let expected: Vec<f64> = (0..values.len())
+                .map(|row| match column {
+                    AuxColumn::MapSum => sums[row][0],
+                    AuxColumn::PixelCount => sums[row][1],
+                    AuxColumn::WeightSum => sums[row][2],
+                    AuxColumn::DistanceSum => sums[row][3],
+                    AuxColumn::Depth => splats[row].depth,
+                    AuxColumn::Radius => {
+                        let [a, b, c] = splats[row].covariance;
+                        let mid = 0.5 * (a + c);
+                        (3.0 * (mid + (mid * mid - (a * c - b * b)).sqrt()).sqrt()).ceil()
+                    }
+                })
+                .collect();
+            // A row may be on screen without being blended anywhere.
+            let shown: Vec<usize> = (0..values.len()).filter(|&row| is_shown(row)).collect();
+            assert!(shown.len() > 20 && !is_shown(0), "{}", shown.len());
+            assert!(values[..3].iter().all(|x| x.to_bits() == 0), "{column:?} of rows not seen");
+            let measured: Vec<f32> = shown.iter().map(|&row| values[row]).collect();
+            let expected: Vec<f64> = shown.iter().map(|&row| expected[row]).collect();
+            let error = relative_error(&measured, &expected);
+            table.check(
+                &format!("{weights:?}, cap {cap}"),
+                &format!("{column:?}"),
+                error,
+                TOLERANCE,
+            );
+        }
+    }
+    table.finish();
+}
+
+#[test]
+fn the_loss_is_that_of_training() {
+    let mut scene = scene();
+    scene.target.mask = None;
+    let request = request(PixelMap::default());
+    let found = observe(&mut backend(&scene, &request, 10_000, 1), &scene, &request, 0).loss;
+    let view = View { camera: &scene.camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
+    let image = render(&Model::of(&scene.model), view, &Rules::STANDARD);
+    let truth: Vec<f64> = scene.target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
+    let (width, height) = (scene.camera.width as usize, scene.camera.height as usize);
+    let expected = loss(&image.rgb, &truth, width, height).loss;
+    assert!((f64::from(found) - expected).abs() < 1e-5, "{found} {expected}");
+}
+
+#[test]
+fn neither_threads_nor_bands_change_a_bit() {
+    let scene = scene();
+    let points = AuxRequest { points: 50, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
+    let run =
+        |cap, threads| observe(&mut backend(&scene, &points, cap, threads), &scene, &points, 0);
+    let expected = run(10_000, 1);
+    assert_eq!(run(10_000, 3), expected);
+    assert_eq!(run(1, 2), expected);
+}
+
+#[test]
+fn training_goes_on_as_if_nothing_had_been_observed() {
+    let scene = scene();
+    let request = AuxRequest { points: 9, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
+    let run = |observes: bool| {
+        let mut backend = backend(&scene, &request, 10_000, 2);
+        for step in 1..=4 {
+            let rate = 1e-3;
+            let rates = LearningRates {
+                mean: rate,
+                log_scale: rate,
+                quat: rate,
+                opacity: rate,
+                sh_dc: rate,
+                sh_rest: rate,
+            };
+            let input = StepInput {
+                step,
+                camera: &scene.camera,
+                target: &scene.target,
+                background: BACKGROUND,
+                sh_degree: 2,
+                rates,
+                cadence: Cadence::default(),
+                seed: 1,
+            };
+            backend.train_step(&input).expect("a small image is rendered");
+            if observes {
+                observe(&mut backend, &scene, &request, 0);
+            }
+        }
+        let signals = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightSum]);
+        let needs = Needs { signals, ..Needs::default() };
+        let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+        let of = |signal| signals.get(signal).expect("a requested signal").to_vec();
+        (backend.download(), of(Signal::ScreenGradient), of(Signal::WeightSum))
+    };
+    assert!(run(false) == run(true));
+}
+
+#[test]
+fn points_lie_on_surfaces_and_follow_alpha() {
+    // One opaque Gaussian in the left of the image: all points are on it.
+    let camera = scenes::camera(60, 40, 95);
+    let mut scene = scene();
+    scene.camera = camera;
+    let local = [(15.0 - camera.cx) / camera.fx * 3.0, (20.0 - camera.cy) / camera.fy * 3.0, 3.0];
+    scene.model = scenes::one_at(&camera, local, [0.2; 3]);
+    scene.model.sh_degree = 1;
+    let n = 3 * (camera.width * camera.height) as usize;
+    let rgb = (0..n).map(|i| (i % 251) as u8).collect();
+    scene.target = Image8 { width: 60, height: 40, rgb, alpha: None, mask: None };
+    let request = AuxRequest { points: 40, ..AuxRequest::default() };
+    let mut backend = backend(&scene, &request, 10_000, 1);
+    let first = observe(&mut backend, &scene, &request, 0);
+    assert!(first.columns.is_empty() && first.points.len() == 40, "{}", first.points.len());
+    let centre = DVec3::from(scene.model.means[0].map(f64::from));
+    let mut places: Vec<[u32; 3]> = Vec::new();
+    for point in &first.points {
+        let world = DVec3::from(point.position.map(f64::from));
+        let local = camera.rotation * world + camera.translation;
+        // Of a sphere the nearest point of the ray: at right angles to its radius.
+        let from_centre = world - centre;
+        assert!(from_centre.length() < 0.2 * 3.5, "{point:?}");
+        let along = (world - camera.centre()).normalize();
+        assert!(from_centre.dot(along).abs() < 1e-3, "{point:?}");
+        let focal = 0.5 * (camera.fx + camera.fy);
+        assert!((f64::from(point.pixel_size) / (local.z / focal) - 1.0).abs() < 1e-4);
+        // The colour of the pixel that the point is seen in.
+        let x = (camera.fx * local.x / local.z + camera.cx).floor() as usize;
+        let y = (camera.fy * local.y / local.z + camera.cy).floor() as usize;
+        assert_eq!(point.colour, scene.target.composited(x, y, BACKGROUND));
+        assert!(point.error > 1.0 / 256.0 && point.error < 1.0);
+        places.push(point.position.map(f32::to_bits));
+    }
+    places.sort_unstable();
+    places.dedup();
+    assert_eq!(places.len(), 40, "a pixel was drawn twice");
+    // Opaque pixels are drawn more often: of the blended ones the mean alpha is lower.
+    let mean = first.points.iter().map(|p| p.error).sum::<f32>() / 40.0;
+    let all = AuxRequest { points: u32::MAX, ..request.clone() };
+    let every = observe(&mut backend, &scene, &all, 0).points;
+    let of_all = every.iter().map(|p| p.error).sum::<f32>() / every.len() as f32;
+    assert!(every.len() > 80 && mean > 1.1 * of_all, "{} {mean} {of_all}", every.len());
+    // Each view draws anew.
+    assert!(observe(&mut backend, &scene, &request, 1).points != first.points);
+    assert!(observe(&mut backend, &scene, &request, 0) == first);
+}
