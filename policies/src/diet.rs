@@ -42,6 +42,11 @@
 //! - `mixed_gradient = false`: g = 2 g_p, as the code runs (its mixed form is switched off there).
 //! - `growth = "all"`: every candidate grows for which there is room or a victim, without the bound
 //!   `rho`, as in the paper and the code.
+//! - `split`: what becomes of a candidate that is larger than `small`.
+//!   - `random`: two samples of the parent, smaller by `split_factor`, as in the original.
+//!   - `long-axis`: two halves along the parent's longest axis, whose ends stay where they were, with
+//!     `child_opacity` times its opacity, as `igs` does. With d = `split_share` they stand at ±3d
+//!     standard deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²).
 //! - `shift`: how far a clone stands from its parent, Σ over the views since the last growth, dL/dμ
 //!   the loss gradient by the mean, s the parent's largest standard deviation. Splits are not
 //!   shifted: their samples are apart already.
@@ -90,7 +95,10 @@
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
 //! | rho | 0.03 | 0 to 1 | budget | most rows that one growth exchanges |
 //! | small | 0.01 | >= 0 | scene extent | up to this size a row is cloned, beyond it split |
-//! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales |
+//! | split | "random" | random, long-axis | | how a large row is split |
+//! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales, for `random` |
+//! | split_share | 0.45 | 0 to 1, both excluded | | d of the split, for `long-axis` |
+//! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor of the children's opacity, for `long-axis` |
 //! | shift | "descent" | descent, paper, code, none | | where clones stand |
 //! | kappa | 0.1 | >= 0 | standard deviations | longest shift of `descent` |
 //! | clone_opacity | "unchanged" | unchanged, conserve | | opacity of clones and their parents |
@@ -143,7 +151,7 @@ mod parameters;
 mod reinit;
 mod victims;
 
-pub use parameters::{CloneOpacity, DietParams, Growth, Importance, NewbornSize, Shift};
+pub use parameters::{CloneOpacity, DietParams, Growth, Importance, NewbornSize, Shift, Split};
 
 crate::register_policy!(
     "diet",

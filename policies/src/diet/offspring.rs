@@ -1,7 +1,7 @@
 //! How a candidate grows: a clone, shifted or not, or a split.
 
-use super::{CloneOpacity, Diet, MEAN_GRADIENT, Shift};
-use crate::adc::{clone_at, split_by};
+use super::{CloneOpacity, Diet, DietParams, MEAN_GRADIENT, Shift, Split};
+use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::plan::{Offspring, OpacityRule, ParentFate, ScaleRule};
 use crate::policy::{PolicyError, Signal, Snapshot};
 
@@ -13,7 +13,11 @@ impl Diet {
         row: usize,
     ) -> Result<Offspring, PolicyError> {
         if now.signal(Signal::ScaleMax)?[row] > self.scene_units(self.params.small, now.scene) {
-            return Ok(split_by(self.params.split_factor as f32));
+            let DietParams { split_factor, split_share, child_opacity, .. } = self.params;
+            return Ok(match self.params.split {
+                Split::Random => split_by(split_factor as f32),
+                Split::LongAxis => split_long_axis(split_share as f32, child_opacity as f32),
+            });
         }
         let clone = clone_at(self.shift(now, row)?);
         match self.params.clone_opacity {

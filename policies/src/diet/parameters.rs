@@ -21,7 +21,10 @@ pub struct DietParams {
     pub growth: Growth,
     pub rho: f64,
     pub small: f64,
+    pub split: Split,
     pub split_factor: f64,
+    pub split_share: f64,
+    pub child_opacity: f64,
     pub shift: Shift,
     pub kappa: f64,
     pub clone_opacity: CloneOpacity,
@@ -56,6 +59,16 @@ pub enum Growth {
     Turnover,
     /// As many as there are room and victims for.
     All,
+}
+
+/// How a large row is split.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Split {
+    /// Two samples of the parent, smaller by `split_factor`.
+    Random,
+    /// Two halves along its longest axis.
+    LongAxis,
 }
 
 /// Where a clone stands.
@@ -114,7 +127,10 @@ impl Default for DietParams {
             growth: Growth::Turnover,
             rho: 0.03,
             small: 0.01,
+            split: Split::Random,
             split_factor: 1.6,
+            split_share: 0.45,
+            child_opacity: 0.6,
             shift: Shift::Descent,
             kappa: 0.1,
             clone_opacity: CloneOpacity::Unchanged,
@@ -151,6 +167,8 @@ impl DietParams {
         in_range("rho", self.rho, 0.0..=1.0)?;
         in_range("small", self.small, 0.0..)?;
         in_range("split_factor", self.split_factor, 1.0..=100.0)?;
+        in_range("split_share", self.split_share, (Excluded(0.0), Excluded(1.0)))?;
+        in_range("child_opacity", self.child_opacity, (Excluded(0.0), Included(1.0)))?;
         in_range("kappa", self.kappa, 0.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", self.max_scale, (Excluded(0.0), Unbounded))?;
