@@ -289,6 +289,7 @@ impl WithSimd for Replay<'_> {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "small whole numbers are exact")]
 mod tests {
     use super::*;
 
