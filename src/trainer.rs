@@ -83,7 +83,8 @@ pub struct EditEvent {
     pub denied: usize,
     /// Rows after.
     pub after: usize,
-    /// Why, in the policy's words.
+    /// Why, in the policy's words, if it gave any.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub cause: String,
 }
 

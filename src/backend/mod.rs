@@ -5,6 +5,8 @@
 
 pub mod cpu;
 
+use std::time::Duration;
+
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, Needs, Signals};
 
@@ -209,4 +211,8 @@ pub trait Backend: Send {
 
     /// Copies the model to the host.
     fn download(&self) -> Gaussians;
+
+    /// Wall time of each stage of the last step, in order; a stage that ran more than once stands
+    /// there as often.
+    fn stage_times(&self) -> &[(&'static str, Duration)];
 }

@@ -13,6 +13,7 @@
 //! }
 //! ```
 
+mod compare;
 mod console;
 mod eval;
 mod failure;
@@ -49,6 +50,8 @@ Examples:
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
+  densify compare data/garden --policies vanilla,diet --budget 200k
+                                                           which policy does best here
   densify policies diet                                    what a policy does, and its parameters
 
 `densify COMMAND --help` explains every option of a command.";
@@ -58,6 +61,7 @@ enum Command {
     Train(Box<train::TrainArgs>),
     Eval(eval::EvalArgs),
     Render(Box<render::RenderArgs>),
+    Compare(compare::CompareArgs),
     Policies(policies::PoliciesArgs),
 }
 
@@ -83,6 +87,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Train(train) => train::run(&train, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
+        Command::Compare(compare) => compare::run(&compare, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
     };
     match done.and_then(|()| console.finish()) {

@@ -3,6 +3,7 @@
 //! Poses are camera-to-world with OpenGL axes (x right, y up, looking along −z). Intrinsics stand
 //! at the top or, taking precedence, in the frame.
 
+use std::collections::HashSet;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -44,7 +45,8 @@ pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, Dataset
     Ok(scene)
 }
 
-/// Reads `transforms.json`.
+/// Reads `transforms.json`. Frames that it lists under `test_filenames` (or `val_filenames`, if it
+/// has only these) are its own test split, as in nerfstudio.
 pub(super) fn read_single(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
     read(root, folders, SINGLE, false)
 }
@@ -62,6 +64,11 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     if list.len() > MAX_FRAMES {
         return Err(top.fault("frames", "there are more than a million"));
     }
+    let mut own_split = false;
+    let tests = match top.names("test_filenames")? {
+        Some(names) => Some(names),
+        None => top.names("val_filenames")?,
+    };
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
     for (index, entry) in list.iter().enumerate() {
         let place = format!("frames[{index}].");
@@ -94,6 +101,9 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             None => folders.mask(named)?,
         };
         let lens = fields.lens(&found.path, found.reduced)?;
+        let held_out =
+            held_out || tests.as_ref().is_some_and(|tests| tests.contains(&relative(file)));
+        own_split |= held_out;
         frames.push(Frame {
             name: relative(file),
             origin: format!("{}: frame {file}", path.display()),
@@ -133,7 +143,8 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             }
         }
     }
-    let mut scene = Scene { frames, notes, points_file, listing: path.clone(), ..Scene::default() };
+    let listing = path.clone();
+    let mut scene = Scene { frames, notes, points_file, listing, own_split, ..Scene::default() };
     if !held_out && let Some(file) = &scene.points_file {
         scene.points = crate::ply::read_points(file)?;
     }
@@ -181,6 +192,17 @@ impl<'a> Fields<'a> {
             Some(Value::String(text)) => Ok(Some(text)),
             Some(_) => Err(self.fault(field, "it is no string")),
         }
+    }
+
+    /// A list of file names.
+    fn names(&self, field: &str) -> Result<Option<HashSet<String>>, DatasetError> {
+        let Some(value) = self.own(field) else {
+            return Ok(None);
+        };
+        let fault = || self.fault(field, "it is no list of file names");
+        let list = value.as_array().ok_or_else(fault)?;
+        let name = |name: &Value| name.as_str().map(relative).ok_or_else(fault);
+        list.iter().map(name).collect::<Result<_, _>>().map(Some)
     }
 
     fn inherited(&self, field: &str) -> Option<&'a Value> {

@@ -85,6 +85,10 @@ impl Backend for CountingBackend {
     fn download(&self) -> Gaussians {
         Gaussians { means: vec![[0.0; 3]; self.rows], ..Gaussians::default() }
     }
+
+    fn stage_times(&self) -> &[(&'static str, std::time::Duration)] {
+        &[]
+    }
 }
 
 /// Splits as many rows as it can at every multiple of `every`, or prunes half, or fails.

@@ -7,16 +7,17 @@
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight.
 //!
-//! The file is one piece because the two passes share their window, their planes and their strips.
-//! Both passes run over strips of rows. A strip convolves its rows and five more on either side
-//! horizontally into its own lines and then vertically; strips write nothing that others read.
+//! The file is one piece because the passes share their window, their planes and their strips. Each
+//! pass runs over strips of rows, which write nothing that others of the same pass read. A row of the
+//! image is convolved vertically straight from the planes, into a few lines that stay in the cache,
+//! and these horizontally: nothing is computed twice, however the image is cut.
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::rasterize::{DARK, TileCanvas};
+use super::rasterize::{DARK, TileCanvas, row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
-use super::simd::{V, WIDTH};
+use super::simd::{V, WIDTH, each};
 use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
 
@@ -44,6 +45,8 @@ const WINDOW: [f32; 2 * REACH + 1] = [
 const STRIP: usize = 2 * TILE;
 /// Zeros left of a line's first pixel, so that loads stay aligned; as many or more on the right.
 const PAD: usize = WIDTH;
+/// Lines of scratch of a pass: e, y, e², y² and e·y, convolved vertically.
+const MOST_LINES: usize = 5;
 
 /// Planes of image size that the loss keeps between its passes: e, y, and three derivatives.
 #[derive(Debug)]
@@ -76,8 +79,8 @@ impl LossBuffers {
     /// Bytes for an image of this size, and for the strips of so many threads.
     pub(super) fn bytes(width: usize, height: usize, threads: usize) -> u64 {
         let planes = 6 * line(width) * height;
-        let strips = threads * (3 + 5 * (STRIP + 2 * REACH)) * line(width);
-        ((planes + strips) * size_of::<f32>()) as u64
+        let lines = threads * MOST_LINES * line(width);
+        ((planes + lines) * size_of::<f32>()) as u64
     }
 
     pub(super) fn new() -> Self {
@@ -124,11 +127,12 @@ impl LossBuffers {
                 (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
             };
             let source = Source { grid, canvas, target, background, channel };
-            (e.par_chunks_mut(stride), y.par_chunks_mut(stride))
+            (e.par_chunks_mut(strip), y.par_chunks_mut(strip))
                 .into_par_iter()
                 .enumerate()
-                .with_min_len(STRIP)
-                .for_each(|(row, (e, y))| source.lines(row, e, y));
+                .for_each(|(i, (e, y))| {
+                    arch.dispatch(Lines { source, first: i * STRIP, stride, e, y })
+                });
             let parts: Vec<LossValue> = (
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),
@@ -192,7 +196,7 @@ fn masked(line: &mut [f32], mask: &[u8]) {
     }
 }
 
-/// One channel of rendering and target, line by line.
+/// One channel of rendering and target.
 #[derive(Clone, Copy)]
 struct Source<'a> {
     grid: &'a Grid,
@@ -202,36 +206,53 @@ struct Source<'a> {
     channel: usize,
 }
 
-impl Source<'_> {
-    /// e = rendering − target and y = target of image row `row` (0 where masked and in the pads).
+/// The planes' lines of one strip of one channel: e = rendering − target and y = target, 0 where
+/// masked and in the pads.
+struct Lines<'a> {
+    source: Source<'a>,
+    first: usize,
+    stride: usize,
+    /// The strip's lines.
+    e: &'a mut [f32],
+    y: &'a mut [f32],
+}
+
+impl WithSimd for Lines<'_> {
+    type Output = ();
+
+    /// Plain loops, which the compiler turns into vectors of the dispatched instruction set.
     #[inline(always)]
-    fn lines(&self, row: usize, e: &mut [f32], y: &mut [f32]) {
-        let Self { grid, canvas, target, background, channel } = *self;
-        e.fill(0.0);
-        y.fill(0.0);
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { source, first, stride, e, y } = self;
+        let Source { grid, canvas, target, background, channel } = source;
         let width = grid.width;
-        let pixels = row * width..(row + 1) * width;
         let inner = PAD..PAD + width;
-        let bytes = &target.rgb[3 * pixels.start..3 * pixels.end];
-        for (y, rgb) in y[inner.clone()].iter_mut().zip(bytes.chunks_exact(3)) {
-            *y = f32::from(rgb[channel]) * (1.0 / 255.0);
-        }
-        if let Some(alpha) = &target.alpha {
-            for (y, &a) in y[inner.clone()].iter_mut().zip(&alpha[pixels.clone()]) {
-                let a = f32::from(a) * (1.0 / 255.0);
-                *y = a * *y + (1.0 - a) * background[channel];
+        let lines = e.chunks_exact_mut(stride).zip(y.chunks_exact_mut(stride));
+        for (row, (e, y)) in (first..).zip(lines) {
+            e.fill(0.0);
+            y.fill(0.0);
+            let pixels = row * width..(row + 1) * width;
+            let bytes = &target.rgb[3 * pixels.start..3 * pixels.end];
+            for (y, rgb) in y[inner.clone()].iter_mut().zip(bytes.as_chunks::<3>().0) {
+                *y = f32::from(rgb[channel]) * (1.0 / 255.0);
             }
-        }
-        let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
-        for (tile, e) in tiles.iter().zip(e[PAD..].chunks_exact_mut(TILE)) {
-            e.copy_from_slice(&tile.planes[channel][row % TILE]);
-        }
-        e[PAD + width..].fill(0.0);
-        for (e, &y) in e[inner.clone()].iter_mut().zip(&y[inner.clone()]) {
-            *e -= y;
-        }
-        if let Some(mask) = &target.mask {
-            masked(&mut e[inner], &mask[pixels]);
+            if let Some(alpha) = &target.alpha {
+                for (y, &a) in y[inner.clone()].iter_mut().zip(&alpha[pixels.clone()]) {
+                    let a = f32::from(a) * (1.0 / 255.0);
+                    *y = a * *y + (1.0 - a) * background[channel];
+                }
+            }
+            let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
+            for (tile, e) in tiles.iter().zip(e[PAD..].as_chunks_mut::<TILE>().0) {
+                *e = row_of_plane(&tile.planes[channel], row % TILE);
+            }
+            e[PAD + width..].fill(0.0);
+            for (e, &y) in e[inner.clone()].iter_mut().zip(&y[inner.clone()]) {
+                *e -= y;
+            }
+            if let Some(mask) = &target.mask {
+                masked(&mut e[inner.clone()], &mask[pixels]);
+            }
         }
     }
 }
@@ -248,35 +269,33 @@ fn horizontal<S: Simd>(s: S, line: &[f32], at: usize) -> V<S> {
     sum
 }
 
-/// The sums Σ_k WINDOW[k]·(line row + k)[at] of `N` quantities that stand in `blurred` one after
-/// another, `lines` lines each.
+/// The lines of `N` planes within reach of `row`, with the row's weights, and how many there are.
+/// They are cut out once per row of the image, so that a load in the inner loop has little to check.
 #[inline(always)]
-fn vertical<S: Simd, const N: usize>(
-    s: S,
-    blurred: &[f32],
-    lines: usize,
-    row: usize,
+fn within_reach<'a, const N: usize>(
+    planes: [&'a [f32]; N],
     stride: usize,
-    at: usize,
-) -> [V<S>; N] {
-    let mut sums = [V::zero(s); N];
-    for (quantity, sum) in sums.iter_mut().enumerate() {
-        let first = (quantity * lines + row) * stride + at;
-        let below = &blurred[first..first + 2 * REACH * stride + S::F32_LANES];
-        for (k, &w) in WINDOW.iter().enumerate() {
-            let line = &below[k * stride..k * stride + S::F32_LANES];
-            *sum = V::splat(s, w).mul_add(V::load(s, line), *sum);
+    row: usize,
+    height: usize,
+) -> ([([&'a [f32]; N], f32); WINDOW.len()], usize) {
+    let from = row.saturating_sub(REACH);
+    let to = (row + REACH + 1).min(height);
+    let mut lines = [([&[][..]; N], 0.0); WINDOW.len()];
+    for (i, (cut, weight)) in lines[..to - from].iter_mut().enumerate() {
+        let line = (from + i) * stride..(from + i + 1) * stride;
+        for (cut, plane) in cut.iter_mut().zip(planes) {
+            *cut = &plane[line.clone()];
         }
+        *weight = WINDOW[from + i + REACH - row];
     }
-    sums
+    (lines, to - from)
 }
 
-/// Zeros for line `l`, outside the image, of `N` quantities. The scratch holds another strip's.
-fn clear_line<const N: usize>(blurred: &mut [f32], lines: usize, l: usize, stride: usize) {
-    for quantity in 0..N {
-        let first = (quantity * lines + l) * stride;
-        blurred[first..first + stride].fill(0.0);
-    }
+/// `N` lines of scratch of `stride` numbers, zero where nothing was written since the first call.
+fn lines_of<const N: usize>(scratch: &mut Vec<f32>, stride: usize) -> [&mut [f32]; N] {
+    scratch.resize(N * stride, 0.0);
+    let mut lines = scratch.chunks_exact_mut(stride);
+    std::array::from_fn(|_| lines.next().unwrap_or_default())
 }
 
 /// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
@@ -305,39 +324,34 @@ impl WithSimd for Similarity<'_> {
         let [p1, p2, p3] = derivatives;
         let (width, height) = (grid.width, grid.height);
         let rows = p1.len() / stride;
-        let lines = rows + 2 * REACH;
-        scratch.resize((3 + 5 * lines) * stride, 0.0);
-        let (products, blurred) = scratch.split_at_mut(3 * stride);
-        let (ee, rest) = products.split_at_mut(stride);
-        let (yy, ey) = rest.split_at_mut(stride);
+        let lines: [&mut [f32]; MOST_LINES] = lines_of(scratch, stride);
         let columns = (PAD..PAD + width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
-        for l in 0..lines {
-            let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < height) else {
-                clear_line::<5>(blurred, lines, l, stride);
-                continue;
-            };
-            let line_e = &e[row * stride..(row + 1) * stride];
-            let line_y = &y[row * stride..(row + 1) * stride];
-            for at in columns.clone() {
-                let (e, y) = (V::load(s, &line_e[at..]), V::load(s, &line_y[at..]));
-                (e * e).store(&mut ee[at..]);
-                (y * y).store(&mut yy[at..]);
-                (e * y).store(&mut ey[at..]);
-            }
-            for at in columns.clone() {
-                for (quantity, line) in [line_e, line_y, &*ee, &*yy, &*ey].iter().enumerate() {
-                    let to = (quantity * lines + l) * stride + at;
-                    horizontal(s, line, at).store(&mut blurred[to..]);
-                }
-            }
-        }
         let c = |x: f32| V::splat(s, x);
         let mut total = LossValue::default();
         for row in 0..rows {
+            let (near, count) = within_reach([e, y], stride, first + row, height);
+            for at in columns.clone() {
+                let mut sums = [V::zero(s); MOST_LINES];
+                for ([e, y], w) in &near[..count] {
+                    let (w, e, y) = (V::splat(s, *w), V::load(s, &e[at..]), V::load(s, &y[at..]));
+                    let (we, wy) = (w * e, w * y);
+                    sums[0] = sums[0] + we;
+                    sums[1] = sums[1] + wy;
+                    sums[2] = we.mul_add(e, sums[2]);
+                    sums[3] = wy.mul_add(y, sums[3]);
+                    sums[4] = we.mul_add(y, sums[4]);
+                }
+                for k in 0..MOST_LINES {
+                    sums[k].store(&mut lines[k][at..]);
+                }
+            }
             let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
             for at in columns.clone() {
-                let [mu_e, mu_y, mean_ee, mean_yy, mean_ey] =
-                    vertical(s, blurred, lines, row, stride, at);
+                let mut means = [V::zero(s); MOST_LINES];
+                for k in 0..MOST_LINES {
+                    means[k] = horizontal(s, lines[k], at);
+                }
+                let [mu_e, mu_y, mean_ee, mean_yy, mean_ey] = means;
                 let mu_x = mu_e + mu_y;
                 let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
                 let var_y = (mean_yy - mu_y * mu_y).max(V::zero(s));
@@ -408,47 +422,45 @@ impl WithSimd for Gradient<'_> {
         let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, mask, tiles } =
             self;
         let rows = STRIP.min(grid.height - first);
-        let lines = rows + 2 * REACH;
-        scratch.resize(3 * lines * stride, 0.0);
+        let lines: [&mut [f32]; 4] = lines_of(scratch, stride);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
-        for l in 0..lines {
-            let Some(row) = (first + l).checked_sub(REACH).filter(|&row| row < grid.height) else {
-                clear_line::<3>(scratch, lines, l, stride);
-                continue;
-            };
-            for at in columns.clone() {
-                for (quantity, plane) in derivatives.iter().enumerate() {
-                    let line = &plane[row * stride..(row + 1) * stride];
-                    let to = (quantity * lines + l) * stride + at;
-                    horizontal(s, line, at).store(&mut scratch[to..]);
-                }
-            }
-        }
         let (l1_scale, ssim_scale) = ((1.0 - SSIM_WEIGHT) * scale, -SSIM_WEIGHT * scale);
         let zero = V::zero(s);
         for tile in tiles.iter_mut() {
             tile.planes[channel] = DARK;
         }
         for row in 0..rows {
+            let (near, count) = within_reach(derivatives, stride, first + row, grid.height);
             for at in columns.clone() {
-                let [by_mu_e, by_ee, by_ey] = vertical(s, scratch, lines, row, stride, at);
+                let mut sums = [zero; 3];
+                for (lines, w) in &near[..count] {
+                    let w = V::splat(s, *w);
+                    for k in 0..3 {
+                        sums[k] = w.mul_add(V::load(s, &lines[k][at..]), sums[k]);
+                    }
+                }
+                for k in 0..3 {
+                    sums[k].store(&mut lines[k][at..]);
+                }
+            }
+            for at in columns.clone() {
+                let [by_mu_e, by_ee, by_ey] = each!(k in 3 => horizontal(s, lines[k], at));
                 let from = (first + row) * stride + at;
                 let (e, y) = (V::load(s, &e[from..]), V::load(s, &y[from..]));
                 let by_ssim = by_mu_e + e * 2.0 * by_ee + y * by_ey;
                 let positive = zero.lt(e).keep(V::splat(s, l1_scale));
                 let negative = e.lt(zero).keep(V::splat(s, l1_scale));
                 let g = by_ssim * ssim_scale + (positive - negative);
-                let x = at - PAD;
-                let tile = &mut tiles[row / TILE * grid.columns + x / TILE];
-                g.store(&mut tile.planes[channel][row % TILE][x % TILE..]);
+                g.store(&mut lines[3][at..]);
             }
             // The loss sees e·mask, so the chain rule has the mask once more.
             if let Some(mask) = mask {
-                let row_of_tiles = row / TILE * grid.columns;
                 let mask = &mask[(first + row) * grid.width..][..grid.width];
-                for (tile, mask) in tiles[row_of_tiles..].iter_mut().zip(mask.chunks(TILE)) {
-                    masked(&mut tile.planes[channel][row % TILE], mask);
-                }
+                masked(&mut lines[3][PAD..PAD + grid.width], mask);
+            }
+            let tiles = &mut tiles[row / TILE * grid.columns..][..grid.columns];
+            for (tile, g) in tiles.iter_mut().zip(lines[3][PAD..].as_chunks::<TILE>().0) {
+                set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
             }
         }
     }

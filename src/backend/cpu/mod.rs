@@ -11,6 +11,7 @@ mod apply;
 mod blocks;
 mod budget;
 mod candidates;
+mod footprint;
 mod fresh;
 mod loss;
 mod observe;
@@ -198,13 +199,6 @@ impl CpuBackend {
         })
     }
 
-    /// Wall time of each stage of the last training step, in order. Bands add up under one name
-    /// only as far as they follow one another.
-    #[must_use]
-    pub fn stage_times(&self) -> &[(&'static str, Duration)] {
-        &self.clock.laps
-    }
-
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
     /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
     ///
@@ -237,12 +231,12 @@ impl CpuBackend {
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient.iter_mut().enumerate() {
             gradient.planes = [DARK; 5];
-            for_each_pixel(&frame.grid, tile, |y, x, at| {
+            for_each_pixel(&frame.grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    gradient.planes[channel][y][x] = upstream.rgb[3 * at + channel];
+                    gradient.planes[channel][patch][lane] = upstream.rgb[3 * at + channel];
                 }
-                gradient.planes[3][y][x] = upstream.alpha[at];
-                gradient.planes[4][y][x] = upstream.depth[at];
+                gradient.planes[3][patch][lane] = upstream.alpha[at];
+                gradient.planes[4][patch][lane] = upstream.depth[at];
             });
         }
         self.backward(&frame, detail);
@@ -277,18 +271,18 @@ impl CpuBackend {
         let grid = Grid::new(rendering.width, rendering.height);
         self.resize_images(&grid);
         for (tile, canvas) in self.canvas.iter_mut().enumerate() {
-            for_each_pixel(&grid, tile, |y, x, at| {
+            for_each_pixel(&grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    canvas.planes[channel][y][x] = rendering.rgb[3 * at + channel];
+                    canvas.planes[channel][patch][lane] = rendering.rgb[3 * at + channel];
                 }
             });
         }
         let value = self.image_loss(&grid, target, background, None);
         let mut gradient = vec![0.0; rendering.rgb.len()];
         for (tile, from) in self.gradient.iter().enumerate() {
-            for_each_pixel(&grid, tile, |y, x, at| {
+            for_each_pixel(&grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    gradient[3 * at + channel] = from.planes[channel][y][x];
+                    gradient[3 * at + channel] = from.planes[channel][patch][lane];
                 }
             });
         }
@@ -392,5 +386,9 @@ impl Backend for CpuBackend {
 
     fn download(&self) -> Gaussians {
         self.params.unpack(self.rows, self.sh_degree)
+    }
+
+    fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.clock.laps
     }
 }

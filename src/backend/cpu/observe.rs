@@ -1,6 +1,6 @@
 //! Auxiliary views: training views that are rendered for a policy's event, and measured row by row.
 //!
-//! Blending is replayed front to back, with the arithmetic of the forward pass, and each row's sums
+//! Blending is replayed front to back, by the rules of the forward pass, and each row's sums
 //! over the pixels that it is blended into are written to one record per (row, tile); these are
 //! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
 //! map the plane of the image gradient that belongs to alpha.
@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::{LOG2_255, Splat};
-use super::rasterize::{ALPHA_MAX, CENTRES, DARK, Plane, TRANSMITTANCE, TilePlace};
+use super::rasterize::{ALPHA_MAX, DARK, Plane, TRANSMITTANCE, TilePlace, row_of_plane};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, TILE, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
@@ -27,6 +27,17 @@ const TRANSMITTANCE_MIN: f32 = 1e-4;
 const STRIDE: usize = 4;
 /// The plane of a tile's gradient that holds the pixel map meanwhile.
 const MAP: usize = 3;
+
+/// Pixel centres along a row of a tile.
+const CENTRES: [f32; TILE] = {
+    let mut centres = [0.5; TILE];
+    let mut i = 0;
+    while i < TILE {
+        centres[i] = i as f32 + 0.5;
+        i += 1;
+    }
+    centres
+};
 
 /// Bytes for an image of so many pixels: error, edge and luma, and the drawing of points.
 pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
@@ -75,8 +86,8 @@ impl CpuBackend {
         let grid = &frame.grid;
         let mut alpha = vec![0.0; grid.width * grid.height];
         for (tile, canvas) in self.canvas.iter().enumerate() {
-            for_each_pixel(grid, tile, |y, x, at| {
-                alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][y][x];
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
             });
         }
         // Views of one step draw apart from each other.
@@ -97,9 +108,9 @@ impl CpuBackend {
         let weight = |at: usize| target.mask.as_ref().map_or(1.0, |m| f32::from(m[at]) / 255.0);
         let mut error = vec![0.0; pixels];
         for (tile, canvas) in self.canvas.iter().enumerate() {
-            for_each_pixel(grid, tile, |y, x, at| {
+            for_each_pixel(grid, tile, |patch, lane, at| {
                 let truth = target.composited(at % grid.width, at / grid.width, background);
-                let difference = |i: usize| (canvas.planes[i][y][x] - truth[i]).abs();
+                let difference = |i: usize| (canvas.planes[i][patch][lane] - truth[i]).abs();
                 error[at] = weight(at) * (difference(0) + difference(1) + difference(2)) / 3.0;
             });
         }
@@ -111,8 +122,8 @@ impl CpuBackend {
         stretch(&mut edge);
         for (tile, gradient) in self.gradient.iter_mut().enumerate() {
             gradient.planes[MAP] = DARK;
-            for_each_pixel(grid, tile, |y, x, at| {
-                gradient.planes[MAP][y][x] = map.error * error[at] + map.edge * edge[at];
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                gradient.planes[MAP][patch][lane] = map.error * error[at] + map.edge * edge[at];
             });
         }
     }
@@ -235,8 +246,10 @@ impl WithSimd for Replay<'_> {
         let Self { splats, list, place, map, records } = self;
         let c = |x: f32| V::splat(s, x);
         let zero = V::zero(s);
+        // Row after row of the tile, where planes go patch by patch.
+        let map: [[f32; TILE]; TILE] = std::array::from_fn(|y| row_of_plane(map, y));
         // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
-        let mut light = DARK;
+        let mut light = [[0.0; TILE]; TILE];
         for row in &mut light[..place.height] {
             row[..place.width].fill(1.0);
         }
@@ -255,7 +268,7 @@ impl WithSimd for Replay<'_> {
                 }
                 let shift = splat.shear.mul_add(dy, mx);
                 let (top, offset) = (c(top), c(shift * -splat.l1));
-                for at in (0..WIDTH).step_by(S::F32_LANES) {
+                for at in (0..TILE).step_by(S::F32_LANES) {
                     let centres = V::load(s, &CENTRES[at..]);
                     let u = c(splat.l1).mul_add(centres, offset);
                     let e = u.neg_mul_add(u, top);
@@ -275,7 +288,7 @@ impl WithSimd for Replay<'_> {
                     left.store(&mut light[y][at..]);
                 }
                 #[expect(clippy::float_cmp, reason = "who has stopped has exactly none")]
-                let all_stopped = light[y] == [0.0; WIDTH];
+                let all_stopped = light[y] == [0.0; TILE];
                 if all_stopped {
                     alive &= !(1 << y);
                 }

@@ -11,7 +11,7 @@ use super::loss::LossValue;
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
-    CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
+    CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
 use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
 use super::regularise::{Noise, Terms};
@@ -183,13 +183,14 @@ impl CpuBackend {
     ) {
         let Frame { grid, .. } = frame;
         let Self { canvas, gradient, loss, candidates, .. } = self;
-        let place = |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, y % TILE, x % TILE);
+        let place =
+            |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, in_plane(x % TILE, y % TILE));
         let error = |x: usize, y: usize| {
-            let (tile, y_in, x_in) = place(x, y);
-            let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][y_in][x_in];
+            let (tile, (patch, lane)) = place(x, y);
+            let alpha = 1.0 - canvas[tile].planes[TRANSMITTANCE][patch][lane];
             (alpha >= request.min_alpha).then(|| match request.error {
                 ErrorMode::Gradient => {
-                    let g = |channel: usize| gradient[tile].planes[channel][y_in][x_in];
+                    let g = |channel: usize| gradient[tile].planes[channel][patch][lane];
                     (g(0) * g(0) + g(1) * g(1) + g(2) * g(2)).sqrt()
                 }
                 ErrorMode::L1 | ErrorMode::L1Dssim => loss.error_at(x, y),
@@ -249,12 +250,12 @@ impl CpuBackend {
             depth: vec![0.0; pixels],
         };
         for (tile, canvas) in self.canvas.iter().enumerate() {
-            for_each_pixel(grid, tile, |y, x, at| {
+            for_each_pixel(grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
-                    out.rgb[3 * at + channel] = canvas.planes[channel][y][x];
+                    out.rgb[3 * at + channel] = canvas.planes[channel][patch][lane];
                 }
-                out.alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][y][x];
-                out.depth[at] = canvas.planes[DEPTH][y][x];
+                out.alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
+                out.depth[at] = canvas.planes[DEPTH][patch][lane];
             });
         }
         out
@@ -325,13 +326,14 @@ pub(super) fn parts<T>(buffer: &mut [T], per_task: usize, tasks: usize) -> Vec<&
     buffer.chunks_mut(per_task).collect()
 }
 
-/// Calls `f(y, x within the tile, pixel of the image)` for every pixel of a tile inside the image.
+/// Calls `f(patch, lane, pixel of the image)` for every pixel of a tile inside the image.
 pub(super) fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize, usize)) {
     let place = TilePlace::new(grid, tile);
     for y in 0..place.height {
         for x in 0..place.width {
             let at = (place.y as usize + y) * grid.width + place.x as usize + x;
-            f(y, x, at);
+            let (patch, lane) = in_plane(x, y);
+            f(patch, lane, at);
         }
     }
 }

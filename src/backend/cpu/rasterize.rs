@@ -2,10 +2,11 @@
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255; a pixel stops, without that
 //! splat, where its transmittance would fall to 1e-4 or below.
 //!
-//! One tile at a time, and within it one row of sixteen pixels per splat at a time. Per row the
-//! exponent is a parabola in x: u = l1·x + c, e = e₀ − u² (base 2, opacity folded in), so that a
-//! pixel costs two operations before its exp2. A bit per row says whether any of its pixels still
-//! takes light.
+//! One tile at a time, and within it one patch of 4×4 pixels per splat at a time: a vector. Most
+//! splats are a few pixels wide, and patches cover them with a third fewer vectors than rows of
+//! sixteen pixels do. In the coordinates (u, z) = Lᵀ·d the exponent is e = log₂o − u² − z²; from
+//! patch to patch u and z only move by a constant each. A bit per patch says whether the splat
+//! reaches it, another whether any of its pixels still takes light.
 
 use std::sync::atomic::AtomicU64;
 
@@ -27,10 +28,45 @@ pub(super) const CANVAS_PLANES: usize = 5;
 pub(super) const TRANSMITTANCE: usize = 3;
 pub(super) const DEPTH: usize = 4;
 
-/// The pixels of one tile, row by row.
-pub(super) type Plane = [[f32; WIDTH]; TILE];
+/// Side of a patch `[px]`: its pixels are one vector, row by row.
+const PATCH: usize = 4;
+/// Patches along a tile's side, and, as it happens, in a vector: a tile has as many patches as a
+/// patch has pixels.
+const ACROSS: usize = TILE / PATCH;
+const PATCHES: usize = ACROSS * ACROSS;
+const _: () = assert!(PATCH * PATCH == WIDTH && PATCHES == WIDTH);
+
+/// The pixels of one tile, patch by patch, both row by row; see [`in_plane`].
+pub(super) type Plane = [[f32; WIDTH]; PATCHES];
+
+/// Patch and lane of a tile's pixel.
+#[inline(always)]
+pub(super) const fn in_plane(x: usize, y: usize) -> (usize, usize) {
+    (y / PATCH * ACROSS + x / PATCH, y % PATCH * PATCH + x % PATCH)
+}
+
+/// Copies row `y` of a tile out of its plane.
+#[inline(always)]
+pub(super) fn row_of_plane(plane: &Plane, y: usize) -> [f32; TILE] {
+    let mut row = [0.0; TILE];
+    for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks_mut::<PATCH>().0) {
+        let (patch, lane) = in_plane(x, y);
+        pixels.copy_from_slice(&plane[patch][lane..lane + PATCH]);
+    }
+    row
+}
+
+/// Copies row `y` of a tile into its plane.
+#[inline(always)]
+pub(super) fn set_row_of_plane(plane: &mut Plane, y: usize, row: &[f32; TILE]) {
+    for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks::<PATCH>().0) {
+        let (patch, lane) = in_plane(x, y);
+        plane[patch][lane..lane + PATCH].copy_from_slice(pixels);
+    }
+}
+
 /// A plane of zeros.
-pub(super) const DARK: Plane = [[0.0; WIDTH]; TILE];
+pub(super) const DARK: Plane = [[0.0; WIDTH]; PATCHES];
 
 /// One rendered tile.
 #[derive(Debug, Clone)]
@@ -38,13 +74,14 @@ pub(super) const DARK: Plane = [[0.0; WIDTH]; TILE];
 pub(super) struct TileCanvas {
     /// Red, green, blue (background included), final transmittance, depth.
     pub(super) planes: [Plane; CANVAS_PLANES],
-    /// Place in the tile's list at which each pixel stopped; `u32::MAX` if it did not.
-    pub(super) stop: [[u32; WIDTH]; TILE],
+    /// Place in the tile's list at which each pixel stopped; `u32::MAX` if it did not, 0 outside the
+    /// image.
+    pub(super) stop: [[u32; WIDTH]; PATCHES],
 }
 
 impl TileCanvas {
     pub(super) const EMPTY: Self =
-        Self { planes: [DARK; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; TILE] };
+        Self { planes: [DARK; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; PATCHES] };
 }
 
 /// Where a tile lies in the image.
@@ -70,54 +107,89 @@ impl TilePlace {
     }
 }
 
-/// A splat in one tile: everything that is constant along a row of pixels.
+/// A splat in one tile: everything that is constant over a patch.
 #[repr(align(64))]
-pub(super) struct Rows {
-    /// Bit y: row y may hold a pixel with alpha >= 1/255.
+pub(super) struct Patches {
+    /// Bit per patch: whether it may hold a pixel with alpha >= 1/255.
     pub(super) mask: u32,
-    /// e₀ per row.
-    pub(super) top: [f32; WIDTH],
-    /// c per row.
-    pub(super) offset: [f32; WIDTH],
-    /// z = l3·dy per row.
-    pub(super) z: [f32; WIDTH],
+    /// What to add to [`Within::u`] and [`Within::z`], per patch.
+    pub(super) u: [f32; PATCHES],
+    pub(super) z: [f32; PATCHES],
 }
 
-impl Rows {
-    pub(super) const EMPTY: Self =
-        Self { mask: 0, top: [0.0; WIDTH], offset: [0.0; WIDTH], z: [0.0; WIDTH] };
+/// u and z of a patch's pixels relative to its upper left corner.
+pub(super) struct Within<S: Simd> {
+    l1: V<S>,
+    /// Derivative of u by y.
+    u_by_y: V<S>,
+    l3: V<S>,
+}
+
+impl<S: Simd> Within<S> {
+    #[inline(always)]
+    pub(super) fn new(s: S, splat: &Splat) -> Self {
+        let c = |x: f32| V::splat(s, x);
+        Self { l1: c(splat.l1), u_by_y: c(-splat.l1 * splat.shear), l3: c(splat.l3) }
+    }
+
+    #[inline(always)]
+    pub(super) fn u(&self, s: S, at: usize) -> V<S> {
+        self.l1.mul_add(V::load(s, &LANE_X[at..]), self.u_by_y * V::load(s, &LANE_Y[at..]))
+    }
+
+    #[inline(always)]
+    pub(super) fn z(&self, s: S, at: usize) -> V<S> {
+        self.l3 * V::load(s, &LANE_Y[at..])
+    }
+}
+
+impl Patches {
+    pub(super) const EMPTY: Self = Self { mask: 0, u: [0.0; PATCHES], z: [0.0; PATCHES] };
 
     #[inline(always)]
     pub(super) fn set<S: Simd>(&mut self, s: S, splat: &Splat, place: &TilePlace) {
         let c = |x: f32| V::splat(s, x);
+        let Splat { l1, shear, l3, .. } = *splat;
         let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
+        // From a patch's corner to the middle of its pixels' centres, and on to the outermost.
+        let (middle, half) = (0.5 * PATCH as f32, 0.5 * (PATCH - 1) as f32);
+        let (u_middle, z_middle) = (c(l1 * (1.0 - shear) * middle), c(l3 * middle));
+        // With slack for rounding.
+        let u_half = c(l1 * (1.0 + shear.abs()) * half * 1.0001 + 1e-3);
+        let z_half = c(l3 * half * 1.0001 + 1e-3);
         self.mask = 0;
         for at in (0..WIDTH).step_by(S::F32_LANES) {
-            let dy = V::load(s, &CENTRES[at..]) - my;
-            let z = dy * splat.l3;
-            let top = z.neg_mul_add(z, c(splat.log2_opacity));
-            let shift = c(splat.shear).mul_add(dy, c(mx));
+            let dy = V::load(s, &CORNER_Y[at..]) - my;
+            let dx = c(shear).neg_mul_add(dy, V::load(s, &CORNER_X[at..]) - mx);
+            let (u, z) = (dx * l1, dy * l3);
+            u.store(&mut self.u[at..]);
             z.store(&mut self.z[at..]);
-            top.store(&mut self.top[at..]);
-            (shift * -splat.l1).store(&mut self.offset[at..]);
-            // Least |x − shift| of the tile's pixel centres, ½ … 15½, with slack for rounding.
-            let nearest = ((shift - 8.0).abs() * 0.9999 - 7.51).max(V::zero(s)) * splat.l1;
-            let reached = (nearest * nearest).le(top + (LOG2_255 + 1e-3));
+            // The least |u| and |z| of the patch.
+            let u = ((u + u_middle).abs() - u_half).max(V::zero(s));
+            let z = ((z + z_middle).abs() - z_half).max(V::zero(s));
+            let reached = u.mul_add(u, z * z).le(c(splat.log2_opacity + LOG2_255 + 1e-3));
             self.mask |= reached.bits() << at;
         }
     }
 }
 
-/// Pixel centres within a tile.
-pub(super) const CENTRES: [f32; WIDTH] = {
-    let mut centres = [0.5; WIDTH];
+/// Pixel centres within a patch, and corners of a tile's patches.
+const LANE_X: [f32; WIDTH] = grid(true, 1.0, 0.5);
+const LANE_Y: [f32; WIDTH] = grid(false, 1.0, 0.5);
+const CORNER_X: [f32; PATCHES] = grid(true, PATCH as f32, 0.0);
+const CORNER_Y: [f32; PATCHES] = grid(false, PATCH as f32, 0.0);
+
+/// One coordinate of the points of a 4×4 grid, row by row.
+const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
+    let mut values = [0.0; WIDTH];
     let mut i = 0;
     while i < WIDTH {
-        centres[i] = i as f32 + 0.5;
+        let index = if x { i % PATCH } else { i / PATCH };
+        values[i] = index as f32 * step + first;
         i += 1;
     }
-    centres
-};
+    values
+}
 
 /// Renders one tile.
 pub(super) struct Rasterize<'a> {
@@ -149,56 +221,68 @@ impl Rasterize<'_> {
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
             *plane = DARK;
         }
-        *stop = [[u32::MAX; WIDTH]; TILE];
+        *stop = [[u32::MAX; WIDTH]; PATCHES];
         // Transmittance while the pixel takes light; 0 once it has stopped (its last value is then
         // in `finished`) and from the start outside the image.
         let mut light = Aligned(DARK);
         let light = &mut light.0;
-        for row in &mut light[..place.height] {
-            row[..place.width].fill(1.0);
+        let mut alive = 0_u32;
+        if place.width == TILE && place.height == TILE {
+            *light = [[1.0; WIDTH]; PATCHES];
+            alive = (1 << PATCHES) - 1;
+        } else {
+            *stop = [[0; WIDTH]; PATCHES];
+            for y in 0..place.height {
+                for x in 0..place.width {
+                    let (patch, lane) = in_plane(x, y);
+                    light[patch][lane] = 1.0;
+                    stop[patch][lane] = u32::MAX;
+                    alive |= 1 << patch;
+                }
+            }
         }
-        let mut alive = (1_u32 << place.height) - 1;
         let mut batch = [Splat::default(); BATCH];
-        let mut rows = Rows::EMPTY;
+        let mut patches = Patches::EMPTY;
 
         'list: for (n, chunk) in list.chunks(BATCH).enumerate() {
             for (splat, entry) in batch.iter_mut().zip(chunk) {
                 *splat = splats[Entry::load(entry).row];
             }
             for (i, splat) in batch[..chunk.len()].iter().enumerate() {
-                rows.set(s, splat, &place);
-                let mut todo = rows.mask & alive;
-                let l1 = c(splat.l1);
+                patches.set(s, splat, &place);
+                let mut todo = patches.mask & alive;
+                let within = Within::new(s, splat);
+                let log2_opacity = c(splat.log2_opacity);
                 let colour = each!(i in 3 => c(splat.colour[i]));
-                let z = c(splat.depth);
+                let at_depth = c(splat.depth);
                 while todo != 0 {
                     // The mask has sixteen bits; saying so again spares every load its bounds check.
-                    let y = todo.trailing_zeros() as usize % TILE;
+                    let p = todo.trailing_zeros() as usize % PATCHES;
                     todo &= todo - 1;
-                    let (top, offset) = (c(rows.top[y]), c(rows.offset[y]));
+                    let (to_u, to_z) = (c(patches.u[p]), c(patches.z[p]));
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let u = l1.mul_add(V::load(s, &CENTRES[at..]), offset);
-                        let e = u.neg_mul_add(u, top);
+                        let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
+                        let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
                         let seen = c(-LOG2_255).le(e);
                         let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &light[y][at..]);
+                        let t = V::load(s, &light[p][at..]);
                         let next = alpha.neg_mul_add(t, t);
                         let goes_on = c(TRANSMITTANCE_MIN).lt(next).and(seen);
                         let w = goes_on.keep(alpha * t);
-                        blend(s, w, colour[0], &mut red[y][at..]);
-                        blend(s, w, colour[1], &mut green[y][at..]);
-                        blend(s, w, colour[2], &mut blue[y][at..]);
+                        blend(s, w, colour[0], &mut red[p][at..]);
+                        blend(s, w, colour[1], &mut green[p][at..]);
+                        blend(s, w, colour[2], &mut blue[p][at..]);
                         if WITH_DEPTH {
-                            blend(s, w, z, &mut depth[y][at..]);
+                            blend(s, w, at_depth, &mut depth[p][at..]);
                         }
-                        goes_on.select(next, t).store(&mut light[y][at..]);
+                        goes_on.select(next, t).store(&mut light[p][at..]);
                         let stops = next.le(c(TRANSMITTANCE_MIN)).and(seen).and(V::zero(s).lt(t));
                         if stops.any() {
                             let place_in_list = (n * BATCH + i) as u32;
                             stop_pixels(
-                                &mut light[y][at..at + S::F32_LANES],
-                                &mut finished[y][at..],
-                                &mut stop[y][at..],
+                                &mut light[p][at..at + S::F32_LANES],
+                                &mut finished[p][at..],
+                                &mut stop[p][at..],
                                 stops.keep(c(1.0)),
                                 place_in_list,
                             );
@@ -206,9 +290,9 @@ impl Rasterize<'_> {
                                 clippy::float_cmp,
                                 reason = "who has stopped has exactly none"
                             )]
-                            let all_stopped = light[y] == [0.0; WIDTH];
+                            let all_stopped = light[p] == [0.0; WIDTH];
                             if all_stopped {
-                                alive &= !(1 << y);
+                                alive &= !(1 << p);
                             }
                         }
                     }
@@ -218,13 +302,13 @@ impl Rasterize<'_> {
                 }
             }
         }
-        for y in 0..TILE {
+        for p in 0..PATCHES {
             for at in (0..WIDTH).step_by(S::F32_LANES) {
-                let t = V::load(s, &light[y][at..]).max(V::load(s, &finished[y][at..]));
-                t.store(&mut finished[y][at..]);
-                blend(s, t, c(background[0]), &mut red[y][at..]);
-                blend(s, t, c(background[1]), &mut green[y][at..]);
-                blend(s, t, c(background[2]), &mut blue[y][at..]);
+                let t = V::load(s, &light[p][at..]).max(V::load(s, &finished[p][at..]));
+                t.store(&mut finished[p][at..]);
+                blend(s, t, c(background[0]), &mut red[p][at..]);
+                blend(s, t, c(background[1]), &mut green[p][at..]);
+                blend(s, t, c(background[2]), &mut blue[p][at..]);
             }
         }
     }

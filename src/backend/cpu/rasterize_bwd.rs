@@ -20,10 +20,10 @@ use pulp::{Simd, WithSimd};
 
 use super::project::{LOG2_255, Splat};
 use super::rasterize::{
-    ALPHA_MAX, Aligned, BATCH, CENTRES, DARK, Plane, Rows, TRANSMITTANCE, TileCanvas, TilePlace,
+    ALPHA_MAX, Aligned, BATCH, DARK, Patches, Plane, TRANSMITTANCE, TileCanvas, TilePlace, Within,
 };
-use super::simd::{V, WIDTH, each};
-use super::tiles::{Entry, TILE};
+use super::simd::{V, WIDTH, each, sums_of_four};
+use super::tiles::Entry;
 
 /// Fields of a record.
 pub(super) mod field {
@@ -140,27 +140,24 @@ impl RasterizeBwd<'_> {
         let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
         let mut behind = Aligned(DARK);
         let (light, behind) = (&mut light.0, &mut behind.0);
-        for y in 0..TILE {
+        // One past the last list entry that any pixel of the patch takes.
+        let mut patch_end = [0_u32; WIDTH];
+        for (p, end) in patch_end.iter_mut().enumerate() {
             for at in (0..WIDTH).step_by(S::F32_LANES) {
-                let b = V::load(s, &gr[y][at..]) * background[0]
-                    + V::load(s, &gg[y][at..]) * background[1]
-                    + V::load(s, &gb[y][at..]) * background[2];
-                b.store(&mut behind[y][at..]);
+                let b = V::load(s, &gr[p][at..]) * background[0]
+                    + V::load(s, &gg[p][at..]) * background[1]
+                    + V::load(s, &gb[p][at..]) * background[2];
+                b.store(&mut behind[p][at..]);
             }
+            *end = canvas.stop[p].iter().copied().max().unwrap_or(0).min(list.len() as u32);
         }
-        // One past the last list entry that any pixel of the row takes.
-        let mut row_end = [0_u32; TILE];
-        for (y, end) in row_end.iter_mut().enumerate().take(place.height) {
-            let row = &canvas.stop[y][..place.width];
-            *end = row.iter().copied().max().unwrap_or(0).min(list.len() as u32);
-        }
-        let list_end = row_end.iter().copied().max().unwrap_or(0) as usize;
+        let list_end = patch_end.iter().copied().max().unwrap_or(0) as usize;
         for entry in &list[list_end..] {
             write(record_of(records, entry, stride), &[0.0; field::ALL]);
         }
 
         let mut batch = [Splat::default(); BATCH];
-        let mut rows = Rows::EMPTY;
+        let mut patches = Patches::EMPTY;
         let batches = list_end.div_ceil(BATCH);
         for n in (0..batches).rev() {
             let first = n * BATCH;
@@ -169,13 +166,14 @@ impl RasterizeBwd<'_> {
                 *splat = splats[Entry::load(entry).row];
             }
             let mut alive = 0_u32;
-            for (y, &end) in row_end.iter().enumerate() {
-                alive |= u32::from(end as usize > first) << y;
+            for (p, &end) in patch_end.iter().enumerate() {
+                alive |= u32::from(end as usize > first) << p;
             }
             for (i, splat) in batch[..chunk.len()].iter().enumerate().rev() {
-                rows.set(s, splat, &place);
-                let mut todo = rows.mask & alive;
-                let l1 = c(splat.l1);
+                patches.set(s, splat, &place);
+                let mut todo = patches.mask & alive;
+                let within = Within::new(s, splat);
+                let log2_opacity = c(splat.log2_opacity);
                 let colour = each!(i in 3 => c(splat.colour[i]));
                 let at_depth = c(splat.depth);
                 let here = s.splat_u32s((first + i) as u32);
@@ -190,33 +188,34 @@ impl RasterizeBwd<'_> {
                     weight_max: zero,
                 };
                 while todo != 0 {
-                    let y = todo.trailing_zeros() as usize % TILE;
+                    // The mask has sixteen bits; saying so again spares every load its bounds check.
+                    let p = todo.trailing_zeros() as usize % WIDTH;
                     todo &= todo - 1;
-                    let (top, offset, z) = (c(rows.top[y]), c(rows.offset[y]), c(rows.z[y]));
+                    let (to_u, to_z) = (c(patches.u[p]), c(patches.z[p]));
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let u = l1.mul_add(V::load(s, &CENTRES[at..]), offset);
-                        let e = u.neg_mul_add(u, top);
-                        let stop = S::as_simd_u32s(&canvas.stop[y][at..]).0[0];
+                        let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
+                        let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
+                        let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
                         let seen = c(-LOG2_255).le(e).and(super::simd::before(s, here, stop));
                         let unclamped = e.exp2();
                         let alpha = seen.keep(unclamped.min(c(ALPHA_MAX)));
-                        let t = V::load(s, &light[y][at..]) / (c(1.0) - alpha);
-                        t.store(&mut light[y][at..]);
+                        let t = V::load(s, &light[p][at..]) / (c(1.0) - alpha);
+                        t.store(&mut light[p][at..]);
                         let w = alpha * t;
                         let (r, g, b) = (
-                            V::load(s, &gr[y][at..]),
-                            V::load(s, &gg[y][at..]),
-                            V::load(s, &gb[y][at..]),
+                            V::load(s, &gr[p][at..]),
+                            V::load(s, &gg[p][at..]),
+                            V::load(s, &gb[p][at..]),
                         );
                         let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
                         if DETAIL == 2 {
-                            let d = V::load(s, &gd[y][at..]);
-                            own = at_depth.mul_add(d, own + V::load(s, &ga[y][at..]));
+                            let d = V::load(s, &gd[p][at..]);
+                            own = at_depth.mul_add(d, own + V::load(s, &ga[p][at..]));
                             sums.depth = w.mul_add(d, sums.depth);
                         }
-                        let was = V::load(s, &behind[y][at..]);
+                        let was = V::load(s, &behind[p][at..]);
                         let ahead = own - was;
-                        alpha.mul_add(ahead, was).store(&mut behind[y][at..]);
+                        alpha.mul_add(ahead, was).store(&mut behind[p][at..]);
                         // No gradient where alpha is at its clamp.
                         let q = unclamped.le(c(ALPHA_MAX)).keep(w * ahead);
                         let qu = q * u;
@@ -244,9 +243,10 @@ impl RasterizeBwd<'_> {
                     }
                 }
                 let mut record = [0.0; field::ALL];
-                for (slot, sum) in record.iter_mut().zip(sums.few) {
-                    *slot = sum.sum();
-                }
+                let [q, u, z, uu, uz, zz, red, green, blue] = sums.few;
+                record[..4].copy_from_slice(&sums_of_four([q, u, z, uu]));
+                record[4..8].copy_from_slice(&sums_of_four([uz, zz, red, green]));
+                record[field::COLOUR + 2] = blue.sum();
                 match DETAIL {
                     1 => record[field::FEW] = sums.weight_max.max_lane(),
                     2 => {
@@ -278,12 +278,25 @@ fn write(to: &[AtomicU32], record: &[f32; field::ALL]) {
     }
 }
 
-/// Adds the records of one row, which lie side by side, to its sums, in order.
+/// The sums over the records of one row, which lie side by side, in order. `sums` has the shape of a
+/// record.
 pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
-    for record in records.chunks_exact(detail.stride()) {
-        for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
-            let x = f32::from_bits(x.load(Relaxed));
-            *sum = if detail.maximum() == Some(i) { sum.max(x) } else { *sum + x };
+    match detail {
+        Detail::Gradients => gather_all::<{ Detail::Gradients.stride() }>(sums, detail, records),
+        Detail::WeightMax => gather_all::<{ Detail::WeightMax.stride() }>(sums, detail, records),
+        Detail::All => gather_all::<{ Detail::All.stride() }>(sums, detail, records),
+    }
+}
+
+/// Adds to what `sums` holds.
+#[inline(always)]
+fn gather_all<const STRIDE: usize>(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
+    let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
+    for record in records.as_chunks::<STRIDE>().0 {
+        for i in 0..STRIDE {
+            let x = f32::from_bits(record[i].load(Relaxed));
+            total[i] = if detail.maximum() == Some(i) { total[i].max(x) } else { total[i] + x };
         }
     }
+    sums.copy_from_slice(&total);
 }

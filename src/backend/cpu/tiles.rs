@@ -14,15 +14,18 @@
 //! consecutive tiles whose lists fit. Tiles are independent, and each row's gradients are summed in
 //! order of tile number, so bands change no bit of the result.
 //!
-//! Entries are counted and emitted by the same function on the same values, and Rust never
-//! contracts floating-point expressions; so the two passes agree.
+//! Counting notes the tiles of a row as bits where its slots will stand, so that its ellipse is
+//! evaluated once. Only of rows that reach farther than the bits do, it is evaluated again when
+//! entries are emitted: by the same function on the same values, and Rust never contracts
+//! floating-point expressions; so the two passes agree.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use super::project::{LOG2_255, Splat};
+use super::footprint::Footprint;
+use super::project::Splat;
 use super::simd::WIDTH;
 
 /// Side of a tile `[px]`.
@@ -96,8 +99,8 @@ pub(super) struct TileLists {
     entries: Vec<AtomicU64>,
     /// The row of each slot. Shape: `[cap]`.
     row_of_slot: Vec<u32>,
-    /// First slot and number of slots of each row; meaningless for rows not visible.
-    /// Shape: `[budget]`.
+    /// First slot and number of slots of each row; meaningless for rows not visible. Between
+    /// counting and emitting, a [`Footprint`] instead. Shape: `[budget]`.
     slots: Vec<[u32; 2]>,
     /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
@@ -197,9 +200,10 @@ impl TileLists {
                 let rows = i * chunk..i * chunk + slots.len();
                 visible.each(rows.clone(), |row, splat| {
                     let before = filled;
-                    for_each_tile(splat, grid, &band, |tile| {
-                        let slot = (first + filled) as u64;
-                        let key = u64::from(splat.depth.to_bits()) << 32 | slot;
+                    let depth = u64::from(splat.depth.to_bits()) << 32;
+                    let footprint = Footprint(slots[row - rows.start]);
+                    footprint.for_each_tile(splat, grid, &band, |tile| {
+                        let key = depth | (first + filled) as u64;
                         entries[cursors[tile] as usize].store(key, Relaxed);
                         cursors[tile] += 1;
                         row_of_slot[filled] = row as u32;
@@ -224,9 +228,13 @@ impl TileLists {
         let chunk = chunk_rows(rows, tiles);
         self.counters.clear();
         self.counters.resize(rows.div_ceil(chunk).max(1) * tiles, 0);
-        self.counters.par_chunks_mut(tiles.max(1)).enumerate().for_each(|(i, counters)| {
-            visible.each(i * chunk..((i + 1) * chunk).min(rows), |_, splat| {
-                for_each_tile(splat, grid, &band, |tile| counters[tile] += 1);
+        let counters = self.counters.par_chunks_mut(tiles.max(1));
+        let work = counters.zip(self.slots[..rows].par_chunks_mut(chunk)).enumerate();
+        work.for_each(|(i, (counters, slots))| {
+            let first = i * chunk;
+            visible.each(first..first + slots.len(), |row, splat| {
+                let footprint = Footprint::new(splat, grid, &band, |tile| counters[tile] += 1);
+                slots[row - first] = footprint.0;
             });
         });
     }
@@ -261,55 +269,4 @@ impl TileLists {
 fn chunk_rows(rows: usize, tiles: usize) -> usize {
     let chunks = (MOST_COUNTERS / tiles.max(1)).clamp(1, MOST_CHUNKS);
     rows.div_ceil(chunks).max(512).next_multiple_of(WIDTH)
-}
-
-/// Slack for the bounds of an ellipse [px]: their rounding errors, f32's at 16,384 px, are far less
-/// relative to the ellipse's size, and a pixel missed at the bound has an alpha of 1/255.
-const SLACK: f32 = 0.02;
-
-/// Calls `f` with the number, relative to the band, of every tile of the band that the splat's
-/// ellipse touches, in ascending order.
-#[inline]
-fn for_each_tile(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(usize)) {
-    let [mx, my] = splat.mean;
-    let (hw, hh) = (splat.half_width * 1.0001 + SLACK, splat.half_height * 1.0001 + SLACK);
-    // Index of the tile whose pixel centres are the first at or after (last at or before) a bound.
-    // `as` saturates, and makes NaN 0.
-    let tile_of = |x: f32, most: usize| ((x * (1.0 / TILE as f32)).max(0.0) as usize).min(most - 1);
-    let (x0, x1) = (tile_of(mx - hw - 0.5, grid.columns), tile_of(mx + hw - 0.5, grid.columns));
-    let (y0, y1) = (tile_of(my - hh - 0.5, grid.rows), tile_of(my + hh - 0.5, grid.rows));
-    let (first_row, last_row) = (band.start / grid.columns, band.end.div_ceil(grid.columns));
-    if x0 == x1 || y0 == y1 {
-        for ty in y0.max(first_row)..(y1 + 1).min(last_row) {
-            for tx in x0..=x1 {
-                let tile = ty * grid.columns + tx;
-                if band.contains(&tile) {
-                    f(tile - band.start);
-                }
-            }
-        }
-        return;
-    }
-    // In folded units the ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy. Its
-    // rightmost point is at dy = peak, its leftmost at dy = −peak.
-    let Splat { shear, l3, inv_l1, peak, .. } = *splat;
-    let reach = splat.log2_opacity + LOG2_255;
-    for ty in y0.max(first_row)..(y1 + 1).min(last_row) {
-        let top = ((ty * TILE) as f32 + 0.5 - my).max(-hh);
-        let bottom = ((ty * TILE + TILE) as f32 - 0.5 - my).min(hh);
-        let half = |dy: f32| (reach - (l3 * dy) * (l3 * dy)).max(0.0).sqrt() * inv_l1;
-        let right_at = peak.max(top).min(bottom);
-        let left_at = (-peak).max(top).min(bottom);
-        let right = (shear * right_at + half(right_at)).min(hw);
-        let left = (shear * left_at - half(left_at)).max(-hw);
-        let (right, left) = (right + 1e-4 * right.abs() + SLACK, left - 1e-4 * left.abs() - SLACK);
-        let from = tile_of(mx + left - 0.5, grid.columns).max(x0);
-        let to = tile_of(mx + right - 0.5, grid.columns).min(x1);
-        for tx in from..=to {
-            let tile = ty * grid.columns + tx;
-            if band.contains(&tile) {
-                f(tile - band.start);
-            }
-        }
-    }
 }

@@ -37,6 +37,7 @@ struct Session<'a> {
     window: Window,
     wall: Duration,
     cpu: Option<Duration>,
+    stages: BTreeMap<&'static str, Duration>,
     tested: BTreeMap<u32, Mean>,
 }
 
@@ -112,6 +113,7 @@ impl<'a> Session<'a> {
             window: Window::default(),
             wall: Duration::ZERO,
             cpu: Some(Duration::ZERO),
+            stages: BTreeMap::new(),
             tested: BTreeMap::new(),
             run,
             console,
@@ -125,6 +127,9 @@ impl<'a> Session<'a> {
         self.wall += wall.elapsed();
         let spent = cpu.and_then(|start| start.try_elapsed().ok());
         self.cpu = self.cpu.zip(spent).map(|(sum, spent)| sum + spent);
+        for &(stage, time) in self.run.trainer.backend().stage_times() {
+            *self.stages.entry(stage).or_default() += time;
+        }
         match stepped {
             Ok(report) => {
                 self.record(&report)?;
@@ -215,6 +220,7 @@ impl<'a> Session<'a> {
             ledger_bytes: ledger.total(),
             ledger: ledger.clone(),
             seconds: self.wall.as_secs_f64(),
+            stage_seconds: self.stages.iter().map(|(&k, time)| (k, time.as_secs_f64())).collect(),
             cpu_seconds: self.cpu.map(|cpu| cpu.as_secs_f64()),
             train_views: trainer.views().count(),
             test_views: test.count(),

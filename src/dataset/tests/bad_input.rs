@@ -252,6 +252,11 @@ fn no_damaged_byte_makes_it_panic() {
 fn transforms() {
     type Case = (&'static str, fn(&mut serde_json::Value), &'static [&'static str]);
     let cases: &[Case] = &[
+        (
+            "test split",
+            |j| j["test_filenames"] = serde_json::json!([1]),
+            &["transforms.json", "test_filenames", "list of file names"],
+        ),
         ("no frames", |j| j["frames"] = 3.into(), &["transforms.json", "frames"]),
         ("frame no object", |j| j["frames"][1] = 3.into(), &["frames[1]"]),
         ("zero frames", |j| j["frames"] = serde_json::json!([]), &["transforms.json", "no image"]),

@@ -91,6 +91,14 @@ fn splits() {
         assert_eq!(data.points.len(), 200);
     }
     assert_eq!(names(&load_with(&made, every(3)).test), ["images/a.png"]);
+
+    // So do the names that nerfstudio's file lists, with "./" before them or without.
+    for field in ["test_filenames", "val_filenames"] {
+        let made = Made::transforms(|json| json[field] = serde_json::json!(["images/b.png"]));
+        let data = load(&made);
+        assert_eq!(names(&data.train), ["images/a.png", "images/c.png"]);
+        assert_eq!(names(&data.test), ["images/b.png"]);
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! The program as its users meet it: arguments in, exit code, messages and files out.
 
+mod comparing;
 mod faults;
 mod looking;
 mod same;

@@ -1,0 +1,243 @@
+//! One run of a comparison, and the record that it leaves.
+
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::{POINTS, run_folder};
+use crate::cli::failure::{Failure, INPUT, OTHER};
+use crate::cli::number::grouped;
+use crate::output::{OutputError, write_atomically};
+
+/// What is run.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Cell {
+    pub(super) scene: PathBuf,
+    pub(super) label: String,
+    pub(super) policy: String,
+    pub(super) budget: usize,
+    pub(super) seed: u32,
+    pub(super) iterations: u32,
+    /// More options of `densify train`.
+    pub(super) train: Vec<String>,
+}
+
+impl fmt::Display for Cell {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { label, policy, budget, seed, .. } = self;
+        write!(f, "{label}, {policy}, {} rows, seed {seed}", grouped(*budget))
+    }
+}
+
+/// A line of `compare.jsonl`: what came of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Record {
+    /// Version of densify.
+    pub(super) densify: String,
+    pub(super) scene: String,
+    pub(super) policy: String,
+    pub(super) budget: usize,
+    pub(super) seed: u32,
+    pub(super) iterations: u32,
+    /// Folder of the run, in `runs`.
+    pub(super) run: String,
+    /// The call, but for the output folder: a run with the same is not run again.
+    pub(super) arguments: Vec<String>,
+    /// Mean over the views held out `[dB]`.
+    pub(super) psnr: f64,
+    /// Mean over the views held out.
+    pub(super) ssim: f64,
+    /// Rows at the end.
+    pub(super) rows: usize,
+    /// Most rows at any instant.
+    pub(super) peak_rows: usize,
+    /// Largest resident memory of the process.
+    pub(super) peak_bytes: Option<u64>,
+    /// Wall time of the steps.
+    pub(super) seconds: f64,
+    /// Processor time of the steps.
+    pub(super) cpu_seconds: Option<f64>,
+    /// Views rendered for the policy's decisions.
+    pub(super) extra_forwards: u64,
+    /// (iteration, PSNR) along the run.
+    pub(super) curve: Vec<(u32, f64)>,
+}
+
+impl Record {
+    /// Whether the budget was kept at every instant.
+    pub(super) fn is_bounded(&self) -> bool {
+        self.peak_rows <= self.budget
+    }
+}
+
+impl Cell {
+    /// The call of `densify` that runs this cell, but for the output folder.
+    fn arguments(&self) -> Vec<String> {
+        let tests: Vec<String> =
+            (1..POINTS).map(|i| (self.iterations * i / POINTS).max(1).to_string()).collect();
+        let mut arguments = vec!["train".to_owned(), self.scene.to_string_lossy().into_owned()];
+        let mut set = |name: &str, value: String| arguments.extend([name.to_owned(), value]);
+        set("--policy", self.policy.clone());
+        set("--budget", self.budget.to_string());
+        set("--seed", self.seed.to_string());
+        set("--iterations", self.iterations.to_string());
+        set("--test-iterations", tests.join(","));
+        arguments.push("--quiet".to_owned());
+        if !self.train.iter().any(|flag| flag == "--eval" || flag.starts_with("--test-every")) {
+            arguments.push("--eval".to_owned());
+        }
+        arguments.extend(self.train.iter().cloned());
+        arguments
+    }
+
+    fn run(&self) -> String {
+        let Self { label, policy, budget, seed, .. } = self;
+        format!("{label}-{policy}-{budget}-seed{seed}")
+    }
+
+    /// Trains in a process of its own, whose memory is then the run's and nobody else's.
+    ///
+    /// # Errors
+    /// With the trainer's message and exit code when it fails.
+    pub(super) fn train(&self, output: &Path) -> Result<Record, Failure> {
+        let other = |message: String| Failure { code: OTHER, message };
+        let program = std::env::current_exe()
+            .map_err(|e| other(format!("cannot find the program that is running: {e}")))?;
+        let run = self.run();
+        let folder = output.join("runs").join(&run);
+        let child = Command::new(program)
+            .args(self.arguments())
+            .arg("--overwrite")
+            .arg("--output")
+            .arg(&folder)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .output()
+            .map_err(|e| other(format!("cannot start a run: {e}")))?;
+        if !child.status.success() {
+            let said = String::from_utf8_lossy(&child.stderr);
+            let message = said.trim().trim_start_matches("error: ").to_owned();
+            let code = child.status.code().and_then(|code| u8::try_from(code).ok());
+            return Err(Failure { code: code.unwrap_or(OTHER), message }
+                .and(&format!("this was the run {self}; the same command goes on from here")));
+        }
+        self.record(&folder, run)
+    }
+
+    fn record(&self, folder: &Path, run: String) -> Result<Record, Failure> {
+        let path = folder.join("stats/summary.json");
+        let bad = |problem: String| Failure {
+            code: OTHER,
+            message: format!("{}: {problem}", path.display()),
+        };
+        let text = fs::read(&path).map_err(|e| bad(e.to_string()))?;
+        let summary: Value = serde_json::from_slice(&text).map_err(|e| bad(e.to_string()))?;
+        let number = |field: &str| {
+            summary[field].as_f64().ok_or_else(|| bad(format!("`{field}` is missing")))
+        };
+        let mut tests: Vec<(u32, f64, f64)> = summary["test"]
+            .as_object()
+            .into_iter()
+            .flatten()
+            .filter_map(|(step, mean)| {
+                Some((step.parse().ok()?, mean["PSNR"].as_f64()?, mean["SSIM"].as_f64()?))
+            })
+            .collect();
+        tests.sort_by_key(|&(step, ..)| step);
+        let Some(&(_, psnr, ssim)) = tests.last() else {
+            return Err(Failure {
+                code: INPUT,
+                message: format!("{}: no view is held out to measure", self.scene.display()),
+            });
+        };
+        Ok(Record {
+            densify: summary["densify"].as_str().unwrap_or_default().to_owned(),
+            scene: self.label.clone(),
+            policy: self.policy.clone(),
+            budget: self.budget,
+            seed: self.seed,
+            iterations: self.iterations,
+            run,
+            arguments: self.arguments(),
+            psnr,
+            ssim,
+            rows: number("rows")? as usize,
+            peak_rows: number("peak_rows")? as usize,
+            peak_bytes: summary["peak_bytes"].as_u64(),
+            seconds: number("seconds")?,
+            cpu_seconds: summary["cpu_seconds"].as_f64(),
+            extra_forwards: number("extra_forwards")? as u64,
+            curve: tests.into_iter().map(|(step, psnr, _)| (step, psnr)).collect(),
+        })
+    }
+}
+
+/// The records in `compare.jsonl`.
+pub(super) struct Records {
+    path: PathBuf,
+    all: Vec<Record>,
+}
+
+impl Records {
+    /// Reads what is there. A last line that was cut off is not: its run runs again.
+    ///
+    /// # Errors
+    /// When a line is no record.
+    pub(super) fn open(path: &Path) -> Result<Self, Failure> {
+        let text = match fs::read_to_string(path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
+            Err(e) => return Err(Failure::input(format!("{}: {e}", path.display()))),
+        };
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        let mut all = Vec::new();
+        for (i, line) in whole.lines().enumerate() {
+            all.push(serde_json::from_str(line).map_err(|e| {
+                Failure::input(format!(
+                    "{}, line {}: {e}; delete the line, and its run runs again",
+                    path.display(),
+                    i + 1
+                ))
+            })?);
+        }
+        Ok(Self { path: path.to_owned(), all })
+    }
+
+    /// The record of a cell whose run is finished.
+    pub(super) fn of(&self, cell: &Cell) -> Option<&Record> {
+        let arguments = cell.arguments();
+        let version = env!("CARGO_PKG_VERSION");
+        self.all.iter().rev().find(|r| r.arguments == arguments && r.densify == version)
+    }
+
+    /// Adds a record and writes them all.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(super) fn add(&mut self, record: Record) -> Result<(), OutputError> {
+        self.all.push(record);
+        let text = self.all.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));
+        write_atomically(&self.path, |out| {
+            for line in text {
+                out.write_all(line.map_err(std::io::Error::other)?.as_bytes())?;
+            }
+            Ok(())
+        })
+    }
+}
+
+/// (iteration, rows) along a run, from its log.
+pub(super) fn rows_over_time(output: &Path, record: &Record) -> Vec<(u32, f64)> {
+    let path = run_folder(output, record).join("stats/train.jsonl");
+    let text = fs::read_to_string(path).unwrap_or_default();
+    let steps = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let point = |step: Value| {
+        let iteration = u32::try_from(step["step"].as_u64()?).ok()?;
+        Some((iteration, step["rows"].as_f64()?))
+    };
+    steps.filter_map(point).collect()
+}

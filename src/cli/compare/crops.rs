@@ -1,0 +1,195 @@
+//! Crops at equal budget: the same window of the same view, by every policy.
+//!
+//! The window is chosen by a rule and not by hand: of all windows of a quarter of the picture's
+//! sides, over all views held out, the one whose photograph has the most edges.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use image::{ImageFormat, Rgb, RgbImage, imageops};
+
+use super::{Picture, Record, distinct, run_folder};
+use crate::cli::console::Console;
+use crate::cli::failure::Failure;
+use crate::cli::number::grouped;
+use crate::cli::run_files::{SplitArg, open_run};
+use crate::dataset::images::Image8;
+use crate::output::write_atomically;
+use crate::views::ViewSource;
+
+/// Width of a crop in the picture `[px]`; small ones are enlarged by whole numbers.
+const SHOWN: u32 = 240;
+/// Space between crops `[px]`.
+const GAP: u32 = 6;
+
+/// A window of a view.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Window {
+    x: u32,
+    y: u32,
+    width: u32,
+    height: u32,
+}
+
+/// Draws a row of crops for every scene and budget: the photograph, then every policy at the first
+/// seed. Runs whose model is gone are left out.
+///
+/// # Errors
+/// When a model cannot be rendered or a file cannot be written.
+pub(super) fn draw(
+    output: &Path,
+    records: &[&Record],
+    console: &Console,
+) -> Result<Vec<Picture>, Failure> {
+    let mut pictures = Vec::new();
+    for scene in distinct(records, |r| &r.scene) {
+        for budget in distinct(records, |r| r.budget) {
+            let here = records.iter().filter(|r| r.scene == *scene && r.budget == budget);
+            let here: Vec<&Record> = here.copied().collect();
+            let Some(seed) = here.iter().map(|r| r.seed).min() else { continue };
+            let mut crops = Vec::new();
+            let mut shown = vec!["photograph".to_owned()];
+            let mut place = None;
+            for record in here.into_iter().filter(|r| r.seed == seed) {
+                let folder = run_folder(output, record);
+                if !crate::output::model_path(&folder, record.iterations).is_file() {
+                    console.say(format_args!("note: {} is gone; no crop of it", folder.display()));
+                    continue;
+                }
+                let quiet = Console::new(true);
+                let mut opened = open_run(&folder, record.iterations, None, None, &quiet)?;
+                let views = opened.views(SplitArg::Test)?;
+                let background = opened.scene.background.fixed();
+                let image = |view: usize| {
+                    let image = views.image(view);
+                    image.map_err(|e| Failure::input(format!("{}: {e}", views.name(view))))
+                };
+                let (view, window) = match place {
+                    Some(place) => place,
+                    None => {
+                        let mut best: Option<(u64, usize, Window)> = None;
+                        for view in 0..views.count() {
+                            let (edges, window) = most_edges(&*image(view)?, background);
+                            if best.is_none_or(|(most, ..)| edges > most) {
+                                best = Some((edges, view, window));
+                            }
+                        }
+                        let Some((_, view, window)) = best else { continue };
+                        crops.push(cut(&photograph(&*image(view)?, background), window));
+                        *place.insert((view, window))
+                    }
+                };
+                let rendering =
+                    opened.backend.render(views.camera(view), background, opened.sh_degree)?;
+                let at = |x: u32, y: u32| {
+                    let first = 3 * (y as usize * rendering.width as usize + x as usize);
+                    let rgb = &rendering.rgb[first..first + 3];
+                    Rgb([0, 1, 2].map(|c| (rgb[c].clamp(0.0, 1.0) * 255.0).round() as u8))
+                };
+                let rendered = RgbImage::from_fn(rendering.width, rendering.height, at);
+                crops.push(cut(&rendered, window));
+                shown.push(record.policy.clone());
+            }
+            if crops.is_empty() {
+                continue;
+            }
+            let file = format!("crops-{scene}-{budget}.png");
+            let mut encoded = Cursor::new(Vec::new());
+            let picture = side_by_side(&crops);
+            write_atomically(&output.join(&file), |out| {
+                picture.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
+                out.write_all(encoded.get_ref())
+            })?;
+            let order = shown.join(", ");
+            let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
+            pictures.push(Picture { file, caption });
+        }
+    }
+    Ok(pictures)
+}
+
+fn photograph(image: &Image8, background: [f32; 3]) -> RgbImage {
+    let at = |x: u32, y: u32| {
+        let colour = image.composited(x as usize, y as usize, background);
+        Rgb(colour.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
+    };
+    RgbImage::from_fn(image.width, image.height, at)
+}
+
+/// The window with the largest sum of |∂G/∂x| + |∂G/∂y| of the green channel, and that sum; of equal
+/// ones the first, row by row.
+fn most_edges(image: &Image8, background: [f32; 3]) -> (u64, Window) {
+    let picture = photograph(image, background);
+    let (width, height) = picture.dimensions();
+    let window = |x, y| Window { x, y, width: (width / 4).max(1), height: (height / 4).max(1) };
+    let Window { width: w, height: h, .. } = window(0, 0);
+    // Sums over the rectangle from the corner, so that a window's sum takes four of them.
+    let columns = width as usize + 1;
+    let mut sums = vec![0_u64; columns * (height as usize + 1)];
+    let green =
+        |x: u32, y: u32| i32::from(picture.get_pixel(x.min(width - 1), y.min(height - 1))[1]);
+    for y in 0..height {
+        let mut row = 0;
+        for x in 0..width {
+            let edge =
+                (green(x + 1, y) - green(x, y)).abs() + (green(x, y + 1) - green(x, y)).abs();
+            row += u64::from(edge.unsigned_abs());
+            let at = (y as usize + 1) * columns + x as usize + 1;
+            sums[at] = sums[at - columns] + row;
+        }
+    }
+    let sum = |x: u32, y: u32| sums[y as usize * columns + x as usize];
+    let mut best = (0, window(0, 0));
+    for y in 0..=height - h {
+        for x in 0..=width - w {
+            let edges = sum(x + w, y + h) + sum(x, y) - sum(x + w, y) - sum(x, y + h);
+            if edges > best.0 {
+                best = (edges, window(x, y));
+            }
+        }
+    }
+    best
+}
+
+fn cut(picture: &RgbImage, Window { x, y, width, height }: Window) -> RgbImage {
+    let crop = imageops::crop_imm(picture, x, y, width, height).to_image();
+    let times = (SHOWN / width).max(1);
+    imageops::resize(&crop, width * times, height * times, imageops::FilterType::Nearest)
+}
+
+fn side_by_side(crops: &[RgbImage]) -> RgbImage {
+    let width = crops.iter().map(|crop| crop.width() + GAP).sum::<u32>() - GAP;
+    let height = crops.iter().map(RgbImage::height).max().unwrap_or(1);
+    let mut picture = RgbImage::from_pixel(width, height, Rgb([255; 3]));
+    let mut x = 0;
+    for crop in crops {
+        imageops::replace(&mut picture, crop, i64::from(x), 0);
+        x += crop.width() + GAP;
+    }
+    picture
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_window_with_the_most_edges_is_found() {
+        let (width, height) = (40_u32, 24_u32);
+        let mut rgb = vec![100_u8; 3 * (width * height) as usize];
+        // A checkerboard of 10 × 6 pixels, as large as a window.
+        for y in 11..17 {
+            for x in 23..33 {
+                rgb[3 * (y * width as usize + x) + 1] = if (x + y) % 2 == 0 { 0 } else { 255 };
+            }
+        }
+        let image = Image8 { width, height, rgb, alpha: None, mask: None };
+        let (edges, window) = most_edges(&image, [0.0; 3]);
+        assert!(edges > 0);
+        assert!((22..=23).contains(&window.x) && (10..=11).contains(&window.y), "{window:?}");
+        assert_eq!((window.width, window.height), (10, 6));
+        let crop = cut(&photograph(&image, [0.0; 3]), window);
+        assert_eq!(crop.dimensions(), (240, 144));
+        assert_eq!(side_by_side(&[crop.clone(), crop]).dimensions(), (486, 144));
+    }
+}

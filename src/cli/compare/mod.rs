@@ -1,0 +1,193 @@
+//! `densify compare`.
+
+mod cell;
+mod crops;
+mod difference;
+mod plots;
+mod table;
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use densify_policies::registry::find;
+
+use super::console::Console;
+use super::failure::Failure;
+use super::number;
+use crate::output::write_atomically;
+use cell::{Cell, Record, Records};
+
+/// Trains a scene with several policies, under the same conditions, and says which did best.
+///
+/// Every policy runs with every budget and every seed, one run after another. A run that is
+/// finished is not run again: call the same command to go on after an interruption. The folder then
+/// holds compare.md (tables and pictures), compare.jsonl (a record per run), plots as SVG, and the
+/// runs themselves.
+///
+/// Quality is measured on views held out. Differences are taken between runs of the same scene,
+/// budget and seed, against the first policy named, with 95 % bootstrap intervals of their mean. A
+/// run whose peak exceeded its budget is marked, and takes no part in the ranking.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct CompareArgs {
+    /// Folders of the scenes
+    #[arg(required = true)]
+    scenes: Vec<PathBuf>,
+    /// Policies, separated by commas; the others are compared with the first
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
+    policies: Vec<String>,
+    /// Budgets in Gaussians, separated by commas
+    #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = number::rows)]
+    budget: Vec<usize>,
+    /// Runs of each kind, with seeds 0, 1, …
+    #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    seeds: u32,
+    /// Length of each run
+    #[arg(short, long, value_name = "N", default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..))]
+    iterations: u32,
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR", default_value = "comparison")]
+    output: PathBuf,
+    /// Options of `densify train` for every run
+    #[arg(last = true, value_name = "TRAIN OPTIONS")]
+    train: Vec<String>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  densify compare data/garden --policies vanilla,diet --budget 200k
+  densify compare data/room data/cup --policies diet,taming,mcmc --budget 15k,30k,60k --seeds 5
+  densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2";
+
+/// Options of `densify train` that are the comparison's to set.
+const OWN_OPTIONS: [&str; 10] = [
+    "--policy",
+    "-p",
+    "--budget",
+    "-b",
+    "--seed",
+    "--iterations",
+    "-i",
+    "--output",
+    "-o",
+    "--test-iterations",
+];
+/// Measurements along each run, for the curves.
+const POINTS: u32 = 8;
+
+pub(super) fn run(args: &CompareArgs, console: &Console) -> Result<(), Failure> {
+    let cells = cells(args)?;
+    let mut records = Records::open(&args.output.join("compare.jsonl"))?;
+    for (i, cell) in cells.iter().enumerate() {
+        let (number, count) = (i + 1, cells.len());
+        if records.of(cell).is_some() {
+            console.say(format_args!("[{number}/{count}] {cell}: done before"));
+            continue;
+        }
+        console.say(format_args!("[{number}/{count}] {cell}"));
+        records.add(cell.train(&args.output)?)?;
+    }
+    let records: Vec<&Record> = cells.iter().filter_map(|cell| records.of(cell)).collect();
+    let mut text = table::markdown(&records, &args.policies);
+    text += "\n## Pictures\n";
+    for picture in plots::draw(&args.output, &records, &args.policies)? {
+        text += &format!("\n![{}]({})\n", picture.caption, picture.file);
+    }
+    for picture in crops::draw(&args.output, &records, console)? {
+        text += &format!("\n![{}]({})\n\n{}.\n", picture.caption, picture.file, picture.caption);
+    }
+    let path = args.output.join("compare.md");
+    write_atomically(&path, |out| out.write_all(text.as_bytes()))?;
+    console.result(table::summary(&records, &args.policies));
+    console.result(format_args!("everything in {}", path.display()));
+    Ok(())
+}
+
+/// A file in the output folder, and what it shows.
+struct Picture {
+    file: String,
+    caption: String,
+}
+
+/// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a
+/// fair one of fewer seeds.
+fn cells(args: &CompareArgs) -> Result<Vec<Cell>, Failure> {
+    for flag in &args.train {
+        let name = flag.split('=').next().unwrap_or_default();
+        if OWN_OPTIONS.contains(&name) {
+            return Err(Failure::input(format!(
+                "{name} is set by the comparison itself; leave it out after `--`"
+            )));
+        }
+    }
+    unique(&args.policies, "--policies")?;
+    unique(&args.budget, "--budget")?;
+    for name in &args.policies {
+        find(name)?;
+    }
+    let labels = labels(&args.scenes)?;
+    let mut cells = Vec::new();
+    for seed in 0..args.seeds {
+        for (scene, label) in args.scenes.iter().zip(&labels) {
+            for &budget in &args.budget {
+                for policy in &args.policies {
+                    cells.push(Cell {
+                        scene: scene.clone(),
+                        label: label.clone(),
+                        policy: policy.clone(),
+                        budget,
+                        seed,
+                        iterations: args.iterations,
+                        train: args.train.clone(),
+                    });
+                }
+            }
+        }
+    }
+    Ok(cells)
+}
+
+fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Failure> {
+    let mut seen = BTreeSet::new();
+    match values.iter().find(|&value| !seen.insert(value)) {
+        Some(twice) => Err(Failure::input(format!("{flag} names {twice} twice"))),
+        None => Ok(()),
+    }
+}
+
+/// A short name for each scene: its folder's.
+fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
+    let mut labels = Vec::new();
+    for scene in scenes {
+        let whole = std::fs::canonicalize(scene).map_err(|e| {
+            Failure::input(format!("{}: {e}; name the scene's folder", scene.display()))
+        })?;
+        let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '.', "-");
+        if labels.contains(&name) {
+            return Err(Failure::input(format!(
+                "two scenes are called {name}; compare them in two calls, or rename one folder"
+            )));
+        }
+        labels.push(name);
+    }
+    Ok(labels)
+}
+
+/// Distinct values of a property of the records, in the order of their appearance.
+fn distinct<'a, T: PartialEq>(records: &[&'a Record], of: impl Fn(&'a Record) -> T) -> Vec<T> {
+    let mut values = Vec::new();
+    for record in records {
+        let value = of(record);
+        if !values.contains(&value) {
+            values.push(value);
+        }
+    }
+    values
+}
+
+/// Where a cell's run is.
+fn run_folder(output: &Path, record: &Record) -> PathBuf {
+    output.join("runs").join(&record.run)
+}

@@ -1,0 +1,277 @@
+//! Plots as SVG: quality against budget, and rows above PSNR along the runs.
+
+use std::ops::Range;
+use std::path::Path;
+
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
+use plotters::prelude::*;
+
+use super::cell::rows_over_time;
+use super::{Picture, Record, distinct};
+use crate::cli::failure::{Failure, OTHER};
+use crate::cli::number::grouped;
+use crate::output::write_atomically;
+
+/// Size of a panel `[px]`.
+const PANEL: (u32, u32) = (720, 300);
+/// Colours that stay apart for the colour-blind (Okabe and Ito 2008).
+const COLOURS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+];
+
+/// A curve per policy.
+struct Panel {
+    title: String,
+    x: &'static str,
+    y: &'static str,
+    /// Whether x is the logarithm of what the axis says.
+    log_x: bool,
+    curves: Vec<(String, Vec<(f64, f64)>)>,
+}
+
+/// Draws every plot into the folder `output`.
+///
+/// # Errors
+/// When a file cannot be written.
+pub(super) fn draw(
+    output: &Path,
+    records: &[&Record],
+    policies: &[String],
+) -> Result<Vec<Picture>, Failure> {
+    let mut pictures = Vec::new();
+    let mut put = |file: String, caption: String, panels: &[Panel]| -> Result<(), Failure> {
+        let text = svg(panels).map_err(|message| Failure { code: OTHER, message })?;
+        write_atomically(&output.join(&file), |out| out.write_all(text.as_bytes()))?;
+        pictures.push(Picture { file, caption });
+        Ok(())
+    };
+    let budgets = distinct(records, |r| r.budget);
+    for scene in distinct(records, |r| &r.scene) {
+        if budgets.len() > 1 {
+            let panel = |y: &'static str, score: fn(&Record) -> f64| Panel {
+                title: format!("{scene}: {y} against budget"),
+                x: "budget (rows)",
+                y,
+                log_x: true,
+                curves: by_policy(policies, |policy| {
+                    let point = |&budget: &usize| {
+                        let runs = of(records, scene, budget, policy);
+                        let score = mean(runs.filter(|r| r.is_bounded()).map(score))?;
+                        Some(((budget as f64).ln(), score))
+                    };
+                    budgets.iter().filter_map(point).collect()
+                }),
+            };
+            let panels = [panel("PSNR (dB)", |r| r.psnr), panel("SSIM", |r| r.ssim)];
+            let caption = format!("{scene}: quality against budget, means over seeds");
+            put(format!("quality-{scene}.svg"), caption, &panels)?;
+        }
+        for &budget in &budgets {
+            let panel = |y: &'static str, curve: &dyn Fn(&Record) -> Vec<(u32, f64)>| Panel {
+                title: format!("{scene}, {} rows: {y} over iterations", grouped(budget)),
+                x: "iteration",
+                y,
+                log_x: false,
+                curves: by_policy(policies, |policy| {
+                    let first = of(records, scene, budget, policy).min_by_key(|r| r.seed);
+                    let points = first.map(curve).unwrap_or_default();
+                    points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
+                }),
+            };
+            let panels = [
+                panel("rows", &|r| rows_over_time(output, r)),
+                panel("PSNR (dB)", &|r| r.curve.clone()),
+            ];
+            let caption = format!(
+                "{scene}, {} rows: rows and PSNR over iterations, first seed",
+                grouped(budget)
+            );
+            put(format!("growth-{scene}-{budget}.svg"), caption, &panels)?;
+        }
+    }
+    Ok(pictures)
+}
+
+fn of<'a, 'b>(
+    records: &'b [&'a Record],
+    scene: &'b str,
+    budget: usize,
+    policy: &'b str,
+) -> impl Iterator<Item = &'a Record> + use<'a, 'b> {
+    let here = move |r: &&Record| r.scene == scene && r.budget == budget && r.policy == policy;
+    records.iter().copied().filter(here)
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (sum, count) = values.fold((0.0, 0_u32), |(sum, count), value| (sum + value, count + 1));
+    (count > 0).then(|| sum / f64::from(count))
+}
+
+fn by_policy(
+    policies: &[String],
+    curve: impl Fn(&str) -> Vec<(f64, f64)>,
+) -> Vec<(String, Vec<(f64, f64)>)> {
+    policies.iter().map(|policy| (policy.clone(), curve(policy))).collect()
+}
+
+/// The panels, one above the other.
+fn svg(panels: &[Panel]) -> Result<String, String> {
+    let mut text = String::new();
+    {
+        let size = (PANEL.0, PANEL.1 * panels.len() as u32);
+        let area = SVGBackend::with_string(&mut text, size).into_drawing_area();
+        area.fill(&WHITE).map_err(|e| e.to_string())?;
+        for (panel, area) in panels.iter().zip(area.split_evenly((panels.len(), 1))) {
+            // An empty panel has no axes.
+            if let Some(bounds) = bounds(panel) {
+                draw_panel(panel, bounds, &area).map_err(|e| e.to_string())?;
+            }
+        }
+        area.present().map_err(|e| e.to_string())?;
+    }
+    Ok(text)
+}
+
+/// What the axes must show, with a margin: `[[x least, x most], [y least, y most]]`.
+fn bounds(panel: &Panel) -> Option<[[f64; 2]; 2]> {
+    let points = || panel.curves.iter().flat_map(|(_, points)| points);
+    let range = |of: fn(&(f64, f64)) -> f64| {
+        let least = points().map(of).reduce(f64::min)?;
+        let most = points().map(of).reduce(f64::max)?;
+        Some([least, most])
+    };
+    let ([x0, x1], [y0, y1]) = (range(|p| p.0)?, range(|p| p.1)?);
+    let margin = if y1 > y0 { 0.08 * (y1 - y0) } else { 0.5 };
+    let x = if panel.log_x { [x0 - 0.1, x1 + 0.1] } else { [0.0, x1.max(1.0)] };
+    Some([x, [y0 - margin, y1 + margin]])
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
+
+fn draw_panel(
+    panel: &Panel,
+    [[x0, x1], [y0, y1]]: [[f64; 2]; 2],
+    area: &Area<'_>,
+) -> Result<(), Box<dyn std::error::Error>> {
+    let mut builder = ChartBuilder::on(area);
+    builder
+        .caption(&panel.title, ("sans-serif", 17))
+        .margin(8)
+        .x_label_area_size(42)
+        .y_label_area_size(70);
+    let ticks = if panel.log_x { ticks_at_points(panel) } else { even_ticks(x1) };
+    let mut chart = builder.build_cartesian_2d(Axis { range: x0..x1, ticks }, y0..y1)?;
+    let whole = |x: &f64| grouped(if panel.log_x { x.exp() } else { *x }.round() as usize);
+    let number = |y: &f64| {
+        if y1 > 1000.0 { grouped(y.max(0.0).round() as usize) } else { format!("{y:.3}") }
+    };
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .x_desc(panel.x)
+        .y_desc(panel.y)
+        .x_label_formatter(&whole)
+        .y_label_formatter(&number)
+        .draw()?;
+    for (i, (policy, points)) in panel.curves.iter().enumerate() {
+        let colour = COLOURS[i % COLOURS.len()];
+        let style = colour.stroke_width(2);
+        chart
+            .draw_series(LineSeries::new(points.iter().copied(), style))?
+            .label(policy)
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+        // Few points are measurements, which a line alone would hide.
+        if points.len() <= 2 * super::POINTS as usize {
+            let dot = |&point: &(f64, f64)| Circle::new(point, 3, colour.filled());
+            chart.draw_series(points.iter().map(dot))?;
+        }
+    }
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::LowerRight)
+        .background_style(WHITE.mix(0.8))
+        .border_style(BLACK.mix(0.3))
+        .draw()?;
+    Ok(())
+}
+
+/// An axis with ticks at chosen places.
+struct Axis {
+    range: Range<f64>,
+    ticks: Vec<f64>,
+}
+
+impl Ranged for Axis {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        let share = (value - self.range.start) / (self.range.end - self.range.start);
+        limit.0 + (f64::from(limit.1 - limit.0) * share).round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        if hint.weight().allow_light_points() { Vec::new() } else { self.ticks.clone() }
+    }
+
+    fn range(&self) -> Range<f64> {
+        self.range.clone()
+    }
+}
+
+/// A tick at every point of the curves.
+fn ticks_at_points(panel: &Panel) -> Vec<f64> {
+    let mut ticks: Vec<f64> =
+        panel.curves.iter().flat_map(|(_, points)| points).map(|&(x, _)| x).collect();
+    ticks.sort_by(f64::total_cmp);
+    ticks.dedup();
+    ticks
+}
+
+/// Ticks from zero to `most` in steps of 1, 2 or 5 times a power of ten, at most eleven.
+fn even_ticks(most: f64) -> Vec<f64> {
+    let decade = 10_f64.powf((most / 10.0).log10().floor());
+    let steps = [1.0, 2.0, 5.0, 10.0].map(|n| n * decade);
+    let step = steps.into_iter().find(|step| most / step <= 10.0).unwrap_or(most);
+    (0..=(most / step) as u32).map(|i| f64::from(i) * step).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plot_shows_every_curve_and_none_is_no_error() {
+        let panel = |log_x| Panel {
+            title: "title".into(),
+            x: "budget",
+            y: "PSNR",
+            log_x,
+            curves: vec![
+                ("one".into(), vec![(1.0, 30.0), (4.0, 32.0)]),
+                ("two".into(), vec![(1.0, 29.0), (4.0, 33.0)]),
+                ("empty".into(), Vec::new()),
+            ],
+        };
+        for log_x in [false, true] {
+            let text = svg(&[panel(log_x), panel(log_x)]).unwrap();
+            assert!(text.starts_with("<svg") && text.trim_end().ends_with("</svg>"));
+            assert_eq!(text.matches("title").count(), 2);
+            // A line on either panel, and one in either legend.
+            assert_eq!(text.matches("<polyline").count() % 2, 0);
+            for name in ["one", "two", "PSNR"] {
+                assert!(text.contains(name), "{name} is not in {text}");
+            }
+        }
+        assert_eq!(even_ticks(300.0), [0.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0]);
+        assert_eq!(even_ticks(7000.0).len(), 8);
+        let empty = Panel { curves: Vec::new(), ..panel(false) };
+        assert!(svg(&[empty]).unwrap().starts_with("<svg"));
+    }
+}

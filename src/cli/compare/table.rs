@@ -1,0 +1,167 @@
+//! The comparison as text: Markdown for the file, a few lines for the terminal.
+
+use std::fmt::Write;
+
+use super::difference::Difference;
+use super::{Record, distinct};
+use crate::cli::number::grouped;
+
+/// Mean over records; `None` where one has no value.
+fn mean(records: &[&Record], of: impl Fn(&Record) -> Option<f64>) -> Option<f64> {
+    let values: Option<Vec<f64>> = records.iter().map(|r| of(r)).collect();
+    values.filter(|v| !v.is_empty()).map(|v| v.iter().sum::<f64>() / v.len() as f64)
+}
+
+fn shown(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+/// The whole comparison.
+pub(super) fn markdown(records: &[&Record], policies: &[String]) -> String {
+    let mut text = String::from("# Comparison of density-control policies\n");
+    let (first, others) = match policies.split_first() {
+        Some((first, others)) if !records.is_empty() => (first, others),
+        _ => return text,
+    };
+    let iterations = records[0].iterations;
+    let seeds = distinct(records, |r| r.seed).len();
+    let _ = write!(
+        text,
+        "\n{} iterations, {seeds} {}. Means over seeds; differences from `{first}` are paired by \
+         scene, budget and seed, with 95 % bootstrap intervals.\n",
+        grouped(iterations as usize),
+        if seeds == 1 { "seed" } else { "seeds" },
+    );
+    if !others.is_empty() {
+        text += "\n## Over all scenes and budgets\n\n";
+        text += "| policy | PSNR | better in | SSIM | better in |\n|---|---|---|---|---|\n";
+        for policy in others {
+            let psnr = Difference::between(records, policy, first, |r| r.psnr);
+            let ssim = Difference::between(records, policy, first, |r| r.ssim);
+            let (Some(psnr), Some(ssim)) = (psnr, ssim) else {
+                let _ = writeln!(text, "| {policy} | not ranked: no run kept its budget | | | |");
+                continue;
+            };
+            let share = |d: &Difference| format!("{} of {}", d.above, d.pairs);
+            let _ = writeln!(
+                text,
+                "| {policy} | {} dB | {} | {} | {} |",
+                psnr.show(2),
+                share(&psnr),
+                ssim.show(4),
+                share(&ssim)
+            );
+        }
+    }
+    for scene in distinct(records, |r| &r.scene) {
+        for budget in distinct(records, |r| r.budget) {
+            let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
+            text += "| policy | PSNR | SSIM | rows | true peak | peak memory [MiB] | time [s] | processor time [s] | extra passes |\n";
+            text += "|---|---|---|---|---|---|---|---|---|\n";
+            for policy in policies {
+                let here =
+                    |r: &&&Record| r.scene == *scene && r.budget == budget && r.policy == *policy;
+                let runs: Vec<&Record> = records.iter().filter(here).copied().collect();
+                text += &line(policy, first, &runs, records, budget);
+            }
+        }
+    }
+    text
+}
+
+fn line(policy: &str, first: &str, runs: &[&Record], records: &[&Record], budget: usize) -> String {
+    let Some(run) = runs.first() else {
+        return String::new();
+    };
+    let here: Vec<&Record> =
+        records.iter().filter(|r| r.scene == run.scene && r.budget == budget).copied().collect();
+    let difference = |score: fn(&Record) -> f64, digits| {
+        let between = Difference::between(&here, policy, first, score);
+        between
+            .filter(|_| policy != first)
+            .map_or_else(String::new, |d| format!(" ({})", d.show(digits)))
+    };
+    let peak = runs.iter().map(|r| r.peak_rows).max().unwrap_or(0);
+    let marked = if peak > budget { " **over the budget: not ranked**" } else { "" };
+    let number = |of: fn(&Record) -> f64, digits| shown(mean(runs, |r| Some(of(r))), digits);
+    let mib = |r: &Record| r.peak_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20));
+    format!(
+        "| {policy} | {}{} | {}{} | {} | {}{marked} | {} | {} | {} | {} |\n",
+        number(|r| r.psnr, 2),
+        difference(|r| r.psnr, 2),
+        number(|r| r.ssim, 4),
+        difference(|r| r.ssim, 4),
+        grouped(mean(runs, |r| Some(r.rows as f64)).unwrap_or(0.0).round() as usize),
+        grouped(peak),
+        shown(mean(runs, mib), 0),
+        number(|r| r.seconds, 1),
+        shown(mean(runs, |r| r.cpu_seconds), 1),
+        number(|r| r.extra_forwards as f64, 0),
+    )
+}
+
+/// A line per policy: means over everything.
+pub(super) fn summary(records: &[&Record], policies: &[String]) -> String {
+    let width = policies.iter().map(String::len).max().unwrap_or(0).max(6);
+    let mut text = format!("{:width$}  PSNR [dB]    SSIM  runs", "policy");
+    for policy in policies {
+        let runs: Vec<&Record> =
+            records.iter().filter(|r| r.policy == *policy && r.is_bounded()).copied().collect();
+        let psnr = shown(mean(&runs, |r| Some(r.psnr)), 3);
+        let ssim = shown(mean(&runs, |r| Some(r.ssim)), 4);
+        let _ = write!(text, "\n{policy:width$}  {psnr:>9}  {ssim:>6}  {:>4}", runs.len());
+        let over = records.iter().filter(|r| r.policy == *policy && !r.is_bounded()).count();
+        if over > 0 {
+            let _ = write!(text, "  ({over} more over the budget, not counted)");
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(policy: &str, seed: u32, psnr: f64, peak_rows: usize) -> Record {
+        Record {
+            densify: "1".into(),
+            scene: "room".into(),
+            policy: policy.into(),
+            budget: 1000,
+            seed,
+            iterations: 7000,
+            run: String::new(),
+            arguments: Vec::new(),
+            psnr,
+            ssim: psnr / 100.0,
+            rows: 900,
+            peak_rows,
+            peak_bytes: None,
+            seconds: 1.25,
+            cpu_seconds: Some(2.5),
+            extra_forwards: 0,
+            curve: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn differences_are_paired_and_broken_budgets_marked() {
+        let all = [
+            record("a", 0, 30.0, 1000),
+            record("a", 1, 32.0, 1000),
+            record("b", 0, 30.5, 1000),
+            record("b", 1, 32.5, 999),
+            record("c", 0, 40.0, 1001),
+            record("c", 1, 40.0, 1001),
+        ];
+        let all: Vec<&Record> = all.iter().collect();
+        let policies = ["a", "b", "c"].map(String::from);
+        let text = markdown(&all, &policies);
+        assert!(text.contains("| b | +0.50 [+0.50, +0.50] dB | 2 of 2 |"), "{text}");
+        assert!(text.contains("| c | not ranked"), "{text}");
+        assert!(text.contains("| a | 31.00 | 0.3100 | 900 | 1,000 | – |"), "{text}");
+        assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
+        let said = summary(&all, &policies);
+        assert!(said.contains("c               –       –     0  (2 more over"), "{said}");
+    }
+}
