@@ -1,5 +1,7 @@
 //! Auxiliary views against the reference: every column, the pixel map, the loss, surface points.
 
+#![expect(clippy::float_cmp, reason = "colours are carried to the last bit")]
+
 use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::backend::{AuxInput, AuxOutput, Backend, LearningRates, StepInput};
 use densify::camera::Camera;
@@ -95,7 +97,7 @@ fn stretched(values: &[f64]) -> Vec<f64> {
 }
 
 fn map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
-    let (width, height) = (scene.camera.width as i64, scene.camera.height as i64);
+    let (width, height) = (i64::from(scene.camera.width), i64::from(scene.camera.height));
     let rgb = |pixel: usize| [0, 1, 2].map(|c| f64::from(scene.target.rgb[3 * pixel + c]));
     let error: Vec<f64> = (0..(width * height) as usize)
         .map(|p| {

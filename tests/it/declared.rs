@@ -2,6 +2,8 @@
 //! cadence. Each is held to its formula, worked out here in f64. One piece, as all train the same
 //! small model in the same way.
 
+#![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
+
 use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
 use densify::backend::{Backend, LearningRates, StepInput};
 use densify::camera::Camera;
