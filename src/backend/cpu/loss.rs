@@ -131,7 +131,7 @@ impl LossBuffers {
                 .into_par_iter()
                 .enumerate()
                 .for_each(|(i, (e, y))| {
-                    arch.dispatch(Lines { source, first: i * STRIP, stride, e, y })
+                    arch.dispatch(Lines { source, first: i * STRIP, stride, e, y });
                 });
             let parts: Vec<LossValue> = (
                 p1.par_chunks_mut(strip),
@@ -269,15 +269,18 @@ fn horizontal<S: Simd>(s: S, line: &[f32], at: usize) -> V<S> {
     sum
 }
 
+/// A line of each of `N` planes, and its weight in the window.
+type Weighted<'a, const N: usize> = ([&'a [f32]; N], f32);
+
 /// The lines of `N` planes within reach of `row`, with the row's weights, and how many there are.
 /// They are cut out once per row of the image, so that a load in the inner loop has little to check.
 #[inline(always)]
-fn within_reach<'a, const N: usize>(
-    planes: [&'a [f32]; N],
+fn within_reach<const N: usize>(
+    planes: [&[f32]; N],
     stride: usize,
     row: usize,
     height: usize,
-) -> ([([&'a [f32]; N], f32); WINDOW.len()], usize) {
+) -> ([Weighted<'_, N>; WINDOW.len()], usize) {
     let from = row.saturating_sub(REACH);
     let to = (row + REACH + 1).min(height);
     let mut lines = [([&[][..]; N], 0.0); WINDOW.len()];

@@ -285,6 +285,7 @@ impl WithSimd for Replay<'_> {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests {
     use super::*;
 
