@@ -7,6 +7,7 @@
 
 mod error;
 mod fresh;
+mod guard;
 
 use densify_policies::plan::{EditPlan, RowOps};
 use densify_policies::policy::{Cadence, DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
@@ -19,6 +20,7 @@ use crate::gaussians::Gaussians;
 use crate::schedule::{self, Background, RateOptions};
 use crate::views::ViewSource;
 pub use error::TrainError;
+use guard::asked;
 
 /// How a run goes, beside its scene and its policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -180,7 +182,8 @@ impl<V: ViewSource> Trainer<V> {
             let view = self.views.name(view).to_owned();
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
-        let event = if self.policy.is_due(step) { self.edit(step)? } else { None };
+        let is_due = asked(|| self.policy.is_due(step)).map_err(|e| self.refused(step, e))?;
+        let event = if is_due { self.edit(step)? } else { None };
         Ok(StepReport { step, view, output, rows: self.backend.rows(), event })
     }
 
@@ -194,7 +197,7 @@ impl<V: ViewSource> Trainer<V> {
 
     /// How often the optimiser steps now: as the options say, else as the policy does.
     fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
-        let wanted = self.policy.cadence(step);
+        let wanted = asked(|| self.policy.cadence(step)).map_err(|e| self.refused(step, e))?;
         let cadence =
             Cadence { sh_rest: self.options.sh_every.unwrap_or(wanted.sh_rest), ..wanted };
         let declared = self.needs.cadence;
@@ -240,7 +243,7 @@ impl<V: ViewSource> Trainer<V> {
         let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };
         let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
         let rng = PolicyRng::new(self.options.seed, step);
-        let planned = self.policy.plan(&now, &rng, &mut plan);
+        let planned = asked(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         planned.map_err(|source| self.refused(step, source))?;
         let ops = plan.compile();
         self.check_plan(step, &ops)?;

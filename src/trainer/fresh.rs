@@ -3,6 +3,7 @@
 
 use densify_policies::policy::{AuxView, Needs, Signal};
 
+use super::guard::asked;
 use super::{TrainError, Trainer};
 use crate::backend::AuxInput;
 use crate::schedule;
@@ -14,10 +15,9 @@ impl<V: ViewSource> Trainer<V> {
     pub(super) fn measure_fresh(&mut self, step: u32) -> Result<Needs, TrainError> {
         let mut needs = self.needs.clone();
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
-        if !needs.signals.contains(Signal::FreshWeightMax)
-            || needs.fresh_views == 0
-            || !self.policy.wants_fresh(step, rows, budget)
-        {
+        let could = needs.signals.contains(Signal::FreshWeightMax) && needs.fresh_views > 0;
+        let wants = || could && self.policy.wants_fresh(step, rows, budget);
+        if !asked(wants).map_err(|e| self.refused(step, e))? {
             needs.signals = needs.signals.without(Signal::FreshWeightMax);
             return Ok(needs);
         }
@@ -35,7 +35,8 @@ impl<V: ViewSource> Trainer<V> {
     /// Shows the policy the auxiliary views that it wants for its event after `step`, one by one.
     pub(super) fn show_views(&mut self, step: u32) -> Result<(), TrainError> {
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
-        let wanted = self.policy.aux_views(step, rows, budget) as usize;
+        let wanted = asked(|| self.policy.aux_views(step, rows, budget));
+        let wanted = wanted.map_err(|e| self.refused(step, e))? as usize;
         let Some(request) = self.needs.aux.clone().filter(|_| wanted > 0) else {
             return Ok(());
         };
@@ -55,7 +56,8 @@ impl<V: ViewSource> Trainer<V> {
             let measured = measured.map_err(|e| self.stopped(step, e))?;
             self.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
-            let seen = self.policy.observe(&AuxView { step, rows, loss, columns, points });
+            let view = AuxView { step, rows, loss, columns, points };
+            let seen = asked(|| self.policy.observe(&view)).and_then(|done| done);
             seen.map_err(|source| self.refused(step, source))?;
         }
         Ok(())

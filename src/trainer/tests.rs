@@ -107,6 +107,7 @@ enum Told {
     Halve,
     Nothing,
     Fail,
+    Panic,
     ReadUndeclared,
     ReadFresh,
 }
@@ -174,6 +175,7 @@ impl DensityPolicy for ToldPolicy {
                 }
             }
             Told::Nothing => {}
+            Told::Panic => panic!("no row {rows}"),
             Told::Fail => return Err(PolicyError::Other("out of ideas".into())),
             Told::ReadUndeclared => {
                 now.signal(Signal::Age)?;
@@ -427,6 +429,10 @@ fn slots_written_before_the_moves_count_for_the_peak() {
 fn a_policy_error_stops_before_the_edit() {
     let (message, rows, done) = failure(&Case { what: Told::Fail, ..CASE });
     assert_eq!(message, "step 2: policy `told`: out of ideas");
+    assert_eq!(rows, 3);
+    assert!(!done.iter().any(|d| d.starts_with("apply")), "{done:?}");
+    let (message, rows, done) = failure(&Case { what: Told::Panic, ..CASE });
+    assert!(message.contains("`told`: it panicked: no row 3;"), "{message}");
     assert_eq!(rows, 3);
     assert!(!done.iter().any(|d| d.starts_with("apply")), "{done:?}");
     let (message, ..) = failure(&Case { what: Told::ReadUndeclared, ..CASE });
