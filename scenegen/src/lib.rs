@@ -1,4 +1,15 @@
 //! Known geometry, ray-traced into posed ground-truth images.
-//!
-//! This package is the wall that keeps mesh loading and ray tracing away from the trainer and
-//! from the policies. It has no public item yet.
+
+#![allow(missing_docs)]
+mod camera;
+mod error;
+mod intersect;
+pub mod mesh;
+mod nearest;
+mod random;
+mod shade;
+mod sky;
+mod surface;
+pub mod texture;
+mod trace;
+pub use camera::Camera;

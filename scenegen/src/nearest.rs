@@ -1,0 +1,72 @@
+//! The surface's nearest point, by branch and bound in the tree that rays use.
+
+use glam::DVec3;
+
+use crate::surface::Surface;
+
+/// The triangle (by its place in leaf order), its nearest point and the distance, all local. Of
+/// several triangles at the same distance, the model's first.
+pub(crate) fn search(surface: &Surface, place: DVec3) -> (u32, DVec3, f64) {
+    let bvh = &surface.bvh;
+    let mut best = (0_u32, DVec3::ZERO, f64::INFINITY);
+    let mut open = vec![(0.0_f64, 0_u32)];
+    while let Some((bound, index)) = open.pop() {
+        if bound > best.2 {
+            continue;
+        }
+        let node = &bvh.nodes[index as usize];
+        let first_pushed = open.len();
+        for child in (0..8).filter(|&c| !node.is_child_empty(c)) {
+            let bounds = node.child_aabb(child);
+            let (lo, hi) = (bounds.min.as_dvec3(), bounds.max.as_dvec3());
+            let bound = (lo - place).max(place - hi).max(DVec3::ZERO).length_squared();
+            if bound > best.2 {
+                continue;
+            }
+            if !node.is_leaf(child) {
+                open.push((bound, node.child_node_index(child)));
+                continue;
+            }
+            let (first, count) = node.child_primitives(child);
+            for slot in first..first + count {
+                let corners = surface.triangles[slot as usize].map(|p| p.as_dvec3());
+                let point = on_triangle(place, corners);
+                let distance = point.distance_squared(place);
+                let earlier = || surface.triangle_of(slot) < surface.triangle_of(best.0);
+                if distance < best.2 || (distance == best.2 && earlier()) {
+                    best = (slot, point, distance);
+                }
+            }
+        }
+        // The nearest child is opened first.
+        open[first_pushed..].sort_by(|a, b| b.0.total_cmp(&a.0));
+    }
+    (best.0, best.1, best.2.sqrt())
+}
+
+/// The triangle's point nearest to `p` (Ericson, "Real-Time Collision Detection", 5.1.5). Triangles
+/// without area are their longest side.
+pub(crate) fn on_triangle(p: DVec3, [a, b, c]: [DVec3; 3]) -> DVec3 {
+    let (ab, ac) = (b - a, c - a);
+    let normal = ab.cross(ac);
+    let area = normal.length_squared();
+    // Barycentric weights of the projection onto the plane; inside, it is the answer.
+    if area > 0.0 {
+        let ap = p - a;
+        let w = ab.cross(ap).dot(normal) / area;
+        let v = ap.cross(ac).dot(normal) / area;
+        if v >= 0.0 && w >= 0.0 && v + w <= 1.0 {
+            return a + v * ab + w * ac;
+        }
+    }
+    let candidates = [on_segment(p, a, b), on_segment(p, b, c), on_segment(p, c, a)];
+    let nearer = |x: &DVec3, y: &DVec3| x.distance_squared(p).total_cmp(&y.distance_squared(p));
+    candidates.into_iter().min_by(nearer).unwrap_or(a)
+}
+
+fn on_segment(p: DVec3, a: DVec3, b: DVec3) -> DVec3 {
+    let way = b - a;
+    let length = way.length_squared();
+    let share = if length > 0.0 { ((p - a).dot(way) / length).clamp(0.0, 1.0) } else { 0.0 };
+    a + share * way
+}
