@@ -25,6 +25,7 @@ mod points;
 mod presets;
 mod primitives;
 mod random;
+mod resource;
 pub mod rig;
 mod scene;
 mod shade;

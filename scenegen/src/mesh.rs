@@ -94,6 +94,8 @@ pub struct Material {
     pub double_sided: bool,
     /// Whether this is a thin structure, left out of the initial points on request.
     pub thin: bool,
+    /// Whether what it emits is also a [`Light`]: sampled light does not count it twice.
+    pub is_light: bool,
 }
 
 impl Default for Material {
@@ -114,6 +116,7 @@ impl Default for Material {
             alpha: AlphaMode::Opaque,
             double_sided: true,
             thin: false,
+            is_light: false,
         }
     }
 }

@@ -73,27 +73,28 @@ impl Model {
         self.add(&positions, &normals, &uvs, &triangles, material);
         for (end, normal, first) in [(a, -axis, 0_u32), (b, axis, 1)] {
             let mut rim: Vec<DVec3> = vec![end];
+            let disc = |p: &DVec3| {
+                let out = (*p - end) * (0.5 / radius);
+                Vec2::new(0.5 + out.dot(x) as f32, 0.5 + out.dot(y) as f32)
+            };
             rim.extend((0..sides).map(|i| positions[(2 * i + first) as usize]));
             let next = |i: u32| 1 + (i + 1) % sides;
             let fan = (0..sides)
                 .map(|i| if first == 1 { [0, 1 + i, next(i)] } else { [0, next(i), 1 + i] });
             let normals = vec![normal.as_vec3(); rim.len()];
-            self.add(&rim, &normals, &[], &fan.collect::<Vec<_>>(), material);
+            let uvs: Vec<Vec2> = rim.iter().map(disc).collect();
+            self.add(&rim, &normals, &uvs, &fan.collect::<Vec<_>>(), material);
         }
     }
 
     /// A texture of `size` x `size` texels painted by a function of (u, v) that returns linear
-    /// colours, averaged over 2 x 2 places per texel.
+    /// colours.
     pub(crate) fn paint(&mut self, size: u32, colour: impl Fn(DVec2) -> Vec3) -> TextureRef {
         let mut texels = Vec::with_capacity(4 * (size * size) as usize);
         for y in 0..size {
             for x in 0..size {
-                let mut sum = Vec3::ZERO;
-                for (dx, dy) in [(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)] {
-                    let at = DVec2::new(f64::from(x) + dx, f64::from(y) + dy) / f64::from(size);
-                    sum += colour(at);
-                }
-                let mean = sum / 4.0;
+                let at = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5) / f64::from(size);
+                let mean = colour(at);
                 texels.extend([encode(mean.x), encode(mean.y), encode(mean.z), 255]);
             }
         }

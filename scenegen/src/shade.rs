@@ -188,8 +188,8 @@ impl Lighting {
         if there.material.reflection == Reflection::Unlit {
             return there.base;
         }
-        let mut total =
-            there.emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
+        let emitted = if there.material.is_light { Vec3::ZERO } else { there.emitted };
+        let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
         for light in &self.lights {
             let u = sample.draws.square();
             let Some((to_light, distance, irradiance)) = arriving(light, there.place, u) else {

@@ -37,7 +37,8 @@ fn build() -> Staging {
     block(&mut model, DVec3::new(-0.35, 0.6, -0.3), DVec3::new(0.3, 0.6, 0.3), 18.0);
     block(&mut model, DVec3::new(0.35, 0.3, 0.35), DVec3::splat(0.3), -16.0);
     let radiance = Vec3::new(14.0, 12.5, 10.0);
-    let glow = Material { emissive: radiance, ..Material::lambert("lamp", [0.0; 3]) };
+    let glow =
+        Material { emissive: radiance, is_light: true, ..Material::lambert("lamp", [0.0; 3]) };
     let lamp = model.material(glow);
     let (corner, u, v) = (DVec3::new(-0.25, 1.99, -0.25), 0.5 * DVec3::X, 0.5 * DVec3::Z);
     model.quad(corner, u, v, lamp);
@@ -45,7 +46,7 @@ fn build() -> Staging {
     model.lights.push(Light { kind, intensity: radiance, range: f64::INFINITY });
     let rig = Rig {
         kind: RigKind::Orbit,
-        arc: 70.0,
+        arc: 45.0,
         elevation: [-12.0, 20.0],
         target: Some([0.0, 1.0, 0.0]),
         focus: Some(1.45),

@@ -4,7 +4,7 @@
 //! of 0.9 x 0.6 m, 1 cm before the middle of each wall at height 1.5 m, with five lines of text whose
 //! strokes are 6 mm wide. A table (top 1.2 x 0.04 x 0.7 m at height 0.72 m, four legs of 5 cm) in the
 //! middle, a shelf (0.8 x 1.8 x 0.3 m) at the wall x = −2.5, a sphere of 0.25 m and a cube of 0.4 m.
-//! Lit by a point light at (0, 2.3, 0) and an even ambient. All Lambert.
+//! Lit by a point light at (0, 1.9, 0) and an even ambient. All Lambert.
 
 use glam::{DQuat, DVec2, DVec3, Vec3};
 
@@ -73,8 +73,8 @@ fn build() -> Staging {
         model.painted("cube", 128, |at| marbled(at, 6, 64, [0.1, 0.3, 0.5], [0.5, 0.75, 0.8]));
     model.cuboid(DVec3::new(1.6, 0.2, 1.2), DVec3::splat(0.2), DQuat::from_rotation_y(0.5), cube);
     model.lights.push(Light {
-        kind: LightKind::Point { position: DVec3::new(0.0, 2.3, 0.0) },
-        intensity: Vec3::new(3.4, 3.2, 2.9),
+        kind: LightKind::Point { position: DVec3::new(0.0, 1.9, 0.0) },
+        intensity: Vec3::new(1.5, 1.4, 1.3),
         range: f64::INFINITY,
     });
     let rig = Rig {
@@ -86,7 +86,7 @@ fn build() -> Staging {
         target: Some([0.0, 1.35, 0.0]),
         ..Rig::default()
     };
-    Staging { model, sky: Sky::uniform(0.32), rig, ambient: Ambient::Open, finest: 0.006 }
+    Staging { model, sky: Sky::uniform(0.42), rig, ambient: Ambient::Open, finest: 0.006 }
 }
 
 fn poster(at: DVec2) -> Vec3 {
