@@ -22,6 +22,7 @@ mod progress;
 mod render;
 mod run_files;
 mod scene;
+mod scenegen;
 mod train;
 
 use std::ffi::OsString;
@@ -45,11 +46,13 @@ struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
+  densify train scene:spheres -i 2000                      train on a built-in scene: no file needed
   densify train data/garden --eval                         train, hold out every 8th photograph
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
   densify policies diet                                    what a policy does, and its parameters
+  densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
 
 `densify COMMAND --help` explains every option of a command.";
 
@@ -59,6 +62,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(Box<render::RenderArgs>),
     Policies(policies::PoliciesArgs),
+    Scenegen(Box<scenegen::ScenegenArgs>),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -84,6 +88,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
+        Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
     };
     match done.and_then(|()| console.finish()) {
         Ok(()) => 0,

@@ -166,7 +166,11 @@ impl Materials {
             Some(index) => match root.samplers.get(index.value()) {
                 Some(sampler) => sampler_of(sampler),
                 None => {
-                    return Err(fault(path, name, format!("there is no sampler {}", index.value())));
+                    return Err(fault(
+                        path,
+                        name,
+                        format!("there is no sampler {}", index.value()),
+                    ));
                 }
             },
         };

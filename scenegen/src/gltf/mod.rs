@@ -39,6 +39,20 @@ const SUPPORTED: [&str; 5] = [
     "KHR_texture_transform",
 ];
 
+/// Extensions that change how surfaces look and not where they are: files that require them are
+/// rendered with their core materials, and a note says so.
+const APPEARANCE: [&str; 9] = [
+    "KHR_materials_anisotropy",
+    "KHR_materials_clearcoat",
+    "KHR_materials_dispersion",
+    "KHR_materials_ior",
+    "KHR_materials_iridescence",
+    "KHR_materials_sheen",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
+    "KHR_materials_volume",
+];
+
 /// A file being read.
 struct Reader<'a> {
     path: &'a Path,
@@ -163,8 +177,8 @@ fn refuse_required(path: &Path, text: &[u8]) -> Result<(), Error> {
         let version: String = head.asset.version.chars().take(20).collect();
         return Err(unsupported(format!("glTF version {version}"), "export it as glTF 2.0"));
     }
-    let needed = head.extensions_required.iter();
-    if let Some(name) = needed.into_iter().find(|name| !SUPPORTED.contains(&name.as_str())) {
+    let known = |name: &str| SUPPORTED.contains(&name) || APPEARANCE.contains(&name);
+    if let Some(name) = head.extensions_required.iter().find(|name| !known(name)) {
         let remedy = match name.as_str() {
             "KHR_draco_mesh_compression" => "export the mesh without Draco compression",
             "EXT_meshopt_compression" | "KHR_meshopt_compression" => {

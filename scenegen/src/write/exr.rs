@@ -18,7 +18,7 @@ pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
     let mut bytes = Cursor::new(Vec::new());
     let image = Image::from_channels((width, frame.height as usize), channels);
     let written = image.write().non_parallel().to_buffered(&mut bytes);
-    written.map_err(|error| Error::io(path)(std::io::Error::other(error)))?;
+    written.map_err(|error| Error::write(path)(std::io::Error::other(error)))?;
     write_file(path, bytes.get_ref())
 }
 
@@ -36,6 +36,6 @@ pub(super) fn write_normals(path: &Path, frame: &Frame) -> Result<(), Error> {
     let mut bytes = Cursor::new(Vec::new());
     let image = Image::from_channels((width, frame.height as usize), channels);
     let written = image.write().non_parallel().to_buffered(&mut bytes);
-    written.map_err(|error| Error::io(path)(std::io::Error::other(error)))?;
+    written.map_err(|error| Error::write(path)(std::io::Error::other(error)))?;
     write_file(path, bytes.get_ref())
 }

@@ -28,27 +28,28 @@ pub struct Written {
     pub points: usize,
 }
 
-/// Renders all views of a scene and writes it to the folder `target`, which must not exist, be
-/// empty, or hold a scene that this function wrote. `progress` is told each view's number as it is
-/// done.
+/// Renders all views of a scene and writes it to the folder `target`, which must not exist or be
+/// empty; with `overwrite`, it may hold a scene that this function wrote. `progress` is told each
+/// view's number as it is done.
 ///
 /// # Errors
 /// When the folder holds anything else, or a file cannot be written.
 pub fn write(
     scene: &Scene,
     target: &Path,
+    overwrite: bool,
     mut progress: impl FnMut(usize),
 ) -> Result<Written, Error> {
-    let replaces = may_be_written(target)?;
+    let replaces = may_be_written(target, overwrite)?;
     let parent = match target.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
-    fs::create_dir_all(parent).map_err(Error::io(parent))?;
+    fs::create_dir_all(parent).map_err(Error::write(parent))?;
     let folder = tempfile::Builder::new()
         .prefix(".densify-scene-")
         .tempdir_in(parent)
-        .map_err(Error::io(parent))?;
+        .map_err(Error::write(parent))?;
     let root = folder.path();
     let mut collector = scene.point_collector();
     for (number, view) in scene.views.iter().enumerate() {
@@ -67,37 +68,45 @@ pub fn write(
         let old = tempfile::Builder::new()
             .prefix(".densify-old-")
             .tempdir_in(parent)
-            .map_err(Error::io(parent))?;
-        fs::rename(target, old.path().join("scene")).map_err(Error::io(target))?;
-        fs::rename(&unused, target).map_err(Error::io(target))?;
+            .map_err(Error::write(parent))?;
+        fs::rename(target, old.path().join("scene")).map_err(Error::write(target))?;
+        fs::rename(&unused, target).map_err(Error::write(target))?;
     } else {
         // An empty folder is in a rename's way on some systems.
         if target.is_dir() {
-            fs::remove_dir(target).map_err(Error::io(target))?;
+            fs::remove_dir(target).map_err(Error::write(target))?;
         }
-        fs::rename(&unused, target).map_err(Error::io(target))?;
+        fs::rename(&unused, target).map_err(Error::write(target))?;
     }
     Ok(Written { views: scene.views.len(), points: points.positions.len() })
 }
 
-/// Whether the target holds an earlier scene; an error if it holds anything else.
-fn may_be_written(target: &Path) -> Result<bool, Error> {
-    if target.join(record::NAME).is_file() {
-        return Ok(true);
-    }
+/// Whether the target holds an earlier scene; an error if it holds one that is to stay, or anything
+/// else.
+fn may_be_written(target: &Path, overwrite: bool) -> Result<bool, Error> {
+    let refuse =
+        |what: &str| Err(Error::option("--output", format!("{} {what}", target.display())));
     let taken = match fs::read_dir(target) {
         Ok(mut entries) => entries.next().is_some(),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => false,
-        Err(error) => return Err(Error::io(target)(error)),
+        Err(error) => return Err(Error::write(target)(error)),
     };
-    if taken {
-        let problem = format!(
-            "{} is not empty and holds no scene.json; name another folder",
-            target.display()
-        );
-        return Err(Error::option("--output", problem));
+    if !taken {
+        return Ok(false);
     }
-    Ok(false)
+    match (target.join(record::NAME).is_file(), overwrite) {
+        (true, true) => Ok(true),
+        (true, false) => refuse("holds a scene; add --overwrite to replace it"),
+        (false, _) => refuse("is not empty and holds no scene.json; name another folder"),
+    }
+}
+
+/// Checks that [`write`] may use a folder, before anything is rendered.
+///
+/// # Errors
+/// As [`write`].
+pub fn check_target(target: &Path, overwrite: bool) -> Result<(), Error> {
+    may_be_written(target, overwrite).map(|_| ())
 }
 
 /// Temporary folders are for their owner only; scenes are as other files.
@@ -106,9 +115,9 @@ fn readable(folder: &Path) -> Result<(), Error> {
     {
         use std::os::unix::fs::PermissionsExt;
         let like = folder.join("sparse");
-        let mode = fs::metadata(&like).map_err(Error::io(&like))?.permissions().mode();
+        let mode = fs::metadata(&like).map_err(Error::write(&like))?.permissions().mode();
         let permissions = fs::Permissions::from_mode(mode);
-        fs::set_permissions(folder, permissions).map_err(Error::io(folder))?;
+        fs::set_permissions(folder, permissions).map_err(Error::write(folder))?;
     }
     let _ = folder;
     Ok(())
@@ -138,15 +147,15 @@ pub fn write_png(path: &Path, width: u32, height: u32, rgba: &[u8]) -> Result<()
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes)
         .write_image(rgba, width, height, ExtendedColorType::Rgba8)
-        .map_err(|error| Error::io(path)(std::io::Error::other(error)))?;
+        .map_err(|error| Error::write(path)(std::io::Error::other(error)))?;
     write_file(path, &bytes)
 }
 
 fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     if let Some(parent) = path.parent() {
-        fs::create_dir_all(parent).map_err(Error::io(parent))?;
+        fs::create_dir_all(parent).map_err(Error::write(parent))?;
     }
-    fs::write(path, bytes).map_err(Error::io(path))
+    fs::write(path, bytes).map_err(Error::write(path))
 }
 
 /// One picture of eight training views, evenly chosen, over light grey. Width, height and RGBA

@@ -50,6 +50,6 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     });
     let path = root.join(NAME);
     let text = serde_json::to_vec_pretty(&record);
-    let text = text.map_err(|error| Error::io(&path)(std::io::Error::other(error)))?;
+    let text = text.map_err(|error| Error::write(&path)(std::io::Error::other(error)))?;
     write_file(&path, &text)
 }

@@ -41,7 +41,7 @@ pub(super) fn write(scene: &Scene, root: &Path, split: Split) -> Result<(), Erro
     top["frames"] = frames.collect();
     let path = root.join(name);
     let text = serde_json::to_vec_pretty(&top);
-    let text = text.map_err(|error| Error::io(&path)(std::io::Error::other(error)))?;
+    let text = text.map_err(|error| Error::write(&path)(std::io::Error::other(error)))?;
     write_file(&path, &text)
 }
 
