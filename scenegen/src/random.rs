@@ -101,3 +101,6 @@ pub(crate) fn frame(normal: Vec3) -> (Vec3, Vec3) {
         Vec3::new(b, sign + normal.y * normal.y * a, -normal.y),
     )
 }
+
+#[cfg(test)]
+mod tests;

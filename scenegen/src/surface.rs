@@ -432,3 +432,6 @@ impl std::fmt::Debug for Surface {
         shown.finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+mod tests;
