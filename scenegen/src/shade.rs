@@ -63,6 +63,11 @@ pub(crate) struct Point<'a> {
 pub(crate) struct Subsample {
     pub(crate) index: u32,
     pub(crate) draws: Draws,
+    /// What the pixel's last ray met, by place in leaf order: the next one is likely to meet it too,
+    /// and then needs to look only in front of it. No result depends on this.
+    pub(crate) met: Option<u32>,
+    /// What hid a light last.
+    pub(crate) hid: Option<u32>,
 }
 
 impl Lighting {
@@ -108,7 +113,7 @@ impl Lighting {
         }
         let mut total = point.emitted;
         for light in &self.lights {
-            let u = stratum(sample.index, self.grid, sample.draws.square());
+            let u = || stratum(sample.index, self.grid, sample.draws.square());
             let Some((to_light, distance, irradiance)) = arriving(light, point.place, u) else {
                 continue;
             };
@@ -116,16 +121,31 @@ impl Lighting {
                 continue;
             }
             let sent = point.reflected(view, to_light) * irradiance;
-            if sent.max_element() > 0.0 && !self.is_shadowed(matter, point, to_light, distance) {
+            if sent.max_element() > 0.0
+                && !self.is_shadowed(matter, point, to_light, distance, sample)
+            {
                 total += sent;
             }
         }
         total + self.ambient(matter, point, view, sample)
     }
 
-    fn is_shadowed(&self, matter: &Matter<'_>, point: &Point<'_>, to: Vec3, distance: f32) -> bool {
+    fn is_shadowed(
+        &self,
+        matter: &Matter<'_>,
+        point: &Point<'_>,
+        to: Vec3,
+        distance: f32,
+        sample: &mut Subsample,
+    ) -> bool {
+        if !self.shadows {
+            return false;
+        }
         let ray = lifted(point, to, (distance - 2.0 * LIFT).max(0.0));
-        self.shadows && matter.surface.occluded(&ray, |slot, at| matter.is_solid(slot, at))
+        let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
+        let found = matter.surface.occluder(&ray, sample.hid, solid);
+        sample.hid = found.or(sample.hid);
+        found.is_some()
     }
 
     fn ambient(
@@ -177,11 +197,12 @@ impl Lighting {
     ) -> Vec3 {
         let ray = lifted(point, direction, f32::MAX);
         if !bounce {
-            let hidden = matter.surface.occluded(&ray, |slot, at| matter.is_solid(slot, at));
+            let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
+            let hidden = matter.surface.occluder(&ray, None, solid).is_some();
             return if hidden { Vec3::ZERO } else { self.sky.radiance(direction) };
         }
         let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
-        let Some(hit) = matter.surface.closest(&ray, None, solid) else {
+        let Some(hit) = matter.surface.closest(&ray, None, None, solid) else {
             return self.sky.radiance(direction);
         };
         let (there, _) = Point::read(matter, &ray, &hit, 0.0);
@@ -191,14 +212,14 @@ impl Lighting {
         let emitted = if there.material.is_light { Vec3::ZERO } else { there.emitted };
         let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
         for light in &self.lights {
-            let u = sample.draws.square();
+            let u = || sample.draws.square();
             let Some((to_light, distance, irradiance)) = arriving(light, there.place, u) else {
                 continue;
             };
             let cos = there.shading.dot(to_light);
             if cos > 0.0
                 && there.geometric.dot(to_light) > 0.0
-                && !self.is_shadowed(matter, &there, to_light, distance)
+                && !self.is_shadowed(matter, &there, to_light, distance, sample)
             {
                 total += there.diffuse_colour() / PI * cos * irradiance;
             }
@@ -480,9 +501,9 @@ impl Located<'_> {
     }
 }
 
-/// Direction to a light, distance, and irradiance of a surface that faces it; `u` picks the point
+/// Direction to a light, distance, and irradiance of a surface that faces it; `u` draws the point
 /// of an area light. None where it does not shine.
-fn arriving(light: &Light, place: Vec3, u: Vec2) -> Option<(Vec3, f32, Vec3)> {
+fn arriving(light: &Light, place: Vec3, u: impl FnOnce() -> Vec2) -> Option<(Vec3, f32, Vec3)> {
     let from_point = |position: DVec3| {
         let way = position.as_vec3() - place;
         let distance = way.length();
@@ -505,6 +526,7 @@ fn arriving(light: &Light, place: Vec3, u: Vec2) -> Option<(Vec3, f32, Vec3)> {
             (share > 0.0).then_some((to, distance, irradiance))
         }
         LightKind::Area { corner, u: side_u, v: side_v } => {
+            let u = u();
             let (side_u, side_v) = (side_u.as_vec3(), side_v.as_vec3());
             let (to, distance) = from_point(corner + (u.x * side_u + u.y * side_v).as_dvec3())?;
             let area = side_u.cross(side_v);

@@ -120,7 +120,7 @@ impl Surface {
     #[must_use]
     pub fn cast(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<SurfaceHit> {
         let ray = self.enter(origin, direction, range)?;
-        let hit = self.closest(&ray, None, |_, _| true)?;
+        let hit = self.closest(&ray, None, None, |_, _| true)?;
         let hit = self.describe(origin, direction, hit);
         (hit.t <= range).then_some(hit)
     }
@@ -137,7 +137,8 @@ impl Surface {
         }
         let step = way * (margin / length);
         let (origin, direction) = (from + step, way - 2.0 * step);
-        self.enter(origin, direction, 1.0).is_some_and(|ray| self.occluded(&ray, |_, _| true))
+        let ray = self.enter(origin, direction, 1.0);
+        ray.is_some_and(|ray| self.occluder(&ray, None, |_, _| true).is_some())
     }
 
     /// The surface's nearest point.
@@ -270,18 +271,22 @@ impl Surface {
     }
 
     /// The first meeting that counts; of several at the same parameter, that with the model's
-    /// first triangle. With `after`, the first one behind that one in the same order.
+    /// first triangle. With `after`, the first one behind that one in the same order. The triangle
+    /// `hint` is tried first.
     #[inline]
     pub(crate) fn closest(
         &self,
         ray: &LocalRay,
         after: Option<(f32, u32)>,
+        hint: Option<u32>,
         accept: impl Fn(u32, &Meeting) -> bool,
     ) -> Option<LocalHit> {
         if self.depth <= SHALLOW {
-            self.closest_with(StackStack::<UVec2, SHALLOW>::default(), ray, after, accept)
+            let stack = StackStack::<UVec2, SHALLOW>::default();
+            self.closest_with(stack, ray, (after, hint), accept)
         } else {
-            self.closest_with(HeapStack::new_with_capacity(self.depth), ray, after, accept)
+            let stack = HeapStack::new_with_capacity(self.depth);
+            self.closest_with(stack, ray, (after, hint), accept)
         }
     }
 
@@ -290,66 +295,86 @@ impl Surface {
         &self,
         stack: impl FastStack<UVec2>,
         ray: &LocalRay,
-        after: Option<(f32, u32)>,
+        (after, hint): (Option<(f32, u32)>, Option<u32>),
         accept: impl Fn(u32, &Meeting) -> bool,
     ) -> Option<LocalHit> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
         let mut boxes = box_ray(ray);
-        let mut state = Walk::new(stack, self.bvh.new_traversal(boxes.direction));
         let mut best: Option<LocalHit> = None;
+        // Whether a meeting is nearer than the best so far.
+        let nearer = |slot: u32, tmax: f32, best: &Option<LocalHit>| -> Option<Meeting> {
+            let at = sheared.meet(&self.triangles[slot as usize])?;
+            if !(at.t > ray.tmin && at.t <= tmax) {
+                return None;
+            }
+            let first = best.is_none_or(|best| {
+                at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
+            });
+            let behind = after.is_none_or(|(t, triangle)| {
+                at.t > t || (at.t == t && self.triangle_of(slot) > triangle)
+            });
+            (first && behind && accept(slot, &at)).then_some(at)
+        };
+        if let Some(slot) = hint
+            && let Some(at) = nearer(slot, boxes.tmax, &best)
+        {
+            boxes.tmax = at.t;
+            best = Some(LocalHit { slot, at });
+        }
+        let mut state = Walk::new(stack, self.bvh.new_traversal(boxes.direction));
         let mut node;
         obvhs::traverse!(self.bvh, node, state, node.intersect_ray(&boxes, state.oct_inv4), {
             let slot = state.primitive_id;
-            if let Some(at) = sheared.meet(&self.triangles[slot as usize])
-                && at.t > ray.tmin
-                && at.t <= boxes.tmax
-            {
-                let first = best.is_none_or(|best| {
-                    at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
-                });
-                let behind = after.is_none_or(|(t, triangle)| {
-                    at.t > t || (at.t == t && self.triangle_of(slot) > triangle)
-                });
-                if first && behind && accept(slot, &at) {
-                    boxes.tmax = at.t;
-                    best = Some(LocalHit { slot, at });
-                }
+            if let Some(at) = nearer(slot, boxes.tmax, &best) {
+                boxes.tmax = at.t;
+                best = Some(LocalHit { slot, at });
             }
         });
         best
     }
 
-    /// Whether there is any meeting that counts.
+    /// Any triangle whose meeting counts, by its place in leaf order; `hint` is tried first.
     #[inline]
-    pub(crate) fn occluded(&self, ray: &LocalRay, accept: impl Fn(u32, &Meeting) -> bool) -> bool {
+    pub(crate) fn occluder(
+        &self,
+        ray: &LocalRay,
+        hint: Option<u32>,
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> Option<u32> {
         if self.depth <= SHALLOW {
-            self.occluded_with(StackStack::<UVec2, SHALLOW>::default(), ray, accept)
+            self.occluder_with(StackStack::<UVec2, SHALLOW>::default(), ray, hint, accept)
         } else {
-            self.occluded_with(HeapStack::new_with_capacity(self.depth), ray, accept)
+            self.occluder_with(HeapStack::new_with_capacity(self.depth), ray, hint, accept)
         }
     }
 
     #[inline]
-    fn occluded_with(
+    fn occluder_with(
         &self,
         stack: impl FastStack<UVec2>,
         ray: &LocalRay,
+        hint: Option<u32>,
         accept: impl Fn(u32, &Meeting) -> bool,
-    ) -> bool {
+    ) -> Option<u32> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
+        let counts = |slot: u32| {
+            sheared
+                .meet(&self.triangles[slot as usize])
+                .is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
+        };
+        if let Some(slot) = hint
+            && counts(slot)
+        {
+            return hint;
+        }
         let boxes = box_ray(ray);
         let mut state = Walk::new(stack, self.bvh.new_traversal(boxes.direction));
         let mut node;
-        let mut found = false;
+        let mut found = None;
         'walk: {
             obvhs::traverse!(self.bvh, node, state, node.intersect_ray(&boxes, state.oct_inv4), {
-                let slot = state.primitive_id;
-                if let Some(at) = sheared.meet(&self.triangles[slot as usize])
-                    && at.t > ray.tmin
-                    && at.t <= ray.tmax
-                    && accept(slot, &at)
-                {
-                    found = true;
+                if counts(state.primitive_id) {
+                    found = Some(state.primitive_id);
                     break 'walk;
                 }
             });

@@ -6,6 +6,7 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
+use crate::intersect::Meeting;
 use crate::mesh::Model;
 use crate::random::{Draws, stratum};
 use crate::shade::{Lighting, Matter, Point, Subsample, Traits};
@@ -100,7 +101,7 @@ impl Tracer<'_> {
     fn pixel(&self, camera: &Camera, corner: DVec2, draws: Draws) -> [u8; 4] {
         let grid = self.lighting.grid;
         let (mut colour, mut alpha) = (Vec3::ZERO, 0.0);
-        let mut sample = Subsample { index: 0, draws };
+        let mut sample = Subsample { index: 0, draws, met: None, hid: None };
         // Width of a subsample at depth 1.
         let spread = 1.0 / (camera.fx * f64::from(grid)) as f32;
         for index in 0..grid * grid {
@@ -130,7 +131,8 @@ impl Tracer<'_> {
     ) -> (Vec3, f32) {
         let (mut colour, mut transmittance) = (Vec3::ZERO, 1.0);
         let matter = self.matter();
-        self.layers(origin, direction, |ray, hit, entry| {
+        self.layers(origin, direction, sample.met, |ray, hit, entry| {
+            sample.met = Some(hit.slot);
             let width = (hit.at.t + entry) * spread;
             let (point, alpha) = Point::read(&matter, ray, &hit, width);
             if alpha > 0.0 {
@@ -151,7 +153,7 @@ impl Tracer<'_> {
     pub(crate) fn first_solid(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3, u32)> {
         let matter = self.matter();
         let mut first = None;
-        self.layers(origin, direction, |ray, hit, _| {
+        self.layers(origin, direction, None, |ray, hit, _| {
             let (_, alpha) = Point::read(&matter, ray, &hit, 0.0);
             if alpha >= 0.5 {
                 let hit = self.surface.describe(origin, direction, hit);
@@ -169,6 +171,7 @@ impl Tracer<'_> {
         &self,
         origin: DVec3,
         direction: DVec3,
+        hint: Option<u32>,
         mut go_on: impl FnMut(&LocalRay, LocalHit, f32) -> bool,
     ) {
         let Some(ray) = self.surface.enter(origin, direction, f64::INFINITY) else {
@@ -178,7 +181,8 @@ impl Tracer<'_> {
         let matter = self.matter();
         let mut after = None;
         for _ in 0..MAX_LAYERS {
-            let hit = self.surface.closest(&ray, after, |slot, at| matter.is_visible(slot, at));
+            let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
+            let hit = self.surface.closest(&ray, after, hint, visible);
             let Some(hit) = hit else {
                 return;
             };
@@ -198,6 +202,8 @@ pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec
             let mut sample = Subsample {
                 index: 0,
                 draws: Draws::new(tracer.seed, &[u64::from(x), u64::from(y)]),
+                met: None,
+                hid: None,
             };
             let corner = DVec2::new(f64::from(x), f64::from(y));
             let direction = camera.direction(corner + Vec2::splat(0.5).as_dvec2());

@@ -27,7 +27,11 @@ fn follows(counts: &[u64], probabilities: &[f64]) -> Result<(), String> {
         }
     }
     let limit = limit(bins);
-    if chi < limit { Ok(()) } else { Err(format!("chi-square {chi} of {bins} bins, limit {limit}")) }
+    if chi < limit {
+        Ok(())
+    } else {
+        Err(format!("chi-square {chi} of {bins} bins, limit {limit}"))
+    }
 }
 
 const DRAWS: usize = 400_000;
@@ -147,7 +151,9 @@ fn normals_are_normal() {
     let density = |x: f64| (-0.5 * x * x).exp() / std::f64::consts::TAU.sqrt();
     let mass = |bin: usize| {
         let width = 0.2 / 50.0;
-        (0..50).map(|i| density((bin as f64 - 20.0) / 5.0 + (f64::from(i) + 0.5) * width) * width).sum()
+        (0..50)
+            .map(|i| density((bin as f64 - 20.0) / 5.0 + (f64::from(i) + 0.5) * width) * width)
+            .sum()
     };
     let probabilities: Vec<f64> = (0..40).map(mass).collect();
     follows(&counts, &probabilities).expect("normal");
