@@ -215,3 +215,6 @@ pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec
     }
     all
 }
+
+#[cfg(test)]
+mod tests;

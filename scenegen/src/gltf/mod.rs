@@ -502,3 +502,6 @@ fn triangles(mode: Mode, indices: &[u32], mirrored: bool) -> Vec<[u32; 3]> {
     }
     triangles
 }
+
+#[cfg(test)]
+mod tests;
