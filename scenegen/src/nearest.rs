@@ -7,39 +7,35 @@ use crate::surface::Surface;
 /// The triangle (by its place in leaf order), its nearest point and the distance, all local. Of
 /// several triangles at the same distance, the model's first.
 pub(crate) fn search(surface: &Surface, place: DVec3) -> (u32, DVec3, f64) {
-    let bvh = &surface.bvh;
+    let nodes = &surface.bvh.nodes;
+    let bound = |index: u32| {
+        let bounds = nodes[index as usize].aabb();
+        let (lo, hi) = (bounds.min.as_dvec3(), bounds.max.as_dvec3());
+        (lo - place).max(place - hi).max(DVec3::ZERO).length_squared()
+    };
     let mut best = (0_u32, DVec3::ZERO, f64::INFINITY);
     let mut open = vec![(0.0_f64, 0_u32)];
-    while let Some((bound, index)) = open.pop() {
-        if bound > best.2 {
+    while let Some((least, index)) = open.pop() {
+        if least > best.2 {
             continue;
         }
-        let node = &bvh.nodes[index as usize];
-        let first_pushed = open.len();
-        for child in (0..8).filter(|&c| !node.is_child_empty(c)) {
-            let bounds = node.child_aabb(child);
-            let (lo, hi) = (bounds.min.as_dvec3(), bounds.max.as_dvec3());
-            let bound = (lo - place).max(place - hi).max(DVec3::ZERO).length_squared();
-            if bound > best.2 {
-                continue;
-            }
-            if !node.is_leaf(child) {
-                open.push((bound, node.child_node_index(child)));
-                continue;
-            }
-            let (first, count) = node.child_primitives(child);
-            for slot in first..first + count {
-                let corners = surface.triangles[slot as usize].map(|p| p.as_dvec3());
-                let point = on_triangle(place, corners);
-                let distance = point.distance_squared(place);
-                let earlier = || surface.triangle_of(slot) < surface.triangle_of(best.0);
-                if distance < best.2 || (distance == best.2 && earlier()) {
-                    best = (slot, point, distance);
-                }
+        let node = &nodes[index as usize];
+        if !node.is_leaf() {
+            let [a, b] =
+                [node.first_index, node.first_index + 1].map(|child| (bound(child), child));
+            // The nearer child is opened first.
+            open.extend(if a.0 < b.0 { [b, a] } else { [a, b] });
+            continue;
+        }
+        for slot in node.first_index..node.first_index + node.prim_count {
+            let corners = surface.triangles[slot as usize].map(|p| p.as_dvec3());
+            let point = on_triangle(place, corners);
+            let distance = point.distance_squared(place);
+            let earlier = || surface.triangle_of(slot) < surface.triangle_of(best.0);
+            if distance < best.2 || (distance == best.2 && earlier()) {
+                best = (slot, point, distance);
             }
         }
-        // The nearest child is opened first.
-        open[first_pushed..].sort_by(|a, b| b.0.total_cmp(&a.0));
     }
     (best.0, best.1, best.2.sqrt())
 }

@@ -223,3 +223,6 @@ impl<'a> PointCollector<'a> {
         Draws::new(self.tracer.seed ^ 0x6472_6f70, &key).unit64() < self.options.dropout
     }
 }
+
+#[cfg(test)]
+mod tests;

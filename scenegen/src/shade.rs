@@ -2,6 +2,7 @@
 //! (glTF 2.0 specification, appendix B), lit by the scene's lights and the sky.
 
 use std::f32::consts::PI;
+use std::sync::OnceLock;
 
 use glam::{DVec3, Vec2, Vec3, Vec4, Vec4Swizzles};
 
@@ -227,17 +228,14 @@ impl Lighting {
         total
     }
 
-    /// The sky in a glossy surface, in closed form: the radiance of a blurred sky times the
-    /// directional albedo of GGX (fit by Karis, "Physically Based Shading on Mobile", 2014).
+    /// The sky in a glossy surface, without rays: the radiance of a blurred sky times the share of it
+    /// that is reflected.
     fn mirrored_sky(&self, point: &Point<'_>, view: Vec3) -> Vec3 {
         let cos = point.shading.dot(view).max(0.0);
-        let r = point.roughness * Vec4::new(-1.0, -0.0275, -0.572, 0.022)
-            + Vec4::new(1.0, 0.0425, 1.04, -0.04);
-        let a = (r.x * r.x).min(2.0_f32.powf(-9.28 * cos)) * r.x + r.y;
-        let (scale, bias) = (-1.04 * a + r.z, 1.04 * a + r.w);
+        let (scale, bias) = directional_albedo(cos, point.roughness);
         let albedo = point.f0() * scale + Vec3::splat(bias);
         let direction = 2.0 * point.shading.dot(view) * point.shading - view;
-        albedo.max(Vec3::ZERO) * self.sky.blurred(direction, point.roughness)
+        albedo * self.sky.blurred(direction, point.roughness)
     }
 
     /// What a glossy surface mirrors, by one sampled direction.
@@ -548,8 +546,6 @@ fn windowed(distance: f32, range: f64) -> f32 {
 }
 
 fn lifted(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {
-    // −0 would turn the tree's box tests around.
-    let direction = direction + Vec3::ZERO;
     LocalRay { origin: point.place + point.geometric * LIFT, direction, tmin: 0.0, tmax }
 }
 
@@ -557,6 +553,55 @@ fn lifted(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {
 fn fresnel(f0: Vec3, cos: f32) -> Vec3 {
     let grazing = (1.0 - cos).clamp(0.0, 1.0);
     f0 + (Vec3::ONE - f0) * (grazing * grazing) * (grazing * grazing) * grazing
+}
+
+/// Steps of the table of directional albedo along each axis.
+const STEPS: usize = 16;
+
+/// The share of light from all around that GGX reflects towards a viewer, as a factor of the normal
+/// reflectance and a rest (Karis, "Real Shading in Unreal Engine 4", 2013): interpolated in a table that
+/// is integrated once by sampling visible normals.
+fn directional_albedo(cos: f32, roughness: f32) -> (f32, f32) {
+    static TABLE: OnceLock<Vec<(f32, f32)>> = OnceLock::new();
+    let table = TABLE.get_or_init(|| {
+        let entry = |i: usize| {
+            let cos = ((i % (STEPS + 1)) as f32 / STEPS as f32).max(0.01);
+            let roughness = (i / (STEPS + 1)) as f32 / STEPS as f32;
+            integrated_albedo(cos, (roughness * roughness).max(MIN_ALPHA))
+        };
+        (0..(STEPS + 1) * (STEPS + 1)).map(entry).collect()
+    });
+    let place = |value: f32| {
+        let at = value.clamp(0.0, 1.0) * STEPS as f32;
+        let low = (at as usize).min(STEPS - 1);
+        (low, at - low as f32)
+    };
+    let ((x, dx), (y, dy)) = (place(cos), place(roughness));
+    let mix = |a: (f32, f32), b: (f32, f32), t: f32| (a.0 + t * (b.0 - a.0), a.1 + t * (b.1 - a.1));
+    let row = |y: usize| {
+        let first = y * (STEPS + 1) + x;
+        mix(table[first], table[first + 1], dx)
+    };
+    mix(row(y), row(y + 1), dy)
+}
+
+fn integrated_albedo(cos: f32, alpha: f32) -> (f32, f32) {
+    const GRID: u32 = 16;
+    let view = Vec3::new((1.0 - cos * cos).sqrt(), 0.0, cos);
+    let (mut scale, mut bias) = (0.0, 0.0);
+    for i in 0..GRID * GRID {
+        let half = ggx_visible_normal(view, alpha, stratum(i, GRID, Vec2::splat(0.5)));
+        let seen = view.dot(half).max(0.0);
+        let out = 2.0 * seen * half - view;
+        if out.z > 0.0 {
+            let weight = shadowing_after_masking(cos, out.z, alpha);
+            let grazing = (1.0 - seen).powi(5);
+            scale += weight * (1.0 - grazing);
+            bias += weight * grazing;
+        }
+    }
+    let count = (GRID * GRID) as f32;
+    (scale / count, bias / count)
 }
 
 /// Height-correlated Smith shadowing and masking, over 4 cos cos (Heitz, JCGT 2014).

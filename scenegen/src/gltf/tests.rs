@@ -177,7 +177,6 @@ fn bad_values_are_errors_that_name_the_element() {
         ("/nodes/0/mesh", json!(4), "mesh 4"),
         ("/nodes/0/children", json!([0]), "node 0"),
         ("/nodes/0/children", json!([7]), "node 7"),
-        ("/nodes/0/scale", json!([1e38, 1e38, 1e38]), "vertex"),
         ("/meshes/0/primitives/0/mode", json!(9), "primitive 0"),
         ("/meshes/0/primitives/0/material", json!(2), "material 2"),
         ("/meshes/0/primitives/0/indices", json!(8), "accessor 8"),
@@ -192,10 +191,6 @@ fn bad_values_are_errors_that_name_the_element() {
         ("/asset", json!({}), "JSON"),
     ] {
         let result = with(pointer, value.clone());
-        if pointer == "/nodes/0/scale" {
-            // Finite, if only just.
-            continue;
-        }
         let message = result.err().unwrap_or_else(|| panic!("{pointer} = {value}")).to_string();
         assert!(message.contains(part), "{pointer} = {value}: {message}");
     }

@@ -181,3 +181,6 @@ pub fn contact_sheet(scene: &Scene) -> (u32, u32, Vec<u8>) {
     }
     ((COLUMNS * width) as u32, 2 * height as u32, sheet)
 }
+
+#[cfg(test)]
+mod tests;
