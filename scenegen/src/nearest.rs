@@ -1,11 +1,12 @@
 //! The surface's nearest point, by branch and bound in the tree that rays use.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 
 use crate::surface::Surface;
 
 /// The triangle (by its place in leaf order), its nearest point and the distance, all local. Of
 /// several triangles at the same distance, the model's first.
+#[expect(clippy::float_cmp, reason = "ties are exact: the same triangle twice")]
 pub(crate) fn search(surface: &Surface, place: DVec3) -> (u32, DVec3, f64) {
     let nodes = &surface.bvh.nodes;
     let bound = |index: u32| {
@@ -28,7 +29,7 @@ pub(crate) fn search(surface: &Surface, place: DVec3) -> (u32, DVec3, f64) {
             continue;
         }
         for slot in node.first_index..node.first_index + node.prim_count {
-            let corners = surface.triangles[slot as usize].map(|p| p.as_dvec3());
+            let corners = surface.triangles[slot as usize].map(Vec3::as_dvec3);
             let point = on_triangle(place, corners);
             let distance = point.distance_squared(place);
             let earlier = || surface.triangle_of(slot) < surface.triangle_of(best.0);

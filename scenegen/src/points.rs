@@ -155,7 +155,7 @@ impl<'a> PointCollector<'a> {
     #[must_use]
     pub fn finish(mut self) -> InitPoints {
         let PointOptions { count, random, noise, outliers, .. } = self.options;
-        let mut draws = Draws::new(self.tracer.seed, &[0x6e6f_6973_65]);
+        let mut draws = Draws::new(self.tracer.seed, &[0x006e_6f69_7365]);
         let (lo, hi) = self.bounds;
         let diagonal = (hi - lo).length();
         let mut points = InitPoints::default();

@@ -174,7 +174,7 @@ impl Lighting {
             let d = cosine_hemisphere(u);
             let direction = d.x * tangent + d.y * bitangent + d.z * point.shading;
             if point.geometric.dot(direction) > 0.0 {
-                sum += self.from_afar(matter, point, direction, bounce, sample);
+                sum += self.arriving_from(matter, point, direction, bounce, sample);
             }
         }
         let diffuse = diffuse_colour * sum / count as f32;
@@ -188,7 +188,7 @@ impl Lighting {
     }
 
     /// Radiance that arrives from a direction: the sky, or what hides it, as lit directly.
-    fn from_afar(
+    fn arriving_from(
         &self,
         matter: &Matter<'_>,
         point: &Point<'_>,
@@ -258,7 +258,7 @@ impl Lighting {
         }
         let weight = fresnel(point.f0(), local.dot(half))
             * shadowing_after_masking(local.z, out.z, point.alpha_ggx);
-        weight * self.from_afar(matter, point, direction, true, sample)
+        weight * self.arriving_from(matter, point, direction, true, sample)
     }
 }
 

@@ -253,7 +253,7 @@ impl Surface {
     /// The hit in world coordinates; its parameter comes from the triangle's plane in f64 and
     /// belongs to the world ray.
     pub(crate) fn describe(&self, origin: DVec3, direction: DVec3, hit: LocalHit) -> SurfaceHit {
-        let [a, b, c] = self.triangles[hit.slot as usize].map(|p| p.as_dvec3());
+        let [a, b, c] = self.triangles[hit.slot as usize].map(Vec3::as_dvec3);
         let (o, d) = (self.to_local(origin), direction * self.scale);
         let normal = (b - a).cross(c - a);
         let along = normal.dot(d);
@@ -293,6 +293,7 @@ impl Surface {
     }
 
     #[inline]
+    #[expect(clippy::float_cmp, reason = "ties are exact: they order triangles at one place")]
     fn closest_with(
         &self,
         mut stack: impl FastStack<u32>,

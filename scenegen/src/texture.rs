@@ -119,8 +119,8 @@ impl Texture {
         let first = &self.levels[0];
         let texels = footprint * ((first.width * first.height) as f32).sqrt();
         let level = if sampler.mipmaps { texels.log2() } else { 0.0 };
-        // Not greater, rather than smaller: NaN takes the first level.
-        if !(level > 0.0) {
+        // NaN takes the first level.
+        if level.is_nan() || level <= 0.0 {
             let nearest = sampler.nearest;
             return if nearest {
                 first.nearest(uv, self.srgb)

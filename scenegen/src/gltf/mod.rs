@@ -504,4 +504,5 @@ fn triangles(mode: Mode, indices: &[u32], mirrored: bool) -> Vec<[u32; 3]> {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, clippy::print_stderr, reason = "exact values; tests say why they skip")]
 mod tests;

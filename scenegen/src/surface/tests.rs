@@ -70,7 +70,7 @@ fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
             }
             // Along axes, with zeros of both signs.
             2 => {
-                let sign = if draws.bits() % 2 == 0 { 1.0 } else { -1.0 };
+                let sign = if draws.bits().is_multiple_of(2) { 1.0 } else { -1.0 };
                 let mut axis = DVec3::splat(sign * 0.0);
                 axis[(draws.bits() % 3) as usize] = sign;
                 axis

@@ -41,7 +41,7 @@ pub(super) fn write_mesh(path: &Path, surface: &Surface) -> Result<(), Error> {
     header +=
         &format!("element face {}\nproperty list uchar uint vertex_indices\n", triangles.len());
     let mut bytes = (header + "end_header\n").into_bytes();
-    for value in triangles.iter().flatten().flat_map(|corner| corner.to_array()) {
+    for value in triangles.iter().flatten().flat_map(glam::DVec3::to_array) {
         bytes.extend(value.to_le_bytes());
     }
     for triangle in 0..triangles.len() as u32 {

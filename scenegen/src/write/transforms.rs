@@ -31,7 +31,7 @@ pub(super) fn write(scene: &Scene, root: &Path, split: Split) -> Result<(), Erro
             "transform_matrix": world_from_opengl(&view.camera),
         });
         // File cameras differ in their field of view.
-        if view.camera.fx != first.fx {
+        if (view.camera.fx - first.fx).abs() > 0.0 {
             for (key, value) in intrinsics(&view.camera).as_object().into_iter().flatten() {
                 frame[key] = value.clone();
             }
