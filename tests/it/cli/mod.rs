@@ -1,6 +1,7 @@
 //! The program as its users meet it: arguments in, exit code, messages and files out.
 
 mod faults;
+mod generated;
 mod looking;
 mod same;
 mod training;
