@@ -1,4 +1,48 @@
 //! Known geometry, ray-traced into posed ground-truth images.
 //!
-//! This package is the wall that keeps mesh loading and ray tracing away from the trainer and
-//! from the policies. It has no public item yet.
+//! A mesh (glTF, OBJ or a built-in scene) becomes views with colour, alpha, depth and normals, and
+//! initial points as structure-from-motion would find them. The [`Surface`] that was traced stays at
+//! hand, so that a trained scene can be measured against it.
+//!
+//! ```
+//! use densify_scenegen::{Options, Scene, Source};
+//!
+//! let options = Options { size: Some((32, 32)), train: Some(3), ..Options::default() };
+//! let scene = Scene::prepare(&Source::Preset("spheres".into()), &options)?;
+//! let frame = scene.render(0);
+//! assert_eq!(frame.rgba.len(), 4 * 32 * 32);
+//! # Ok::<(), densify_scenegen::Error>(())
+//! ```
+
+mod camera;
+mod error;
+mod gltf;
+mod intersect;
+pub mod mesh;
+mod nearest;
+mod obj;
+mod points;
+mod presets;
+mod primitives;
+mod random;
+mod resource;
+mod rig;
+mod scene;
+mod shade;
+mod sky;
+mod surface;
+pub mod texture;
+mod trace;
+mod write;
+
+pub use camera::Camera;
+pub use error::Error;
+pub use points::{InitPoints, PointCollector, PointOptions};
+pub use presets::{PRESETS, Preset};
+pub use rig::{Rig, RigKind};
+pub use scene::{Generated, Options, Requirements, Scene, Source, Split, View, generate};
+pub use shade::Ambient;
+pub use sky::Sky;
+pub use surface::{Nearest, Surface, SurfaceHit};
+pub use trace::Frame;
+pub use write::{Written, check_target, contact_sheet, write, write_png};

@@ -49,6 +49,16 @@ impl From<PlyError> for Failure {
     }
 }
 
+impl From<densify_scenegen::Error> for Failure {
+    fn from(error: densify_scenegen::Error) -> Self {
+        let code = match error {
+            densify_scenegen::Error::Write { .. } => OTHER,
+            _ => INPUT,
+        };
+        Self { code, message: error.to_string() }
+    }
+}
+
 impl From<InitError> for Failure {
     fn from(error: InitError) -> Self {
         match error {

@@ -23,6 +23,7 @@ mod progress;
 mod render;
 mod run_files;
 mod scene;
+mod scenegen;
 mod train;
 
 use std::ffi::OsString;
@@ -46,6 +47,7 @@ struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
+  densify train scene:spheres -i 2000                      train on a built-in scene: no file needed
   densify train data/garden --eval                         train, hold out every 8th photograph
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
@@ -53,6 +55,7 @@ Examples:
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
+  densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
 
 `densify COMMAND --help` explains every option of a command.";
 
@@ -63,6 +66,7 @@ enum Command {
     Render(Box<render::RenderArgs>),
     Compare(compare::CompareArgs),
     Policies(policies::PoliciesArgs),
+    Scenegen(Box<scenegen::ScenegenArgs>),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -89,6 +93,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
+        Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
     };
     match done.and_then(|()| console.finish()) {
         Ok(()) => 0,

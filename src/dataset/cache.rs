@@ -290,7 +290,15 @@ mod tests {
                 let path = folder.join(format!("{i}.png"));
                 image::RgbImage::from_pixel(16, 16, [i, 0, 0].into()).save(&path).unwrap();
                 let header = probe(&path).unwrap();
-                ImageSource { path, mask: None, width: 16, height: 16, undistortion: None, header }
+                ImageSource {
+                    path,
+                    mask: None,
+                    width: 16,
+                    height: 16,
+                    undistortion: None,
+                    header,
+                    rendered: None,
+                }
             })
             .collect()
     }

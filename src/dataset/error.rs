@@ -14,6 +14,9 @@ pub enum DatasetError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// A built-in scene cannot be made.
+    #[error("{0}")]
+    BuiltIn(#[from] densify_scenegen::Error),
     /// The folder is in none of the known formats.
     #[error(
         "{path} is no dataset: found neither {looked_for}; name a folder with a COLMAP model or transforms files"

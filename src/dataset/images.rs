@@ -38,6 +38,8 @@ pub struct ImageSource {
     pub undistortion: Option<Undistortion>,
     /// What the image file's header says.
     pub header: ImageHeader,
+    /// Pixels that are in memory already, of the size of the header; no file is read then.
+    pub rendered: Option<SharedImage>,
 }
 
 /// What an image file's header says.
@@ -141,6 +143,13 @@ impl ImageSource {
     /// When a file is missing, unreadable, over the limits, or not what its header said at first.
     pub fn load(&self) -> Result<Image8, DatasetError> {
         let header = self.header;
+        if let Some(image) = &self.rendered {
+            return Ok(if self.shrinks() {
+                resample::shrink(image, self.width, self.height)
+            } else {
+                Image8::clone(image)
+            });
+        }
         let decoded = decode(&self.path)?;
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
             return Err(DatasetError::ImageSize {
@@ -267,6 +276,7 @@ mod tests {
             height: header.height,
             undistortion: None,
             header,
+            rendered: None,
         }
     }
 

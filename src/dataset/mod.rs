@@ -4,6 +4,7 @@
 //! `transforms_test.json`, else a COLMAP model under `sparse/0`, else `transforms.json`.
 //! All files are untrusted: see [`DatasetError`].
 
+pub mod builtin;
 mod cache;
 mod colmap;
 mod error;
@@ -128,13 +129,17 @@ struct Frame {
 }
 
 impl Dataset {
-    /// Loads the dataset in the folder `path`. Image files are checked by their headers; pixels
+    /// Loads the dataset in the folder `path`, or the built-in scene that `path` names
+    /// (`scene:NAME`, see [`builtin`]). Image files are checked by their headers; pixels
     /// are read later, through [`images::ImageCache`].
     ///
     /// # Errors
     /// When the format is unknown, a file is missing, unreadable or contradicts itself, or no
     /// view is left to train on. The message names file, field and remedy.
     pub fn load(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
+        if let Some(name) = builtin::name(path) {
+            return builtin::load(path, name, options);
+        }
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {

@@ -180,12 +180,17 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
             height,
             undistortion,
             header,
+            rendered: None,
         },
     })
 }
 
 /// The size to train at.
-fn target_size(header: &ImageHeader, resolution: Option<Resolution>, reduced: bool) -> (u32, u32) {
+pub(super) fn target_size(
+    header: &ImageHeader,
+    resolution: Option<Resolution>,
+    reduced: bool,
+) -> (u32, u32) {
     match resolution {
         Some(Resolution::Divisor(k)) if !reduced => {
             (divided(header.width, k), divided(header.height, k))

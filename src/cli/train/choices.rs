@@ -85,6 +85,9 @@ pub(super) fn check_iterations(flag: &str, chosen: &[u32], iterations: u32) -> R
 
 /// `output/SCENE-POLICY`, SCENE being the dataset folder's name.
 pub(super) fn default_output(scene: &Path, policy: &str) -> PathBuf {
+    if let Some(name) = crate::dataset::builtin::name(scene) {
+        return Path::new("output").join(format!("{name}-{policy}"));
+    }
     let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
     let name = full.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy());
     Path::new("output").join(format!("{name}-{policy}"))

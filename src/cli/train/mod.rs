@@ -21,11 +21,12 @@ const DEFAULT_BUDGET: usize = 200_000;
 /// Trains a scene.
 ///
 /// SCENE is a folder with a COLMAP reconstruction (images/ and sparse/0/), a NeRF-synthetic scene
-/// (transforms_train.json and transforms_test.json) or a nerfstudio dataset (transforms.json).
+/// (transforms_train.json and transforms_test.json) or a nerfstudio dataset (transforms.json); or a
+/// built-in scene by name, as scene:spheres (`densify scenegen --list` shows them).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct TrainArgs {
-    /// Folder of the dataset
+    /// Folder of the dataset, or scene:NAME
     #[arg(help_heading = "Scene")]
     scene: PathBuf,
     /// Folder to write to `[default: output/SCENE-POLICY]`
@@ -109,6 +110,7 @@ pub(super) struct TrainArgs {
 
 const EXAMPLES: &str = "\
 Examples:
+  densify train scene:spheres --iterations 2000
   densify train data/garden
   densify train data/garden --eval -r 4 --budget 1.5M -o runs/garden
   densify train data/chair --background white --init-points 50k

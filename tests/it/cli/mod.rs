@@ -2,6 +2,7 @@
 
 mod comparing;
 mod faults;
+mod generated;
 mod looking;
 mod same;
 mod training;

@@ -1,0 +1,288 @@
+//! Buffers, buffer views and accessors, every offset checked.
+
+use std::borrow::Cow;
+use std::path::Path;
+
+use gltf::json;
+use json::accessor::{ComponentType, Type};
+use json::validation::Checked;
+
+use super::fault;
+use crate::error::Error;
+use crate::resource::{Folder, data_uri};
+
+/// Most elements of an accessor that has no data of its own (sparse ones begin as zeros): nothing
+/// in the file bounds their number.
+const MAX_ZEROS: usize = 1 << 24;
+
+/// The contents of a file's buffers, read when first asked for.
+pub(super) struct Buffers<'a> {
+    path: &'a Path,
+    root: &'a json::Root,
+    folder: &'a Folder,
+    blob: Option<&'a [u8]>,
+    read: Vec<Option<Cow<'a, [u8]>>>,
+}
+
+/// An accessor's elements as numbers.
+pub(super) struct Floats {
+    size: usize,
+    values: Vec<f32>,
+}
+
+impl Floats {
+    pub(super) fn count(&self) -> usize {
+        self.values.len() / self.size
+    }
+
+    /// Element `i`; components beyond the accessor's own are 1.
+    pub(super) fn get<const N: usize>(&self, i: usize) -> [f32; N] {
+        let element = &self.values[i * self.size..(i + 1) * self.size];
+        std::array::from_fn(|c| element.get(c).copied().unwrap_or(1.0))
+    }
+}
+
+/// Where an accessor's elements lie.
+struct Layout {
+    component: ComponentType,
+    size: usize,
+    count: usize,
+    normalised: bool,
+}
+
+impl<'a> Buffers<'a> {
+    pub(super) fn new(
+        path: &'a Path,
+        root: &'a json::Root,
+        folder: &'a Folder,
+        blob: Option<&'a [u8]>,
+    ) -> Self {
+        Self { path, root, folder, blob, read: vec![None; root.buffers.len()] }
+    }
+
+    pub(super) fn folder(&self) -> &'a Folder {
+        self.folder
+    }
+
+    /// The bytes of a buffer view.
+    pub(super) fn view(&mut self, index: usize, element: &str) -> Result<&[u8], Error> {
+        let path = self.path;
+        let name = format!("{element}, buffer view {index}");
+        let Some(view) = self.root.buffer_views.get(index) else {
+            return Err(fault(path, name, "there is no such buffer view"));
+        };
+        let (offset, length) = (view.byte_offset.map_or(0, |o| o.0), view.byte_length.0);
+        let buffer = self.buffer(view.buffer.value(), &name)?;
+        let range = usize::try_from(offset).ok().zip(usize::try_from(length).ok());
+        let bytes =
+            range.and_then(|(offset, length)| buffer.get(offset..offset.checked_add(length)?));
+        bytes.ok_or_else(|| {
+            fault(
+                path,
+                name,
+                format!("bytes {offset} to {offset} + {length} lie beyond its buffer"),
+            )
+        })
+    }
+
+    fn buffer(&mut self, index: usize, element: &str) -> Result<&[u8], Error> {
+        let name = || format!("{element}, buffer {index}");
+        let Some(buffer) = self.root.buffers.get(index) else {
+            return Err(fault(self.path, name(), "there is no such buffer"));
+        };
+        if self.read[index].is_none() {
+            let bytes: Cow<'a, [u8]> = match &buffer.uri {
+                Some(uri) if uri.starts_with("data:") => match data_uri(uri) {
+                    Some(bytes) => bytes.into(),
+                    None => return Err(fault(self.path, name(), "its data URI is no base64")),
+                },
+                Some(uri) => self.folder.read_uri(&name(), uri)?.into(),
+                None if index == 0 => match self.blob {
+                    Some(blob) => blob.into(),
+                    None => {
+                        return Err(fault(
+                            self.path,
+                            name(),
+                            "it has neither a URI nor a binary chunk",
+                        ));
+                    }
+                },
+                None => return Err(fault(self.path, name(), "it has no URI")),
+            };
+            let declared = buffer.byte_length.0;
+            if (bytes.len() as u64) < declared {
+                let problem = format!("it should have {declared} bytes and has {}", bytes.len());
+                return Err(fault(self.path, name(), problem));
+            }
+            self.read[index] = Some(bytes);
+        }
+        let whole = self.read[index].as_deref().unwrap_or_default();
+        // What lies beyond the declared length is padding.
+        Ok(&whole[..usize::try_from(buffer.byte_length.0).unwrap_or(whole.len()).min(whole.len())])
+    }
+
+    /// An accessor's elements, which must have one of `sizes` components. Normalised integers become
+    /// fractions.
+    pub(super) fn floats(
+        &mut self,
+        index: usize,
+        sizes: &[usize],
+        element: &str,
+    ) -> Result<Floats, Error> {
+        let name = format!("{element}, accessor {index}");
+        let layout = self.layout(index, &name)?;
+        if !sizes.contains(&layout.size) {
+            let problem = format!("it has {} components, not {}", layout.size, sizes[0]);
+            return Err(fault(self.path, name, problem));
+        }
+        let convert = |bytes: &[u8]| number(layout.component, layout.normalised, bytes);
+        let values = self.elements(index, &layout, &name, convert)?;
+        Ok(Floats { size: layout.size, values })
+    }
+
+    /// An accessor's elements as vertex indices.
+    pub(super) fn indices(&mut self, index: usize, element: &str) -> Result<Vec<u32>, Error> {
+        let name = format!("{element} indices, accessor {index}");
+        let layout = self.layout(index, &name)?;
+        let unsigned =
+            matches!(layout.component, ComponentType::U8 | ComponentType::U16 | ComponentType::U32);
+        if layout.size != 1 || !unsigned {
+            return Err(fault(self.path, name, "indices must be unsigned scalars"));
+        }
+        self.elements(index, &layout, &name, whole)
+    }
+
+    fn layout(&self, index: usize, name: &str) -> Result<Layout, Error> {
+        let Some(accessor) = self.root.accessors.get(index) else {
+            return Err(fault(self.path, name, "there is no such accessor"));
+        };
+        let (Checked::Valid(component), Checked::Valid(kind)) =
+            (accessor.component_type, accessor.type_)
+        else {
+            return Err(fault(self.path, name, "its type or componentType is unknown"));
+        };
+        let size = match kind {
+            Type::Scalar => 1,
+            Type::Vec2 => 2,
+            Type::Vec3 => 3,
+            Type::Vec4 => 4,
+            Type::Mat2 | Type::Mat3 | Type::Mat4 => {
+                return Err(fault(self.path, name, "matrices are no vertex attributes"));
+            }
+        };
+        let count = usize::try_from(accessor.count.0).unwrap_or(usize::MAX);
+        if count == 0 {
+            return Err(fault(self.path, name, "it has no elements"));
+        }
+        Ok(Layout { component: component.0, size, count, normalised: accessor.normalized })
+    }
+
+    /// All components of an accessor, sparse replacements made.
+    fn elements<T: Copy + Default>(
+        &mut self,
+        index: usize,
+        layout: &Layout,
+        name: &str,
+        convert: impl Fn(&[u8]) -> T,
+    ) -> Result<Vec<T>, Error> {
+        let (path, accessor) = (self.path, &self.root.accessors[index]);
+        let width = layout.component.size();
+        let mut values = match accessor.buffer_view {
+            Some(view) => {
+                let offset = accessor.byte_offset.map_or(0, |o| o.0);
+                let stride = self.root.buffer_views.get(view.value()).and_then(|v| v.byte_stride);
+                let bytes = self.view(view.value(), name)?;
+                let place = Place { offset, stride: stride.map(|s| s.0), width };
+                gather(bytes, &place, layout, convert_ref(&convert))
+                    .ok_or_else(|| beyond(path, name))?
+            }
+            None if layout.count > MAX_ZEROS => {
+                return Err(fault(path, name, "it has more than 2^24 elements and no buffer view"));
+            }
+            None => vec![T::default(); layout.count * layout.size],
+        };
+        let Some(sparse) = &accessor.sparse else {
+            return Ok(values);
+        };
+        let Checked::Valid(component) = sparse.indices.component_type else {
+            return Err(fault(path, name, "its sparse indices have an unknown componentType"));
+        };
+        let count = usize::try_from(sparse.count.0).unwrap_or(usize::MAX);
+        let one = Layout { component: component.0, size: 1, count, normalised: false };
+        let view = self.view(sparse.indices.buffer_view.value(), name)?;
+        let place =
+            Place { offset: sparse.indices.byte_offset.0, stride: None, width: component.0.size() };
+        let places = gather(view, &place, &one, whole).ok_or_else(|| beyond(path, name))?;
+        let many = Layout { count, ..*layout };
+        let view = self.view(sparse.values.buffer_view.value(), name)?;
+        let place = Place { offset: sparse.values.byte_offset.0, stride: None, width };
+        let news =
+            gather(view, &place, &many, convert_ref(&convert)).ok_or_else(|| beyond(path, name))?;
+        for (&target, new) in places.iter().zip(news.chunks_exact(layout.size)) {
+            let at = target as usize * layout.size;
+            let Some(old) = values.get_mut(at..at + layout.size) else {
+                return Err(fault(path, name, format!("its sparse index {target} lies beyond it")));
+            };
+            old.copy_from_slice(new);
+        }
+        Ok(values)
+    }
+}
+
+fn convert_ref<T>(convert: &impl Fn(&[u8]) -> T) -> impl Fn(&[u8]) -> T + '_ {
+    move |bytes| convert(bytes)
+}
+
+fn beyond(path: &Path, name: &str) -> Error {
+    fault(path, name, "its elements lie beyond its buffer view")
+}
+
+struct Place {
+    offset: u64,
+    stride: Option<usize>,
+    width: usize,
+}
+
+/// The components of `layout.count` elements; None where they lie beyond the bytes.
+fn gather<T>(
+    bytes: &[u8],
+    place: &Place,
+    layout: &Layout,
+    convert: impl Fn(&[u8]) -> T,
+) -> Option<Vec<T>> {
+    let element = layout.size * place.width;
+    let stride = place.stride.filter(|&stride| stride > 0).unwrap_or(element);
+    let bytes = bytes.get(usize::try_from(place.offset).ok()?..)?;
+    // The last element need not fill its stride.
+    let needed = (layout.count.checked_sub(1)?).checked_mul(stride)?.checked_add(element)?;
+    if stride < element || needed > bytes.len() {
+        return None;
+    }
+    let mut values = Vec::with_capacity(layout.count * layout.size);
+    for i in 0..layout.count {
+        let element = &bytes[i * stride..i * stride + element];
+        values.extend(element.chunks_exact(place.width).map(&convert));
+    }
+    Some(values)
+}
+
+fn word<const N: usize>(bytes: &[u8]) -> [u8; N] {
+    bytes.try_into().unwrap_or([0; N])
+}
+
+/// A component as a number (glTF 2.0, 3.11: normalised integers).
+fn number(component: ComponentType, normalised: bool, bytes: &[u8]) -> f32 {
+    let (value, full) = match component {
+        ComponentType::I8 => (f32::from(i8::from_le_bytes(word(bytes))), 127.0),
+        ComponentType::U8 => (f32::from(u8::from_le_bytes(word(bytes))), 255.0),
+        ComponentType::I16 => (f32::from(i16::from_le_bytes(word(bytes))), 32_767.0),
+        ComponentType::U16 => (f32::from(u16::from_le_bytes(word(bytes))), 65_535.0),
+        ComponentType::U32 => (u32::from_le_bytes(word(bytes)) as f32, 1.0),
+        ComponentType::F32 => return f32::from_le_bytes(word(bytes)),
+    };
+    if normalised { (value / full).max(-1.0) } else { value }
+}
+
+fn whole(bytes: &[u8]) -> u32 {
+    bytes.iter().rev().fold(0, |value, &byte| value << 8 | u32::from(byte))
+}

@@ -1,0 +1,91 @@
+//! Watertight ray–triangle intersection.
+//!
+//! Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013): the triangle is
+//! sheared into the ray's space, where two triangles that share an edge evaluate the very same
+//! products for it with opposite signs, so that a ray cannot pass between them. Where an edge
+//! function is exactly zero it is evaluated again in f64, in which the products are exact.
+
+use glam::Vec3;
+
+/// A ray prepared for intersecting many triangles.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ShearedRay {
+    pub(crate) origin: Vec3,
+    kx: usize,
+    ky: usize,
+    kz: usize,
+    shear: Vec3,
+}
+
+/// Where a ray meets a triangle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Meeting {
+    /// Ray parameter.
+    pub(crate) t: f32,
+    /// Weight of the second vertex.
+    pub(crate) v: f32,
+    /// Weight of the third vertex.
+    pub(crate) w: f32,
+    /// Whether the ray sees the side from which the vertices are counter-clockwise.
+    pub(crate) front: bool,
+}
+
+impl ShearedRay {
+    /// `direction` is finite and not zero.
+    #[inline]
+    pub(crate) fn new(origin: Vec3, direction: Vec3) -> Self {
+        let size = direction.abs();
+        let kz = if size.x > size.y {
+            if size.x > size.z { 0 } else { 2 }
+        } else if size.y > size.z {
+            1
+        } else {
+            2
+        };
+        let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
+        // Winding is kept.
+        if direction[kz] < 0.0 {
+            std::mem::swap(&mut kx, &mut ky);
+        }
+        let inverse = 1.0 / direction[kz];
+        let shear = Vec3::new(direction[kx] * inverse, direction[ky] * inverse, inverse);
+        Self { origin, kx, ky, kz, shear }
+    }
+
+    /// The meeting with a triangle, whatever its ray parameter.
+    #[inline]
+    pub(crate) fn meet(&self, triangle: &[Vec3; 3]) -> Option<Meeting> {
+        let [a, b, c] = triangle.map(|p| {
+            let p = p - self.origin;
+            let z = p[self.kz];
+            (p[self.kx] - self.shear.x * z, p[self.ky] - self.shear.y * z, self.shear.z * z)
+        });
+        let mut u = c.0 * b.1 - c.1 * b.0;
+        let mut v = a.0 * c.1 - a.1 * c.0;
+        let mut w = b.0 * a.1 - b.1 * a.0;
+        if u == 0.0 || v == 0.0 || w == 0.0 {
+            let exact = |p: (f32, f32, f32), q: (f32, f32, f32)| {
+                (f64::from(p.0) * f64::from(q.1) - f64::from(p.1) * f64::from(q.0)) as f32
+            };
+            u = exact(c, b);
+            v = exact(a, c);
+            w = exact(b, a);
+        }
+        if (u < 0.0 || v < 0.0 || w < 0.0) && (u > 0.0 || v > 0.0 || w > 0.0) {
+            return None;
+        }
+        let determinant = u + v + w;
+        if determinant == 0.0 {
+            return None;
+        }
+        let inverse = 1.0 / determinant;
+        let t = (u * a.2 + v * b.2 + w * c.2) * inverse;
+        // A determinant so small that its inverse overflows makes t infinite or NaN: no meeting.
+        t.is_finite().then_some(Meeting {
+            t,
+            v: v * inverse,
+            w: w * inverse,
+            front: determinant > 0.0,
+        })
+    }
+}

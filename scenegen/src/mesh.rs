@@ -1,0 +1,246 @@
+//! Geometry, materials, lights and cameras as one type, whatever they were loaded from.
+//!
+//! Coordinates are the source's own (right-handed, +y up unless the source says otherwise) and in
+//! f64: nodes far from the origin lose nothing before the tracer recentres them.
+
+use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
+
+use crate::texture::{Texture, TextureRef};
+
+/// Everything a source describes.
+#[derive(Debug, Clone, Default)]
+pub struct Model {
+    /// Name for messages and for `scene.json`.
+    pub name: String,
+    /// Vertex positions, finite. Shape: `[vertices]`.
+    pub positions: Vec<DVec3>,
+    /// Unit vertex normals; empty, or one per vertex, zero where the source has none (then the
+    /// geometric normal stands in). Shape: `[vertices]`.
+    pub normals: Vec<Vec3>,
+    /// Tangents with handedness in w; empty, or one per vertex, zero where there is none.
+    pub tangents: Vec<Vec4>,
+    /// Texture coordinates, two sets; each empty or one per vertex. v points down.
+    pub uvs: [Vec<Vec2>; 2],
+    /// Linear RGBA vertex colours, which multiply the base colour; empty or one per vertex.
+    pub colours: Vec<Vec4>,
+    /// Vertex indices, counter-clockwise seen from outside. Shape: `[triangles]`.
+    pub triangles: Vec<[u32; 3]>,
+    /// Material of each triangle. Shape: `[triangles]`.
+    pub triangle_materials: Vec<u32>,
+    /// Materials; never empty once triangles exist.
+    pub materials: Vec<Material>,
+    /// Decoded images.
+    pub textures: Vec<Texture>,
+    /// Lights of the source; without any, the renderer brings its own.
+    pub lights: Vec<Light>,
+    /// Cameras of the source.
+    pub cameras: Vec<FileCamera>,
+    /// What was noticed while loading and may interest the user.
+    pub notes: Vec<String>,
+}
+
+/// How a surface reflects.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reflection {
+    /// The base colour as it is, without light (`KHR_materials_unlit`).
+    Unlit,
+    /// Diffuse only: looks the same from everywhere.
+    Lambert,
+    /// glTF's metallic-roughness model: diffuse and GGX.
+    MetalRough,
+}
+
+/// What happens to light where alpha is below one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum AlphaMode {
+    /// Alpha is ignored.
+    Opaque,
+    /// There is no surface where alpha is below the cutoff.
+    Mask(f32),
+    /// The surface covers by its alpha.
+    Blend,
+}
+
+/// A material; glTF's metallic-roughness model and its special cases.
+#[derive(Debug, Clone)]
+pub struct Material {
+    /// Name for messages.
+    pub name: String,
+    /// How it reflects.
+    pub reflection: Reflection,
+    /// Linear base colour and alpha.
+    pub base: Vec4,
+    /// Metalness, `0..=1`.
+    pub metallic: f32,
+    /// Perceptual roughness, `0..=1`; its square is GGX's alpha.
+    pub roughness: f32,
+    /// Linear radiance emitted.
+    pub emissive: Vec3,
+    /// Multiplies base colour and alpha (sRGB).
+    pub base_texture: Option<TextureRef>,
+    /// Multiplies alpha with its red channel (OBJ's `map_d`).
+    pub alpha_texture: Option<TextureRef>,
+    /// Green multiplies roughness, blue metalness (linear).
+    pub metal_rough_texture: Option<TextureRef>,
+    /// Tangent-space normals (linear).
+    pub normal_texture: Option<TextureRef>,
+    /// Scale of the normal map's x and y.
+    pub normal_scale: f32,
+    /// Multiplies what is emitted (sRGB).
+    pub emissive_texture: Option<TextureRef>,
+    /// What alpha means.
+    pub alpha: AlphaMode,
+    /// Whether the back is visible too.
+    pub double_sided: bool,
+    /// Whether this is a thin structure, left out of the initial points on request.
+    pub thin: bool,
+    /// Whether what it emits is also a [`Light`]: sampled light does not count it twice.
+    pub is_light: bool,
+}
+
+impl Default for Material {
+    fn default() -> Self {
+        Self {
+            name: "default".into(),
+            reflection: Reflection::Lambert,
+            base: Vec4::ONE,
+            metallic: 0.0,
+            roughness: 1.0,
+            emissive: Vec3::ZERO,
+            base_texture: None,
+            alpha_texture: None,
+            metal_rough_texture: None,
+            normal_texture: None,
+            normal_scale: 1.0,
+            emissive_texture: None,
+            alpha: AlphaMode::Opaque,
+            double_sided: true,
+            thin: false,
+            is_light: false,
+        }
+    }
+}
+
+impl Material {
+    /// A diffuse material of one linear colour.
+    #[must_use]
+    pub fn lambert(name: &str, colour: [f32; 3]) -> Self {
+        Self { name: name.into(), base: Vec3::from(colour).extend(1.0), ..Self::default() }
+    }
+}
+
+/// Where a light's rays come from. Directions and positions are the source's coordinates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum LightKind {
+    /// Parallel light travelling along `direction` (unit length); intensity is irradiance.
+    Directional {
+        /// Where the light goes.
+        direction: DVec3,
+    },
+    /// Light from a point; intensity is radiant intensity, falling with the square of distance.
+    Point {
+        /// Where it is.
+        position: DVec3,
+    },
+    /// Light from a point into a cone.
+    Spot {
+        /// Where it is.
+        position: DVec3,
+        /// Axis of the cone, unit length.
+        direction: DVec3,
+        /// Cosine of the angle within which it is full.
+        cos_inner: f32,
+        /// Cosine of the angle beyond which it is dark.
+        cos_outer: f32,
+    },
+    /// A rectangle that emits to the side of `u x v`; intensity is radiance. Sampled.
+    Area {
+        /// A corner.
+        corner: DVec3,
+        /// One side.
+        u: DVec3,
+        /// The other side.
+        v: DVec3,
+    },
+}
+
+/// A light.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Light {
+    /// Its shape and place.
+    pub kind: LightKind,
+    /// Linear colour times intensity, in the kind's unit.
+    pub intensity: Vec3,
+    /// Distance beyond which there is no light; infinite where there is no such.
+    pub range: f64,
+}
+
+/// A camera that a file brings.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FileCamera {
+    /// Its name.
+    pub name: String,
+    /// Columns: right, down, forward; orthonormal.
+    pub world_from_camera: DMat3,
+    /// Its place.
+    pub centre: DVec3,
+    /// Vertical field of view `[rad]`.
+    pub yfov: f64,
+}
+
+impl Model {
+    /// Appends a triangle mesh whose vertices share one material. Normals may be empty (flat
+    /// shading); UVs may be empty.
+    pub fn add(
+        &mut self,
+        positions: &[DVec3],
+        normals: &[Vec3],
+        uvs: &[Vec2],
+        triangles: &[[u32; 3]],
+        material: u32,
+    ) {
+        let first = self.positions.len() as u32;
+        self.positions.extend_from_slice(positions);
+        pad(&mut self.normals, normals, first as usize, positions.len(), Vec3::ZERO);
+        pad(&mut self.uvs[0], uvs, first as usize, positions.len(), Vec2::ZERO);
+        self.triangles.extend(triangles.iter().map(|t| t.map(|i| i + first)));
+        self.triangle_materials.resize(self.triangles.len(), material);
+    }
+
+    /// Adds a material; its number.
+    pub fn material(&mut self, material: Material) -> u32 {
+        self.materials.push(material);
+        self.materials.len() as u32 - 1
+    }
+
+    /// Smallest and largest coordinates of all triangles' vertices.
+    #[must_use]
+    pub fn bounds(&self) -> (DVec3, DVec3) {
+        let used = self.triangles.iter().flatten().map(|&i| self.positions[i as usize]);
+        let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        used.fold(empty, |(lo, hi), p| (lo.min(p), hi.max(p)))
+    }
+
+    /// Whether everything looks the same from every side: then colour depends on place only.
+    #[must_use]
+    pub fn view_independent(&self) -> bool {
+        let mut used = vec![false; self.materials.len()];
+        for &m in &self.triangle_materials {
+            used[m as usize] = true;
+        }
+        let shiny = |m: &Material| m.reflection == Reflection::MetalRough;
+        // A one-sided face is there or not, depending on the side it is seen from, and a blended
+        // one mixes with what is behind it; neither changes a surface's own colour.
+        !self.materials.iter().zip(&used).any(|(m, &used)| used && shiny(m))
+    }
+}
+
+/// Appends one value per vertex to a list that is empty until the first source has any.
+fn pad<T: Copy>(list: &mut Vec<T>, values: &[T], before: usize, count: usize, missing: T) {
+    if values.is_empty() && list.is_empty() {
+        return;
+    }
+    list.resize(before, missing);
+    list.extend_from_slice(values);
+    list.resize(before + count, missing);
+}

@@ -1,0 +1,570 @@
+//! Wavefront OBJ with MTL.
+//!
+//! Read here rather than by the `tobj` crate, which panics on short colours (`Kd 1 1`), refuses `v` with
+//! weight and colour, and triangulates concave polygons as fans. Faces are seen from both sides;
+//! materials are diffuse unless they bring the PBR keys `Pr` or `Pm`. Smoothing groups are ignored: a
+//! vertex without normal is flat.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use glam::{DVec2, DVec3, Vec2, Vec3, Vec4};
+
+use crate::error::Error;
+use crate::mesh::{AlphaMode, Material, Model, Reflection};
+use crate::resource::{self, Folder};
+use crate::texture::{Texture, TextureRef, Wrap};
+
+/// Most triangles of a file.
+const MAX_TRIANGLES: usize = 1 << 26;
+/// Corners up to which a polygon is cut ear by ear, which takes the cube of their number.
+const MAX_EARS: usize = 256;
+const REMEDY: &str = "correct the file or export it again";
+
+/// A face's corner: numbers of position, texture coordinate and normal.
+type Corner = (usize, Option<usize>, Option<usize>);
+
+struct Reader<'a> {
+    path: &'a Path,
+    folder: Folder,
+    positions: Vec<DVec3>,
+    colours: Vec<Vec3>,
+    uvs: Vec<Vec2>,
+    normals: Vec<Vec3>,
+    vertices: HashMap<Corner, u32>,
+    materials: HashMap<String, u32>,
+    textures: HashMap<(PathBuf, bool), u32>,
+    current: Option<u32>,
+    model: Model,
+}
+
+/// Loads a file with its materials.
+pub(crate) fn load(path: &Path) -> Result<Model, Error> {
+    let bytes = resource::read(path)?;
+    let mut reader = Reader {
+        path,
+        folder: Folder::of(path)?,
+        positions: Vec::new(),
+        colours: Vec::new(),
+        uvs: Vec::new(),
+        normals: Vec::new(),
+        vertices: HashMap::new(),
+        materials: HashMap::new(),
+        textures: HashMap::new(),
+        current: None,
+        model: Model::default(),
+    };
+    reader.model.name =
+        path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    for (number, line) in lines(&bytes) {
+        reader.line(&line, number)?;
+    }
+    if reader.model.triangles.is_empty() {
+        return Err(Error::Empty { name: path.display().to_string() });
+    }
+    Ok(reader.model)
+}
+
+/// Lines with their numbers, without comments, joined where one ends with a backslash.
+fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, String)> + '_ {
+    let mut rest = bytes.split(|&b| b == b'\n').enumerate();
+    std::iter::from_fn(move || {
+        let (number, first) = rest.next()?;
+        let mut line = String::from_utf8_lossy(first).trim_end().to_owned();
+        while line.ends_with('\\') {
+            line.pop();
+            let Some((_, next)) = rest.next() else {
+                break;
+            };
+            line.push(' ');
+            line += String::from_utf8_lossy(next).trim_end();
+        }
+        Some((number + 1, line))
+    })
+}
+
+impl Reader<'_> {
+    fn fault(&self, line: usize, problem: impl Into<String>) -> Error {
+        fault(self.path, line, problem)
+    }
+
+    fn line(&mut self, line: &str, number: usize) -> Result<(), Error> {
+        let line = line.trim_start();
+        let (key, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
+        match key {
+            "v" => {
+                let v = self.numbers(rest, number)?;
+                let &[x, y, z, ..] = &v[..] else {
+                    return Err(self.fault(number, "a vertex needs x, y and z"));
+                };
+                let position = DVec3::new(x, y, z);
+                if !position.is_finite() {
+                    let vertex = self.positions.len() + 1;
+                    return Err(self.fault(number, format!("vertex {vertex} is not finite")));
+                }
+                // x y z r g b, or x y z w r g b.
+                if v.len() == 6 || v.len() == 7 {
+                    self.colours.resize(self.positions.len(), Vec3::ONE);
+                    let c = &v[v.len() - 3..];
+                    let colour = Vec3::new(c[0] as f32, c[1] as f32, c[2] as f32);
+                    self.colours.push(if colour.is_finite() {
+                        colour.max(Vec3::ZERO)
+                    } else {
+                        Vec3::ONE
+                    });
+                }
+                self.positions.push(position);
+            }
+            "vt" => {
+                let v = self.numbers(rest, number)?;
+                let u = v.first().copied().unwrap_or(0.0) as f32;
+                // OBJ's v points up.
+                let v = 1.0 - v.get(1).copied().unwrap_or(0.0) as f32;
+                self.uvs.push(Vec2::new(u, v));
+            }
+            "vn" => {
+                let v = self.numbers(rest, number)?;
+                let &[x, y, z, ..] = &v[..] else {
+                    return Err(self.fault(number, "a normal needs x, y and z"));
+                };
+                let normal = DVec3::new(x, y, z).normalize_or_zero().as_vec3();
+                self.normals.push(if normal.is_finite() { normal } else { Vec3::ZERO });
+            }
+            "f" => self.face(rest, number)?,
+            "usemtl" => {
+                let name = without_comment(rest).trim();
+                self.current = self.materials.get(name).copied();
+                if self.current.is_none() && !self.model.notes.iter().any(|n| n.contains(name)) {
+                    let name: String = name.chars().take(80).collect();
+                    self.model
+                        .notes
+                        .push(format!("there is no material {name}; a grey one stands in"));
+                }
+            }
+            "mtllib" => self.library(rest, number)?,
+            // Lines, points, groups, curves: nothing to trace.
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn numbers(&self, text: &str, number: usize) -> Result<Vec<f64>, Error> {
+        let parse = |word: &str| {
+            word.parse::<f64>().map_err(|_| {
+                let word: String = word.chars().take(40).collect();
+                self.fault(number, format!("{word:?} is no number"))
+            })
+        };
+        without_comment(text).split_whitespace().take(8).map(parse).collect()
+    }
+
+    fn face(&mut self, rest: &str, number: usize) -> Result<(), Error> {
+        let words = without_comment(rest).split_whitespace();
+        let corners = words.map(|word| self.corner(word, number)).collect::<Result<Vec<_>, _>>()?;
+        // Points and lines written as faces.
+        if corners.len() < 3 {
+            return Ok(());
+        }
+        let vertices: Vec<u32> = corners.iter().map(|&corner| self.vertex(corner)).collect();
+        let places: Vec<DVec3> = corners.iter().map(|c| self.positions[c.0]).collect();
+        let material = match self.current {
+            Some(material) => material,
+            None => self.stand_in(),
+        };
+        let triangles = triangulated(&places);
+        if self.model.triangles.len() + triangles.len() > MAX_TRIANGLES {
+            return Err(self.fault(number, "the file has more than 2^26 triangles"));
+        }
+        for triangle in triangles {
+            self.model.triangles.push(triangle.map(|i| vertices[i]));
+            self.model.triangle_materials.push(material);
+        }
+        Ok(())
+    }
+
+    fn stand_in(&mut self) -> u32 {
+        if let Some(&number) = self.materials.get("") {
+            return number;
+        }
+        let number = self.model.material(Material::lambert("none", [0.6; 3]));
+        self.materials.insert(String::new(), number);
+        number
+    }
+
+    fn corner(&self, word: &str, number: usize) -> Result<Corner, Error> {
+        let mut parts = word.split('/');
+        let mut index = |count: usize, what: &str| {
+            let text = parts.next().unwrap_or("");
+            if text.is_empty() {
+                return Ok(None);
+            }
+            let text: String = text.chars().take(40).collect();
+            let value: i64 = text
+                .parse()
+                .map_err(|_| self.fault(number, format!("{text:?} is no {what} index")))?;
+            // Negative ones count back from the last.
+            let found = if value > 0 { value - 1 } else { count as i64 + value };
+            let valid = value != 0 && (0..count as i64).contains(&found);
+            let problem = || self.fault(number, format!("{what} index {value} of {count}"));
+            valid.then_some(Some(found as usize)).ok_or_else(problem)
+        };
+        let position = index(self.positions.len(), "vertex")?;
+        let uv = index(self.uvs.len(), "texture")?;
+        let normal = index(self.normals.len(), "normal")?;
+        let position =
+            position.ok_or_else(|| self.fault(number, "a corner has no vertex index"))?;
+        Ok((position, uv, normal))
+    }
+
+    fn vertex(&mut self, corner: Corner) -> u32 {
+        let model = &mut self.model;
+        *self.vertices.entry(corner).or_insert_with(|| {
+            let first = model.positions.len();
+            model.positions.push(self.positions[corner.0]);
+            let colour = self.colours.get(corner.0).map(|c| c.extend(1.0));
+            let colour = colour.or((!self.colours.is_empty()).then_some(Vec4::ONE));
+            push(&mut model.colours, first, colour, Vec4::ONE);
+            push(&mut model.uvs[0], first, corner.1.map(|i| self.uvs[i]), Vec2::ZERO);
+            push(&mut model.normals, first, corner.2.map(|i| self.normals[i]), Vec3::ZERO);
+            first as u32
+        })
+    }
+
+    /// Reads a material library. A missing one is noted.
+    fn library(&mut self, rest: &str, number: usize) -> Result<(), Error> {
+        let whole = rest.trim();
+        let element = format!("line {number}: mtllib");
+        // One name with spaces, or several names.
+        let one = self.folder.resolve(&element, &slashed(whole)).ok().filter(|path| path.is_file());
+        let names: Vec<&str> = match one {
+            Some(_) => vec![whole],
+            None => without_comment(whole).split_whitespace().collect(),
+        };
+        for name in names {
+            let path = self.folder.resolve(&element, &slashed(name))?;
+            if path.is_file() {
+                let bytes = resource::read(&path)?;
+                self.read_materials(&path, &bytes)?;
+            } else {
+                let name: String = name.chars().take(80).collect();
+                self.model.notes.push(format!("there is no {name}; its materials are grey"));
+            }
+        }
+        Ok(())
+    }
+
+    fn read_materials(&mut self, path: &Path, bytes: &[u8]) -> Result<(), Error> {
+        let mut open: Option<(Material, Maps)> = None;
+        for (number, line) in lines(bytes) {
+            let line = line.trim_start();
+            let (key, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
+            if key == "newmtl" {
+                self.close_material(path, open.take())?;
+                let name = without_comment(rest).trim();
+                open = Some((Material::lambert(name, [0.6; 3]), Maps::default()));
+            } else if let Some((material, maps)) = &mut open {
+                maps.line(material, key, rest, (path, number))?;
+            }
+        }
+        self.close_material(path, open)
+    }
+
+    fn close_material(&mut self, path: &Path, open: Option<(Material, Maps)>) -> Result<(), Error> {
+        let Some((mut material, maps)) = open else {
+            return Ok(());
+        };
+        material.base_texture = self.map(path, maps.base.as_ref(), true)?;
+        material.emissive_texture = self.map(path, maps.emissive.as_ref(), true)?;
+        material.alpha_texture = self.map(path, maps.alpha.as_ref(), false)?;
+        material.normal_texture = self.map(path, maps.normal.as_ref(), false)?;
+        if material.base.w < 1.0 || material.alpha_texture.is_some() {
+            material.alpha = AlphaMode::Blend;
+        }
+        if maps.has_pbr_texture {
+            let note = "map_Pr and map_Pm are not rendered";
+            self.model.notes.push(format!("material {}: {note}", material.name));
+        }
+        let name = material.name.clone();
+        let number = self.model.material(material);
+        self.materials.insert(name, number);
+        Ok(())
+    }
+
+    fn map(
+        &mut self,
+        path: &Path,
+        map: Option<&Map>,
+        srgb: bool,
+    ) -> Result<Option<TextureRef>, Error> {
+        let Some(map) = map else {
+            return Ok(None);
+        };
+        let element = format!("line {}: texture", map.line);
+        let file = self.folder.resolve(&element, &map.file)?;
+        let key = (file.clone(), srgb);
+        let number = match self.textures.get(&key) {
+            Some(&number) => number,
+            None => {
+                let texture: Texture =
+                    resource::decode(&file, &element, &resource::read(&file)?, srgb)?;
+                let model = &mut self.model;
+                resource::check_texels(path, &element, &model.textures, &texture)?;
+                model.textures.push(texture);
+                let number = model.textures.len() as u32 - 1;
+                self.textures.insert(key, number);
+                number
+            }
+        };
+        let mut found = TextureRef::new(number);
+        if map.clamp {
+            found.sampler.wrap_u = Wrap::Clamp;
+            found.sampler.wrap_v = Wrap::Clamp;
+        }
+        // Scale and offset are meant with v pointing up.
+        let (s, o) = (map.scale, map.offset);
+        found.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
+        Ok(Some(found))
+    }
+}
+
+/// A texture statement.
+struct Map {
+    file: String,
+    line: usize,
+    scale: Vec2,
+    offset: Vec2,
+    clamp: bool,
+}
+
+/// The textures of a material.
+#[derive(Default)]
+struct Maps {
+    base: Option<Map>,
+    emissive: Option<Map>,
+    alpha: Option<Map>,
+    normal: Option<Map>,
+    has_pbr_texture: bool,
+}
+
+impl Maps {
+    /// A statement of a material library; unknown ones are skipped.
+    fn line(
+        &mut self,
+        material: &mut Material,
+        key: &str,
+        rest: &str,
+        (path, line): (&Path, usize),
+    ) -> Result<(), Error> {
+        let numbers = || -> Result<Vec<f32>, Error> {
+            let words = without_comment(rest).split_whitespace();
+            let parse = |word: &str| match word.parse::<f32>() {
+                Ok(value) if value.is_finite() => Ok(value),
+                _ => Err(fault(path, line, format!("{key} is no finite number"))),
+            };
+            words.take(3).map(parse).collect()
+        };
+        let one = || -> Result<f32, Error> {
+            numbers()?
+                .first()
+                .copied()
+                .ok_or_else(|| fault(path, line, format!("{key} has no value")))
+        };
+        // A colour of one number is grey.
+        let colour = || -> Result<Vec3, Error> {
+            match numbers()?[..] {
+                [r, g, b] => Ok(Vec3::new(r, g, b).max(Vec3::ZERO)),
+                [grey] => Ok(Vec3::splat(grey.max(0.0))),
+                _ => Err(fault(path, line, format!("{key} needs three numbers"))),
+            }
+        };
+        let is_spectral = matches!(rest.split_whitespace().next(), Some("spectral" | "xyz"));
+        match key {
+            "Kd" if !is_spectral => material.base = colour()?.extend(material.base.w),
+            "Ke" if !is_spectral => material.emissive = colour()?,
+            // `d -halo 0.5` begins with a word; the halo is left out.
+            "d" => material.base.w = halo(rest).map_or_else(one, Ok)?.clamp(0.0, 1.0),
+            "Tr" => material.base.w = (1.0 - one()?).clamp(0.0, 1.0),
+            "Pr" => {
+                material.reflection = Reflection::MetalRough;
+                material.roughness = one()?.clamp(0.0, 1.0);
+            }
+            "Pm" => {
+                material.reflection = Reflection::MetalRough;
+                material.metallic = one()?.clamp(0.0, 1.0);
+            }
+            "map_Kd" => self.base = Map::read(rest, line),
+            "map_Ke" => self.emissive = Map::read(rest, line),
+            "map_d" => self.alpha = Map::read(rest, line),
+            "norm" => self.normal = Map::read(rest, line),
+            "map_Pr" | "map_Pm" => self.has_pbr_texture = true,
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+fn halo(rest: &str) -> Option<f32> {
+    rest.trim().strip_prefix("-halo")?.trim().parse().ok()
+}
+
+impl Map {
+    /// Options, then a file name that may hold spaces; None without a name.
+    fn read(rest: &str, line: usize) -> Option<Self> {
+        let mut map =
+            Self { file: String::new(), line, scale: Vec2::ONE, offset: Vec2::ZERO, clamp: false };
+        let mut rest = rest.trim();
+        while rest.starts_with('-') {
+            let (option, mut after) = cut(rest);
+            // Up to three numbers for some; the second and third may be left out.
+            let most = match option {
+                "-o" | "-s" | "-t" => 3,
+                "-mm" => 2,
+                _ => 1,
+            };
+            let mut values = Vec::new();
+            while values.len() < most {
+                let (word, behind) = cut(after);
+                let number = word.parse::<f32>().ok().filter(|v| v.is_finite());
+                if most > 1 && number.is_none() {
+                    break;
+                }
+                if option == "-clamp" {
+                    map.clamp = word == "on";
+                }
+                values.push(number.unwrap_or(0.0));
+                after = behind;
+            }
+            let pair = |default: f32| {
+                let at = |i: usize| values.get(i).copied().unwrap_or(default);
+                Vec2::new(at(0), at(1))
+            };
+            match option {
+                "-o" => map.offset = pair(0.0),
+                "-s" => map.scale = pair(1.0),
+                _ => {}
+            }
+            rest = after;
+        }
+        map.file = slashed(rest);
+        (!map.file.is_empty()).then_some(map)
+    }
+}
+
+/// The first word and what follows it.
+fn cut(text: &str) -> (&str, &str) {
+    let (word, rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
+    (word, rest.trim_start())
+}
+
+fn fault(path: &Path, line: usize, problem: impl Into<String>) -> Error {
+    Error::Malformed {
+        path: path.to_owned(),
+        element: format!("line {line}"),
+        problem: problem.into(),
+        remedy: REMEDY,
+    }
+}
+
+fn without_comment(text: &str) -> &str {
+    text.split('#').next().unwrap_or(text)
+}
+
+/// Names from other systems use backslashes.
+fn slashed(name: &str) -> String {
+    name.replace('\\', "/")
+}
+
+/// Appends a value to a list that stays empty until a vertex has one.
+fn push<T: Copy>(list: &mut Vec<T>, before: usize, value: Option<T>, missing: T) {
+    if value.is_some() || !list.is_empty() {
+        list.resize(before, missing);
+        list.push(value.unwrap_or(missing));
+    }
+}
+
+/// A polygon as triangles: ears are cut off until a triangle is left.
+fn triangulated(corners: &[DVec3]) -> Vec<[usize; 3]> {
+    let fan =
+        |left: &[usize]| left.windows(2).skip(1).map(|t| [left[0], t[0], t[1]]).collect::<Vec<_>>();
+    let mut left: Vec<usize> = (0..corners.len()).collect();
+    if left.len() <= 3 || left.len() > MAX_EARS {
+        return fan(&left);
+    }
+    // Newell's normal: the plane that fits a polygon that is not quite flat.
+    let next = |i: usize| corners[(i + 1) % corners.len()];
+    let sum = |i: usize| (corners[i] - corners[0]).cross(next(i) - corners[0]);
+    let normal = (0..corners.len()).map(sum).sum::<DVec3>().normalize_or_zero();
+    if normal == DVec3::ZERO {
+        return fan(&left);
+    }
+    let (x, y) = normal.any_orthonormal_pair();
+    // The pair may be left-handed about the normal.
+    let hand = x.cross(y).dot(normal).signum();
+    let flat: Vec<DVec2> = corners.iter().map(|p| DVec2::new(p.dot(x), hand * p.dot(y))).collect();
+    let area = |a: usize, b: usize, c: usize| (flat[b] - flat[a]).perp_dot(flat[c] - flat[a]);
+    let mut triangles = Vec::with_capacity(corners.len() - 2);
+    while left.len() > 3 {
+        let count = left.len();
+        let ear = (0..count).find(|&i| {
+            let (a, b, c) = (left[(i + count - 1) % count], left[i], left[(i + 1) % count]);
+            let inside =
+                |&p: &usize| area(a, b, p) >= 0.0 && area(b, c, p) >= 0.0 && area(c, a, p) >= 0.0;
+            area(a, b, c) > 0.0 && !left.iter().filter(|p| ![a, b, c].contains(p)).any(inside)
+        });
+        // A polygon that crosses itself has no ear; what is left becomes a fan.
+        let Some(i) = ear else {
+            break;
+        };
+        triangles.push([left[(i + count - 1) % count], left[i], left[(i + 1) % count]]);
+        left.remove(i);
+    }
+    triangles.extend(fan(&left));
+    triangles
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn area(corners: &[DVec3], triangles: &[[usize; 3]]) -> (f64, f64) {
+        let cross = |t: &[usize; 3]| {
+            let [a, b, c] = t.map(|i| corners[i]);
+            (b - a).cross(c - a) * 0.5
+        };
+        let sum: DVec3 = triangles.iter().map(cross).sum();
+        (sum.length(), triangles.iter().map(|t| cross(t).length()).sum())
+    }
+
+    #[test]
+    fn concave_polygons_keep_their_area() {
+        // An L of area 3, in any order of turning and any plane.
+        let l = [(0., 0.), (2., 0.), (2., 1.), (1., 1.), (1., 2.), (0., 2.)];
+        for turn in 0..6 {
+            for reversed in [false, true] {
+                let mut corners: Vec<DVec3> = (0..6)
+                    .map(|i| l[(i + turn) % 6])
+                    .map(|(x, y)| DVec3::new(x, y, 0.5 * x + y))
+                    .collect();
+                if reversed {
+                    corners.reverse();
+                }
+                let triangles = triangulated(&corners);
+                let (signed, total) = area(&corners, &triangles);
+                let expected = 3.0 * DVec3::new(0.5, 1.0, -1.0).length();
+                assert_eq!(triangles.len(), 4);
+                assert!((signed - expected).abs() < 1e-12, "{signed}");
+                assert!((total - expected).abs() < 1e-12, "{total}");
+            }
+        }
+    }
+
+    #[test]
+    fn texture_options_are_told_from_the_name() {
+        let map = Map::read("-o 0.5 0.25 -s 2 3 1 -clamp on -bm 0.3 my file.png", 1).expect("map");
+        assert_eq!(map.file, "my file.png");
+        assert_eq!((map.offset, map.scale), (Vec2::new(0.5, 0.25), Vec2::new(2.0, 3.0)));
+        assert!(map.clamp);
+        assert!(Map::read("-s 1 1 1", 1).is_none());
+        assert!(Map::read("", 1).is_none());
+    }
+}

@@ -1,0 +1,228 @@
+//! Initial points as structure-from-motion would find them, with errors of known size.
+//!
+//! Candidates are pixels of training views, drawn with probability by the local gradient of
+//! luminance: where an image is flat, feature matching finds nothing. A candidate counts when at
+//! least three training views see it.
+
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::camera::Camera;
+use crate::random::Draws;
+use crate::trace::{Frame, Tracer};
+
+/// Views that must see a point.
+const MIN_VIEWS: usize = 3;
+/// Candidates per point wanted: most are seen by three views, and noise needs no more.
+const CANDIDATES: f64 = 2.0;
+/// Gradient every pixel counts as having: half a step of eight bits.
+const GRADIENT_FLOOR: f64 = 0.5;
+/// Side of the cubes that drop out together, as a share of the diagonal.
+const PATCH: f64 = 0.02;
+/// Relative depth difference up to which a view sees a point.
+const SAME_DEPTH: f64 = 1e-3;
+
+/// How many points, and how wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PointOptions {
+    /// Points wanted; fewer where the views see fewer.
+    pub count: usize,
+    /// Uniformly in the bounding box, instead of on surfaces.
+    pub random: bool,
+    /// Standard deviation of each coordinate, as a share of the diagonal.
+    pub noise: f64,
+    /// Share of points that lie anywhere in the bounding box enlarged by a fifth.
+    pub outliers: f64,
+    /// Share of space, in cubes of 2 % of the diagonal, in which no point is found.
+    pub dropout: f64,
+    /// Whether thin structures yield no points.
+    pub without_thin: bool,
+}
+
+impl Default for PointOptions {
+    fn default() -> Self {
+        Self {
+            count: 5000,
+            random: false,
+            noise: 1e-3,
+            outliers: 0.02,
+            dropout: 0.0,
+            without_thin: false,
+        }
+    }
+}
+
+/// Points to start training from.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct InitPoints {
+    /// World positions. Shape: `[points]`.
+    pub positions: Vec<DVec3>,
+    /// sRGB colours. Shape: `[points]`.
+    pub colours: Vec<[u8; 3]>,
+    /// Numbers of the training views that see each, ascending. Shape: `[points]`.
+    pub seen_by: Vec<Vec<u32>>,
+    /// How many of them were displaced to anywhere.
+    pub outliers: usize,
+}
+
+struct Candidate {
+    /// Decides which candidates are taken.
+    order: u64,
+    position: DVec3,
+    colour: [u8; 3],
+}
+
+/// Gathers candidates from training views as they are rendered.
+pub struct PointCollector<'a> {
+    tracer: Tracer<'a>,
+    cameras: &'a [Camera],
+    options: PointOptions,
+    bounds: (DVec3, DVec3),
+    candidates: Vec<Candidate>,
+}
+
+impl<'a> PointCollector<'a> {
+    pub(crate) fn new(tracer: Tracer<'a>, cameras: &'a [Camera], options: PointOptions) -> Self {
+        let bounds = tracer.surface.bounds();
+        Self { tracer, cameras, options, bounds, candidates: Vec::new() }
+    }
+
+    /// Draws candidates from training view number `view`.
+    pub fn observe(&mut self, view: usize, frame: &Frame) {
+        if self.options.random || self.options.count == 0 {
+            return;
+        }
+        let camera = &self.cameras[view];
+        let wanted = self.options.count as f64 * CANDIDATES / self.cameras.len() as f64;
+        let weights = self.weights(frame);
+        let total: f64 = weights.iter().sum();
+        if total <= 0.0 {
+            return;
+        }
+        let mut draws = Draws::new(self.tracer.seed, &[0x706f_696e_7473, view as u64]);
+        // Systematic sampling: one draw per equal share of the weights.
+        let step = total / wanted.ceil();
+        let mut next = step * draws.unit64();
+        let mut sum = 0.0;
+        for (pixel, weight) in weights.iter().enumerate() {
+            sum += weight;
+            while next < sum {
+                next += step;
+                let (x, y) = (pixel % frame.width as usize, pixel / frame.width as usize);
+                let direction = camera.direction(DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
+                let position = camera.centre + f64::from(frame.depth[pixel]) * direction;
+                let rgba = &frame.rgba[4 * pixel..4 * pixel + 4];
+                let colour = [rgba[0], rgba[1], rgba[2]];
+                self.candidates.push(Candidate { order: draws.bits(), position, colour });
+            }
+        }
+    }
+
+    /// The weight of each pixel.
+    fn weights(&self, frame: &Frame) -> Vec<f64> {
+        let (width, height) = (frame.width as usize, frame.height as usize);
+        let luminance = |i: usize| {
+            let c = &frame.rgba[4 * i..4 * i + 3];
+            0.299 * f64::from(c[0]) + 0.587 * f64::from(c[1]) + 0.114 * f64::from(c[2])
+        };
+        // An outline against nothing is no feature of the surface.
+        let solid = |i: usize| frame.depth[i] > 0.0 && frame.rgba[4 * i + 3] == 255;
+        let slope = |i: usize, before: Option<usize>, after: Option<usize>| {
+            let before = before.filter(|&j| solid(j)).unwrap_or(i);
+            let after = after.filter(|&j| solid(j)).unwrap_or(i);
+            luminance(after) - luminance(before)
+        };
+        let weight = |i: usize| {
+            if !solid(i) || (self.options.without_thin && self.is_thin(frame.triangles[i])) {
+                return 0.0;
+            }
+            let (x, y) = (i % width, i / width);
+            let dx = slope(i, (x > 0).then(|| i - 1), (x + 1 < width).then(|| i + 1));
+            let dy = slope(i, (y > 0).then(|| i - width), (y + 1 < height).then(|| i + width));
+            dx.hypot(dy) + GRADIENT_FLOOR
+        };
+        (0..width * height).map(weight).collect()
+    }
+
+    fn is_thin(&self, triangle: u32) -> bool {
+        let model = self.tracer.model;
+        let material = model.triangle_materials.get(triangle as usize);
+        material.is_some_and(|&m| model.materials[m as usize].thin)
+    }
+
+    /// The points of all views observed.
+    #[must_use]
+    pub fn finish(mut self) -> InitPoints {
+        let PointOptions { count, random, noise, outliers, .. } = self.options;
+        let mut draws = Draws::new(self.tracer.seed, &[0x006e_6f69_7365]);
+        let (lo, hi) = self.bounds;
+        let diagonal = (hi - lo).length();
+        let mut points = InitPoints::default();
+        let anywhere = |draws: &mut Draws, margin: f64| {
+            let share = DVec3::new(draws.unit64(), draws.unit64(), draws.unit64());
+            let (lo, hi) = (lo - margin * (hi - lo), hi + margin * (hi - lo));
+            lo + share * (hi - lo)
+        };
+        if random {
+            for _ in 0..count {
+                points.positions.push(anywhere(&mut draws, 0.0));
+                points.colours.push([0; 3].map(|_: u8| (draws.bits() >> 56) as u8));
+                points.seen_by.push(Vec::new());
+            }
+            return points;
+        }
+        self.candidates.sort_by_key(|candidate| candidate.order);
+        let needed = MIN_VIEWS.min(self.cameras.len());
+        // In blocks, so that views are not asked about candidates nobody needs.
+        for block in self.candidates.chunks(4096) {
+            let seen: Vec<Vec<u32>> = block.par_iter().map(|c| self.viewers(c.position)).collect();
+            for (candidate, seen) in block.iter().zip(seen) {
+                if points.positions.len() < count
+                    && seen.len() >= needed
+                    && !self.is_dropped(candidate.position, diagonal)
+                {
+                    points.positions.push(candidate.position);
+                    points.colours.push(candidate.colour);
+                    points.seen_by.push(seen);
+                }
+            }
+            if points.positions.len() >= count {
+                break;
+            }
+        }
+        for position in &mut points.positions {
+            if draws.unit64() < outliers {
+                *position = anywhere(&mut draws, 0.1);
+                points.outliers += 1;
+            } else if noise > 0.0 {
+                let shift = DVec3::new(draws.normal(), draws.normal(), draws.normal());
+                *position += noise * diagonal * shift;
+            }
+        }
+        points
+    }
+
+    /// The training views that see a point of a surface.
+    fn viewers(&self, point: DVec3) -> Vec<u32> {
+        let sees = |camera: &Camera| {
+            let (pixel, depth) = camera.project(point);
+            if depth <= 0.0 || !camera.contains(pixel) {
+                return false;
+            }
+            let first = self.tracer.first_solid(camera.centre, camera.direction(pixel));
+            first.is_some_and(|(t, ..)| (t - depth).abs() <= SAME_DEPTH * depth)
+        };
+        let seen = self.cameras.iter().enumerate().filter(|(_, camera)| sees(camera));
+        seen.map(|(i, _)| i as u32).collect()
+    }
+
+    fn is_dropped(&self, point: DVec3, diagonal: f64) -> bool {
+        let cell = (point / (PATCH * diagonal).max(f64::MIN_POSITIVE)).floor();
+        let key = [cell.x, cell.y, cell.z].map(|v| v as i64 as u64);
+        Draws::new(self.tracer.seed ^ 0x6472_6f70, &key).unit64() < self.options.dropout
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,95 @@
+//! Built-in scenes: exact geometry from a few dozen lines each, no external data.
+//!
+//! A scene's file documents its geometry. Lengths are in metres; +y is up.
+
+mod chirp;
+mod cornell;
+mod glossy;
+mod layers;
+mod room;
+mod spheres;
+mod table;
+mod thin;
+
+use glam::{DVec3, Vec3};
+
+use crate::mesh::{Light, LightKind, Model};
+use crate::rig::Rig;
+use crate::shade::Ambient;
+use crate::sky::Sky;
+
+/// A built-in scene.
+#[derive(Debug, Clone, Copy)]
+pub struct Preset {
+    /// Name on the command line.
+    pub name: &'static str,
+    /// One line for lists.
+    pub summary: &'static str,
+    pub(crate) build: fn() -> Staging,
+}
+
+/// What a preset decides.
+pub(crate) struct Staging {
+    pub(crate) model: Model,
+    pub(crate) sky: Sky,
+    pub(crate) rig: Rig,
+    pub(crate) ambient: Ambient,
+    /// Size of the finest feature a trainer could be asked to reproduce `[m]`.
+    pub(crate) finest: f64,
+}
+
+/// All built-in scenes.
+pub const PRESETS: [Preset; 8] = [
+    spheres::PRESET,
+    thin::PRESET,
+    chirp::PRESET,
+    table::PRESET,
+    layers::PRESET,
+    room::PRESET,
+    glossy::PRESET,
+    cornell::PRESET,
+];
+
+impl Staging {
+    /// Lit by the sun and an open sky, seen by the default rig.
+    fn outdoors(model: Model, finest: f64) -> Self {
+        let mut model = model;
+        model.lights.push(sun());
+        Self { model, sky: open_sky(), rig: Rig::default(), ambient: Ambient::Open, finest }
+    }
+}
+
+/// Parallel light from the upper front right; with the open sky, white reflects at most 1.
+pub(crate) fn sun() -> Light {
+    let direction = -DVec3::new(0.5, 0.8, 0.6).normalize();
+    let intensity = Vec3::new(1.0, 0.96, 0.9) * (0.55 * std::f32::consts::PI);
+    Light { kind: LightKind::Directional { direction }, intensity, range: f64::INFINITY }
+}
+
+/// A slightly blue sky over slightly brown ground.
+pub(crate) fn open_sky() -> Sky {
+    Sky { zenith: [0.42, 0.46, 0.52], ground: [0.22, 0.2, 0.17], up: [0.0, 1.0, 0.0] }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::Surface;
+
+    #[test]
+    fn every_preset_builds_and_is_described() {
+        for preset in PRESETS {
+            let staging = (preset.build)();
+            assert!(!preset.summary.is_empty() && staging.finest > 0.0, "{}", preset.name);
+            let surface = Surface::new(&staging.model).expect("triangles");
+            let (train, test) = staging.rig.cameras(&surface, &[]).expect("cameras");
+            assert_eq!(train.len(), staging.rig.train as usize, "{}", preset.name);
+            let reach = train.iter().map(|c| c.centre.distance(train[0].centre));
+            let apart = 1e-3 * reach.fold(0.0, f64::max);
+            for a in &train {
+                let same = test.iter().find(|b| a.centre.distance(b.centre) < apart);
+                assert!(same.is_none(), "{}: a test view is a training view", preset.name);
+            }
+        }
+    }
+}

@@ -1,0 +1,258 @@
+//! Files that a mesh file refers to, and images: all untrusted.
+//!
+//! References are plain relative paths that stay in the mesh's folder, symbolic links followed. No
+//! allocation is sized by what a header declares: readers take what is there, decoders have limits.
+
+use std::fs::File;
+use std::io::{Cursor, Read};
+use std::path::{Path, PathBuf};
+
+use image::{ImageReader, Limits};
+
+use crate::error::Error;
+use crate::texture::Texture;
+
+/// Largest file read `[bytes]`.
+const MAX_FILE: u64 = 16 << 30;
+/// Largest side of an image `[px]`.
+const MAX_SIDE: u32 = 16_384;
+/// Most pixels of an image.
+const MAX_PIXELS: u64 = 1 << 28;
+/// Most bytes a decoder may allocate.
+const MAX_DECODED: u64 = 1 << 30;
+/// Most texels of all textures of a model.
+const MAX_TEXELS: u64 = 1 << 29;
+/// Longest reference `[bytes]`.
+const MAX_NAME: usize = 4096;
+
+/// Reads a whole file.
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
+    let file = File::open(path).map_err(Error::io(path))?;
+    let known = file.metadata().map_err(Error::io(path))?;
+    let too_large = || Error::Malformed {
+        path: path.to_owned(),
+        element: "the file".into(),
+        problem: "it is larger than 16 GiB".into(),
+        remedy: "split the mesh",
+    };
+    if known.len() > MAX_FILE {
+        return Err(too_large());
+    }
+    let mut bytes = Vec::new();
+    file.take(MAX_FILE + 1).read_to_end(&mut bytes).map_err(Error::io(path))?;
+    if bytes.len() as u64 > MAX_FILE { Err(too_large()) } else { Ok(bytes) }
+}
+
+/// The folder a mesh file lies in.
+pub(crate) struct Folder {
+    /// The mesh file, for messages.
+    file: PathBuf,
+    folder: PathBuf,
+}
+
+impl Folder {
+    pub(crate) fn of(file: &Path) -> Result<Self, Error> {
+        let folder = match file.parent() {
+            Some(parent) if !parent.as_os_str().is_empty() => parent,
+            _ => Path::new("."),
+        };
+        let folder = folder.canonicalize().map_err(Error::io(folder))?;
+        Ok(Self { file: file.to_owned(), folder })
+    }
+
+    /// The path a reference stands for; whether a file is there is not looked at.
+    pub(crate) fn resolve(&self, element: &str, reference: &str) -> Result<PathBuf, Error> {
+        let refuse = |problem| {
+            Err(Error::Uri {
+                path: self.file.clone(),
+                element: element.to_owned(),
+                uri: reference.chars().take(80).collect(),
+                problem,
+            })
+        };
+        if reference.is_empty() || reference.len() > MAX_NAME {
+            return refuse("is empty or longer than 4 KiB");
+        }
+        if reference.contains('\0') {
+            return refuse("holds a NUL");
+        }
+        // A colon before the first slash ends a scheme or a drive.
+        if reference.split(['/', '\\']).next().is_some_and(|first| first.contains(':')) {
+            return refuse("is no relative path");
+        }
+        if reference.starts_with(['/', '\\']) {
+            return refuse("is an absolute path");
+        }
+        if reference.split(['/', '\\']).any(|part| part == "..") {
+            return refuse("leads out of the folder");
+        }
+        let path = self.folder.join(reference);
+        match path.canonicalize() {
+            Ok(real) if !real.starts_with(&self.folder) => refuse("leads out of the folder"),
+            _ => Ok(path),
+        }
+    }
+
+    /// Reads the file that a percent-encoded relative URI stands for.
+    pub(crate) fn read_uri(&self, element: &str, uri: &str) -> Result<Vec<u8>, Error> {
+        // A name that is literally there wins: files with a % in their names exist.
+        let literal = self.resolve(element, uri)?;
+        if literal.is_file() {
+            return read(&literal);
+        }
+        let decoded = percent_decoded(uri).ok_or_else(|| Error::Uri {
+            path: self.file.clone(),
+            element: element.to_owned(),
+            uri: uri.chars().take(80).collect(),
+            problem: "has a % that is followed by no two hexadecimal digits of UTF-8",
+        })?;
+        read(&self.resolve(element, &decoded)?)
+    }
+}
+
+/// Refuses a texture with which a model would have too many texels: many small files can name many
+/// large images.
+pub(crate) fn check_texels(
+    file: &Path,
+    element: &str,
+    before: &[Texture],
+    texture: &Texture,
+) -> Result<(), Error> {
+    let texels = |texture: &Texture| {
+        let (width, height) = texture.size();
+        u64::from(width) * u64::from(height)
+    };
+    let total: u64 = before.iter().chain([texture]).map(texels).sum();
+    if total <= MAX_TEXELS {
+        return Ok(());
+    }
+    Err(Error::Malformed {
+        path: file.to_owned(),
+        element: element.to_owned(),
+        problem: "all textures together have more than 2^29 texels".into(),
+        remedy: "store smaller textures",
+    })
+}
+
+fn percent_decoded(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let [first, after @ ..] = rest {
+        if *first == b'%' {
+            let digits = std::str::from_utf8(after.get(..2)?).ok()?;
+            bytes.push(u8::from_str_radix(digits, 16).ok()?);
+            rest = &after[2..];
+        } else {
+            bytes.push(*first);
+            rest = after;
+        }
+    }
+    String::from_utf8(bytes).ok()
+}
+
+/// The bytes of a `data:` URI with base64; None if it is none.
+pub(crate) fn data_uri(uri: &str) -> Option<Vec<u8>> {
+    let (head, body) = uri.strip_prefix("data:")?.split_once(',')?;
+    head.ends_with(";base64").then(|| base64(body)).flatten()
+}
+
+fn base64(text: &str) -> Option<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(text.len() / 4 * 3);
+    let (mut held, mut bits) = (0_u32, 0);
+    for c in text.trim_end_matches('=').bytes() {
+        let value = match c {
+            b'A'..=b'Z' => c - b'A',
+            b'a'..=b'z' => c - b'a' + 26,
+            b'0'..=b'9' => c - b'0' + 52,
+            b'+' | b'-' => 62,
+            b'/' | b'_' => 63,
+            _ => return None,
+        };
+        held = held << 6 | u32::from(value);
+        bits += 6;
+        if bits >= 8 {
+            bits -= 8;
+            bytes.push((held >> bits) as u8);
+        }
+    }
+    Some(bytes)
+}
+
+/// Decodes a PNG, JPEG or WebP image.
+pub(crate) fn decode(
+    file: &Path,
+    element: &str,
+    bytes: &[u8],
+    srgb: bool,
+) -> Result<Texture, Error> {
+    let fault = |problem: String| Error::Malformed {
+        path: file.to_owned(),
+        element: element.to_owned(),
+        problem,
+        remedy: "store it as a PNG or JPEG of at most 16384 px a side",
+    };
+    let reader = |bytes| {
+        let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
+        let mut limits = Limits::default();
+        limits.max_image_width = Some(MAX_SIDE);
+        limits.max_image_height = Some(MAX_SIDE);
+        limits.max_alloc = Some(MAX_DECODED);
+        reader.limits(limits);
+        Ok::<_, std::io::Error>(reader)
+    };
+    let header = reader(bytes).map_err(|e| fault(e.to_string()))?;
+    let (width, height) = header.into_dimensions().map_err(|e| fault(e.to_string()))?;
+    if width > MAX_SIDE || height > MAX_SIDE || u64::from(width) * u64::from(height) > MAX_PIXELS {
+        return Err(fault(format!("it has {width}x{height} px")));
+    }
+    let image = reader(bytes).map_err(|e| fault(e.to_string()))?;
+    let image = image.decode().map_err(|e| fault(e.to_string()))?.into_rgba8();
+    Ok(Texture::new(width, height, image.into_raw(), srgb))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn references_stay_in_the_folder() {
+        let folder = tempfile::tempdir().expect("folder");
+        let file = folder.path().join("a.gltf");
+        std::fs::write(&file, "x").expect("write");
+        let here = Folder::of(&file).expect("folder");
+        for bad in [
+            "../b.bin",
+            "a/../../b",
+            "/etc/passwd",
+            "file:///etc/passwd",
+            "C:\\x",
+            "\\\\host\\x",
+            "",
+            "http://x/y",
+            "a\0b",
+            "..",
+            "x\\..\\..\\y",
+        ] {
+            assert!(matches!(here.resolve("buffer 0", bad), Err(Error::Uri { .. })), "{bad}");
+        }
+        for bad in ["%2e%2e/b.bin", "%2Fetc/passwd", "%zz", "%", "%ff"] {
+            assert!(matches!(here.read_uri("buffer 0", bad), Err(Error::Uri { .. })), "{bad}");
+        }
+        std::fs::write(folder.path().join("a b.bin"), "seen").expect("write");
+        assert_eq!(here.read_uri("buffer 0", "a%20b.bin").expect("read"), b"seen");
+        assert_eq!(here.read_uri("buffer 0", "./a b.bin").expect("read"), b"seen");
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink("/etc", folder.path().join("out")).expect("link");
+            assert!(matches!(here.resolve("image 1", "out/hostname"), Err(Error::Uri { .. })));
+        }
+    }
+
+    #[test]
+    fn base64_is_read_with_and_without_padding() {
+        assert_eq!(data_uri("data:x/y;base64,Zm9vYg==").expect("data"), b"foob");
+        assert_eq!(data_uri("data:;base64,Zm9vYmE").expect("data"), b"fooba");
+        assert_eq!(data_uri("data:;base64,Zm*v"), None);
+        assert_eq!(data_uri("data:text/plain,abc"), None);
+    }
+}

@@ -1,0 +1,304 @@
+//! Where the cameras stand.
+//!
+//! Training and test views follow different paths. No camera stands in a solid or closer to a
+//! surface than [`Rig::clearance`] of the geometry's diagonal: a view from inside a wall would be
+//! ground truth of nothing.
+
+use std::f64::consts::TAU;
+
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::camera::Camera;
+use crate::error::Error;
+use crate::mesh::FileCamera;
+use crate::random::Draws;
+use crate::surface::Surface;
+
+/// How cameras are arranged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RigKind {
+    /// Rings around the scene, looking at its middle.
+    Orbit,
+    /// A Fibonacci lattice on the upper hemisphere, looking at the middle.
+    Dome,
+    /// Inside the scene, looking in all directions: for rooms.
+    Inside,
+    /// An ellipse as wide and deep as the scene, looking at the middle.
+    Ellipse,
+    /// At and around the cameras that the file brings.
+    File,
+}
+
+/// A rig with everything decided.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Rig {
+    /// Arrangement.
+    pub kind: RigKind,
+    /// Views to train on.
+    pub train: u32,
+    /// Views held out.
+    pub test: u32,
+    /// Image width `[px]`.
+    pub width: u32,
+    /// Image height `[px]`.
+    pub height: u32,
+    /// Horizontal field of view `[degrees]`.
+    pub fov: f64,
+    /// Distance from the middle, in multiples of that at which the scene's bounding sphere fills
+    /// the image; inside, the path's radius as a share of the room.
+    pub radius: f64,
+    /// Lowest and highest elevation `[degrees]`.
+    pub elevation: [f64; 2],
+    /// The part of a full turn that cameras stand in, about +z `[degrees]`.
+    pub arc: f64,
+    /// Standard deviation of the cameras' places, as a share of their distance.
+    pub jitter: f64,
+    /// Least distance from any surface, as a share of the diagonal.
+    pub clearance: f64,
+    /// What the cameras look at; the middle of the bounding box where not given.
+    pub target: Option<[f64; 3]>,
+    /// Radius of what is to fill the image; that of the bounding sphere where not given.
+    pub focus: Option<f64>,
+    /// Seed of the jitter.
+    pub seed: u64,
+}
+
+impl Default for Rig {
+    fn default() -> Self {
+        Self {
+            kind: RigKind::Dome,
+            train: 60,
+            test: 20,
+            width: 256,
+            height: 256,
+            fov: 50.0,
+            radius: 1.0,
+            elevation: [5.0, 75.0],
+            arc: 360.0,
+            jitter: 0.0,
+            clearance: 0.005,
+            target: None,
+            focus: None,
+            seed: 0,
+        }
+    }
+}
+
+/// The golden angle `[rad]`.
+const GOLDEN: f64 = TAU * 0.381_966_011_250_105;
+/// Places tried for a camera before giving up.
+const ATTEMPTS: u64 = 200;
+
+/// A place and what it looks at.
+type Stand = (DVec3, DVec3);
+
+impl Rig {
+    /// The cameras of training and test views.
+    ///
+    /// # Errors
+    /// When an option is out of range, a file camera is asked for and there is none, or no place
+    /// outside the geometry is found.
+    pub fn cameras(
+        &self,
+        surface: &Surface,
+        file: &[FileCamera],
+    ) -> Result<(Vec<Camera>, Vec<Camera>), Error> {
+        self.check()?;
+        if self.kind == RigKind::File && file.is_empty() {
+            let problem =
+                "the file brings no perspective camera; choose orbit, dome, ellipse or inside";
+            return Err(Error::option("--rig", problem));
+        }
+        let split = |test: bool| {
+            let count = if test { self.test } else { self.train };
+            (0..count).map(|i| self.camera(surface, file, i, test)).collect::<Result<Vec<_>, _>>()
+        };
+        Ok((split(false)?, split(true)?))
+    }
+
+    fn check(&self) -> Result<(), Error> {
+        let side = |option, value: u32| match value {
+            1..=16_384 => Ok(()),
+            _ => Err(Error::option(option, format!("{value} px is not in 1..=16384"))),
+        };
+        side("--width", self.width)?;
+        side("--height", self.height)?;
+        if u64::from(self.width) * u64::from(self.height) > 1 << 28 {
+            return Err(Error::option("--size", "an image has at most 2^28 pixels"));
+        }
+        if self.train == 0 || self.train > 100_000 || self.test > 100_000 {
+            return Err(Error::option(
+                "--views",
+                "there must be 1 to 100000 training views and at most 100000 test views",
+            ));
+        }
+        if !(self.fov > 0.5 && self.fov < 170.0) {
+            return Err(Error::option(
+                "--fov",
+                format!("{} degrees is not between 0.5 and 170", self.fov),
+            ));
+        }
+        if !(self.radius > 0.0 && self.radius <= 1e3) {
+            return Err(Error::option("--radius", format!("{} is not in (0, 1000]", self.radius)));
+        }
+        if !(self.jitter >= 0.0 && self.jitter <= 0.5) {
+            return Err(Error::option("--jitter", format!("{} is not in 0..=0.5", self.jitter)));
+        }
+        Ok(())
+    }
+
+    fn camera(
+        &self,
+        surface: &Surface,
+        file: &[FileCamera],
+        i: u32,
+        test: bool,
+    ) -> Result<Camera, Error> {
+        let mut draws = Draws::new(self.seed, &[u64::from(i), u64::from(test)]);
+        for attempt in 0..ATTEMPTS {
+            if self.kind == RigKind::File && attempt == 0 && !test && (i as usize) < file.len() {
+                // The file's author chose this place.
+                return Ok(self.of_file(&file[i as usize]));
+            }
+            let (place, target) = self.stand(surface, file, i, test);
+            let reach = (place - target).length();
+            // First by the jitter asked for, then ever farther from a place that is no good.
+            let spread = self.jitter.max(0.005 * attempt as f64) * reach;
+            let mut shift = || DVec3::new(draws.normal(), draws.normal(), draws.normal());
+            let offset = if spread > 0.0 { shift() * spread } else { DVec3::ZERO };
+            let place = place + offset;
+            if self.is_free(surface, place) {
+                return Ok(self.looking(place, target, file, i));
+            }
+        }
+        Err(Error::NoPlace { view: i as usize })
+    }
+
+    fn size(&self) -> (u32, u32) {
+        (self.width, self.height)
+    }
+
+    fn looking(&self, place: DVec3, target: DVec3, file: &[FileCamera], i: u32) -> Camera {
+        let camera = Camera::looking(place, target, DVec3::Y, self.fov.to_radians(), self.size());
+        if self.kind != RigKind::File {
+            return camera;
+        }
+        let like = self.of_file(&file[i as usize % file.len()]);
+        let up = -like.world_from_camera.y_axis;
+        let turned = Camera::looking(place, target, up, self.fov.to_radians(), self.size());
+        Camera { fx: like.fx, fy: like.fy, ..turned }
+    }
+
+    fn of_file(&self, file: &FileCamera) -> Camera {
+        let (width, height) = self.size();
+        let focal = 0.5 * f64::from(height) / (0.5 * file.yfov).tan();
+        Camera {
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx: 0.5 * f64::from(width),
+            cy: 0.5 * f64::from(height),
+            world_from_camera: file.world_from_camera,
+            centre: file.centre,
+        }
+    }
+
+    /// Where view `i` of its split stands before jitter, and what it looks at.
+    fn stand(&self, surface: &Surface, file: &[FileCamera], i: u32, test: bool) -> Stand {
+        let (lo, hi) = surface.bounds();
+        let middle = self.target.map_or(0.5 * (lo + hi), DVec3::from);
+        let half = 0.5 * (hi - lo);
+        let fill = self.focus.unwrap_or(half.length()).max(f64::MIN_POSITIVE);
+        let fov_x = self.fov.to_radians();
+        let fov_y =
+            2.0 * ((0.5 * fov_x).tan() * f64::from(self.height) / f64::from(self.width)).atan();
+        let distance = self.radius * fill / (0.5 * fov_x.min(fov_y)).sin();
+        let count = f64::from(if test { self.test } else { self.train });
+        let (i, low, high) =
+            (f64::from(i), self.elevation[0].to_radians(), self.elevation[1].to_radians());
+        // Test views stand between training views in every coordinate.
+        let shift = if test { 0.5 } else { 0.0 };
+        let along = |share: f64| self.arc.to_radians() * (share - 0.5);
+        match self.kind {
+            RigKind::Orbit => {
+                let azimuth = along((i + 0.25 + shift) / count);
+                let share = if test { 0.5 } else { (i * 0.618_033_988_749_895).fract() };
+                (middle + distance * on_sphere(azimuth, low + share * (high - low)), middle)
+            }
+            RigKind::Dome => {
+                let share = (i + 0.5) / count;
+                let elevation = (low.sin() + share * (high.sin() - low.sin())).asin();
+                let turn = ((i + shift) * GOLDEN + shift).rem_euclid(TAU) / TAU;
+                (middle + distance * on_sphere(along(turn), elevation), middle)
+            }
+            RigKind::Ellipse => {
+                let azimuth = along((i + shift) / count);
+                let wide = half.length() / half.x.hypot(half.z).max(f64::MIN_POSITIVE);
+                let scale = distance / half.length().max(f64::MIN_POSITIVE) * wide;
+                let scale = if test { 0.93 * scale } else { scale };
+                let elevation = low + (0.5 - 0.5 * (2.0 * azimuth).cos()) * (high - low);
+                let flat = on_sphere(azimuth, 0.0) * DVec3::new(half.x, 0.0, half.z) * scale;
+                let up = flat.length() * elevation.tan();
+                (middle + flat + DVec3::Y * up, middle)
+            }
+            RigKind::Inside => {
+                let ring = if test { 0.6 * self.radius } else { self.radius };
+                let azimuth = TAU * (i + shift) / count;
+                let height = 0.3 * ((i * 0.618_033_988_749_895 + shift).fract() - 0.5);
+                let place = middle + (on_sphere(azimuth, 0.0) * ring + DVec3::Y * height) * half;
+                // Looks outwards or across, in every direction in turn.
+                let yaw = i * GOLDEN + shift;
+                let pitch = low + (i * 0.754_877_666_246_693 + shift).fract() * (high - low);
+                (place, place + on_sphere(yaw, pitch) * half.length())
+            }
+            RigKind::File => {
+                let camera = &file[i as usize % file.len()];
+                let forward = camera.world_from_camera.z_axis;
+                let met = surface.cast(camera.centre, forward, f64::INFINITY);
+                let focus = met.map_or(half.length(), |hit| hit.t);
+                let round = 1.0 + (i / file.len() as f64).floor();
+                let angle = i * GOLDEN + 2.0 * shift;
+                let reach = 0.12 * focus * (round / (1.0 + count / file.len() as f64)).sqrt();
+                let m: &DMat3 = &camera.world_from_camera;
+                let offset = reach * (angle.cos() * m.x_axis + angle.sin() * m.y_axis);
+                (camera.centre + offset, camera.centre + forward * focus)
+            }
+        }
+    }
+
+    /// Whether a camera may stand here.
+    fn is_free(&self, surface: &Surface, place: DVec3) -> bool {
+        let (lo, hi) = surface.bounds();
+        let outside = (lo - place).max(place - hi).max_element();
+        let clearance = self.clearance * surface.diagonal();
+        if outside > clearance {
+            return true;
+        }
+        surface.nearest(place).distance >= clearance && !is_inside(surface, place)
+    }
+}
+
+/// Whether a place is in a solid: most of what is seen from there is the back of surfaces.
+fn is_inside(surface: &Surface, place: DVec3) -> bool {
+    const RAYS: i32 = 26;
+    let (mut fronts, mut backs) = (0, 0);
+    for i in 0..RAYS {
+        let height = (2.0 * f64::from(i) + 1.0) / f64::from(RAYS) - 1.0;
+        let direction = on_sphere(f64::from(i) * GOLDEN, height.asin());
+        match surface.cast(place, direction, f64::INFINITY) {
+            Some(hit) if hit.front => fronts += 1,
+            Some(_) => backs += 1,
+            None => {}
+        }
+    }
+    backs > fronts
+}
+
+/// The unit vector at an azimuth about +y, starting at +z, and an elevation `[rad]`.
+fn on_sphere(azimuth: f64, elevation: f64) -> DVec3 {
+    let flat = elevation.cos();
+    DVec3::new(flat * azimuth.sin(), elevation.sin(), flat * azimuth.cos())
+}

@@ -1,0 +1,425 @@
+//! From a source and options to a scene whose views can be rendered.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::camera::Camera;
+use crate::error::Error;
+use crate::mesh::{FileCamera, Model, Reflection};
+use crate::points::{InitPoints, PointCollector, PointOptions};
+use crate::presets::{PRESETS, Staging, open_sky, sun};
+use crate::rig::{Rig, RigKind};
+use crate::shade::{Ambient, Lighting, Traits};
+use crate::sky::Sky;
+use crate::surface::Surface;
+use crate::trace::{Frame, Tracer, luminances};
+use crate::{gltf, obj};
+
+/// What to render.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Source {
+    /// A built-in scene, by name.
+    Preset(String),
+    /// A `.gltf`, `.glb` or `.obj` file.
+    File(PathBuf),
+}
+
+/// How to render it. What is `None` is as the preset says, or the default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Options {
+    /// Arrangement of the cameras.
+    pub rig: Option<RigKind>,
+    /// Views to train on.
+    pub train: Option<u32>,
+    /// Views held out.
+    pub test: Option<u32>,
+    /// Image width and height `[px]`.
+    pub size: Option<(u32, u32)>,
+    /// Horizontal field of view `[degrees]`.
+    pub fov: Option<f64>,
+    /// See [`Rig::radius`].
+    pub radius: Option<f64>,
+    /// See [`Rig::jitter`].
+    pub jitter: Option<f64>,
+    /// Subsamples per pixel along a side: 4 is 16 samples.
+    pub grid: u32,
+    /// Light from the sky and from other surfaces.
+    pub ambient: Option<Ambient>,
+    /// Whether lights cast shadows.
+    pub shadows: bool,
+    /// Whether all materials are diffuse only.
+    pub lambert: bool,
+    /// Factor on all light; None chooses for files that bring their own lights, and is 1 else.
+    pub exposure: Option<f32>,
+    /// Initial points.
+    pub points: PointOptions,
+    /// Seed of everything random.
+    pub seed: u64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            rig: None,
+            train: None,
+            test: None,
+            size: None,
+            fov: None,
+            radius: None,
+            jitter: None,
+            grid: 4,
+            ambient: None,
+            shadows: true,
+            lambert: false,
+            exposure: None,
+            points: PointOptions::default(),
+            seed: 0,
+        }
+    }
+}
+
+/// A view's part in training.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Split {
+    /// Trained on.
+    Train,
+    /// Held out.
+    Test,
+}
+
+/// A posed view, not yet rendered.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// Name without ending, as in file names: `train/r_000`.
+    pub name: String,
+    /// Its part in training.
+    pub split: Split,
+    /// Its camera.
+    pub camera: Camera,
+}
+
+/// What a scene asks of a trainer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Requirements {
+    /// Whether every surface looks the same from all sides: colours of degree 0 suffice then.
+    pub view_independent: bool,
+    /// Smallest and largest coordinates.
+    pub bounds: [[f64; 3]; 2],
+    /// Length of the bounding box's diagonal.
+    pub diagonal: f64,
+    /// Size of the finest feature at the median viewing distance `[px]`: as a preset states it, or
+    /// a mesh's median edge.
+    pub finest_feature_px: f64,
+    /// Share of views' centre pixels that show no surface: how much of the images is background.
+    pub open_share: f64,
+}
+
+/// Geometry, light and cameras; nothing is rendered yet.
+pub struct Scene {
+    /// Preset's or file's name.
+    pub name: String,
+    /// Geometry and materials.
+    pub model: Model,
+    /// The geometry as traced.
+    pub surface: Surface,
+    /// All views, training views first.
+    pub views: Vec<View>,
+    /// How the cameras were arranged.
+    pub rig: Rig,
+    /// Options as given.
+    pub options: Options,
+    /// What was decided for [`Options::ambient`].
+    pub ambient: Ambient,
+    /// Light from all around.
+    pub sky: Sky,
+    /// What was decided for [`Options::exposure`].
+    pub exposure: f32,
+    /// What it asks of a trainer.
+    pub requirements: Requirements,
+    train_cameras: Vec<Camera>,
+    lighting: Lighting,
+    traits: Vec<Traits>,
+}
+
+/// A scene with all its views, in memory.
+pub struct Generated {
+    /// The scene.
+    pub scene: Scene,
+    /// Rendered views, as [`Scene::views`].
+    pub frames: Vec<Frame>,
+    /// Points to start from.
+    pub points: InitPoints,
+}
+
+/// Renders a scene with all its views into memory.
+///
+/// # Errors
+/// As [`Scene::prepare`].
+pub fn generate(source: &Source, options: &Options) -> Result<Generated, Error> {
+    let scene = Scene::prepare(source, options)?;
+    let mut collector = scene.point_collector();
+    let mut frames = Vec::new();
+    for (i, view) in scene.views.iter().enumerate() {
+        let frame = scene.render(i);
+        if view.split == Split::Train {
+            collector.observe(i, &frame);
+        }
+        frames.push(frame);
+    }
+    let points = collector.finish();
+    Ok(Generated { scene, frames, points })
+}
+
+impl Scene {
+    /// Loads or builds the geometry and places the cameras.
+    ///
+    /// # Errors
+    /// When the preset is unknown, the file is unreadable, malformed or needs what is not
+    /// supported, an option is out of range, or there is no place for a camera.
+    pub fn prepare(source: &Source, options: &Options) -> Result<Self, Error> {
+        check(options)?;
+        let (name, staging, cameras) = stage(source)?;
+        let Staging { mut model, mut sky, rig, ambient, finest } = staging;
+        if options.lambert {
+            for material in &mut model.materials {
+                if material.reflection == Reflection::MetalRough {
+                    material.reflection = Reflection::Lambert;
+                }
+            }
+        }
+        let surface = Surface::new(&model)?;
+        let rig = decided(rig, options);
+        let (train, test) = rig.cameras(&surface, &cameras)?;
+        let ambient = options.ambient.unwrap_or(ambient);
+        let traits = Traits::all(&surface, &model);
+        let brought_lights = matches!(source, Source::File(_)) && !model.lights.is_empty();
+        let mut exposure = options.exposure.unwrap_or(1.0);
+        if matches!(source, Source::File(_)) && model.lights.is_empty() {
+            model.lights.push(sun());
+        }
+        let light = |sky, grid| {
+            Lighting::new(&model.lights, &surface, sky, (ambient, options.shadows, grid))
+        };
+        if brought_lights {
+            if options.exposure.is_none() {
+                let dark = light(Sky::uniform(0.0), 1);
+                let (surface, model, traits) = (&surface, &model, &traits);
+                let tracer =
+                    Tracer { surface, model, traits, lighting: &dark, exposure: 1.0, seed: 0 };
+                exposure = exposure_for(&tracer, &train);
+            }
+            // Fill light in the units the exposure takes to the image's.
+            sky = dimmed(sky, 0.4 / exposure);
+        }
+        let lighting = light(sky, options.grid);
+        let requirements = requirements(&model, &surface, &train, finest);
+        let name_of = |split: &str, i: usize| format!("{split}/r_{i:03}");
+        let views = |cameras: &[Camera], split: Split, folder: &str| {
+            let view =
+                |(i, &camera): (usize, &Camera)| View { name: name_of(folder, i), split, camera };
+            cameras.iter().enumerate().map(view).collect::<Vec<_>>()
+        };
+        let mut all = views(&train, Split::Train, "train");
+        all.extend(views(&test, Split::Test, "test"));
+        Ok(Self {
+            name,
+            surface,
+            views: all,
+            rig,
+            options: options.clone(),
+            ambient,
+            sky,
+            exposure,
+            requirements,
+            train_cameras: train,
+            lighting,
+            traits,
+            model,
+        })
+    }
+
+    /// Renders a view. The same at any number of threads.
+    #[must_use]
+    pub fn render(&self, view: usize) -> Frame {
+        self.tracer().render(&self.views[view].camera, view as u64)
+    }
+
+    /// Renders the scene as another camera sees it.
+    #[must_use]
+    pub fn render_from(&self, camera: &Camera) -> Frame {
+        self.tracer().render(camera, u64::MAX)
+    }
+
+    /// Gathers initial points from training views as they are rendered.
+    #[must_use]
+    pub fn point_collector(&self) -> PointCollector<'_> {
+        PointCollector::new(self.tracer(), &self.train_cameras, self.options.points)
+    }
+
+    /// Whether a triangle belongs to a thin structure.
+    #[must_use]
+    pub fn is_thin(&self, triangle: u32) -> bool {
+        let material = self.model.triangle_materials.get(triangle as usize);
+        material.is_some_and(|&m| self.model.materials[m as usize].thin)
+    }
+
+    fn tracer(&self) -> Tracer<'_> {
+        Tracer {
+            surface: &self.surface,
+            model: &self.model,
+            traits: &self.traits,
+            lighting: &self.lighting,
+            exposure: self.exposure,
+            seed: self.options.seed,
+        }
+    }
+}
+
+fn check(options: &Options) -> Result<(), Error> {
+    let share = |option, value: f64| match value {
+        0.0..=1.0 => Ok(()),
+        _ => Err(Error::option(option, format!("{value} is not in 0..=1"))),
+    };
+    share("--point-noise", options.points.noise)?;
+    share("--outliers", options.points.outliers)?;
+    share("--dropout", options.points.dropout)?;
+    if !(1..=64).contains(&options.grid) {
+        return Err(Error::option(
+            "--samples",
+            format!("{} per side is not in 1..=64", options.grid),
+        ));
+    }
+    if options.points.count > 1 << 28 {
+        return Err(Error::option("--points", "there can be at most 2^28 points"));
+    }
+    if options.exposure.is_some_and(|e| !(e > 0.0 && e.is_finite())) {
+        return Err(Error::option("--exposure", "it must be positive"));
+    }
+    Ok(())
+}
+
+fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
+    match source {
+        Source::Preset(name) => {
+            let Some(preset) = PRESETS.iter().find(|preset| preset.name == name) else {
+                let known = PRESETS.map(|preset| preset.name).join(", ");
+                return Err(Error::UnknownPreset { name: name.clone(), known });
+            };
+            let mut staging = (preset.build)();
+            staging.model.name = name.clone();
+            Ok((name.clone(), staging, Vec::new()))
+        }
+        Source::File(path) => {
+            let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+            let model = match ending.as_deref() {
+                Some("gltf" | "glb") => gltf::load(path)?,
+                Some("obj") => obj::load(path)?,
+                _ => {
+                    let feature = "a file that is neither .gltf, .glb nor .obj".to_owned();
+                    let remedy = "export the mesh to one of them".to_owned();
+                    return Err(Error::Unsupported { path: path.clone(), feature, remedy });
+                }
+            };
+            let cameras = model.cameras.clone();
+            let finest = median_edge(&model);
+            let staging = Staging {
+                sky: open_sky(),
+                rig: Rig { elevation: [-15.0, 70.0], ..Rig::default() },
+                ambient: Ambient::Open,
+                finest,
+                model,
+            };
+            let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
+            Ok((name.unwrap_or_default(), staging, cameras))
+        }
+    }
+}
+
+fn decided(rig: Rig, options: &Options) -> Rig {
+    let kind = options.rig.unwrap_or(rig.kind);
+    let default = Rig::default();
+    // Another arrangement than the preset's does not inherit what was chosen for that.
+    let rig = match kind {
+        same if same == rig.kind => rig,
+        RigKind::Inside => Rig {
+            radius: 0.45,
+            elevation: [-25.0, 15.0],
+            clearance: 0.02,
+            fov: 80.0,
+            arc: 360.0,
+            ..rig
+        },
+        _ => Rig { arc: 360.0, radius: default.radius, clearance: default.clearance, ..rig },
+    };
+    let (width, height) = options.size.unwrap_or((rig.width, rig.height));
+    Rig {
+        kind,
+        train: options.train.unwrap_or(rig.train),
+        test: options.test.unwrap_or(rig.test),
+        width,
+        height,
+        fov: options.fov.unwrap_or(rig.fov),
+        radius: options.radius.unwrap_or(rig.radius),
+        jitter: options.jitter.unwrap_or(rig.jitter),
+        seed: options.seed,
+        ..rig
+    }
+}
+
+/// The exposure at which the brightest fiftieth of what is lit is at 0.9.
+fn exposure_for(tracer: &Tracer<'_>, cameras: &[Camera]) -> f32 {
+    let step = cameras.len().div_ceil(6).max(1);
+    let mut all = Vec::new();
+    for camera in cameras.iter().step_by(step) {
+        all.extend(luminances(tracer, camera, (camera.width / 48).max(1)));
+    }
+    all.retain(|l| l.is_finite() && *l > 0.0);
+    all.sort_by(f32::total_cmp);
+    match all.get(all.len() * 49 / 50) {
+        Some(&bright) => (0.9 / bright).clamp(1e-9, 1e9),
+        None => 1.0,
+    }
+}
+
+fn dimmed(sky: Sky, factor: f32) -> Sky {
+    Sky { zenith: sky.zenith.map(|v| v * factor), ground: sky.ground.map(|v| v * factor), ..sky }
+}
+
+fn requirements(model: &Model, surface: &Surface, cameras: &[Camera], finest: f64) -> Requirements {
+    let (lo, hi) = surface.bounds();
+    let middle = 0.5 * (lo + hi);
+    let seen = |c: &Camera| surface.cast(c.centre, c.forward(), f64::INFINITY).map(|hit| hit.t);
+    let met: Vec<Option<f64>> = cameras.iter().map(seen).collect();
+    let open = met.iter().filter(|t| t.is_none()).count();
+    let mut scales: Vec<f64> = cameras
+        .iter()
+        .zip(&met)
+        .map(|(camera, met)| camera.fx / met.unwrap_or(camera.centre.distance(middle)))
+        .collect();
+    scales.sort_by(f64::total_cmp);
+    let scale = scales.get(scales.len() / 2).copied().unwrap_or(0.0);
+    Requirements {
+        view_independent: model.view_independent(),
+        bounds: [lo.to_array(), hi.to_array()],
+        diagonal: surface.diagonal(),
+        finest_feature_px: finest * scale,
+        open_share: open as f64 / cameras.len().max(1) as f64,
+    }
+}
+
+fn median_edge(model: &Model) -> f64 {
+    // A sample of the triangles is enough.
+    let step = (model.triangles.len() / 10_000).max(1);
+    let at = |i: u32| model.positions[i as usize];
+    let mut edges: Vec<f64> = model
+        .triangles
+        .iter()
+        .step_by(step)
+        .flat_map(|&[a, b, c]| {
+            [at(a).distance(at(b)), at(b).distance(at(c)), at(c).distance(at(a))]
+        })
+        .collect();
+    edges.sort_by(f64::total_cmp);
+    edges.get(edges.len() / 2).copied().unwrap_or(0.0)
+}

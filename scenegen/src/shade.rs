@@ -1,0 +1,621 @@
+//! How much light a surface sends towards the viewer: Lambert and glTF's metallic-roughness model
+//! (glTF 2.0 specification, appendix B), lit by the scene's lights and the sky.
+
+use std::f32::consts::PI;
+use std::sync::OnceLock;
+
+use glam::{DVec3, Vec2, Vec3, Vec4, Vec4Swizzles};
+
+use crate::intersect::Meeting;
+use crate::mesh::{AlphaMode, Light, LightKind, Material, Model, Reflection};
+use crate::random::{
+    Draws, cosine_hemisphere, frame, ggx_distribution, ggx_visible_normal, stratum,
+};
+use crate::sky::Sky;
+use crate::surface::{LocalHit, LocalRay, Surface};
+use crate::texture::TextureRef;
+
+/// Smallest alpha of GGX: below, the peak of a highlight is too narrow for single precision.
+const MIN_ALPHA: f32 = 1e-3;
+/// Secondary rays start this far above the surface and end this far before a light: 20 ulps of
+/// local coordinates, as the hit point is rounded in each coordinate and along the ray.
+const LIFT: f32 = 2.5e-3;
+/// Normal reflectance of a dielectric.
+const DIELECTRIC: f32 = 0.04;
+
+/// Light from the sky and from other surfaces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Ambient {
+    /// The whole sky reaches everything; in closed form, no secondary ray.
+    Open,
+    /// What of the sky is hidden is sampled, by this many rays per pixel.
+    Occlusion(u32),
+    /// One bounce: what is hidden is replaced by what hides it, by this many rays per pixel.
+    Bounce(u32),
+}
+
+/// All that shading needs to know of a scene.
+pub(crate) struct Lighting {
+    /// In local coordinates.
+    lights: Vec<Light>,
+    pub(crate) sky: Sky,
+    pub(crate) ambient: Ambient,
+    pub(crate) shadows: bool,
+    /// Subsamples per pixel along a side.
+    pub(crate) grid: u32,
+}
+
+/// A point of a surface with its material's textures read.
+pub(crate) struct Point<'a> {
+    place: Vec3,
+    /// Towards the viewer.
+    geometric: Vec3,
+    shading: Vec3,
+    material: &'a Material,
+    base: Vec3,
+    metallic: f32,
+    alpha_ggx: f32,
+    roughness: f32,
+    emitted: Vec3,
+}
+
+/// Which of a pixel's subsamples is shaded, with its random numbers.
+pub(crate) struct Subsample {
+    pub(crate) index: u32,
+    pub(crate) draws: Draws,
+    /// What the pixel's last ray met, by place in leaf order: the next one is likely to meet it too,
+    /// and then needs to look only in front of it. No result depends on this.
+    pub(crate) met: Option<u32>,
+    /// What hid a light last.
+    pub(crate) hid: Option<u32>,
+}
+
+impl Lighting {
+    pub(crate) fn new(
+        lights: &[Light],
+        surface: &Surface,
+        sky: Sky,
+        (ambient, shadows, grid): (Ambient, bool, u32),
+    ) -> Self {
+        let place = |p: DVec3| surface.to_local(p);
+        let scale = surface.scale();
+        let lights = lights.iter().map(|light| {
+            // Falls with the square of distance: in local units distances are larger.
+            let spread = (scale * scale) as f32;
+            let (kind, gain) = match light.kind {
+                LightKind::Directional { .. } => (light.kind, 1.0),
+                LightKind::Point { position } => {
+                    (LightKind::Point { position: place(position) }, spread)
+                }
+                LightKind::Spot { position, direction, cos_inner, cos_outer } => {
+                    let position = place(position);
+                    (LightKind::Spot { position, direction, cos_inner, cos_outer }, spread)
+                }
+                LightKind::Area { corner, u, v } => {
+                    (LightKind::Area { corner: place(corner), u: u * scale, v: v * scale }, 1.0)
+                }
+            };
+            Light { kind, intensity: light.intensity * gain, range: light.range * scale }
+        });
+        Self { lights: lights.collect(), sky, ambient, shadows, grid: grid.max(1) }
+    }
+
+    /// Radiance of a point towards the viewer.
+    pub(crate) fn radiance(
+        &self,
+        matter: &Matter<'_>,
+        point: &Point<'_>,
+        view: Vec3,
+        sample: &mut Subsample,
+    ) -> Vec3 {
+        if point.material.reflection == Reflection::Unlit {
+            return point.base;
+        }
+        let mut total = point.emitted;
+        for light in &self.lights {
+            let u = || stratum(sample.index, self.grid, sample.draws.square());
+            let Some((to_light, distance, irradiance)) = arriving(light, point.place, u) else {
+                continue;
+            };
+            if point.geometric.dot(to_light) <= 0.0 {
+                continue;
+            }
+            let sent = point.reflected(view, to_light) * irradiance;
+            if sent.max_element() > 0.0
+                && !self.is_shadowed(matter, point, to_light, distance, sample)
+            {
+                total += sent;
+            }
+        }
+        total + self.ambient(matter, point, view, sample)
+    }
+
+    fn is_shadowed(
+        &self,
+        matter: &Matter<'_>,
+        point: &Point<'_>,
+        to: Vec3,
+        distance: f32,
+        sample: &mut Subsample,
+    ) -> bool {
+        if !self.shadows {
+            return false;
+        }
+        let ray = lifted(point, to, (distance - 2.0 * LIFT).max(0.0));
+        let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
+        let found = matter.surface.occluder(&ray, sample.hid, solid);
+        sample.hid = found.or(sample.hid);
+        found.is_some()
+    }
+
+    fn ambient(
+        &self,
+        matter: &Matter<'_>,
+        point: &Point<'_>,
+        view: Vec3,
+        sample: &mut Subsample,
+    ) -> Vec3 {
+        let shiny = point.material.reflection == Reflection::MetalRough;
+        let diffuse_colour = point.diffuse_colour();
+        let rays = match self.ambient {
+            Ambient::Open => {
+                let diffuse = diffuse_colour * self.sky.irradiance(point.shading) / PI;
+                return if shiny { diffuse + self.mirrored_sky(point, view) } else { diffuse };
+            }
+            Ambient::Occlusion(rays) | Ambient::Bounce(rays) => rays,
+        };
+        let bounce = matches!(self.ambient, Ambient::Bounce(_));
+        let count = rays.div_ceil(self.grid * self.grid).max(1);
+        let (tangent, bitangent) = frame(point.shading);
+        let mut sum = Vec3::ZERO;
+        for _ in 0..count {
+            let u = stratum(sample.index, self.grid, sample.draws.square());
+            let d = cosine_hemisphere(u);
+            let direction = d.x * tangent + d.y * bitangent + d.z * point.shading;
+            if point.geometric.dot(direction) > 0.0 {
+                sum += self.arriving_from(matter, point, direction, bounce, sample);
+            }
+        }
+        let diffuse = diffuse_colour * sum / count as f32;
+        if !shiny {
+            return diffuse;
+        }
+        if !bounce {
+            return diffuse + self.mirrored_sky(point, view);
+        }
+        diffuse + self.mirrored(matter, point, view, sample)
+    }
+
+    /// Radiance that arrives from a direction: the sky, or what hides it, as lit directly.
+    fn arriving_from(
+        &self,
+        matter: &Matter<'_>,
+        point: &Point<'_>,
+        direction: Vec3,
+        bounce: bool,
+        sample: &mut Subsample,
+    ) -> Vec3 {
+        let ray = lifted(point, direction, f32::MAX);
+        if !bounce {
+            let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
+            let hidden = matter.surface.occluder(&ray, None, solid).is_some();
+            return if hidden { Vec3::ZERO } else { self.sky.radiance(direction) };
+        }
+        let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
+        let Some(hit) = matter.surface.closest(&ray, None, None, solid) else {
+            return self.sky.radiance(direction);
+        };
+        let (there, _) = Point::read(matter, &ray, &hit, 0.0);
+        if there.material.reflection == Reflection::Unlit {
+            return there.base;
+        }
+        let emitted = if there.material.is_light { Vec3::ZERO } else { there.emitted };
+        let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
+        for light in &self.lights {
+            let u = || sample.draws.square();
+            let Some((to_light, distance, irradiance)) = arriving(light, there.place, u) else {
+                continue;
+            };
+            let cos = there.shading.dot(to_light);
+            if cos > 0.0
+                && there.geometric.dot(to_light) > 0.0
+                && !self.is_shadowed(matter, &there, to_light, distance, sample)
+            {
+                total += there.diffuse_colour() / PI * cos * irradiance;
+            }
+        }
+        total
+    }
+
+    /// The sky in a glossy surface, without rays: the radiance of a blurred sky times the share of it
+    /// that is reflected.
+    fn mirrored_sky(&self, point: &Point<'_>, view: Vec3) -> Vec3 {
+        let cos = point.shading.dot(view).max(0.0);
+        let (scale, bias) = directional_albedo(cos, point.roughness);
+        let albedo = point.f0() * scale + Vec3::splat(bias);
+        let direction = 2.0 * point.shading.dot(view) * point.shading - view;
+        albedo * self.sky.blurred(direction, point.roughness)
+    }
+
+    /// What a glossy surface mirrors, by one sampled direction.
+    fn mirrored(
+        &self,
+        matter: &Matter<'_>,
+        point: &Point<'_>,
+        view: Vec3,
+        sample: &mut Subsample,
+    ) -> Vec3 {
+        let (tangent, bitangent) = frame(point.shading);
+        let cos = view.dot(point.shading).max(1e-4);
+        let local = Vec3::new(view.dot(tangent), view.dot(bitangent), cos).normalize();
+        let u = stratum(sample.index, self.grid, sample.draws.square());
+        let half = ggx_visible_normal(local, point.alpha_ggx, u);
+        let out = 2.0 * local.dot(half) * half - local;
+        let direction = out.x * tangent + out.y * bitangent + out.z * point.shading;
+        if out.z <= 0.0 || point.geometric.dot(direction) <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let weight = fresnel(point.f0(), local.dot(half))
+            * shadowing_after_masking(local.z, out.z, point.alpha_ggx);
+        weight * self.arriving_from(matter, point, direction, true, sample)
+    }
+}
+
+impl<'a> Point<'a> {
+    /// Reads the material at a hit; also its alpha, 0 where a mask says there is no surface.
+    /// `width` is the width of the ray's cone there, local units.
+    pub(crate) fn read(
+        matter: &Matter<'a>,
+        ray: &LocalRay,
+        hit: &LocalHit,
+        width: f32,
+    ) -> (Self, f32) {
+        let (at, material) = matter.locate(hit.slot, &hit.at, width);
+        let model = matter.model;
+        let [a, b, c] = at.corners;
+        let Meeting { v, w, front, .. } = hit.at;
+        let face = (b - a).cross(c - a);
+        let side = if front { 1.0 } else { -1.0 };
+        // A triangle met edge-on or without area has no normal of its own.
+        let geometric = face.normalize_or(-ray.direction * side) * side;
+        let base = at.base(material);
+        let alpha = at.alpha(material, base.w);
+
+        let smooth = at.interpolated(&model.normals).unwrap_or(Vec3::ZERO);
+        let mut shading = smooth.normalize_or_zero() * side;
+        if shading.dot(geometric) <= 0.0 {
+            shading = geometric;
+        }
+        if let Some(texture) = &material.normal_texture {
+            let texel = at.texel(Some(texture)).xyz();
+            shading = at.bumped(shading, side, texel, texture, material.normal_scale);
+            // A normal that turns away from the viewer's side would be lit from behind.
+            if shading.dot(geometric) <= 0.0 {
+                shading = geometric;
+            }
+        }
+        let mr = at.texel(material.metal_rough_texture.as_ref());
+        let roughness = (material.roughness * mr.y).clamp(0.0, 1.0);
+        let emitted = material.emissive * at.texel(material.emissive_texture.as_ref()).xyz();
+        let point = Self {
+            place: a + v * (b - a) + w * (c - a),
+            geometric,
+            shading,
+            material,
+            base: base.xyz(),
+            metallic: (material.metallic * mr.z).clamp(0.0, 1.0),
+            alpha_ggx: (roughness * roughness).max(MIN_ALPHA),
+            roughness,
+            emitted,
+        };
+        (point, alpha)
+    }
+
+    fn diffuse_colour(&self) -> Vec3 {
+        match self.material.reflection {
+            Reflection::MetalRough => self.base * (1.0 - self.metallic),
+            Reflection::Lambert | Reflection::Unlit => self.base,
+        }
+    }
+
+    fn f0(&self) -> Vec3 {
+        Vec3::splat(DIELECTRIC).lerp(self.base, self.metallic)
+    }
+
+    /// Reflected radiance per irradiance from a direction, cosine included.
+    fn reflected(&self, view: Vec3, to_light: Vec3) -> Vec3 {
+        let cos_light = self.shading.dot(to_light);
+        if cos_light <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let diffuse = self.diffuse_colour() / PI;
+        if self.material.reflection == Reflection::Lambert {
+            return diffuse * cos_light;
+        }
+        let cos_view = self.shading.dot(view).max(1e-4);
+        let half = (view + to_light).normalize_or(self.shading);
+        let f = fresnel(self.f0(), view.dot(half).max(0.0));
+        let d = ggx_distribution(self.shading.dot(half).clamp(0.0, 1.0), self.alpha_ggx);
+        let specular = f * d * visibility(cos_view, cos_light, self.alpha_ggx);
+        ((Vec3::ONE - f) * diffuse + specular) * cos_light
+    }
+}
+
+/// What rays meet: geometry with its materials.
+pub(crate) struct Matter<'a> {
+    pub(crate) surface: &'a Surface,
+    pub(crate) model: &'a Model,
+    /// By place in leaf order; empty where every triangle is opaque from both sides.
+    pub(crate) traits: &'a [Traits],
+}
+
+/// What a ray must know of a triangle before it counts as met.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Traits {
+    /// Its back is invisible.
+    pub(crate) one_sided: bool,
+    /// Its alpha may be below one.
+    pub(crate) see_through: bool,
+}
+
+impl Traits {
+    /// The traits of all triangles by place in leaf order; empty where none has any.
+    pub(crate) fn all(surface: &Surface, model: &Model) -> Vec<Self> {
+        let of = |slot: usize| {
+            let triangle = surface.triangle_of(slot as u32) as usize;
+            let material = &model.materials[model.triangle_materials[triangle] as usize];
+            Self {
+                one_sided: !material.double_sided,
+                see_through: material.alpha != AlphaMode::Opaque,
+            }
+        };
+        let all: Vec<Self> = (0..surface.len()).map(of).collect();
+        if all.iter().all(|&t| t == Self::default()) { Vec::new() } else { all }
+    }
+}
+
+impl<'a> Matter<'a> {
+    /// Whether a triangle is there at all for a ray from a camera.
+    #[inline]
+    pub(crate) fn is_visible(&self, slot: u32, at: &Meeting) -> bool {
+        at.front || !self.traits.get(slot as usize).is_some_and(|t| t.one_sided)
+    }
+
+    /// Whether a triangle hides what is behind it: for shadows and sampled light, from both sides,
+    /// where its alpha is at least one half.
+    fn is_solid(&self, slot: u32, at: &Meeting) -> bool {
+        if !self.traits.get(slot as usize).is_some_and(|t| t.see_through) {
+            return true;
+        }
+        let (at, material) = self.locate(slot, at, 0.0);
+        at.alpha(material, at.base(material).w) >= 0.5
+    }
+
+    fn locate(&self, slot: u32, at: &Meeting, width: f32) -> (Located<'a>, &'a Material) {
+        let model = self.model;
+        let triangle = self.surface.triangle_of(slot) as usize;
+        let indices = model.triangles[triangle].map(|i| i as usize);
+        let material = &model.materials[model.triangle_materials[triangle] as usize];
+        let weights = [1.0 - at.v - at.w, at.v, at.w];
+        let corners = self.surface.triangles[slot as usize];
+        (Located { model, indices, weights, corners, width }, material)
+    }
+}
+
+/// A place on a triangle, for reading what its corners and textures say.
+struct Located<'a> {
+    model: &'a Model,
+    indices: [usize; 3],
+    weights: [f32; 3],
+    corners: [Vec3; 3],
+    width: f32,
+}
+
+impl Located<'_> {
+    fn base(&self, material: &Material) -> Vec4 {
+        let tint = self.interpolated(&self.model.colours).unwrap_or(Vec4::ONE);
+        material.base * self.texel(material.base_texture.as_ref()) * tint
+    }
+
+    /// The surface's alpha, by the base colour's.
+    fn alpha(&self, material: &Material, base: f32) -> f32 {
+        if material.alpha == AlphaMode::Opaque {
+            return 1.0;
+        }
+        let opacity = (base * self.texel(material.alpha_texture.as_ref()).x).clamp(0.0, 1.0);
+        match material.alpha {
+            AlphaMode::Mask(cutoff) => f32::from(u8::from(opacity >= cutoff)),
+            AlphaMode::Opaque | AlphaMode::Blend => opacity,
+        }
+    }
+
+    fn interpolated<T>(&self, values: &[T]) -> Option<T>
+    where
+        T: Copy + std::ops::Mul<f32, Output = T> + std::ops::Add<Output = T>,
+    {
+        let [a, b, c] = self.indices.map(|i| values.get(i).copied());
+        Some(a? * self.weights[0] + b? * self.weights[1] + c? * self.weights[2])
+    }
+
+    fn texel(&self, texture: Option<&TextureRef>) -> Vec4 {
+        let Some(texture) = texture else {
+            return Vec4::ONE;
+        };
+        let uvs = &self.model.uvs[texture.uv_set.min(1)];
+        let uv = texture.transformed(self.interpolated(uvs).unwrap_or(Vec2::ZERO));
+        let image = &self.model.textures[texture.texture as usize];
+        let mut footprint = 0.0;
+        if self.width > 0.0 && uvs.len() > self.indices[0].max(self.indices[1]).max(self.indices[2])
+        {
+            let [a, b, c] = self.indices.map(|i| uvs[i]);
+            let uv_area = (b - a).perp_dot(c - a).abs() * texture.area_scale();
+            let [a, b, c] = self.corners;
+            let area = (b - a).cross(c - a).length();
+            footprint = if area > 0.0 { self.width * (uv_area / area).sqrt() } else { 0.0 };
+        }
+        image.sample(uv, &texture.sampler, footprint)
+    }
+
+    /// The shading normal as a normal map turns it.
+    fn bumped(
+        &self,
+        normal: Vec3,
+        side: f32,
+        texel: Vec3,
+        texture: &TextureRef,
+        scale: f32,
+    ) -> Vec3 {
+        let bump = (2.0 * texel - Vec3::ONE) * Vec3::new(scale, scale, 1.0);
+        let given = self.interpolated(&self.model.tangents).filter(|t| t.w != 0.0);
+        let (tangent, handedness) = match given {
+            Some(t) => (t.xyz(), t.w.signum()),
+            None => match self.tangent_of_uvs(texture) {
+                Some(found) => found,
+                None => return normal,
+            },
+        };
+        let tangent = (tangent - normal * normal.dot(tangent)).normalize_or_zero();
+        // Seen from behind, the normal is turned but the image on the surface is not.
+        let bitangent = normal.cross(tangent) * handedness * side;
+        (bump.x * tangent + bump.y * bitangent + bump.z * normal).normalize_or(normal)
+    }
+
+    /// Direction of growing u, and 1 or −1 as growing v (which points down) is to its other side.
+    fn tangent_of_uvs(&self, texture: &TextureRef) -> Option<(Vec3, f32)> {
+        let uvs = &self.model.uvs[texture.uv_set.min(1)];
+        let [ta, tb, tc] = self.indices.map(|i| uvs.get(i).map(|&uv| texture.transformed(uv)));
+        let (d1, d2) = (tb? - ta?, tc? - ta?);
+        let [a, b, c] = self.corners;
+        let (e1, e2) = (b - a, c - a);
+        let determinant = d1.perp_dot(d2);
+        if determinant == 0.0 {
+            return None;
+        }
+        let tangent = (e1 * d2.y - e2 * d1.y) / determinant;
+        // glTF's bitangent is along growing v of an image whose origin is its upper left corner
+        // turned around: green points up in the image.
+        Some((tangent, -determinant.signum()))
+    }
+}
+
+/// Direction to a light, distance, and irradiance of a surface that faces it; `u` draws the point
+/// of an area light. None where it does not shine.
+fn arriving(light: &Light, place: Vec3, u: impl FnOnce() -> Vec2) -> Option<(Vec3, f32, Vec3)> {
+    let from_point = |position: DVec3| {
+        let way = position.as_vec3() - place;
+        let distance = way.length();
+        let near = distance > 0.0 && f64::from(distance) <= light.range;
+        near.then(|| (way / distance, distance))
+    };
+    match light.kind {
+        LightKind::Directional { direction } => {
+            Some((-direction.as_vec3(), f32::MAX, light.intensity))
+        }
+        LightKind::Point { position } => {
+            let (to, distance) = from_point(position)?;
+            Some((to, distance, light.intensity * windowed(distance, light.range)))
+        }
+        LightKind::Spot { position, direction, cos_inner, cos_outer } => {
+            let (to, distance) = from_point(position)?;
+            let cos = -to.dot(direction.as_vec3());
+            let share = ((cos - cos_outer) / (cos_inner - cos_outer).max(1e-3)).clamp(0.0, 1.0);
+            let irradiance = light.intensity * (windowed(distance, light.range) * share * share);
+            (share > 0.0).then_some((to, distance, irradiance))
+        }
+        LightKind::Area { corner, u: side_u, v: side_v } => {
+            let u = u();
+            let (side_u, side_v) = (side_u.as_vec3(), side_v.as_vec3());
+            let (to, distance) = from_point(corner + (u.x * side_u + u.y * side_v).as_dvec3())?;
+            let area = side_u.cross(side_v);
+            let projected = -to.dot(area);
+            let solid_angle = projected / (distance * distance);
+            (projected > 0.0).then_some((to, distance, light.intensity * solid_angle))
+        }
+    }
+}
+
+/// 1 / distance², cut off smoothly at the range (KHR_lights_punctual, recommended form).
+fn windowed(distance: f32, range: f64) -> f32 {
+    let inverse_square = 1.0 / (distance * distance);
+    if !range.is_finite() {
+        return inverse_square;
+    }
+    let share = f64::from(distance) / range;
+    inverse_square * (1.0 - share.powi(4)).clamp(0.0, 1.0) as f32
+}
+
+fn lifted(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {
+    LocalRay { origin: point.place + point.geometric * LIFT, direction, tmin: 0.0, tmax }
+}
+
+/// Schlick's approximation.
+fn fresnel(f0: Vec3, cos: f32) -> Vec3 {
+    let grazing = (1.0 - cos).clamp(0.0, 1.0);
+    f0 + (Vec3::ONE - f0) * (grazing * grazing) * (grazing * grazing) * grazing
+}
+
+/// Steps of the table of directional albedo along each axis.
+const STEPS: usize = 16;
+
+/// The share of light from all around that GGX reflects towards a viewer, as a factor of the normal
+/// reflectance and a rest (Karis, "Real Shading in Unreal Engine 4", 2013): interpolated in a table that
+/// is integrated once by sampling visible normals.
+fn directional_albedo(cos: f32, roughness: f32) -> (f32, f32) {
+    static TABLE: OnceLock<Vec<(f32, f32)>> = OnceLock::new();
+    let table = TABLE.get_or_init(|| {
+        let entry = |i: usize| {
+            let cos = ((i % (STEPS + 1)) as f32 / STEPS as f32).max(0.01);
+            let roughness = (i / (STEPS + 1)) as f32 / STEPS as f32;
+            integrated_albedo(cos, (roughness * roughness).max(MIN_ALPHA))
+        };
+        (0..(STEPS + 1) * (STEPS + 1)).map(entry).collect()
+    });
+    let place = |value: f32| {
+        let at = value.clamp(0.0, 1.0) * STEPS as f32;
+        let low = (at as usize).min(STEPS - 1);
+        (low, at - low as f32)
+    };
+    let ((x, dx), (y, dy)) = (place(cos), place(roughness));
+    let mix = |a: (f32, f32), b: (f32, f32), t: f32| (a.0 + t * (b.0 - a.0), a.1 + t * (b.1 - a.1));
+    let row = |y: usize| {
+        let first = y * (STEPS + 1) + x;
+        mix(table[first], table[first + 1], dx)
+    };
+    mix(row(y), row(y + 1), dy)
+}
+
+fn integrated_albedo(cos: f32, alpha: f32) -> (f32, f32) {
+    const GRID: u32 = 16;
+    let view = Vec3::new((1.0 - cos * cos).sqrt(), 0.0, cos);
+    let (mut scale, mut bias) = (0.0, 0.0);
+    for i in 0..GRID * GRID {
+        let half = ggx_visible_normal(view, alpha, stratum(i, GRID, Vec2::splat(0.5)));
+        let seen = view.dot(half).max(0.0);
+        let out = 2.0 * seen * half - view;
+        if out.z > 0.0 {
+            let weight = shadowing_after_masking(cos, out.z, alpha);
+            let grazing = (1.0 - seen).powi(5);
+            scale += weight * (1.0 - grazing);
+            bias += weight * grazing;
+        }
+    }
+    let count = (GRID * GRID) as f32;
+    (scale / count, bias / count)
+}
+
+/// Height-correlated Smith shadowing and masking, over 4 cos cos (Heitz, JCGT 2014).
+fn visibility(cos_view: f32, cos_light: f32, alpha: f32) -> f32 {
+    let a2 = alpha * alpha;
+    let v = cos_light * (cos_view * cos_view * (1.0 - a2) + a2).sqrt();
+    let l = cos_view * (cos_light * cos_light * (1.0 - a2) + a2).sqrt();
+    0.5 / (v + l)
+}
+
+/// G2 / G1: what is left of a sampled visible normal's light.
+pub(crate) fn shadowing_after_masking(cos_view: f32, cos_out: f32, alpha: f32) -> f32 {
+    let a2 = alpha * alpha;
+    let lambda = |c: f32| 0.5 * ((1.0 + a2 * (1.0 / (c * c) - 1.0).max(0.0)).sqrt() - 1.0);
+    let (v, o) = (lambda(cos_view), lambda(cos_out));
+    (1.0 + v) / (1.0 + v + o)
+}

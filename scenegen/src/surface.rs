@@ -1,0 +1,439 @@
+//! The geometry as traced: one BVH over all triangles, for rays and for nearest points.
+//!
+//! The tree is the library's binary one: on a CPU its traversal is a quarter faster than that of its
+//! eight-way compressed one (`benches/scenegen.rs` measures both).
+//!
+//! Vertices are moved to local coordinates in which the geometry's largest half side is 1024:
+//! single precision then has the same meaning for a mesh of any size and place, and the absolute
+//! tolerances of the tree's builder (1e-4) lie below an ulp of the geometry.
+//!
+//! Boxes handed to the builder are wider than their triangles by [`PADDING`], so that rounding in
+//! the box tests cannot lose a triangle that the watertight intersection would meet; together they
+//! leave no cracks.
+
+use glam::{DVec3, Vec3, Vec3A};
+use obvhs::aabb::Aabb;
+use obvhs::bvh2::Bvh2;
+use obvhs::bvh2::leaf_collapser::collapse;
+use obvhs::bvh2::node::Bvh2Node;
+use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
+use obvhs::faststack::{FastStack, HeapStack, StackStack};
+use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
+use obvhs::ray::{Ray, RayHit};
+
+use crate::error::Error;
+use crate::intersect::{Meeting, ShearedRay};
+use crate::mesh::Model;
+use crate::nearest;
+
+/// Largest half side of the geometry in local coordinates.
+const HALF_SIDE: f64 = 1024.0;
+/// Added to all sides of a triangle's box. Rounding of a box test is at most 3 ulps of the largest
+/// coordinate difference (Ize, "Robust BVH Ray Traversal", JCGT 2013); rays start within twice the
+/// half side, so that is 3 · 2⁻²⁴ · 4096 = 7e-4.
+const PADDING: f32 = 1e-3;
+/// Deepest tree for which the traversal stack lies on the stack.
+const SHALLOW: usize = 96;
+
+/// A triangle mesh that rays and nearest-point queries can be put to. World coordinates are the
+/// source's own.
+pub struct Surface {
+    pub(crate) bvh: Bvh2,
+    /// In the order of the tree's leaves, local coordinates.
+    pub(crate) triangles: Vec<[Vec3; 3]>,
+    centre: DVec3,
+    /// Local units per world unit.
+    scale: f64,
+    depth: usize,
+    bounds: (DVec3, DVec3),
+    build_seconds: f64,
+}
+
+/// Where a ray meets the surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SurfaceHit {
+    /// Ray parameter: distance in units of the direction's length.
+    pub t: f64,
+    /// The point, world coordinates.
+    pub point: DVec3,
+    /// Unit geometric normal by the triangle's winding; zero for a triangle without area.
+    pub normal: DVec3,
+    /// Number of the triangle in the model.
+    pub triangle: u32,
+    /// Whether the ray comes from the side the normal points to.
+    pub front: bool,
+}
+
+/// The surface's point nearest to a place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Nearest {
+    /// Distance `[world units]`.
+    pub distance: f64,
+    /// The nearest point, world coordinates.
+    pub point: DVec3,
+    /// Number of its triangle in the model.
+    pub triangle: u32,
+}
+
+/// A ray in local coordinates. The direction need not have unit length.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LocalRay {
+    pub(crate) origin: Vec3,
+    pub(crate) direction: Vec3,
+    /// Meetings up to and including this parameter do not count.
+    pub(crate) tmin: f32,
+    /// Nor do those beyond this one.
+    pub(crate) tmax: f32,
+}
+
+/// A meeting with a triangle, by its place in leaf order.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LocalHit {
+    pub(crate) slot: u32,
+    pub(crate) at: Meeting,
+}
+
+impl Surface {
+    /// Builds the tree.
+    ///
+    /// # Errors
+    /// When the model has no triangles.
+    pub fn new(model: &Model) -> Result<Self, Error> {
+        if model.triangles.is_empty() {
+            return Err(Error::Empty { name: model.name.clone() });
+        }
+        let start = std::time::Instant::now();
+        let bounds = model.bounds();
+        let centre = 0.5 * (bounds.0 + bounds.1);
+        let half = (0.5 * (bounds.1 - bounds.0)).max_element();
+        // A mesh of a single point has no size; any scale will do.
+        let scale =
+            if half > 0.0 && (HALF_SIDE / half).is_finite() { HALF_SIDE / half } else { 1.0 };
+        let local = |i: u32| ((model.positions[i as usize] - centre) * scale).as_vec3();
+        let in_order: Vec<[Vec3; 3]> = model.triangles.iter().map(|t| t.map(local)).collect();
+        let bvh = build(&in_order);
+        let triangles =
+            bvh.primitive_indices.iter().map(|&id| in_order[id as usize]).collect::<Vec<_>>();
+        let depth = depth(&bvh);
+        let build_seconds = start.elapsed().as_secs_f64();
+        Ok(Self { bvh, triangles, centre, scale, depth, bounds, build_seconds })
+    }
+
+    /// The first triangle a ray meets, seen from either side, nearer than `range` (a ray
+    /// parameter). None for a direction without length.
+    #[must_use]
+    pub fn cast(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<SurfaceHit> {
+        let ray = self.enter(origin, direction, range)?;
+        let hit = self.closest(&ray, None, None, |_, _| true)?;
+        let hit = self.describe(origin, direction, hit);
+        (hit.t <= range).then_some(hit)
+    }
+
+    /// Whether anything lies strictly between two places; both ends are left out by a millionth of
+    /// the geometry's size, so that they may lie on the surface.
+    #[must_use]
+    pub fn blocked(&self, from: DVec3, to: DVec3) -> bool {
+        let way = to - from;
+        let length = way.length();
+        let margin = 1e-6 * self.diagonal();
+        if length <= 2.0 * margin {
+            return false;
+        }
+        let step = way * (margin / length);
+        let (origin, direction) = (from + step, way - 2.0 * step);
+        let ray = self.enter(origin, direction, 1.0);
+        ray.is_some_and(|ray| self.occluder(&ray, None, |_, _| true).is_some())
+    }
+
+    /// The surface's nearest point.
+    #[must_use]
+    pub fn nearest(&self, place: DVec3) -> Nearest {
+        let (slot, point, distance) = nearest::search(self, self.to_local(place));
+        Nearest {
+            distance: distance / self.scale,
+            point: self.to_world(point),
+            triangle: self.triangle_of(slot),
+        }
+    }
+
+    /// Number of triangles.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.triangles.len()
+    }
+
+    /// Never: a surface has triangles.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.triangles.is_empty()
+    }
+
+    /// Smallest and largest coordinates.
+    #[must_use]
+    pub fn bounds(&self) -> (DVec3, DVec3) {
+        self.bounds
+    }
+
+    /// Length of the bounding box's diagonal `[world units]`.
+    #[must_use]
+    pub fn diagonal(&self) -> f64 {
+        (self.bounds.1 - self.bounds.0).length()
+    }
+
+    /// Seconds it took to build the tree.
+    #[must_use]
+    pub fn build_seconds(&self) -> f64 {
+        self.build_seconds
+    }
+
+    /// Bytes of tree and triangles.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.bvh.nodes.len() * size_of::<Bvh2Node>()
+            + self.triangles.len() * (size_of::<[Vec3; 3]>() + size_of::<u32>())
+    }
+
+    /// All triangles as traced, in the model's order.
+    #[must_use]
+    pub fn triangles(&self) -> Vec<[DVec3; 3]> {
+        let mut all = vec![[DVec3::ZERO; 3]; self.triangles.len()];
+        for (slot, triangle) in self.triangles.iter().enumerate() {
+            all[self.triangle_of(slot as u32) as usize] =
+                triangle.map(|p| self.to_world(p.as_dvec3()));
+        }
+        all
+    }
+
+    pub(crate) fn to_local(&self, world: DVec3) -> DVec3 {
+        (world - self.centre) * self.scale
+    }
+
+    pub(crate) fn to_world(&self, local: DVec3) -> DVec3 {
+        local / self.scale + self.centre
+    }
+
+    /// Local units per world unit.
+    pub(crate) fn scale(&self) -> f64 {
+        self.scale
+    }
+
+    pub(crate) fn triangle_of(&self, slot: u32) -> u32 {
+        self.bvh.primitive_indices[slot as usize]
+    }
+
+    /// The local ray for a world ray, its origin moved to where the ray enters the bounding box:
+    /// single precision is spent on the geometry, not on the way to it. Its parameter counts from
+    /// there. None where it misses the box.
+    pub(crate) fn enter(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<LocalRay> {
+        let (o, d) = (self.to_local(origin), direction * self.scale);
+        let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
+        let (mut near, mut far) = (0.0_f64, range);
+        for axis in 0..3 {
+            if d[axis] == 0.0 {
+                if o[axis].abs() > half[axis] {
+                    return None;
+                }
+                continue;
+            }
+            let a = (-half[axis] - o[axis]) / d[axis];
+            let b = (half[axis] - o[axis]) / d[axis];
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        let length = d.length();
+        if !(near <= far && length > 0.0 && length.is_finite()) {
+            return None;
+        }
+        let direction = (d / length).as_vec3();
+        // Half an ulp more than the exact range: callers compare again in f64.
+        let tmax = ((far - near) * length * (1.0 + 1e-6)) as f32;
+        Some(LocalRay { origin: (o + near * d).as_vec3(), direction, tmin: 0.0, tmax })
+    }
+
+    /// The hit in world coordinates; its parameter comes from the triangle's plane in f64 and
+    /// belongs to the world ray.
+    pub(crate) fn describe(&self, origin: DVec3, direction: DVec3, hit: LocalHit) -> SurfaceHit {
+        let [a, b, c] = self.triangles[hit.slot as usize].map(Vec3::as_dvec3);
+        let (o, d) = (self.to_local(origin), direction * self.scale);
+        let normal = (b - a).cross(c - a);
+        let along = normal.dot(d);
+        let by_weights = a + f64::from(hit.at.v) * (b - a) + f64::from(hit.at.w) * (c - a);
+        let by_plane = normal.dot(a - o) / along;
+        let by_point = (by_weights - o).dot(d) / d.length_squared();
+        // Along a triangle seen edge-on the plane says nothing; the weights still do.
+        let edge_on = along.abs() <= 1e-6 * normal.length() * d.length();
+        let t = if edge_on || !by_plane.is_finite() { by_point } else { by_plane };
+        SurfaceHit {
+            t,
+            point: origin + t * direction,
+            normal: normal.normalize_or_zero(),
+            triangle: self.triangle_of(hit.slot),
+            front: hit.at.front,
+        }
+    }
+
+    /// The first meeting that counts; of several at the same parameter, that with the model's
+    /// first triangle. With `after`, the first one behind that one in the same order. The triangle
+    /// `hint` is tried first.
+    #[inline]
+    pub(crate) fn closest(
+        &self,
+        ray: &LocalRay,
+        after: Option<(f32, u32)>,
+        hint: Option<u32>,
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> Option<LocalHit> {
+        if self.depth <= SHALLOW {
+            let stack = StackStack::<u32, SHALLOW>::default();
+            self.closest_with(stack, ray, (after, hint), accept)
+        } else {
+            let stack = HeapStack::new_with_capacity(self.depth);
+            self.closest_with(stack, ray, (after, hint), accept)
+        }
+    }
+
+    #[inline]
+    #[expect(clippy::float_cmp, reason = "ties are exact: they order triangles at one place")]
+    fn closest_with(
+        &self,
+        mut stack: impl FastStack<u32>,
+        ray: &LocalRay,
+        (after, hint): (Option<(f32, u32)>, Option<u32>),
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> Option<LocalHit> {
+        let sheared = ShearedRay::new(ray.origin, ray.direction);
+        let mut boxes = box_ray(ray);
+        let mut best: Option<LocalHit> = None;
+        // Whether a meeting is nearer than the best so far.
+        let nearer = |slot: u32, tmax: f32, best: &Option<LocalHit>| -> Option<Meeting> {
+            let at = sheared.meet(&self.triangles[slot as usize])?;
+            if !(at.t > ray.tmin && at.t <= tmax) {
+                return None;
+            }
+            let first = best.is_none_or(|best| {
+                at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
+            });
+            let behind = after.is_none_or(|(t, triangle)| {
+                at.t > t || (at.t == t && self.triangle_of(slot) > triangle)
+            });
+            (first && behind && accept(slot, &at)).then_some(at)
+        };
+        if let Some(slot) = hint
+            && let Some(at) = nearer(slot, boxes.tmax, &best)
+        {
+            boxes.tmax = at.t;
+            best = Some(LocalHit { slot, at });
+        }
+        let look = |node: &Bvh2Node, boxes: &mut Ray, _: &mut RayHit| {
+            for slot in node.first_index..node.first_index + node.prim_count {
+                if let Some(at) = nearer(slot, boxes.tmax, &best) {
+                    boxes.tmax = at.t;
+                    best = Some(LocalHit { slot, at });
+                }
+            }
+            true
+        };
+        self.bvh.ray_traverse_dynamic(&mut stack, boxes, &mut RayHit::none(), look);
+        best
+    }
+
+    /// Any triangle whose meeting counts, by its place in leaf order; `hint` is tried first.
+    #[inline]
+    pub(crate) fn occluder(
+        &self,
+        ray: &LocalRay,
+        hint: Option<u32>,
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> Option<u32> {
+        if self.depth <= SHALLOW {
+            self.occluder_with(StackStack::<u32, SHALLOW>::default(), ray, hint, accept)
+        } else {
+            self.occluder_with(HeapStack::new_with_capacity(self.depth), ray, hint, accept)
+        }
+    }
+
+    #[inline]
+    fn occluder_with(
+        &self,
+        mut stack: impl FastStack<u32>,
+        ray: &LocalRay,
+        hint: Option<u32>,
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> Option<u32> {
+        let sheared = ShearedRay::new(ray.origin, ray.direction);
+        let counts = |slot: u32| {
+            sheared
+                .meet(&self.triangles[slot as usize])
+                .is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
+        };
+        if let Some(slot) = hint
+            && counts(slot)
+        {
+            return hint;
+        }
+        let mut found = None;
+        let look = |node: &Bvh2Node, _: &mut Ray, _: &mut RayHit| {
+            found =
+                (node.first_index..node.first_index + node.prim_count).find(|&slot| counts(slot));
+            found.is_none()
+        };
+        self.bvh.ray_traverse_dynamic(&mut stack, box_ray(ray), &mut RayHit::none(), look);
+        found
+    }
+}
+
+#[inline]
+fn box_ray(ray: &LocalRay) -> Ray {
+    Ray::new(Vec3A::from(ray.origin), Vec3A::from(ray.direction), 0.0, ray.tmax)
+}
+
+fn build(triangles: &[[Vec3; 3]]) -> Bvh2 {
+    let boxes: Vec<Aabb> = triangles
+        .iter()
+        .map(|[a, b, c]| {
+            let (lo, hi) = (a.min(*b).min(*c) - PADDING, a.max(*b).max(*c) + PADDING);
+            Aabb::new(Vec3A::from(lo), Vec3A::from(hi))
+        })
+        .collect();
+    // The library's medium preset, step by step: its own function validates in debug builds and
+    // panics for the degenerate trees that hostile meshes have.
+    let mut bvh = PlocBuilder::with_capacity(boxes.len()).build(
+        PlocSearchDistance::Medium,
+        &boxes,
+        (0..boxes.len() as u32).collect(),
+        SortPrecision::U64,
+        3,
+    );
+    let mut optimiser = ReinsertionOptimizer::default();
+    optimiser.run(&mut bvh, 0.05, None);
+    collapse(&mut bvh, 8, 3.0);
+    optimiser.run(&mut bvh, 0.1, None);
+    bvh
+}
+
+/// Number of levels below the root, plus one: the library's own bound is that of the tree before it
+/// was improved, and its stacks panic when full.
+fn depth(bvh: &Bvh2) -> usize {
+    let mut deepest = 1;
+    let mut open = vec![(0_u32, 1_usize)];
+    while let Some((index, level)) = open.pop() {
+        deepest = deepest.max(level);
+        if let Some(node) = bvh.nodes.get(index as usize)
+            && !node.is_leaf()
+        {
+            open.extend([(node.first_index, level + 1), (node.first_index + 1, level + 1)]);
+        }
+    }
+    deepest
+}
+
+impl std::fmt::Debug for Surface {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut shown = f.debug_struct("Surface");
+        shown.field("triangles", &self.triangles.len()).field("bounds", &self.bounds);
+        shown.finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,265 @@
+use glam::DQuat;
+
+use super::*;
+use crate::nearest::on_triangle;
+use crate::primitives::icosphere;
+use crate::random::Draws;
+
+fn model(triangles: &[[DVec3; 3]]) -> Model {
+    let mut model = Model::default();
+    for triangle in triangles {
+        model.add(triangle, &[], &[], &[[0, 1, 2]], 0);
+    }
+    model
+}
+
+fn point(draws: &mut Draws) -> DVec3 {
+    2.0 * DVec3::new(draws.unit64(), draws.unit64(), draws.unit64()) - 1.0
+}
+
+/// Random triangles of all sizes, and all kinds of degenerate ones.
+fn soup(count: usize, seed: u64) -> Vec<[DVec3; 3]> {
+    let mut draws = Draws::new(seed, &[]);
+    let mut all: Vec<[DVec3; 3]> = Vec::new();
+    for i in 0..count {
+        let (p, size) = (point(&mut draws), 10.0_f64.powf(0.3 - 3.0 * draws.unit64()));
+        let (u, v) = (size * point(&mut draws), size * point(&mut draws));
+        all.push(match i % 12 {
+            // A point, a line, a line with its corners in another order, a needle.
+            0 => [p, p, p],
+            1 => [p, p + u, p + 2.0 * u],
+            2 => [p, p + u, p],
+            3 => [p, p + u, p + u + 1e-9 * v],
+            // Another one, exactly or turned round, or the next size of the same.
+            4 if i > 12 => all[i - 7],
+            5 if i > 12 => [all[i - 8][2], all[i - 8][1], all[i - 8][0]],
+            // In a plane of two coordinates, through many others.
+            6 => {
+                [p * DVec3::new(1., 1., 0.), u * DVec3::new(1., 1., 0.), v * DVec3::new(1., 1., 0.)]
+            }
+            7 => [DVec3::new(0.5, p.y, p.z), DVec3::new(0.5, u.y, u.z), DVec3::new(0.5, v.y, v.z)],
+            _ => [p, p + u, p + v],
+        });
+    }
+    all
+}
+
+/// The first meeting by trying every triangle.
+fn brute_force(surface: &Surface, ray: &LocalRay) -> Option<(f32, u32)> {
+    let sheared = ShearedRay::new(ray.origin, ray.direction);
+    let meet = |slot: u32| {
+        let at = sheared.meet(&surface.triangles[slot as usize])?;
+        (at.t > ray.tmin && at.t <= ray.tmax).then_some((at.t, surface.triangle_of(slot)))
+    };
+    (0..surface.len() as u32)
+        .filter_map(meet)
+        .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
+}
+
+fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
+    let mut draws = Draws::new(seed, &[]);
+    let mut all = Vec::new();
+    while all.len() < count {
+        let origin = 1.6 * point(&mut draws);
+        let direction = match all.len() % 4 {
+            0 => point(&mut draws),
+            // At a corner, where several triangles may meet.
+            1 => {
+                let at = (draws.bits() % surface.len() as u64) as usize;
+                surface.to_world(surface.triangles[at][0].as_dvec3()) - origin
+            }
+            // Along axes, with zeros of both signs.
+            2 => {
+                let sign = if draws.bits().is_multiple_of(2) { 1.0 } else { -1.0 };
+                let mut axis = DVec3::splat(sign * 0.0);
+                axis[(draws.bits() % 3) as usize] = sign;
+                axis
+            }
+            _ => point(&mut draws) * DVec3::new(1.0, 1.0, -0.0),
+        };
+        all.extend(surface.enter(origin, direction, f64::INFINITY));
+    }
+    all
+}
+
+#[test]
+fn the_closest_hit_is_that_of_trying_every_triangle() {
+    let mut hits = 0;
+    for (count, seed) in [(1, 1), (2, 2), (7, 3), (60, 4), (1500, 5)] {
+        let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
+        for ray in rays(&surface, 4000, seed + 100) {
+            let expected = brute_force(&surface, &ray);
+            let found = surface.closest(&ray, None, None, |_, _| true);
+            let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
+            assert_eq!(found, expected, "{count} triangles, {ray:?}");
+            assert_eq!(surface.occluder(&ray, None, |_, _| true).is_some(), expected.is_some());
+            // Whatever is tried first, and whichever triangle it is.
+            for hint in [0, surface.len() as u32 / 2] {
+                let found = surface.closest(&ray, None, Some(hint), |_, _| true);
+                let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
+                assert_eq!(found, expected);
+                let any = surface.occluder(&ray, Some(hint), |_, _| true);
+                assert_eq!(any.is_some(), expected.is_some());
+            }
+            hits += usize::from(expected.is_some());
+        }
+    }
+    assert!(hits > 3000, "only {hits} rays met anything");
+}
+
+#[test]
+fn meetings_behind_the_first_come_in_order_and_all() {
+    let surface = Surface::new(&model(&soup(300, 8))).expect("triangles");
+    for ray in rays(&surface, 500, 9) {
+        let sheared = ShearedRay::new(ray.origin, ray.direction);
+        let mut expected: Vec<(f32, u32)> = (0..surface.len() as u32)
+            .filter_map(|slot| {
+                let at = sheared.meet(&surface.triangles[slot as usize])?;
+                (at.t > ray.tmin && at.t <= ray.tmax).then_some((at.t, surface.triangle_of(slot)))
+            })
+            .collect();
+        expected.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let (mut after, mut found) = (None, Vec::new());
+        while let Some(hit) = surface.closest(&ray, after, None, |_, _| true) {
+            after = Some((hit.at.t, surface.triangle_of(hit.slot)));
+            found.extend(after);
+        }
+        assert_eq!(found, expected);
+    }
+}
+
+#[test]
+fn no_ray_leaks_through_a_sphere() {
+    let (corners, triangles) = icosphere(5);
+    // Off the origin and turned, so that nothing is symmetric in single precision.
+    let (centre, turn) = (DVec3::new(0.37, -1.91, 12.3), DQuat::from_rotation_x(0.7));
+    let place = |p: DVec3| centre + turn * p * 1.7;
+    let mut sphere = Model::default();
+    let placed: Vec<DVec3> = corners.iter().map(|&p| place(p)).collect();
+    sphere.add(&placed, &[], &[], &triangles, 0);
+    let surface = Surface::new(&sphere).expect("triangles");
+    let mut draws = Draws::new(3, &[]);
+    let mut leaks = 0;
+    for i in 0..1_000_000_u32 {
+        let [a, b, c] = triangles[(draws.bits() % triangles.len() as u64) as usize]
+            .map(|corner| placed[corner as usize]);
+        // At corners, edges and anywhere, from inside; and from outside, where it must hit twice.
+        let target = match i % 3 {
+            0 => a,
+            1 => a.lerp(b, draws.unit64()),
+            _ => (a + b + c) / 3.0,
+        };
+        let inside = centre + 1.2 * point(&mut draws) * 0.5;
+        let direction = target - inside;
+        let hit = surface.cast(inside, direction, f64::INFINITY);
+        leaks += u32::from(hit.is_none_or(|hit| (hit.t - 1.0).abs() > 1e-3));
+        if i % 10 == 0 {
+            // Past the target, towards the inside: something must be met within the sphere.
+            let outside = inside + 3.0 * direction.normalize() * 1.7;
+            leaks += u32::from(surface.cast(outside, inside - outside, 1.0).is_none());
+        }
+    }
+    assert_eq!(leaks, 0);
+}
+
+#[test]
+fn trees_of_any_depth_are_walked() {
+    // Sizes fall by half: every level of the tree splits off one triangle.
+    let chain: Vec<[DVec3; 3]> = (0..900)
+        .map(|i| {
+            let size = 0.97_f64.powi(i);
+            [
+                DVec3::X * size,
+                DVec3::X * size + DVec3::Y * 0.01 * size,
+                DVec3::X * size + DVec3::Z * 0.01 * size,
+            ]
+        })
+        .collect();
+    let same = vec![chain[0]; 5000];
+    for (triangles, expected) in [(chain, 40), (same, 0)] {
+        let surface = Surface::new(&model(&triangles)).expect("triangles");
+        for stack in [surface.depth, SHALLOW + 1] {
+            // Both kinds of stack.
+            let built = Surface::new(&model(&triangles)).expect("triangles");
+            let surface = Surface { depth: stack.max(built.depth), ..built };
+            let target = triangles[expected];
+            let middle = (target[0] + target[1] + target[2]) / 3.0;
+            for from in [middle + DVec3::X, middle - DVec3::X, middle - DVec3::new(1.0, 0.01, 0.0)]
+            {
+                let ray = surface.enter(from, middle - from, 9.0).expect("it points there");
+                let found = surface.closest(&ray, None, None, |_, _| true);
+                let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
+                assert_eq!(found, brute_force(&surface, &ray));
+                assert!(found.is_some());
+            }
+            assert_eq!(surface.nearest(middle).triangle, expected as u32);
+        }
+    }
+}
+
+#[test]
+fn the_nearest_point_is_that_of_trying_every_triangle() {
+    for (count, seed) in [(1, 11), (5, 12), (800, 13)] {
+        let triangles = soup(count, seed);
+        let surface = Surface::new(&model(&triangles)).expect("triangles");
+        let traced = surface.triangles();
+        let mut draws = Draws::new(seed, &[1]);
+        for _ in 0..500 {
+            let place = 1.5 * point(&mut draws);
+            let distance = |t: &[DVec3; 3]| on_triangle(place, *t).distance(place);
+            let expected = traced.iter().map(distance).fold(f64::INFINITY, f64::min);
+            let found = surface.nearest(place);
+            assert!((found.distance - expected).abs() < 1e-9, "{found:?} for {expected}");
+            assert!((found.point.distance(place) - found.distance).abs() < 1e-9);
+            assert!(distance(&traced[found.triangle as usize]) <= expected + 1e-9);
+        }
+    }
+}
+
+#[test]
+fn nearest_points_of_a_triangle() {
+    let triangle = [DVec3::ZERO, 2.0 * DVec3::X, 2.0 * DVec3::Y];
+    for (place, expected) in [
+        (DVec3::new(0.5, 0.5, 3.0), DVec3::new(0.5, 0.5, 0.0)),
+        (DVec3::new(-1.0, -1.0, 1.0), DVec3::ZERO),
+        (DVec3::new(1.0, -1.0, 0.0), DVec3::X),
+        (DVec3::new(2.0, 2.0, 1.0), DVec3::new(1.0, 1.0, 0.0)),
+        (DVec3::new(5.0, -1.0, 0.0), 2.0 * DVec3::X),
+    ] {
+        assert!(on_triangle(place, triangle).distance(expected) < 1e-12, "{place}");
+    }
+    let line = [DVec3::ZERO, DVec3::X, 3.0 * DVec3::X];
+    assert_eq!(on_triangle(DVec3::new(2.0, 1.0, 0.0), line), 2.0 * DVec3::X);
+    assert_eq!(on_triangle(DVec3::Y, [DVec3::ONE; 3]), DVec3::ONE);
+}
+
+#[test]
+fn size_and_place_of_a_mesh_do_not_matter() {
+    let triangle = [DVec3::ZERO, DVec3::X, DVec3::Y];
+    for (scale, offset) in [(1e-6, 0.0), (1.0, 1e6), (1e9, -1e12), (1e-30, 0.0)] {
+        let moved = triangle.map(|p| p * scale + offset);
+        let surface = Surface::new(&model(&[moved])).expect("triangles");
+        let from = DVec3::new(0.25, 0.25, 5.0) * scale + offset;
+        let hit = surface.cast(from, DVec3::NEG_Z * scale, f64::INFINITY).expect("a hit");
+        assert!((hit.t - 5.0).abs() < 1e-4, "{} at scale {scale}", hit.t);
+        assert!(hit.front && hit.normal.distance(DVec3::Z) < 1e-6);
+        assert!(surface.cast(from, DVec3::Z * scale, f64::INFINITY).is_none());
+    }
+    // Neither a direction without length nor a mesh of one point is a panic.
+    let surface = Surface::new(&model(&[[DVec3::ONE; 3]])).expect("triangles");
+    assert!(surface.cast(DVec3::ZERO, DVec3::ZERO, 1.0).is_none());
+    assert!(surface.cast(DVec3::ZERO, DVec3::ONE, 9.0).is_none());
+    assert!(surface.cast(DVec3::ZERO, DVec3::NAN, 9.0).is_none());
+    assert!((surface.nearest(DVec3::ZERO).distance - 3.0_f64.sqrt()).abs() < 1e-12);
+    assert!(matches!(Surface::new(&Model::default()), Err(Error::Empty { .. })));
+}
+
+#[test]
+fn what_lies_between_two_places_blocks() {
+    let wall = [DVec3::new(0., -9., -9.), DVec3::new(0., 9., -9.), DVec3::new(0., 0., 9.)];
+    let surface = Surface::new(&model(&[wall])).expect("triangles");
+    assert!(surface.blocked(DVec3::NEG_X, DVec3::X));
+    assert!(!surface.blocked(DVec3::NEG_X, 0.5 * DVec3::NEG_X));
+    // Ends on the surface do not count.
+    assert!(!surface.blocked(DVec3::NEG_X, DVec3::ZERO) && !surface.blocked(DVec3::ZERO, DVec3::X));
+}

@@ -1,0 +1,246 @@
+//! Images on surfaces: colour spaces, wrap modes, filters and texture transforms.
+//!
+//! Texels are filtered in linear light. Minification uses a pyramid of halved images, so that a
+//! fine texture has the same colour from every distance; a ground truth that shimmers would teach
+//! a trainer noise.
+
+use std::sync::OnceLock;
+
+use glam::{Vec2, Vec4};
+
+/// How texture coordinates beyond the unit square are meant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wrap {
+    /// The edge goes on.
+    Clamp,
+    /// The image repeats.
+    Repeat,
+    /// The image repeats, every other time mirrored.
+    Mirror,
+}
+
+/// How texels are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sampler {
+    /// Horizontally.
+    pub wrap_u: Wrap,
+    /// Vertically.
+    pub wrap_v: Wrap,
+    /// Whether a texel is a square of one colour when it is larger than a pixel's sample.
+    pub nearest: bool,
+    /// Whether smaller images stand in for many texels.
+    pub mipmaps: bool,
+}
+
+impl Default for Sampler {
+    fn default() -> Self {
+        Self { wrap_u: Wrap::Repeat, wrap_v: Wrap::Repeat, nearest: false, mipmaps: true }
+    }
+}
+
+/// A texture as a material uses it.
+#[derive(Debug, Clone, Copy)]
+pub struct TextureRef {
+    /// Number of the texture in the model.
+    pub texture: u32,
+    /// Which set of texture coordinates: 0 or 1.
+    pub uv_set: usize,
+    /// How to read it.
+    pub sampler: Sampler,
+    /// Rows of the matrix that texture coordinates (u, v, 1) are multiplied with first
+    /// (`KHR_texture_transform`).
+    pub transform: [[f32; 3]; 2],
+}
+
+impl TextureRef {
+    /// A texture read through its first coordinates, repeated and filtered.
+    #[must_use]
+    pub fn new(texture: u32) -> Self {
+        let transform = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+        Self { texture, uv_set: 0, sampler: Sampler::default(), transform }
+    }
+
+    pub(crate) fn transformed(&self, uv: Vec2) -> Vec2 {
+        let row = |r: [f32; 3]| r[0] * uv.x + r[1] * uv.y + r[2];
+        Vec2::new(row(self.transform[0]), row(self.transform[1]))
+    }
+
+    /// How much larger areas become by the transform.
+    pub(crate) fn area_scale(&self) -> f32 {
+        let [[a, b, _], [c, d, _]] = self.transform;
+        (a * d - b * c).abs()
+    }
+}
+
+/// A decoded image with its smaller copies.
+#[derive(Debug, Clone)]
+pub struct Texture {
+    /// Whether colours are sRGB-encoded; alpha never is.
+    pub srgb: bool,
+    levels: Vec<Level>,
+}
+
+#[derive(Debug, Clone)]
+struct Level {
+    width: u32,
+    height: u32,
+    /// RGBA. Shape: `[height, width, 4]`.
+    texels: Vec<u8>,
+}
+
+impl Texture {
+    /// A texture of `width` x `height` RGBA texels, the upper row first. `texels` has four bytes
+    /// for each; missing ones are white.
+    #[must_use]
+    pub fn new(width: u32, height: u32, mut texels: Vec<u8>, srgb: bool) -> Self {
+        let (width, height) = (width.max(1), height.max(1));
+        texels.resize(4 * width as usize * height as usize, 255);
+        let mut levels = vec![Level { width, height, texels }];
+        while let Some(last) = levels.last()
+            && (last.width > 1 || last.height > 1)
+        {
+            let smaller = last.halved(srgb);
+            levels.push(smaller);
+        }
+        Self { srgb, levels }
+    }
+
+    /// Width and height `[texels]`.
+    #[must_use]
+    pub fn size(&self) -> (u32, u32) {
+        (self.levels[0].width, self.levels[0].height)
+    }
+
+    /// The linear RGBA value at `uv`, (0, 0) being the upper left corner, averaged over about
+    /// `footprint` of the texture's width.
+    #[must_use]
+    pub fn sample(&self, uv: Vec2, sampler: &Sampler, footprint: f32) -> Vec4 {
+        let uv = Vec2::new(wrapped(uv.x, sampler.wrap_u), wrapped(uv.y, sampler.wrap_v));
+        let first = &self.levels[0];
+        let texels = footprint * ((first.width * first.height) as f32).sqrt();
+        let level = if sampler.mipmaps { texels.log2() } else { 0.0 };
+        // NaN takes the first level.
+        if level.is_nan() || level <= 0.0 {
+            let nearest = sampler.nearest;
+            return if nearest {
+                first.nearest(uv, self.srgb)
+            } else {
+                first.linear(uv, sampler, self.srgb)
+            };
+        }
+        let last = self.levels.len() - 1;
+        let level = level.min(last as f32);
+        let (lower, share) = (level as usize, level.fract());
+        let a = self.levels[lower].linear(uv, sampler, self.srgb);
+        if share == 0.0 || lower == last {
+            return a;
+        }
+        a.lerp(self.levels[lower + 1].linear(uv, sampler, self.srgb), share)
+    }
+}
+
+impl Level {
+    fn texel(&self, x: u32, y: u32, srgb: bool) -> Vec4 {
+        let at = 4 * (y as usize * self.width as usize + x as usize);
+        let t = &self.texels[at..at + 4];
+        let linear = |v: u8| if srgb { decoded()[v as usize] } else { f32::from(v) / 255.0 };
+        Vec4::new(linear(t[0]), linear(t[1]), linear(t[2]), f32::from(t[3]) / 255.0)
+    }
+
+    fn nearest(&self, uv: Vec2, srgb: bool) -> Vec4 {
+        let x = ((uv.x * self.width as f32) as u32).min(self.width - 1);
+        let y = ((uv.y * self.height as f32) as u32).min(self.height - 1);
+        self.texel(x, y, srgb)
+    }
+
+    fn linear(&self, uv: Vec2, sampler: &Sampler, srgb: bool) -> Vec4 {
+        let (x0, x1, fx) = neighbours(uv.x, self.width, sampler.wrap_u);
+        let (y0, y1, fy) = neighbours(uv.y, self.height, sampler.wrap_v);
+        let upper = self.texel(x0, y0, srgb).lerp(self.texel(x1, y0, srgb), fx);
+        let lower = self.texel(x0, y1, srgb).lerp(self.texel(x1, y1, srgb), fx);
+        upper.lerp(lower, fy)
+    }
+
+    /// The image at half its size, averaged in linear light.
+    fn halved(&self, srgb: bool) -> Self {
+        let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
+        let mut texels = Vec::with_capacity(4 * width as usize * height as usize);
+        for y in 0..height {
+            for x in 0..width {
+                // The range of source texels; three where the size is odd.
+                let (x0, x1) = range(x, width, self.width);
+                let (y0, y1) = range(y, height, self.height);
+                let mut sum = Vec4::ZERO;
+                for v in y0..y1 {
+                    for u in x0..x1 {
+                        sum += self.texel(u, v, srgb);
+                    }
+                }
+                let mean = sum / ((x1 - x0) * (y1 - y0)) as f32;
+                let code = |v: f32| if srgb { encode(v) } else { to_u8(v) };
+                texels.extend([code(mean.x), code(mean.y), code(mean.z), to_u8(mean.w)]);
+            }
+        }
+        Self { width, height, texels }
+    }
+}
+
+fn range(i: u32, count: u32, of: u32) -> (u32, u32) {
+    let (i, count, of) = (u64::from(i), u64::from(count), u64::from(of));
+    ((i * of / count) as u32, ((i + 1) * of / count) as u32)
+}
+
+/// Into `[0, 1]`, by the wrap mode. NaN becomes 0.
+fn wrapped(x: f32, wrap: Wrap) -> f32 {
+    let x = if x.is_finite() { x } else { 0.0 };
+    match wrap {
+        Wrap::Clamp => x.clamp(0.0, 1.0),
+        Wrap::Repeat => x - x.floor(),
+        Wrap::Mirror => {
+            let x = x - 2.0 * (0.5 * x).floor();
+            if x > 1.0 { 2.0 - x } else { x }
+        }
+    }
+}
+
+/// The two texels about a coordinate in `[0, 1]` and the second one's weight.
+fn neighbours(u: f32, size: u32, wrap: Wrap) -> (u32, u32, f32) {
+    let x = u * size as f32 - 0.5;
+    let floor = x.floor();
+    let last = i64::from(size) - 1;
+    let index = |i: i64| match wrap {
+        Wrap::Repeat => i.rem_euclid(i64::from(size)) as u32,
+        // Mirrored, the neighbour beyond the edge is the edge itself.
+        Wrap::Clamp | Wrap::Mirror => i.clamp(0, last) as u32,
+    };
+    (index(floor as i64), index(floor as i64 + 1), x - floor)
+}
+
+fn to_u8(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
+}
+
+/// Linear light of a sRGB value in `[0, 1]` (IEC 61966-2-1).
+#[must_use]
+pub fn linear_from_srgb(v: f64) -> f64 {
+    if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+}
+
+/// The sRGB value of linear light in `[0, 1]` (IEC 61966-2-1).
+#[must_use]
+pub fn srgb_from_linear(v: f64) -> f64 {
+    if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
+}
+
+/// Linear light of each sRGB byte.
+fn decoded() -> &'static [f32; 256] {
+    static TABLE: OnceLock<[f32; 256]> = OnceLock::new();
+    TABLE.get_or_init(|| std::array::from_fn(|i| linear_from_srgb(i as f64 / 255.0) as f32))
+}
+
+/// The sRGB byte nearest to linear light: rounded half up in the encoded space, values outside
+/// `[0, 1]` clamped, NaN to 0.
+#[must_use]
+pub fn encode(v: f32) -> u8 {
+    (srgb_from_linear(f64::from(v.clamp(0.0, 1.0))) * 255.0 + 0.5) as u8
+}

@@ -1,0 +1,281 @@
+use std::f32::consts::PI;
+
+use glam::{DQuat, Vec4};
+
+use super::*;
+use crate::mesh::{AlphaMode, Light, LightKind, Material, Reflection};
+use crate::rig::RigKind;
+use crate::shade::Ambient;
+use crate::sky::Sky;
+use crate::{Options, Scene, Source};
+
+/// A rendering of a model by a camera.
+fn render(model: &Model, camera: &Camera, sky: Sky, ambient: Ambient) -> Frame {
+    let surface = Surface::new(model).expect("triangles");
+    let traits = Traits::all(&surface, model);
+    let lighting = Lighting::new(&model.lights, &surface, sky, (ambient, true, 4));
+    let (surface, traits, lighting) = (&surface, &traits[..], &lighting);
+    Tracer { surface, model, traits, lighting, exposure: 1.0, seed: 1 }.render(camera, 0)
+}
+
+fn above(height: f64) -> Camera {
+    Camera::looking(DVec3::new(0.2, height, 0.1), DVec3::ZERO, DVec3::Z, 0.8, (48, 40))
+}
+
+fn floor(material: Material) -> Model {
+    let mut model = Model::default();
+    let material = model.material(material);
+    model.quad(DVec3::new(-9.0, 0.0, 9.0), 18.0 * DVec3::X, -18.0 * DVec3::Z, material);
+    model
+}
+
+fn sun(towards: DVec3, irradiance: f32) -> Light {
+    let kind = LightKind::Directional { direction: -towards.normalize() };
+    Light { kind, intensity: Vec3::splat(irradiance), range: f64::INFINITY }
+}
+
+#[test]
+fn a_lit_plane_has_the_colour_and_depth_of_the_formula() {
+    let mut model = floor(Material::lambert("grey", [0.5, 0.25, 0.1]));
+    let towards = DVec3::new(1.0, 2.0, 0.5);
+    model.lights.push(sun(towards, 2.0));
+    let camera = above(3.0);
+    let sky = Sky { zenith: [0.3; 3], ground: [0.1; 3], up: [0.0, 1.0, 0.0] };
+    let frame = render(&model, &camera, sky, Ambient::Open);
+    // Irradiance of the sun, and of the sky: pi · (0.2 + 2/3 · 0.1).
+    let irradiance = 2.0 * towards.normalize().y as f32 + PI * (0.2 + 0.2 / 3.0);
+    let expected = [0.5, 0.25, 0.1].map(|albedo| encode(albedo / PI * irradiance));
+    for (i, pixel) in frame.rgba.chunks_exact(4).enumerate() {
+        for channel in 0..3 {
+            assert!(pixel[channel].abs_diff(expected[channel]) <= 1, "{pixel:?}, not {expected:?}");
+        }
+        assert_eq!(pixel[3], 255);
+        let at = DVec2::new((i % 48) as f64 + 0.5, (i / 48) as f64 + 0.5);
+        let depth = -camera.centre.y / camera.direction(at).y;
+        assert!((f64::from(frame.depth[i]) / depth - 1.0).abs() < 1e-6);
+        assert_eq!(frame.normals[i], [0.0, 1.0, 0.0]);
+    }
+}
+
+#[test]
+fn lights_follow_their_laws() {
+    let at = DVec3::new(0.0, 2.0, 0.0);
+    let down = DVec3::NEG_Y;
+    // Irradiance straight below: I / d², cut off beyond the range and outside the cone.
+    let point = |range| Light {
+        kind: LightKind::Point { position: at },
+        intensity: Vec3::splat(3.0),
+        range,
+    };
+    let spot = |direction: DVec3| Light {
+        kind: LightKind::Spot {
+            position: at,
+            direction: direction.normalize(),
+            cos_inner: 0.98,
+            cos_outer: 0.9,
+        },
+        intensity: Vec3::splat(3.0),
+        range: f64::INFINITY,
+    };
+    let area = Light {
+        kind: LightKind::Area {
+            corner: at - DVec3::new(0.01, 0.0, 0.01),
+            u: 0.02 * DVec3::X,
+            v: 0.02 * DVec3::Z,
+        },
+        intensity: Vec3::splat(3.0 / 0.0004),
+        range: f64::INFINITY,
+    };
+    let away = Light {
+        kind: LightKind::Area { corner: at, u: 0.02 * DVec3::Z, v: 0.02 * DVec3::X },
+        ..area
+    };
+    let cases = [
+        (point(f64::INFINITY), 0.75),
+        (point(1.9), 0.0),
+        (point(2.5), 0.75 * (1.0 - 0.8_f32.powi(4))),
+        (spot(down), 0.75),
+        (spot(DVec3::X), 0.0),
+        (area, 0.75),
+        (away, 0.0),
+    ];
+    for (light, irradiance) in cases {
+        let mut model = floor(Material::lambert("white", [1.0; 3]));
+        model.lights.push(light);
+        // A narrow view of the point below the light, from the side.
+        let camera =
+            Camera::looking(DVec3::new(1.0, 1.0, 0.0), DVec3::ZERO, DVec3::Y, 0.01, (8, 8));
+        let frame = render(&model, &camera, Sky::uniform(0.0), Ambient::Open);
+        let expected = encode(irradiance / PI);
+        let found = frame.rgba[0];
+        assert!(found.abs_diff(expected) <= 1, "{light:?}: {found}, not {expected}");
+    }
+}
+
+#[test]
+fn a_sphere_has_its_depth_and_normals() {
+    let mut model = Model::default();
+    let material = model.material(Material::default());
+    let (centre, radius) = (DVec3::new(0.5, -0.3, 0.2), 1.3);
+    model.sphere(centre, radius, 6, material);
+    let camera = Camera::looking(DVec3::new(3.0, 2.0, 4.0), centre, DVec3::Y, 0.7, (64, 64));
+    let frame = render(&model, &camera, Sky::uniform(1.0), Ambient::Open);
+    let mut seen = 0;
+    for i in 0..64 * 64 {
+        let d = camera.direction(DVec2::new((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5));
+        let o = camera.centre - centre;
+        let (a, b, c) = (d.dot(d), o.dot(d), o.dot(o) - radius * radius);
+        let root = b * b - a * c;
+        let normal = Vec3::from(frame.normals[i]);
+        if root <= 0.0 {
+            assert_eq!((frame.depth[i], normal, frame.triangles[i]), (0.0, Vec3::ZERO, u32::MAX));
+            continue;
+        }
+        let t = (-b - root.sqrt()) / a;
+        let exact = (o + t * d) / radius;
+        // Corners lie on the sphere: flat faces are inside it by at most the sagitta of an edge of
+        // 1.1 / 64 radians, 3.7e-5 radii, and more along grazing rays.
+        let grazing = -exact.dot(d.normalize());
+        if grazing > 0.1 {
+            let beyond = (f64::from(frame.depth[i]) - t) * d.length() * grazing;
+            assert!((-1e-6..1e-4).contains(&beyond), "{beyond} at pixel {i}");
+            assert!(normal.as_dvec3().dot(exact) > 0.9998, "normal at pixel {i}");
+            seen += 1;
+        }
+    }
+    assert!(seen > 1000, "{seen} pixels");
+}
+
+#[test]
+fn the_white_furnace_is_white() {
+    let camera = Camera::looking(DVec3::new(2.0, 1.0, 3.0), DVec3::ZERO, DVec3::Y, 0.5, (24, 24));
+    let furnace = |material: Material, ambient| {
+        let mut model = Model::default();
+        let material = model.material(material);
+        model.sphere(DVec3::ZERO, 0.5, 4, material);
+        let frame = render(&model, &camera, Sky::uniform(0.5), ambient);
+        let inside: Vec<f32> = frame
+            .rgba
+            .chunks_exact(4)
+            .filter(|pixel| pixel[3] == 255)
+            .map(|pixel| f32::from(pixel[0]))
+            .collect();
+        assert!(inside.len() > 30);
+        inside.iter().sum::<f32>() / inside.len() as f32
+    };
+    let white = f32::from(encode(0.5));
+    let lambert = Material::lambert("white", [1.0; 3]);
+    for ambient in [Ambient::Open, Ambient::Occlusion(64), Ambient::Bounce(64)] {
+        let mean = furnace(lambert.clone(), ambient);
+        assert!((mean - white).abs() < 0.6, "{ambient:?}: {mean}, not {white}");
+    }
+    // GGX loses what bounces within its microsurface, more the rougher, and never gains.
+    let metal = |roughness| Material {
+        reflection: Reflection::MetalRough,
+        metallic: 1.0,
+        roughness,
+        ..Material::default()
+    };
+    for (roughness, least) in [(0.1, 0.97), (0.3, 0.93), (1.0, 0.35)] {
+        for ambient in [Ambient::Open, Ambient::Bounce(64)] {
+            let mean = furnace(metal(roughness), ambient);
+            let linear = crate::texture::linear_from_srgb(f64::from(mean) / 255.0) / 0.5;
+            assert!(linear < 1.01 && linear > least, "{roughness}, {ambient:?}: {linear}");
+        }
+    }
+}
+
+#[test]
+fn light_is_hidden_by_what_is_in_its_way_and_by_that_only() {
+    let mut model = floor(Material::lambert("white", [1.0; 3]));
+    model.lights.push(sun(DVec3::Y, PI));
+    let camera = Camera::looking(DVec3::new(3.0, 0.5, 0.0), DVec3::ZERO, DVec3::Y, 0.02, (8, 8));
+    let sky = Sky::uniform(0.1);
+    let lit = render(&model, &camera, sky, Ambient::Open).rgba[0];
+    assert_eq!(lit, encode(1.1));
+    // A lid over the place.
+    let lid = model.material(Material::default());
+    model.quad(DVec3::new(-1.0, 1.0, -1.0), 2.0 * DVec3::X, 2.0 * DVec3::Z, lid);
+    assert_eq!(render(&model, &camera, sky, Ambient::Open).rgba[0], encode(0.1));
+    let hidden = render(&model, &camera, sky, Ambient::Occlusion(256)).rgba[0];
+    assert!(hidden < encode(0.1), "{hidden}");
+    // Through holes in a mask, and through little opacity, light passes.
+    for alpha in [AlphaMode::Mask(0.5), AlphaMode::Blend] {
+        model.materials[lid as usize].base = Vec4::new(1.0, 1.0, 1.0, 0.3);
+        model.materials[lid as usize].alpha = alpha;
+        assert_eq!(render(&model, &camera, sky, Ambient::Open).rgba[0], lit, "{alpha:?}");
+    }
+}
+
+#[test]
+fn depth_is_that_of_the_first_surface_of_at_least_half_opacity() {
+    let camera = above(5.0);
+    let (floor_depth, lid_depth) = (5.0, 4.0);
+    let middle = (20 * 48 + 24) as usize;
+    for (alpha, opacity, one_sided, expected) in [
+        (AlphaMode::Opaque, 0.1, false, lid_depth),
+        (AlphaMode::Blend, 0.6, false, lid_depth),
+        (AlphaMode::Blend, 0.4, false, floor_depth),
+        (AlphaMode::Mask(0.3), 0.4, false, lid_depth),
+        (AlphaMode::Mask(0.5), 0.4, false, floor_depth),
+        (AlphaMode::Opaque, 1.0, true, floor_depth),
+    ] {
+        let mut model = floor(Material::lambert("white", [1.0; 3]));
+        let lid = model.material(Material {
+            base: Vec4::new(0.0, 0.0, 0.0, opacity),
+            alpha,
+            double_sided: !one_sided,
+            ..Material::default()
+        });
+        // Its front is below.
+        model.quad(DVec3::new(-1.0, 1.0, -1.0), 2.0 * DVec3::X, 2.0 * DVec3::Z, lid);
+        let frame = render(&model, &camera, Sky::uniform(1.0), Ambient::Open);
+        let found = f64::from(frame.depth[middle]);
+        let exact = -expected / camera.direction(DVec2::new(24.5, 20.5)).y;
+        assert!((found - exact).abs() < 1e-5, "{alpha:?} {opacity}: {found}, not {exact}");
+        if alpha == AlphaMode::Blend {
+            // Black over white.
+            let value = frame.rgba[4 * middle];
+            assert!(value.abs_diff(encode(1.0 - opacity)) <= 1, "{value}");
+        }
+    }
+}
+
+#[test]
+fn images_are_the_same_at_any_number_of_threads() {
+    for name in ["spheres", "cornell"] {
+        let options =
+            Options { size: Some((40, 33)), train: Some(3), test: Some(1), ..Options::default() };
+        let scene = Scene::prepare(&Source::Preset(name.into()), &options).expect("preset");
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("pool");
+            pool.install(|| scene.render(1))
+        };
+        let one = with(1);
+        assert!(one == with(2) && one == with(5), "{name}");
+        assert!(one != scene.render(2));
+    }
+}
+
+#[test]
+fn cameras_keep_out_of_solids() {
+    // A block fills most of the box that an inside rig walks in.
+    let mut model = Model::default();
+    let material = model.material(Material::default());
+    model.cuboid(DVec3::ZERO, -DVec3::splat(2.0), DQuat::IDENTITY, material);
+    model.cuboid(DVec3::X * 0.9, DVec3::new(0.4, 1.2, 1.2), DQuat::IDENTITY, material);
+    let surface = Surface::new(&model).expect("triangles");
+    let rig = crate::rig::Rig {
+        kind: RigKind::Inside,
+        radius: 0.45,
+        clearance: 0.02,
+        ..Default::default()
+    };
+    let (train, test) = rig.cameras(&surface, &[]).expect("places");
+    for camera in train.iter().chain(&test) {
+        let p = camera.centre;
+        let within = (p.x - 0.9).abs() < 0.4 && p.y.abs() < 1.2 && p.z.abs() < 1.2;
+        assert!(!within && p.abs().max_element() < 2.0, "{p}");
+        assert!(surface.nearest(p).distance >= 0.02 * surface.diagonal());
+    }
+}

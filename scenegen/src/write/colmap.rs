@@ -1,0 +1,64 @@
+//! COLMAP's text model under `sparse/0`; image names are relative to `images`.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use glam::DQuat;
+
+use super::write_file;
+use crate::error::Error;
+use crate::points::InitPoints;
+use crate::scene::Scene;
+
+pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
+    let folder = root.join("sparse").join("0");
+    let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
+    let mut images = String::from(
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
+    );
+    // What each view sees, and at which place of its list.
+    let mut seen: Vec<Vec<usize>> = vec![Vec::new(); scene.views.len()];
+    let mut tracks: Vec<Vec<(usize, usize)>> = vec![Vec::new(); points.positions.len()];
+    for (point, views) in points.seen_by.iter().enumerate() {
+        for &view in views {
+            let list = &mut seen[view as usize];
+            tracks[point].push((view as usize, list.len()));
+            list.push(point);
+        }
+    }
+    for (number, view) in scene.views.iter().enumerate() {
+        let (id, c) = (number + 1, &view.camera);
+        // Writing to a String does not fail.
+        let _ = writeln!(
+            cameras,
+            "{id} PINHOLE {} {} {} {} {} {}",
+            c.width, c.height, c.fx, c.fy, c.cx, c.cy
+        );
+        let rotation = c.world_from_camera.transpose();
+        let q = DQuat::from_mat3(&rotation).normalize();
+        let t = -(rotation * c.centre);
+        let _ = writeln!(
+            images,
+            "{id} {} {} {} {} {} {} {} {id} {}.png",
+            q.w, q.x, q.y, q.z, t.x, t.y, t.z, view.name
+        );
+        let observations = seen[number].iter().map(|&point| {
+            let (pixel, _) = c.project(points.positions[point]);
+            format!("{} {} {}", pixel.x, pixel.y, point + 1)
+        });
+        images += &observations.collect::<Vec<_>>().join(" ");
+        images.push('\n');
+    }
+    let mut cloud =
+        String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
+    for (point, (p, [r, g, b])) in points.positions.iter().zip(&points.colours).enumerate() {
+        let _ = write!(cloud, "{} {} {} {} {r} {g} {b} 0", point + 1, p.x, p.y, p.z);
+        for (view, place) in &tracks[point] {
+            let _ = write!(cloud, " {} {place}", view + 1);
+        }
+        cloud.push('\n');
+    }
+    write_file(&folder.join("cameras.txt"), cameras.as_bytes())?;
+    write_file(&folder.join("images.txt"), images.as_bytes())?;
+    write_file(&folder.join("points3D.txt"), cloud.as_bytes())
+}

@@ -1,0 +1,186 @@
+//! A scene as files that trainers read.
+//!
+//! Everything is written into a temporary folder beside the target, which is then renamed: there is
+//! a whole scene or none. Views stream: one image is held at a time.
+
+mod colmap;
+mod exr;
+mod ply;
+mod record;
+mod transforms;
+
+use std::fs;
+use std::path::Path;
+
+use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+
+use crate::error::Error;
+use crate::points::InitPoints;
+use crate::scene::{Scene, Split};
+use crate::trace::Frame;
+
+/// What was written.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Written {
+    /// Number of views.
+    pub views: usize,
+    /// Number of initial points.
+    pub points: usize,
+}
+
+/// Renders all views of a scene and writes it to the folder `target`, which must not exist or be
+/// empty; with `overwrite`, it may hold a scene that this function wrote. `progress` is told each
+/// view's number as it is done.
+///
+/// # Errors
+/// When the folder holds anything else, or a file cannot be written.
+pub fn write(
+    scene: &Scene,
+    target: &Path,
+    overwrite: bool,
+    mut progress: impl FnMut(usize),
+) -> Result<Written, Error> {
+    let replaces = may_be_written(target, overwrite)?;
+    let parent = match target.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    fs::create_dir_all(parent).map_err(Error::write(parent))?;
+    let folder = tempfile::Builder::new()
+        .prefix(".densify-scene-")
+        .tempdir_in(parent)
+        .map_err(Error::write(parent))?;
+    let root = folder.path();
+    let mut collector = scene.point_collector();
+    for (number, view) in scene.views.iter().enumerate() {
+        let frame = scene.render(number);
+        if view.split == Split::Train {
+            collector.observe(number, &frame);
+        }
+        write_frame(root, &view.name, &frame)?;
+        progress(number);
+    }
+    let points = collector.finish();
+    write_rest(scene, root, &points)?;
+    readable(root)?;
+    let unused = folder.keep();
+    if replaces {
+        let old = tempfile::Builder::new()
+            .prefix(".densify-old-")
+            .tempdir_in(parent)
+            .map_err(Error::write(parent))?;
+        fs::rename(target, old.path().join("scene")).map_err(Error::write(target))?;
+        fs::rename(&unused, target).map_err(Error::write(target))?;
+    } else {
+        // An empty folder is in a rename's way on some systems.
+        if target.is_dir() {
+            fs::remove_dir(target).map_err(Error::write(target))?;
+        }
+        fs::rename(&unused, target).map_err(Error::write(target))?;
+    }
+    Ok(Written { views: scene.views.len(), points: points.positions.len() })
+}
+
+/// Whether the target holds an earlier scene; an error if it holds one that is to stay, or anything
+/// else.
+fn may_be_written(target: &Path, overwrite: bool) -> Result<bool, Error> {
+    let refuse =
+        |what: &str| Err(Error::option("--output", format!("{} {what}", target.display())));
+    let taken = match fs::read_dir(target) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => false,
+        Err(error) => return Err(Error::write(target)(error)),
+    };
+    if !taken {
+        return Ok(false);
+    }
+    match (target.join(record::NAME).is_file(), overwrite) {
+        (true, true) => Ok(true),
+        (true, false) => refuse("holds a scene; add --overwrite to replace it"),
+        (false, _) => refuse("is not empty and holds no scene.json; name another folder"),
+    }
+}
+
+/// Checks that [`write`] may use a folder, before anything is rendered.
+///
+/// # Errors
+/// As [`write`].
+pub fn check_target(target: &Path, overwrite: bool) -> Result<(), Error> {
+    may_be_written(target, overwrite).map(|_| ())
+}
+
+/// Temporary folders are for their owner only; scenes are as other files.
+fn readable(folder: &Path) -> Result<(), Error> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        let like = folder.join("sparse");
+        let mode = fs::metadata(&like).map_err(Error::write(&like))?.permissions().mode();
+        let permissions = fs::Permissions::from_mode(mode);
+        fs::set_permissions(folder, permissions).map_err(Error::write(folder))?;
+    }
+    let _ = folder;
+    Ok(())
+}
+
+fn write_frame(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
+    let path = root.join("images").join(format!("{name}.png"));
+    write_png(&path, frame.width, frame.height, &frame.rgba)?;
+    exr::write_depth(&root.join("depth").join(format!("{name}.exr")), frame)?;
+    exr::write_normals(&root.join("normals").join(format!("{name}.exr")), frame)
+}
+
+fn write_rest(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
+    transforms::write(scene, root, Split::Train)?;
+    transforms::write(scene, root, Split::Test)?;
+    colmap::write(scene, root, points)?;
+    ply::write_points(&root.join("points3d.ply"), points)?;
+    ply::write_mesh(&root.join("mesh.ply"), &scene.surface)?;
+    record::write(scene, root, points)
+}
+
+/// Writes RGBA pixels as a PNG.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_png(path: &Path, width: u32, height: u32, rgba: &[u8]) -> Result<(), Error> {
+    let mut bytes = Vec::new();
+    PngEncoder::new(&mut bytes)
+        .write_image(rgba, width, height, ExtendedColorType::Rgba8)
+        .map_err(|error| Error::write(path)(std::io::Error::other(error)))?;
+    write_file(path, &bytes)
+}
+
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    if let Some(parent) = path.parent() {
+        fs::create_dir_all(parent).map_err(Error::write(parent))?;
+    }
+    fs::write(path, bytes).map_err(Error::write(path))
+}
+
+/// One picture of eight training views, evenly chosen, over light grey. Width, height and RGBA
+/// pixels.
+#[must_use]
+pub fn contact_sheet(scene: &Scene) -> (u32, u32, Vec<u8>) {
+    const COLUMNS: usize = 4;
+    const GREY: f32 = 224.0;
+    let train = scene.views.iter().filter(|view| view.split == Split::Train).count();
+    let (width, height) = (scene.rig.width as usize, scene.rig.height as usize);
+    let mut sheet = vec![255_u8; 4 * COLUMNS * width * 2 * height];
+    for place in 0..2 * COLUMNS {
+        let frame = scene.render((place * train / (2 * COLUMNS)).min(train - 1));
+        let (left, top) = (place % COLUMNS * width, place / COLUMNS * height);
+        for (i, pixel) in frame.rgba.chunks_exact(4).enumerate() {
+            let at = 4 * ((top + i / width) * COLUMNS * width + left + i % width);
+            let alpha = f32::from(pixel[3]) / 255.0;
+            for channel in 0..3 {
+                let value = alpha * f32::from(pixel[channel]) + (1.0 - alpha) * GREY;
+                sheet[at + channel] = (value + 0.5) as u8;
+            }
+        }
+    }
+    ((COLUMNS * width) as u32, 2 * height as u32, sheet)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,55 @@
+//! `scene.json`: what was rendered and how, enough to render it again.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use super::write_file;
+use crate::error::Error;
+use crate::points::InitPoints;
+use crate::scene::Scene;
+
+/// Name of the file; a folder that holds it holds a scene.
+pub(super) const NAME: &str = "scene.json";
+
+pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
+    let model = &scene.model;
+    let record = json!({
+        "generator": concat!("densify-scenegen ", env!("CARGO_PKG_VERSION")),
+        "source": scene.name,
+        "options": scene.options,
+        "rig": scene.rig,
+        "ambient": scene.ambient,
+        "sky": scene.sky,
+        "exposure": scene.exposure,
+        "samples_per_pixel": scene.options.grid * scene.options.grid,
+        "mesh": {
+            "triangles": model.triangles.len(),
+            "vertices": model.positions.len(),
+            "materials": model.materials.len(),
+            "textures": model.textures.len(),
+            "lights": model.lights.len(),
+            "bytes": scene.surface.bytes(),
+        },
+        "scene_requirements": scene.requirements,
+        "points": { "count": points.positions.len(), "outliers": points.outliers },
+        "thin_materials": model
+            .materials
+            .iter()
+            .enumerate()
+            .filter_map(|(number, material)| material.thin.then_some(number))
+            .collect::<Vec<_>>(),
+        "notes": model.notes,
+        "files": {
+            "images": "sRGB with straight alpha",
+            "depth": "camera z of the first surface with alpha >= 0.5 through the pixel's centre; 0 where there is none",
+            "normals": "its geometric normal in world space, towards the camera; 0 where there is none",
+            "mesh.ply": "the triangles as traced",
+            "points3d.ply": "initial points",
+        },
+    });
+    let path = root.join(NAME);
+    let text = serde_json::to_vec_pretty(&record);
+    let text = text.map_err(|error| Error::write(&path)(std::io::Error::other(error)))?;
+    write_file(&path, &text)
+}

@@ -1,0 +1,265 @@
+//! `densify scenegen`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use densify_scenegen::{
+    Ambient, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target, contact_sheet,
+    write, write_png,
+};
+
+use super::console::Console;
+use super::failure::Failure;
+use super::number;
+use super::run_files::use_threads;
+
+/// Ray-traces a mesh into posed images of known geometry.
+///
+/// INPUT is a .gltf, .glb or .obj file; --preset names a built-in scene instead. Writes images with
+/// alpha, depth and normals (EXR), cameras for NeRF-synthetic and nerfstudio readers
+/// (transforms_train.json, transforms_test.json) and for COLMAP's (sparse/0), initial points
+/// (points3d.ply), the mesh as traced (mesh.ply), and what was done (scene.json). Built-in scenes can be
+/// trained on without any file: densify train scene:NAME.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct ScenegenArgs {
+    /// Mesh to render: .gltf, .glb or .obj
+    #[arg(conflicts_with_all = ["preset", "list"], required_unless_present_any = ["preset", "list"])]
+    input: Option<PathBuf>,
+    /// Render a built-in scene
+    #[arg(long, value_name = "NAME", conflicts_with = "list")]
+    preset: Option<String>,
+    /// List the built-in scenes
+    #[arg(long)]
+    list: bool,
+    /// Folder to write the scene to
+    #[arg(short, long, value_name = "DIR", help_heading = "Output", required_unless_present_any = ["list", "contact_sheet"])]
+    output: Option<PathBuf>,
+    /// Write one PNG of eight views, to look at
+    #[arg(long, value_name = "FILE", help_heading = "Output", conflicts_with = "list")]
+    contact_sheet: Option<PathBuf>,
+    /// Replace the scene that is in the output folder, once this one is complete
+    #[arg(long, help_heading = "Output")]
+    overwrite: bool,
+
+    /// How the cameras stand [default: as the built-in scene says; dome for files]
+    #[arg(long, value_enum, value_name = "RIG", help_heading = "Cameras")]
+    rig: Option<RigArg>,
+    /// Views to train on `[default: 60, or as the built-in scene says]`
+    #[arg(long, value_name = "N", help_heading = "Cameras")]
+    train: Option<u32>,
+    /// Views held out, on a path of their own `[default: 20, or as the built-in scene says]`
+    #[arg(long, value_name = "N", help_heading = "Cameras")]
+    test: Option<u32>,
+    /// Image size in pixels: 400, or 640x480 `[default: 256, or as the built-in scene says]`
+    #[arg(long, value_name = "SIZE", help_heading = "Cameras", value_parser = size)]
+    size: Option<(u32, u32)>,
+    /// Horizontal field of view in degrees
+    #[arg(long, value_name = "DEGREES", help_heading = "Cameras")]
+    fov: Option<f64>,
+    /// Distance of the cameras, 1 being where the scene fills the image; with --rig inside, the
+    /// radius of their path as a share of the room
+    #[arg(long, value_name = "FACTOR", help_heading = "Cameras")]
+    radius: Option<f64>,
+    /// Scatter of the cameras' places, as a share of their distance
+    #[arg(long, value_name = "SHARE", help_heading = "Cameras")]
+    jitter: Option<f64>,
+
+    /// Samples along each side of a pixel: 4 makes 16
+    #[arg(long, value_name = "N", help_heading = "Light", default_value_t = 4)]
+    samples: u32,
+    /// Sample what is hidden from the sky, with this many rays per pixel
+    #[arg(long, value_name = "RAYS", help_heading = "Light", value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    ao: Option<u32>,
+    /// Sample light that surfaces reflect onto each other once, with this many rays per pixel
+    #[arg(long, value_name = "RAYS", help_heading = "Light", conflicts_with = "ao", value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    bounce: Option<u32>,
+    /// Let lights shine through everything
+    #[arg(long, help_heading = "Light")]
+    no_shadows: bool,
+    /// Make all materials diffuse: what is seen does not depend on the side it is seen from
+    #[arg(long, help_heading = "Light")]
+    lambert: bool,
+    /// Factor on all light [default: 1; chosen for files that bring lights of their own]
+    #[arg(long, value_name = "FACTOR", help_heading = "Light")]
+    exposure: Option<f32>,
+
+    /// Initial points to make: on surfaces with detail that at least three views see
+    #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
+    points: usize,
+    /// Place them anywhere instead
+    #[arg(long, help_heading = "Points")]
+    random_points: bool,
+    /// Standard deviation of their coordinates, as a share of the scene's diagonal
+    #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.001)]
+    point_noise: f64,
+    /// Share of them that lie just anywhere
+    #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.02)]
+    outliers: f64,
+    /// Share of space, in patches of 2 % of the diagonal, without any
+    #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.0)]
+    dropout: f64,
+    /// Make none on thin structures
+    #[arg(long, help_heading = "Points")]
+    without_thin: bool,
+
+    /// Everything random follows from this number
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+    /// Processor threads to use; the result does not depend on it `[default: all]`
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  densify scenegen --list
+  densify scenegen --preset thin -o data/thin
+  densify scenegen mesh.glb -o data/mesh --train 100 --size 400
+  densify scenegen house.obj -o data/house --rig inside --bounce 64
+  densify scenegen mesh.glb --contact-sheet look.png";
+
+/// Spelling of [`RigKind`] on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum RigArg {
+    /// Rings around the scene
+    Orbit,
+    /// Evenly on the upper hemisphere
+    Dome,
+    /// Inside, looking in all directions: for rooms
+    Inside,
+    /// On an ellipse as wide and deep as the scene
+    Ellipse,
+    /// At and around the file's own cameras
+    File,
+}
+
+impl From<RigArg> for RigKind {
+    fn from(rig: RigArg) -> Self {
+        match rig {
+            RigArg::Orbit => Self::Orbit,
+            RigArg::Dome => Self::Dome,
+            RigArg::Inside => Self::Inside,
+            RigArg::Ellipse => Self::Ellipse,
+            RigArg::File => Self::File,
+        }
+    }
+}
+
+fn size(text: &str) -> Result<(u32, u32), String> {
+    let wrong = |_| format!("`{text}` is no image size; write it as 400 or 640x480");
+    let (width, height) = text.split_once('x').unwrap_or((text, text));
+    Ok((width.parse().map_err(wrong)?, height.parse().map_err(wrong)?))
+}
+
+impl ScenegenArgs {
+    fn options(&self) -> Options {
+        let ambient = match (self.ao, self.bounce) {
+            (Some(rays), _) => Some(Ambient::Occlusion(rays)),
+            (None, Some(rays)) => Some(Ambient::Bounce(rays)),
+            (None, None) => None,
+        };
+        Options {
+            rig: self.rig.map(RigKind::from),
+            train: self.train,
+            test: self.test,
+            size: self.size,
+            fov: self.fov,
+            radius: self.radius,
+            jitter: self.jitter,
+            grid: self.samples,
+            ambient,
+            shadows: !self.no_shadows,
+            lambert: self.lambert,
+            exposure: self.exposure,
+            points: PointOptions {
+                count: self.points,
+                random: self.random_points,
+                noise: self.point_noise,
+                outliers: self.outliers,
+                dropout: self.dropout,
+                without_thin: self.without_thin,
+            },
+            seed: self.seed,
+        }
+    }
+}
+
+pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure> {
+    if args.list {
+        let width = PRESETS.iter().map(|preset| preset.name.len()).max().unwrap_or(0);
+        for preset in PRESETS {
+            console.result(format_args!("{:width$}  {}", preset.name, preset.summary));
+        }
+        console.result(format_args!(
+            "\n`densify train scene:NAME` trains on one; `densify scenegen --preset NAME -o DIR` writes it."
+        ));
+        return Ok(());
+    }
+    let source = match (&args.preset, &args.input) {
+        (Some(name), _) => Source::Preset(name.clone()),
+        (None, Some(path)) => Source::File(path.clone()),
+        (None, None) => {
+            return Err(Failure::input("name a mesh, or a built-in scene with --preset"));
+        }
+    };
+    if let Some(output) = &args.output {
+        check_target(output, args.overwrite)?;
+    }
+    use_threads(args.threads);
+    let scene = Scene::prepare(&source, &args.options())?;
+    describe(&scene, console);
+    if let Some(path) = &args.contact_sheet {
+        let (width, height, rgba) = contact_sheet(&scene);
+        write_png(path, width, height, &rgba)?;
+        console.result(format_args!("eight views in {}", path.display()));
+    }
+    let Some(output) = &args.output else {
+        return Ok(());
+    };
+    let count = scene.views.len();
+    let tenth = count.div_ceil(10).max(1);
+    let written = write(&scene, output, args.overwrite, |view| {
+        if (view + 1) % tenth == 0 || view + 1 == count {
+            console.progress(format_args!("rendered {} of {count} views", view + 1));
+        }
+    })?;
+    console.result(format_args!(
+        "{} views and {} points in {}",
+        written.views,
+        number::grouped(written.points),
+        output.display()
+    ));
+    Ok(())
+}
+
+fn describe(scene: &Scene, console: &Console) {
+    for note in &scene.model.notes {
+        console.say(format_args!("note: {note}"));
+    }
+    let (rig, needs) = (&scene.rig, &scene.requirements);
+    console.say(format_args!(
+        "scene    {}: {} triangles, {}",
+        scene.name,
+        number::grouped(scene.surface.len()),
+        if needs.view_independent { "view-independent" } else { "view-dependent" }
+    ));
+    console.say(format_args!(
+        "views    {} to train on, {} held out, {}x{} px, finest feature {:.1} px",
+        rig.train, rig.test, rig.width, rig.height, needs.finest_feature_px
+    ));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_read() {
+        assert_eq!(size("400"), Ok((400, 400)));
+        assert_eq!(size("640x480"), Ok((640, 480)));
+        for bad in ["", "x", "640x", "-1", "640x480x3", "1.5"] {
+            assert!(size(bad).unwrap_err().contains("640x480"), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,184 @@
+//! Built-in scenes by name: `scene:spheres` is rendered in memory, no file is read or written.
+//!
+//! Their images are as `densify scenegen --preset NAME` writes them with its defaults.
+
+use std::num::NonZeroU32;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use densify_scenegen::{Frame, Generated, Options, Source, generate};
+
+use super::images::{Image8, ImageHeader, ImageSource};
+use super::normalise::Normalisation;
+use super::prepare::target_size;
+use super::{Dataset, DatasetError, LoadOptions, PointCloud, Split, View};
+use crate::camera::Camera;
+
+/// What a path to a built-in scene begins with.
+pub const PREFIX: &str = "scene:";
+
+/// The name of the built-in scene that a path stands for, if it does.
+#[must_use]
+pub fn name(path: &Path) -> Option<&str> {
+    path.to_str()?.strip_prefix(PREFIX)
+}
+
+/// Renders a built-in scene.
+///
+/// # Errors
+/// When there is no such scene, or the options leave no view to train on.
+pub(super) fn load(
+    path: &Path,
+    name: &str,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let generated = generate(&Source::Preset(name.to_owned()), &Options::default())?;
+    let Generated { scene, frames, points } = generated;
+    let mut views: Vec<(View, bool)> = scene
+        .views
+        .iter()
+        .zip(frames)
+        .map(|(view, frame)| {
+            let camera = camera(&view.camera);
+            let held_out = view.split == densify_scenegen::Split::Test;
+            (posed(&view.name, camera, frame, options), held_out)
+        })
+        .collect();
+    views.sort_by(|a, b| a.0.name.as_bytes().cmp(b.0.name.as_bytes()));
+    let every = match options.split {
+        Split::Every(every) => Some(NonZeroU32::get(every) as usize),
+        Split::None | Split::Eval => None,
+    };
+    let count = views.len();
+    let (mut train, mut test) = (Vec::new(), Vec::new());
+    for (index, (view, held_out)) in views.into_iter().enumerate() {
+        let held_out = every.map_or(held_out, |every| index % every == 0);
+        if held_out { test.push(view) } else { train.push(view) }
+    }
+    if train.is_empty() {
+        return Err(DatasetError::NoTrainingViews { views: count });
+    }
+    let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
+    let normalisation = Normalisation::fit(&centres, &points.positions);
+    for view in train.iter_mut().chain(&mut test) {
+        view.camera = normalisation.camera(&view.camera);
+    }
+    let positions = points.positions.iter().map(|&point| normalisation.point(point)).collect();
+    Ok(Dataset {
+        root: path.to_owned(),
+        train,
+        test,
+        points: PointCloud { positions, colours: points.colours },
+        normalisation,
+        notes: scene.model.notes,
+    })
+}
+
+/// The trainer's camera for a rendered view.
+fn camera(from: &densify_scenegen::Camera) -> Camera {
+    let rotation = from.world_from_camera.transpose();
+    Camera {
+        width: from.width,
+        height: from.height,
+        fx: from.fx,
+        fy: from.fy,
+        cx: from.cx,
+        cy: from.cy,
+        rotation,
+        translation: -(rotation * from.centre),
+    }
+}
+
+fn posed(name: &str, camera: Camera, frame: Frame, options: &LoadOptions) -> View {
+    let pixels = frame.rgba.chunks_exact(4);
+    let rgb = pixels.clone().flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+    let alpha: Vec<u8> = pixels.map(|pixel| pixel[3]).collect();
+    let has_alpha = alpha.iter().any(|&a| a < 255);
+    let image = Image8 {
+        width: frame.width,
+        height: frame.height,
+        rgb,
+        alpha: has_alpha.then_some(alpha),
+        mask: None,
+    };
+    let header = ImageHeader {
+        width: frame.width,
+        height: frame.height,
+        has_alpha,
+        decoded_bytes: image.bytes(),
+        file_bytes: 0,
+    };
+    let (width, height) = target_size(&header, options.resolution, false);
+    View {
+        name: format!("{name}.png"),
+        camera: camera.resized(width, height),
+        source: ImageSource {
+            path: PathBuf::from(format!("{PREFIX}{name}")),
+            mask: None,
+            width,
+            height,
+            undistortion: None,
+            header,
+            rendered: Some(Arc::new(image)),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+
+    #[test]
+    fn pixels_and_rays_agree_with_the_trainers_projection() {
+        let turned = densify_scenegen::Camera::looking(
+            DVec3::new(3.0, -2.0, 5.5),
+            DVec3::new(0.1, 0.4, -0.3),
+            DVec3::new(0.1, 1.0, 0.2),
+            0.9,
+            (1920, 1080),
+        );
+        let shifted =
+            densify_scenegen::Camera { cx: 900.5, cy: 500.25, fy: turned.fx * 1.1, ..turned };
+        for from in [turned, shifted] {
+            let camera = camera(&from);
+            for (x, y, depth) in
+                [(0.5, 0.5, 0.01), (1919.5, 3.5, 1.0), (7.25, 1079.9, 1e4), (960.0, 540.0, 7.0)]
+            {
+                let world = from.centre + depth * from.direction(DVec2::new(x, y));
+                let (pixel, z) = camera.project(world);
+                assert!((pixel - DVec2::new(x, y)).length() < 1e-4, "{pixel} for {x}, {y}");
+                assert!((z / depth - 1.0).abs() < 1e-9, "{z} for {depth}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_built_in_scene_needs_no_file() {
+        let path = Path::new("scene:spheres");
+        let options =
+            LoadOptions { resolution: Some("4".parse().unwrap()), ..LoadOptions::default() };
+        let dataset = Dataset::load(path, &options).unwrap();
+        assert_eq!((dataset.train.len(), dataset.test.len()), (30, 10));
+        assert!(dataset.points.len() > 3000, "{} points", dataset.points.len());
+        let view = &dataset.train[0];
+        let image = view.source.load().unwrap();
+        assert_eq!((image.width, image.height), (32, 32));
+        assert_eq!((view.camera.width, view.camera.height), (32, 32));
+        // Points lie where cameras look: most project into every view.
+        let inside = |p: &&DVec3| {
+            let (pixel, depth) = view.camera.project(**p);
+            depth > 0.0 && (0.0..32.0).contains(&pixel.x) && (0.0..32.0).contains(&pixel.y)
+        };
+        let seen = dataset.points.positions.iter().filter(inside).count();
+        assert!(seen * 4 > dataset.points.len() * 3, "{seen} of {}", dataset.points.len());
+    }
+
+    #[test]
+    fn unknown_scenes_are_refused_by_name() {
+        let error = Dataset::load(Path::new("scene:nonsense"), &LoadOptions::default());
+        let message = error.unwrap_err().to_string();
+        assert!(message.contains("nonsense") && message.contains("spheres"), "{message}");
+    }
+}
