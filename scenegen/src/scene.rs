@@ -1,4 +1,6 @@
 //! From a source and options to a scene whose views can be rendered.
+//!
+//! One piece: what is decided for a scene is decided in one order.
 
 use std::path::PathBuf;
 

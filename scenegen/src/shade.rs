@@ -1,5 +1,7 @@
 //! How much light a surface sends towards the viewer: Lambert and glTF's metallic-roughness model
 //! (glTF 2.0 specification, appendix B), lit by the scene's lights and the sky.
+//!
+//! One piece: lights, surfaces and what they reflect share the point being shaded.
 
 use std::f32::consts::PI;
 use std::sync::OnceLock;

@@ -10,6 +10,8 @@
 //! Boxes handed to the builder are wider than their triangles by [`PADDING`], so that rounding in
 //! the box tests cannot lose a triangle that the watertight intersection would meet; together they
 //! leave no cracks.
+//!
+//! One piece: both traversals share the tree, its coordinates and its rounding bounds.
 
 use glam::{DVec3, Vec3, Vec3A};
 use obvhs::aabb::Aabb;

@@ -3,6 +3,8 @@
 //! The `gltf` crate's types describe the JSON; indices, offsets and counts are checked here, as its
 //! own readers index without looking. Skins, morph targets and animations are left as they are at
 //! rest. Occlusion textures are ignored: the tracer computes occlusion when asked.
+//!
+//! This file is long because a node's mesh, camera and light share its walk.
 
 mod accessors;
 mod materials;

@@ -47,6 +47,9 @@ fn build() -> Staging {
     let rig = Rig {
         kind: RigKind::Orbit,
         arc: 45.0,
+        // Every pixel costs 64 rays and their shadows.
+        width: 128,
+        height: 128,
         elevation: [-12.0, 20.0],
         target: Some([0.0, 1.0, 0.0]),
         focus: Some(1.45),
