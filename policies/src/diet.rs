@@ -12,8 +12,8 @@
 //! colour. Dead rows (less opaque than `min_opacity`; after step `max_scale_from` also larger than
 //! `max_scale` · scene extent) are pruned; they are no candidates. If there are more candidates than
 //! room, up to `rho` · budget of them are paid for by as many victims. Then the candidates grow, the
-//! largest g first: small ones (up to `small` · scene extent) are cloned, the others split in two,
-//! smaller by `split_factor`. What is left over is counted as denied. The statistics start anew.
+//! largest g first: small ones (up to `small` · scene extent) are cloned, the others split in two
+//! (`split`). What is left over is counted as denied. The statistics start anew.
 //!
 //! **Victims** are the least important rows, candidates excepted: those whose largest blend weight
 //! α·T, over all pixels of the views of `importance`, is smallest. Newborns are protected until
@@ -31,6 +31,10 @@
 //!
 //! The default of `rho` is 0.03. With 0.1, ten events replace a whole model, and runs of 3,000 steps
 //! ended 0.1 to 0.5 dB lower on two scenes of photographs (two pairs of runs each, one seed).
+//!
+//! The default of `split` is `long-axis`, where paper and code split as the original does. In six
+//! pairs of runs of 2,000 or 3,000 steps on four scenes it was better by +0.2, +0.5, +0.6, +0.3, +1.3
+//! and −0.1 dB, and in SSIM in every pair.
 //!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;
@@ -95,7 +99,7 @@
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
 //! | rho | 0.03 | 0 to 1 | budget | most rows that one growth exchanges |
 //! | small | 0.01 | >= 0 | scene extent | up to this size a row is cloned, beyond it split |
-//! | split | "random" | random, long-axis | | how a large row is split |
+//! | split | "long-axis" | random, long-axis | | how a large row is split |
 //! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales, for `random` |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split, for `long-axis` |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor of the children's opacity, for `long-axis` |

@@ -127,7 +127,7 @@ impl Default for DietParams {
             growth: Growth::Turnover,
             rho: 0.03,
             small: 0.01,
-            split: Split::Random,
+            split: Split::LongAxis,
             split_factor: 1.6,
             split_share: 0.45,
             child_opacity: 0.6,

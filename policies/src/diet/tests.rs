@@ -2,9 +2,9 @@
 
 use super::offspring::conserving_scale;
 use super::*;
-use crate::adc::{clone_at, split_by};
+use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::event::{Event, Outcome, View};
-use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
+use crate::plan::{EditCounts, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
 use crate::registry::find;
 
@@ -183,7 +183,8 @@ fn clones_shift_by_the_rule() {
         .with(Signal::MeanGradientNorm, &[1e-3, 0.0, 3.0]);
     let shifts = |set: &str| -> Vec<[f32; 3]> {
         let families = run(&event, set).ops.families;
-        assert_eq!(families[2].offspring.placement, Placement::Sampled);
+        let split = families[2].offspring.placement;
+        assert!(matches!(split, Placement::LongAxis { .. }), "a split was shifted: {split:?}");
         let offset = |placement| match placement {
             Placement::Offset(offset) => offset,
             other => panic!("{other:?}"),
@@ -205,14 +206,20 @@ fn clones_shift_by_the_rule() {
 }
 
 #[test]
-fn splits_and_clones_are_those_of_the_original() {
+fn large_rows_split_and_small_ones_are_cloned() {
     let event = event(600, 2, 10)
         .with(Signal::ScreenGradient, &[2.0, 1.0])
         .with(Signal::ScaleMax, &[0.101, 0.1]);
-    let families = run(&event, "").ops.families;
-    assert_eq!(families[0].offspring, split_by(1.6));
-    assert_eq!(families[0].offspring.scale, ScaleRule::Uniform(0.625));
-    assert_eq!(families[1].offspring, clone_at([0.0; 3]));
+    let offspring = |set: &str| -> Vec<Offspring> {
+        run(&event, set).ops.families.iter().map(|family| family.offspring).collect()
+    };
+    let [original, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
+    assert_eq!((original, clone), (split_by(1.6), clone_at([0.0; 3])));
+    assert_eq!(original.scale, ScaleRule::Uniform(0.625));
+    let [halves, clone] = offspring("")[..] else { panic!("two families") };
+    assert_eq!((halves, clone), (split_long_axis(0.45, 0.6), clone_at([0.0; 3])));
+    let other = offspring("split_share = 0.3\nchild_opacity = 0.8")[0];
+    assert_eq!(other, split_long_axis(0.3, 0.8));
 }
 
 #[test]
