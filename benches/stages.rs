@@ -5,6 +5,7 @@
 
 #![expect(clippy::print_stdout, reason = "its output is a table")]
 
+use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
@@ -15,6 +16,7 @@ use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
 use densify_policies::policy::Cadence;
 use glam::{DMat3, DVec3};
+use pulp::{Arch, Simd, WithSimd};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -61,7 +63,53 @@ fn median(mut times: Vec<Duration>) -> f64 {
     times[times.len() / 2].as_secs_f64() * 1e3
 }
 
+/// Multiply-adds on twelve independent vectors: as many as two units of latency four need, and half
+/// as many again.
+struct MultiplyAdds {
+    rounds: u32,
+}
+
+impl WithSimd for MultiplyAdds {
+    /// A sum, so that nothing is left out; and operations, two to a multiply-add.
+    type Output = (f32, f64);
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> (f32, f64) {
+        let (a, b) = (s.splat_f32s(black_box(0.993)), s.splat_f32s(black_box(0.37)));
+        let mut sums = [s.splat_f32s(1.0); 12];
+        for _ in 0..self.rounds {
+            for sum in &mut sums {
+                *sum = s.mul_add_e_f32s(*sum, a, b);
+            }
+        }
+        let total = sums.iter().map(|&sum| s.reduce_sum_f32s(sum)).sum();
+        (total, 2.0 * (S::F32_LANES * sums.len()) as f64 * f64::from(self.rounds))
+    }
+}
+
+/// What one thread of this machine can do at most: GFLOP/s, and GB/s read and written in place.
+fn peak() -> (f64, f64) {
+    let mut rates = (0.0_f64, 0.0_f64);
+    let mut memory = vec![1.0_f32; 32 << 20];
+    for _ in 0..5 {
+        let start = ProcessTime::now();
+        let (sum, operations) = Arch::new().dispatch(MultiplyAdds { rounds: 5_000_000 });
+        rates.0 = rates.0.max(operations / start.elapsed().as_secs_f64() * 1e-9);
+        black_box(sum);
+        let start = ProcessTime::now();
+        for x in &mut memory {
+            *x = *x * 0.999 + 0.1;
+        }
+        let bytes = 2.0 * size_of_val(&memory[..]) as f64;
+        rates.1 = rates.1.max(bytes / start.elapsed().as_secs_f64() * 1e-9);
+        black_box(&mut memory);
+    }
+    rates
+}
+
 fn main() {
+    let (flops, bytes) = peak();
+    println!("one thread: at most {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
     let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
     let rates = LearningRates {
         mean: 1e-6,

@@ -9,6 +9,8 @@ mod error;
 mod fresh;
 mod guard;
 
+use std::time::{Duration, Instant};
+
 use densify_policies::plan::{EditPlan, RowOps};
 use densify_policies::policy::{Cadence, DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
@@ -119,6 +121,8 @@ pub struct Trainer<V> {
     next_order: Vec<usize>,
     peak_rows: usize,
     extra_forwards: u64,
+    policy_time: Duration,
+    views_time: Duration,
     events: Vec<EditEvent>,
 }
 
@@ -144,6 +148,8 @@ impl<V: ViewSource> Trainer<V> {
             next_order: schedule::view_order(count, options.seed, 0),
             peak_rows: backend.rows(),
             extra_forwards: 0,
+            policy_time: Duration::ZERO,
+            views_time: Duration::ZERO,
             views,
             backend,
             policy,
@@ -183,7 +189,9 @@ impl<V: ViewSource> Trainer<V> {
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
         let is_due = asked(|| self.policy.is_due(step)).map_err(|e| self.refused(step, e))?;
+        let start = Instant::now();
         let event = if is_due { self.edit(step)? } else { None };
+        self.policy_time += start.elapsed();
         Ok(StepReport { step, view, output, rows: self.backend.rows(), event })
     }
 
@@ -236,8 +244,10 @@ impl<V: ViewSource> Trainer<V> {
     /// Asks the policy for a plan and executes it. A plan that changes no row and was refused
     /// nothing is no event: policies may be due at steps at which they find nothing to do.
     fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
+        let start = Instant::now();
         let needs = self.measure_fresh(step)?;
         self.show_views(step)?;
+        self.views_time += start.elapsed();
         let (signals, candidates) =
             self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
         let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };
@@ -304,6 +314,13 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn extra_forwards(&self) -> u64 {
         self.extra_forwards
+    }
+
+    /// Wall time of all policy events so far: signals, plan and its execution; and, apart from these,
+    /// of the views that were rendered for them.
+    #[must_use]
+    pub fn policy_times(&self) -> (Duration, Duration) {
+        (self.policy_time.saturating_sub(self.views_time), self.views_time)
     }
 
     /// All edits so far.

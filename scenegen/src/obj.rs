@@ -5,7 +5,7 @@
 //! materials are diffuse unless they bring the PBR keys `Pr` or `Pm`. Smoothing groups are ignored: a
 //! vertex without normal is flat.
 //!
-//! One file for the format: geometry and materials share line reading and faults.
+//! One piece: geometry and materials share line reading and faults.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

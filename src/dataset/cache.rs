@@ -2,8 +2,8 @@
 //!
 //! Training visits every view once per epoch, in a new order each time. A view just seen is
 //! therefore the one whose next use is, on average, furthest away: when room is needed, the most
-//! recently used image goes first, never one that was announced. Least-recently-used eviction
-//! would miss every time as soon as the images do not all fit.
+//! recently used image goes first, never one that was announced. (Least-recently-used eviction
+//! would miss every time as soon as the images do not all fit.) One piece: a cache and its threads.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};

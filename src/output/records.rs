@@ -90,7 +90,8 @@ pub struct Summary {
     pub ledger: Ledger,
     /// Wall time of all steps `[s]`.
     pub seconds: f64,
-    /// Wall time of each stage of the steps, summed `[s]`.
+    /// Wall time of each stage of the steps, of the policy's events, and of the views rendered for
+    /// these, summed `[s]`.
     pub stage_seconds: BTreeMap<&'static str, f64>,
     /// CPU time of all steps, all threads together `[s]`, where the system says.
     pub cpu_seconds: Option<f64>,

@@ -4,7 +4,7 @@
 //! own readers index without looking. Skins, morph targets and animations are left as they are at
 //! rest. Occlusion textures are ignored: the tracer computes occlusion when asked.
 //!
-//! This file is long because a node's mesh, camera and light share its walk.
+//! One piece: a node's mesh, camera and light share its walk.
 
 mod accessors;
 mod materials;

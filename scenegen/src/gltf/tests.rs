@@ -1,3 +1,5 @@
+//! glTF as other programs write it, as the specification allows it, and damaged.
+
 use std::path::PathBuf;
 
 use serde_json::{Value, json};

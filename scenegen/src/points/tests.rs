@@ -1,3 +1,5 @@
+//! Initial points: how many, where, and how far off.
+
 use super::*;
 use crate::{Options, Scene, Source, Split};
 

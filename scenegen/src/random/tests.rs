@@ -1,3 +1,5 @@
+//! Samplers against their distributions, by chi-square.
+
 use super::*;
 
 /// The value that chi-square of `bins` bins exceeds once in a million (Wilson and Hilferty).

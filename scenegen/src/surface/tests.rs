@@ -1,3 +1,5 @@
+//! Rays and nearest points against brute force, degenerate meshes and cracks.
+
 use glam::DQuat;
 
 use super::*;

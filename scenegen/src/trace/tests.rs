@@ -1,3 +1,5 @@
+//! Frames against what can be worked out by hand.
+
 use std::f32::consts::PI;
 
 use glam::{DQuat, Vec4};

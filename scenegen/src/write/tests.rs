@@ -1,3 +1,5 @@
+//! What is written, and that nothing is half-written.
+
 use super::*;
 use crate::{Options, PointOptions, Source};
 

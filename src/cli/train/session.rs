@@ -207,6 +207,10 @@ impl<'a> Session<'a> {
 
     fn write_summary(&self, finished: bool) -> Result<(), OutputError> {
         let Prepared { config, trainer, test, ledger, .. } = &self.run;
+        let (events, views) = trainer.policy_times();
+        let policy = [("policy events", events), ("policy views", views)];
+        let stages = self.stages.iter().map(|(&stage, &time)| (stage, time)).chain(policy);
+        let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
         let summary = Summary {
             densify: config.densify.clone(),
             policy: config.policy.name.clone(),
@@ -220,7 +224,7 @@ impl<'a> Session<'a> {
             ledger_bytes: ledger.total(),
             ledger: ledger.clone(),
             seconds: self.wall.as_secs_f64(),
-            stage_seconds: self.stages.iter().map(|(&k, time)| (k, time.as_secs_f64())).collect(),
+            stage_seconds,
             cpu_seconds: self.cpu.map(|cpu| cpu.as_secs_f64()),
             train_views: trainer.views().count(),
             test_views: test.count(),
