@@ -5,6 +5,7 @@
 //! pass and optimiser, and then, where the policy is due, one edit of the rows. A policy sees the
 //! model as the optimiser left it.
 
+mod check;
 mod error;
 mod fresh;
 mod guard;
@@ -21,6 +22,7 @@ use crate::dataset::images::SharedImage;
 use crate::gaussians::Gaussians;
 use crate::schedule::{self, Background, RateOptions};
 use crate::views::ViewSource;
+use check::check;
 pub use error::TrainError;
 use guard::asked;
 
@@ -372,36 +374,6 @@ fn checked_needs(
     let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
     needs.check().map_err(bad)?;
     Ok(needs)
-}
-
-fn check(
-    scene: &SceneInfo,
-    options: &TrainOptions,
-    views: usize,
-    backend: &dyn Backend,
-) -> Result<(), TrainError> {
-    let bad = |reason: String| Err(TrainError::BadOption(reason));
-    if views == 0 {
-        return Err(TrainError::NoViews);
-    }
-    if u32::try_from(views) != Ok(scene.train_views) {
-        return bad(format!("{views} views, but the scene tells of {}", scene.train_views));
-    }
-    if options.iterations == 0 || options.iterations != scene.iterations {
-        let (here, there) = (options.iterations, scene.iterations);
-        return bad(format!("--iterations is {here} (scene: {there}); both must be equal, >= 1"));
-    }
-    if !(scene.extent.is_finite() && scene.extent > 0.0) {
-        return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
-    }
-    if let Some(rate) = options.rates.invalid() {
-        return bad(format!("learning rate `{rate}` must be a positive number"));
-    }
-    let (rows, budget) = (backend.rows(), backend.budget());
-    if budget != scene.budget || rows > budget {
-        return bad(format!("{rows} rows, budget {budget} (scene: {})", scene.budget));
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -1,0 +1,36 @@
+//! Whether scene, options, views and backend agree, before the first step.
+
+use densify_policies::policy::SceneInfo;
+
+use super::{TrainError, TrainOptions};
+use crate::backend::Backend;
+
+pub(super) fn check(
+    scene: &SceneInfo,
+    options: &TrainOptions,
+    views: usize,
+    backend: &dyn Backend,
+) -> Result<(), TrainError> {
+    let bad = |reason: String| Err(TrainError::BadOption(reason));
+    if views == 0 {
+        return Err(TrainError::NoViews);
+    }
+    if u32::try_from(views) != Ok(scene.train_views) {
+        return bad(format!("{views} views, but the scene tells of {}", scene.train_views));
+    }
+    if options.iterations == 0 || options.iterations != scene.iterations {
+        let (here, there) = (options.iterations, scene.iterations);
+        return bad(format!("--iterations is {here} (scene: {there}); both must be equal, >= 1"));
+    }
+    if !(scene.extent.is_finite() && scene.extent > 0.0) {
+        return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
+    }
+    if let Some(rate) = options.rates.invalid() {
+        return bad(format!("learning rate `{rate}` must be a positive number"));
+    }
+    let (rows, budget) = (backend.rows(), backend.budget());
+    if budget != scene.budget || rows > budget {
+        return bad(format!("{rows} rows, budget {budget} (scene: {})", scene.budget));
+    }
+    Ok(())
+}
