@@ -240,7 +240,8 @@ impl Ground<'_> {
 
 /// `sum / count`; NaN where there is nothing.
 fn share(sum: f64, count: f64) -> f64 {
-    if count > 0.0 { sum / count } else { f64::NAN }
+    // An empty sum is −0.
+    if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
 }
 
 /// NaN as `null`, which JSON has for it, and back.
