@@ -114,8 +114,8 @@ impl GroundTruth {
     }
 
     /// Thickness of the thin structure `[world units]` that the ray from `origin` along `direction`
-    /// meets first, at ray parameter `depth`: the way through it against its normal, for a wire its
-    /// diameter. `None` where what is met is not thin, or not there.
+    /// meets first, at ray parameter `depth`: the shortest of the way through it against its normal
+    /// and of two ways across that through its middle; for a wire its diameter. `None` where what is met is not thin, or not there.
     #[must_use]
     pub fn thickness(&self, origin: DVec3, direction: DVec3, depth: f64) -> Option<f64> {
         let surface = self.surface();
@@ -130,7 +130,15 @@ impl GroundTruth {
         let inward = if hit.front { -hit.normal } else { hit.normal };
         let step = STEP * surface.diagonal();
         let other = surface.cast(hit.point + step * inward, inward, f64::INFINITY)?;
-        Some(other.t + step)
+        let through = other.t + step;
+        let middle = hit.point + 0.5 * through * inward;
+        let across = |axis: DVec3| {
+            let reach =
+                |way| surface.cast(middle, way, f64::INFINITY).map_or(f64::INFINITY, |h| h.t);
+            reach(axis) + reach(-axis)
+        };
+        let (u, v) = inward.any_orthonormal_pair();
+        Some(through.min(across(u)).min(across(v)))
     }
 }
 

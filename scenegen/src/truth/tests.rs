@@ -24,7 +24,10 @@ fn folders_say_what_the_scene_says() {
     let frame = scene.render(2);
     let here = GroundTruth::of_scene(scene);
     let there = GroundTruth::open(&target).expect("read").expect("a scene");
-    assert_eq!(here.surface().triangles(), there.surface().triangles());
+    let corners = |truth: &GroundTruth| truth.surface().triangles().concat();
+    let (a, b) = (corners(&here), corners(&there));
+    assert_eq!(a.len(), b.len());
+    assert!(a.iter().zip(&b).all(|(a, b)| a.distance(*b) < 1e-6), "another mesh");
     assert!(here.has_thin() && there.has_thin());
     let test = views.iter().find(|view| view.split == Split::Test).expect("a test view");
     let sight = here.sight(&test.name, &test.camera).expect("traced");
@@ -61,6 +64,11 @@ fn wires_are_as_thick_as_they_are() {
     assert!((0.0115..=0.012).contains(&thickness), "{thickness}");
     let beside = DVec3::new(-0.9, 0.7, 2.0);
     assert!(truth.thickness(beside, DVec3::NEG_Z, 2.6).is_none());
+    // At its end, where the wire is all the way along it, it is as thick as across: radius 12 mm.
+    let above = DVec3::new(-0.75, 3.0, 0.003);
+    let depth = truth.surface().cast(above, DVec3::NEG_Y, 10.0).expect("an end").t;
+    let thickness = truth.thickness(above, DVec3::NEG_Y, depth).expect("thin");
+    assert!((0.02..=0.025).contains(&thickness), "{thickness}");
     // Something else stands before it.
     assert!(truth.thickness(from, DVec3::NEG_Z, depth + 0.1).is_none());
 }
