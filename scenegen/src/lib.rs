@@ -33,6 +33,7 @@ mod sky;
 mod surface;
 pub mod texture;
 mod trace;
+mod truth;
 mod write;
 
 pub use camera::Camera;
@@ -45,4 +46,5 @@ pub use shade::Ambient;
 pub use sky::Sky;
 pub use surface::{Nearest, Surface, SurfaceHit};
 pub use trace::Frame;
+pub use truth::{GroundTruth, Sight};
 pub use write::{Written, check_target, contact_sheet, write, write_png};

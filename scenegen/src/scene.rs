@@ -4,6 +4,7 @@
 
 use std::path::PathBuf;
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
@@ -264,6 +265,12 @@ impl Scene {
     pub fn is_thin(&self, triangle: u32) -> bool {
         let material = self.model.triangle_materials.get(triangle as usize);
         material.is_some_and(|&m| self.model.materials[m as usize].thin)
+    }
+
+    /// Depth, as a ray parameter, and normal of the first surface with alpha of at least one half.
+    pub(crate) fn first_solid(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
+        let solid = self.tracer().first_solid(origin, direction);
+        solid.map(|(depth, normal, _)| (depth, normal))
     }
 
     fn tracer(&self) -> Tracer<'_> {

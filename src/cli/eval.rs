@@ -1,20 +1,25 @@
 //! `densify eval`.
 
+use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use clap::Args;
 
 use super::console::Console;
 use super::failure::Failure;
+use super::number::grouped;
 use super::run_files::{SplitArg, iteration, open_run};
 use crate::evaluate::evaluate;
-use crate::output::{Mean, write_scores};
+use crate::metrics::geometry::{self, Geometry, Ground};
+use crate::output::{Mean, write_geometry, write_scores};
 
 /// Measures a trained scene against its photographs: PSNR and SSIM.
 ///
 /// Prints the scores of each view and their mean, and writes them to results.json and
 /// per_view.json in the run's folder (results_train.json and per_view_train.json for the views
-/// trained on).
+/// trained on). Where the geometry is known (built-in scenes, and those that `densify scenegen`
+/// wrote), also measures how the Gaussians sit on it: a second table, and geometry.json
+/// (geometry_train.json).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct EvalArgs {
@@ -44,7 +49,8 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     // A folder without config.toml is no run, whatever else it holds.
     crate::output::RunConfig::read(run)?;
     let iteration = iteration(run, args.iteration)?;
-    let mut opened = open_run(run, iteration, args.scene.clone(), args.threads, console)?;
+    let moved_to = args.scene.clone();
+    let mut opened = open_run(run, iteration, moved_to, args.threads, geometry::needs(), console)?;
     let views = opened.views(args.split)?;
     let background = opened.scene.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
@@ -56,5 +62,55 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let Mean { psnr, ssim } = scores.mean();
     console.result(format_args!("{:width$}  {psnr:9.3}  {ssim:.4}", "mean"));
     write_scores(run, args.split.into(), iteration, &scores)?;
+    if let Some(truth) = opened.dataset.ground_truth()? {
+        let train = opened.views(SplitArg::Train)?;
+        let ground = Ground {
+            truth: &truth,
+            normalisation: &opened.dataset.normalisation,
+            background,
+            sh_degree: opened.sh_degree,
+        };
+        let measured = geometry::measure(opened.backend.as_mut(), &ground, &train, &views)?;
+        console.result(table(&measured));
+        write_geometry(run, args.split.into(), iteration, &measured)?;
+    }
     Ok(())
+}
+
+/// The geometric measurements as lines; lengths as percentages of the diagonal.
+fn table(geometry: &Geometry) -> String {
+    let Geometry { depth, normal_error, centres, floaters, thin, redundancy } = geometry;
+    let percent = |value: f64| {
+        if value.is_finite() { format!("{:.3} %", 100.0 * value) } else { "–".into() }
+    };
+    let plain = |value: f64, unit: &str| {
+        if value.is_finite() { format!("{value:.2}{unit}") } else { "–".into() }
+    };
+    let mut lines = vec![
+        ("depth RMSE (of the diagonal)".to_owned(), percent(depth.rmse)),
+        ("depth error, relative".to_owned(), percent(depth.abs_rel)),
+        ("surface covered".to_owned(), percent(depth.coverage)),
+        ("normal error, median".to_owned(), plain(*normal_error, "°")),
+        ("centre to surface, mean (of the diagonal)".to_owned(), percent(centres.accuracy)),
+        ("centre to surface, 95 % within".to_owned(), percent(centres.accuracy_p95)),
+        ("surface to centre, mean".to_owned(), percent(centres.completeness)),
+        ("Chamfer distance".to_owned(), percent(centres.chamfer)),
+        ("F-score at 0.5 %".to_owned(), percent(centres.f_score_half_percent)),
+        ("F-score at 1 %".to_owned(), percent(centres.f_score_one_percent)),
+        ("floaters".to_owned(), grouped(floaters.count)),
+        ("floaters, share of rows".to_owned(), percent(floaters.of_rows)),
+        ("floaters, share of weight".to_owned(), percent(floaters.of_weight)),
+    ];
+    for width in thin {
+        let name = format!("thin structures found, {} px wide", width.width);
+        lines.push((name, percent(width.recall)));
+    }
+    lines.push(("rows blended per pixel".to_owned(), plain(redundancy.blended_per_pixel, "")));
+    lines.push(("rows that never weigh 1 %".to_owned(), percent(redundancy.below_one_percent)));
+    let width = lines.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
+    let mut text = String::from("\ngeometry");
+    for (name, value) in lines {
+        let _ = write!(text, "\n{name:width$}  {value:>10}");
+    }
+    text
 }

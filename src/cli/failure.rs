@@ -6,6 +6,7 @@ use crate::backend::BackendError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
 use crate::init::InitError;
+use crate::metrics::geometry::GeometryError;
 use crate::output::OutputError;
 use crate::ply::PlyError;
 use crate::trainer::TrainError;
@@ -104,6 +105,17 @@ impl From<TrainError> for Failure {
             TrainError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
             TrainError::Backend { .. } => DEVICE,
             _ => OTHER,
+        };
+        Self { code, message: error.to_string() }
+    }
+}
+
+impl From<GeometryError> for Failure {
+    fn from(error: GeometryError) -> Self {
+        let code = match &error {
+            GeometryError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
+            GeometryError::Backend { .. } => DEVICE,
+            _ => INPUT,
         };
         Self { code, message: error.to_string() }
     }

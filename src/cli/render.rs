@@ -5,6 +5,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 
 use super::console::Console;
@@ -109,7 +110,8 @@ fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
     if !args.model.is_file() {
         crate::output::RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;
-        return open_run(&args.model, iteration, args.scene.clone(), args.threads, console);
+        let moved_to = args.scene.clone();
+        return open_run(&args.model, iteration, moved_to, args.threads, Needs::default(), console);
     }
     let Some(scene) = &args.scene else {
         return Err(Failure::input(format!(
@@ -120,7 +122,8 @@ fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
     if args.iteration.is_some() {
         return Err(Failure::input("--iteration is for a run's folder; a file has only one model"));
     }
-    open(&args.model, scene, args.data.config(scene), args.near, args.threads, console)
+    let config = args.data.config(scene);
+    open(&args.model, scene, config, (args.near, args.threads), Needs::default(), console)
 }
 
 /// A file name without ending for each view. Names come from data files: no part of one may lead

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use densify_policies::policy::Needs;
+
 use super::console::Console;
 use super::failure::Failure;
 use super::scene;
@@ -67,12 +69,14 @@ pub(super) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> 
     }
 }
 
-/// Opens the model of a run with its dataset, or with that dataset at `moved_to`.
+/// Opens the model of a run with its dataset, or with that dataset at `moved_to`, in a backend for
+/// `needs`.
 pub(super) fn open_run(
     run: &Path,
     iteration: u32,
     moved_to: Option<PathBuf>,
     threads: Option<u16>,
+    needs: Needs,
     console: &Console,
 ) -> Result<Opened, Failure> {
     let config = RunConfig::read(run)?;
@@ -80,7 +84,7 @@ pub(super) fn open_run(
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
     let near = config.train.near;
-    open(&model, &path, config.scene, near, threads, console).map_err(|failure| {
+    open(&model, &path, config.scene, (near, threads), needs, console).map_err(|failure| {
         if was_moved || path.is_dir() {
             failure
         } else {
@@ -89,13 +93,13 @@ pub(super) fn open_run(
     })
 }
 
-/// Opens a model, by whatever program, with a dataset.
+/// Opens a model, by whatever program, with a dataset. The near plane is a fraction of the extent.
 pub(super) fn open(
     model: &Path,
     dataset: &Path,
     config: SceneConfig,
-    near: f64,
-    threads: Option<u16>,
+    (near, threads): (f64, Option<u16>),
+    needs: Needs,
     console: &Console,
 ) -> Result<Opened, Failure> {
     use_threads(threads);
@@ -114,6 +118,7 @@ pub(super) fn open(
     options.near = (near * dataset.extent()) as f32;
     options.threads = threads.map(usize::from);
     options.largest_image = scene::largest_image(&dataset);
+    options.needs = needs;
     Ok(Opened {
         sh_degree: model.sh_degree,
         backend: Box::new(CpuBackend::new(&model, &options)?),

@@ -6,7 +6,9 @@ use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use densify_scenegen::{Frame, Generated, Options, Source, generate};
+use densify_scenegen::{
+    Frame, Generated, GroundTruth, InitPoints, Options, Scene, Source, generate,
+};
 
 use super::images::{Image8, ImageHeader, ImageSource};
 use super::normalise::Normalisation;
@@ -34,6 +36,30 @@ pub(super) fn load(
 ) -> Result<Dataset, DatasetError> {
     let generated = generate(&Source::Preset(name.to_owned()), &Options::default())?;
     let Generated { scene, frames, points } = generated;
+    dataset(path, &scene, frames, points, options)
+}
+
+/// The geometry of a built-in scene, as [`load`] renders it.
+///
+/// # Errors
+/// When there is no such scene.
+pub(super) fn ground_truth(name: &str) -> Result<GroundTruth, DatasetError> {
+    let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
+    Ok(GroundTruth::of_scene(scene))
+}
+
+/// A rendered scene as a dataset that goes by the name of `path`. `frames` are those of all its
+/// views, in their order.
+///
+/// # Errors
+/// When the options leave no view to train on.
+pub fn dataset(
+    path: &Path,
+    scene: &Scene,
+    frames: Vec<Frame>,
+    points: InitPoints,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
     let mut views: Vec<(View, bool)> = scene
         .views
         .iter()
@@ -70,7 +96,7 @@ pub(super) fn load(
         test,
         points: PointCloud { positions, colours: points.colours },
         normalisation,
-        notes: scene.model.notes,
+        notes: scene.model.notes.clone(),
     })
 }
 

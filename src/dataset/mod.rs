@@ -29,6 +29,7 @@ pub(crate) mod tests;
 
 use std::path::{Path, PathBuf};
 
+use densify_scenegen::GroundTruth;
 use glam::{DMat3, DVec3};
 
 use crate::camera::Camera;
@@ -146,6 +147,18 @@ impl Dataset {
             return Err(DatasetError::NoImages { path: scene.listing });
         }
         prepare::dataset(path, scene, options)
+    }
+
+    /// The geometry that the images were rendered from, in the dataset's own coordinates: there is
+    /// one for built-in scenes and in folders that `densify scenegen` wrote.
+    ///
+    /// # Errors
+    /// When there is one, but it cannot be read.
+    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
+        match builtin::name(&self.root) {
+            Some(name) => builtin::ground_truth(name).map(Some),
+            None => Ok(GroundTruth::open(&self.root)?),
+        }
     }
 
     /// The scene's extent [scene units]: 1.1 times the largest distance of a training camera from

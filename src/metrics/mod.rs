@@ -1,4 +1,5 @@
-//! How like the photograph a render is: PSNR and SSIM.
+//! How like the photograph a render is, PSNR and SSIM, and how like the surface the model is where
+//! that is known ([`geometry`]).
 //!
 //! Both compare a rendered image with a packed target, both in sRGB encoding, and both accumulate
 //! in `f64`, so that a figure does not depend on the image's size or on the number of threads.
@@ -7,6 +8,7 @@
 //! the mask counts: the render's error is scaled by the mask before windows are taken, so what
 //! lies under the mask cannot leak into its neighbours' SSIM, and pixels are weighted by it.
 
+pub mod geometry;
 mod psnr;
 mod ssim;
 

@@ -9,7 +9,7 @@ use tempfile::TempDir;
 use super::OutputError;
 
 /// What a run owns in its folder. Anything else in there is the user's and is left alone.
-const OWNED: [&str; 8] = [
+const OWNED: [&str; 10] = [
     "config.toml",
     "cameras.json",
     MODELS,
@@ -18,6 +18,8 @@ const OWNED: [&str; 8] = [
     "per_view.json",
     "results_train.json",
     "per_view_train.json",
+    "geometry.json",
+    "geometry_train.json",
 ];
 const MODELS: &str = "point_cloud";
 const OWNED_PREFIX: &str = "events.out.tfevents.";

@@ -8,6 +8,7 @@
 //!   point_cloud/iteration_N/point_cloud.ply      the model
 //!   stats/train.jsonl  events.jsonl  summary.json
 //!   results.json  per_view.json                  test scores, as the original trainer lays them out
+//!   geometry.json                                how the model sits on a known surface
 //!   events.out.tfevents.*                        the same curves for TensorBoard
 //! ```
 //!
@@ -25,7 +26,9 @@ pub use atomic::write_atomically;
 pub use cameras::cameras_json;
 pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
 pub use folder::{RunFolder, model_path, saved_iterations};
-pub use records::{Mean, RecordLog, StepRecord, Summary, write_json, write_scores};
+pub use records::{
+    Mean, RecordLog, StepRecord, Summary, geometry_of, write_geometry, write_json, write_scores,
+};
 pub use tensorboard::TensorBoard;
 
 use std::path::{Path, PathBuf};

@@ -11,6 +11,7 @@ use serde_json::{Map, Value};
 use super::{OutputError, write_atomically};
 use crate::evaluate::{Scores, Split, ViewScore};
 use crate::memory::Ledger;
+use crate::metrics::geometry::Geometry;
 
 /// A file of JSON records, one a line, that grows by whole lines.
 #[derive(Debug)]
@@ -150,17 +151,61 @@ pub fn write_scores(
     enter(&run.join(results), iteration, mean)
 }
 
+/// Enters geometric measurements into `geometry.json` (`geometry_train.json` for the views trained
+/// on) as `{"ours_3000": {"depth": {…}, …}}`. Entries of other iterations stay.
+///
+/// # Errors
+/// [`OutputError`].
+pub fn write_geometry(
+    run: &Path,
+    split: Split,
+    iteration: u32,
+    geometry: &Geometry,
+) -> Result<(), OutputError> {
+    let entry = serde_json::to_value(geometry).unwrap_or_default();
+    enter(&run.join(geometry_file(split)), iteration, entry)
+}
+
+/// The geometric measurements of an iteration on the test views, if there are any.
+///
+/// # Errors
+/// [`OutputError`] when the file says something else.
+pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, OutputError> {
+    let path = run.join(geometry_file(Split::Test));
+    let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
+    match read_all(&path)?.remove(&entry_name(iteration)) {
+        None => Ok(None),
+        Some(entry) => {
+            serde_json::from_value(entry).map(Some).map_err(|e| malformed(e.to_string()))
+        }
+    }
+}
+
+fn geometry_file(split: Split) -> &'static str {
+    match split {
+        Split::Test => "geometry.json",
+        Split::Train => "geometry_train.json",
+    }
+}
+
+fn entry_name(iteration: u32) -> String {
+    format!("ours_{iteration}")
+}
+
 fn enter(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
-    let mut all: Map<String, Value> = match std::fs::read_to_string(path) {
-        Ok(text) => serde_json::from_str(&text).map_err(|e| OutputError::Malformed {
-            path: path.to_owned(),
-            problem: e.to_string(),
-        })?,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Map::new(),
-        Err(e) => return Err(OutputError::io("read", path)(e)),
-    };
-    all.insert(format!("ours_{iteration}"), entry);
+    let mut all = read_all(path)?;
+    all.insert(entry_name(iteration), entry);
     write_json(path, &all)
+}
+
+/// The entries of a file; none where there is no file.
+fn read_all(path: &Path) -> Result<Map<String, Value>, OutputError> {
+    match std::fs::read_to_string(path) {
+        Ok(text) => serde_json::from_str(&text)
+            .map_err(|e| OutputError::Malformed { path: path.to_owned(), problem: e.to_string() }),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(Map::new()),
+        Err(e) => Err(OutputError::io("read", path)(e)),
+    }
 }
 
 #[cfg(test)]

@@ -19,6 +19,8 @@ use crate::points::InitPoints;
 use crate::scene::{Scene, Split};
 use crate::trace::Frame;
 
+pub(crate) use record::NAME as SCENE_FILE;
+
 /// What was written.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Written {
@@ -135,7 +137,7 @@ fn write_rest(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Err
     transforms::write(scene, root, Split::Test)?;
     colmap::write(scene, root, points)?;
     ply::write_points(&root.join("points3d.ply"), points)?;
-    ply::write_mesh(&root.join("mesh.ply"), &scene.surface)?;
+    ply::write_mesh(&root.join("mesh.ply"), scene)?;
     record::write(scene, root, points)
 }
 

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::write_file;
 use crate::error::Error;
 use crate::points::InitPoints;
-use crate::surface::Surface;
+use crate::scene::Scene;
 
 /// Points with colours, and with the zero normals that the original 3DGS reader asks for.
 pub(super) fn write_points(path: &Path, points: &InitPoints) -> Result<(), Error> {
@@ -30,16 +30,16 @@ pub(super) fn write_points(path: &Path, points: &InitPoints) -> Result<(), Error
 }
 
 /// The triangles as traced, in world coordinates, each with its own corners; f64, as a mesh far from
-/// the origin needs it.
-pub(super) fn write_mesh(path: &Path, surface: &Surface) -> Result<(), Error> {
-    let triangles = surface.triangles();
+/// the origin needs it. With each triangle goes whether it is of a thin structure.
+pub(super) fn write_mesh(path: &Path, scene: &Scene) -> Result<(), Error> {
+    let triangles = scene.surface.triangles();
     let mut header =
         format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", 3 * triangles.len());
     for name in ["x", "y", "z"] {
         header += &format!("property double {name}\n");
     }
-    header +=
-        &format!("element face {}\nproperty list uchar uint vertex_indices\n", triangles.len());
+    header += &format!("element face {}\n", triangles.len());
+    header += "property list uchar uint vertex_indices\nproperty uchar thin\n";
     let mut bytes = (header + "end_header\n").into_bytes();
     for value in triangles.iter().flatten().flat_map(glam::DVec3::to_array) {
         bytes.extend(value.to_le_bytes());
@@ -49,6 +49,7 @@ pub(super) fn write_mesh(path: &Path, surface: &Surface) -> Result<(), Error> {
         for corner in 0..3 {
             bytes.extend((3 * triangle + corner).to_le_bytes());
         }
+        bytes.push(u8::from(scene.is_thin(triangle)));
     }
     write_file(path, &bytes)
 }

@@ -10,7 +10,7 @@ use crate::points::InitPoints;
 use crate::scene::Scene;
 
 /// Name of the file; a folder that holds it holds a scene.
-pub(super) const NAME: &str = "scene.json";
+pub(crate) const NAME: &str = "scene.json";
 
 pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
     let model = &scene.model;
@@ -44,7 +44,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             "images": "sRGB with straight alpha",
             "depth": "camera z of the first surface with alpha >= 0.5 through the pixel's centre; 0 where there is none",
             "normals": "its geometric normal in world space, towards the camera; 0 where there is none",
-            "mesh.ply": "the triangles as traced",
+            "mesh.ply": "the triangles as traced; thin is 1 for those of thin structures",
             "points3d.ply": "initial points",
         },
     });

@@ -11,7 +11,9 @@ use serde_json::Value;
 use super::{POINTS, run_folder};
 use crate::cli::failure::{Failure, INPUT, OTHER};
 use crate::cli::number::grouped;
-use crate::output::{OutputError, write_atomically};
+use crate::dataset::builtin;
+use crate::metrics::geometry::Geometry;
+use crate::output::{OutputError, geometry_of, write_atomically};
 
 /// What is run.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,6 +67,9 @@ pub(super) struct Record {
     pub(super) extra_forwards: u64,
     /// (iteration, PSNR) along the run.
     pub(super) curve: Vec<(u32, f64)>,
+    /// How the model sits on the surface, where that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) geometry: Option<Geometry>,
 }
 
 impl Record {
@@ -109,23 +114,41 @@ impl Cell {
             .map_err(|e| other(format!("cannot find the program that is running: {e}")))?;
         let run = self.run();
         let folder = output.join("runs").join(&run);
-        let child = Command::new(program)
-            .args(self.arguments())
-            .arg("--overwrite")
-            .arg("--output")
-            .arg(&folder)
+        let mut call = Command::new(&program);
+        call.args(self.arguments()).arg("--overwrite").arg("--output").arg(&folder);
+        self.wait_for(&mut call)?;
+        if has_geometry(&self.scene) {
+            // In a process of its own too: the memory of the run stays the run's.
+            let mut call = Command::new(&program);
+            call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene).arg("--quiet");
+            call.args(self.threads());
+            self.wait_for(&mut call)?;
+        }
+        self.record(&folder, run)
+    }
+
+    fn wait_for(&self, call: &mut Command) -> Result<(), Failure> {
+        let child = call
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .output()
-            .map_err(|e| other(format!("cannot start a run: {e}")))?;
-        if !child.status.success() {
-            let said = String::from_utf8_lossy(&child.stderr);
-            let message = said.trim().trim_start_matches("error: ").to_owned();
-            let code = child.status.code().and_then(|code| u8::try_from(code).ok());
-            return Err(Failure { code: code.unwrap_or(OTHER), message }
-                .and(&format!("this was the run {self}; the same command goes on from here")));
+            .map_err(|e| Failure { code: OTHER, message: format!("cannot start a run: {e}") })?;
+        if child.status.success() {
+            return Ok(());
         }
-        self.record(&folder, run)
+        let said = String::from_utf8_lossy(&child.stderr);
+        let message = said.trim().trim_start_matches("error: ").to_owned();
+        let code = child.status.code().and_then(|code| u8::try_from(code).ok());
+        Err(Failure { code: code.unwrap_or(OTHER), message }
+            .and(&format!("this was the run {self}; the same command goes on from here")))
+    }
+
+    /// The threads that runs are granted, as options of `densify eval`.
+    fn threads(&self) -> &[String] {
+        let at = self.train.iter().position(|flag| flag.split('=').next() == Some("--threads"));
+        let Some(at) = at else { return &[] };
+        let end = if self.train[at].contains('=') { at + 1 } else { at + 2 };
+        &self.train[at..end.min(self.train.len())]
     }
 
     fn record(&self, folder: &Path, run: String) -> Result<Record, Failure> {
@@ -172,8 +195,15 @@ impl Cell {
             cpu_seconds: summary["cpu_seconds"].as_f64(),
             extra_forwards: number("extra_forwards")? as u64,
             curve: tests.into_iter().map(|(step, psnr, _)| (step, psnr)).collect(),
+            geometry: geometry_of(folder, self.iterations)?,
         })
     }
+}
+
+/// Whether the surface of a scene is known.
+fn has_geometry(scene: &Path) -> bool {
+    let is_generated = || ["scene.json", "mesh.ply"].iter().all(|name| scene.join(name).is_file());
+    builtin::name(scene).is_some() || is_generated()
 }
 
 /// The records in `compare.jsonl`.

@@ -6,6 +6,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
+use densify_policies::policy::Needs;
 use image::{ImageFormat, Rgb, RgbImage, imageops};
 
 use super::{Picture, Record, distinct, run_folder};
@@ -57,7 +58,8 @@ pub(super) fn draw(
                     continue;
                 }
                 let quiet = Console::new(true);
-                let mut opened = open_run(&folder, record.iterations, None, None, &quiet)?;
+                let needs = Needs::default();
+                let mut opened = open_run(&folder, record.iterations, None, None, needs, &quiet)?;
                 let views = opened.views(SplitArg::Test)?;
                 let background = opened.scene.background.fixed();
                 let image = |view: usize| {

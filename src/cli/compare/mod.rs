@@ -15,6 +15,7 @@ use densify_policies::registry::find;
 use super::console::Console;
 use super::failure::Failure;
 use super::number;
+use crate::dataset::builtin;
 use crate::output::write_atomically;
 use cell::{Cell, Record, Records};
 
@@ -27,11 +28,13 @@ use cell::{Cell, Record, Records};
 ///
 /// Quality is measured on views held out. Differences are taken between runs of the same scene,
 /// budget and seed, against the first policy named, with 95 % bootstrap intervals of their mean. A
-/// run whose peak exceeded its budget is marked, and takes no part in the ranking.
+/// run whose peak exceeded its budget is marked, and takes no part in the ranking. Where the geometry
+/// is known (built-in scenes, and those that `densify scenegen` wrote), the tables also say how well
+/// the Gaussians sit on it.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompareArgs {
-    /// Folders of the scenes
+    /// Folders of the scenes, or built-in scenes (scene:NAME)
     #[arg(required = true)]
     scenes: Vec<PathBuf>,
     /// Policies, separated by commas; the others are compared with the first
@@ -58,7 +61,8 @@ const EXAMPLES: &str = "\
 Examples:
   densify compare data/garden --policies vanilla,diet --budget 200k
   densify compare data/room data/cup --policies diet,taming,mcmc --budget 15k,30k,60k --seeds 5
-  densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2";
+  densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2
+  densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
 
 /// Options of `densify train` that are the comparison's to set.
 const OWN_OPTIONS: [&str; 10] = [
@@ -156,23 +160,32 @@ fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Fa
     }
 }
 
-/// A short name for each scene: its folder's.
+/// A short name for each scene: its folder's, or that of the built-in scene.
 fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
     let mut labels = Vec::new();
     for scene in scenes {
+        if let Some(name) = builtin::name(scene) {
+            labels.push(unlike(&labels, name.to_owned())?);
+            continue;
+        }
         let whole = std::fs::canonicalize(scene).map_err(|e| {
             Failure::input(format!("{}: {e}; name the scene's folder", scene.display()))
         })?;
         let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let name = name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '.', "-");
-        if labels.contains(&name) {
-            return Err(Failure::input(format!(
-                "two scenes are called {name}; compare them in two calls, or rename one folder"
-            )));
-        }
-        labels.push(name);
+        labels.push(unlike(&labels, name)?);
     }
     Ok(labels)
+}
+
+/// The name, if it is none of those that are taken.
+fn unlike(taken: &[String], name: String) -> Result<String, Failure> {
+    if taken.contains(&name) {
+        return Err(Failure::input(format!(
+            "two scenes are called {name}; compare them in two calls, or rename one folder"
+        )));
+    }
+    Ok(name)
 }
 
 /// Distinct values of a property of the records, in the order of their appearance.

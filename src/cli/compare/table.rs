@@ -5,6 +5,7 @@ use std::fmt::Write;
 use super::difference::Difference;
 use super::{Record, distinct};
 use crate::cli::number::grouped;
+use crate::metrics::geometry::Geometry;
 
 /// Mean over records; `None` where one has no value.
 fn mean(records: &[&Record], of: impl Fn(&Record) -> Option<f64>) -> Option<f64> {
@@ -64,7 +65,44 @@ pub(super) fn markdown(records: &[&Record], policies: &[String]) -> String {
                 let runs: Vec<&Record> = records.iter().filter(here).copied().collect();
                 text += &line(policy, first, &runs, records, budget);
             }
+            text += &geometry(records, policies, scene, budget);
         }
+    }
+    text
+}
+
+/// The table of what was measured against the known surface; nothing where none is known.
+fn geometry(records: &[&Record], policies: &[String], scene: &str, budget: usize) -> String {
+    let here: Vec<&Record> =
+        records.iter().filter(|r| r.scene == *scene && r.budget == budget).copied().collect();
+    if here.iter().all(|r| r.geometry.is_none()) {
+        return String::new();
+    }
+    let mut text = String::from(
+        "\nGeometry, lengths as % of the diagonal of the scene:\n\n\
+         | policy | depth RMSE [%] | Chamfer [%] | F-score at 1 % [%] | floaters [% of rows] |\n\
+         |---|---|---|---|---|\n",
+    );
+    let columns: [(fn(&Geometry) -> f64, usize); 4] = [
+        (|g| g.depth.rmse, 3),
+        (|g| g.centres.chamfer, 3),
+        (|g| g.centres.f_score_one_percent, 1),
+        (|g| g.floaters.of_rows, 2),
+    ];
+    for policy in policies {
+        let runs: Vec<&Record> = here.iter().filter(|r| r.policy == *policy).copied().collect();
+        if runs.is_empty() {
+            continue;
+        }
+        let _ = write!(text, "| {policy}");
+        for (of, digits) in columns {
+            let percent = |r: &Record| {
+                let value = r.geometry.as_ref().map(of);
+                value.filter(|value| value.is_finite()).map(|value| 100.0 * value)
+            };
+            let _ = write!(text, " | {}", shown(mean(&runs, percent), digits));
+        }
+        text += " |\n";
     }
     text
 }
@@ -141,6 +179,7 @@ mod tests {
             cpu_seconds: Some(2.5),
             extra_forwards: 0,
             curve: Vec::new(),
+            geometry: None,
         }
     }
 
@@ -161,7 +200,34 @@ mod tests {
         assert!(text.contains("| c | not ranked"), "{text}");
         assert!(text.contains("| a | 31.00 | 0.3100 | 900 | 1,000 | – |"), "{text}");
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
+        assert!(!text.contains("Geometry"), "{text}");
         let said = summary(&all, &policies);
         assert!(said.contains("c               –       –     0  (2 more over"), "{said}");
+    }
+
+    #[test]
+    fn geometry_is_shown_where_it_is_known() {
+        let measured = |rmse: f64| -> Geometry {
+            let text = format!(
+                r#"{{"depth": {{"rmse": {rmse}, "abs_rel": null, "coverage": 1.0}}, "normal_error": 3.0,
+                "centres": {{"accuracy": 0.01, "accuracy_p95": 0.02, "completeness": 0.005,
+                "chamfer": 0.015, "f_score_half_percent": 0.5, "f_score_one_percent": 0.75}},
+                "floaters": {{"count": 9, "of_rows": 0.01, "of_weight": null}}, "thin": [],
+                "redundancy": {{"blended_per_pixel": 9.0, "below_one_percent": 0.25}}}}"#
+            );
+            serde_json::from_str(&text).expect("geometry")
+        };
+        let with =
+            |policy: &str, seed, geometry| Record { geometry, ..record(policy, seed, 30.0, 1000) };
+        let all = [
+            with("a", 0, Some(measured(0.02))),
+            with("a", 1, Some(measured(0.03))),
+            with("b", 0, Some(measured(0.5))),
+            with("b", 1, None),
+        ];
+        let all: Vec<&Record> = all.iter().collect();
+        let text = markdown(&all, &["a", "b"].map(String::from));
+        assert!(text.contains("| a | 2.500 | 1.500 | 75.0 | 1.00 |"), "{text}");
+        assert!(text.contains("| b | – | – | – | – |"), "{text}");
     }
 }

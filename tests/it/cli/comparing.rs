@@ -35,6 +35,7 @@ fn every_run_is_there_once_and_in_the_table() {
     for word in ["| vanilla |", "| diet |", "250 rows", "320 rows", " of 4 |"] {
         assert!(table.contains(word), "{word} is not in {table}");
     }
+    assert!(!table.contains("Chamfer") && all.iter().all(|r| r.get("geometry").is_none()));
     // Every picture that the table shows is there.
     let pictures: Vec<&str> =
         table.split("](").skip(1).filter_map(|rest| rest.split(')').next()).collect();

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use densify::dataset::{Dataset, LoadOptions};
 
-use super::{densify, files, scratch, text, train};
+use super::{densify, files, json, read, records, scratch, text, train};
 
 fn load(path: &Path) -> Dataset {
     Dataset::load(path, &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -56,7 +56,64 @@ fn built_in_scenes_are_trained_on_and_measured_by_name() {
     let said = train(Path::new("scene:spheres"), &run, 4, "--budget 6k").ok();
     assert!(said.stdout.contains("30 views"), "{}", said.stdout);
     let said = densify(&["eval", text(&run)]).ok();
-    assert!(said.stdout.contains("PSNR"), "{}", said.stdout);
+    assert!(said.stdout.contains("PSNR") && said.stdout.contains("Chamfer"), "{}", said.stdout);
+    assert!(json(&run.join("geometry.json"))["ours_4"]["depth"]["rmse"].is_f64());
+}
+
+/// `thin`, small, in a folder.
+fn wires(folder: &Path) {
+    let small = "--size 32 --train 6 --test 2 --points 300 --samples 1";
+    let mut arguments = vec!["scenegen", "--preset", "thin", "-o", text(folder)];
+    arguments.extend(small.split_whitespace());
+    densify(&arguments).ok();
+}
+
+#[test]
+fn written_scenes_are_measured_against_their_files() {
+    let (root, run) = scratch();
+    let folder = root.path().join("wires");
+    wires(&folder);
+    train(&folder, &run, 6, "--budget 400 --eval").ok();
+    let said = densify(&["eval", text(&run)]).ok().stdout;
+    for word in ["mean", "depth RMSE", "F-score", "floaters", "thin structures found, 1 px wide"] {
+        assert!(said.contains(word), "{word} is not in {said}");
+    }
+    let measured = json(&run.join("geometry.json"))["ours_6"].clone();
+    assert!(measured["centres"]["chamfer"].as_f64() > Some(0.0), "{measured}");
+    // A new run takes the place of the old one with all that was measured of it.
+    train(&folder, &run, 6, "--budget 400 --eval --overwrite").ok();
+    assert!(!run.join("geometry.json").exists());
+    // At half the size files are of no use; the mesh is.
+    train(&folder, &run, 6, "--budget 400 --eval --overwrite -r 2").ok();
+    densify(&["eval", text(&run), "--split", "train"]).ok();
+    let half = json(&run.join("geometry_train.json"))["ours_6"].clone();
+    assert!(half["depth"]["coverage"].as_f64() > Some(0.5), "{half}");
+    // What is damaged is named.
+    std::fs::write(folder.join("mesh.ply"), "ply\n").expect("write");
+    densify(&["eval", text(&run)]).refused("a damaged mesh", &["mesh.ply", "--overwrite"]);
+    // Without a known surface there is nothing to measure.
+    std::fs::remove_file(folder.join("scene.json")).expect("it is there");
+    std::fs::remove_file(run.join("geometry_train.json")).expect("it is there");
+    let said = densify(&["eval", text(&run)]).ok().stdout;
+    assert!(said.contains("PSNR") && !said.contains("Chamfer"), "{said}");
+    assert!(!run.join("geometry.json").exists() && !run.join("geometry_train.json").exists());
+}
+
+#[test]
+fn comparisons_have_columns_for_a_known_surface() {
+    let (root, output) = scratch();
+    let folder = root.path().join("wires");
+    wires(&folder);
+    let mut arguments = vec!["compare", text(&folder), "-o", text(&output), "--seeds", "1"];
+    arguments.extend(["--policies", "vanilla,diet", "--budget", "350", "--iterations", "8"]);
+    densify(&arguments).ok();
+    let table = String::from_utf8(read(&output.join("compare.md"))).expect("UTF-8");
+    for word in ["depth RMSE [%]", "Chamfer [%]", "F-score at 1 %", "floaters"] {
+        assert!(table.contains(word), "{word} is not in {table}");
+    }
+    for record in records(&output.join("compare.jsonl")) {
+        assert!(record["geometry"]["depth"]["rmse"].as_f64() > Some(0.0), "{record}");
+    }
 }
 
 #[test]

@@ -1,0 +1,190 @@
+//! Ground truth of a scene, to measure a trained one against: the surface, and what each view sees
+//! of it.
+//!
+//! It comes from a scene in memory, or from a folder that [`write`](crate::write) wrote. Files are
+//! untrusted: sizes are checked against the file's length before anything is allocated.
+
+mod exr;
+mod ply;
+
+use std::path::{Path, PathBuf};
+
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+use crate::camera::Camera;
+use crate::error::Error;
+use crate::mesh::{Material, Model};
+use crate::scene::Scene;
+use crate::surface::Surface;
+use crate::write::SCENE_FILE;
+
+/// Depths agree if they differ by less than this share: depth files hold f32.
+const SAME_DEPTH: f64 = 1e-5;
+/// Step into the surface before its thickness is measured, in diagonals.
+const STEP: f64 = 1e-7;
+
+/// The geometry that a scene was rendered from.
+pub struct GroundTruth {
+    kind: Kind,
+}
+
+enum Kind {
+    Scene(Box<Scene>),
+    Folder { root: PathBuf, surface: Surface, thin: Vec<bool> },
+}
+
+/// What a view sees of the surface.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sight {
+    /// Image width `[px]`.
+    pub width: u32,
+    /// Image height `[px]`.
+    pub height: u32,
+    /// As [`Frame::depth`](crate::Frame::depth) `[world units]`. Shape: `[height, width]`.
+    pub depth: Vec<f32>,
+    /// As [`Frame::normals`](crate::Frame::normals). Shape: `[height, width]`.
+    pub normals: Vec<[f32; 3]>,
+}
+
+impl GroundTruth {
+    /// The ground truth of a scene in memory.
+    #[must_use]
+    pub fn of_scene(scene: Scene) -> Self {
+        Self { kind: Kind::Scene(Box::new(scene)) }
+    }
+
+    /// The ground truth in a folder; `None` where the folder holds no scene of this program.
+    ///
+    /// # Errors
+    /// When there is one but its mesh cannot be read.
+    pub fn open(root: &Path) -> Result<Option<Self>, Error> {
+        let mesh = root.join("mesh.ply");
+        if !(root.join(SCENE_FILE).is_file() && mesh.is_file()) {
+            return Ok(None);
+        }
+        let (corners, thin) = ply::read(&mesh)?;
+        let mut model = Model { name: mesh.display().to_string(), ..Model::default() };
+        let material = model.material(Material::lambert("", [1.0; 3]));
+        model.triangles = (0..thin.len() as u32).map(|t| [0, 1, 2].map(|c| 3 * t + c)).collect();
+        model.triangle_materials = vec![material; thin.len()];
+        model.positions = corners;
+        let surface = Surface::new(&model)?;
+        Ok(Some(Self { kind: Kind::Folder { root: root.to_owned(), surface, thin } }))
+    }
+
+    /// The surface, in world coordinates.
+    #[must_use]
+    pub fn surface(&self) -> &Surface {
+        match &self.kind {
+            Kind::Scene(scene) => &scene.surface,
+            Kind::Folder { surface, .. } => surface,
+        }
+    }
+
+    /// What `camera` sees. `view` is the view's name as a dataset has it; in a folder it says which
+    /// depth and normal files to read. Where there are none of that name, or of another size than
+    /// the camera's, the mesh is traced: the same, but for surfaces with alpha below one half, which
+    /// the mesh does not know.
+    ///
+    /// # Errors
+    /// When a file is there but damaged.
+    pub fn sight(&self, view: &str, camera: &Camera) -> Result<Sight, Error> {
+        match &self.kind {
+            Kind::Scene(scene) => Ok(trace(camera, |ray| scene.first_solid(camera.centre, ray))),
+            Kind::Folder { root, surface, .. } => {
+                if let Some(stored) = stored(root, view, (camera.width, camera.height))? {
+                    return Ok(stored);
+                }
+                Ok(trace(camera, |ray| {
+                    let hit = surface.cast(camera.centre, ray, f64::INFINITY)?;
+                    Some((hit.t, if hit.front { hit.normal } else { -hit.normal }))
+                }))
+            }
+        }
+    }
+
+    /// Whether any part of it is a thin structure, such as a wire.
+    #[must_use]
+    pub fn has_thin(&self) -> bool {
+        match &self.kind {
+            Kind::Scene(scene) => scene.model.materials.iter().any(|material| material.thin),
+            Kind::Folder { thin, .. } => thin.contains(&true),
+        }
+    }
+
+    /// Thickness of the thin structure `[world units]` that the ray from `origin` along `direction`
+    /// meets first, at ray parameter `depth`: the shortest of the way through it against its normal
+    /// and of two ways across that through its middle; for a wire its diameter. `None` where what is met is not thin, or not there.
+    #[must_use]
+    pub fn thickness(&self, origin: DVec3, direction: DVec3, depth: f64) -> Option<f64> {
+        let surface = self.surface();
+        let hit = surface.cast(origin, direction, depth * (1.0 + SAME_DEPTH))?;
+        let is_thin = match &self.kind {
+            Kind::Scene(scene) => scene.is_thin(hit.triangle),
+            Kind::Folder { thin, .. } => thin[hit.triangle as usize],
+        };
+        if !is_thin || hit.t < depth * (1.0 - SAME_DEPTH) {
+            return None;
+        }
+        let inward = if hit.front { -hit.normal } else { hit.normal };
+        let step = STEP * surface.diagonal();
+        let other = surface.cast(hit.point + step * inward, inward, f64::INFINITY)?;
+        let through = other.t + step;
+        let middle = hit.point + 0.5 * through * inward;
+        let across = |axis: DVec3| {
+            let reach =
+                |way| surface.cast(middle, way, f64::INFINITY).map_or(f64::INFINITY, |h| h.t);
+            reach(axis) + reach(-axis)
+        };
+        let (u, v) = inward.any_orthonormal_pair();
+        Some(through.min(across(u)).min(across(v)))
+    }
+}
+
+impl std::fmt::Debug for GroundTruth {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("GroundTruth").field("surface", self.surface()).finish_non_exhaustive()
+    }
+}
+
+/// A sight by its rays through the pixels' centres.
+fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) -> Sight {
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let seen: Vec<(f32, [f32; 3])> = (0..width * height)
+        .into_par_iter()
+        .map(|i| {
+            let pixel = DVec2::new((i % width) as f64, (i / width) as f64) + 0.5;
+            let seen = first(camera.direction(pixel));
+            seen.map_or((0.0, [0.0; 3]), |(t, n)| (t as f32, n.as_vec3().to_array()))
+        })
+        .collect();
+    let (depth, normals) = seen.into_iter().unzip();
+    Sight { width: camera.width, height: camera.height, depth, normals }
+}
+
+/// The depth and normals stored for a view, if there are files of its name and size.
+fn stored(root: &Path, view: &str, size: (u32, u32)) -> Result<Option<Sight>, Error> {
+    // Datasets name views by their image's path, with or without the images' folder.
+    let name = view.trim_start_matches("./");
+    let name = Path::new(name.strip_prefix("images/").unwrap_or(name)).with_extension("exr");
+    if !name.components().all(|part| matches!(part, std::path::Component::Normal(_))) {
+        return Ok(None);
+    }
+    let (depth_file, normal_file) =
+        (root.join("depth").join(&name), root.join("normals").join(&name));
+    if !(depth_file.is_file() && normal_file.is_file()) {
+        return Ok(None);
+    }
+    let Some([depth]) = exr::read(&depth_file, ["Z"], size)? else {
+        return Ok(None);
+    };
+    let Some([x, y, z]) = exr::read(&normal_file, ["X", "Y", "Z"], size)? else {
+        return Ok(None);
+    };
+    let normals = x.into_iter().zip(y).zip(z).map(|((x, y), z)| [x, y, z]).collect();
+    Ok(Some(Sight { width: size.0, height: size.1, depth, normals }))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,263 @@
+//! How well Gaussians sit on the surface that the images were made from, where that is known.
+//!
+//! The model and the cameras are in the dataset's normalised coordinates; everything is measured in
+//! the mesh's own, world coordinates, in `f64`. Lengths are reported as fractions of the diagonal
+//! of the mesh's bounding box. The weight of a row, w, is the sum of its blend weights α·T over
+//! all pixels of all training views. Samples are drawn by a fixed seed: the same model has the same
+//! numbers.
+
+mod centres;
+mod pixels;
+mod rows;
+mod seen;
+
+use densify_policies::policy::{AuxColumn, AuxRequest, Needs, Signal, SignalSet};
+use densify_scenegen::{GroundTruth, Sight};
+use serde::{Deserialize, Serialize};
+
+use crate::backend::{Backend, BackendError};
+use crate::camera::Camera;
+use crate::dataset::normalise::Normalisation;
+use crate::views::{ViewError, ViewSource};
+use pixels::Pixels;
+use rows::Rows;
+use seen::Seen;
+
+/// The numbers. Those of what is not there (no centre, no pixel, no wire) are NaN, or `null` in
+/// JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Geometry {
+    /// Depth on the views measured.
+    pub depth: DepthErrors,
+    /// Median angle between the surface's normal and the shortest axis of the Gaussian that stands
+    /// for the pixel `[degrees]`, in 0..=90. That is, of the eight Gaussians of opacity above 0.1
+    /// whose centres are nearest to the surface point, the one that is densest there: a stand-in
+    /// for the one with the largest blend weight. Over pixels as in [`DepthErrors`], of which at
+    /// most some 2,000 per view are taken, on a regular grid.
+    #[serde(with = "nullable")]
+    pub normal_error: f64,
+    /// Distance from centres to surface and back.
+    pub centres: CentreErrors,
+    /// Rows in empty space.
+    pub floaters: Floaters,
+    /// Recall of thin structures, by width, thinnest first; empty where the scene has none.
+    pub thin: Vec<ThinRecall>,
+    /// How much is spent on little.
+    pub redundancy: Redundancy,
+}
+
+/// Rendered depth, Σ α·T·z / Σ α·T, against the first surface's. Over the pixels that show a surface
+/// and where the rendered alpha is above 0.5.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DepthErrors {
+    /// Root mean square error `[diagonals]`.
+    #[serde(with = "nullable")]
+    pub rmse: f64,
+    /// Mean of |error| / depth.
+    #[serde(with = "nullable")]
+    pub abs_rel: f64,
+    /// Share of the pixels that show a surface where the rendered alpha is above 0.5.
+    #[serde(with = "nullable")]
+    pub coverage: f64,
+}
+
+/// Centres as points on the surface. Big Gaussians legitimately have their centres off it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CentreErrors {
+    /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
+    #[serde(with = "nullable")]
+    pub accuracy: f64,
+    /// The distance that 95 % of all weight w do not exceed `[diagonals]`.
+    #[serde(with = "nullable")]
+    pub accuracy_p95: f64,
+    /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`. Over
+    /// samples of equal density, 20,000 on the whole mesh, of which those count that at least two
+    /// training views see.
+    #[serde(with = "nullable")]
+    pub completeness: f64,
+    /// Accuracy + completeness `[diagonals]`.
+    #[serde(with = "nullable")]
+    pub chamfer: f64,
+    /// Harmonic mean of precision, the share of weight w within 0.5 % of the diagonal of the mesh,
+    /// and recall, the share of samples within that of a centre; in 0..=1.
+    #[serde(with = "nullable")]
+    pub f_score_half_percent: f64,
+    /// The same at 1 %.
+    #[serde(with = "nullable")]
+    pub f_score_one_percent: f64,
+}
+
+/// Rows of opacity above 0.05, farther from the mesh than 1 % of the diagonal and than twice their
+/// largest standard deviation, at a place that at least two training views see through: what they
+/// show there is farther away, or nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Floaters {
+    /// Their number.
+    pub count: usize,
+    /// Their share of the rows.
+    #[serde(with = "nullable")]
+    pub of_rows: f64,
+    /// Their share of the weight w.
+    #[serde(with = "nullable")]
+    pub of_weight: f64,
+}
+
+/// Pixels that show a thin structure of about a width. Found are those where alpha is above 0.5,
+/// depth is off by less than the structure's thickness and 1 % of the depth, and colour by less than
+/// 0.1 in the mean over channels.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ThinRecall {
+    /// Width in the image, to the nearest power of two `[px]`.
+    pub width: f64,
+    /// Pixels that show one.
+    pub pixels: usize,
+    /// Share of these that are found.
+    pub recall: f64,
+}
+
+/// What rows do for the training views.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Redundancy {
+    /// Mean number of rows blended per pixel.
+    #[serde(with = "nullable")]
+    pub blended_per_pixel: f64,
+    /// Share of rows whose largest blend weight in any pixel of any view is below 0.01.
+    #[serde(with = "nullable")]
+    pub below_one_percent: f64,
+}
+
+/// The scene that a model is measured in.
+#[derive(Debug, Clone, Copy)]
+pub struct Ground<'a> {
+    /// The surface.
+    pub truth: &'a GroundTruth,
+    /// From the surface's coordinates to the model's and the cameras'.
+    pub normalisation: &'a Normalisation,
+    /// Background colour of the renders, sRGB-encoded in `[0, 1]`.
+    pub background: [f32; 3],
+    /// Spherical-harmonic degree evaluated, <= the model's.
+    pub sh_degree: u8,
+}
+
+/// Why geometry cannot be measured.
+#[derive(Debug, thiserror::Error)]
+pub enum GeometryError {
+    /// A ground-truth file is damaged.
+    #[error("view `{view}`: {source}")]
+    Truth {
+        /// The view's name.
+        view: String,
+        /// What is wrong.
+        source: densify_scenegen::Error,
+    },
+    /// A view's pixels could not be read.
+    #[error("view `{view}`: {source}")]
+    View {
+        /// The view's name.
+        view: String,
+        /// What the source of the views says.
+        source: ViewError,
+    },
+    /// A view could not be rendered.
+    #[error("view `{view}`: {source}")]
+    Backend {
+        /// The view's name.
+        view: String,
+        /// What the backend says.
+        source: BackendError,
+    },
+    /// There are more rows than can be searched.
+    #[error("{0} rows are too many to search for neighbours")]
+    TooManyRows(usize),
+}
+
+/// What a backend must be made for, so that [`measure`] can use it.
+#[must_use]
+pub fn needs() -> Needs {
+    let columns = vec![AuxColumn::WeightSum, AuxColumn::PixelCount];
+    Needs {
+        signals: SignalSet::default().with(Signal::FreshWeightMax),
+        fresh_views: 1,
+        aux: Some(AuxRequest { columns, ..AuxRequest::default() }),
+        ..Needs::default()
+    }
+}
+
+/// Measures the model in `backend`, which was made for [`needs`]: weights, visibility and emptiness
+/// by the views trained on, depth, normals and thin structures by `views`.
+///
+/// # Errors
+/// [`GeometryError`] at the first view that cannot be measured.
+pub fn measure(
+    backend: &mut dyn Backend,
+    ground: &Ground<'_>,
+    train: &impl ViewSource,
+    views: &impl ViewSource,
+) -> Result<Geometry, GeometryError> {
+    let rows = Rows::new(&backend.download(), ground);
+    let seen = Seen::by(backend, ground, &rows, train)?;
+    let mut pixels = Pixels::new(&rows, ground)?;
+    for view in 0..views.count() {
+        pixels.add(backend, views, view)?;
+    }
+    Ok(Geometry {
+        depth: pixels.depth(),
+        normal_error: pixels.normal_error(),
+        centres: centres::errors(&rows, &seen, ground)?,
+        floaters: seen.floaters(&rows, ground.diagonal()),
+        thin: pixels.thin(),
+        redundancy: seen.redundancy(),
+    })
+}
+
+impl Ground<'_> {
+    /// Diagonal of the mesh's bounding box `[world units]`.
+    fn diagonal(&self) -> f64 {
+        self.truth.surface().diagonal()
+    }
+
+    /// A view's camera in world coordinates, for projecting and for casting rays.
+    fn cameras(&self, scene: &Camera) -> (Camera, densify_scenegen::Camera) {
+        let world = self.normalisation.denormalise_camera(scene);
+        let caster = densify_scenegen::Camera {
+            width: world.width,
+            height: world.height,
+            fx: world.fx,
+            fy: world.fy,
+            cx: world.cx,
+            cy: world.cy,
+            world_from_camera: world.rotation.transpose(),
+            centre: world.centre(),
+        };
+        (world, caster)
+    }
+
+    fn sight(&self, name: &str, caster: &densify_scenegen::Camera) -> Result<Sight, GeometryError> {
+        let sight = self.truth.sight(name, caster);
+        sight.map_err(|source| GeometryError::Truth { view: name.to_owned(), source })
+    }
+}
+
+/// `sum / count`; NaN where there is nothing.
+fn share(sum: f64, count: f64) -> f64 {
+    // An empty sum is −0.
+    if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
+}
+
+/// NaN as `null`, which JSON has for it, and back.
+mod nullable {
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde's signature")]
+    pub(super) fn serialize<S: Serializer>(value: &f64, to: S) -> Result<S::Ok, S::Error> {
+        if value.is_finite() { to.serialize_f64(*value) } else { to.serialize_none() }
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+        Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::NAN))
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
+mod tests;

@@ -1,0 +1,72 @@
+//! Centres against the mesh, and the mesh against the centres.
+
+use rayon::prelude::*;
+
+use super::rows::{Finder, Rows};
+use super::seen::Seen;
+use super::{CentreErrors, GeometryError, Ground, share};
+
+pub(super) fn errors(
+    rows: &Rows,
+    seen: &Seen,
+    ground: &Ground<'_>,
+) -> Result<CentreErrors, GeometryError> {
+    let diagonal = ground.diagonal();
+    let finder = Finder::new(rows)?;
+    let back: Vec<f64> =
+        seen.samples.par_iter().map(|&sample| finder.distance(sample) / diagonal).collect();
+    let forth: Vec<(f64, f64)> = rows
+        .distances
+        .iter()
+        .zip(&seen.weights)
+        .filter(|&(_, &weight)| weight > 0.0)
+        .map(|(&distance, &weight)| (distance / diagonal, weight))
+        .collect();
+    let total: f64 = forth.iter().map(|&(_, weight)| weight).sum();
+    let accuracy = share(forth.iter().map(|(distance, weight)| distance * weight).sum(), total);
+    let completeness = share(back.iter().sum(), back.len() as f64);
+    let f_score = |limit: f64| {
+        let within = forth.iter().filter(|&&(distance, _)| distance <= limit);
+        let precision = share(within.map(|&(_, weight)| weight).sum(), total);
+        let reached = back.iter().filter(|&&distance| distance <= limit).count();
+        let recall = share(reached as f64, back.len() as f64);
+        let sum = precision + recall;
+        if sum > 0.0 { 2.0 * precision * recall / sum } else { sum }
+    };
+    Ok(CentreErrors {
+        accuracy,
+        accuracy_p95: percentile(forth.clone(), 0.95),
+        completeness,
+        chamfer: accuracy + completeness,
+        f_score_half_percent: f_score(0.005),
+        f_score_one_percent: f_score(0.01),
+    })
+}
+
+/// The smallest value that a `share` of all weight does not exceed; NaN without weight.
+fn percentile(mut values: Vec<(f64, f64)>, share: f64) -> f64 {
+    values.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let goal = share * values.iter().map(|&(_, weight)| weight).sum::<f64>();
+    let mut sum = 0.0;
+    let reached = values.iter().find(|&&(_, weight)| {
+        sum += weight;
+        sum >= goal
+    });
+    // Rounding of the sum may leave the last one short of the goal.
+    reached.or(values.last()).map_or(f64::NAN, |&(value, _)| value)
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_count_by_weight() {
+        let values = vec![(3.0, 1.0), (1.0, 8.0), (2.0, 1.0)];
+        assert_eq!(percentile(values.clone(), 0.5), 1.0);
+        assert_eq!(percentile(values.clone(), 0.9), 2.0);
+        assert_eq!(percentile(values, 0.95), 3.0);
+        assert!(percentile(Vec::new(), 0.95).is_nan());
+    }
+}
