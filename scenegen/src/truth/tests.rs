@@ -1,3 +1,5 @@
+//! Ground truth read back, and damaged files.
+
 use std::fs;
 
 use super::*;

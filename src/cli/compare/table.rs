@@ -71,6 +71,9 @@ pub(super) fn markdown(records: &[&Record], policies: &[String]) -> String {
     text
 }
 
+/// A number of those measured against the known surface.
+type Measure = fn(&Geometry) -> f64;
+
 /// The table of what was measured against the known surface; nothing where none is known.
 fn geometry(records: &[&Record], policies: &[String], scene: &str, budget: usize) -> String {
     let here: Vec<&Record> =
@@ -83,7 +86,7 @@ fn geometry(records: &[&Record], policies: &[String], scene: &str, budget: usize
          | policy | depth RMSE [%] | Chamfer [%] | F-score at 1 % [%] | floaters [% of rows] |\n\
          |---|---|---|---|---|\n",
     );
-    let columns: [(fn(&Geometry) -> f64, usize); 4] = [
+    let columns: [(Measure, usize); 4] = [
         (|g| g.depth.rmse, 3),
         (|g| g.centres.chamfer, 3),
         (|g| g.centres.f_score_one_percent, 1),

@@ -1,3 +1,5 @@
+//! Geometric measures against cases worked out by hand.
+
 use std::path::Path;
 use std::sync::Arc;
 
