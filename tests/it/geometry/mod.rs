@@ -65,6 +65,7 @@ impl Known {
     }
 
     /// Trains and measures. The budget is held at every step.
+    #[expect(clippy::print_stderr, reason = "shown where a test fails")]
     pub(crate) fn train(&self, run: Run<'_>) -> Outcome {
         let Self { dataset, truth, .. } = self;
         let entry = find(run.policy).expect("a policy");
