@@ -31,7 +31,7 @@ pub struct GroundTruth {
 
 enum Kind {
     Scene(Box<Scene>),
-    Folder { root: PathBuf, surface: Surface, thin: Vec<bool> },
+    Folder { root: PathBuf, surface: Box<Surface>, thin: Vec<bool> },
 }
 
 /// What a view sees of the surface.
@@ -69,7 +69,7 @@ impl GroundTruth {
         model.triangles = (0..thin.len() as u32).map(|t| [0, 1, 2].map(|c| 3 * t + c)).collect();
         model.triangle_materials = vec![material; thin.len()];
         model.positions = corners;
-        let surface = Surface::new(&model)?;
+        let surface = Box::new(Surface::new(&model)?);
         Ok(Some(Self { kind: Kind::Folder { root: root.to_owned(), surface, thin } }))
     }
 

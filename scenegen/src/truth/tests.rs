@@ -1,3 +1,5 @@
+//! Files and scenes say the same; damaged files are refused.
+
 use std::fs;
 
 use super::*;

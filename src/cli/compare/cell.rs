@@ -120,7 +120,7 @@ impl Cell {
         if has_geometry(&self.scene) {
             // In a process of its own too: the memory of the run stays the run's.
             let mut call = Command::new(&program);
-            call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene).arg("--quiet");
+            call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene);
             call.args(self.threads());
             self.wait_for(&mut call)?;
         }

@@ -83,7 +83,9 @@ fn geometry(records: &[&Record], policies: &[String], scene: &str, budget: usize
          | policy | depth RMSE [%] | Chamfer [%] | F-score at 1 % [%] | floaters [% of rows] |\n\
          |---|---|---|---|---|\n",
     );
-    let columns: [(fn(&Geometry) -> f64, usize); 4] = [
+    /// A measurement, and the digits it is shown with.
+    type Column = (fn(&Geometry) -> f64, usize);
+    let columns: [Column; 4] = [
         (|g| g.depth.rmse, 3),
         (|g| g.centres.chamfer, 3),
         (|g| g.centres.f_score_one_percent, 1),

@@ -148,9 +148,7 @@ fn a_constant_offset_is_an_error_but_no_structure() {
             let [.., z] = candidate.position;
             assert!((z - 2.0).abs() < 0.01, "{mode:?}: a candidate at depth {z}");
         }
-        let share = found.iter().filter(within).count() as f64 / found.len() as f64;
-        eprintln!("{mode:?}: {share}");
-        share
+        found.iter().filter(within).count() as f64 / found.len() as f64
     };
     let [gradient, l1, l1_dssim] = MODES.map(share);
     assert!(l1 > 0.25, "l1: {l1}");
