@@ -90,7 +90,8 @@ fn cuboid(low: DVec3, high: DVec3) -> Vec<[DVec3; 3]> {
 /// A ground truth of these triangles, those from `thin` on thin ones.
 fn truth(triangles: &[[DVec3; 3]], thin: usize) -> GroundTruth {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("scene.json"), "{}").unwrap();
+    std::fs::write(folder.path().join("scene.json"), r#"{"generator": "densify-scenegen"}"#)
+        .unwrap();
     write_mesh(&folder.path().join("mesh.ply"), triangles, thin);
     GroundTruth::open(folder.path()).unwrap().unwrap()
 }
