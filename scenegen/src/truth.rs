@@ -7,10 +7,12 @@
 mod exr;
 mod ply;
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
+use serde_json::Value;
 
 use crate::camera::Camera;
 use crate::error::Error;
@@ -19,6 +21,8 @@ use crate::scene::Scene;
 use crate::surface::Surface;
 use crate::write::SCENE_FILE;
 
+/// Longest `scene.json` that is read `[bytes]`.
+const LONGEST_RECORD: u64 = 1 << 24;
 /// Depths agree if they differ by less than this share: depth files hold f32.
 const SAME_DEPTH: f64 = 1e-5;
 /// Step into the surface before its thickness is measured, in diagonals.
@@ -54,13 +58,23 @@ impl GroundTruth {
         Self { kind: Kind::Scene(Box::new(scene)) }
     }
 
+    /// Whether a folder holds a scene that this program wrote, by its `scene.json`.
+    #[must_use]
+    pub fn is_in(root: &Path) -> bool {
+        let record = root.join(SCENE_FILE);
+        let is_short = fs::metadata(&record).is_ok_and(|data| data.len() <= LONGEST_RECORD);
+        let text = if is_short { fs::read(&record).unwrap_or_default() } else { Vec::new() };
+        let record: Value = serde_json::from_slice(&text).unwrap_or_default();
+        record["generator"].as_str().is_some_and(|by| by.starts_with("densify-scenegen"))
+    }
+
     /// The ground truth in a folder; `None` where the folder holds no scene of this program.
     ///
     /// # Errors
     /// When there is one but its mesh cannot be read.
     pub fn open(root: &Path) -> Result<Option<Self>, Error> {
         let mesh = root.join("mesh.ply");
-        if !(root.join(SCENE_FILE).is_file() && mesh.is_file()) {
+        if !Self::is_in(root) {
             return Ok(None);
         }
         let (corners, thin) = ply::read(&mesh)?;

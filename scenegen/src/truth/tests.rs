@@ -1,4 +1,4 @@
-//! Ground truth read back, and damaged files.
+//! Files and scenes say the same; damaged files are refused.
 
 use std::fs;
 
@@ -54,6 +54,12 @@ fn folders_say_what_the_scene_says() {
         &here.sight("", &half).expect("traced"),
     );
     assert!(GroundTruth::open(root.path()).expect("no scene").is_none());
+    // Another program's files of these names are not ours to read.
+    fs::write(root.path().join("mesh.ply"), "ply").expect("write");
+    for record in ["{\"generator\": \"other\"}", "[1, 2]", "{"] {
+        fs::write(root.path().join("scene.json"), record).expect("write");
+        assert!(GroundTruth::open(root.path()).expect("no scene").is_none(), "{record}");
+    }
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use densify_scenegen::GroundTruth;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -120,7 +121,7 @@ impl Cell {
         if has_geometry(&self.scene) {
             // In a process of its own too: the memory of the run stays the run's.
             let mut call = Command::new(&program);
-            call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene).arg("--quiet");
+            call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene);
             call.args(self.threads());
             self.wait_for(&mut call)?;
         }
@@ -202,8 +203,7 @@ impl Cell {
 
 /// Whether the surface of a scene is known.
 fn has_geometry(scene: &Path) -> bool {
-    let is_generated = || ["scene.json", "mesh.ply"].iter().all(|name| scene.join(name).is_file());
-    builtin::name(scene).is_some() || is_generated()
+    builtin::name(scene).is_some() || GroundTruth::is_in(scene)
 }
 
 /// The records in `compare.jsonl`.

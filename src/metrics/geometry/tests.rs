@@ -1,4 +1,4 @@
-//! Geometric measures against cases worked out by hand.
+//! Every number against a case that is computed by hand: rows on, before and behind a square.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -90,7 +90,8 @@ fn cuboid(low: DVec3, high: DVec3) -> Vec<[DVec3; 3]> {
 /// A ground truth of these triangles, those from `thin` on thin ones.
 fn truth(triangles: &[[DVec3; 3]], thin: usize) -> GroundTruth {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("scene.json"), "{}").unwrap();
+    std::fs::write(folder.path().join("scene.json"), r#"{"generator": "densify-scenegen"}"#)
+        .unwrap();
     write_mesh(&folder.path().join("mesh.ply"), triangles, thin);
     GroundTruth::open(folder.path()).unwrap().unwrap()
 }
@@ -183,6 +184,24 @@ fn an_offset_is_that_offset() {
     assert_eq!((g.floaters.count, g.floaters.of_rows), (1600, 1.0));
     close(g.floaters.of_weight, 1.0, 1e-12);
     close(g.depth.rmse, 0.1 / DIAGONAL, 1e-6);
+}
+
+#[test]
+fn what_no_view_sees_does_not_count() {
+    // Rows behind the carpet weigh next to nothing.
+    let (mut model, hidden) = (carpet(0.0), carpet(0.5));
+    for row in 0..hidden.len() {
+        let place = DVec3::from(hidden.means[row].map(f64::from));
+        push(&mut model, place, DVec3::new(0.03, 0.03, 0.001), 0.95);
+    }
+    let accuracy = measured(&truth(&square(), 2), &model).centres.accuracy;
+    assert!(accuracy > 0.0 && accuracy < 0.05 * 0.5 / DIAGONAL, "{accuracy}");
+    // Nor does the mesh behind the mesh need any: both cameras' views of it are blocked.
+    let mut triangles = square();
+    triangles.extend(square().into_iter().map(|t| t.map(|p| p + DVec3::Z)));
+    let g = measured(&truth(&triangles, 4), &carpet(0.0));
+    let mean = 0.05 * (2f64.sqrt() + 1f64.asinh()) / 6.0 / 3.0;
+    close(g.centres.completeness, mean, 0.02 * mean);
 }
 
 #[test]

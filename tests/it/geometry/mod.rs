@@ -65,7 +65,10 @@ impl Known {
     }
 
     /// Trains and measures. The budget is held at every step.
-    #[expect(clippy::print_stderr, reason = "shown where a test fails")]
+    #[expect(
+        clippy::print_stderr,
+        reason = "the numbers, where a test fails or is asked to show them"
+    )]
     pub(crate) fn train(&self, run: Run<'_>) -> Outcome {
         let Self { dataset, truth, .. } = self;
         let entry = find(run.policy).expect("a policy");
@@ -124,7 +127,6 @@ impl Known {
             rows: model.len(),
             peak: trainer.peak_rows(),
         };
-        // Shown where a test fails.
         eprintln!("{:8} {:8} seed {}: {outcome}", self.name, run.policy, run.seed);
         outcome
     }
