@@ -103,10 +103,10 @@ fn may_be_written(target: &Path, overwrite: bool) -> Result<bool, Error> {
     }
 }
 
-/// Checks that [`write`] may use a folder, before anything is rendered.
+/// Checks that [`write()`] may use a folder, before anything is rendered.
 ///
 /// # Errors
-/// As [`write`].
+/// As [`write()`].
 pub fn check_target(target: &Path, overwrite: bool) -> Result<(), Error> {
     may_be_written(target, overwrite).map(|_| ())
 }
