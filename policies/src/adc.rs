@@ -4,7 +4,11 @@
 //! Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance Field Rendering*, 2023, section 5.2;
 //! constants of its public code.
 
-use crate::plan::{Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
+use std::ops::Bound::Excluded;
+
+use crate::parameters::in_range;
+use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
+use crate::policy::{PolicyError, SceneInfo};
 use crate::sample::top_k;
 
 /// Steps at which something happens: `from` < step < `until`, multiples of `every` (0: never).
@@ -23,6 +27,49 @@ impl Window {
     #[must_use]
     pub fn is_due(&self, step: u32) -> bool {
         self.every > 0 && self.from < step && step < self.until && step.is_multiple_of(self.every)
+    }
+}
+
+/// The original's opacity resets: regular ones, and one more for scenes on a white background.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OpacityResets {
+    regular: Window,
+    /// The extra one, if there is any `[step]`.
+    white: Option<u32>,
+    /// What no opacity is above afterwards, in (0, 1).
+    most: f32,
+}
+
+impl OpacityResets {
+    /// Resets to at most `opacity` at the multiples of `every` before `until`, and at `white_at` if
+    /// the scene's background is white (all in steps; 0: never).
+    ///
+    /// # Errors
+    /// When `reset_opacity` is not in (0, 1), as the f32 that the plan will check.
+    pub fn new(
+        (every, until, white_at): (u32, u32, u32),
+        opacity: f64,
+        scene: &SceneInfo,
+    ) -> Result<Self, PolicyError> {
+        let most = opacity as f32;
+        in_range("reset_opacity", f64::from(most), (Excluded(0.0), Excluded(1.0)))?;
+        let white = (scene.white_background && white_at < until).then_some(white_at);
+        Ok(Self { regular: Window { from: 0, until, every }, white, most })
+    }
+
+    /// Whether there is a reset at `step` (1-based).
+    #[must_use]
+    pub fn is_due(&self, step: u32) -> bool {
+        step > 0 && (self.regular.is_due(step) || self.white == Some(step))
+    }
+
+    /// Resets where it is due.
+    pub fn plan(&self, step: u32, plan: &mut EditPlan) {
+        if self.is_due(step) {
+            plan.cause("reset");
+            // In range since `new`.
+            let _ = plan.clamp_opacity(self.most);
+        }
     }
 }
 

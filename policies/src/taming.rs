@@ -83,7 +83,7 @@
 use std::ops::Bound::{Excluded, Unbounded};
 
 use crate::adc::{
-    Mortality, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
+    Mortality, OpacityResets, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
 };
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
@@ -114,9 +114,7 @@ crate::register_policy!(
 pub struct Taming {
     params: TamingParams,
     grow: Window,
-    reset: Window,
-    /// The extra reset, if there is one `[step]`.
-    white_reset: Option<u32>,
+    resets: OpacityResets,
     score: Score,
 }
 
@@ -144,18 +142,14 @@ impl ConfiguredPolicy for Taming {
         in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
         in_range("prune_share", params.prune_share, 0.0..=1.0)?;
-        // As the f32 that the plan will check.
-        let reset_opacity = f64::from(params.reset_opacity as f32);
-        in_range("reset_opacity", reset_opacity, (Excluded(0.0), Excluded(1.0)))?;
+        let resets = (params.reset_every, params.grow_until, params.white_reset_at);
+        let resets = OpacityResets::new(resets, params.reset_opacity, scene)?;
         in_range("sh_every", params.sh_every.into(), 1.0..=1000.0)?;
         in_range("sh_rest", params.sh_rest, (Excluded(0.0), Unbounded))?;
         let TamingParams { grow_from: from, grow_until: until, .. } = params;
-        let white_reset = (scene.white_background && params.white_reset_at < until)
-            .then_some(params.white_reset_at);
         Ok(Self {
             grow: Window { from, until, every: params.grow_every },
-            reset: Window { from: 0, until, every: params.reset_every },
-            white_reset,
+            resets,
             score: Score::default(),
             params,
         })
@@ -191,7 +185,7 @@ impl DensityPolicy for Taming {
     }
 
     fn is_due(&self, step: u32) -> bool {
-        self.grow.is_due(step) || self.resets_at(step)
+        self.grow.is_due(step) || self.resets.is_due(step)
     }
 
     fn cadence(&self, _step: u32) -> Cadence {
@@ -221,11 +215,7 @@ impl DensityPolicy for Taming {
             self.densify(now, rng, plan)?;
             plan.reset(Reset::Signals);
         }
-        if self.resets_at(now.step) {
-            plan.cause("reset");
-            // In range since `new`.
-            let _ = plan.clamp_opacity(self.params.reset_opacity as f32);
-        }
+        self.resets.plan(now.step, plan);
         Ok(())
     }
 
@@ -239,10 +229,6 @@ impl DensityPolicy for Taming {
 }
 
 impl Taming {
-    fn resets_at(&self, step: u32) -> bool {
-        step > 0 && (self.reset.is_due(step) || self.white_reset == Some(step))
-    }
-
     /// B, the rows at the end of the curve.
     fn end(&self, scene: &SceneInfo, budget: usize) -> usize {
         match self.params.multiplier {

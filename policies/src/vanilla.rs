@@ -55,7 +55,7 @@ use std::ops::Bound::{Excluded, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::adc::{
-    Mortality, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
+    Mortality, OpacityResets, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
 };
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
@@ -120,9 +120,7 @@ impl Default for VanillaParams {
 pub struct Vanilla {
     params: VanillaParams,
     grow: Window,
-    reset: Window,
-    /// The extra reset, if there is one `[step]`.
-    white_reset: Option<u32>,
+    resets: OpacityResets,
 }
 
 impl ConfiguredPolicy for Vanilla {
@@ -143,18 +141,10 @@ impl ConfiguredPolicy for Vanilla {
         in_range("split_factor", params.split_factor, 1.0..=100.0)?;
         in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
-        // As the f32 that the plan will check.
-        let reset_opacity = f64::from(params.reset_opacity as f32);
-        in_range("reset_opacity", reset_opacity, (Excluded(0.0), Excluded(1.0)))?;
+        let resets = (params.reset_every, params.grow_until, params.white_reset_at);
+        let resets = OpacityResets::new(resets, params.reset_opacity, scene)?;
         let VanillaParams { grow_from: from, grow_until: until, .. } = params;
-        let white_reset = (scene.white_background && params.white_reset_at < until)
-            .then_some(params.white_reset_at);
-        Ok(Self {
-            grow: Window { from, until, every: params.grow_every },
-            reset: Window { from: 0, until, every: params.reset_every },
-            white_reset,
-            params,
-        })
+        Ok(Self { grow: Window { from, until, every: params.grow_every }, resets, params })
     }
 }
 
@@ -170,7 +160,7 @@ impl DensityPolicy for Vanilla {
     }
 
     fn is_due(&self, step: u32) -> bool {
-        self.grow.is_due(step) || self.resets_at(step)
+        self.grow.is_due(step) || self.resets.is_due(step)
     }
 
     fn plan(
@@ -184,11 +174,7 @@ impl DensityPolicy for Vanilla {
             self.densify(now, plan)?;
             plan.reset(Reset::Signals);
         }
-        if self.resets_at(now.step) {
-            plan.cause("reset");
-            // In range since `new`.
-            let _ = plan.clamp_opacity(self.params.reset_opacity as f32);
-        }
+        self.resets.plan(now.step, plan);
         Ok(())
     }
 
@@ -202,10 +188,6 @@ impl DensityPolicy for Vanilla {
 }
 
 impl Vanilla {
-    fn resets_at(&self, step: u32) -> bool {
-        step > 0 && (self.reset.is_due(step) || self.white_reset == Some(step))
-    }
-
     /// Growth, then pruning. In the original, too, rows are pruned as they are after growth: a huge
     /// row that has been split is judged by its children's size.
     fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> Result<(), PolicyError> {
