@@ -9,7 +9,7 @@ use std::path::Path;
 use densify_policies::policy::Needs;
 use image::{ImageFormat, Rgb, RgbImage, imageops};
 
-use super::{Picture, Record, distinct, run_folder};
+use super::{Picture, Record, budgets_of, distinct, run_folder};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
@@ -44,7 +44,7 @@ pub(super) fn draw(
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
     for scene in distinct(records, |r| &r.scene) {
-        for budget in distinct(records, |r| r.budget) {
+        for budget in budgets_of(records, scene) {
             let here = records.iter().filter(|r| r.scene == *scene && r.budget == budget);
             let here: Vec<&Record> = here.copied().collect();
             let Some(seed) = here.iter().map(|r| r.seed).min() else { continue };

@@ -7,6 +7,7 @@ mod plots;
 mod table;
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -40,9 +41,10 @@ pub(super) struct CompareArgs {
     /// Policies, separated by commas; the others are compared with the first
     #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
     policies: Vec<String>,
-    /// Budgets in Gaussians, separated by commas
-    #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = number::rows)]
-    budget: Vec<usize>,
+    /// Budgets in Gaussians, separated by commas; SCENE=ROWS for one scene alone, by its folder's
+    /// name, which then takes part with these only
+    #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = budget)]
+    budget: Vec<Budget>,
     /// Runs of each kind, with seeds 0, 1, …
     #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     seeds: u32,
@@ -57,11 +59,37 @@ pub(super) struct CompareArgs {
     train: Vec<String>,
 }
 
+/// A budget that is asked for.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Budget {
+    /// The label of the only scene that it is for.
+    scene: Option<String>,
+    rows: usize,
+}
+
+impl fmt::Display for Budget {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.scene {
+            Some(scene) => write!(f, "{scene}={}", self.rows),
+            None => write!(f, "{}", self.rows),
+        }
+    }
+}
+
+fn budget(text: &str) -> Result<Budget, String> {
+    let (scene, rows) = match text.rsplit_once('=') {
+        Some((scene, rows)) => (Some(scene.to_owned()), rows),
+        None => (None, text),
+    };
+    Ok(Budget { scene, rows: number::rows(rows)? })
+}
+
 const EXAMPLES: &str = "\
 Examples:
   densify compare data/garden --policies vanilla,diet --budget 200k
   densify compare data/room data/cup --policies diet,taming,mcmc --budget 15k,30k,60k --seeds 5
   densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2
+  densify compare data/room data/cup --policies vanilla,diet --budget room=28k,30k
   densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
 
 /// Options of `densify train` that are the comparison's to set.
@@ -131,10 +159,11 @@ fn cells(args: &CompareArgs) -> Result<Vec<Cell>, Failure> {
         find(name)?;
     }
     let labels = labels(&args.scenes)?;
+    let budgets = budgets(&args.budget, &labels)?;
     let mut cells = Vec::new();
     for seed in 0..args.seeds {
-        for (scene, label) in args.scenes.iter().zip(&labels) {
-            for &budget in &args.budget {
+        for ((scene, label), budgets) in args.scenes.iter().zip(&labels).zip(&budgets) {
+            for &budget in budgets {
                 for policy in &args.policies {
                     cells.push(Cell {
                         scene: scene.clone(),
@@ -158,6 +187,31 @@ fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Fa
         Some(twice) => Err(Failure::input(format!("{flag} names {twice} twice"))),
         None => Ok(()),
     }
+}
+
+/// The budgets of each scene: its own, or else those for all.
+fn budgets(asked: &[Budget], labels: &[String]) -> Result<Vec<Vec<usize>>, Failure> {
+    let stranger = asked.iter().find(|b| b.scene.as_ref().is_some_and(|s| !labels.contains(s)));
+    if let Some(stranger) = stranger {
+        return Err(Failure::input(format!(
+            "--budget {stranger} is for none of the scenes; they are called {}",
+            labels.join(", ")
+        )));
+    }
+    let of = |scene: Option<&String>| -> Vec<usize> {
+        asked.iter().filter(|b| b.scene.as_ref() == scene).map(|b| b.rows).collect()
+    };
+    let one = |label: &String| {
+        let own = of(Some(label));
+        let rows = if own.is_empty() { of(None) } else { own };
+        if rows.is_empty() {
+            return Err(Failure::input(format!(
+                "--budget has none for {label}; add {label}=ROWS, or ROWS for all scenes"
+            )));
+        }
+        Ok(rows)
+    };
+    labels.iter().map(one).collect()
 }
 
 /// A short name for each scene: its folder's, or that of the built-in scene.
@@ -200,6 +254,12 @@ fn distinct<'a, T: PartialEq>(records: &[&'a Record], of: impl Fn(&'a Record) ->
     values
 }
 
+/// The budgets of a scene, in the order of their appearance.
+fn budgets_of(records: &[&Record], scene: &str) -> Vec<usize> {
+    let here: Vec<&Record> = records.iter().filter(|r| r.scene == scene).copied().collect();
+    distinct(&here, |r| r.budget)
+}
+
 /// Where a cell's run is.
 fn run_folder(output: &Path, record: &Record) -> PathBuf {
     output.join("runs").join(&record.run)
@@ -208,6 +268,23 @@ fn run_folder(output: &Path, record: &Record) -> PathBuf {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_scene_with_budgets_of_its_own_takes_no_others() {
+        let labels = ["room".to_owned(), "cup".to_owned()];
+        let of = |text: &str| {
+            let asked: Result<Vec<Budget>, String> = text.split(',').map(budget).collect();
+            budgets(&asked.expect("they parse"), &labels)
+        };
+        let rows = |text| of(text).map_err(|failure| failure.message);
+        assert_eq!(rows("30k"), Ok(vec![vec![30_000]; 2]));
+        assert_eq!(rows("30k,room=28k,room=1k"), Ok(vec![vec![28_000, 1_000], vec![30_000]]));
+        assert!(rows("room=28k").is_err_and(|m| m.contains("cup=ROWS")));
+        assert!(rows("30k,rom=28k").is_err_and(|m| m.contains("rom=28000") && m.contains("room")));
+        for text in ["room=", "=", "room=x"] {
+            assert!(budget(text).is_err(), "{text}");
+        }
+    }
 
     #[test]
     fn built_in_scenes_go_by_their_names() {

@@ -7,7 +7,7 @@ use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::prelude::*;
 
 use super::cell::rows_over_time;
-use super::{Picture, Record, distinct};
+use super::{Picture, Record, budgets_of, distinct};
 use crate::cli::failure::{Failure, OTHER};
 use crate::cli::number::grouped;
 use crate::output::write_atomically;
@@ -51,8 +51,8 @@ pub(super) fn draw(
         pictures.push(Picture { file, caption });
         Ok(())
     };
-    let budgets = distinct(records, |r| r.budget);
     for scene in distinct(records, |r| &r.scene) {
+        let budgets = budgets_of(records, scene);
         if budgets.len() > 1 {
             let panel = |y: &'static str, score: fn(&Record) -> f64| Panel {
                 title: format!("{scene}: {y} against budget"),

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::difference::Difference;
-use super::{Record, distinct};
+use super::{Record, budgets_of, distinct};
 use crate::cli::number::grouped;
 use crate::metrics::geometry::Geometry;
 
@@ -55,7 +55,7 @@ pub(super) fn markdown(records: &[&Record], policies: &[String]) -> String {
         }
     }
     for scene in distinct(records, |r| &r.scene) {
-        for budget in distinct(records, |r| r.budget) {
+        for budget in budgets_of(records, scene) {
             let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
             text += "| policy | PSNR | SSIM | rows | true peak | peak memory [MiB] | time [s] | processor time [s] | extra passes |\n";
             text += "|---|---|---|---|---|---|---|---|---|\n";
