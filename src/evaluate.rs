@@ -1,7 +1,7 @@
 //! Scores of a model on held-out views.
 
 use crate::backend::{Backend, BackendError};
-use crate::metrics::{MetricError, psnr, ssim};
+use crate::metrics::{MetricError, flip, psnr, ssim};
 use crate::output::Mean;
 use crate::views::{ViewError, ViewSource};
 
@@ -23,6 +23,8 @@ pub struct ViewScore {
     pub psnr: f64,
     /// Structural similarity.
     pub ssim: f64,
+    /// FLIP error.
+    pub flip: f64,
 }
 
 /// Scores of a set of views.
@@ -39,7 +41,11 @@ impl Scores {
         let mean = |score: fn(&ViewScore) -> f64| {
             self.views.iter().map(score).sum::<f64>() / self.views.len() as f64
         };
-        Mean { psnr: mean(|view| view.psnr), ssim: mean(|view| view.ssim) }
+        Mean {
+            psnr: mean(|view| view.psnr),
+            ssim: mean(|view| view.ssim),
+            flip: mean(|view| view.flip),
+        }
     }
 }
 
@@ -99,6 +105,7 @@ pub fn evaluate(
             name: name(),
             psnr: psnr(&rendering.rgb, &image, background).map_err(metric)?,
             ssim: ssim(&rendering.rgb, &image, background).map_err(metric)?,
+            flip: flip(&rendering.rgb, &image, background).map_err(metric)?,
         };
         seen(&score);
         scores.views.push(score);

@@ -11,9 +11,9 @@ use super::number::grouped;
 use super::run_files::{SplitArg, iteration, open_run};
 use crate::evaluate::evaluate;
 use crate::metrics::geometry::{self, Geometry, Ground};
-use crate::output::{Mean, write_geometry, write_scores};
+use crate::output::{write_geometry, write_scores};
 
-/// Measures a trained scene against its photographs: PSNR and SSIM.
+/// Measures a trained scene against its photographs: PSNR, SSIM and FLIP.
 ///
 /// Prints the scores of each view and their mean, and writes them to results.json and
 /// per_view.json in the run's folder (results_train.json and per_view_train.json for the views
@@ -55,12 +55,15 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let background = opened.scene.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
-    console.result(format_args!("{:width$}  PSNR [dB]    SSIM", "view"));
+    console.result(format_args!("{:width$}  PSNR [dB]    SSIM    FLIP", "view"));
+    let line = |name: &str, psnr: f64, ssim: f64, flip: f64| {
+        console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}"));
+    };
     let scores = evaluate(opened.backend.as_mut(), &views, background, opened.sh_degree, |view| {
-        console.result(format_args!("{:width$}  {:9.3}  {:.4}", view.name, view.psnr, view.ssim));
+        line(&view.name, view.psnr, view.ssim, view.flip);
     })?;
-    let Mean { psnr, ssim } = scores.mean();
-    console.result(format_args!("{:width$}  {psnr:9.3}  {ssim:.4}", "mean"));
+    let mean = scores.mean();
+    line("mean", mean.psnr, mean.ssim, mean.flip);
     write_scores(run, args.split.into(), iteration, &scores)?;
     if let Some(truth) = opened.dataset.ground_truth()? {
         let train = opened.views(SplitArg::Train)?;

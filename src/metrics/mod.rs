@@ -1,17 +1,19 @@
-//! How like the photograph a render is, PSNR and SSIM, and how like the surface the model is where
+//! How like the photograph a render is, PSNR, SSIM and FLIP, and how like the surface the model is where
 //! that is known ([`geometry`]).
 //!
-//! Both compare a rendered image with a packed target, both in sRGB encoding, and both accumulate
+//! All compare a rendered image with a packed target, both in sRGB encoding, and accumulate
 //! in `f64`, so that a figure does not depend on the image's size or on the number of threads.
 //! Renders are clamped to `[0, 1]` first, as a viewer would show them. A target with coverage is
 //! composited on the background the render was made with. A target with a mask is compared where
 //! the mask counts: the render's error is scaled by the mask before windows are taken, so what
 //! lies under the mask cannot leak into its neighbours' SSIM, and pixels are weighted by it.
 
+mod flip;
 pub mod geometry;
 mod psnr;
 mod ssim;
 
+pub use flip::flip;
 pub use psnr::psnr;
 pub use ssim::ssim;
 

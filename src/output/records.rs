@@ -113,6 +113,9 @@ pub struct Mean {
     /// Structural similarity.
     #[serde(rename = "SSIM")]
     pub ssim: f64,
+    /// FLIP error: what the eye sees of the difference, 0 for equal images.
+    #[serde(rename = "FLIP")]
+    pub flip: f64,
 }
 
 /// Writes a value as indented JSON.
@@ -127,7 +130,7 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError
 }
 
 /// Enters scores into the files of a split: mean scores into `results.json` as
-/// `{"ours_3000": {"PSNR": …, "SSIM": …}}`, scores by view into `per_view.json` as
+/// `{"ours_3000": {"PSNR": …, "SSIM": …, "FLIP": …}}`, scores by view into `per_view.json` as
 /// `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`. Entries of other iterations stay.
 ///
 /// # Errors
@@ -145,7 +148,11 @@ pub fn write_scores(
     let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
         scores.views.iter().map(|view| (view.name.clone(), score(view).into())).collect()
     };
-    let views = serde_json::json!({ "PSNR": column(|v| v.psnr), "SSIM": column(|v| v.ssim) });
+    let views = serde_json::json!({
+        "PSNR": column(|v| v.psnr),
+        "SSIM": column(|v| v.ssim),
+        "FLIP": column(|v| v.flip),
+    });
     enter(&run.join(per_view), iteration, views)?;
     let mean = serde_json::to_value(scores.mean()).unwrap_or_default();
     enter(&run.join(results), iteration, mean)
@@ -213,7 +220,7 @@ mod tests {
     use super::*;
 
     fn scores(psnr: f64) -> Scores {
-        let view = |name: &str, psnr| ViewScore { name: name.into(), psnr, ssim: 0.5 };
+        let view = |name: &str, psnr| ViewScore { name: name.into(), psnr, ssim: 0.5, flip: 0.25 };
         Scores { views: vec![view("b.png", psnr), view("a/c.png", psnr + 2.0)] }
     }
 
@@ -227,8 +234,8 @@ mod tests {
             serde_json::from_slice(&std::fs::read(root.path().join(name)).unwrap()).unwrap()
         };
         let expected = serde_json::json!({
-            "ours_7": { "PSNR": 31.0, "SSIM": 0.5 },
-            "ours_30": { "PSNR": 21.0, "SSIM": 0.5 },
+            "ours_7": { "PSNR": 31.0, "SSIM": 0.5, "FLIP": 0.25 },
+            "ours_30": { "PSNR": 21.0, "SSIM": 0.5, "FLIP": 0.25 },
         });
         assert_eq!(read("results.json"), expected);
         assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);

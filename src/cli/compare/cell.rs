@@ -1,5 +1,6 @@
 //! One run of a comparison, and the record that it leaves.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,7 +15,7 @@ use crate::cli::failure::{Failure, INPUT, OTHER};
 use crate::cli::number::grouped;
 use crate::dataset::builtin;
 use crate::metrics::geometry::Geometry;
-use crate::output::{OutputError, geometry_of, write_atomically};
+use crate::output::{Mean, OutputError, geometry_of, write_atomically};
 
 /// What is run.
 #[derive(Debug, Clone, PartialEq)]
@@ -54,6 +55,8 @@ pub(super) struct Record {
     pub(super) psnr: f64,
     /// Mean over the views held out.
     pub(super) ssim: f64,
+    /// Mean over the views held out: FLIP error.
+    pub(super) flip: f64,
     /// Rows at the end.
     pub(super) rows: usize,
     /// Most rows at any instant.
@@ -163,16 +166,9 @@ impl Cell {
         let number = |field: &str| {
             summary[field].as_f64().ok_or_else(|| bad(format!("`{field}` is missing")))
         };
-        let mut tests: Vec<(u32, f64, f64)> = summary["test"]
-            .as_object()
-            .into_iter()
-            .flatten()
-            .filter_map(|(step, mean)| {
-                Some((step.parse().ok()?, mean["PSNR"].as_f64()?, mean["SSIM"].as_f64()?))
-            })
-            .collect();
-        tests.sort_by_key(|&(step, ..)| step);
-        let Some(&(_, psnr, ssim)) = tests.last() else {
+        let tests: BTreeMap<u32, Mean> = serde_json::from_value(summary["test"].clone())
+            .map_err(|e| bad(format!("`test`: {e}")))?;
+        let Some((_, &Mean { psnr, ssim, flip })) = tests.last_key_value() else {
             return Err(Failure {
                 code: INPUT,
                 message: format!("{}: no view is held out to measure", self.scene.display()),
@@ -189,13 +185,14 @@ impl Cell {
             arguments: self.arguments(),
             psnr,
             ssim,
+            flip,
             rows: number("rows")? as usize,
             peak_rows: number("peak_rows")? as usize,
             peak_bytes: summary["peak_bytes"].as_u64(),
             seconds: number("seconds")?,
             cpu_seconds: summary["cpu_seconds"].as_f64(),
             extra_forwards: number("extra_forwards")? as u64,
-            curve: tests.into_iter().map(|(step, psnr, _)| (step, psnr)).collect(),
+            curve: tests.into_iter().map(|(step, mean)| (step, mean.psnr)).collect(),
             geometry: geometry_of(folder, self.iterations)?,
         })
     }

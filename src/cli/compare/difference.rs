@@ -18,6 +18,8 @@ pub(super) struct Difference {
     pub(super) pairs: usize,
     /// Pairs in which the difference is above zero.
     pub(super) above: usize,
+    /// Pairs in which it is below zero.
+    pub(super) below: usize,
 }
 
 impl Difference {
@@ -61,7 +63,8 @@ impl Difference {
             [0.025, 0.975].map(|q| means[(q * (RESAMPLES - 1) as f64).round() as usize])
         });
         let above = differences.iter().filter(|&&d| d > 0.0).count();
-        Some(Self { mean: mean(differences), interval, pairs, above })
+        let below = differences.iter().filter(|&&d| d < 0.0).count();
+        Some(Self { mean: mean(differences), interval, pairs, above, below })
     }
 
     /// `+0.12 [+0.05, +0.19]`.
@@ -81,7 +84,7 @@ mod tests {
     #[test]
     fn intervals_hold_the_mean_and_shrink_with_the_pairs() {
         let few = Difference::of(&[0.0, 1.0, 2.0]).unwrap();
-        assert!((few.mean - 1.0).abs() < 1e-12 && (few.pairs, few.above) == (3, 2));
+        assert!((few.mean - 1.0).abs() < 1e-12 && (few.pairs, few.above, few.below) == (3, 2, 0));
         let [low, high] = few.interval.unwrap();
         // The mean of three draws is 0 or 2 in 1 of 27 cases each, so both ends are reached.
         assert!(low.abs() < 1e-12 && (high - 2.0).abs() < 1e-12);

@@ -68,7 +68,11 @@ pub(super) fn draw(
                     budgets.iter().filter_map(point).collect()
                 }),
             };
-            let panels = [panel("PSNR (dB)", |r| r.psnr), panel("SSIM", |r| r.ssim)];
+            let panels = [
+                panel("PSNR (dB)", |r| r.psnr),
+                panel("SSIM", |r| r.ssim),
+                panel("FLIP", |r| r.flip),
+            ];
             let caption = format!("{scene}: quality against budget, means over seeds");
             put(format!("quality-{scene}.svg"), caption, &panels)?;
         }

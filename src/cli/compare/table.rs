@@ -35,30 +35,38 @@ pub(super) fn markdown(records: &[&Record], policies: &[String]) -> String {
     );
     if !others.is_empty() {
         text += "\n## Over all scenes and budgets\n\n";
-        text += "| policy | PSNR | better in | SSIM | better in |\n|---|---|---|---|---|\n";
+        text += "| policy | PSNR | better in | SSIM | better in | FLIP | better in |\n\
+                 |---|---|---|---|---|---|---|\n";
         for policy in others {
             let psnr = Difference::between(records, policy, first, |r| r.psnr);
             let ssim = Difference::between(records, policy, first, |r| r.ssim);
-            let (Some(psnr), Some(ssim)) = (psnr, ssim) else {
-                let _ = writeln!(text, "| {policy} | not ranked: no run kept its budget | | | |");
+            let flip = Difference::between(records, policy, first, |r| r.flip);
+            let (Some(psnr), Some(ssim), Some(flip)) = (psnr, ssim, flip) else {
+                let _ =
+                    writeln!(text, "| {policy} | not ranked: no run kept its budget | | | | | |");
                 continue;
             };
-            let share = |d: &Difference| format!("{} of {}", d.above, d.pairs);
             let _ = writeln!(
                 text,
-                "| {policy} | {} dB | {} | {} | {} |",
+                "| {policy} | {} dB | {} of {} | {} | {} of {} | {} | {} of {} |",
                 psnr.show(2),
-                share(&psnr),
+                psnr.above,
+                psnr.pairs,
                 ssim.show(4),
-                share(&ssim)
+                ssim.above,
+                ssim.pairs,
+                flip.show(4),
+                // An error: less is better.
+                flip.below,
+                flip.pairs,
             );
         }
     }
     for scene in distinct(records, |r| &r.scene) {
         for budget in budgets_of(records, scene) {
             let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
-            text += "| policy | PSNR | SSIM | rows | true peak | peak memory [MiB] | time [s] | processor time [s] | extra passes |\n";
-            text += "|---|---|---|---|---|---|---|---|---|\n";
+            text += "| policy | PSNR | SSIM | FLIP | rows | true peak | peak memory [MiB] | time [s] | processor time [s] | extra passes |\n";
+            text += "|---|---|---|---|---|---|---|---|---|---|\n";
             for policy in policies {
                 let here =
                     |r: &&&Record| r.scene == *scene && r.budget == budget && r.policy == *policy;
@@ -127,11 +135,13 @@ fn line(policy: &str, first: &str, runs: &[&Record], records: &[&Record], budget
     let number = |of: fn(&Record) -> f64, digits| shown(mean(runs, |r| Some(of(r))), digits);
     let mib = |r: &Record| r.peak_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20));
     format!(
-        "| {policy} | {}{} | {}{} | {} | {}{marked} | {} | {} | {} | {} |\n",
+        "| {policy} | {}{} | {}{} | {}{} | {} | {}{marked} | {} | {} | {} | {} |\n",
         number(|r| r.psnr, 2),
         difference(|r| r.psnr, 2),
         number(|r| r.ssim, 4),
         difference(|r| r.ssim, 4),
+        number(|r| r.flip, 4),
+        difference(|r| r.flip, 4),
         grouped(mean(runs, |r| Some(r.rows as f64)).unwrap_or(0.0).round() as usize),
         grouped(peak),
         shown(mean(runs, mib), 0),
@@ -144,13 +154,15 @@ fn line(policy: &str, first: &str, runs: &[&Record], records: &[&Record], budget
 /// A line per policy: means over everything.
 pub(super) fn summary(records: &[&Record], policies: &[String]) -> String {
     let width = policies.iter().map(String::len).max().unwrap_or(0).max(6);
-    let mut text = format!("{:width$}  PSNR [dB]    SSIM  runs", "policy");
+    let mut text = format!("{:width$}  PSNR [dB]    SSIM    FLIP  runs", "policy");
     for policy in policies {
         let runs: Vec<&Record> =
             records.iter().filter(|r| r.policy == *policy && r.is_bounded()).copied().collect();
         let psnr = shown(mean(&runs, |r| Some(r.psnr)), 3);
         let ssim = shown(mean(&runs, |r| Some(r.ssim)), 4);
-        let _ = write!(text, "\n{policy:width$}  {psnr:>9}  {ssim:>6}  {:>4}", runs.len());
+        let flip = shown(mean(&runs, |r| Some(r.flip)), 4);
+        let _ =
+            write!(text, "\n{policy:width$}  {psnr:>9}  {ssim:>6}  {flip:>6}  {:>4}", runs.len());
         let over = records.iter().filter(|r| r.policy == *policy && !r.is_bounded()).count();
         if over > 0 {
             let _ = write!(text, "  ({over} more over the budget, not counted)");
@@ -175,6 +187,7 @@ mod tests {
             arguments: Vec::new(),
             psnr,
             ssim: psnr / 100.0,
+            flip: 1.0 - psnr / 100.0,
             rows: 900,
             peak_rows,
             peak_bytes: None,
@@ -199,13 +212,13 @@ mod tests {
         let all: Vec<&Record> = all.iter().collect();
         let policies = ["a", "b", "c"].map(String::from);
         let text = markdown(&all, &policies);
-        assert!(text.contains("| b | +0.50 [+0.50, +0.50] dB | 2 of 2 |"), "{text}");
+        assert!(text.contains("| b | +0.50 [+0.50, +0.50] dB | 2 of 2 | +0.0050 [+0.0050, +0.0050] | 2 of 2 | -0.0050 [-0.0050, -0.0050] | 2 of 2 |"), "{text}");
         assert!(text.contains("| c | not ranked"), "{text}");
-        assert!(text.contains("| a | 31.00 | 0.3100 | 900 | 1,000 | – |"), "{text}");
+        assert!(text.contains("| a | 31.00 | 0.3100 | 0.6900 | 900 | 1,000 | – |"), "{text}");
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
         let said = summary(&all, &policies);
-        assert!(said.contains("c               –       –     0  (2 more over"), "{said}");
+        assert!(said.contains("c               –       –       –     0  (2 more over"), "{said}");
     }
 
     #[test]

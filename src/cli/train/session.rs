@@ -195,12 +195,14 @@ impl<'a> Session<'a> {
         let scores = evaluate(trainer.backend(), test, background, degree, |_| ())?;
         let mean = scores.mean();
         write_scores(&self.folder, Split::Test, step, &scores)?;
-        self.board
-            .scalars(step, &[("test/psnr", mean.psnr as f32), ("test/ssim", mean.ssim as f32)])?;
+        let Mean { psnr, ssim, flip } = mean;
+        let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
+        self.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
         self.tested.insert(step, mean);
         if !is_last {
-            let Mean { psnr, ssim } = mean;
-            self.console.say(format_args!("step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}"));
+            self.console.say(format_args!(
+                "step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}"
+            ));
         }
         Ok(())
     }
@@ -237,10 +239,10 @@ impl<'a> Session<'a> {
     fn report(&self, path: &Path) {
         let Prepared { config, trainer, test, ledger, .. } = &self.run;
         let steps = trainer.steps_done();
-        if let Some(Mean { psnr, ssim }) = self.tested.get(&steps) {
+        if let Some(Mean { psnr, ssim, flip }) = self.tested.get(&steps) {
             let views = test.count();
             self.console.say(format_args!(
-                "test     PSNR {psnr:.2} dB, SSIM {ssim:.4} (mean of {views} views)"
+                "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
             ));
         }
         self.console.say(format_args!(

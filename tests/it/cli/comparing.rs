@@ -24,6 +24,8 @@ fn every_run_is_there_once_and_in_the_table() {
     for record in &all {
         assert!(record["peak_rows"].as_u64() <= record["budget"].as_u64(), "{record}");
         assert!(record["psnr"].as_f64() > Some(5.0), "{record}");
+        let flip = record["flip"].as_f64().expect("a number");
+        assert!(flip > 0.0 && flip < 0.9, "{record}");
         assert_eq!(record["curve"].as_array().map(Vec::len), Some(8), "{record}");
         let arguments = record["arguments"].to_string();
         assert!(arguments.contains(r#""--sh-degree","0""#), "{arguments}");

@@ -1,0 +1,394 @@
+//! LDR-FLIP: how different two images look when they are flipped between (Andersson, Nilsson,
+//! Akenine-Möller, Oskarsson, Åström and Fairchild, *FLIP: A Difference Evaluator for Alternating
+//! Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; section and equation numbers are
+//! its). A colour pipeline filters both images by the eye's contrast sensitivity and measures a
+//! perceptual distance; a feature pipeline compares edges and points, and amplifies the first
+//! where they differ.
+
+use std::f64::consts::PI;
+
+use rayon::prelude::*;
+
+use super::{MetricError, Pair};
+use crate::dataset::images::Image8;
+
+/// Pixels per degree of the visual field: a monitor 0.7 m wide with 3840 px, seen from 0.7 m; the
+/// paper's default, with which published figures are made.
+const PIXELS_PER_DEGREE: f64 = 3840.0 * PI / 180.0;
+/// Contrast sensitivity of each opponent channel, Σ a·√(π/b)·exp(−π²·x²/b) with x in degrees: its
+/// terms (a, b). Table 1.
+const SENSITIVITY: [[(f64, f64); 2]; 3] =
+    [[(1.0, 0.0047), (0.0, 1e-5)], [(1.0, 0.0053), (0.0, 1e-5)], [(34.1, 0.04), (13.5, 0.025)]];
+/// Widest term of [`SENSITIVITY`]; all kernels reach as far as its own would.
+const WIDEST: f64 = 0.04;
+/// Exponent of colour distances, q_c.
+const COLOUR_EXPONENT: f64 = 0.7;
+/// Distances up to this share of the largest, p_c, …
+const SMALL_SHARE: f64 = 0.4;
+/// … fill this share of the range of errors, p_t.
+const SMALL_RANGE: f64 = 0.95;
+/// Width of a feature `[degrees]`, w.
+const FEATURE_WIDTH: f64 = 0.082;
+/// Exponent of feature differences, q_f.
+const FEATURE_EXPONENT: f64 = 0.5;
+/// Rows of pixels filtered together, as in [`super::ssim()`].
+const BLOCK: usize = 32;
+
+/// Linear sRGB to CIE XYZ, D65.
+const XYZ_OF_RGB: [[f64; 3]; 3] = [
+    [0.412_390_799_265_959_5, 0.357_584_339_383_878, 0.180_480_788_401_834_3],
+    [0.212_639_005_871_510_4, 0.715_168_678_767_756, 0.072_192_315_360_733_71],
+    [0.019_330_818_715_591_85, 0.119_194_779_794_626, 0.950_532_152_249_660_6],
+];
+/// Inverse of [`XYZ_OF_RGB`].
+const RGB_OF_XYZ: [[f64; 3]; 3] = [
+    [3.240_969_941_904_521_5, -1.537_383_177_570_093_5, -0.498_610_760_293_003_3],
+    [-0.969_243_636_280_879_8, 1.875_967_501_507_720_6, 0.041_555_057_407_175_6],
+    [0.055_630_079_696_993_6, -0.203_976_958_888_976_5, 1.056_971_514_242_878_6],
+];
+
+/// Mean FLIP error of a render against a target, in `[0, 1]`; 0 when they are equal.
+///
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is what
+/// a target with coverage is composited on. Beyond the border the images go on as they end. NaN when
+/// the render holds a NaN.
+///
+/// # Errors
+/// When the sizes differ or the target's mask ignores every pixel.
+pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f64, MetricError> {
+    let pair = Pair::new(rendered, target, background)?;
+    let filters = Filters::new();
+    let largest = largest_distance();
+    // One sum per block of rows, added in order: the same bits at any thread count.
+    let sums: Vec<[f64; 2]> = (0..pair.height.div_ceil(BLOCK))
+        .into_par_iter()
+        .map(|block| {
+            let first = block * BLOCK;
+            let last = (first + BLOCK).min(pair.height);
+            let [truth, render] = [false, true].map(|r| seen(&pair, &filters, first, last, r));
+            let pixels = first * pair.width..last * pair.width;
+            pixels.zip(truth.iter().zip(&render)).fold([0.0; 2], |sum, (p, (a, b))| {
+                let weight = pair.weight(p);
+                if weight > 0.0 {
+                    [sum[0] + weight * difference(a, b, largest), sum[1] + weight]
+                } else {
+                    sum
+                }
+            })
+        })
+        .collect();
+    let [error, weight] =
+        sums.iter().fold([0.0; 2], |sum, block| [sum[0] + block[0], sum[1] + block[1]]);
+    if weight == 0.0 {
+        return Err(MetricError::NothingToCompare);
+    }
+    Ok(error / weight)
+}
+
+/// What the eye makes of a pixel.
+struct Seen {
+    /// Lightness and Hunt-adjusted chroma of the filtered image.
+    colour: [f64; 3],
+    /// Strengths of the edge and of the point at the pixel.
+    features: [f64; 2],
+}
+
+/// Equation 11: the colour difference, amplified by the difference of features.
+fn difference(a: &Seen, b: &Seen, largest: f64) -> f64 {
+    let colour = redistributed(hyab(a.colour, b.colour).powf(COLOUR_EXPONENT), largest);
+    let [edge, point] = [0, 1].map(|i| (a.features[i] - b.features[i]).abs());
+    // A NaN of either must not be lost, as `max` would lose it.
+    let feature = if point > edge { point } else { edge };
+    let feature = (feature / 2.0_f64.sqrt()).powf(FEATURE_EXPONENT);
+    colour.powf(1.0 - feature)
+}
+
+/// Section 4.1.4: the few large distances share a small part of the range.
+fn redistributed(distance: f64, largest: f64) -> f64 {
+    let bend = SMALL_SHARE * largest;
+    if distance < bend {
+        SMALL_RANGE / bend * distance
+    } else {
+        SMALL_RANGE + (distance - bend) / (largest - bend) * (1.0 - SMALL_RANGE)
+    }
+}
+
+/// The distance between pure green and pure blue, than which none is larger, c_max.
+fn largest_distance() -> f64 {
+    let [green, blue] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(hunt_adjusted_lab);
+    hyab(green, blue).powf(COLOUR_EXPONENT)
+}
+
+/// Equation 6.
+fn hyab(a: [f64; 3], b: [f64; 3]) -> f64 {
+    (a[0] - b[0]).abs() + (a[1] - b[1]).hypot(a[2] - b[2])
+}
+
+fn product(matrix: &[[f64; 3]; 3], v: [f64; 3]) -> [f64; 3] {
+    matrix.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2])
+}
+
+/// XYZ over that of white; rows of the matrix sum to white.
+fn relative_xyz(rgb: [f64; 3]) -> [f64; 3] {
+    let xyz = product(&XYZ_OF_RGB, rgb);
+    [0, 1, 2].map(|i| xyz[i] / XYZ_OF_RGB[i].iter().sum::<f64>())
+}
+
+/// CIELAB's opponents without its cube root, in which filtering is linear: (Y, Cx, Cz).
+fn opponents(rgb: [f64; 3]) -> [f64; 3] {
+    let [x, y, z] = relative_xyz(rgb);
+    [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
+}
+
+/// Inverse of [`opponents`].
+fn rgb_of_opponents([luminance, cx, cz]: [f64; 3]) -> [f64; 3] {
+    let y = (luminance + 16.0) / 116.0;
+    let relative = [y + cx / 500.0, y, y - cz / 200.0];
+    let white = XYZ_OF_RGB.map(|row| row.iter().sum::<f64>());
+    product(&RGB_OF_XYZ, [0, 1, 2].map(|i| relative[i] * white[i]))
+}
+
+/// CIELAB of a linear colour, chroma scaled with lightness (equation 5).
+fn hunt_adjusted_lab(rgb: [f64; 3]) -> [f64; 3] {
+    const DELTA: f64 = 6.0 / 29.0;
+    let [x, y, z] = relative_xyz(rgb)
+        .map(|t| if t > DELTA.powi(3) { t.cbrt() } else { t / (3.0 * DELTA * DELTA) + 4.0 / 29.0 });
+    let lightness = 116.0 * y - 16.0;
+    [lightness, 0.01 * lightness * 500.0 * (x - y), 0.01 * lightness * 200.0 * (y - z)]
+}
+
+fn linear(encoded: f64) -> f64 {
+    if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+}
+
+/// The kernels of both pipelines, along one axis each: every filter is a sum of separable ones.
+struct Filters {
+    /// Terms of each opponent channel; both passes of a term together have the term's weight.
+    sensitivity: [Vec<Vec<f64>>; 3],
+    /// A Gaussian of the width of features, sum 1; its first derivative, whose halves sum to ∓1;
+    /// its second, whose parts of one sign sum to ∓1.
+    feature: [Vec<f64>; 3],
+}
+
+impl Filters {
+    fn new() -> Self {
+        let reach = (3.0 * (WIDEST / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil();
+        let sensitivity = SENSITIVITY.map(|terms| {
+            let kernels = terms.map(|(a, b)| {
+                let shape = sampled(reach, |x| (-(PI * x / PIXELS_PER_DEGREE).powi(2) / b).exp());
+                let sum: f64 = shape.iter().sum();
+                (a * (PI / b).sqrt() * sum * sum, shape.into_iter().map(move |k| k / sum))
+            });
+            let total: f64 = kernels.iter().map(|(weight, _)| weight).sum();
+            let kernels = kernels.into_iter().filter(|(weight, _)| *weight > 0.0);
+            kernels
+                .map(|(weight, shape)| shape.map(|k| k * (weight / total).sqrt()).collect())
+                .collect()
+        });
+        let deviation = 0.5 * FEATURE_WIDTH * PIXELS_PER_DEGREE;
+        let reach = (3.0 * deviation).ceil();
+        let gaussian = |x: f64| (-0.5 * (x / deviation).powi(2)).exp();
+        let smooth = sampled(reach, gaussian);
+        let sum: f64 = smooth.iter().sum();
+        let feature = [
+            smooth.into_iter().map(|k| k / sum).collect(),
+            balanced(sampled(reach, |x| -x * gaussian(x))),
+            balanced(sampled(reach, |x| ((x / deviation).powi(2) - 1.0) * gaussian(x))),
+        ];
+        Self { sensitivity, feature }
+    }
+
+    /// Pixels from the centre of the widest kernel to its edge.
+    fn reach(&self) -> usize {
+        self.sensitivity[0][0].len() / 2
+    }
+}
+
+/// A function at −reach, …, reach.
+fn sampled(reach: f64, function: impl Fn(f64) -> f64) -> Vec<f64> {
+    let reach = reach as i32;
+    (-reach..=reach).map(|x| function(f64::from(x))).collect()
+}
+
+/// Positive taps scaled to sum to 1, negative ones to −1.
+fn balanced(kernel: Vec<f64>) -> Vec<f64> {
+    let positive: f64 = kernel.iter().filter(|k| **k > 0.0).sum();
+    let negative: f64 = kernel.iter().filter(|k| **k < 0.0).sum();
+    kernel.into_iter().map(|k| if k > 0.0 { k / positive } else { k / -negative }).collect()
+}
+
+/// Rows `first..last` of the render, or of the target.
+fn seen(pair: &Pair<'_>, filters: &Filters, first: usize, last: usize, render: bool) -> Vec<Seen> {
+    let width = pair.width;
+    let reach = filters.reach();
+    // Rows of the block and those that its kernels see; beyond the border the last one goes on.
+    let lines = first..last + 2 * reach;
+    let mut planes = [const { Vec::new() }; 3];
+    for line in lines {
+        let y = line.saturating_sub(reach).min(pair.height - 1);
+        for p in y * width..(y + 1) * width {
+            let channels = opponents([0, 1, 2].map(|c| linear(value(pair, p, c, render))));
+            for (plane, channel) in planes.iter_mut().zip(channels) {
+                plane.push(channel);
+            }
+        }
+    }
+    let rows = last - first;
+    let filtered = [0, 1, 2].map(|c| {
+        let mut sum = vec![0.0; rows * width];
+        for kernel in &filters.sensitivity[c] {
+            add_down(&mut sum, &across(&planes[c], width, kernel), width, kernel, reach);
+        }
+        sum
+    });
+    // Luminance in [0, 1]; an offset is nothing to the derivatives.
+    let luminance: Vec<f64> = planes[0].iter().map(|y| (y + 16.0) / 116.0).collect();
+    let [smooth, first_derivative, second_derivative] = &filters.feature;
+    let along = [smooth, first_derivative, second_derivative]
+        .map(|kernel| across(&luminance, width, kernel));
+    let derivative = |x: usize, kernel: &[f64]| {
+        let mut sum = vec![0.0; rows * width];
+        add_down(&mut sum, &along[x], width, kernel, reach);
+        sum
+    };
+    let edges = [derivative(1, smooth), derivative(0, first_derivative)];
+    let points = [derivative(2, smooth), derivative(0, second_derivative)];
+    (0..rows * width)
+        .map(|i| {
+            let rgb = rgb_of_opponents([0, 1, 2].map(|c| filtered[c][i]));
+            Seen {
+                colour: hunt_adjusted_lab(rgb.map(|v| v.clamp(0.0, 1.0))),
+                features: [&edges, &points].map(|[x, y]| x[i].hypot(y[i])),
+            }
+        })
+        .collect()
+}
+
+/// Channel `c` of pixel `p`, sRGB-encoded; of the render where it counts.
+fn value(pair: &Pair<'_>, p: usize, c: usize, render: bool) -> f64 {
+    let truth = pair.truth(p, c);
+    let weight = pair.weight(p);
+    // An ignored pixel may hold anything, NaN included.
+    if render && weight > 0.0 { truth + weight * pair.error(p, c) } else { truth }
+}
+
+/// Every row filtered along itself.
+fn across(plane: &[f64], width: usize, kernel: &[f64]) -> Vec<f64> {
+    let reach = kernel.len() / 2;
+    let mut out = vec![0.0; plane.len()];
+    let mut padded = vec![0.0; width + 2 * reach];
+    for (row, out) in plane.chunks_exact(width).zip(out.chunks_exact_mut(width)) {
+        padded[..reach].fill(row[0]);
+        padded[reach..reach + width].copy_from_slice(row);
+        padded[reach + width..].fill(row[width - 1]);
+        for (i, k) in kernel.iter().enumerate() {
+            for (sum, value) in out.iter_mut().zip(&padded[i..]) {
+                *sum += k * value;
+            }
+        }
+    }
+    out
+}
+
+/// Adds a plane filtered down its columns. It has `reach` rows more above and below than `sum`.
+fn add_down(sum: &mut [f64], plane: &[f64], width: usize, kernel: &[f64], reach: usize) {
+    let skipped = reach - kernel.len() / 2;
+    for (y, sum) in sum.chunks_exact_mut(width).enumerate() {
+        for (i, k) in kernel.iter().enumerate() {
+            let row = &plane[(y + skipped + i) * width..][..width];
+            for (sum, value) in sum.iter_mut().zip(row) {
+                *sum += k * value;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn target(width: u32, height: u32, of: impl Fn(f64, f64, f64) -> f64) -> Image8 {
+        let mut rgb = Vec::new();
+        for y in 0..height {
+            for x in 0..width {
+                for c in 0..3 {
+                    let value = of(f64::from(x), f64::from(y), f64::from(c));
+                    rgb.push((255.0 * value).round() as u8);
+                }
+            }
+        }
+        Image8 { width, height, rgb, alpha: None, mask: None }
+    }
+
+    fn as_render(image: &Image8) -> Vec<f32> {
+        image.rgb.iter().map(|&v| f32::from(v) / 255.0).collect()
+    }
+
+    fn waves(phase: f64) -> Image8 {
+        target(37, 24, |x, y, c| {
+            0.5 + 0.45 * (phase + 0.31 * x * (c + 1.0) + 0.17 * y * (3.0 - c)).sin()
+        })
+    }
+
+    fn between(render: &Image8, truth: &Image8) -> f64 {
+        flip(&as_render(render), truth, [0.0; 3]).unwrap()
+    }
+
+    /// Means by the authors' own program, version 1.7, at its default distance.
+    #[test]
+    fn the_authors_program_says_the_same() {
+        let black = target(9, 9, |_, _, _| 0.0);
+        let dot = target(9, 9, |x, y, _| if x == 4.0 && y == 4.0 { 1.0 } else { 0.0 });
+        let cases = [
+            ("waves", between(&waves(0.3), &waves(0.0)), 0.350_385_308),
+            ("black and white", between(&target(9, 9, |_, _, _| 1.0), &black), 0.967_388_868),
+            ("a dot", between(&dot, &black), 0.176_478_878),
+        ];
+        for (case, measured, expected) in cases {
+            // The program works in float32.
+            assert!((measured - expected).abs() < 2e-5, "{case}: {measured} for {expected}");
+        }
+    }
+
+    #[test]
+    fn equal_images_do_not_differ_and_order_does_not_matter() {
+        // The render is in f32, and small distances count more than in proportion.
+        assert!(between(&waves(0.0), &waves(0.0)) < 1e-4);
+        let (there, back) = (between(&waves(0.3), &waves(0.0)), between(&waves(0.0), &waves(0.3)));
+        assert!((there - back).abs() < 1e-5, "{there} and {back}");
+    }
+
+    #[test]
+    fn blocks_of_rows_do_not_show() {
+        // A picture of 100 rows that repeats 1 column: as wide or as high, the error is the same.
+        let tall = |phase: f64| target(1, 100, |_, y, c| 0.5 + 0.4 * (phase + 0.2 * y + c).sin());
+        let wide = |phase: f64| target(100, 1, |x, _, c| 0.5 + 0.4 * (phase + 0.2 * x + c).sin());
+        let (a, b) = (between(&tall(0.5), &tall(0.0)), between(&wide(0.5), &wide(0.0)));
+        assert!((a - b).abs() < 1e-12 && a > 0.01, "{a} and {b}");
+    }
+
+    #[test]
+    fn masks_coverage_and_nan() {
+        let mut half = waves(0.0);
+        let right = |p: usize| p % 37 >= 18;
+        half.mask = Some((0..37 * 24).map(|p| if right(p) { 0 } else { 255 }).collect());
+        let mut render = as_render(&half);
+        for (i, value) in render.iter_mut().enumerate() {
+            if right(i / 3) {
+                *value = f32::NAN;
+            }
+        }
+        // What is ignored neither counts nor leaks into its neighbours.
+        assert!(flip(&render, &half, [0.0; 3]).unwrap() < 1e-4);
+        render[0] = f32::NAN;
+        assert!(flip(&render, &half, [0.0; 3]).unwrap().is_nan());
+        half.mask = Some(vec![0; 37 * 24]);
+        assert_eq!(flip(&render, &half, [0.0; 3]), Err(MetricError::NothingToCompare));
+
+        let mut covered = target(9, 9, |_, _, _| 1.0);
+        covered.alpha = Some(vec![0; 81]);
+        let grey = flip(&[0.5; 243], &covered, [0.5; 3]).unwrap();
+        assert!(grey.abs() < 1e-12, "{grey}");
+        assert!(flip(&[0.5; 11], &covered, [0.5; 3]).is_err());
+    }
+}
