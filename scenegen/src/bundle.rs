@@ -134,6 +134,7 @@ impl<'a> Bundle<'a> {
 
     /// The rays that may meet a triangle, as bits: all but those for which the edge functions have
     /// both signs. They are those of [`ShearedRay::meet`], operation by operation.
+    #[expect(clippy::needless_range_loop, reason = "lanes side by side become vectors")]
     #[inline(always)]
     fn may_meet(&self, triangle: &[Vec3; 3]) -> u32 {
         let [x, y, z] = self.axes;

@@ -118,10 +118,10 @@ impl Surface {
         let scale =
             if half > 0.0 && (HALF_SIDE / half).is_finite() { HALF_SIDE / half } else { 1.0 };
         let local = |i: u32| ((model.positions[i as usize] - centre) * scale).as_vec3();
-        let in_order: Vec<[Vec3; 3]> = model.triangles.iter().map(|t| t.map(local)).collect();
-        let bvh = build(&in_order);
-        let triangles =
-            bvh.primitive_indices.iter().map(|&id| in_order[id as usize]).collect::<Vec<_>>();
+        let triangle = |corners: &[u32; 3]| corners.map(local);
+        let bvh = build(model.triangles.iter().map(|t| padded(&triangle(t))).collect());
+        let in_leaves = bvh.primitive_indices.iter().map(|&id| &model.triangles[id as usize]);
+        let triangles = in_leaves.map(triangle).collect();
         let depth = depth(&bvh);
         let build_seconds = start.elapsed().as_secs_f64();
         Ok(Self { bvh, triangles, centre, scale, depth, bounds, build_seconds })
@@ -210,6 +210,11 @@ impl Surface {
                 triangle.map(|p| self.to_world(p.as_dvec3()));
         }
         all
+    }
+
+    /// A corner of the model as it is traced: rounded in local coordinates.
+    pub(crate) fn traced(&self, corner: DVec3) -> DVec3 {
+        self.to_world(self.to_local(corner).as_vec3().as_dvec3())
     }
 
     pub(crate) fn to_local(&self, world: DVec3) -> DVec3 {
@@ -413,8 +418,7 @@ pub(crate) fn padded([a, b, c]: &[Vec3; 3]) -> Aabb {
     Aabb::new(a.min(b).min(c) - PADDING, a.max(b).max(c) + PADDING)
 }
 
-fn build(triangles: &[[Vec3; 3]]) -> Bvh2 {
-    let boxes: Vec<Aabb> = triangles.iter().map(padded).collect();
+fn build(boxes: Vec<Aabb>) -> Bvh2 {
     // The library's medium preset, step by step: its own function validates in debug builds and
     // panics for the degenerate trees that hostile meshes have.
     let mut bvh = PlocBuilder::with_capacity(boxes.len()).build(
@@ -424,10 +428,14 @@ fn build(triangles: &[[Vec3; 3]]) -> Bvh2 {
         SortPrecision::U64,
         3,
     );
+    drop(boxes);
     let mut optimiser = ReinsertionOptimizer::default();
     optimiser.run(&mut bvh, 0.05, None);
     collapse(&mut bvh, 8, 3.0);
     optimiser.run(&mut bvh, 0.1, None);
+    // The builder made one leaf per triangle, and needs parents where tracing does not.
+    bvh.nodes.shrink_to_fit();
+    bvh.parents = Vec::new();
     bvh
 }
 

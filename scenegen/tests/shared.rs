@@ -2,11 +2,11 @@
 //! name, and each malformed file does what the table here says.
 //!
 //! Files with a validator's report mostly hold no scene. So each is read twice: as it is, and with
-//! a scene of all its meshes (or, where it has none, of its accessors or buffer views as
-//! positions and indices) before a buffer of zeros. What the validator calls an error and is read all the same is harmless: metadata that
-//! nothing here looks at, alignments that cost other readers and not this one, and morph targets,
-//! which are not rendered. What it accepts loads, or has no triangle to render; of a type that only
-//! an extension could explain, positions are no positions.
+//! a scene of all its meshes (or, where it has none, of its accessors or buffer views as positions
+//! and indices) before a buffer of zeros. What the validator calls an error and is read all the same
+//! is harmless: metadata that nothing here looks at, alignments that cost other readers and not this
+//! one, and morph targets, which are not rendered. What it accepts loads, or has no triangle to
+//! render; of a type that only an extension could explain, positions are no positions.
 //!
 //! One piece: the tables are rows, one a file.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
