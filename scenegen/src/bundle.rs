@@ -166,7 +166,7 @@ impl<'a> Bundle<'a> {
 
     /// Visits the triangles that rays may meet, the nearer boxes first; `look` is given a triangle's
     /// place in leaf order and the rays, and returns the parameter up to which any ray still looks:
-    /// below zero, nothing is left to do.
+    /// negative infinity once nothing is left to do.
     #[inline]
     fn walk(&self, surface: &Surface, mut look: impl FnMut(u32, u32) -> f32) {
         let nodes = &surface.bvh.nodes;
@@ -332,7 +332,7 @@ impl Surface {
                     *hint = Some(slot);
                 }
             }
-            if open == 0 { -1.0 } else { reach }
+            if open == 0 { f32::NEG_INFINITY } else { reach }
         });
         hidden
     }

@@ -121,6 +121,7 @@ Examples:
   densify scenegen --preset thin -o data/thin
   densify scenegen mesh.glb -o data/mesh --train 100 --size 400
   densify scenegen house.obj -o data/house --rig inside --bounce 64
+  densify scenegen mesh.glb -o data/mesh --sky studio.hdr --ao 64
   densify scenegen mesh.glb --contact-sheet look.png";
 
 /// Spelling of [`RigKind`] on the command line.
