@@ -14,7 +14,7 @@ pub(crate) struct ShearedRay {
     kx: usize,
     ky: usize,
     kz: usize,
-    shear: Vec3,
+    pub(crate) shear: Vec3,
 }
 
 /// Where a ray meets a triangle.
@@ -52,14 +52,22 @@ impl ShearedRay {
         Self { origin, kx, ky, kz, shear }
     }
 
+    /// Which coordinates are the first two and the third of the ray's space.
+    #[inline]
+    pub(crate) fn axes(&self) -> [usize; 3] {
+        [self.kx, self.ky, self.kz]
+    }
+
     /// The meeting with a triangle, whatever its ray parameter.
     #[inline]
     pub(crate) fn meet(&self, triangle: &[Vec3; 3]) -> Option<Meeting> {
-        let [a, b, c] = triangle.map(|p| {
+        let corner = |p: Vec3| {
             let p = p - self.origin;
             let z = p[self.kz];
             (p[self.kx] - self.shear.x * z, p[self.ky] - self.shear.y * z, self.shear.z * z)
-        });
+        };
+        // Not by `map`, which is not inlined.
+        let (a, b, c) = (corner(triangle[0]), corner(triangle[1]), corner(triangle[2]));
         let mut u = c.0 * b.1 - c.1 * b.0;
         let mut v = a.0 * c.1 - a.1 * c.0;
         let mut w = b.0 * a.1 - b.1 * a.0;

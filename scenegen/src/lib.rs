@@ -14,6 +14,7 @@
 //! # Ok::<(), densify_scenegen::Error>(())
 //! ```
 
+mod bundle;
 mod camera;
 mod error;
 mod gltf;
@@ -21,6 +22,7 @@ mod intersect;
 pub mod mesh;
 mod nearest;
 mod obj;
+mod panorama;
 mod points;
 mod presets;
 mod primitives;
@@ -38,6 +40,7 @@ mod write;
 
 pub use camera::Camera;
 pub use error::Error;
+pub use panorama::Panorama;
 pub use points::{InitPoints, PointCollector, PointOptions};
 pub use presets::{PRESETS, Preset};
 pub use rig::{Rig, RigKind};

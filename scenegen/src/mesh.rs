@@ -80,8 +80,10 @@ pub struct Material {
     pub base_texture: Option<TextureRef>,
     /// Multiplies alpha with its red channel (OBJ's `map_d`).
     pub alpha_texture: Option<TextureRef>,
-    /// Green multiplies roughness, blue metalness (linear).
-    pub metal_rough_texture: Option<TextureRef>,
+    /// Green multiplies roughness (linear).
+    pub roughness_texture: Option<TextureRef>,
+    /// Blue multiplies metalness (linear); in glTF it is the same texture.
+    pub metallic_texture: Option<TextureRef>,
     /// Tangent-space normals (linear).
     pub normal_texture: Option<TextureRef>,
     /// Scale of the normal map's x and y.
@@ -109,7 +111,8 @@ impl Default for Material {
             emissive: Vec3::ZERO,
             base_texture: None,
             alpha_texture: None,
-            metal_rough_texture: None,
+            roughness_texture: None,
+            metallic_texture: None,
             normal_texture: None,
             normal_scale: 1.0,
             emissive_texture: None,

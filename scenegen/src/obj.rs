@@ -2,8 +2,12 @@
 //!
 //! Read here rather than by the `tobj` crate, which panics on short colours (`Kd 1 1`), refuses `v` with
 //! weight and colour, and triangulates concave polygons as fans. Faces are seen from both sides;
-//! materials are diffuse unless they bring the PBR keys `Pr` or `Pm`. Smoothing groups are ignored: a
-//! vertex without normal is flat.
+//! materials are diffuse unless they bring the PBR keys `Pr`, `Pm`, `map_Pr` or `map_Pm`. `norm` is a
+//! tangent-space normal map as in glTF; height maps (`bump`, `map_bump`) are left out with a note.
+//!
+//! A corner without normal is flat, or smooth within its smoothing group (`s 1`): the mean of the
+//! normals of the group's faces there, weighted by their angles (Thürmer and Wüthrich, "Computing
+//! Vertex Normals from Polygonal Facets", 1998).
 //!
 //! One piece: geometry and materials share line reading and faults.
 
@@ -23,8 +27,15 @@ const MAX_TRIANGLES: usize = 1 << 26;
 const MAX_EARS: usize = 256;
 const REMEDY: &str = "correct the file or export it again";
 
-/// A face's corner: numbers of position, texture coordinate and normal.
-type Corner = (usize, Option<usize>, Option<usize>);
+/// A face's corner: what numbers of the file it names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+struct Corner {
+    position: usize,
+    uv: Option<usize>,
+    normal: Option<usize>,
+    /// Smoothing group, where the corner has no normal and one is to be found.
+    group: Option<u32>,
+}
 
 struct Reader<'a> {
     path: &'a Path,
@@ -37,6 +48,10 @@ struct Reader<'a> {
     materials: HashMap<String, u32>,
     textures: HashMap<(PathBuf, bool), u32>,
     current: Option<u32>,
+    /// Smoothing group of the faces to come.
+    group: Option<u32>,
+    /// Sums of face normals by angle, by position and group.
+    smooth: HashMap<(usize, u32), DVec3>,
     model: Model,
 }
 
@@ -54,6 +69,8 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         materials: HashMap::new(),
         textures: HashMap::new(),
         current: None,
+        group: None,
+        smooth: HashMap::new(),
         model: Model::default(),
     };
     reader.model.name =
@@ -64,6 +81,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     if reader.model.triangles.is_empty() {
         return Err(Error::Empty { name: path.display().to_string() });
     }
+    reader.close_groups();
     Ok(reader.model)
 }
 
@@ -133,6 +151,21 @@ impl Reader<'_> {
                 self.normals.push(if normal.is_finite() { normal } else { Vec3::ZERO });
             }
             "f" => self.face(rest, number)?,
+            "s" => {
+                let word = without_comment(rest).trim();
+                self.group = match word {
+                    "off" | "" => None,
+                    "on" => Some(1),
+                    _ => match word.parse::<u32>() {
+                        Ok(group) => (group > 0).then_some(group),
+                        Err(_) => {
+                            let word: String = word.chars().take(40).collect();
+                            let problem = format!("{word:?} is no smoothing group");
+                            return Err(self.fault(number, problem));
+                        }
+                    },
+                };
+            }
             "usemtl" => {
                 let name = without_comment(rest).trim();
                 self.current = self.materials.get(name).copied();
@@ -168,7 +201,7 @@ impl Reader<'_> {
             return Ok(());
         }
         let vertices: Vec<u32> = corners.iter().map(|&corner| self.vertex(corner)).collect();
-        let places: Vec<DVec3> = corners.iter().map(|c| self.positions[c.0]).collect();
+        let places: Vec<DVec3> = corners.iter().map(|c| self.positions[c.position]).collect();
         let material = match self.current {
             Some(material) => material,
             None => self.stand_in(),
@@ -178,6 +211,7 @@ impl Reader<'_> {
             return Err(self.fault(number, "the file has more than 2^26 triangles"));
         }
         for triangle in triangles {
+            self.smoothen(triangle.map(|i| corners[i]));
             self.model.triangles.push(triangle.map(|i| vertices[i]));
             self.model.triangle_materials.push(material);
         }
@@ -215,19 +249,48 @@ impl Reader<'_> {
         let normal = index(self.normals.len(), "normal")?;
         let position =
             position.ok_or_else(|| self.fault(number, "a corner has no vertex index"))?;
-        Ok((position, uv, normal))
+        let group = self.group.filter(|_| normal.is_none());
+        Ok(Corner { position, uv, normal, group })
+    }
+
+    /// Adds a triangle's normal to those of its corners' groups.
+    fn smoothen(&mut self, corners: [Corner; 3]) {
+        let place = corners.map(|corner| self.positions[corner.position]);
+        for i in 0..3 {
+            let Some(group) = corners[i].group else { continue };
+            let (u, v) = (place[(i + 1) % 3] - place[i], place[(i + 2) % 3] - place[i]);
+            // Nothing for triangles without area: their normal is none.
+            let angle = u.cross(v).length().atan2(u.dot(v));
+            let sum = self.smooth.entry((corners[i].position, group)).or_default();
+            *sum += angle * u.cross(v).normalize_or_zero();
+        }
+    }
+
+    /// Gives the corners of smoothing groups their normals.
+    fn close_groups(&mut self) {
+        if self.smooth.is_empty() {
+            return;
+        }
+        let normals = &mut self.model.normals;
+        normals.resize(self.model.positions.len(), Vec3::ZERO);
+        for (corner, &vertex) in &self.vertices {
+            if let Some(sum) = corner.group.and_then(|g| self.smooth.get(&(corner.position, g))) {
+                normals[vertex as usize] = sum.normalize_or_zero().as_vec3();
+            }
+        }
     }
 
     fn vertex(&mut self, corner: Corner) -> u32 {
         let model = &mut self.model;
         *self.vertices.entry(corner).or_insert_with(|| {
             let first = model.positions.len();
-            model.positions.push(self.positions[corner.0]);
-            let colour = self.colours.get(corner.0).map(|c| c.extend(1.0));
+            model.positions.push(self.positions[corner.position]);
+            let colour = self.colours.get(corner.position).map(|c| c.extend(1.0));
             let colour = colour.or((!self.colours.is_empty()).then_some(Vec4::ONE));
             push(&mut model.colours, first, colour, Vec4::ONE);
-            push(&mut model.uvs[0], first, corner.1.map(|i| self.uvs[i]), Vec2::ZERO);
-            push(&mut model.normals, first, corner.2.map(|i| self.normals[i]), Vec3::ZERO);
+            push(&mut model.uvs[0], first, corner.uv.map(|i| self.uvs[i]), Vec2::ZERO);
+            let normal = corner.normal.map(|i| self.normals[i]);
+            push(&mut model.normals, first, normal, Vec3::ZERO);
             first as u32
         })
     }
@@ -282,9 +345,17 @@ impl Reader<'_> {
         if material.base.w < 1.0 || material.alpha_texture.is_some() {
             material.alpha = AlphaMode::Blend;
         }
-        if maps.has_pbr_texture {
-            let note = "map_Pr and map_Pm are not rendered";
-            self.model.notes.push(format!("material {}: {note}", material.name));
+        material.roughness_texture = self.map(path, maps.roughness.as_ref(), false)?;
+        material.metallic_texture = self.map(path, maps.metallic.as_ref(), false)?;
+        // A map without a number beside it says everything.
+        if maps.metallic.is_some() && !maps.has_metallic {
+            material.metallic = 1.0;
+        }
+        if maps.has_height {
+            let name: String = material.name.chars().take(80).collect();
+            self.model.notes.push(format!(
+                "material {name}: bump maps are not rendered; a normal map (norm) would be"
+            ));
         }
         let name = material.name.clone();
         let number = self.model.material(material);
@@ -301,14 +372,15 @@ impl Reader<'_> {
         let Some(map) = map else {
             return Ok(None);
         };
-        let element = format!("line {}: texture", map.line);
+        let library = path.file_name().unwrap_or_default().to_string_lossy();
+        let element = format!("{library} line {}: texture", map.line);
         let file = self.folder.resolve(&element, &map.file)?;
         let key = (file.clone(), srgb);
         let number = match self.textures.get(&key) {
             Some(&number) => number,
             None => {
-                let texture: Texture =
-                    resource::decode(&file, &element, &resource::read(&file)?, srgb)?;
+                let bytes = self.folder.read(&element, &file)?;
+                let texture: Texture = resource::decode(&file, &element, &bytes, srgb)?;
                 let model = &mut self.model;
                 resource::check_texels(path, &element, &model.textures, &texture)?;
                 model.textures.push(texture);
@@ -345,7 +417,12 @@ struct Maps {
     emissive: Option<Map>,
     alpha: Option<Map>,
     normal: Option<Map>,
-    has_pbr_texture: bool,
+    roughness: Option<Map>,
+    metallic: Option<Map>,
+    /// Whether `Pm` was there.
+    has_metallic: bool,
+    /// Whether there is a height map.
+    has_height: bool,
 }
 
 impl Maps {
@@ -393,12 +470,21 @@ impl Maps {
             "Pm" => {
                 material.reflection = Reflection::MetalRough;
                 material.metallic = one()?.clamp(0.0, 1.0);
+                self.has_metallic = true;
             }
             "map_Kd" => self.base = Map::read(rest, line),
             "map_Ke" => self.emissive = Map::read(rest, line),
             "map_d" => self.alpha = Map::read(rest, line),
             "norm" => self.normal = Map::read(rest, line),
-            "map_Pr" | "map_Pm" => self.has_pbr_texture = true,
+            "map_Pr" => {
+                material.reflection = Reflection::MetalRough;
+                self.roughness = Map::read(rest, line);
+            }
+            "map_Pm" => {
+                material.reflection = Reflection::MetalRough;
+                self.metallic = Map::read(rest, line);
+            }
+            "bump" | "map_bump" | "map_Bump" => self.has_height = true,
             _ => {}
         }
         Ok(())
@@ -525,7 +611,10 @@ fn triangulated(corners: &[DVec3]) -> Vec<[usize; 3]> {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
 mod tests {
+    use std::io::Cursor;
+
     use super::*;
 
     fn area(corners: &[DVec3], triangles: &[[usize; 3]]) -> (f64, f64) {
@@ -558,6 +647,91 @@ mod tests {
                 assert!((total - expected).abs() < 1e-12, "{total}");
             }
         }
+    }
+
+    /// Loads an OBJ file with files beside it.
+    fn loaded(obj: &str, files: &[(&str, &[u8])]) -> Result<Model, Error> {
+        let folder = tempfile::tempdir().expect("folder");
+        for (name, bytes) in files {
+            std::fs::write(folder.path().join(name), bytes).expect("write");
+        }
+        let path = folder.path().join("test.obj");
+        std::fs::write(&path, obj).expect("write");
+        load(&path)
+    }
+
+    /// Two squares that meet at a right angle, along the y axis.
+    const ROOF: &str = "v 0 0 0\nv 0 1 0\nv 1 0 0\nv 1 1 0\nv 0 0 -1\nv 0 1 -1\n";
+
+    #[test]
+    fn smoothing_groups_share_normals_and_no_group_is_flat() {
+        let normals = |text: &str| {
+            let model = loaded(&format!("{ROOF}{text}"), &[]).expect("a roof");
+            let at = |i: u32| model.normals.get(i as usize).copied().unwrap_or_default();
+            // By triangle and corner: position and normal.
+            let corners = model.triangles.iter().flatten();
+            corners.map(|&i| (model.positions[i as usize], at(i))).collect::<Vec<_>>()
+        };
+        let (z, x) = (Vec3::Z, Vec3::NEG_X);
+        let edge = (z + x).normalize();
+        for (text, at_edge, beside) in [
+            ("s 1\nf 1 3 4 2\nf 5 1 2 6\n", [edge, edge], [z, x]),
+            ("s 1\nf 1 3 4 2\ns 2\nf 5 1 2 6\n", [z, x], [z, x]),
+            ("f 1 3 4 2\nf 5 1 2 6\n", [Vec3::ZERO; 2], [Vec3::ZERO; 2]),
+            ("s 1\ns off\nf 1 3 4 2\ns 0\nf 5 1 2 6\n", [Vec3::ZERO; 2], [Vec3::ZERO; 2]),
+            // A normal of its own comes before the group's.
+            (
+                "vn 0 1 0\ns 1\nf 1//1 3//1 4//1 2//1\ns off\nf 5 1 2 6\n",
+                [Vec3::Y, Vec3::ZERO],
+                [Vec3::Y, Vec3::ZERO],
+            ),
+        ] {
+            for (i, (position, normal)) in normals(text).into_iter().enumerate() {
+                let face = i / 6;
+                let is_edge = position.x == 0.0 && position.z == 0.0;
+                let expected = if is_edge { at_edge[face] } else { beside[face] };
+                assert!(normal.distance(expected) < 1e-6, "{text}: {position} has {normal}");
+            }
+        }
+        let error = loaded(&format!("{ROOF}s five\nf 1 2 3\n"), &[]).expect_err("no group");
+        assert!(error.to_string().contains("line 7") && error.to_string().contains("five"));
+    }
+
+    #[test]
+    fn maps_of_roughness_and_metalness_are_read() {
+        let grey = |value: u8| {
+            let mut bytes = Cursor::new(Vec::new());
+            let image = image::GrayImage::from_pixel(2, 2, image::Luma([value]));
+            image.write_to(&mut bytes, image::ImageFormat::Png).expect("PNG");
+            bytes.into_inner()
+        };
+        let (rough, metal) = (grey(51), grey(204));
+        let load = |library: &str| {
+            let obj = format!("mtllib a.mtl\n{ROOF}vt 0 0\nusemtl m\nf 1/1 3/1 4/1\n");
+            let files: [(&str, &[u8]); 3] =
+                [("a.mtl", library.as_bytes()), ("r.png", &rough), ("m.png", &metal)];
+            loaded(&obj, &files).expect("a triangle")
+        };
+        let model = load("newmtl m\nmap_Pr r.png\nmap_Pm m.png\nPr 0.5\nbump r.png\n");
+        let material = &model.materials[0];
+        assert_eq!(material.reflection, Reflection::MetalRough);
+        assert_eq!((material.roughness, material.metallic), (0.5, 1.0));
+        let value = |texture: &Option<TextureRef>| {
+            let texture = texture.as_ref().expect("a texture");
+            let image = &model.textures[texture.texture as usize];
+            image.sample(Vec2::splat(0.5), &texture.sampler, 0.0)
+        };
+        // Where shading looks: green for roughness, blue for metalness.
+        assert!((value(&material.roughness_texture).y - 0.2).abs() < 1e-6);
+        assert!((value(&material.metallic_texture).z - 0.8).abs() < 1e-6);
+        assert!(model.notes.iter().any(|note| note.contains("bump")), "{:?}", model.notes);
+        // Without the map of one of them, it is the number's, and no metal by default.
+        let model = load("newmtl m\nmap_Pr r.png\n");
+        let material = &model.materials[0];
+        assert_eq!((material.roughness, material.metallic), (1.0, 0.0));
+        assert!(material.metallic_texture.is_none() && model.notes.is_empty());
+        let model = load("newmtl m\nPm 0.25\nmap_Pm m.png\n");
+        assert_eq!(model.materials[0].metallic, 0.25);
     }
 
     #[test]

@@ -210,7 +210,7 @@ impl<'a> PointCollector<'a> {
             if depth <= 0.0 || !camera.contains(pixel) {
                 return false;
             }
-            let first = self.tracer.first_solid(camera.centre, camera.direction(pixel));
+            let first = self.tracer.first_solid(camera.centre, camera.direction(pixel), None);
             first.is_some_and(|(t, ..)| (t - depth).abs() <= SAME_DEPTH * depth)
         };
         let seen = self.cameras.iter().enumerate().filter(|(_, camera)| sees(camera));

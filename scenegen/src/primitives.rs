@@ -119,14 +119,15 @@ pub(crate) fn noise(at: DVec2, cells: u32, octaves: u32, seed: u64) -> f64 {
         let p = at * f64::from(cells);
         let (floor, share) = (p.floor(), p - p.floor());
         let smooth = share * share * (3.0 - 2.0 * share);
-        let value = |dx: f64, dy: f64| {
-            let wrap = |v: f64| (v as i64).rem_euclid(i64::from(cells)) as u64;
-            let cell = [u64::from(octave), wrap(floor.x + dx), wrap(floor.y + dy)];
-            Draws::new(seed, &cell).unit64()
-        };
+        let wrap = |v: f64| (v as i64).rem_euclid(i64::from(cells)) as u64;
+        let lattice = Draws::new(seed, &[u64::from(octave)]);
+        let columns = [0.0, 1.0].map(|dx| lattice.with(wrap(floor.x + dx)));
         let mix = |a: f64, b: f64, t: f64| a + (b - a) * t;
-        let upper = mix(value(0.0, 0.0), value(1.0, 0.0), smooth.x);
-        let lower = mix(value(0.0, 1.0), value(1.0, 1.0), smooth.x);
+        let [upper, lower] = [0.0, 1.0].map(|dy| {
+            let row = wrap(floor.y + dy);
+            let [left, right] = columns.map(|column| column.with(row).unit64());
+            mix(left, right, smooth.x)
+        });
         sum += weight * mix(upper, lower, smooth.y);
         total += weight;
         weight *= 0.5;

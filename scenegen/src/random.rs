@@ -23,8 +23,12 @@ pub(crate) struct Draws {
 impl Draws {
     /// The stream of a seed and what identifies the purpose: view, pixel, sample.
     pub(crate) fn new(seed: u64, parts: &[u64]) -> Self {
-        let key = parts.iter().fold(mix(seed), |key, &part| mix(key ^ mix(part)));
-        Self { key, count: 0 }
+        parts.iter().fold(Self { key: mix(seed), count: 0 }, |draws, &part| draws.with(part))
+    }
+
+    /// The stream that [`Draws::new`] makes with one more part; nothing was drawn before.
+    pub(crate) fn with(self, part: u64) -> Self {
+        Self { key: mix(self.key ^ mix(part)), count: 0 }
     }
 
     pub(crate) fn bits(&mut self) -> u64 {

@@ -7,13 +7,15 @@ use std::fs::File;
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
-use image::{ImageReader, Limits};
+use image::{ImageFormat, ImageReader, Limits};
 
 use crate::error::Error;
 use crate::texture::Texture;
 
 /// Largest file read `[bytes]`.
 const MAX_FILE: u64 = 16 << 30;
+/// Formats of textures.
+const FORMATS: [ImageFormat; 3] = [ImageFormat::Png, ImageFormat::Jpeg, ImageFormat::WebP];
 /// Largest side of an image `[px]`.
 const MAX_SIDE: u32 = 16_384;
 /// Most pixels of an image.
@@ -106,7 +108,21 @@ impl Folder {
             uri: uri.chars().take(80).collect(),
             problem: "has a % that is followed by no two hexadecimal digits of UTF-8",
         })?;
-        read(&self.resolve(element, &decoded)?)
+        self.read(element, &self.resolve(element, &decoded)?)
+    }
+
+    /// Reads a file that was resolved for an element.
+    pub(crate) fn read(&self, element: &str, path: &Path) -> Result<Vec<u8>, Error> {
+        if path.exists() {
+            return read(path);
+        }
+        let name = path.strip_prefix(&self.folder).unwrap_or(path);
+        Err(Error::Malformed {
+            path: self.file.clone(),
+            element: element.to_owned(),
+            problem: format!("there is no file {}", name.display()),
+            remedy: "put it where the mesh file says, or take its mention out",
+        })
     }
 }
 
@@ -193,12 +209,15 @@ pub(crate) fn decode(
     };
     let reader = |bytes| {
         let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
+        if !reader.format().is_some_and(|format| FORMATS.contains(&format)) {
+            return Err(std::io::Error::other("it is neither PNG, JPEG nor WebP"));
+        }
         let mut limits = Limits::default();
         limits.max_image_width = Some(MAX_SIDE);
         limits.max_image_height = Some(MAX_SIDE);
         limits.max_alloc = Some(MAX_DECODED);
         reader.limits(limits);
-        Ok::<_, std::io::Error>(reader)
+        Ok(reader)
     };
     let header = reader(bytes).map_err(|e| fault(e.to_string()))?;
     let (width, height) = header.into_dimensions().map_err(|e| fault(e.to_string()))?;

@@ -119,20 +119,19 @@ impl Rig {
     }
 
     fn check(&self) -> Result<(), Error> {
-        let side = |option, value: u32| match value {
-            1..=16_384 => Ok(()),
-            _ => Err(Error::option(option, format!("{value} px is not in 1..=16384"))),
-        };
-        side("--width", self.width)?;
-        side("--height", self.height)?;
+        for side in [self.width, self.height] {
+            if !(1..=16_384).contains(&side) {
+                return Err(Error::option("--size", format!("{side} px is not in 1..=16384")));
+            }
+        }
         if u64::from(self.width) * u64::from(self.height) > 1 << 28 {
             return Err(Error::option("--size", "an image has at most 2^28 pixels"));
         }
-        if self.train == 0 || self.train > 100_000 || self.test > 100_000 {
-            return Err(Error::option(
-                "--views",
-                "there must be 1 to 100000 training views and at most 100000 test views",
-            ));
+        for (option, least, count) in [("--train", 1, self.train), ("--test", 0, self.test)] {
+            if !(least..=100_000).contains(&count) {
+                let problem = format!("{count} views are not in {least}..=100000");
+                return Err(Error::option(option, problem));
+            }
         }
         if !(self.fov > 0.5 && self.fov < 170.0) {
             return Err(Error::option(

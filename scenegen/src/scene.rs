@@ -3,6 +3,7 @@
 //! One piece: what is decided for a scene is decided in one order.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -10,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::error::Error;
 use crate::mesh::{FileCamera, Model, Reflection};
+use crate::panorama::Panorama;
 use crate::points::{InitPoints, PointCollector, PointOptions};
 use crate::presets::{PRESETS, Staging, open_sky, sun};
 use crate::rig::{Rig, RigKind};
@@ -49,11 +51,13 @@ pub struct Options {
     pub grid: u32,
     /// Light from the sky and from other surfaces.
     pub ambient: Option<Ambient>,
+    /// An equirectangular `.hdr` or `.exr` image as the sky, in place of the built-in sky and sun.
+    pub sky: Option<PathBuf>,
     /// Whether lights cast shadows.
     pub shadows: bool,
     /// Whether all materials are diffuse only.
     pub lambert: bool,
-    /// Factor on all light; None chooses for files that bring their own lights, and is 1 else.
+    /// Factor on all light; None chooses where files bring their own lights or sky, and is 1 else.
     pub exposure: Option<f32>,
     /// Initial points.
     pub points: PointOptions,
@@ -73,6 +77,7 @@ impl Default for Options {
             jitter: None,
             grid: 4,
             ambient: None,
+            sky: None,
             shadows: true,
             lambert: false,
             exposure: None,
@@ -196,26 +201,34 @@ impl Scene {
         let (train, test) = rig.cameras(&surface, &cameras)?;
         let ambient = options.ambient.unwrap_or(ambient);
         let traits = Traits::all(&surface, &model);
-        let brought_lights = matches!(source, Source::File(_)) && !model.lights.is_empty();
-        let mut exposure = options.exposure.unwrap_or(1.0);
-        if matches!(source, Source::File(_)) && model.lights.is_empty() {
+        let is_file = matches!(source, Source::File(_));
+        let brought_lights = is_file && !model.lights.is_empty();
+        if let Some(path) = &options.sky {
+            sky = Sky::Image(Arc::new(Panorama::load(path)?));
+            model.lights.retain(|light| *light != sun());
+        } else if is_file && !brought_lights {
             model.lights.push(sun());
         }
         let light = |sky, grid| {
             Lighting::new(&model.lights, &surface, sky, (ambient, options.shadows, grid))
         };
-        if brought_lights {
+        let mut exposure = options.exposure.unwrap_or(1.0);
+        // Light in units of its own.
+        if brought_lights || options.sky.is_some() {
+            let is_fill = options.sky.is_none();
             if options.exposure.is_none() {
-                let dark = light(Sky::uniform(0.0), 1);
+                let only = light(if is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
                 let (surface, model, traits) = (&surface, &model, &traits);
                 let tracer =
-                    Tracer { surface, model, traits, lighting: &dark, exposure: 1.0, seed: 0 };
+                    Tracer { surface, model, traits, lighting: &only, exposure: 1.0, seed: 0 };
                 exposure = exposure_for(&tracer, &train);
             }
             // Fill light in the units the exposure takes to the image's.
-            sky = dimmed(sky, 0.4 / exposure);
+            if is_fill {
+                sky = sky.dimmed(0.4 / exposure);
+            }
         }
-        let lighting = light(sky, options.grid);
+        let lighting = light(sky.clone(), options.grid);
         let requirements = requirements(&model, &surface, &train, finest);
         let name_of = |split: &str, i: usize| format!("{split}/r_{i:03}");
         let views = |cameras: &[Camera], split: Split, folder: &str| {
@@ -269,7 +282,7 @@ impl Scene {
 
     /// Depth, as a ray parameter, and normal of the first surface with alpha of at least one half.
     pub(crate) fn first_solid(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
-        let solid = self.tracer().first_solid(origin, direction);
+        let solid = self.tracer().first_solid(origin, direction, None);
         solid.map(|(depth, normal, _)| (depth, normal))
     }
 
@@ -389,10 +402,6 @@ fn exposure_for(tracer: &Tracer<'_>, cameras: &[Camera]) -> f32 {
         Some(&bright) => (0.9 / bright).clamp(1e-9, 1e9),
         None => 1.0,
     }
-}
-
-fn dimmed(sky: Sky, factor: f32) -> Sky {
-    Sky { zenith: sky.zenith.map(|v| v * factor), ground: sky.ground.map(|v| v * factor), ..sky }
 }
 
 fn requirements(model: &Model, surface: &Surface, cameras: &[Camera], finest: f64) -> Requirements {

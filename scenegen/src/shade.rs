@@ -8,6 +8,7 @@ use std::sync::OnceLock;
 
 use glam::{DVec3, Vec2, Vec3, Vec4, Vec4Swizzles};
 
+use crate::bundle::{LANES, has};
 use crate::intersect::Meeting;
 use crate::mesh::{AlphaMode, Light, LightKind, Material, Model, Reflection};
 use crate::random::{
@@ -62,15 +63,23 @@ pub(crate) struct Point<'a> {
     emitted: Vec3,
 }
 
-/// Which of a pixel's subsamples is shaded, with its random numbers.
-pub(crate) struct Subsample {
-    pub(crate) index: u32,
+/// Random numbers of a pixel, and what its rays met.
+pub(crate) struct Sampling {
     pub(crate) draws: Draws,
-    /// What the pixel's last ray met, by place in leaf order: the next one is likely to meet it too,
-    /// and then needs to look only in front of it. No result depends on this.
+    /// What a ray from the camera met, by place in leaf order.
     pub(crate) met: Option<u32>,
-    /// What hid a light last.
+    /// What hid a light last, by place in leaf order: it is likely to hide it again, and is tried
+    /// first. No result depends on this.
     pub(crate) hid: Option<u32>,
+}
+
+/// A point as one of a pixel's subsamples sees it.
+pub(crate) struct Seen<'a> {
+    /// Number of the subsample.
+    pub(crate) index: u32,
+    pub(crate) point: Point<'a>,
+    /// Towards the viewer.
+    pub(crate) view: Vec3,
 }
 
 impl Lighting {
@@ -103,61 +112,67 @@ impl Lighting {
         Self { lights: lights.collect(), sky, ambient, shadows, grid: grid.max(1) }
     }
 
-    /// Radiance of a point towards the viewer.
+    /// Radiance of points towards their viewers. At most [`LANES`]: those of a pixel, whose way to a
+    /// light is shared.
     pub(crate) fn radiance(
         &self,
         matter: &Matter<'_>,
-        point: &Point<'_>,
-        view: Vec3,
-        sample: &mut Subsample,
-    ) -> Vec3 {
-        if point.material.reflection == Reflection::Unlit {
-            return point.base;
+        points: &[Seen<'_>],
+        sampling: &mut Sampling,
+    ) -> [Vec3; LANES] {
+        let mut total = [Vec3::ZERO; LANES];
+        for (total, Seen { point, .. }) in total.iter_mut().zip(points) {
+            *total = if point.is_unlit() { point.base } else { point.emitted };
         }
-        let mut total = point.emitted;
         for light in &self.lights {
-            let u = || stratum(sample.index, self.grid, sample.draws.square());
-            let Some((to_light, distance, irradiance)) = arriving(light, point.place, u) else {
-                continue;
-            };
-            if point.geometric.dot(to_light) <= 0.0 {
-                continue;
+            let mut rays = [LocalRay::NONE; LANES];
+            // Of each ray, its point's number and the light it brings where nothing is in its way.
+            let mut brings = [(0, Vec3::ZERO); LANES];
+            let mut count = 0;
+            for (number, Seen { index, point, view }) in points.iter().enumerate() {
+                if point.is_unlit() {
+                    continue;
+                }
+                let u = || stratum(*index, self.grid, sampling.draws.square());
+                let Some((to_light, distance, irradiance)) = arriving(light, point.place, u) else {
+                    continue;
+                };
+                if point.geometric.dot(to_light) <= 0.0 {
+                    continue;
+                }
+                let sent = point.reflected(*view, to_light) * irradiance;
+                if sent.max_element() > 0.0 {
+                    rays[count] = lifted_to(point, to_light, distance);
+                    brings[count] = (number, sent);
+                    count += 1;
+                }
             }
-            let sent = point.reflected(view, to_light) * irradiance;
-            if sent.max_element() > 0.0
-                && !self.is_shadowed(matter, point, to_light, distance, sample)
-            {
-                total += sent;
+            let hidden = self.shadowed(matter, &rays[..count], sampling);
+            for (lane, &(number, sent)) in brings.iter().enumerate().take(count) {
+                if !has(hidden, lane) {
+                    total[number] += sent;
+                }
             }
         }
-        total + self.ambient(matter, point, view, sample)
+        for (total, seen) in total.iter_mut().zip(points) {
+            if !seen.point.is_unlit() {
+                *total += self.ambient(matter, seen, sampling);
+            }
+        }
+        total
     }
 
-    fn is_shadowed(
-        &self,
-        matter: &Matter<'_>,
-        point: &Point<'_>,
-        to: Vec3,
-        distance: f32,
-        sample: &mut Subsample,
-    ) -> bool {
+    /// Which rays to a light do not reach it, as bits.
+    fn shadowed(&self, matter: &Matter<'_>, rays: &[LocalRay], sampling: &mut Sampling) -> u32 {
         if !self.shadows {
-            return false;
+            return 0;
         }
-        let ray = lifted(point, to, (distance - 2.0 * LIFT).max(0.0));
         let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
-        let found = matter.surface.occluder(&ray, sample.hid, solid);
-        sample.hid = found.or(sample.hid);
-        found.is_some()
+        matter.surface.occluded_of(rays, &mut sampling.hid, solid)
     }
 
-    fn ambient(
-        &self,
-        matter: &Matter<'_>,
-        point: &Point<'_>,
-        view: Vec3,
-        sample: &mut Subsample,
-    ) -> Vec3 {
+    fn ambient(&self, matter: &Matter<'_>, seen: &Seen<'_>, sampling: &mut Sampling) -> Vec3 {
+        let Seen { index, ref point, view } = *seen;
         let shiny = point.material.reflection == Reflection::MetalRough;
         let diffuse_colour = point.diffuse_colour();
         let rays = match self.ambient {
@@ -172,11 +187,11 @@ impl Lighting {
         let (tangent, bitangent) = frame(point.shading);
         let mut sum = Vec3::ZERO;
         for _ in 0..count {
-            let u = stratum(sample.index, self.grid, sample.draws.square());
+            let u = stratum(index, self.grid, sampling.draws.square());
             let d = cosine_hemisphere(u);
             let direction = d.x * tangent + d.y * bitangent + d.z * point.shading;
             if point.geometric.dot(direction) > 0.0 {
-                sum += self.arriving_from(matter, point, direction, bounce, sample);
+                sum += self.arriving_from(matter, point, direction, bounce, sampling);
             }
         }
         let diffuse = diffuse_colour * sum / count as f32;
@@ -186,7 +201,7 @@ impl Lighting {
         if !bounce {
             return diffuse + self.mirrored_sky(point, view);
         }
-        diffuse + self.mirrored(matter, point, view, sample)
+        diffuse + self.mirrored(matter, seen, sampling)
     }
 
     /// Radiance that arrives from a direction: the sky, or what hides it, as lit directly.
@@ -196,12 +211,12 @@ impl Lighting {
         point: &Point<'_>,
         direction: Vec3,
         bounce: bool,
-        sample: &mut Subsample,
+        sampling: &mut Sampling,
     ) -> Vec3 {
         let ray = lifted(point, direction, f32::MAX);
         if !bounce {
             let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
-            let hidden = matter.surface.occluder(&ray, None, solid).is_some();
+            let hidden = matter.surface.occluder(&ray, solid).is_some();
             return if hidden { Vec3::ZERO } else { self.sky.radiance(direction) };
         }
         let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
@@ -209,20 +224,20 @@ impl Lighting {
             return self.sky.radiance(direction);
         };
         let (there, _) = Point::read(matter, &ray, &hit, 0.0);
-        if there.material.reflection == Reflection::Unlit {
+        if there.is_unlit() {
             return there.base;
         }
         let emitted = if there.material.is_light { Vec3::ZERO } else { there.emitted };
         let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
         for light in &self.lights {
-            let u = || sample.draws.square();
+            let u = || sampling.draws.square();
             let Some((to_light, distance, irradiance)) = arriving(light, there.place, u) else {
                 continue;
             };
             let cos = there.shading.dot(to_light);
             if cos > 0.0
                 && there.geometric.dot(to_light) > 0.0
-                && !self.is_shadowed(matter, &there, to_light, distance, sample)
+                && self.shadowed(matter, &[lifted_to(&there, to_light, distance)], sampling) == 0
             {
                 total += there.diffuse_colour() / PI * cos * irradiance;
             }
@@ -241,17 +256,12 @@ impl Lighting {
     }
 
     /// What a glossy surface mirrors, by one sampled direction.
-    fn mirrored(
-        &self,
-        matter: &Matter<'_>,
-        point: &Point<'_>,
-        view: Vec3,
-        sample: &mut Subsample,
-    ) -> Vec3 {
+    fn mirrored(&self, matter: &Matter<'_>, seen: &Seen<'_>, sampling: &mut Sampling) -> Vec3 {
+        let Seen { index, ref point, view } = *seen;
         let (tangent, bitangent) = frame(point.shading);
         let cos = view.dot(point.shading).max(1e-4);
         let local = Vec3::new(view.dot(tangent), view.dot(bitangent), cos).normalize();
-        let u = stratum(sample.index, self.grid, sample.draws.square());
+        let u = stratum(index, self.grid, sampling.draws.square());
         let half = ggx_visible_normal(local, point.alpha_ggx, u);
         let out = 2.0 * local.dot(half) * half - local;
         let direction = out.x * tangent + out.y * bitangent + out.z * point.shading;
@@ -260,7 +270,7 @@ impl Lighting {
         }
         let weight = fresnel(point.f0(), local.dot(half))
             * shadowing_after_masking(local.z, out.z, point.alpha_ggx);
-        weight * self.arriving_from(matter, point, direction, true, sample)
+        weight * self.arriving_from(matter, point, direction, true, sampling)
     }
 }
 
@@ -297,8 +307,10 @@ impl<'a> Point<'a> {
                 shading = geometric;
             }
         }
-        let mr = at.texel(material.metal_rough_texture.as_ref());
-        let roughness = (material.roughness * mr.y).clamp(0.0, 1.0);
+        let (rough, metal) = (&material.roughness_texture, &material.metallic_texture);
+        let rough_texel = at.texel(rough.as_ref());
+        let metal_texel = if metal == rough { rough_texel } else { at.texel(metal.as_ref()) };
+        let roughness = (material.roughness * rough_texel.y).clamp(0.0, 1.0);
         let emitted = material.emissive * at.texel(material.emissive_texture.as_ref()).xyz();
         let point = Self {
             place: a + v * (b - a) + w * (c - a),
@@ -306,12 +318,16 @@ impl<'a> Point<'a> {
             shading,
             material,
             base: base.xyz(),
-            metallic: (material.metallic * mr.z).clamp(0.0, 1.0),
+            metallic: (material.metallic * metal_texel.z).clamp(0.0, 1.0),
             alpha_ggx: (roughness * roughness).max(MIN_ALPHA),
             roughness,
             emitted,
         };
         (point, alpha)
+    }
+
+    fn is_unlit(&self) -> bool {
+        self.material.reflection == Reflection::Unlit
     }
 
     fn diffuse_colour(&self) -> Vec3 {
@@ -545,6 +561,11 @@ fn windowed(distance: f32, range: f64) -> f32 {
     }
     let share = f64::from(distance) / range;
     inverse_square * (1.0 - share.powi(4)).clamp(0.0, 1.0) as f32
+}
+
+/// The ray from a point that ends just before a light.
+fn lifted_to(point: &Point<'_>, to_light: Vec3, distance: f32) -> LocalRay {
+    lifted(point, to_light, (distance - 2.0 * LIFT).max(0.0))
 }
 
 fn lifted(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {

@@ -1,55 +1,96 @@
-//! Light from all around: a gradient between ground and zenith.
+//! Light from all around: a gradient between ground and zenith, or an image.
 //!
-//! Its radiance is linear in the sine of elevation. Irradiance then has a closed form, so a scene
-//! that asks for no occlusion of the sky needs no secondary ray for it.
+//! A gradient's radiance is linear in the sine of elevation. Irradiance then has a closed form, so a
+//! scene that asks for no occlusion of the sky needs no secondary ray for it.
 
 use std::f32::consts::PI;
+use std::sync::Arc;
 
 use glam::Vec3;
-use serde::{Deserialize, Serialize};
+use serde::{Serialize, Serializer};
 
-/// The sky.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Sky {
-    /// Linear radiance straight up.
-    pub zenith: [f32; 3],
-    /// Linear radiance straight down.
-    pub ground: [f32; 3],
-    /// Upward direction, unit length.
-    pub up: [f32; 3],
+use crate::panorama::Panorama;
+
+/// The sky. It lights; where a ray meets no surface the image stays transparent.
+#[derive(Debug, Clone, Serialize)]
+#[serde(untagged)]
+pub enum Sky {
+    /// Between two colours.
+    Gradient {
+        /// Linear radiance straight up.
+        zenith: [f32; 3],
+        /// Linear radiance straight down.
+        ground: [f32; 3],
+        /// Upward direction, unit length.
+        up: [f32; 3],
+    },
+    /// As an image has it.
+    Image(#[serde(serialize_with = "shared")] Arc<Panorama>),
+}
+
+/// As what is shared.
+fn shared<S: Serializer>(image: &Panorama, to: S) -> Result<S::Ok, S::Error> {
+    image.serialize(to)
 }
 
 impl Sky {
     /// The same radiance from everywhere.
     #[must_use]
     pub fn uniform(radiance: f32) -> Self {
-        Self { zenith: [radiance; 3], ground: [radiance; 3], up: [0.0, 1.0, 0.0] }
+        Self::Gradient { zenith: [radiance; 3], ground: [radiance; 3], up: [0.0, 1.0, 0.0] }
     }
 
-    /// Mean of zenith and ground, and half their difference.
-    fn parts(&self) -> (Vec3, Vec3) {
-        let (zenith, ground) = (Vec3::from(self.zenith), Vec3::from(self.ground));
-        (0.5 * (zenith + ground), 0.5 * (zenith - ground))
+    /// A gradient's light times a factor; an image is as it is.
+    pub(crate) fn dimmed(self, factor: f32) -> Self {
+        match self {
+            Self::Gradient { zenith, ground, up } => Self::Gradient {
+                zenith: zenith.map(|v| v * factor),
+                ground: ground.map(|v| v * factor),
+                up,
+            },
+            Self::Image(image) => Self::Image(image),
+        }
     }
 
     /// Radiance from a direction of unit length.
     pub(crate) fn radiance(&self, direction: Vec3) -> Vec3 {
-        let (mean, half) = self.parts();
-        mean + half * direction.dot(Vec3::from(self.up))
+        match self {
+            Self::Gradient { zenith, ground, up } => {
+                let (mean, half) = parts(zenith, ground);
+                mean + half * direction.dot(Vec3::from(*up))
+            }
+            Self::Image(image) => image.radiance(direction),
+        }
     }
 
     /// Irradiance of a surface with this normal: the integral of radiance times cosine over its
-    /// hemisphere, pi · (mean + 2/3 · half · n·up).
+    /// hemisphere. Of a gradient, pi · (mean + 2/3 · half · n·up).
     pub(crate) fn irradiance(&self, normal: Vec3) -> Vec3 {
-        let (mean, half) = self.parts();
-        PI * (mean + (2.0 / 3.0) * half * normal.dot(Vec3::from(self.up)))
+        match self {
+            Self::Gradient { zenith, ground, up } => {
+                let (mean, half) = parts(zenith, ground);
+                PI * (mean + (2.0 / 3.0) * half * normal.dot(Vec3::from(*up)))
+            }
+            Self::Image(image) => PI * image.blurred(normal, 1.0),
+        }
     }
 
     /// Mean radiance of a lobe about a direction that is sharp at roughness 0 and a cosine lobe
     /// at 1.
     pub(crate) fn blurred(&self, direction: Vec3, roughness: f32) -> Vec3 {
-        let (mean, half) = self.parts();
-        let sharpness = 1.0 - roughness * roughness / 3.0;
-        mean + half * (sharpness * direction.dot(Vec3::from(self.up)))
+        match self {
+            Self::Gradient { zenith, ground, up } => {
+                let (mean, half) = parts(zenith, ground);
+                let sharpness = 1.0 - roughness * roughness / 3.0;
+                mean + half * (sharpness * direction.dot(Vec3::from(*up)))
+            }
+            Self::Image(image) => image.blurred(direction, roughness),
+        }
     }
+}
+
+/// Mean of zenith and ground, and half their difference.
+fn parts(zenith: &[f32; 3], ground: &[f32; 3]) -> (Vec3, Vec3) {
+    let (zenith, ground) = (Vec3::from(*zenith), Vec3::from(*ground));
+    (0.5 * (zenith + ground), 0.5 * (zenith - ground))
 }

@@ -88,6 +88,12 @@ pub(crate) struct LocalRay {
     pub(crate) tmax: f32,
 }
 
+impl LocalRay {
+    /// Meets nothing; stands where a ray will.
+    pub(crate) const NONE: Self =
+        Self { origin: Vec3::ZERO, direction: Vec3::Z, tmin: 0.0, tmax: 0.0 };
+}
+
 /// A meeting with a triangle, by its place in leaf order.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LocalHit {
@@ -112,10 +118,10 @@ impl Surface {
         let scale =
             if half > 0.0 && (HALF_SIDE / half).is_finite() { HALF_SIDE / half } else { 1.0 };
         let local = |i: u32| ((model.positions[i as usize] - centre) * scale).as_vec3();
-        let in_order: Vec<[Vec3; 3]> = model.triangles.iter().map(|t| t.map(local)).collect();
-        let bvh = build(&in_order);
-        let triangles =
-            bvh.primitive_indices.iter().map(|&id| in_order[id as usize]).collect::<Vec<_>>();
+        let triangle = |corners: &[u32; 3]| corners.map(local);
+        let bvh = build(model.triangles.iter().map(|t| padded(&triangle(t))).collect());
+        let in_leaves = bvh.primitive_indices.iter().map(|&id| &model.triangles[id as usize]);
+        let triangles = in_leaves.map(triangle).collect();
         let depth = depth(&bvh);
         let build_seconds = start.elapsed().as_secs_f64();
         Ok(Self { bvh, triangles, centre, scale, depth, bounds, build_seconds })
@@ -144,7 +150,7 @@ impl Surface {
         let step = way * (margin / length);
         let (origin, direction) = (from + step, way - 2.0 * step);
         let ray = self.enter(origin, direction, 1.0);
-        ray.is_some_and(|ray| self.occluder(&ray, None, |_, _| true).is_some())
+        ray.is_some_and(|ray| self.occluder(&ray, |_, _| true).is_some())
     }
 
     /// The surface's nearest point.
@@ -206,6 +212,11 @@ impl Surface {
         all
     }
 
+    /// A corner of the model as it is traced: rounded in local coordinates.
+    pub(crate) fn traced(&self, corner: DVec3) -> DVec3 {
+        self.to_world(self.to_local(corner).as_vec3().as_dvec3())
+    }
+
     pub(crate) fn to_local(&self, world: DVec3) -> DVec3 {
         (world - self.centre) * self.scale
     }
@@ -217,6 +228,11 @@ impl Surface {
     /// Local units per world unit.
     pub(crate) fn scale(&self) -> f64 {
         self.scale
+    }
+
+    /// Levels of the tree, an upper bound of what a stack must hold.
+    pub(crate) fn depth(&self) -> usize {
+        self.depth
     }
 
     pub(crate) fn triangle_of(&self, slot: u32) -> u32 {
@@ -339,18 +355,30 @@ impl Surface {
         best
     }
 
-    /// Any triangle whose meeting counts, by its place in leaf order; `hint` is tried first.
+    /// Whether a triangle, by its place in leaf order, is met in a way that counts.
+    #[inline]
+    pub(crate) fn hides(
+        &self,
+        slot: u32,
+        ray: &LocalRay,
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> bool {
+        let sheared = ShearedRay::new(ray.origin, ray.direction);
+        let met = sheared.meet(&self.triangles[slot as usize]);
+        met.is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
+    }
+
+    /// Any triangle whose meeting counts, by its place in leaf order.
     #[inline]
     pub(crate) fn occluder(
         &self,
         ray: &LocalRay,
-        hint: Option<u32>,
         accept: impl Fn(u32, &Meeting) -> bool,
     ) -> Option<u32> {
         if self.depth <= SHALLOW {
-            self.occluder_with(StackStack::<u32, SHALLOW>::default(), ray, hint, accept)
+            self.occluder_with(StackStack::<u32, SHALLOW>::default(), ray, accept)
         } else {
-            self.occluder_with(HeapStack::new_with_capacity(self.depth), ray, hint, accept)
+            self.occluder_with(HeapStack::new_with_capacity(self.depth), ray, accept)
         }
     }
 
@@ -359,7 +387,6 @@ impl Surface {
         &self,
         mut stack: impl FastStack<u32>,
         ray: &LocalRay,
-        hint: Option<u32>,
         accept: impl Fn(u32, &Meeting) -> bool,
     ) -> Option<u32> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
@@ -368,11 +395,6 @@ impl Surface {
                 .meet(&self.triangles[slot as usize])
                 .is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
         };
-        if let Some(slot) = hint
-            && counts(slot)
-        {
-            return hint;
-        }
         let mut found = None;
         let look = |node: &Bvh2Node, _: &mut Ray, _: &mut RayHit| {
             found =
@@ -389,14 +411,14 @@ fn box_ray(ray: &LocalRay) -> Ray {
     Ray::new(Vec3A::from(ray.origin), Vec3A::from(ray.direction), 0.0, ray.tmax)
 }
 
-fn build(triangles: &[[Vec3; 3]]) -> Bvh2 {
-    let boxes: Vec<Aabb> = triangles
-        .iter()
-        .map(|[a, b, c]| {
-            let (lo, hi) = (a.min(*b).min(*c) - PADDING, a.max(*b).max(*c) + PADDING);
-            Aabb::new(Vec3A::from(lo), Vec3A::from(hi))
-        })
-        .collect();
+/// The box that is tested for a triangle.
+#[inline]
+pub(crate) fn padded([a, b, c]: &[Vec3; 3]) -> Aabb {
+    let [a, b, c] = [Vec3A::from(*a), Vec3A::from(*b), Vec3A::from(*c)];
+    Aabb::new(a.min(b).min(c) - PADDING, a.max(b).max(c) + PADDING)
+}
+
+fn build(boxes: Vec<Aabb>) -> Bvh2 {
     // The library's medium preset, step by step: its own function validates in debug builds and
     // panics for the degenerate trees that hostile meshes have.
     let mut bvh = PlocBuilder::with_capacity(boxes.len()).build(
@@ -406,10 +428,14 @@ fn build(triangles: &[[Vec3; 3]]) -> Bvh2 {
         SortPrecision::U64,
         3,
     );
+    drop(boxes);
     let mut optimiser = ReinsertionOptimizer::default();
     optimiser.run(&mut bvh, 0.05, None);
     collapse(&mut bvh, 8, 3.0);
     optimiser.run(&mut bvh, 0.1, None);
+    // The builder made one leaf per triangle, and needs parents where tracing does not.
+    bvh.nodes.shrink_to_fit();
+    bvh.parents = Vec::new();
     bvh
 }
 

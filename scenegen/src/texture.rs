@@ -39,7 +39,7 @@ impl Default for Sampler {
 }
 
 /// A texture as a material uses it.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TextureRef {
     /// Number of the texture in the model.
     pub texture: u32,
@@ -140,6 +140,7 @@ impl Texture {
 }
 
 impl Level {
+    #[inline]
     fn texel(&self, x: u32, y: u32, srgb: bool) -> Vec4 {
         let at = 4 * (y as usize * self.width as usize + x as usize);
         let t = &self.texels[at..at + 4];
@@ -153,6 +154,7 @@ impl Level {
         self.texel(x, y, srgb)
     }
 
+    #[inline]
     fn linear(&self, uv: Vec2, sampler: &Sampler, srgb: bool) -> Vec4 {
         let (x0, x1, fx) = neighbours(uv.x, self.width, sampler.wrap_u);
         let (y0, y1, fy) = neighbours(uv.y, self.height, sampler.wrap_v);

@@ -5,11 +5,12 @@
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
+use crate::bundle::LANES;
 use crate::camera::Camera;
 use crate::intersect::Meeting;
 use crate::mesh::Model;
 use crate::random::{Draws, stratum};
-use crate::shade::{Lighting, Matter, Point, Subsample, Traits};
+use crate::shade::{Lighting, Matter, Point, Sampling, Seen, Traits};
 use crate::surface::{LocalHit, LocalRay, Surface};
 use crate::texture::encode;
 
@@ -19,6 +20,8 @@ const MAX_LAYERS: usize = 64;
 const MIN_TRANSMITTANCE: f32 = 1.0 / 512.0;
 /// Rows that one task traces.
 const BAND: usize = 4;
+/// Columns of the tiles of a band that are skipped where they show nothing.
+const TILE: usize = 8;
 
 /// One rendered view.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,6 +54,49 @@ pub(crate) struct Tracer<'a> {
     pub(crate) seed: u64,
 }
 
+/// Rays of a pixel from the camera, at most [`LANES`].
+struct Rays {
+    rays: [LocalRay; LANES],
+    /// Number of the subsample that each is.
+    index: [u32; LANES],
+    /// Distance at which each one's parameter starts, local units.
+    entry: [f32; LANES],
+    count: usize,
+    /// Width of a ray's cone at distance 1.
+    spread: f32,
+}
+
+impl Rays {
+    fn new(spread: f32) -> Self {
+        let (rays, index, entry) = ([LocalRay::NONE; LANES], [0; LANES], [0.0; LANES]);
+        Self { rays, index, entry, count: 0, spread }
+    }
+
+    /// Adds one if it comes near the surface.
+    fn add(&mut self, surface: &Surface, index: u32, origin: DVec3, direction: DVec3) {
+        if let Some(ray) = surface.enter(origin, direction, f64::INFINITY) {
+            let entry = (ray.origin.as_dvec3() - surface.to_local(origin)).length() as f32;
+            self.rays[self.count] = ray;
+            self.index[self.count] = index;
+            self.entry[self.count] = entry;
+            self.count += 1;
+        }
+    }
+
+    fn all(&self) -> &[LocalRay] {
+        &self.rays[..self.count]
+    }
+
+    fn read<'a>(&self, matter: &Matter<'a>, lane: usize, hit: &LocalHit) -> (Point<'a>, f32) {
+        let width = (hit.at.t + self.entry[lane]) * self.spread;
+        Point::read(matter, &self.rays[lane], hit, width)
+    }
+
+    fn seen<'a>(&self, lane: usize, point: Point<'a>) -> Seen<'a> {
+        Seen { index: self.index[lane], point, view: -self.rays[lane].direction }
+    }
+}
+
 impl Frame {
     fn empty(width: u32, height: u32) -> Self {
         let pixels = width as usize * height as usize;
@@ -77,84 +123,140 @@ impl Tracer<'_> {
             .zip(frame.normals.par_chunks_mut(BAND * row))
             .zip(frame.triangles.par_chunks_mut(BAND * row));
         bands.enumerate().for_each(|(band, (((rgba, depth), normals), triangles))| {
-            for i in 0..depth.len() {
-                let (x, y) = (i % row, band * BAND + i / row);
-                let pixel = DVec2::new(x as f64, y as f64);
-                let draws = Draws::new(self.seed, &[view, (y * row + x) as u64]);
-                rgba[4 * i..4 * i + 4].copy_from_slice(&self.pixel(camera, pixel, draws));
-                let direction = camera.direction(pixel + 0.5);
-                if let Some(first) = self.first_solid(camera.centre, direction) {
-                    depth[i] = first.0 as f32;
-                    normals[i] = first.1.as_vec3().to_array();
-                    triangles[i] = first.2;
+            let top = band * BAND;
+            let rows = depth.len() / row;
+            for left in (0..row).step_by(TILE) {
+                let tile = (left, top, TILE.min(row - left), rows);
+                if self.is_empty(camera, tile) {
+                    continue;
+                }
+                let places = (0..rows).flat_map(|y| (left..left + tile.2).map(move |x| (x, y)));
+                for (x, y) in places {
+                    let i = y * row + x;
+                    let pixel = DVec2::new(x as f64, (top + y) as f64);
+                    let draws = Draws::new(self.seed, &[view, ((top + y) * row + x) as u64]);
+                    let (colour, met) = self.pixel(camera, pixel, draws);
+                    rgba[4 * i..4 * i + 4].copy_from_slice(&colour);
+                    let direction = camera.direction(pixel + 0.5);
+                    if let Some(first) = self.first_solid(camera.centre, direction, met) {
+                        depth[i] = first.0 as f32;
+                        normals[i] = first.1.as_vec3().to_array();
+                        triangles[i] = first.2;
+                    }
                 }
             }
         });
         frame
     }
 
+    /// Whether no ray through a tile of pixels (left, top, width, height) meets anything.
+    fn is_empty(
+        &self,
+        camera: &Camera,
+        (x, y, width, height): (usize, usize, usize, usize),
+    ) -> bool {
+        // Single precision rounds the pyramid by less than 3e-7 of the distance.
+        let margin = 1e-6 * camera.fx.max(camera.fy);
+        let (left, top) = (x as f64 - margin, y as f64 - margin);
+        let (right, bottom) = ((x + width) as f64 + margin, (y + height) as f64 + margin);
+        let corners = [(left, top), (right, top), (left, bottom), (right, bottom)];
+        let directions = corners.map(|(x, y)| camera.direction(DVec2::new(x, y)));
+        self.surface.is_beside(camera.centre, directions)
+    }
+
     fn matter(&self) -> Matter<'_> {
         Matter { surface: self.surface, model: self.model, traits: self.traits }
     }
 
-    /// Colour and alpha of a pixel, whose upper left corner is at `corner`.
-    fn pixel(&self, camera: &Camera, corner: DVec2, draws: Draws) -> [u8; 4] {
+    /// Colour and alpha of a pixel, whose upper left corner is at `corner`; also a triangle that one
+    /// of its rays met, by place in leaf order.
+    fn pixel(&self, camera: &Camera, corner: DVec2, draws: Draws) -> ([u8; 4], Option<u32>) {
         let grid = self.lighting.grid;
         let (mut colour, mut alpha) = (Vec3::ZERO, 0.0);
-        let mut sample = Subsample { index: 0, draws, met: None, hid: None };
+        let mut sampling = Sampling { draws, met: None, hid: None };
         // Width of a subsample at depth 1.
         let spread = 1.0 / (camera.fx * f64::from(grid)) as f32;
-        for index in 0..grid * grid {
-            sample.index = index;
-            let place = stratum(index, grid, sample.draws.square());
-            let direction = camera.direction(corner + place.as_dvec2());
-            let (c, a) = self.through(camera.centre, direction, spread, &mut sample);
+        let mut indices = 0..grid * grid;
+        while !indices.is_empty() {
+            let mut rays = Rays::new(spread);
+            for index in indices.by_ref().take(LANES) {
+                let place = stratum(index, grid, sampling.draws.square());
+                let direction = camera.direction(corner + place.as_dvec2());
+                rays.add(self.surface, index, camera.centre, direction);
+            }
+            let (c, a) = self.through(&rays, &mut sampling);
             colour += c;
             alpha += a;
         }
         if alpha <= 0.0 {
-            return [0; 4];
+            return ([0; 4], sampling.met);
         }
         let straight = colour * (self.exposure / alpha);
         let coverage = alpha / (grid * grid) as f32;
         let a = (coverage.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-        [encode(straight.x), encode(straight.y), encode(straight.z), a]
+        ([encode(straight.x), encode(straight.y), encode(straight.z), a], sampling.met)
     }
 
-    /// Colour, weighted with alpha, and alpha along a ray.
-    fn through(
+    /// Sums over rays: colour, weighted with alpha, and alpha.
+    fn through(&self, rays: &Rays, sampling: &mut Sampling) -> (Vec3, f32) {
+        let matter = self.matter();
+        let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
+        let (mut colours, mut alphas) = (Vec3::ZERO, 0.0);
+        // First surfaces together, as most are opaque; what is behind them, ray by ray.
+        let hits = self.surface.closest_of(rays.all(), visible);
+        sampling.met = hits[rays.count / 2].map(|hit| hit.slot).or(sampling.met);
+        let mut alphas_of = [0.0; LANES];
+        let mut seen = Vec::with_capacity(LANES);
+        for (lane, hit) in hits.iter().enumerate() {
+            let Some(hit) = hit else { continue };
+            let (point, alpha) = rays.read(&matter, lane, hit);
+            alphas_of[lane] = alpha;
+            if alpha > 0.0 {
+                seen.push(rays.seen(lane, point));
+            }
+        }
+        let mut radiance = self.lighting.radiance(&matter, &seen, sampling).into_iter();
+        for (lane, hit) in hits.iter().enumerate() {
+            let Some(hit) = hit else { continue };
+            let alpha = alphas_of[lane];
+            let (mut colour, mut transmittance) = (Vec3::ZERO, 1.0 - alpha);
+            if alpha > 0.0 {
+                colour = alpha * radiance.next().unwrap_or_default();
+            }
+            if transmittance > MIN_TRANSMITTANCE {
+                self.layers(&rays.rays[lane], Some(*hit), None, |hit| {
+                    let (point, alpha) = rays.read(&matter, lane, &hit);
+                    if alpha > 0.0 {
+                        let seen = [rays.seen(lane, point)];
+                        let radiance = self.lighting.radiance(&matter, &seen, sampling)[0];
+                        colour += transmittance * alpha * radiance;
+                        transmittance *= 1.0 - alpha;
+                    }
+                    transmittance > MIN_TRANSMITTANCE
+                });
+            }
+            if transmittance <= MIN_TRANSMITTANCE {
+                transmittance = 0.0;
+            }
+            colours += colour;
+            alphas += 1.0 - transmittance;
+        }
+        (colours, alphas)
+    }
+
+    /// Depth, normal and triangle of the first surface with alpha of at least one half. The triangle
+    /// `hint`, by place in leaf order, is tried first.
+    pub(crate) fn first_solid(
         &self,
         origin: DVec3,
         direction: DVec3,
-        spread: f32,
-        sample: &mut Subsample,
-    ) -> (Vec3, f32) {
-        let (mut colour, mut transmittance) = (Vec3::ZERO, 1.0);
-        let matter = self.matter();
-        self.layers(origin, direction, sample.met, |ray, hit, entry| {
-            sample.met = Some(hit.slot);
-            let width = (hit.at.t + entry) * spread;
-            let (point, alpha) = Point::read(&matter, ray, &hit, width);
-            if alpha > 0.0 {
-                let view = -ray.direction;
-                let radiance = self.lighting.radiance(&matter, &point, view, sample);
-                colour += transmittance * alpha * radiance;
-                transmittance *= 1.0 - alpha;
-            }
-            transmittance > MIN_TRANSMITTANCE
-        });
-        if transmittance <= MIN_TRANSMITTANCE {
-            transmittance = 0.0;
-        }
-        (colour, 1.0 - transmittance)
-    }
-
-    /// Depth, normal and triangle of the first surface with alpha of at least one half.
-    pub(crate) fn first_solid(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3, u32)> {
+        hint: Option<u32>,
+    ) -> Option<(f64, DVec3, u32)> {
         let matter = self.matter();
         let mut first = None;
-        self.layers(origin, direction, None, |ray, hit, _| {
-            let (_, alpha) = Point::read(&matter, ray, &hit, 0.0);
+        let ray = self.surface.enter(origin, direction, f64::INFINITY)?;
+        self.layers(&ray, None, hint, |hit| {
+            let (_, alpha) = Point::read(&matter, &ray, &hit, 0.0);
             if alpha >= 0.5 {
                 let hit = self.surface.describe(origin, direction, hit);
                 let normal = if hit.normal.dot(direction) > 0.0 { -hit.normal } else { hit.normal };
@@ -165,31 +267,27 @@ impl Tracer<'_> {
         first
     }
 
-    /// Visits the visible surfaces along a ray, front to back, while `go_on` says so. The third
-    /// argument is the distance at which the ray's parameter starts, local units.
+    /// Visits the visible surfaces along a ray, front to back, behind `last` if there is one, while
+    /// `go_on` says so.
     fn layers(
         &self,
-        origin: DVec3,
-        direction: DVec3,
+        ray: &LocalRay,
+        last: Option<LocalHit>,
         hint: Option<u32>,
-        mut go_on: impl FnMut(&LocalRay, LocalHit, f32) -> bool,
+        mut go_on: impl FnMut(LocalHit) -> bool,
     ) {
-        let Some(ray) = self.surface.enter(origin, direction, f64::INFINITY) else {
-            return;
-        };
-        let entry = (ray.origin.as_dvec3() - self.surface.to_local(origin)).length() as f32;
         let matter = self.matter();
-        let mut after = None;
-        for _ in 0..MAX_LAYERS {
-            let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
-            let hit = self.surface.closest(&ray, after, hint, visible);
-            let Some(hit) = hit else {
+        let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
+        let passed = |hit: LocalHit| (hit.at.t, self.surface.triangle_of(hit.slot));
+        let mut after = last.map(passed);
+        for _ in usize::from(after.is_some())..MAX_LAYERS {
+            let Some(hit) = self.surface.closest(ray, after, hint, visible) else {
                 return;
             };
-            if !go_on(&ray, hit, entry) || self.traits.is_empty() {
+            if !go_on(hit) || self.traits.is_empty() {
                 return;
             }
-            after = Some((hit.at.t, self.surface.triangle_of(hit.slot)));
+            after = Some(passed(hit));
         }
     }
 }
@@ -199,15 +297,12 @@ pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec
     let mut all = Vec::new();
     for y in (0..camera.height).step_by(step as usize) {
         for x in (0..camera.width).step_by(step as usize) {
-            let mut sample = Subsample {
-                index: 0,
-                draws: Draws::new(tracer.seed, &[u64::from(x), u64::from(y)]),
-                met: None,
-                hid: None,
-            };
+            let draws = Draws::new(tracer.seed, &[u64::from(x), u64::from(y)]);
             let corner = DVec2::new(f64::from(x), f64::from(y));
             let direction = camera.direction(corner + Vec2::splat(0.5).as_dvec2());
-            let (c, a) = tracer.through(camera.centre, direction, 0.0, &mut sample);
+            let mut ray = Rays::new(0.0);
+            ray.add(tracer.surface, 0, camera.centre, direction);
+            let (c, a) = tracer.through(&ray, &mut Sampling { draws, met: None, hid: None });
             if a > 0.5 {
                 all.push(c.dot(Vec3::new(0.2126, 0.7152, 0.0722)));
             }

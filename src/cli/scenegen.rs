@@ -74,13 +74,17 @@ pub(super) struct ScenegenArgs {
     /// Sample light that surfaces reflect onto each other once, with this many rays per pixel
     #[arg(long, value_name = "RAYS", help_heading = "Light", conflicts_with = "ao", value_parser = clap::value_parser!(u32).range(1..=65_536))]
     bounce: Option<u32>,
+    /// Light from all around: an equirectangular .hdr or .exr image, +y up and +x in its middle, in
+    /// place of the built-in sky and sun. It is not seen: images stay transparent where nothing is
+    #[arg(long, value_name = "FILE", help_heading = "Light")]
+    sky: Option<PathBuf>,
     /// Let lights shine through everything
     #[arg(long, help_heading = "Light")]
     no_shadows: bool,
     /// Make all materials diffuse: what is seen does not depend on the side it is seen from
     #[arg(long, help_heading = "Light")]
     lambert: bool,
-    /// Factor on all light [default: 1; chosen for files that bring lights of their own]
+    /// Factor on all light [default: 1; chosen where the mesh file brings lights, and with --sky]
     #[arg(long, value_name = "FACTOR", help_heading = "Light")]
     exposure: Option<f32>,
 
@@ -117,6 +121,7 @@ Examples:
   densify scenegen --preset thin -o data/thin
   densify scenegen mesh.glb -o data/mesh --train 100 --size 400
   densify scenegen house.obj -o data/house --rig inside --bounce 64
+  densify scenegen mesh.glb -o data/mesh --sky studio.hdr --ao 64
   densify scenegen mesh.glb --contact-sheet look.png";
 
 /// Spelling of [`RigKind`] on the command line.
@@ -169,6 +174,7 @@ impl ScenegenArgs {
             jitter: self.jitter,
             grid: self.samples,
             ambient,
+            sky: self.sky.clone(),
             shadows: !self.no_shadows,
             lambert: self.lambert,
             exposure: self.exposure,

@@ -7,7 +7,8 @@ use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
+use image::error::ImageFormatHint;
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
 pub use super::cache::ImageCache;
 use super::error::DatasetError;
@@ -20,6 +21,8 @@ pub const MAX_SIDE: u32 = 16_384;
 pub const MAX_PIXELS: u64 = 1 << 28;
 /// Most bytes of one image as its decoder yields it.
 const MAX_DECODED_BYTES: u64 = 1 << 30;
+/// Formats of photographs.
+const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
 /// As much of a file as almost always holds the header, so that sizes are read cheaply.
 const HEADER_BYTES: u64 = 256 << 10;
 
@@ -247,6 +250,11 @@ fn header_of<R: std::io::BufRead + std::io::Seek>(
     file_bytes: u64,
 ) -> Result<ImageHeader, image::ImageError> {
     let mut reader = reader.with_guessed_format().map_err(image::ImageError::IoError)?;
+    // Decoders of others may be there because another crate of the build asks for them.
+    if let Some(format) = reader.format().filter(|format| !FORMATS.contains(format)) {
+        let hint = ImageFormatHint::Exact(format);
+        return Err(image::ImageError::Unsupported(hint.into()));
+    }
     reader.limits(limits());
     let decoder = reader.into_decoder()?;
     let (width, height) = decoder.dimensions();

@@ -4,6 +4,10 @@
 //! own readers index without looking. Skins, morph targets and animations are left as they are at
 //! rest. Occlusion textures are ignored: the tracer computes occlusion when asked.
 //!
+//! What nothing here depends on is not complained of: alignments, bounds of accessors, targets of
+//! buffer views, names of attributes that are not read, morph targets, and objects that the scene
+//! does not use. `tests/shared.rs` lists what becomes of a validator's test files.
+//!
 //! One piece: a node's mesh, camera and light share its walk.
 
 mod accessors;
@@ -16,6 +20,7 @@ use gltf::json;
 use json::extensions::scene::khr_lights_punctual::Type as LightType;
 use json::mesh::{Mode, Primitive, Semantic};
 use json::validation::Checked;
+use serde_json::Value;
 
 use crate::error::Error;
 use crate::mesh::{FileCamera, Light, LightKind, Model};
@@ -72,8 +77,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         return Err(fault(path, "JSON", "it is larger than 64 MiB"));
     }
     refuse_required(path, text)?;
-    let root: json::Root =
-        json::deserialize::from_slice(text).map_err(|e| fault(path, "JSON", e.to_string()))?;
+    let root = parse(path, text)?;
     for (what, count) in [
         ("nodes", root.nodes.len()),
         ("meshes", root.meshes.len()),
@@ -111,6 +115,36 @@ pub(super) fn fault(path: &Path, element: impl Into<String>, problem: impl Into<
         element: element.into(),
         problem: problem.into(),
         remedy: REMEDY,
+    }
+}
+
+/// The JSON part. Whole numbers may be written as 1.0 (glTF 2.0, 2.7.1), which the crate's types
+/// refuse: these are written anew where it fails.
+fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
+    let error = match json::deserialize::from_slice(text) {
+        Ok(root) => return Ok(root),
+        Err(error) => fault(path, "JSON", error.to_string()),
+    };
+    let Ok(mut value) = serde_json::from_slice::<Value>(text) else {
+        return Err(error);
+    };
+    whole_numbers(&mut value);
+    // What is wrong besides is where it was.
+    serde_json::from_value(value).map_err(|_| error)
+}
+
+fn whole_numbers(value: &mut Value) {
+    match value {
+        Value::Array(list) => list.iter_mut().for_each(whole_numbers),
+        Value::Object(map) => map.values_mut().for_each(whole_numbers),
+        Value::Number(number) => {
+            // Beyond 2^53 not every whole number is a float.
+            let float = number.as_f64().filter(|v| v.fract() == 0.0 && (0.0..9e15).contains(v));
+            if let Some(float) = float {
+                *value = Value::from(float as u64);
+            }
+        }
+        _ => {}
     }
 }
 
@@ -302,7 +336,10 @@ impl Reader<'_> {
         }
         let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic));
         let Some(positions) = attribute(Semantic::Positions) else {
-            return Err(self.fault(element, "it has no POSITION"));
+            // Allowed (glTF 2.0, 3.7.2.1): positions may come from an extension.
+            let note = format!("{element} has no positions and is not rendered");
+            self.model.notes.push(note);
+            return Ok(());
         };
         let positions = self.buffers.floats(positions.value(), &[3], element)?;
         let count = positions.count();

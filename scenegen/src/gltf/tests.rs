@@ -1,8 +1,6 @@
 //! glTF as other programs write it, as the specification allows it, and damaged.
 
-use std::path::PathBuf;
-
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::*;
 
@@ -182,7 +180,7 @@ fn bad_values_are_errors_that_name_the_element() {
         ("/meshes/0/primitives/0/mode", json!(9), "primitive 0"),
         ("/meshes/0/primitives/0/material", json!(2), "material 2"),
         ("/meshes/0/primitives/0/indices", json!(8), "accessor 8"),
-        ("/meshes/0/primitives/0/attributes", json!({ "NORMAL": 0 }), "POSITION"),
+        ("/meshes/0/primitives/0/attributes", json!({ "NORMAL": 0 }), "no triangle"),
         (
             "/meshes/0/primitives/0/attributes",
             json!({ "POSITION": 0, "TEXCOORD_0": 1 }),
@@ -222,73 +220,10 @@ fn required_extensions_are_refused_by_name() {
     assert!(with("/extensionsRequired", json!(["KHR_materials_clearcoat"])).is_ok());
 }
 
-/// The shared data's meshes, or None with a word why.
-fn shared(folder: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("DENSIFY_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    let path = root.join("data/meshes").join(folder);
-    if path.is_dir() {
-        return Some(path);
-    }
-    eprintln!("skipped: there is no {}", path.display());
-    None
-}
-
-fn files(folder: &Path, found: &mut Vec<PathBuf>) {
-    let entries = std::fs::read_dir(folder).expect("folder");
-    for path in entries.map(|entry| entry.expect("entry").path()) {
-        let ending = path.extension().unwrap_or_default();
-        if path.is_dir() {
-            files(&path, found);
-        } else if ["gltf", "glb", "obj"].iter().any(|known| ending == *known) {
-            found.push(path);
-        }
-    }
-}
-
-fn prepare(path: &Path) -> Result<crate::Scene, Error> {
-    let options = crate::Options {
-        size: Some((24, 24)),
-        train: Some(2),
-        test: Some(1),
-        ..Default::default()
-    };
-    crate::Scene::prepare(&crate::Source::File(path.to_owned()), &options)
-}
-
 #[test]
-fn every_shared_mesh_renders() {
-    for folder in ["gltf", "obj"] {
-        let Some(folder) = shared(folder) else { return };
-        let mut all = Vec::new();
-        files(&folder, &mut all);
-        assert!(all.len() > 10);
-        for path in all {
-            let scene = prepare(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-            let covered = |i| scene.render(i).rgba.chunks_exact(4).filter(|p| p[3] > 0).count();
-            // One-sided planes are invisible from behind.
-            let seen: usize = (0..scene.views.len()).map(covered).sum();
-            assert!(seen > 10, "{}: {seen} pixels", path.display());
-        }
-    }
-}
-
-#[test]
-fn shared_files_to_refuse_are_refused_and_malformed_ones_are_no_panic() {
-    let (Some(refuse), Some(malformed)) = (shared("refuse"), shared("malformed")) else { return };
-    let mut all = Vec::new();
-    files(&refuse, &mut all);
-    assert!(!all.is_empty());
-    for path in &all {
-        let error = prepare(path).err().unwrap_or_else(|| panic!("{}", path.display()));
-        assert!(matches!(error, Error::Unsupported { .. }), "{}: {error}", path.display());
-    }
-    all.clear();
-    files(&malformed, &mut all);
-    assert!(all.len() > 50);
-    for path in &all {
-        if let Err(error) = prepare(path) {
-            assert!(!error.to_string().is_empty());
-        }
-    }
+fn whole_numbers_may_be_written_as_floats() {
+    let model = with("/accessors/0/count", json!(4.0)).expect("square");
+    assert_eq!(area(&model), DVec3::Z);
+    let message = with("/accessors/0/count", json!(4.5)).expect_err("no whole number").to_string();
+    assert!(message.contains("JSON") && message.contains("4.5"), "{message}");
 }

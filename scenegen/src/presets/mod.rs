@@ -68,7 +68,7 @@ pub(crate) fn sun() -> Light {
 
 /// A slightly blue sky over slightly brown ground.
 pub(crate) fn open_sky() -> Sky {
-    Sky { zenith: [0.42, 0.46, 0.52], ground: [0.22, 0.2, 0.17], up: [0.0, 1.0, 0.0] }
+    Sky::Gradient { zenith: [0.42, 0.46, 0.52], ground: [0.22, 0.2, 0.17], up: [0.0, 1.0, 0.0] }
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use glam::DQuat;
 
 use super::*;
+use crate::bundle::{LANES, has};
 use crate::nearest::on_triangle;
 use crate::primitives::icosphere;
 use crate::random::Draws;
@@ -94,14 +95,12 @@ fn the_closest_hit_is_that_of_trying_every_triangle() {
             let found = surface.closest(&ray, None, None, |_, _| true);
             let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
             assert_eq!(found, expected, "{count} triangles, {ray:?}");
-            assert_eq!(surface.occluder(&ray, None, |_, _| true).is_some(), expected.is_some());
+            assert_eq!(surface.occluder(&ray, |_, _| true).is_some(), expected.is_some());
             // Whatever is tried first, and whichever triangle it is.
             for hint in [0, surface.len() as u32 / 2] {
                 let found = surface.closest(&ray, None, Some(hint), |_, _| true);
                 let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
                 assert_eq!(found, expected);
-                let any = surface.occluder(&ray, Some(hint), |_, _| true);
-                assert_eq!(any.is_some(), expected.is_some());
             }
             hits += usize::from(expected.is_some());
         }
@@ -264,4 +263,69 @@ fn what_lies_between_two_places_blocks() {
     assert!(!surface.blocked(DVec3::NEG_X, 0.5 * DVec3::NEG_X));
     // Ends on the surface do not count.
     assert!(!surface.blocked(DVec3::NEG_X, DVec3::ZERO) && !surface.blocked(DVec3::ZERO, DVec3::X));
+}
+
+#[test]
+fn bundles_find_what_their_rays_find_alone() {
+    let (mut met, mut hidden_of_all) = (0, 0);
+    for (count, seed) in [(1, 11), (7, 12), (60, 13), (1500, 14)] {
+        let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
+        let mut draws = Draws::new(seed, &[1]);
+        for round in 0..600 {
+            // From nearly parallel, as from a pixel, to all over the place.
+            let spread = [1e-6, 1e-3, 0.1, 2.0][round % 4];
+            let (eye, aim) = (1.6 * point(&mut draws), point(&mut draws));
+            let mut rays = Vec::new();
+            for _ in 0..1 + draws.bits() as usize % LANES {
+                let origin =
+                    eye + if round % 3 == 0 { spread * point(&mut draws) } else { DVec3::ZERO };
+                let mut direction = aim - eye + spread * point(&mut draws);
+                if round % 5 == 0 {
+                    direction[round % 2] = 0.0;
+                }
+                let range = if round % 7 == 0 { 1.0 } else { f64::INFINITY };
+                rays.extend(surface.enter(origin, direction, range));
+            }
+            // Every other triangle is not there.
+            for accept in [|_: u32| true, |slot: u32| slot.is_multiple_of(2)] {
+                let found = surface.closest_of(&rays, |slot, _| accept(slot));
+                let mut hint = Some(0).filter(|_| round % 2 == 0);
+                let hidden = surface.occluded_of(&rays, &mut hint, |slot, _| accept(slot));
+                for (lane, ray) in rays.iter().enumerate() {
+                    let alone = surface.closest(ray, None, None, |slot, _| accept(slot));
+                    let told = |hit: Option<LocalHit>| hit.map(|hit| (hit.slot, hit.at));
+                    assert_eq!(told(found[lane]), told(alone), "{count} triangles, {ray:?}");
+                    assert_eq!(has(hidden, lane), alone.is_some(), "{count} triangles, {ray:?}");
+                    met += usize::from(alone.is_some());
+                }
+                assert!(found[rays.len()..].iter().all(Option::is_none));
+                assert_eq!(hidden.checked_shr(rays.len() as u32).unwrap_or(0), 0);
+                hidden_of_all += 1;
+            }
+        }
+    }
+    assert!(met > hidden_of_all, "{met} rays of {hidden_of_all} bundles met anything");
+}
+
+#[test]
+fn what_is_beside_a_pyramid_is_met_by_no_ray_in_it() {
+    let surface = Surface::new(&model(&soup(40, 21))).expect("triangles");
+    let mut draws = Draws::new(22, &[]);
+    let (mut beside, mut wrong) = (0, Vec::new());
+    for _ in 0..4000 {
+        let (eye, aim) = (2.5 * point(&mut draws), 1.5 * point(&mut draws));
+        let (u, v) = (0.2 * point(&mut draws), 0.2 * point(&mut draws));
+        let at = |x: f64, y: f64| aim - eye + x * u + y * v;
+        let corners = [at(-1.01, -1.01), at(1.01, -1.01), at(-1.01, 1.01), at(1.01, 1.01)];
+        if !surface.is_beside(eye, corners) {
+            continue;
+        }
+        beside += 1;
+        for _ in 0..20 {
+            let direction = at(2.0 * draws.unit64() - 1.0, 2.0 * draws.unit64() - 1.0);
+            wrong.extend(surface.cast(eye, direction, f64::INFINITY));
+        }
+    }
+    assert!(beside > 200, "only {beside} pyramids miss everything");
+    assert!(wrong.is_empty(), "{} rays met something", wrong.len());
 }

@@ -1,11 +1,13 @@
 //! Frames against what can be worked out by hand.
 
 use std::f32::consts::PI;
+use std::sync::Arc;
 
 use glam::{DQuat, Vec4};
 
 use super::*;
 use crate::mesh::{AlphaMode, Light, LightKind, Material, Reflection};
+use crate::panorama::Panorama;
 use crate::rig::RigKind;
 use crate::shade::Ambient;
 use crate::sky::Sky;
@@ -42,7 +44,7 @@ fn a_lit_plane_has_the_colour_and_depth_of_the_formula() {
     let towards = DVec3::new(1.0, 2.0, 0.5);
     model.lights.push(sun(towards, 2.0));
     let camera = above(3.0);
-    let sky = Sky { zenith: [0.3; 3], ground: [0.1; 3], up: [0.0, 1.0, 0.0] };
+    let sky = Sky::Gradient { zenith: [0.3; 3], ground: [0.1; 3], up: [0.0, 1.0, 0.0] };
     let frame = render(&model, &camera, sky, Ambient::Open);
     // Irradiance of the sun, and of the sky: pi · (0.2 + 2/3 · 0.1).
     let irradiance = 2.0 * towards.normalize().y as f32 + PI * (0.2 + 0.2 / 3.0);
@@ -192,20 +194,20 @@ fn light_is_hidden_by_what_is_in_its_way_and_by_that_only() {
     let mut model = floor(Material::lambert("white", [1.0; 3]));
     model.lights.push(sun(DVec3::Y, PI));
     let camera = Camera::looking(DVec3::new(3.0, 0.5, 0.0), DVec3::ZERO, DVec3::Y, 0.02, (8, 8));
-    let sky = Sky::uniform(0.1);
-    let lit = render(&model, &camera, sky, Ambient::Open).rgba[0];
+    let sky = || Sky::uniform(0.1);
+    let lit = render(&model, &camera, sky(), Ambient::Open).rgba[0];
     assert_eq!(lit, encode(1.1));
     // A lid over the place.
     let lid = model.material(Material::default());
     model.quad(DVec3::new(-1.0, 1.0, -1.0), 2.0 * DVec3::X, 2.0 * DVec3::Z, lid);
-    assert_eq!(render(&model, &camera, sky, Ambient::Open).rgba[0], encode(0.1));
-    let hidden = render(&model, &camera, sky, Ambient::Occlusion(256)).rgba[0];
+    assert_eq!(render(&model, &camera, sky(), Ambient::Open).rgba[0], encode(0.1));
+    let hidden = render(&model, &camera, sky(), Ambient::Occlusion(256)).rgba[0];
     assert!(hidden < encode(0.1), "{hidden}");
     // Through holes in a mask, and through little opacity, light passes.
     for alpha in [AlphaMode::Mask(0.5), AlphaMode::Blend] {
         model.materials[lid as usize].base = Vec4::new(1.0, 1.0, 1.0, 0.3);
         model.materials[lid as usize].alpha = alpha;
-        assert_eq!(render(&model, &camera, sky, Ambient::Open).rgba[0], lit, "{alpha:?}");
+        assert_eq!(render(&model, &camera, sky(), Ambient::Open).rgba[0], lit, "{alpha:?}");
     }
 }
 
@@ -280,4 +282,40 @@ fn cameras_keep_out_of_solids() {
         assert!(!within && p.abs().max_element() < 2.0, "{p}");
         assert!(surface.nearest(p).distance >= 0.02 * surface.diagonal());
     }
+}
+
+#[test]
+fn an_image_as_sky_lights_like_the_same_sky_and_sampling_agrees() {
+    let mut model = floor(Material::lambert("grey", [0.5; 3]));
+    let shiny = Material {
+        reflection: Reflection::MetalRough,
+        metallic: 1.0,
+        roughness: 0.4,
+        ..Material::lambert("metal", [0.8; 3])
+    };
+    let shiny = model.material(shiny);
+    model.cuboid(DVec3::new(0.0, 0.3, 0.0), DVec3::splat(0.3), DQuat::IDENTITY, shiny);
+    let camera = above(3.0);
+    // A sky of one colour, as a formula and as an image.
+    let image = |width: usize, radiance: &dyn Fn(usize) -> Vec3| {
+        let pixels = (0..width * width / 2).map(radiance).collect();
+        Sky::Image(Arc::new(Panorama::new("sky".into(), width, pixels)))
+    };
+    for ambient in [Ambient::Open, Ambient::Occlusion(64), Ambient::Bounce(64)] {
+        let plain = render(&model, &camera, Sky::uniform(0.6), ambient);
+        let pictured = render(&model, &camera, image(32, &|_| Vec3::splat(0.6)), ambient);
+        for (a, b) in plain.rgba.iter().zip(&pictured.rgba) {
+            assert!(a.abs_diff(*b) <= 1, "{ambient:?}: {a} and {b}");
+        }
+    }
+    // One bright side: what is sampled is in the mean what is computed, on an empty floor.
+    let model = floor(Material::lambert("grey", [0.5; 3]));
+    let side = image(64, &|i| if i % 64 < 32 { Vec3::splat(2.0) } else { Vec3::ZERO });
+    let mean = |ambient| {
+        let frame = render(&model, &camera, side.clone(), ambient);
+        let sum: f64 = frame.rgba.chunks_exact(4).map(|p| f64::from(p[0])).sum();
+        sum / (frame.rgba.len() / 4) as f64
+    };
+    let (formula, sampled) = (mean(Ambient::Open), mean(Ambient::Occlusion(64)));
+    assert!((formula - sampled).abs() < 1.0, "{formula} and {sampled}");
 }

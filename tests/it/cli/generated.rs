@@ -122,14 +122,17 @@ fn bad_input_is_refused_and_leaves_nothing() {
     let broken = root.path().join("broken.glb");
     std::fs::write(&broken, b"glTF\x02\0\0\0\xff\xff\xff\xff").expect("write");
     let (broken, out) = (text(&broken), text(&out));
-    let cases: [(&[&str], &[&str]); 8] = [
+    let cases: [(&[&str], &[&str]); 11] = [
         (&["scenegen", broken, "-o", out], &["broken.glb", "GLB header"]),
         (&["scenegen", "nothing.obj", "-o", out], &["nothing.obj"]),
         (&["scenegen", "mesh.fbx", "-o", out], &["mesh.fbx", ".obj"]),
         (&["scenegen", "--preset", "nonsense", "-o", out], &["nonsense", "spheres"]),
-        (&["scenegen", "--preset", "thin", "-o", out, "--size", "99999"], &["--width", "99999"]),
+        (&["scenegen", "--preset", "thin", "-o", out, "--size", "99999"], &["--size", "99999"]),
         (&["scenegen", "--preset", "thin", "-o", out, "--fov", "180"], &["--fov"]),
         (&["scenegen", "--preset", "thin", "-o", out, "--rig", "file"], &["--rig"]),
+        (&["scenegen", "--preset", "thin", "-o", out, "--train", "0"], &["--train", "0 views"]),
+        (&["scenegen", "--preset", "thin", "-o", out, "--sky", "none.hdr"], &["none.hdr"]),
+        (&["scenegen", "--preset", "thin", "-o", out, "--sky", broken], &["broken.glb", "HDR"]),
         (&["train", "scene:nonsense"], &["nonsense", "spheres"]),
     ];
     for (arguments, words) in cases {

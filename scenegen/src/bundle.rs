@@ -1,0 +1,339 @@
+//! Several rays at once: those of a pixel, or from what a pixel shows to a light, go nearly the same
+//! way, and one walk through the tree serves them all.
+//!
+//! A node is entered if any of the rays could meet what is in it. That is decided with intervals
+//! that hold all rays (Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for
+//! Entire Ray Packets", 2006). Rounding is monotonic, so the bounds hold for rounded values too and
+//! no box is missed that a single ray would enter. A leaf's triangles are tested against all rays
+//! in vectors, and only those rays that the test leaves do the whole of [`ShearedRay::meet`]. So
+//! every ray finds, to the bit, what it would find alone.
+
+use glam::{BVec3A, DVec3, Vec3, Vec3A};
+use obvhs::aabb::Aabb;
+
+use crate::intersect::{Meeting, ShearedRay};
+use crate::surface::{LocalHit, LocalRay, Surface, padded};
+
+/// Most rays of a bundle: the default subsamples of a pixel.
+pub(crate) const LANES: usize = 16;
+/// Deepest tree that is walked with a bundle.
+const DEEPEST: usize = 96;
+
+/// Each lane's bit.
+const BITS: [u32; LANES] = {
+    let mut bits = [0; LANES];
+    let mut lane = 0;
+    while lane < LANES {
+        bits[lane] = 1 << lane;
+        lane += 1;
+    }
+    bits
+};
+
+/// Whether bit `lane` is set.
+pub(crate) fn has(lanes: u32, lane: usize) -> bool {
+    lanes >> lane & 1 == 1
+}
+
+/// The lanes whose bits are set, ascending.
+fn each(mut lanes: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let lane = lanes.trailing_zeros() as usize;
+        lanes &= lanes.wrapping_sub(1);
+        (lane < LANES).then_some(lane)
+    })
+}
+
+/// Bounds of all rays of a bundle. Along an axis, a ray goes forward or backward; where some rays do
+/// the one and some the other, or nothing at all, the axis decides nothing: its bounds are infinite.
+struct Beam {
+    /// Axes along which all rays go backward.
+    backward: BVec3A,
+    /// The origin that comes first to the near plane of a box, and that which comes last to the far
+    /// one.
+    first: Vec3A,
+    last: Vec3A,
+    /// Bounds of the reciprocal directions.
+    inverse: (Vec3A, Vec3A),
+}
+
+impl Beam {
+    /// Around rays with these origins and directions.
+    fn around(rays: impl Iterator<Item = (Vec3, Vec3)>) -> Self {
+        let whole = (Vec3A::INFINITY, Vec3A::NEG_INFINITY);
+        let (mut origin, mut direction) = (whole, whole);
+        for (o, d) in rays {
+            let (o, d) = (Vec3A::from(o), Vec3A::from(d));
+            origin = (origin.0.min(o), origin.1.max(o));
+            direction = (direction.0.min(d), direction.1.max(d));
+        }
+        // Below, a reciprocal overflows.
+        let tiny = Vec3A::splat(f32::MIN_POSITIVE);
+        let backward = direction.1.cmple(-tiny);
+        let decides = backward | direction.0.cmpge(tiny);
+        // A reciprocal falls where the direction grows, on either side of zero.
+        let or_one = |v: Vec3A| Vec3A::select(decides, v, Vec3A::ONE);
+        let inverse = (or_one(1.0 / direction.1), or_one(1.0 / direction.0));
+        let first = Vec3A::select(backward, origin.0, origin.1);
+        let last = Vec3A::select(backward, origin.1, origin.0);
+        Self {
+            backward,
+            first: Vec3A::select(decides, first, Vec3A::INFINITY),
+            last: Vec3A::select(decides, last, Vec3A::NEG_INFINITY),
+            inverse,
+        }
+    }
+
+    /// A bound of where the first ray enters a box; infinite where no ray can meet it.
+    #[inline(always)]
+    fn entry(&self, aabb: &Aabb) -> f32 {
+        let near = Vec3A::select(self.backward, aabb.max, aabb.min) - self.first;
+        let far = Vec3A::select(self.backward, aabb.min, aabb.max) - self.last;
+        let entry = (near * self.inverse.0).min(near * self.inverse.1).max_element();
+        let exit = (far * self.inverse.0).max(far * self.inverse.1).min_element();
+        if exit >= entry && exit >= 0.0 { entry } else { f32::INFINITY }
+    }
+}
+
+/// Rays side by side in the space that they share.
+struct Bundle<'a> {
+    rays: &'a [LocalRay],
+    sheared: [ShearedRay; LANES],
+    /// Which coordinates are the first two and the third of the sheared space.
+    axes: [usize; 3],
+    /// Origins in these axes, and the shear.
+    origin: [[f32; LANES]; 3],
+    shear: [[f32; LANES]; 2],
+    beam: Beam,
+}
+
+impl<'a> Bundle<'a> {
+    /// None where the rays are no bundle: a single one, or not all along the same axis.
+    fn new(rays: &'a [LocalRay]) -> Option<Self> {
+        if !(2..=LANES).contains(&rays.len()) {
+            return None;
+        }
+        let mut sheared = [ShearedRay::new(rays[0].origin, rays[0].direction); LANES];
+        for (to, ray) in sheared.iter_mut().zip(rays).skip(1) {
+            *to = ShearedRay::new(ray.origin, ray.direction);
+        }
+        let axes = sheared[0].axes();
+        if sheared.iter().any(|ray| ray.axes() != axes) {
+            return None;
+        }
+        let (mut origin, mut shear) = ([[0.0; LANES]; 3], [[0.0; LANES]; 2]);
+        for (lane, ray) in sheared.iter().enumerate() {
+            for (to, axis) in origin.iter_mut().zip(axes) {
+                to[lane] = ray.origin[axis];
+            }
+            (shear[0][lane], shear[1][lane]) = (ray.shear.x, ray.shear.y);
+        }
+        let beam = Beam::around(rays.iter().map(|ray| (ray.origin, ray.direction)));
+        Some(Self { rays, sheared, axes, origin, shear, beam })
+    }
+
+    /// The rays that may meet a triangle, as bits: all but those for which the edge functions have
+    /// both signs. They are those of [`ShearedRay::meet`], operation by operation.
+    #[expect(clippy::needless_range_loop, reason = "lanes side by side become vectors")]
+    #[inline(always)]
+    fn may_meet(&self, triangle: &[Vec3; 3]) -> u32 {
+        let [x, y, z] = self.axes;
+        let corner = |p: Vec3| {
+            let p = [p[x], p[y], p[z]];
+            let mut flat = [[0.0_f32; LANES]; 2];
+            for lane in 0..LANES {
+                let z = p[2] - self.origin[2][lane];
+                flat[0][lane] = (p[0] - self.origin[0][lane]) - self.shear[0][lane] * z;
+                flat[1][lane] = (p[1] - self.origin[1][lane]) - self.shear[1][lane] * z;
+            }
+            flat
+        };
+        // Not by `map`, which is not inlined.
+        let (a, b, c) = (corner(triangle[0]), corner(triangle[1]), corner(triangle[2]));
+        let mut may = 0;
+        for lane in 0..LANES {
+            let u = c[0][lane] * b[1][lane] - c[1][lane] * b[0][lane];
+            let v = a[0][lane] * c[1][lane] - a[1][lane] * c[0][lane];
+            let w = b[0][lane] * a[1][lane] - b[1][lane] * a[0][lane];
+            let below = (u < 0.0) | (v < 0.0) | (w < 0.0);
+            let above = (u > 0.0) | (v > 0.0) | (w > 0.0);
+            // Zeros are evaluated anew in f64.
+            let exact = (u == 0.0) | (v == 0.0) | (w == 0.0);
+            may |= if (below & above) & !exact { 0 } else { BITS[lane] };
+        }
+        may & u32::MAX >> (32 - self.rays.len())
+    }
+
+    /// Visits the triangles that rays may meet, the nearer boxes first; `look` is given a triangle's
+    /// place in leaf order and the rays, and returns the parameter up to which any ray still looks:
+    /// negative infinity once nothing is left to do.
+    #[inline]
+    fn walk(&self, surface: &Surface, mut look: impl FnMut(u32, u32) -> f32) {
+        let nodes = &surface.bvh.nodes;
+        let mut reach = self.rays.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
+        let mut open = [(0_u32, 0.0_f32); DEEPEST];
+        let mut count = 1;
+        open[0] = (0, self.beam.entry(nodes[0].aabb()));
+        while count > 0 {
+            count -= 1;
+            let (mut index, entry) = open[count];
+            if entry >= reach {
+                continue;
+            }
+            loop {
+                let node = &nodes[index as usize];
+                if node.is_leaf() {
+                    for slot in node.first_index..node.first_index + node.prim_count {
+                        let triangle = &surface.triangles[slot as usize];
+                        if self.beam.entry(&padded(triangle)) >= reach {
+                            continue;
+                        }
+                        let lanes = self.may_meet(triangle);
+                        if lanes != 0 {
+                            reach = look(slot, lanes);
+                        }
+                    }
+                    break;
+                }
+                let (mut near, mut far) = (node.first_index, node.first_index + 1);
+                let mut first = self.beam.entry(nodes[near as usize].aabb());
+                let mut second = self.beam.entry(nodes[far as usize].aabb());
+                if second < first {
+                    (near, far) = (far, near);
+                    (first, second) = (second, first);
+                }
+                if second < reach {
+                    open[count] = (far, second);
+                    count += 1;
+                }
+                if first >= reach {
+                    break;
+                }
+                index = near;
+            }
+        }
+    }
+}
+
+impl Surface {
+    /// Whether all rays from `origin` within the pyramid of these directions certainly miss it: no
+    /// leaf's box is near. The pyramid must exceed the rays by more than single precision rounds,
+    /// relative to distance.
+    pub(crate) fn is_beside(&self, origin: DVec3, directions: [DVec3; 4]) -> bool {
+        let origin = self.to_local(origin).as_vec3();
+        let beam = Beam::around(directions.into_iter().map(|d| (origin, d.as_vec3())));
+        let nodes = &self.bvh.nodes;
+        let mut open = vec![0_u32];
+        while let Some(index) = open.pop() {
+            let node = &nodes[index as usize];
+            if beam.entry(node.aabb()) < f32::INFINITY {
+                if node.is_leaf() {
+                    return false;
+                }
+                open.extend([node.first_index, node.first_index + 1]);
+            }
+        }
+        true
+    }
+
+    /// [`Surface::closest`] for each of at most [`LANES`] rays.
+    pub(crate) fn closest_of(
+        &self,
+        rays: &[LocalRay],
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> [Option<LocalHit>; LANES] {
+        let mut best = [None::<LocalHit>; LANES];
+        let bundle = if self.depth() <= DEEPEST { Bundle::new(rays) } else { None };
+        let Some(bundle) = bundle else {
+            let mut hint = None;
+            for (best, ray) in best.iter_mut().zip(rays) {
+                *best = self.closest(ray, None, hint, &accept);
+                hint = best.map(|hit| hit.slot).or(hint);
+            }
+            return best;
+        };
+        let mut tmax = [0.0; LANES];
+        for (tmax, ray) in tmax.iter_mut().zip(rays) {
+            *tmax = ray.tmax;
+        }
+        let mut reach = tmax.iter().copied().fold(0.0, f32::max);
+        bundle.walk(self, |slot, lanes| {
+            let mut changed = false;
+            for lane in each(lanes) {
+                let met = bundle.sheared[lane].meet(&self.triangles[slot as usize]);
+                let Some(at) = met.filter(|at| at.t > rays[lane].tmin && at.t <= tmax[lane]) else {
+                    continue;
+                };
+                let first = best[lane].is_none_or(|best| {
+                    at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
+                });
+                if first && accept(slot, &at) {
+                    tmax[lane] = at.t;
+                    best[lane] = Some(LocalHit { slot, at });
+                    changed = true;
+                }
+            }
+            if changed {
+                reach = tmax.iter().copied().fold(0.0, f32::max);
+            }
+            reach
+        });
+        best
+    }
+
+    /// Which of at most [`LANES`] rays have an [`Surface::occluder`], as bits. What `hint` names is
+    /// tried first, and becomes what was found last.
+    pub(crate) fn occluded_of(
+        &self,
+        rays: &[LocalRay],
+        hint: &mut Option<u32>,
+        accept: impl Fn(u32, &Meeting) -> bool,
+    ) -> u32 {
+        let mut hidden = 0;
+        // Where the hint hides a ray already, a bundle of the others is a smaller one.
+        let mut left = [0_usize; LANES];
+        let mut count = 0;
+        for (lane, ray) in rays.iter().enumerate() {
+            let counts = |slot: u32| self.hides(slot, ray, &accept);
+            if hint.is_some_and(counts) {
+                hidden |= 1 << lane;
+            } else {
+                left[count] = lane;
+                count += 1;
+            }
+        }
+        let Some(&first) = left[..count].first() else {
+            return hidden;
+        };
+        let mut others = [rays[first]; LANES];
+        for (other, &lane) in others.iter_mut().zip(&left[..count]) {
+            *other = rays[lane];
+        }
+        let others = &others[..count];
+        let bundle = if self.depth() <= DEEPEST { Bundle::new(others) } else { None };
+        let Some(bundle) = bundle else {
+            for (ray, lane) in others.iter().zip(left) {
+                if let Some(slot) = self.occluder(ray, &accept) {
+                    hidden |= 1 << lane;
+                    *hint = Some(slot);
+                }
+            }
+            return hidden;
+        };
+        let mut open = u32::MAX >> (32 - count);
+        let reach = others.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
+        bundle.walk(self, |slot, lanes| {
+            for lane in each(lanes & open) {
+                let ray = &others[lane];
+                let met = bundle.sheared[lane].meet(&self.triangles[slot as usize]);
+                if met.is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at)) {
+                    open &= !(1 << lane);
+                    hidden |= 1 << left[lane];
+                    *hint = Some(slot);
+                }
+            }
+            if open == 0 { f32::NEG_INFINITY } else { reach }
+        });
+        hidden
+    }
+}

@@ -1,0 +1,232 @@
+//! Light from all around as an equirectangular image: Radiance `.hdr` or OpenEXR.
+//!
+//! +y is up; the image's middle shows what lies towards +x, and its right half what lies towards
+//! +z, as it looks from within. Files are untrusted: sizes are checked before anything is decoded,
+//! what is no number is black, and what is infinite is as bright as a half float can say.
+//!
+//! Blurred copies are made once, so that a surface that asks for no occlusion needs no secondary
+//! ray: each is the image averaged with a power of the cosine as weight. Of the exponent k that is
+//! chosen for a roughness, the mean cosine (k + 1) / (k + 2) is 1 − roughness² / 3, and so the
+//! roughest copy is irradiance / pi.
+
+use std::f32::consts::{PI, TAU};
+use std::io::Cursor;
+use std::path::Path;
+
+use glam::{DVec3, Vec3};
+use image::{ImageFormat, ImageReader, Limits};
+use rayon::prelude::*;
+use serde::{Serialize, Serializer, ser::SerializeStruct};
+
+use crate::error::Error;
+use crate::resource;
+
+/// Largest side `[px]`.
+const MAX_SIDE: u32 = 16_384;
+/// Most bytes that a decoder may allocate; floats for 2^26 px.
+const MAX_DECODED: u64 = 1 << 30;
+/// Most bytes of an image that one byte of its file can stand for: zip's limit, 1032, and a margin.
+const EXPANSION: u64 = 1100;
+/// Largest radiance, a half float's.
+const BRIGHTEST: f32 = 65_504.0;
+/// Columns of the cells that are averaged, and of the averages; half as many rows. Both suffice for
+/// the sharpest lobe, which is some 20 degrees wide.
+const CELLS: usize = 96;
+const AVERAGES: usize = 48;
+/// Blurred copies, for roughness 1/4, 2/4, 3/4 and 1.
+const LEVELS: usize = 4;
+
+/// An image of the sky.
+#[derive(Debug)]
+pub struct Panorama {
+    name: String,
+    image: Sphere,
+    blurred: Vec<Sphere>,
+}
+
+/// Radiance by direction.
+#[derive(Debug)]
+struct Sphere {
+    width: usize,
+    /// Linear RGB, the upper row first. Shape: `[width / 2, width]`.
+    values: Vec<Vec3>,
+}
+
+/// The pixels of a small part of the sphere in one.
+struct Cell {
+    /// Their mean direction.
+    direction: Vec3,
+    /// Their solid angle, up to a factor that all cells share.
+    weight: f32,
+    /// Their mean.
+    value: Vec3,
+}
+
+impl Panorama {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// When it cannot be read, is no `.hdr` or `.exr` image of moderate size, or is not twice as wide
+    /// as high.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let bytes = resource::read(path)?;
+        let fault = |problem: String| Error::Malformed {
+            path: path.to_owned(),
+            element: "the sky".into(),
+            problem,
+            remedy: "give an equirectangular .hdr or .exr image, at most 11584 px wide",
+        };
+        let reader = || {
+            let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
+            let mut reader = reader.map_err(|e| fault(e.to_string()))?;
+            if !matches!(reader.format(), Some(ImageFormat::Hdr | ImageFormat::OpenExr)) {
+                return Err(fault("it is neither Radiance HDR nor OpenEXR".into()));
+            }
+            let mut limits = Limits::default();
+            limits.max_image_width = Some(MAX_SIDE);
+            limits.max_image_height = Some(MAX_SIDE);
+            limits.max_alloc = Some(MAX_DECODED);
+            reader.limits(limits);
+            Ok(reader)
+        };
+        let (width, height) = reader()?.into_dimensions().map_err(|e| fault(e.to_string()))?;
+        if height == 0 || width != 2 * height {
+            return Err(fault(format!("it has {width}x{height} px, and is not twice as wide")));
+        }
+        // Decoders may hold four floats per pixel.
+        let decoded = u64::from(width) * u64::from(height) * 16;
+        if decoded > MAX_DECODED || decoded > (bytes.len() as u64).saturating_mul(EXPANSION) {
+            return Err(fault(format!(
+                "it has {width}x{height} px, which is too many or not in the file"
+            )));
+        }
+        let image = reader()?.decode().map_err(|e| fault(e.to_string()))?.into_rgb32f();
+        let pixels = image.pixels().map(|pixel| Vec3::from(pixel.0)).collect();
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
+        Ok(Self::new(name.unwrap_or_default(), width as usize, pixels))
+    }
+
+    /// A panorama of `width` x `width / 2` linear RGB pixels, the upper row first.
+    pub(crate) fn new(name: String, width: usize, mut pixels: Vec<Vec3>) -> Self {
+        for value in pixels.iter_mut().flat_map(Vec3::as_mut) {
+            // NaN becomes 0 too.
+            *value = if *value > 0.0 { value.min(BRIGHTEST) } else { 0.0 };
+        }
+        let image = Sphere { width, values: pixels };
+        let cells = image.cells();
+        let level = |i: usize| Sphere::averaged(&cells, exponent((i + 1) as f32 / LEVELS as f32));
+        let blurred = (0..LEVELS).map(level).collect();
+        Self { name, image, blurred }
+    }
+
+    /// Radiance from a direction of unit length.
+    pub(crate) fn radiance(&self, direction: Vec3) -> Vec3 {
+        self.image.at(direction)
+    }
+
+    /// Mean radiance of a lobe about a direction: the image itself at roughness 0, with a cosine as
+    /// weight at 1.
+    pub(crate) fn blurred(&self, direction: Vec3, roughness: f32) -> Vec3 {
+        let level = roughness.clamp(0.0, 1.0) * LEVELS as f32;
+        let (below, share) = (level as usize, level.fract());
+        let of = |level: usize| match level {
+            0 => self.image.at(direction),
+            _ => self.blurred[(level - 1).min(LEVELS - 1)].at(direction),
+        };
+        if share == 0.0 { of(below) } else { of(below).lerp(of(below + 1), share) }
+    }
+}
+
+impl Serialize for Panorama {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let mut fields = to.serialize_struct("Panorama", 2)?;
+        fields.serialize_field("image", &self.name)?;
+        fields.serialize_field("size", &[self.image.width, self.image.width / 2])?;
+        fields.end()
+    }
+}
+
+/// Exponent of the cosine for a roughness above zero.
+fn exponent(roughness: f32) -> f32 {
+    3.0 / (roughness * roughness) - 2.0
+}
+
+impl Sphere {
+    fn height(&self) -> usize {
+        self.width / 2
+    }
+
+    /// Bilinear between pixels' centres, round the horizon and not across the poles.
+    fn at(&self, direction: Vec3) -> Vec3 {
+        let (width, height) = (self.width, self.height());
+        let u = direction.z.atan2(direction.x) / TAU + 0.5;
+        let v = direction.y.clamp(-1.0, 1.0).acos() / PI;
+        let (x, y) = (u * width as f32 - 0.5, v * height as f32 - 0.5);
+        let (left, upper) = (x.floor(), y.floor());
+        let column = |x: f32| (x as i64).rem_euclid(width as i64) as usize;
+        let row = |y: f32| (y as i64).clamp(0, height as i64 - 1) as usize;
+        let value = |x: f32, y: f32| self.values[row(y) * width + column(x)];
+        let above = value(left, upper).lerp(value(left + 1.0, upper), x - left);
+        let below = value(left, upper + 1.0).lerp(value(left + 1.0, upper + 1.0), x - left);
+        above.lerp(below, y - upper)
+    }
+
+    /// The image in [`CELLS`] columns.
+    fn cells(&self) -> Vec<Cell> {
+        if self.width < CELLS {
+            let at = |i: usize| self.at(direction(i, CELLS));
+            let values = (0..CELLS * CELLS / 2).map(at).collect();
+            return Self { width: CELLS, values }.cells();
+        }
+        let mut sums = vec![(DVec3::ZERO, 0.0_f64, DVec3::ZERO); CELLS * CELLS / 2];
+        for (i, value) in self.values.iter().enumerate() {
+            let (x, y) = (i % self.width, i / self.width);
+            let sum = &mut sums[y * CELLS / self.width * CELLS + x * CELLS / self.width];
+            let weight = f64::from(polar(y, self.height()).sin());
+            sum.0 += weight * direction(i, self.width).as_dvec3();
+            sum.1 += weight;
+            sum.2 += weight * value.as_dvec3();
+        }
+        let cell = |(direction, weight, value): (DVec3, f64, DVec3)| Cell {
+            direction: direction.normalize_or_zero().as_vec3(),
+            weight: weight as f32,
+            value: (value / weight).as_vec3(),
+        };
+        sums.into_iter().filter(|sum| sum.1 > 0.0).map(cell).collect()
+    }
+
+    /// Means of cells with the cosine to the power `exponent` as weight.
+    fn averaged(cells: &[Cell], exponent: f32) -> Self {
+        let mean = |i: usize| {
+            let about = direction(i, AVERAGES);
+            let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+            for cell in cells {
+                let cos = about.dot(cell.direction);
+                if cos > 0.0 {
+                    let weight = cell.weight * cos.powf(exponent);
+                    sum += weight * cell.value;
+                    total += weight;
+                }
+            }
+            sum / total
+        };
+        let values = (0..AVERAGES * AVERAGES / 2).into_par_iter().map(mean).collect();
+        Self { width: AVERAGES, values }
+    }
+}
+
+/// Angle of a row's middle from the zenith `[rad]`.
+fn polar(row: usize, height: usize) -> f32 {
+    (row as f32 + 0.5) / height as f32 * PI
+}
+
+/// The direction of a pixel's middle.
+fn direction(i: usize, width: usize) -> Vec3 {
+    let (x, y) = (i % width, i / width);
+    let turn = ((x as f32 + 0.5) / width as f32 - 0.5) * TAU;
+    let (sin, cos) = polar(y, width / 2).sin_cos();
+    Vec3::new(sin * turn.cos(), cos, sin * turn.sin())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,49 @@
+//! Views stream to disk: how many there are makes no difference to memory. A program of its own,
+//! as the peak is the process's.
+#![allow(clippy::print_stderr, reason = "tests say why they skip")]
+
+use densify_scenegen::{Options, PointOptions, Scene, Source, write};
+
+const SIDE: u32 = 256;
+/// Colour, depth, normal and triangle.
+const PIXEL_BYTES: u64 = 4 + 4 + 12 + 4;
+
+/// Most memory this process ever held `[bytes]`, where the system tells.
+fn peak() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
+}
+
+fn write_views(train: u32) {
+    let options = Options {
+        size: Some((SIDE, SIDE)),
+        train: Some(train),
+        test: Some(1),
+        grid: 1,
+        points: PointOptions { count: 100, ..PointOptions::default() },
+        ..Options::default()
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let scene = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("a scene");
+    let written = write(&scene, &folder.path().join("scene"), false, |_| ()).expect("written");
+    assert_eq!(written.views, train as usize + 1);
+}
+
+#[test]
+fn the_number_of_views_makes_no_difference() {
+    write_views(3);
+    let Some(few) = peak() else {
+        eprintln!("skipped: this system does not tell a process's peak");
+        return;
+    };
+    write_views(60);
+    let many = peak().expect("it was told before");
+    let image = u64::from(SIDE * SIDE) * PIXEL_BYTES;
+    // Held, they would be sixty; four are left to the allocator's moods.
+    assert!(
+        many - few < 4 * image,
+        "{} more images at the peak",
+        (many - few) as f64 / image as f64
+    );
+}
