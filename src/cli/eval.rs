@@ -1,6 +1,7 @@
 //! `densify eval`.
 
 use std::fmt::Write as _;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -58,6 +59,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     console.result(format_args!("{:width$}  PSNR [dB]    SSIM", "view"));
     let scores = evaluate(opened.backend.as_mut(), &views, background, opened.sh_degree, |view| {
         console.result(format_args!("{:width$}  {:9.3}  {:.4}", view.name, view.psnr, view.ssim));
+        ControlFlow::Continue(())
     })?;
     let Mean { psnr, ssim } = scores.mean();
     console.result(format_args!("{:width$}  {psnr:9.3}  {ssim:.4}", "mean"));

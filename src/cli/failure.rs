@@ -3,6 +3,7 @@
 use densify_policies::policy::PolicyError;
 
 use crate::backend::BackendError;
+use crate::checkpoint::CheckpointError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
 use crate::init::InitError;
@@ -110,6 +111,19 @@ impl From<TrainError> for Failure {
     }
 }
 
+impl From<CheckpointError> for Failure {
+    fn from(error: CheckpointError) -> Self {
+        match error {
+            CheckpointError::Write(error) => error.into(),
+            CheckpointError::Backend(error) => error.into(),
+            error @ (CheckpointError::Read { .. } | CheckpointError::Policy { .. }) => {
+                Self { code: OTHER, message: error.to_string() }
+            }
+            error @ CheckpointError::Invalid { .. } => Self::input(error),
+        }
+    }
+}
+
 impl From<GeometryError> for Failure {
     fn from(error: GeometryError) -> Self {
         let code = match &error {
@@ -126,6 +140,7 @@ impl From<EvaluateError> for Failure {
         let code = match &error {
             EvaluateError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
             EvaluateError::Backend { .. } => DEVICE,
+            EvaluateError::Stopped => OTHER,
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

@@ -1,9 +1,20 @@
 //! Files that are there in full or not at all.
 
+use std::ffi::OsStr;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use super::OutputError;
+use super::disk::{Named, Operation, attempt};
+
+/// What the names of files and folders begin with that are not complete yet.
+pub(super) const TEMPORARY: &str = ".densify-";
+
+/// Whether a file or folder of this name is one that a writer has not completed.
+#[must_use]
+pub fn is_temporary(name: &OsStr) -> bool {
+    name.to_string_lossy().starts_with(TEMPORARY)
+}
 
 /// Writes a file under a temporary name in the same folder, syncs it and renames it: whoever looks
 /// sees the old content or the new one, whatever happens in between. Creates missing folders.
@@ -29,16 +40,19 @@ fn replace(
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
 ) -> io::Result<()> {
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".densify-");
+    builder.prefix(TEMPORARY);
     // Temporary files are private by default; a result is as readable as any other new file.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    attempt(Operation::Create, path)?;
     let mut file = builder.tempfile_in(folder)?;
-    let mut buffered = BufWriter::with_capacity(1 << 16, file.as_file_mut());
+    let mut buffered = BufWriter::with_capacity(1 << 16, Named { file: file.as_file_mut(), path });
     write(&mut buffered)?;
     buffered.flush()?;
     drop(buffered);
+    attempt(Operation::Sync, path)?;
     file.as_file().sync_all()?;
+    attempt(Operation::Rename, path)?;
     file.persist(path)?;
     // The rename lasts once the folder is synced; not every file system can do that.
     #[cfg(unix)]

@@ -7,9 +7,13 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 use super::OutputError;
+use super::atomic::{TEMPORARY, is_temporary};
+use super::disk::{Operation, attempt};
+use super::tensorboard::PREFIX as OWNED_PREFIX;
 
 /// What a run owns in its folder. Anything else in there is the user's and is left alone.
-const OWNED: [&str; 10] = [
+const OWNED: [&str; 11] = [
+    CHECKPOINTS,
     "config.toml",
     "cameras.json",
     MODELS,
@@ -22,7 +26,8 @@ const OWNED: [&str; 10] = [
     "geometry_train.json",
 ];
 const MODELS: &str = "point_cloud";
-const OWNED_PREFIX: &str = "events.out.tfevents.";
+/// Name of the folder of checkpoints in a run's folder.
+pub const CHECKPOINTS: &str = "checkpoints";
 
 /// Where a run keeps the model of an iteration.
 #[must_use]
@@ -88,13 +93,37 @@ impl RunFolder {
         Self::check(target, overwrite)?;
         let is_new = !target.exists();
         let fail = |e| OutputError::io("create the folder", target)(e);
+        attempt(Operation::Create, target).map_err(fail)?;
         fs::create_dir_all(target).map_err(fail)?;
         let occupied = !owned_entries(target)?.is_empty();
         let staging = occupied
-            .then(|| tempfile::Builder::new().prefix(".densify-").tempdir_in(target))
+            .then(|| tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(target))
             .transpose()
             .map_err(OutputError::io("create a folder in", target))?;
         Ok(Self { target: target.to_owned(), is_new, staging })
+    }
+
+    /// The folder of a run that goes on, or that begins anew because it has kept nothing; then what
+    /// it has written is removed.
+    ///
+    /// # Errors
+    /// [`OutputError::NotAFolder`], [`OutputError::Io`].
+    pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
+        Self::check(target, true)?;
+        if anew {
+            remove_owned(target);
+        }
+        let is_new = !target.exists();
+        fs::create_dir_all(target).map_err(OutputError::io("create the folder", target))?;
+        Ok(Self { target: target.to_owned(), is_new, staging: None })
+    }
+
+    /// Hidden folders in `target` in which runs wait, or waited, to replace the one there.
+    #[must_use]
+    pub fn staged(target: &Path) -> Vec<PathBuf> {
+        let entries = fs::read_dir(target).into_iter().flatten().flatten();
+        let hidden = entries.filter(|entry| is_temporary(&entry.file_name()));
+        hidden.map(|entry| entry.path()).filter(|path| path.is_dir()).collect()
     }
 
     /// Where to write now.
@@ -120,7 +149,9 @@ impl RunFolder {
         let carry = |from: &Path, to: &Path| -> Result<(), OutputError> {
             for name in owned_entries(from)? {
                 let path = from.join(&name);
-                fs::rename(&path, to.join(&name)).map_err(OutputError::io("move", &path))?;
+                attempt(Operation::Rename, &path)
+                    .and_then(|()| fs::rename(&path, to.join(&name)))
+                    .map_err(OutputError::io("move", &path))?;
             }
             Ok(())
         };
