@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::{Checkpoint, CheckpointError};
-use crate::output::{CHECKPOINTS, is_temporary};
+use crate::output::CHECKPOINTS;
 
 /// How many are kept: a newer one may turn out to be damaged.
 const KEPT: usize = 2;
@@ -43,16 +43,12 @@ pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     (None, rejected)
 }
 
-/// Removes all but the two newest checkpoints up to `step`, which has just been written, and what
-/// writers that were killed have left. One beyond `step` is not of this run's past (it may be a
-/// damaged one): it stays until it is written anew. Whatever cannot be removed stays.
+/// Removes all but the two newest checkpoints up to `step`, which has just been written. One beyond
+/// `step` is not of this run's past (it may be a damaged one): it stays until it is written anew.
+/// Whatever cannot be removed stays.
 pub fn tidy(run: &Path, step: u32) {
     let past = listed(run).into_iter().filter(|&(of, _)| of <= step);
     for (_, path) in past.skip(KEPT) {
         let _ = fs::remove_file(path);
-    }
-    let entries = fs::read_dir(run.join(CHECKPOINTS)).into_iter().flatten().flatten();
-    for entry in entries.filter(|entry| is_temporary(&entry.file_name())) {
-        let _ = fs::remove_file(entry.path());
     }
 }

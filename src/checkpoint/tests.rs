@@ -188,7 +188,7 @@ fn no_flipped_bit_passes() {
         bytes[at] ^= bit;
         std::fs::write(&flipped, &bytes).unwrap();
         let problem = problem(&flipped);
-        assert!(problem.contains("flipped.safetensors: it"), "{at}: {problem}");
+        assert!(problem.contains("flipped.safetensors: "), "{at}: {problem}");
         bytes[at] ^= bit;
     }
     let last = bytes.len() - 1;
@@ -201,7 +201,7 @@ fn no_flipped_bit_passes() {
 fn headers_that_promise_too_much_are_refused_without_allocation() {
     let root = tempfile::tempdir().unwrap();
     let path = root.path().join("c.safetensors");
-    let mut check = |length: u64, header: &str, words: &str| {
+    let check = |length: u64, header: &str, words: &str| {
         std::fs::write(&path, [&length.to_le_bytes()[..], header.as_bytes()].concat()).unwrap();
         let problem = problem(&path);
         assert!(problem.contains(words), "{header}: {problem}");
@@ -256,7 +256,6 @@ fn the_newest_sound_one_is_found_and_two_are_kept() {
         std::fs::copy(&path, checkpoint_path(run, step)).unwrap();
     }
     std::fs::write(checkpoint_path(run, 100), "damaged").unwrap();
-    std::fs::write(run.join("checkpoints/.densify-x"), "half").unwrap();
     std::fs::write(run.join("checkpoints/notes.txt"), "mine").unwrap();
     let (found, rejected) = newest(run);
     assert_eq!(found.unwrap().path(), checkpoint_path(run, 30));

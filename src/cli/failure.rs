@@ -92,7 +92,7 @@ impl From<BackendError> for Failure {
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
         let code = match error {
-            OutputError::Io { .. } => OTHER,
+            OutputError::Io { .. } | OutputError::NotReplaced { .. } => OTHER,
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

@@ -11,8 +11,7 @@ use super::disk::{Named, Operation, attempt};
 pub(super) const TEMPORARY: &str = ".densify-";
 
 /// Whether a file or folder of this name is one that a writer has not completed.
-#[must_use]
-pub fn is_temporary(name: &OsStr) -> bool {
+pub(super) fn is_temporary(name: &OsStr) -> bool {
     name.to_string_lossy().starts_with(TEMPORARY)
 }
 

@@ -104,7 +104,8 @@ impl RunFolder {
     }
 
     /// The folder of a run that goes on, or that begins anew because it has kept nothing; then what
-    /// it has written is removed.
+    /// it has written is removed. Files that a process which was killed has not completed are removed
+    /// in any case.
     ///
     /// # Errors
     /// [`OutputError::NotAFolder`], [`OutputError::Io`].
@@ -113,6 +114,7 @@ impl RunFolder {
         if anew {
             remove_owned(target);
         }
+        remove_incomplete(target, DEEPEST);
         let is_new = !target.exists();
         fs::create_dir_all(target).map_err(OutputError::io("create the folder", target))?;
         Ok(Self { target: target.to_owned(), is_new, staging: None })
@@ -135,30 +137,18 @@ impl RunFolder {
     /// Takes the place of the run that was there, if any; returns where the run is.
     ///
     /// # Errors
-    /// [`OutputError::Io`]. The new run is then kept in the hidden folder that the error names.
+    /// [`OutputError::NotReplaced`] with the hidden folder in which the new run then is; the old one
+    /// stays.
     pub fn finish(self) -> Result<PathBuf, OutputError> {
         let Self { target, staging, .. } = self;
         let Some(staging) = staging else {
             return Ok(target);
         };
         let staging = staging.keep();
-        let aside = tempfile::Builder::new()
-            .prefix(".densify-old-")
-            .tempdir_in(&target)
-            .map_err(OutputError::io("create a folder in", &target))?;
-        let carry = |from: &Path, to: &Path| -> Result<(), OutputError> {
-            for name in owned_entries(from)? {
-                let path = from.join(&name);
-                attempt(Operation::Rename, &path)
-                    .and_then(|()| fs::rename(&path, to.join(&name)))
-                    .map_err(OutputError::io("move", &path))?;
-            }
-            Ok(())
-        };
-        carry(&target, aside.path())?;
-        carry(&staging, &target)?;
-        fs::remove_dir_all(&staging).map_err(OutputError::io("remove", &staging))?;
-        Ok(target)
+        match replace(&target, &staging) {
+            Ok(()) => Ok(target),
+            Err(source) => Err(OutputError::NotReplaced { staging, source: Box::new(source) }),
+        }
     }
 
     /// Ends a run that failed: the run that was there stays, and what the failed one has written
@@ -182,11 +172,61 @@ impl RunFolder {
     }
 }
 
+/// Puts the run in `staging` in the place of the one in `target`, or leaves both as they are.
+fn replace(target: &Path, staging: &Path) -> Result<(), OutputError> {
+    let aside = tempfile::Builder::new()
+        .prefix(".densify-old-")
+        .tempdir_in(target)
+        .map_err(OutputError::io("create a folder in", target))?;
+    let moved = carry(target, aside.path())
+        .map_err(|error| (error, false))
+        .and_then(|()| carry(staging, target).map_err(|error| (error, true)));
+    let Err((error, half)) = moved else {
+        return fs::remove_dir_all(staging).map_err(OutputError::io("remove", staging));
+    };
+    let back = if half { carry(target, staging) } else { Ok(()) };
+    if back.and_then(|()| carry(aside.path(), target)).is_err() {
+        // What cannot go back is not to go with its folder.
+        let _ = aside.keep();
+    }
+    Err(error)
+}
+
+/// Moves what belongs to a run to another folder.
+fn carry(from: &Path, to: &Path) -> Result<(), OutputError> {
+    for name in owned_entries(from)? {
+        let path = from.join(&name);
+        attempt(Operation::Rename, &path)
+            .and_then(|()| fs::rename(&path, to.join(&name)))
+            .map_err(OutputError::io("move", &path))?;
+    }
+    Ok(())
+}
+
 /// Removes what belongs to a run, as far as the system lets it.
 fn remove_owned(folder: &Path) {
     for name in owned_entries(folder).unwrap_or_default() {
         let path = folder.join(name);
         let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+    }
+}
+
+/// Folders within folders of a run: `point_cloud/iteration_N`.
+const DEEPEST: u32 = 2;
+
+/// Removes the files that are not complete, down to folders so deep.
+fn remove_incomplete(folder: &Path, deeper: u32) {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    for entry in entries {
+        let (name, path) = (entry.file_name(), entry.path());
+        // Links are not followed: what they lead to is the user's.
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
+                remove_incomplete(&path, deeper - 1);
+            }
+            Ok(kind) if kind.is_file() && is_temporary(&name) => _ = fs::remove_file(&path),
+            _ => {}
+        }
     }
 }
 
@@ -210,6 +250,7 @@ fn is_owned(name: &OsStr) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::output::disk::{Fault, with_fault};
 
     fn write(path: &Path, text: &str) {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -258,6 +299,55 @@ mod tests {
         run.finish().unwrap();
         assert_eq!(tree(root.path()), ["config.toml", "notes.txt", "point_cloud"]);
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"new");
+    }
+
+    #[test]
+    fn a_run_that_cannot_take_its_place_leaves_the_old_one_there() {
+        let root = tempfile::tempdir().unwrap();
+        // The first cannot go out of the way, the second cannot come in.
+        for file in ["config.toml", "results.json"] {
+            for name in ["config.toml", "cameras.json", "stats/old.jsonl"] {
+                write(&root.path().join(name), "old");
+            }
+            let before = tree(root.path());
+            let run = RunFolder::create(root.path(), true).unwrap();
+            for name in ["config.toml", "cameras.json", "results.json"] {
+                write(&run.path().join(name), "new");
+            }
+            let fault = Fault {
+                operation: Operation::Rename,
+                file,
+                spared: 0,
+                kind: std::io::ErrorKind::Other,
+            };
+            let staging = run.path().to_owned();
+            let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
+            assert!(error.contains(file) && error.contains(&*staging.to_string_lossy()), "{error}");
+            assert_eq!(tree(&staging), ["cameras.json", "config.toml", "results.json"]);
+            fs::remove_dir_all(staging).unwrap();
+            assert_eq!(tree(root.path()), before);
+            assert_eq!(fs::read(root.path().join("cameras.json")).unwrap(), b"old");
+        }
+    }
+
+    #[test]
+    fn a_run_that_goes_on_finds_nothing_half_written() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["config.toml", "stats/train.jsonl", "point_cloud/iteration_1/point_cloud.ply"]
+        {
+            write(&root.path().join(name), "old");
+        }
+        for name in [".densify-1", "stats/.densify-2", "point_cloud/iteration_1/.densify-3"] {
+            write(&root.path().join(name), "half");
+        }
+        write(&root.path().join(".densify-x/checkpoints/a"), "another run, waiting");
+        RunFolder::resume(root.path(), false).unwrap();
+        assert_eq!(tree(root.path()), [".densify-x", "config.toml", "point_cloud", "stats"]);
+        assert_eq!(tree(&root.path().join("stats")), ["train.jsonl"]);
+        assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
+        assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-x")]);
+        RunFolder::resume(root.path(), true).unwrap();
+        assert_eq!(tree(root.path()), [".densify-x"]);
     }
 
     #[test]

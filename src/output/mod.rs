@@ -24,7 +24,7 @@ mod folder;
 mod records;
 mod tensorboard;
 
-pub use atomic::{is_temporary, write_atomically};
+pub use atomic::write_atomically;
 pub use cameras::cameras_json;
 pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
 pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
@@ -61,6 +61,16 @@ pub enum OutputError {
         path: PathBuf,
         /// What a run would have.
         missing: &'static str,
+    },
+    /// A run cannot take the place of the one that is there.
+    #[error(
+        "{source}; the new run is complete in {staging}, the one that it was to replace is still there"
+    )]
+    NotReplaced {
+        /// Where the new run is.
+        staging: PathBuf,
+        /// What could not be moved.
+        source: Box<OutputError>,
     },
     /// A file of a run does not say what it should.
     #[error("{path}: {problem}; this file was written by another version or changed by hand")]

@@ -141,7 +141,7 @@ impl<'a> Session<'a> {
             // A run that was stopped may not have come to what follows its last step.
             self.after(done, duties, true)?;
         }
-        let mut progress = Progress::new(self.console, last, budget);
+        let mut progress = Progress::new(self.console, done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
             if let Some(interrupt) = self.interrupts.received() {
                 return Err(self.interrupted(interrupt));
@@ -204,8 +204,10 @@ impl<'a> Session<'a> {
         let step = self.run.trainer.steps_done();
         let kept = match self.keep() {
             Ok(path) => format!(
-                "the run is kept in {}; go on with the same command and --resume",
-                path.display()
+                "the run is kept in {}; go on with: densify train {} -o {} --resume",
+                path.display(),
+                self.run.config.scene.path.display(),
+                self.folder.display()
             ),
             Err(error) => format!("no checkpoint could be written: {error}"),
         };

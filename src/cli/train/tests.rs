@@ -163,21 +163,19 @@ fn what_stops_a_run_leaves_what_it_goes_on_from() {
         (&[Operation::Write], ".densify", 2, &["4", "8"]),
     ];
     for (operations, file, spared, left) in faults {
-        for &operation in operations {
-            for kind in KINDS {
-                case.clear();
-                let (code, message) = case.fault(operation, file, spared, kind);
-                let what = format!("{operation:?} {file}: {message}");
-                assert_eq!(code, OTHER, "{what}");
-                let system = std::io::Error::from(kind).to_string();
-                for words in [file, "cannot write", &system, "was written until then is in"] {
-                    assert!(message.contains(words), "{words:?} is not in: {what}");
-                }
-                assert_eq!(case.checkpoints(), left, "{what}");
-                case.train("--resume").unwrap_or_else(|e| panic!("{what}: {}", e.message));
-                assert!(case.model() == expected, "{what}");
-                assert!(is_there(&case.run(), "stats/summary.json"), "{what}");
+        for (&operation, kind) in operations.iter().zip(KINDS.iter().copied().cycle()) {
+            case.clear();
+            let (code, message) = case.fault(operation, file, spared, kind);
+            let what = format!("{operation:?} {file}: {message}");
+            assert_eq!(code, OTHER, "{what}");
+            let system = std::io::Error::from(kind).to_string();
+            for words in [file, "cannot write", &system, "was written until then is in"] {
+                assert!(message.contains(words), "{words:?} is not in: {what}");
             }
+            assert_eq!(case.checkpoints(), left, "{what}");
+            case.train("--resume").unwrap_or_else(|e| panic!("{what}: {}", e.message));
+            assert!(case.model() == expected, "{what}");
+            assert!(is_there(&case.run(), "stats/summary.json"), "{what}");
         }
     }
 }

@@ -101,8 +101,12 @@ fn whatever_outlives_a_step_is_kept() {
         "--policy mcmc --policy-set mcmc.grow_every=7 --sh-every 16",
         "--policy taming --policy-set taming.grow_every=7 --background random --threads 2",
         "--policy vanilla --policy-set vanilla.grow_every=9 --tile-cap 400 --seed 5",
-        "--policy diet --policy-set diet.grow_every=9 --policy-set diet.insert_every=11 --save-iterations 50,150 --eval \
+        "--policy diet --policy-set diet.grow_every=9 --save-iterations 50,150 --eval \
          --test-iterations 30,101,160",
+        // Candidates wait at the checkpoint.
+        "--policy diet --policy-set diet.grow_every=9 --policy-set diet.insert_every=19 \
+         --policy-set diet.rows_per_candidate=20 --policy-set diet.compensate_from=60 \
+         --policy-set diet.compensate_until=180 --policy-set diet.rho_c=0.1",
     ] {
         compare(scene.path(), &format!("--budget 360 {flags}"), flags);
     }
@@ -110,11 +114,7 @@ fn whatever_outlives_a_step_is_kept() {
 
 #[test]
 fn a_built_in_scene_goes_on_too() {
-    compare(
-        Path::new("scene:spheres"),
-        "--budget 4k -r 16 --policy-set diet.grow_every=20",
-        "",
-    );
+    compare(Path::new("scene:spheres"), "--budget 4k -r 16 --policy-set diet.grow_every=20", "");
 }
 
 /// A run of 40 steps with checkpoints at 10, 20, …; the last two are left.
