@@ -156,7 +156,10 @@ pub(super) fn run(words: &[OsString], args: TrainArgs, console: &Console) -> Res
     let (args, resumed) = match args.resume {
         true => match resume::start(words, &args, console)? {
             Start::Anew => (args, None),
-            Start::From(args, resumed) => (*args, Some(resumed)),
+            Start::From(run) => {
+                let (args, resumed) = *run;
+                (args, Some(resumed))
+            }
         },
         false => (args, None),
     };

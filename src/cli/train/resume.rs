@@ -32,7 +32,7 @@ pub(super) enum Start {
     /// There is nothing yet to go on from, and nothing to lose.
     Anew,
     /// From a checkpoint, with all options.
-    From(Box<TrainArgs>, Resumed),
+    From(Box<(TrainArgs, Resumed)>),
 }
 
 /// Settings in `config.toml` that change no byte of the result.
@@ -101,7 +101,7 @@ pub(super) fn start(
         )));
     }
     args.iterations = length;
-    Ok(Start::From(Box::new(args), Resumed { checkpoint, last }))
+    Ok(Start::From(Box::new((args, Resumed { checkpoint, last }))))
 }
 
 /// Where a run of these options goes.

@@ -178,7 +178,8 @@ fn go_on(
             "note: extended from {length} to {last} iterations; all schedules stay those of {length}, \
              beyond which step sizes no longer fall"
         ));
-    } else if step >= last {
+    }
+    if step >= last {
         console.say(format_args!(
             "note: all {last} iterations are done; --iterations with a larger number extends the run"
         ));

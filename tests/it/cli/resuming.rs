@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use densify_policies::registry::policies;
+use densify_policies::registry::{PolicyEntry, find, policies};
 use serde_json::Value;
 
 use super::{Outcome, densify, files, json, model, often, read, records, scratch, text, train};
@@ -83,12 +83,19 @@ fn compare(scene: &Path, flags: &str, what: &str) {
     assert!(!steps.contains(&half), "{what}: an edit just then");
 }
 
+/// Flags by which a policy acts almost to the end.
+fn late(policy: &PolicyEntry) -> String {
+    let ends = policy.parameters().into_iter().filter(|(name, _)| name.ends_with("_until"));
+    ends.map(|(name, _)| format!("--policy-set {}.{name}=190 ", policy.name)).collect()
+}
+
 #[test]
 fn every_policy_goes_on_as_if_nothing_had_been() {
     let scene = Photographs::colmap_text();
     for entry in policies().expect("the registry is sound") {
         let (policy, often) = (entry.name, often(entry));
-        let flags = format!("--budget 360 --policy {policy} {often} --eval");
+        let late = late(entry);
+        let flags = format!("--budget 2k --policy {policy} {often} {late} --eval");
         compare(scene.path(), &flags, policy);
     }
 }
@@ -106,15 +113,21 @@ fn whatever_outlives_a_step_is_kept() {
         // Candidates wait at the checkpoint.
         "--policy diet --policy-set diet.grow_every=9 --policy-set diet.insert_every=19 \
          --policy-set diet.rows_per_candidate=20 --policy-set diet.compensate_from=60 \
-         --policy-set diet.compensate_until=180 --policy-set diet.rho_c=0.1",
+         --policy-set diet.rho_c=0.1",
     ] {
-        compare(scene.path(), &format!("--budget 360 {flags}"), flags);
+        let policy = flags.split(' ').nth(1).expect("a name");
+        let late = late(find(policy).expect("it is registered"));
+        compare(scene.path(), &format!("--budget 2k {flags} {late}"), flags);
     }
 }
 
 #[test]
 fn a_built_in_scene_goes_on_too() {
-    compare(Path::new("scene:spheres"), "--budget 4k -r 16 --policy-set diet.grow_every=20", "");
+    compare(
+        Path::new("scene:spheres"),
+        "--budget 4k -r 16 --policy-set diet.grow_every=20 --policy-set diet.grow_until=190",
+        "",
+    );
 }
 
 /// A run of 40 steps with checkpoints at 10, 20, …; the last two are left.
