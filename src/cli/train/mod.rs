@@ -109,8 +109,9 @@ pub(super) struct TrainArgs {
     /// stops the run. The two newest are kept. 0: none but when stopped
     #[arg(long, value_name = "N", help_heading = "Output", default_value_t = CHECKPOINT_EVERY)]
     checkpoint_every: u32,
-    /// Go on from the newest checkpoint in the output folder, with its options; --iterations may
-    /// extend the run. Without any checkpoint the run begins at its start
+    /// Go on from the newest checkpoint in the output folder, with its options (but for those that say
+    /// when to save, measure and keep the run); --iterations may extend it. Without any checkpoint the
+    /// run begins at its start
     #[arg(long, help_heading = "Output", conflicts_with = "overwrite")]
     resume: bool,
     /// Replace the run that is in the output folder, once this one is complete

@@ -63,13 +63,13 @@ fn assert_same(a: &Path, b: &Path, what: &str) {
 /// which everything later is still there but the later checkpoint.
 fn compare(scene: &Path, flags: &str, what: &str) {
     let (root, whole) = scratch();
-    let flags = format!("--quiet --checkpoint-every {HALF} {flags}");
+    let flags = format!("--checkpoint-every {HALF} {flags}");
     train(scene, &whole, ITERATIONS, &flags).ok();
     let part = root.path().join("part");
     copy(&whole, &part);
     std::fs::remove_file(checkpoint(&part, ITERATIONS)).expect("the last checkpoint");
     std::fs::remove_file(densify::output::model_path(&part, ITERATIONS)).expect("the model");
-    let outcome = densify(&["train", text(scene), "-o", text(&part), "--resume"]).ok();
+    let outcome = train(scene, &part, ITERATIONS, &format!("{flags} --resume")).ok();
     let said = format!("from step {HALF}");
     assert!(outcome.stdout.contains(&said), "{what}: {}", outcome.stdout);
     assert_same(&whole, &part, what);
