@@ -76,11 +76,11 @@ pub fn write(path: &Path, header: &Header, backend: &dyn Backend) -> Result<(), 
             }
             Err(io::Error::other(format!("`{}` changed while it was written", tensor.name)))
         });
-        done.or_else(|stop| match stop {
-            Stop::Io(error) => Err(error),
+        done.map_err(|stop| match stop {
+            Stop::Io(error) => error,
             Stop::Backend(error) => {
                 lost = Some(error);
-                Err(io::Error::other("the backend is lost"))
+                io::Error::other("the backend is lost")
             }
         })
     });
@@ -323,7 +323,7 @@ impl Checkpoint {
             return Err(BackendError::OutOfMemory { what, bytes: (count * N) as u64 }.into());
         }
         self.scan(place, |bytes| {
-            values.extend(bytes.as_chunks::<N>().0.iter().map(|&b| decode(b)))
+            values.extend(bytes.as_chunks::<N>().0.iter().map(|&b| decode(b)));
         })?;
         Ok(values)
     }

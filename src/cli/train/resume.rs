@@ -187,8 +187,8 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Vec<OsString> {
     words.extend(rates.iter().map(|(name, rate)| format!("--lr={name}={rate}").into()));
     // Parameters of one policy are none of another one, which is refused later.
     let name = &policy.name;
-    let another = given.get_one::<String>("policy").is_some_and(|given_name| given_name != name);
-    if !is_given(given, "policy_config") && !(another && is_given(given, "policy")) {
+    let another = is_given(given, "policy") && given.get_one("policy") != Some(name);
+    if !another && !is_given(given, "policy_config") {
         let set = policy.parameters.iter();
         words.extend(set.map(|(key, value)| format!("--policy-set={name}.{key}={value}").into()));
     }
