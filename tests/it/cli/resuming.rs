@@ -103,9 +103,9 @@ fn every_policy_goes_on_as_if_nothing_had_been() {
 #[test]
 fn whatever_outlives_a_step_is_kept() {
     let scene = Photographs::colmap_text();
-    // Gradients summed between steps; bands; a background of its own at every step; a later degree.
+    // Gradients summed until the very next step; bands; a background of its own at every step; a later degree.
     for flags in [
-        "--policy mcmc --policy-set mcmc.grow_every=7 --sh-every 16",
+        "--policy mcmc --policy-set mcmc.grow_every=7 --sh-every 17",
         "--policy taming --policy-set taming.grow_every=7 --background random --threads 2",
         "--policy vanilla --policy-set vanilla.grow_every=9 --tile-cap 400 --seed 5",
         "--policy diet --policy-set diet.grow_every=9 --save-iterations 50,150 --eval \
