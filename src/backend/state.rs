@@ -5,6 +5,11 @@
 //! itself. Parameters of a row stand in this order: mean 3, log-scale 3, quaternion (w, x, y, z) 4,
 //! opacity logit 1, then three per spherical-harmonic coefficient (red, green, blue).
 
+use std::io;
+
+/// Values that are converted to bytes at a time.
+const ENCODED: usize = 1 << 14;
+
 /// A named array.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
@@ -52,6 +57,24 @@ impl Values {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
+    }
+
+    /// Passes the values on as little-endian bytes, some at a time.
+    pub(crate) fn encode(&self, mut sink: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<()> {
+        let mut bytes = Vec::new();
+        match self {
+            Self::F32(values) => values.chunks(ENCODED).try_for_each(|chunk| {
+                bytes.clear();
+                bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
+                sink(&bytes)
+            }),
+            Self::U16(values) => values.chunks(ENCODED).try_for_each(|chunk| {
+                bytes.clear();
+                bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
+                sink(&bytes)
+            }),
+            Self::U8(values) => sink(values),
+        }
     }
 
     /// The type's name, as safetensors has it.

@@ -24,8 +24,8 @@ const CHECKSUM_KEY: &str = "densify.crc32c";
 const MAX_HEADER: u64 = 64 << 20;
 /// Bytes before the header: its length.
 const LENGTH: u64 = 8;
-/// Values converted at a time.
-const CHUNK: usize = 1 << 14;
+/// Bytes read at a time; a multiple of every type's size.
+const CHUNK: usize = 1 << 16;
 
 /// What is known of an array beside its values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -173,26 +173,6 @@ impl Record {
     }
 }
 
-impl Values {
-    /// Passes the values on as little-endian bytes, some at a time.
-    fn encode(&self, mut sink: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<()> {
-        let mut bytes = Vec::new();
-        match self {
-            Self::F32(values) => values.chunks(CHUNK).try_for_each(|chunk| {
-                bytes.clear();
-                bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
-                sink(&bytes)
-            }),
-            Self::U16(values) => values.chunks(CHUNK).try_for_each(|chunk| {
-                bytes.clear();
-                bytes.extend(chunk.iter().flat_map(|value| value.to_le_bytes()));
-                sink(&bytes)
-            }),
-            Self::U8(values) => sink(values),
-        }
-    }
-}
-
 /// A checkpoint that is sound: every part of the file has been checked.
 #[derive(Debug)]
 pub struct Checkpoint {
@@ -335,10 +315,10 @@ impl Checkpoint {
         let failed = |source| CheckpointError::Read { path: path.clone(), source };
         file.seek(SeekFrom::Start(*start)).map_err(failed)?;
         let mut left = record.bytes().unwrap_or(usize::MAX);
-        let mut buffer = vec![0; left.min(4 * CHUNK)];
+        let mut buffer = vec![0; left.min(CHUNK)];
         let mut crc = 0;
         while left > 0 {
-            let bytes = &mut buffer[..left.min(4 * CHUNK)];
+            let bytes = &mut buffer[..left.min(CHUNK)];
             file.read_exact(bytes).map_err(failed)?;
             crc = crc32c::crc32c_append(crc, bytes);
             seen(bytes);

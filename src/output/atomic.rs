@@ -59,6 +59,25 @@ fn replace(
     Ok(())
 }
 
+/// Folders within folders of a run: `point_cloud/iteration_N`.
+pub(super) const DEEPEST: u32 = 2;
+
+/// Removes the files that are not complete, down to folders so deep.
+pub(super) fn remove_incomplete(folder: &Path, deeper: u32) {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    for entry in entries {
+        let (name, path) = (entry.file_name(), entry.path());
+        // Links are not followed: what they lead to is the user's.
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
+                remove_incomplete(&path, deeper - 1);
+            }
+            Ok(kind) if kind.is_file() && is_temporary(&name) => _ = std::fs::remove_file(&path),
+            _ => {}
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 use super::OutputError;
-use super::atomic::{TEMPORARY, is_temporary};
+use super::atomic::{DEEPEST, TEMPORARY, is_temporary, remove_incomplete};
 use super::disk::{Operation, attempt};
 use super::tensorboard::PREFIX as OWNED_PREFIX;
 
@@ -208,25 +208,6 @@ fn remove_owned(folder: &Path) {
     for name in owned_entries(folder).unwrap_or_default() {
         let path = folder.join(name);
         let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
-    }
-}
-
-/// Folders within folders of a run: `point_cloud/iteration_N`.
-const DEEPEST: u32 = 2;
-
-/// Removes the files that are not complete, down to folders so deep.
-fn remove_incomplete(folder: &Path, deeper: u32) {
-    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
-    for entry in entries {
-        let (name, path) = (entry.file_name(), entry.path());
-        // Links are not followed: what they lead to is the user's.
-        match entry.file_type() {
-            Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
-                remove_incomplete(&path, deeper - 1);
-            }
-            Ok(kind) if kind.is_file() && is_temporary(&name) => _ = fs::remove_file(&path),
-            _ => {}
-        }
     }
 }
 

@@ -60,7 +60,7 @@ use stage_clock::StageClock;
 use summed::Summed;
 use tiles::{Grid, TileLists};
 
-pub use optimise::ModelGradient;
+pub use optimise::{ImageGradient, ModelGradient};
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
@@ -100,17 +100,6 @@ impl CpuOptions {
             needs: Needs::default(),
         }
     }
-}
-
-/// dL/dpixel for [`CpuBackend::differentiate`].
-#[derive(Debug, Clone, PartialEq)]
-pub struct ImageGradient {
-    /// Shape: `[height, width, 3]`.
-    pub rgb: Vec<f32>,
-    /// Shape: `[height, width]`.
-    pub alpha: Vec<f32>,
-    /// Shape: `[height, width]`.
-    pub depth: Vec<f32>,
 }
 
 /// The native backend.
