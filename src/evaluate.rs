@@ -1,5 +1,7 @@
 //! Scores of a model on held-out views.
 
+use std::ops::ControlFlow;
+
 use crate::backend::{Backend, BackendError};
 use crate::metrics::{MetricError, flip, psnr, ssim};
 use crate::output::Mean;
@@ -76,18 +78,22 @@ pub enum EvaluateError {
         /// What the comparison says.
         source: MetricError,
     },
+    /// The caller wanted no more.
+    #[error("stopped before all views were measured")]
+    Stopped,
 }
 
-/// Renders every view and compares it with its image. `seen` is called after each view.
+/// Renders every view and compares it with its image. `seen` is called after each view, and may stop
+/// it there.
 ///
 /// # Errors
-/// [`EvaluateError`] at the first view that cannot be scored.
+/// [`EvaluateError`] at the first view that cannot be scored; [`EvaluateError::Stopped`].
 pub fn evaluate(
     backend: &mut dyn Backend,
     views: &impl ViewSource,
     background: [f32; 3],
     sh_degree: u8,
-    mut seen: impl FnMut(&ViewScore),
+    mut seen: impl FnMut(&ViewScore) -> ControlFlow<()>,
 ) -> Result<Scores, EvaluateError> {
     let count = views.count();
     let mut scores = Scores::default();
@@ -107,8 +113,11 @@ pub fn evaluate(
             ssim: ssim(&rendering.rgb, &image, background).map_err(metric)?,
             flip: flip(&rendering.rgb, &image, background).map_err(metric)?,
         };
-        seen(&score);
+        let flow = seen(&score);
         scores.views.push(score);
+        if flow.is_break() {
+            return Err(EvaluateError::Stopped);
+        }
     }
     Ok(scores)
 }

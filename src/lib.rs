@@ -55,6 +55,7 @@
 
 pub mod backend;
 pub mod camera;
+pub mod checkpoint;
 pub mod cli;
 pub mod dataset;
 pub mod evaluate;

@@ -9,6 +9,7 @@ mod check;
 mod error;
 mod fresh;
 mod guard;
+mod state;
 
 use std::time::{Duration, Instant};
 
@@ -25,6 +26,7 @@ use crate::views::ViewSource;
 use check::check;
 pub use error::TrainError;
 use guard::asked;
+pub use state::TrainerState;
 
 /// How a run goes, beside its scene and its policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -193,7 +195,7 @@ impl<V: ViewSource> Trainer<V> {
         let is_due = asked(|| self.policy.is_due(step)).map_err(|e| self.refused(step, e))?;
         let start = Instant::now();
         let event = if is_due { self.edit(step)? } else { None };
-        self.policy_time += start.elapsed();
+        self.policy_time = self.policy_time.saturating_add(start.elapsed());
         Ok(StepReport { step, view, output, rows: self.backend.rows(), event })
     }
 
@@ -232,7 +234,9 @@ impl<V: ViewSource> Trainer<V> {
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
             self.backend.begin_epoch();
         }
-        let last = self.options.iterations.saturating_sub(self.step + 1) as usize;
+        // A run that is extended goes on beyond its last iteration; then nothing is known of the end.
+        let left = self.options.iterations.checked_sub(self.step + 1);
+        let last = left.map_or(usize::MAX, |left| left as usize);
         let upcoming: Vec<usize> = self.order[place + 1..]
             .iter()
             .chain(&self.next_order)
@@ -249,7 +253,7 @@ impl<V: ViewSource> Trainer<V> {
         let start = Instant::now();
         let needs = self.measure_fresh(step)?;
         self.show_views(step)?;
-        self.views_time += start.elapsed();
+        self.views_time = self.views_time.saturating_add(start.elapsed());
         let (signals, candidates) =
             self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
         let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };

@@ -4,6 +4,7 @@
 //! Signals come down when a policy is due, row operations go up; parameters stay where they are.
 
 pub mod cpu;
+mod state;
 
 use std::time::Duration;
 
@@ -14,6 +15,7 @@ use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
+pub use state::{StateError, Tensor, Values};
 
 /// Step sizes of one iteration, one per parameter class.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -211,6 +213,28 @@ pub trait Backend: Send {
 
     /// Copies the model to the host.
     fn download(&self) -> Gaussians;
+
+    /// Names of the arrays that hold, beside the model, all that the future depends on: moments,
+    /// ages, accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.
+    fn state(&self) -> Vec<String>;
+
+    /// Copies one array of [`state`](Self::state) to the host.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When there is no such array: a bug in the caller.
+    fn save(&self, name: &str) -> Result<Tensor, BackendError>;
+
+    /// Takes back what [`save`](Self::save) returned, into a backend made with the same options for
+    /// the [model](Self::download) of that moment. When all arrays are back, the future is the same
+    /// to the bit.
+    ///
+    /// # Errors
+    /// [`StateError`] when this backend has no such array, or one of another type or shape. The
+    /// array may come from a file that cannot be trusted.
+    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError>;
 
     /// Wall time of each stage of the last step, in order; a stage that ran more than once stands
     /// there as often.

@@ -1,6 +1,7 @@
 //! `densify eval`.
 
 use std::fmt::Write as _;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -61,6 +62,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     };
     let scores = evaluate(opened.backend.as_mut(), &views, background, opened.sh_degree, |view| {
         line(&view.name, view.psnr, view.ssim, view.flip);
+        ControlFlow::Continue(())
     })?;
     let mean = scores.mean();
     line("mean", mean.psnr, mean.ssim, mean.flip);

@@ -3,6 +3,7 @@
 use densify_policies::policy::PolicyError;
 
 use crate::backend::BackendError;
+use crate::checkpoint::CheckpointError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
 use crate::init::InitError;
@@ -91,7 +92,7 @@ impl From<BackendError> for Failure {
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
         let code = match error {
-            OutputError::Io { .. } => OTHER,
+            OutputError::Io { .. } | OutputError::NotReplaced { .. } => OTHER,
             _ => INPUT,
         };
         Self { code, message: error.to_string() }
@@ -107,6 +108,19 @@ impl From<TrainError> for Failure {
             _ => OTHER,
         };
         Self { code, message: error.to_string() }
+    }
+}
+
+impl From<CheckpointError> for Failure {
+    fn from(error: CheckpointError) -> Self {
+        match error {
+            CheckpointError::Write(error) => error.into(),
+            CheckpointError::Backend(error) => error.into(),
+            error @ (CheckpointError::Read { .. } | CheckpointError::Policy { .. }) => {
+                Self { code: OTHER, message: error.to_string() }
+            }
+            error @ CheckpointError::Invalid { .. } => Self::input(error),
+        }
     }
 }
 
@@ -126,6 +140,7 @@ impl From<EvaluateError> for Failure {
         let code = match &error {
             EvaluateError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
             EvaluateError::Backend { .. } => DEVICE,
+            EvaluateError::Stopped => OTHER,
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

@@ -1,7 +1,7 @@
 //! The command line: arguments → validated options → run. The only place that prints.
 //!
 //! One file per subcommand. Exit codes: 0 for success, 2 for bad input or usage, 3 where device or
-//! memory do not suffice, 1 for anything else. An error is one message that names file, field or
+//! memory do not suffice, 130 and 143 for a run that SIGINT or SIGTERM has ended, 1 for anything else. An error is one message that names file, field or
 //! flag and the remedy.
 //!
 //! A program that brings policies of its own is two lines:
@@ -77,7 +77,8 @@ pub fn run() -> ExitCode {
 
 /// Runs a command line, the program's name first; returns the exit code.
 fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
-    let arguments = match Arguments::try_parse_from(arguments) {
+    let words: Vec<OsString> = arguments.into_iter().map(Into::into).collect();
+    let arguments = match Arguments::try_parse_from(&words) {
         Ok(arguments) => arguments,
         Err(help_or_error) => {
             // A reader that has gone away is no reason to fail.
@@ -88,7 +89,10 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     let quiet = matches!(&arguments.command, Command::Train(train) if train.quiet);
     let console = Console::new(quiet);
     let done = match arguments.command {
-        Command::Train(train) => train::run(&train, &console),
+        Command::Train(train) => {
+            let after = words.iter().skip(1).skip_while(|word| *word != "train").skip(1);
+            train::run(&after.cloned().collect::<Vec<_>>(), *train, &console)
+        }
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),

@@ -20,6 +20,8 @@ const NEWEST: f32 = 0.05;
 pub(super) struct Progress<'a> {
     console: &'a Console,
     bar: Option<ProgressBar>,
+    /// Steps of processes before this one.
+    done: u32,
     iterations: u32,
     budget: usize,
     started: Instant,
@@ -28,8 +30,8 @@ pub(super) struct Progress<'a> {
 }
 
 impl<'a> Progress<'a> {
-    /// Progress towards `iterations`; silent on a quiet console.
-    pub(super) fn new(console: &'a Console, iterations: u32, budget: usize) -> Self {
+    /// Progress from `done` steps towards `iterations`; silent on a quiet console.
+    pub(super) fn new(console: &'a Console, done: u32, iterations: u32, budget: usize) -> Self {
         let bar = (!console.is_quiet() && stderr().is_terminal()).then(|| {
             let style = ProgressStyle::with_template(
                 "{bar:24.cyan/dim} {pos}/{len}  {speed}  {msg}  {eta} left",
@@ -40,10 +42,12 @@ impl<'a> Progress<'a> {
                 let _ = write!(out, "{:.1} it/s", state.per_sec());
             });
             let bar = ProgressBar::new(u64::from(iterations)).with_style(style);
-            console.bars().add(bar)
+            let bar = console.bars().add(bar.with_position(u64::from(done)));
+            bar.reset_eta();
+            bar
         });
         let now = Instant::now();
-        Self { console, bar, iterations, budget, started: now, drawn: now, loss: None }
+        Self { console, bar, done, iterations, budget, started: now, drawn: now, loss: None }
     }
 
     /// Counts a step.
@@ -60,7 +64,7 @@ impl<'a> Progress<'a> {
             }
         } else if is_milestone(step, self.iterations) {
             let elapsed = self.started.elapsed().as_secs_f64().max(1e-9);
-            let speed = f64::from(step) / elapsed;
+            let speed = f64::from(step - self.done) / elapsed;
             let left = f64::from(self.iterations - step) / speed;
             self.console.progress(format_args!(
                 "step {step}/{} ({} %)  {speed:.1} it/s  {}  {} left",

@@ -1,9 +1,19 @@
 //! Files that are there in full or not at all.
 
+use std::ffi::OsStr;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use super::OutputError;
+use super::disk::{Named, Operation, attempt};
+
+/// What the names of files and folders begin with that are not complete yet.
+pub(super) const TEMPORARY: &str = ".densify-";
+
+/// Whether a file or folder of this name is one that a writer has not completed.
+pub(super) fn is_temporary(name: &OsStr) -> bool {
+    name.to_string_lossy().starts_with(TEMPORARY)
+}
 
 /// Writes a file under a temporary name in the same folder, syncs it and renames it: whoever looks
 /// sees the old content or the new one, whatever happens in between. Creates missing folders.
@@ -29,21 +39,43 @@ fn replace(
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
 ) -> io::Result<()> {
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".densify-");
+    builder.prefix(TEMPORARY);
     // Temporary files are private by default; a result is as readable as any other new file.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    attempt(Operation::Create, path)?;
     let mut file = builder.tempfile_in(folder)?;
-    let mut buffered = BufWriter::with_capacity(1 << 16, file.as_file_mut());
+    let mut buffered = BufWriter::with_capacity(1 << 16, Named { file: file.as_file_mut(), path });
     write(&mut buffered)?;
     buffered.flush()?;
     drop(buffered);
+    attempt(Operation::Sync, path)?;
     file.as_file().sync_all()?;
+    attempt(Operation::Rename, path)?;
     file.persist(path)?;
     // The rename lasts once the folder is synced; not every file system can do that.
     #[cfg(unix)]
     let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
     Ok(())
+}
+
+/// Folders within folders of a run: `point_cloud/iteration_N`.
+pub(super) const DEEPEST: u32 = 2;
+
+/// Removes the files that are not complete, down to folders so deep.
+pub(super) fn remove_incomplete(folder: &Path, deeper: u32) {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    for entry in entries {
+        let (name, path) = (entry.file_name(), entry.path());
+        // Links are not followed: what they lead to is the user's.
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
+                remove_incomplete(&path, deeper - 1);
+            }
+            Ok(kind) if kind.is_file() && is_temporary(&name) => _ = std::fs::remove_file(&path),
+            _ => {}
+        }
+    }
 }
 
 #[cfg(test)]

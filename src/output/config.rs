@@ -54,6 +54,10 @@ pub struct TrainConfig {
     pub budget: usize,
     /// Length of the run in steps.
     pub iterations: u32,
+    /// Step to which the run was extended beyond its length. Schedules do not know of it: step sizes
+    /// stay at their end.
+    #[serde(default)]
+    pub extended_to: Option<u32>,
     /// Seed of everything that is drawn.
     pub seed: u64,
     /// Highest spherical-harmonic degree.
@@ -155,6 +159,7 @@ mod tests {
             train: TrainConfig {
                 budget: 28_000,
                 iterations: 2_000,
+                extended_to: None,
                 seed: i64::MAX as u64,
                 sh_degree: 3,
                 near: 0.01,

@@ -7,9 +7,13 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 use super::OutputError;
+use super::atomic::{DEEPEST, TEMPORARY, is_temporary, remove_incomplete};
+use super::disk::{Operation, attempt};
+use super::tensorboard::PREFIX as OWNED_PREFIX;
 
 /// What a run owns in its folder. Anything else in there is the user's and is left alone.
-const OWNED: [&str; 10] = [
+const OWNED: [&str; 11] = [
+    CHECKPOINTS,
     "config.toml",
     "cameras.json",
     MODELS,
@@ -22,7 +26,8 @@ const OWNED: [&str; 10] = [
     "geometry_train.json",
 ];
 const MODELS: &str = "point_cloud";
-const OWNED_PREFIX: &str = "events.out.tfevents.";
+/// Name of the folder of checkpoints in a run's folder.
+pub const CHECKPOINTS: &str = "checkpoints";
 
 /// Where a run keeps the model of an iteration.
 #[must_use]
@@ -88,13 +93,39 @@ impl RunFolder {
         Self::check(target, overwrite)?;
         let is_new = !target.exists();
         let fail = |e| OutputError::io("create the folder", target)(e);
+        attempt(Operation::Create, target).map_err(fail)?;
         fs::create_dir_all(target).map_err(fail)?;
         let occupied = !owned_entries(target)?.is_empty();
         let staging = occupied
-            .then(|| tempfile::Builder::new().prefix(".densify-").tempdir_in(target))
+            .then(|| tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(target))
             .transpose()
             .map_err(OutputError::io("create a folder in", target))?;
         Ok(Self { target: target.to_owned(), is_new, staging })
+    }
+
+    /// The folder of a run that goes on, or that begins anew because it has kept nothing; then what
+    /// it has written is removed. Files that a process which was killed has not completed are removed
+    /// in any case.
+    ///
+    /// # Errors
+    /// [`OutputError::NotAFolder`], [`OutputError::Io`].
+    pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
+        Self::check(target, true)?;
+        if anew {
+            remove_owned(target);
+        }
+        remove_incomplete(target, DEEPEST);
+        let is_new = !target.exists();
+        fs::create_dir_all(target).map_err(OutputError::io("create the folder", target))?;
+        Ok(Self { target: target.to_owned(), is_new, staging: None })
+    }
+
+    /// Hidden folders in `target` in which runs wait, or waited, to replace the one there.
+    #[must_use]
+    pub fn staged(target: &Path) -> Vec<PathBuf> {
+        let entries = fs::read_dir(target).into_iter().flatten().flatten();
+        let hidden = entries.filter(|entry| is_temporary(&entry.file_name()));
+        hidden.map(|entry| entry.path()).filter(|path| path.is_dir()).collect()
     }
 
     /// Where to write now.
@@ -106,28 +137,18 @@ impl RunFolder {
     /// Takes the place of the run that was there, if any; returns where the run is.
     ///
     /// # Errors
-    /// [`OutputError::Io`]. The new run is then kept in the hidden folder that the error names.
+    /// [`OutputError::NotReplaced`] with the hidden folder in which the new run then is; the old one
+    /// stays.
     pub fn finish(self) -> Result<PathBuf, OutputError> {
         let Self { target, staging, .. } = self;
         let Some(staging) = staging else {
             return Ok(target);
         };
         let staging = staging.keep();
-        let aside = tempfile::Builder::new()
-            .prefix(".densify-old-")
-            .tempdir_in(&target)
-            .map_err(OutputError::io("create a folder in", &target))?;
-        let carry = |from: &Path, to: &Path| -> Result<(), OutputError> {
-            for name in owned_entries(from)? {
-                let path = from.join(&name);
-                fs::rename(&path, to.join(&name)).map_err(OutputError::io("move", &path))?;
-            }
-            Ok(())
-        };
-        carry(&target, aside.path())?;
-        carry(&staging, &target)?;
-        fs::remove_dir_all(&staging).map_err(OutputError::io("remove", &staging))?;
-        Ok(target)
+        match replace(&target, &staging) {
+            Ok(()) => Ok(target),
+            Err(source) => Err(OutputError::NotReplaced { staging, source: Box::new(source) }),
+        }
     }
 
     /// Ends a run that failed: the run that was there stays, and what the failed one has written
@@ -149,6 +170,37 @@ impl RunFolder {
             }
         }
     }
+}
+
+/// Puts the run in `staging` in the place of the one in `target`, or leaves both as they are.
+fn replace(target: &Path, staging: &Path) -> Result<(), OutputError> {
+    let aside = tempfile::Builder::new()
+        .prefix(".densify-old-")
+        .tempdir_in(target)
+        .map_err(OutputError::io("create a folder in", target))?;
+    let moved = carry(target, aside.path())
+        .map_err(|error| (error, false))
+        .and_then(|()| carry(staging, target).map_err(|error| (error, true)));
+    let Err((error, half)) = moved else {
+        return fs::remove_dir_all(staging).map_err(OutputError::io("remove", staging));
+    };
+    let back = if half { carry(target, staging) } else { Ok(()) };
+    if back.and_then(|()| carry(aside.path(), target)).is_err() {
+        // What cannot go back is not to go with its folder.
+        let _ = aside.keep();
+    }
+    Err(error)
+}
+
+/// Moves what belongs to a run to another folder.
+fn carry(from: &Path, to: &Path) -> Result<(), OutputError> {
+    for name in owned_entries(from)? {
+        let path = from.join(&name);
+        attempt(Operation::Rename, &path)
+            .and_then(|()| fs::rename(&path, to.join(&name)))
+            .map_err(OutputError::io("move", &path))?;
+    }
+    Ok(())
 }
 
 /// Removes what belongs to a run, as far as the system lets it.
@@ -179,6 +231,7 @@ fn is_owned(name: &OsStr) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::output::disk::{Fault, with_fault};
 
     fn write(path: &Path, text: &str) {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -227,6 +280,55 @@ mod tests {
         run.finish().unwrap();
         assert_eq!(tree(root.path()), ["config.toml", "notes.txt", "point_cloud"]);
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"new");
+    }
+
+    #[test]
+    fn a_run_that_cannot_take_its_place_leaves_the_old_one_there() {
+        let root = tempfile::tempdir().unwrap();
+        // The first cannot go out of the way, the second cannot come in.
+        for file in ["config.toml", "results.json"] {
+            for name in ["config.toml", "cameras.json", "stats/old.jsonl"] {
+                write(&root.path().join(name), "old");
+            }
+            let before = tree(root.path());
+            let run = RunFolder::create(root.path(), true).unwrap();
+            for name in ["config.toml", "cameras.json", "results.json"] {
+                write(&run.path().join(name), "new");
+            }
+            let fault = Fault {
+                operation: Operation::Rename,
+                file,
+                spared: 0,
+                kind: std::io::ErrorKind::Other,
+            };
+            let staging = run.path().to_owned();
+            let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
+            assert!(error.contains(file) && error.contains(&*staging.to_string_lossy()), "{error}");
+            assert_eq!(tree(&staging), ["cameras.json", "config.toml", "results.json"]);
+            fs::remove_dir_all(staging).unwrap();
+            assert_eq!(tree(root.path()), before);
+            assert_eq!(fs::read(root.path().join("cameras.json")).unwrap(), b"old");
+        }
+    }
+
+    #[test]
+    fn a_run_that_goes_on_finds_nothing_half_written() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["config.toml", "stats/train.jsonl", "point_cloud/iteration_1/point_cloud.ply"]
+        {
+            write(&root.path().join(name), "old");
+        }
+        for name in [".densify-1", "stats/.densify-2", "point_cloud/iteration_1/.densify-3"] {
+            write(&root.path().join(name), "half");
+        }
+        write(&root.path().join(".densify-x/checkpoints/a"), "another run, waiting");
+        RunFolder::resume(root.path(), false).unwrap();
+        assert_eq!(tree(root.path()), [".densify-x", "config.toml", "point_cloud", "stats"]);
+        assert_eq!(tree(&root.path().join("stats")), ["train.jsonl"]);
+        assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
+        assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-x")]);
+        RunFolder::resume(root.path(), true).unwrap();
+        assert_eq!(tree(root.path()), [".densify-x"]);
     }
 
     #[test]

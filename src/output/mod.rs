@@ -6,6 +6,7 @@
 //!   config.toml                                  everything needed to repeat the run
 //!   cameras.json                                 all cameras, world coordinates
 //!   point_cloud/iteration_N/point_cloud.ply      the model
+//!   checkpoints/iteration_N.safetensors          what a run goes on from
 //!   stats/train.jsonl  events.jsonl  summary.json
 //!   results.json  per_view.json                  test scores, as the original trainer lays them out
 //!   geometry.json                                how the model sits on a known surface
@@ -18,6 +19,7 @@
 mod atomic;
 mod cameras;
 mod config;
+pub(crate) mod disk;
 mod folder;
 mod records;
 mod tensorboard;
@@ -25,7 +27,7 @@ mod tensorboard;
 pub use atomic::write_atomically;
 pub use cameras::cameras_json;
 pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
-pub use folder::{RunFolder, model_path, saved_iterations};
+pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
 pub use records::{
     Mean, RecordLog, StepRecord, Summary, geometry_of, write_geometry, write_json, write_scores,
 };
@@ -59,6 +61,16 @@ pub enum OutputError {
         path: PathBuf,
         /// What a run would have.
         missing: &'static str,
+    },
+    /// A run cannot take the place of the one that is there.
+    #[error(
+        "{source}; the new run is complete in {staging}, the one that it was to replace is still there"
+    )]
+    NotReplaced {
+        /// Where the new run is.
+        staging: PathBuf,
+        /// What could not be moved.
+        source: Box<OutputError>,
     },
     /// A file of a run does not say what it should.
     #[error("{path}: {problem}; this file was written by another version or changed by hand")]

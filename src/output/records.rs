@@ -1,13 +1,14 @@
 //! Numbers of a run: the logs that grow, the summary, and the test scores.
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
-use std::io::Write;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 
+use super::disk::{Named, Operation, attempt};
 use super::{OutputError, write_atomically};
 use crate::evaluate::{Scores, Split, ViewScore};
 use crate::memory::Ledger;
@@ -31,8 +32,60 @@ impl RecordLog {
                 .map_err(OutputError::io("create the folder", folder))?;
         }
         let mut options = OpenOptions::new();
-        let file = options.create(true).write(true).truncate(true).open(path);
-        Ok(Self { file: file.map_err(OutputError::io("create", path))?, path: path.to_owned() })
+        let file = attempt(Operation::Create, path)
+            .and_then(|()| options.create(true).write(true).truncate(true).open(path));
+        let file = file.map_err(OutputError::io("create", path))?;
+        mark_as_in_use(&file);
+        Ok(Self { file, path: path.to_owned() })
+    }
+
+    /// Whether a process is writing to the log now, as far as the system says.
+    #[must_use]
+    pub fn is_in_use(path: &Path) -> bool {
+        // Elsewhere a lock would keep readers out, too.
+        cfg!(unix)
+            && File::open(path)
+                .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+    }
+
+    /// Goes on with a log that was `bytes` long when the run was last known to be sound: what was
+    /// written after that is cut off. Says whether all of it was there; what is missing stays
+    /// missing.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`].
+    pub fn resume(path: &Path, bytes: u64) -> Result<(Self, bool), OutputError> {
+        let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else {
+            return Ok((Self::create(path)?, bytes == 0));
+        };
+        mark_as_in_use(&file);
+        let mut cut = || {
+            let there = file.metadata()?.len();
+            if there < bytes {
+                // Whole lines only.
+                let mut text = Vec::new();
+                file.read_to_end(&mut text)?;
+                let end = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
+                file.set_len(end as u64)?;
+            } else {
+                file.set_len(bytes)?;
+            }
+            file.seek(SeekFrom::End(0))?;
+            Ok(there >= bytes)
+        };
+        let whole = cut().map_err(OutputError::io("cut", path))?;
+        Ok((Self { file, path: path.to_owned() }, whole))
+    }
+
+    /// Length `[bytes]`, all of it on disk.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`].
+    pub fn synced(&self) -> Result<u64, OutputError> {
+        let length = attempt(Operation::Sync, &self.path)
+            .and_then(|()| self.file.sync_all())
+            .and_then(|()| self.file.metadata());
+        Ok(length.map_err(OutputError::io("write", &self.path))?.len())
     }
 
     /// Adds a line.
@@ -42,8 +95,17 @@ impl RecordLog {
     pub fn append(&mut self, record: &impl Serialize) -> Result<(), OutputError> {
         let line = serde_json::to_string(record).map_err(std::io::Error::other);
         // One write a line, so that a reader, or a kill, finds whole lines.
-        line.and_then(|line| self.file.write_all((line + "\n").as_bytes()))
-            .map_err(OutputError::io("write", &self.path))
+        let Self { file, path } = self;
+        line.and_then(|line| Named { file, path }.write_all((line + "\n").as_bytes()))
+            .map_err(OutputError::io("write", path))
+    }
+}
+
+/// For as long as the file is open; the system forgets it even where the process is killed. Not every
+/// file system can do that.
+fn mark_as_in_use(file: &File) {
+    if cfg!(unix) {
+        let _ = file.try_lock();
     }
 }
 
@@ -93,7 +155,7 @@ pub struct Summary {
     pub seconds: f64,
     /// Wall time of each stage of the steps, of the policy's events, and of the views rendered for
     /// these, summed `[s]`.
-    pub stage_seconds: BTreeMap<&'static str, f64>,
+    pub stage_seconds: BTreeMap<String, f64>,
     /// CPU time of all steps, all threads together `[s]`, where the system says.
     pub cpu_seconds: Option<f64>,
     /// Number of views trained on.
@@ -108,7 +170,7 @@ pub struct Summary {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Mean {
     /// Peak signal-to-noise ratio `[dB]`.
-    #[serde(rename = "PSNR")]
+    #[serde(rename = "PSNR", deserialize_with = "or_infinite")]
     pub psnr: f64,
     /// Structural similarity.
     #[serde(rename = "SSIM")]
@@ -116,6 +178,11 @@ pub struct Mean {
     /// FLIP error: what the eye sees of the difference, 0 for equal images.
     #[serde(rename = "FLIP")]
     pub flip: f64,
+}
+
+/// JSON has no infinity and writes null: the ratio of two equal images.
+fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
 /// Writes a value as indented JSON.
@@ -244,6 +311,34 @@ mod tests {
         let message =
             write_scores(root.path(), Split::Test, 7, &scores(1.0)).unwrap_err().to_string();
         assert!(message.contains("results.json"), "{message}");
+    }
+
+    #[test]
+    fn a_log_goes_on_where_the_checkpoint_was() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("stats/events.jsonl");
+        let mut log = RecordLog::create(&path).unwrap();
+        log.append(&1).unwrap();
+        let sound = log.synced().unwrap();
+        log.append(&22).unwrap();
+        let go_on = |bytes| {
+            let (mut log, whole) = RecordLog::resume(&path, bytes).unwrap();
+            log.append(&3).unwrap();
+            (std::fs::read_to_string(&path).unwrap(), whole)
+        };
+        assert_eq!(go_on(sound), ("1\n3\n".to_owned(), true));
+        // A log that was cut: its last line is no longer whole.
+        std::fs::write(&path, "1\n2").unwrap();
+        assert_eq!(go_on(9), ("1\n3\n".to_owned(), false));
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(go_on(9), ("3\n".to_owned(), false));
+    }
+
+    #[test]
+    fn a_perfect_score_is_read_back() {
+        let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0 };
+        let text = serde_json::to_string(&perfect).unwrap();
+        assert_eq!(serde_json::from_str::<Mean>(&text).unwrap(), perfect);
     }
 
     #[test]

@@ -10,6 +10,10 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use super::OutputError;
+use super::disk::{Named, Operation, attempt};
+
+/// What the names of event files begin with.
+pub(super) const PREFIX: &str = "events.out.tfevents.";
 
 /// An event file, open for appending.
 #[derive(Debug)]
@@ -26,15 +30,44 @@ impl TensorBoard {
     pub fn create(folder: &Path) -> Result<Self, OutputError> {
         let now = wall_time();
         // TensorBoard reads any file whose name contains "tfevents", in the order of their names.
-        let path = folder.join(format!("events.out.tfevents.{:010}.densify", now as u64));
-        let file = OpenOptions::new()
-            .create(true)
-            .append(true)
-            .open(&path)
+        let path = folder.join(format!("{PREFIX}{:010}.densify", now as u64));
+        let file = attempt(Operation::Create, &path)
+            .and_then(|()| OpenOptions::new().create(true).append(true).open(&path))
             .map_err(OutputError::io("create", &path))?;
         let mut board = Self { file, path };
         board.append(&version_event(now))?;
         Ok(board)
+    }
+
+    /// Goes on with the event file `name` in `folder`, which was `bytes` long when the run was last
+    /// known to be sound: what was written after that is cut off. Starts another file where it is
+    /// gone or shorter, or where the name is none of an event file.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`].
+    pub fn resume(folder: &Path, name: &str, bytes: u64) -> Result<Self, OutputError> {
+        let path = folder.join(name);
+        let ours = name.starts_with(PREFIX) && !name.contains(['/', '\\']);
+        let there = || path.symlink_metadata().is_ok_and(|m| m.is_file() && m.len() >= bytes);
+        if !ours || !there() {
+            return Self::create(folder);
+        }
+        let file = OpenOptions::new().append(true).open(&path);
+        let cut = file.and_then(|file| file.set_len(bytes).map(|()| file));
+        Ok(Self { file: cut.map_err(OutputError::io("cut", &path))?, path })
+    }
+
+    /// Name and length `[bytes]` of the file, all of it on disk.
+    ///
+    /// # Errors
+    /// [`OutputError::Io`].
+    pub fn synced(&self) -> Result<(String, u64), OutputError> {
+        let length = attempt(Operation::Sync, &self.path)
+            .and_then(|()| self.file.sync_all())
+            .and_then(|()| self.file.metadata());
+        let length = length.map_err(OutputError::io("write", &self.path))?.len();
+        let name = self.path.file_name().map(|name| name.to_string_lossy().into_owned());
+        Ok((name.unwrap_or_default(), length))
     }
 
     /// Adds the value of each tag at `step`.
@@ -47,7 +80,8 @@ impl TensorBoard {
 
     fn append(&mut self, event: &[u8]) -> Result<(), OutputError> {
         // One write a record, so that a reader, or a kill, finds whole records.
-        self.file.write_all(&record(event)).map_err(OutputError::io("write", &self.path))
+        let Self { file, path } = self;
+        Named { file, path }.write_all(&record(event)).map_err(OutputError::io("write", path))
     }
 }
 
@@ -147,6 +181,25 @@ mod tests {
         ]
         .concat();
         assert_eq!(event, expected);
+    }
+
+    #[test]
+    fn a_file_goes_on_where_the_checkpoint_was() {
+        let root = tempfile::tempdir().unwrap();
+        let mut board = TensorBoard::create(root.path()).unwrap();
+        board.scalars(1, &[("loss", 0.25)]).unwrap();
+        let (name, bytes) = board.synced().unwrap();
+        board.scalars(2, &[("loss", 0.5)]).unwrap();
+        let board = TensorBoard::resume(root.path(), &name, bytes).unwrap();
+        assert_eq!(board.synced().unwrap(), (name.clone(), bytes));
+        // None of ours: it is not touched.
+        let other = root.path().join("notes");
+        std::fs::write(&other, "mine").unwrap();
+        for foreign in ["notes", "../notes", "events.out.tfevents./../notes"] {
+            let board = TensorBoard::resume(root.path(), foreign, 1).unwrap();
+            assert!(board.path.file_name().unwrap().to_str().unwrap().starts_with(PREFIX));
+        }
+        assert_eq!(std::fs::read(&other).unwrap(), b"mine");
     }
 
     #[test]

@@ -11,7 +11,7 @@ use densify_policies::policy::{
 use glam::{DMat3, DVec3};
 
 use super::*;
-use crate::backend::{AuxInput, AuxOutput, Rendering};
+use crate::backend::{AuxInput, AuxOutput, Rendering, StateError, Tensor};
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
@@ -84,6 +84,15 @@ impl Backend for CountingBackend {
     }
     fn download(&self) -> Gaussians {
         Gaussians { means: vec![[0.0; 3]; self.rows], ..Gaussians::default() }
+    }
+    fn state(&self) -> Vec<String> {
+        Vec::new()
+    }
+    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
+        panic!("{name} is not kept")
+    }
+    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        Err(tensor.error("nothing is kept"))
     }
 
     fn stage_times(&self) -> &[(&'static str, std::time::Duration)] {

@@ -4,6 +4,8 @@
 //! line; a thread owns whole blocks, so that stages split without locks; and one row's parameters
 //! lie within four kilobytes, where planes over all rows would touch sixty pages.
 
+use std::ops::Range;
+
 use super::simd::WIDTH;
 use crate::gaussians::{Gaussians, sh_coefficients};
 
@@ -92,6 +94,21 @@ impl Blocks {
     pub(super) fn clear_row(&mut self, row: usize) {
         for plane in 0..self.planes {
             self.set(row, plane, 0.0);
+        }
+    }
+
+    /// Some planes of the first `rows` rows, row by row. Shape: `[rows, planes.len()]`.
+    pub(super) fn to_rows(&self, rows: usize, planes: Range<usize>) -> Vec<f32> {
+        (0..rows).flat_map(|row| planes.clone().map(move |p| self.get(row, p))).collect()
+    }
+
+    /// The opposite of [`to_rows`](Self::to_rows).
+    pub(super) fn set_rows(&mut self, rows: usize, planes: Range<usize>, values: &[f32]) {
+        let mut values = values.iter();
+        for row in 0..rows {
+            for (plane, &value) in planes.clone().zip(&mut values) {
+                self.set(row, plane, value);
+            }
         }
     }
 

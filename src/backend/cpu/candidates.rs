@@ -39,6 +39,16 @@ impl Candidates {
         request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
     }
 
+    /// Whether a policy wants any.
+    pub(super) fn is_wanted(&self) -> bool {
+        self.request.is_some()
+    }
+
+    /// Most that are held at a time.
+    pub(super) fn capacity(&self) -> usize {
+        self.request.map_or(0, |r| r.capacity)
+    }
+
     pub(super) fn list(&self) -> &[Candidate] {
         &self.list
     }

@@ -25,6 +25,7 @@ mod regularise;
 mod signals;
 mod simd;
 mod stage_clock;
+mod state;
 mod summed;
 mod tiles;
 
@@ -36,7 +37,10 @@ use densify_policies::policy::{Candidate, LossTerms, Needs, NoiseTerm, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
-use super::{AuxInput, AuxOutput, Backend, BackendError, Rendering, StepInput, StepOutput};
+use super::{
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
+    Tensor,
+};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
@@ -56,7 +60,7 @@ use stage_clock::StageClock;
 use summed::Summed;
 use tiles::{Grid, TileLists};
 
-pub use optimise::ModelGradient;
+pub use optimise::{ImageGradient, ModelGradient};
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
@@ -96,17 +100,6 @@ impl CpuOptions {
             needs: Needs::default(),
         }
     }
-}
-
-/// dL/dpixel for [`CpuBackend::differentiate`].
-#[derive(Debug, Clone, PartialEq)]
-pub struct ImageGradient {
-    /// Shape: `[height, width, 3]`.
-    pub rgb: Vec<f32>,
-    /// Shape: `[height, width]`.
-    pub alpha: Vec<f32>,
-    /// Shape: `[height, width]`.
-    pub depth: Vec<f32>,
 }
 
 /// The native backend.
@@ -386,6 +379,18 @@ impl Backend for CpuBackend {
 
     fn download(&self) -> Gaussians {
         self.params.unpack(self.rows, self.sh_degree)
+    }
+
+    fn state(&self) -> Vec<String> {
+        self.state_names()
+    }
+
+    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
+        Ok(self.state_tensor(name))
+    }
+
+    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        self.restore_tensor(tensor)
     }
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {

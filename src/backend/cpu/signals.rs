@@ -134,6 +134,20 @@ impl Accumulators {
         self.layout
     }
 
+    /// What is kept between steps, by name and plane. Weights of fresh views are not: they are
+    /// measured and taken within one event.
+    pub(super) fn state(&self) -> impl Iterator<Item = (String, usize)> {
+        let sums = SUMS.iter().zip(self.layout.sums);
+        let sums = sums.filter_map(|(signal, plane)| Some((format!("{signal:?}"), plane?)));
+        let epochs = ["WeightMax.previous", "WeightMax.current"].map(str::to_owned);
+        sums.chain(
+            self.layout
+                .weight_max
+                .into_iter()
+                .flat_map(move |planes| epochs.clone().into_iter().zip(planes)),
+        )
+    }
+
     /// Which record fields the requested signals need.
     pub(super) fn detail(&self) -> Detail {
         let any = |signals: &[Signal]| signals.iter().any(|&s| self.requested.contains(s));

@@ -14,7 +14,7 @@ use super::blocks::{Blocks, plane};
 use super::passes::parts;
 use super::simd::WIDTH;
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
-use crate::backend::StepInput;
+use crate::backend::{StateError, StepInput, Tensor};
 
 /// The sums of all rows.
 #[derive(Debug)]
@@ -48,6 +48,11 @@ pub(super) struct TaskSums<'a> {
     sums: &'a mut [f32],
     rest_ages: &'a mut [u16],
 }
+
+/// Names of what is kept between steps.
+const GRADIENTS: &str = "gradients";
+const WAITING: &str = "waiting";
+const REST_AGES: &str = "rest_ages";
 
 /// The first plane that sums for this cadence must hold; `planes` where none must.
 fn first_plane(planes: usize, longest: Cadence) -> usize {
@@ -106,6 +111,63 @@ impl Summed {
             .zip(ages)
             .map(|(sums, rest_ages)| TaskSums { first, stride, sums, rest_ages })
             .collect()
+    }
+
+    /// What is kept between steps, by name.
+    pub(super) fn state(&self) -> &'static [&'static str] {
+        match (Self::is_wanted(self.longest), self.rest_ages.is_empty()) {
+            (false, _) => &[],
+            (true, true) => &[GRADIENTS, WAITING],
+            (true, false) => &[GRADIENTS, WAITING, REST_AGES],
+        }
+    }
+
+    /// An array of the state: sums `[rows, summed planes]`, who waits `[2]`, ages of bands 1–3
+    /// `[rows]`.
+    pub(super) fn tensor(&self, part: &str, rows: usize) -> Option<Tensor> {
+        let planes = self.planes();
+        let name = format!("summed.{part}");
+        let part = self.state().iter().find(|known| **known == part)?;
+        Some(match *part {
+            GRADIENTS => Tensor::f32(name, &[rows, planes], self.sums.to_rows(rows, 0..planes)),
+            WAITING => {
+                let Due { main, rest, .. } = self.pending;
+                Tensor::u8(name, &[2], vec![u8::from(main), u8::from(rest)])
+            }
+            _ => Tensor::u16(name, &[rows], self.rest_ages[..rows].to_vec()),
+        })
+    }
+
+    /// Takes back what [`tensor`](Self::tensor) returned.
+    pub(super) fn restore(
+        &mut self,
+        part: &str,
+        rows: usize,
+        tensor: Tensor,
+    ) -> Result<(), StateError> {
+        let planes = self.planes();
+        match self.state().iter().find(|known| **known == part) {
+            None => return Err(tensor.error("this run keeps nothing of that name")),
+            Some(&GRADIENTS) => {
+                let values = tensor.into_f32(&[rows, planes])?;
+                self.sums.set_rows(rows, 0..planes, &values);
+            }
+            Some(&WAITING) => {
+                let waiting = tensor.into_u8(&[2])?;
+                let [main, rest] = [0, 1].map(|i| waiting[i] != 0);
+                self.pending = Due { main, rest, waited: [false; 2] };
+            }
+            Some(_) => {
+                let ages = tensor.into_u16(&[rows])?;
+                self.rest_ages[..rows].copy_from_slice(&ages);
+            }
+        }
+        Ok(())
+    }
+
+    /// Planes that are summed.
+    fn planes(&self) -> usize {
+        self.sums.stride() / WIDTH
     }
 
     pub(super) fn clear_row(&mut self, row: usize) {

@@ -120,6 +120,10 @@ impl Cell {
         let folder = output.join("runs").join(&run);
         let mut call = Command::new(&program);
         call.args(self.arguments()).arg("--overwrite").arg("--output").arg(&folder);
+        if !self.train.iter().any(|flag| flag.starts_with("--checkpoint-every")) {
+            // A run of a comparison that is interrupted runs again, so that its times are whole.
+            call.args(["--checkpoint-every", "0"]);
+        }
         self.wait_for(&mut call)?;
         if has_geometry(&self.scene) {
             // In a process of its own too: the memory of the run stays the run's.

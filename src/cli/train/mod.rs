@@ -1,9 +1,13 @@
 //! `densify train`.
 
 mod choices;
+mod interrupt;
+mod resume;
 mod session;
 mod setup;
+mod tally;
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
@@ -13,6 +17,7 @@ use super::failure::Failure;
 use super::number;
 use super::scene::{NEAR, SceneArgs};
 use crate::output::InitChoice;
+use resume::Start;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
 /// a room or an object; large outdoor scenes want more.
@@ -100,6 +105,15 @@ pub(super) struct TrainArgs {
     /// Iterations after which to measure the views held out, beside the last
     #[arg(long, value_name = "N", help_heading = "Output", num_args = 1.., value_delimiter = ',')]
     test_iterations: Vec<u32>,
+    /// Steps between two checkpoints; one is written at the end, too, and when SIGINT or SIGTERM
+    /// stops the run. The two newest are kept. 0: none but when stopped
+    #[arg(long, value_name = "N", help_heading = "Output", default_value_t = CHECKPOINT_EVERY)]
+    checkpoint_every: u32,
+    /// Go on from the newest checkpoint in the output folder, with its options (but for those that say
+    /// when to save, measure and keep the run); --iterations may extend it. Without any checkpoint the
+    /// run begins at its start
+    #[arg(long, help_heading = "Output", conflicts_with = "overwrite")]
+    resume: bool,
     /// Replace the run that is in the output folder, once this one is complete
     #[arg(long, help_heading = "Output")]
     overwrite: bool,
@@ -108,13 +122,17 @@ pub(super) struct TrainArgs {
     pub(super) quiet: bool,
 }
 
+/// Steps between two checkpoints. One takes about as long as one to three steps.
+const CHECKPOINT_EVERY: u32 = 1_000;
+
 const EXAMPLES: &str = "\
 Examples:
   densify train scene:spheres --iterations 2000
   densify train data/garden
   densify train data/garden --eval -r 4 --budget 1.5M -o runs/garden
   densify train data/chair --background white --init-points 50k
-  densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2";
+  densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2
+  densify train data/garden --resume";
 
 /// Spelling of [`InitChoice`] on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -134,7 +152,21 @@ impl From<Init> for InitChoice {
     }
 }
 
-pub(super) fn run(args: &TrainArgs, console: &Console) -> Result<(), Failure> {
-    let prepared = setup::prepare(args, console)?;
-    session::train(args, prepared, console)
+/// Trains. `words` are those after `train` on the command line, which `args` was parsed from.
+pub(super) fn run(words: &[OsString], args: TrainArgs, console: &Console) -> Result<(), Failure> {
+    let (args, resumed) = match args.resume {
+        true => match resume::start(words, &args, console)? {
+            Start::Anew => (args, None),
+            Start::From(run) => {
+                let (args, resumed) = *run;
+                (args, Some(resumed))
+            }
+        },
+        false => (args, None),
+    };
+    let prepared = setup::prepare(&args, resumed, console)?;
+    session::train(&args, prepared, console)
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,22 +1,26 @@
 //! The loop around the trainer: progress, logs, saves, measurements, and the end, good or bad.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use cpu_time::ProcessTime;
 
 use super::TrainArgs;
+use super::interrupt::{Interrupt, Interrupts};
 use super::setup::Prepared;
+use super::tally::{Logs, Tally};
+use crate::checkpoint::{CheckpointError, Header, checkpoint_path, tidy, write};
 use crate::cli::console::Console;
 use crate::cli::failure::{Failure, INPUT};
 use crate::cli::number::{duration, grouped};
 use crate::cli::progress::Progress;
-use crate::evaluate::{Split, evaluate};
-use crate::memory::{Bytes, peak_resident};
+use crate::evaluate::{EvaluateError, Split, evaluate};
+use crate::memory::Bytes;
 use crate::output::{
-    Mean, OutputError, RecordLog, RunFolder, StepRecord, Summary, TensorBoard, cameras_json,
-    model_path, saved_iterations, write_atomically, write_json, write_scores,
+    CHECKPOINTS, Mean, OutputError, RunFolder, Summary, cameras_json, model_path, saved_iterations,
+    write_atomically, write_json, write_scores,
 };
 use crate::ply::write_splats;
 use crate::trainer::{StepReport, TrainError};
@@ -31,45 +35,45 @@ struct Session<'a> {
     console: &'a Console,
     /// Where files go now.
     folder: PathBuf,
-    steps: RecordLog,
-    events: RecordLog,
-    board: TensorBoard,
-    window: Window,
-    wall: Duration,
-    cpu: Option<Duration>,
-    stages: BTreeMap<&'static str, Duration>,
-    tested: BTreeMap<u32, Mean>,
+    logs: Logs,
+    tally: Tally,
+    interrupts: Interrupts,
+    /// Step of the last checkpoint that this process has written.
+    checkpoint: Option<u32>,
 }
 
-/// Sums over the steps since the last record.
-#[derive(Default)]
-struct Window {
-    steps: u32,
-    loss: f32,
-    l1: f32,
-    ssim: f32,
+/// What is done after which step, beside training.
+struct Duties {
+    saves: BTreeSet<u32>,
+    tests: BTreeSet<u32>,
+    checkpoint_every: u32,
+    last: u32,
 }
 
 pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Result<(), Failure> {
-    let last = args.iterations;
-    let folder = RunFolder::create(&run.output, args.overwrite)?;
-    let mut session = Session::start(run, folder.path(), console)?;
-    let saves: BTreeSet<u32> = args.save_iterations.iter().copied().chain([last]).collect();
-    let tests: BTreeSet<u32> = args.test_iterations.iter().copied().chain([last]).collect();
-    let budget = session.run.config.train.budget;
-    let mut progress = Progress::new(console, last, budget);
-    let done = (1..=last).try_for_each(|step| {
-        let report = session.step()?;
-        progress.step(step, report.output.loss, report.rows);
-        if saves.contains(&step) {
-            session.save(step)?;
+    let interrupts = Interrupts::listen();
+    let last = run.last;
+    let folder = match args.resume {
+        true => RunFolder::resume(&run.output, run.kept.is_none())?,
+        false => RunFolder::create(&run.output, args.overwrite)?,
+    };
+    let goes_on = run.kept.is_some();
+    let mut session = match Session::start(run, folder.path(), interrupts, console) {
+        Ok(session) => session,
+        // Where nothing can be written nothing has been learned.
+        Err(error) if goes_on => return Err(error.into()),
+        Err(error) => {
+            folder.discard();
+            return Err(error.into());
         }
-        if tests.contains(&step) {
-            session.test(step, step == last)?;
-        }
-        Ok(())
-    });
-    progress.finish();
+    };
+    let duties = Duties {
+        saves: args.save_iterations.iter().copied().chain([last]).collect(),
+        tests: args.test_iterations.iter().copied().chain([last]).collect(),
+        checkpoint_every: args.checkpoint_every,
+        last,
+    };
+    let done = session.go(&duties);
     let finished = done.and_then(|()| session.write_summary(true).map_err(Failure::from));
     match finished {
         Ok(()) => {
@@ -78,7 +82,7 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
             Ok(())
         }
         // Such as a photograph that cannot be decoded: nothing was learned that is worth keeping.
-        Err(failure) if failure.code == INPUT && saved_iterations(folder.path()).is_err() => {
+        Err(failure) if failure.code == INPUT && has_nothing(folder.path()) => {
             drop(session);
             folder.discard();
             Err(failure)
@@ -93,8 +97,18 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
     }
 }
 
+/// Whether a run has left neither a model nor a checkpoint.
+fn has_nothing(folder: &Path) -> bool {
+    saved_iterations(folder).is_err() && !folder.join(CHECKPOINTS).exists()
+}
+
 impl<'a> Session<'a> {
-    fn start(run: Prepared, folder: &Path, console: &'a Console) -> Result<Self, OutputError> {
+    fn start(
+        mut run: Prepared,
+        folder: &Path,
+        interrupts: Interrupts,
+        console: &'a Console,
+    ) -> Result<Self, OutputError> {
         run.config.write(folder)?;
         let to_world = &run.dataset.normalisation;
         if let Some(warning) = to_world.f32_warning() {
@@ -105,30 +119,108 @@ impl<'a> Session<'a> {
         write_atomically(&folder.join("cameras.json"), |out| {
             out.write_all(cameras_json(cameras)?.as_bytes())
         })?;
-        Ok(Self {
-            steps: RecordLog::create(&folder.join("stats/train.jsonl"))?,
-            events: RecordLog::create(&folder.join("stats/events.jsonl"))?,
-            board: TensorBoard::create(folder)?,
-            folder: folder.to_owned(),
-            window: Window::default(),
-            wall: Duration::ZERO,
-            cpu: Some(Duration::ZERO),
-            stages: BTreeMap::new(),
-            tested: BTreeMap::new(),
-            run,
-            console,
-        })
+        let (logs, tally) = match run.kept.take() {
+            None => (Logs::create(folder)?, Tally::new()),
+            Some(kept) => {
+                let (logs, tally, lost) = Logs::resume(folder, kept)?;
+                for name in lost {
+                    console.say(format_args!("note: {name} has lost records; they stay missing"));
+                }
+                (logs, tally)
+            }
+        };
+        let folder = folder.to_owned();
+        Ok(Self { run, console, folder, logs, tally, interrupts, checkpoint: None })
+    }
+
+    /// All steps that are left.
+    fn go(&mut self, duties: &Duties) -> Result<(), Failure> {
+        let done = self.run.trainer.steps_done();
+        let (last, budget) = (duties.last, self.run.config.train.budget);
+        if done > 0 {
+            // A run that was stopped may not have come to what follows its last step.
+            self.after(done, duties, true)?;
+        }
+        let mut progress = Progress::new(self.console, done, last, budget);
+        let stepped = (done + 1..=last).try_for_each(|step| {
+            if let Some(interrupt) = self.interrupts.received() {
+                return Err(self.interrupted(interrupt));
+            }
+            let report = self.step()?;
+            progress.step(step, report.output.loss, report.rows);
+            self.after(step, duties, false)
+        });
+        progress.finish();
+        stepped
+    }
+
+    /// What follows a step: the model is saved, measured, and the run kept. Where the run is
+    /// resumed, only what is not there yet.
+    fn after(&mut self, step: u32, duties: &Duties, resumed: bool) -> Result<(), Failure> {
+        let there = |path: PathBuf| resumed && path.is_file();
+        if duties.saves.contains(&step) && !there(model_path(&self.folder, step)) {
+            self.save(step)?;
+        }
+        if duties.tests.contains(&step) && !(resumed && self.tally.tested.contains_key(&step)) {
+            self.test(step, step == duties.last)?;
+        }
+        let every = duties.checkpoint_every;
+        let due = every > 0 && (step.is_multiple_of(every) || step == duties.last);
+        if due && !there(checkpoint_path(&self.folder, step)) {
+            // The run is worth more than its checkpoint; the one before is still there.
+            if let Err(error) = self.keep() {
+                tracing::error!(
+                    step,
+                    "the checkpoint could not be written, training goes on: {error}"
+                );
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes a checkpoint of the run as it is now; returns where.
+    fn keep(&mut self) -> Result<PathBuf, CheckpointError> {
+        let step = self.run.trainer.steps_done();
+        let path = checkpoint_path(&self.folder, step);
+        if self.checkpoint == Some(step) {
+            return Ok(path);
+        }
+        let trainer = self.run.trainer.state();
+        let header = Header {
+            densify: self.run.config.densify.clone(),
+            config: self.run.config.clone(),
+            dataset: self.run.fingerprint.clone(),
+            trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
+            session: self.logs.keep(&self.tally)?,
+        };
+        write(&path, &header, self.run.trainer.backend())?;
+        tidy(&self.folder, step);
+        self.checkpoint = Some(step);
+        Ok(path)
+    }
+
+    /// Ends the run in order, so that it can go on later.
+    fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
+        let step = self.run.trainer.steps_done();
+        let kept = match self.keep() {
+            Ok(path) => format!(
+                "the run is kept in {}; go on with: densify train {} -o {} --resume",
+                path.display(),
+                self.run.config.scene.path.display(),
+                self.folder.display()
+            ),
+            Err(error) => format!("no checkpoint could be written: {error}"),
+        };
+        Failure { code: exit_code, message: format!("stopped by {name} after step {step}; {kept}") }
     }
 
     /// One iteration with its records. On a policy's error the model is saved first.
     fn step(&mut self) -> Result<StepReport, Failure> {
         let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
         let stepped = self.run.trainer.step();
-        self.wall += wall.elapsed();
-        let spent = cpu.and_then(|start| start.try_elapsed().ok());
-        self.cpu = self.cpu.zip(spent).map(|(sum, spent)| sum + spent);
+        self.tally.time(wall, cpu);
         for &(stage, time) in self.run.trainer.backend().stage_times() {
-            *self.stages.entry(stage).or_default() += time;
+            self.tally.stage(stage, time);
         }
         match stepped {
             Ok(report) => {
@@ -150,28 +242,18 @@ impl<'a> Session<'a> {
     }
 
     fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
+        let Self { logs, tally, run, .. } = self;
         if let Some(event) = &report.event {
-            self.events.append(event)?;
+            logs.events.append(event)?;
         }
-        let window = &mut self.window;
-        window.steps += 1;
-        window.loss += report.output.loss;
-        window.l1 += report.output.l1;
-        window.ssim += report.output.ssim;
+        tally.step(&report.output);
         let step = report.step;
-        if step.is_multiple_of(RECORD_EVERY) || step == self.run.config.train.iterations {
-            let Window { steps, loss, l1, ssim } = std::mem::take(window);
-            let mean = |sum: f32| sum / steps as f32;
-            let record = StepRecord {
-                step,
-                loss: mean(loss),
-                l1: mean(l1),
-                ssim: mean(ssim),
-                rows: report.rows,
-                seconds: self.wall.as_secs_f64(),
-            };
-            self.steps.append(&record)?;
-            self.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
+        // The end of a run is a record even where it is extended, so that records do not depend on it.
+        let ends = [run.config.train.iterations, run.last].contains(&step);
+        if step.is_multiple_of(RECORD_EVERY) || ends {
+            let record = tally.record(step, report.rows);
+            logs.steps.append(&record)?;
+            logs.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
         }
         Ok(())
     }
@@ -192,13 +274,22 @@ impl<'a> Session<'a> {
         }
         let background = config.scene.background.fixed();
         let degree = config.train.sh_degree;
-        let scores = evaluate(trainer.backend(), test, background, degree, |_| ())?;
+        let interrupts = self.interrupts;
+        let scores = evaluate(trainer.backend(), test, background, degree, |_| {
+            interrupts.received().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
+        });
+        let scores = match (scores, self.interrupts.received()) {
+            (Err(EvaluateError::Stopped), Some(interrupt)) => {
+                return Err(self.interrupted(interrupt));
+            }
+            (scores, _) => scores?,
+        };
         let mean = scores.mean();
         write_scores(&self.folder, Split::Test, step, &scores)?;
         let Mean { psnr, ssim, flip } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
-        self.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
-        self.tested.insert(step, mean);
+        self.logs.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
+        self.tally.tested.insert(step, mean);
         if !is_last {
             self.console.say(format_args!(
                 "step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}"
@@ -211,7 +302,8 @@ impl<'a> Session<'a> {
         let Prepared { config, trainer, test, ledger, .. } = &self.run;
         let (events, views) = trainer.policy_times();
         let policy = [("policy events", events), ("policy views", views)];
-        let stages = self.stages.iter().map(|(&stage, &time)| (stage, time)).chain(policy);
+        let policy = policy.map(|(stage, time)| (stage.to_owned(), time));
+        let stages = self.tally.stages.clone().into_iter().chain(policy);
         let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
         let summary = Summary {
             densify: config.densify.clone(),
@@ -222,15 +314,15 @@ impl<'a> Session<'a> {
             peak_rows: trainer.peak_rows(),
             budget: config.train.budget,
             extra_forwards: trainer.extra_forwards(),
-            peak_bytes: peak_resident(),
+            peak_bytes: self.tally.peak_bytes(),
             ledger_bytes: ledger.total(),
             ledger: ledger.clone(),
-            seconds: self.wall.as_secs_f64(),
+            seconds: self.tally.wall.as_secs_f64(),
             stage_seconds,
-            cpu_seconds: self.cpu.map(|cpu| cpu.as_secs_f64()),
+            cpu_seconds: self.tally.cpu.map(|cpu| cpu.as_secs_f64()),
             train_views: trainer.views().count(),
             test_views: test.count(),
-            test: self.tested.clone(),
+            test: self.tally.tested.clone(),
         };
         write_json(&self.folder.join("stats/summary.json"), &summary)
     }
@@ -239,7 +331,7 @@ impl<'a> Session<'a> {
     fn report(&self, path: &Path) {
         let Prepared { config, trainer, test, ledger, .. } = &self.run;
         let steps = trainer.steps_done();
-        if let Some(Mean { psnr, ssim, flip }) = self.tested.get(&steps) {
+        if let Some(Mean { psnr, ssim, flip }) = self.tally.tested.get(&steps) {
             let views = test.count();
             self.console.say(format_args!(
                 "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
@@ -252,14 +344,14 @@ impl<'a> Session<'a> {
             grouped(config.train.budget)
         ));
         let promised = Bytes(ledger.total());
-        if let Some(peak) = peak_resident() {
+        if let Some(peak) = self.tally.peak_bytes() {
             let peak = Bytes(peak);
             self.console.say(format_args!("memory   {peak} at its peak, {promised} promised"));
         }
-        let cpu = self.cpu.map_or_else(String::new, |cpu| {
+        let cpu = self.tally.cpu.map_or_else(String::new, |cpu| {
             format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
         });
-        self.console.say(format_args!("time     {}{cpu}", duration(self.wall)));
+        self.console.say(format_args!("time     {}{cpu}", duration(self.tally.wall)));
         self.console.say(format_args!("model    {}", model_path(path, steps).display()));
         self.console.say(format_args!("numbers  {}", path.join("stats").display()));
     }

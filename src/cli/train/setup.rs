@@ -6,10 +6,13 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::{Needs, RateOverrides, SceneInfo};
 use densify_policies::registry::{PolicyEntry, find};
 
-use super::choices::{check_iterations, default_output, learning_rates, parameters};
+use super::choices::{check_iterations, learning_rates, parameters};
+use super::resume::{self, Resumed, output};
+use super::tally::Kept;
 use super::{DEFAULT_BUDGET, TrainArgs};
 use crate::backend::Backend;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::checkpoint::{Checkpoint, Fingerprint};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
@@ -41,17 +44,29 @@ pub(super) struct Prepared {
     /// Everything of the dataset but its points.
     pub(super) dataset: Dataset,
     pub(super) ledger: Ledger,
+    /// What the dataset is, for checkpoints.
+    pub(super) fingerprint: Fingerprint,
+    /// The step at which the run ends.
+    pub(super) last: u32,
+    /// What the session was, for a run that goes on.
+    pub(super) kept: Option<Kept>,
 }
 
-pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, Failure> {
+pub(super) fn prepare(
+    args: &TrainArgs,
+    resumed: Option<Resumed>,
+    console: &Console,
+) -> Result<Prepared, Failure> {
+    let last = resumed.as_ref().map_or(args.iterations, |resumed| resumed.last);
+    let mut checkpoint = resumed.map(|resumed| resumed.checkpoint);
     let entry = find(&args.policy)?;
     let parameters = parameters(args, entry)?;
     // Before anything is loaded, so that a slip is told at once.
     learning_rates(&args.lr, args.iterations, &RateOverrides::default())?;
-    check_iterations("--save-iterations", &args.save_iterations, args.iterations)?;
-    check_iterations("--test-iterations", &args.test_iterations, args.iterations)?;
-    let output = args.output.clone().unwrap_or_else(|| default_output(&args.scene, &args.policy));
-    RunFolder::check(&output, args.overwrite)?;
+    check_iterations("--save-iterations", &args.save_iterations, last)?;
+    check_iterations("--test-iterations", &args.test_iterations, last)?;
+    let output = output(args);
+    RunFolder::check(&output, args.overwrite || args.resume)?;
     use_threads(args.threads);
 
     let scene_config = args.data.config(&args.scene);
@@ -63,25 +78,39 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     }
     console.say(scene::describe(&args.scene, &dataset));
     let budget = args.budget.unwrap_or(DEFAULT_BUDGET);
-    let (mut model, init, init_points) = first_model(args, &dataset, budget, console)?;
+    let (mut model, init, init_points) = match &mut checkpoint {
+        None => first_model(args, &dataset, budget, console)?,
+        Some(checkpoint) => {
+            let TrainConfig { init, init_points, .. } = checkpoint.header().config.train;
+            (
+                checkpoint.model()?,
+                args.init.map_or(init, Into::into),
+                args.init_points.or(init_points),
+            )
+        }
+    };
     let scene = SceneInfo {
         extent: dataset.extent() as f32,
         train_views: u32::try_from(dataset.train.len())
             .map_err(|_| Failure::input("the scene has more than 4 billion views"))?,
         budget,
-        initial_rows: model.len(),
+        initial_rows: (checkpoint.as_ref())
+            .map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows),
         iterations: args.iterations,
         white_background: scene_config.background == Background::White,
     };
     let policy = entry.build(&parameters, &scene)?;
     let declared = policy.needs(&scene);
-    restart(&mut model, &declared.start);
+    if checkpoint.is_none() {
+        restart(&mut model, &declared.start);
+    }
     let rates = learning_rates(&args.lr, args.iterations, &declared.rates)?;
     let config = RunConfig {
         densify: env!("CARGO_PKG_VERSION").to_owned(),
         train: TrainConfig {
             budget,
             iterations: args.iterations,
+            extended_to: (last > args.iterations).then_some(last),
             seed: args.seed,
             sh_degree: args.sh_degree,
             near: args.near,
@@ -97,6 +126,11 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
         },
         scene: scene_config,
     };
+    let fingerprint = Fingerprint::of(&dataset);
+    if let Some(checkpoint) = &checkpoint {
+        resume::check(&config, checkpoint)?;
+        check_dataset(checkpoint, &fingerprint)?;
+    }
     announce(args, entry, &config, &output, console);
 
     let views = DatasetViews::new(dataset.train.clone(), args.data.image_cache, DECODERS);
@@ -115,8 +149,62 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
     let (backend, ledger) =
         backend(args, &config, &dataset, needs, &scene, model, [&views, &test])?;
     console.say(format_args!("memory promised\n{ledger}"));
-    let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
-    Ok(Prepared { config, output, trainer, test, dataset, ledger })
+    let mut trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
+    let kept = checkpoint.map(|checkpoint| go_on(checkpoint, &mut trainer, last, console));
+    let kept = kept.transpose()?;
+    Ok(Prepared { config, output, trainer, test, dataset, ledger, fingerprint, last, kept })
+}
+
+/// Gives the trainer, which holds the model of the checkpoint, all else that is in it.
+fn go_on(
+    mut checkpoint: Checkpoint,
+    trainer: &mut Trainer<DatasetViews>,
+    last: u32,
+    console: &Console,
+) -> Result<Kept, Failure> {
+    checkpoint.restore(trainer.backend())?;
+    let header = checkpoint.header();
+    let fail =
+        |problem: String| Failure::input(format!("{}: {problem}", checkpoint.path().display()));
+    let state = header.trainer.clone();
+    let step = state.step;
+    trainer.resume(state).map_err(|error| fail(error.to_string()))?;
+    let kept = serde_json::from_value(header.session.clone());
+    let kept = kept.map_err(|error| fail(format!("its session: {error}")))?;
+    let length = header.config.train.iterations;
+    console.say(format_args!("resume   from step {step}, {}", checkpoint.path().display()));
+    if last > length {
+        console.say(format_args!(
+            "note: extended from {length} to {last} iterations; all schedules stay those of {length}, \
+             beyond which step sizes no longer fall"
+        ));
+    }
+    if step >= last {
+        console.say(format_args!(
+            "note: all {last} iterations are done; --iterations with a larger number extends the run"
+        ));
+    }
+    let version = env!("CARGO_PKG_VERSION");
+    if header.densify != version {
+        console.say(format_args!(
+            "note: the checkpoint was written by densify {}, this is {version}; the result may differ \
+             from that of a run that was not interrupted",
+            header.densify
+        ));
+    }
+    Ok(kept)
+}
+
+/// Fails unless the dataset is the one that the run began with.
+fn check_dataset(checkpoint: &Checkpoint, now: &Fingerprint) -> Result<(), Failure> {
+    let Some(difference) = checkpoint.header().dataset.difference(now) else {
+        return Ok(());
+    };
+    Err(Failure::input(format!(
+        "--resume: this is not the dataset of {}: {difference}; give the dataset of that run, or begin \
+         a new run without --resume",
+        checkpoint.path().display()
+    )))
 }
 
 /// The renderer with the model, and the ledger of the whole run.
@@ -161,7 +249,7 @@ fn backend(
     ledger.add_to(Section::Passing, "a policy's event", plan);
     // The model as downloaded and as exported.
     let row = float * (11 + 3 * sh_coefficients(config.train.sh_degree) as u64);
-    ledger.add_to(Section::Passing, "export of the model", 2 * budget * row);
+    ledger.add_to(Section::Passing, "export of the model, checkpoint", 2 * budget * row);
     if test.count() > 0 {
         let (width, height) = options.largest_image;
         let rendering = u64::from(width) * u64::from(height) * 5 * float;

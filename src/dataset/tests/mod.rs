@@ -3,5 +3,5 @@
 mod bad_input;
 mod formats;
 mod shared;
-mod write;
+pub(crate) mod write;
 pub(crate) use shared::shared;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 /// A dataset of three cameras around the origin, in a format, with 200 points.
-pub(super) struct Made {
+pub(crate) struct Made {
     folder: TempDir,
 }
 
@@ -28,7 +28,7 @@ impl Made {
         Self { folder }
     }
 
-    pub(super) fn colmap_txt() -> Self {
+    pub(crate) fn colmap_txt() -> Self {
         let made = Self::with_images();
         made.write("sparse/0/cameras.txt", "# cameras\n1 PINHOLE 20 12 15 16 10 6\n");
         let mut images = String::from("# images\n");
@@ -110,7 +110,7 @@ impl Made {
         made
     }
 
-    pub(super) fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         self.folder.path()
     }
 

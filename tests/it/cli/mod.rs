@@ -3,7 +3,9 @@
 mod comparing;
 mod faults;
 mod generated;
+mod killing;
 mod looking;
+mod resuming;
 mod same;
 mod training;
 

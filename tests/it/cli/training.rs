@@ -25,8 +25,10 @@ fn check_tree(run: &Path) {
     let board = names.iter().position(|name| name.starts_with("events.out.tfevents."));
     names.remove(board.expect("a TensorBoard file"));
     let ply = format!("point_cloud/iteration_{ITERATIONS}/point_cloud.ply");
+    let checkpoint = format!("checkpoints/iteration_{ITERATIONS}.safetensors");
     let expected = [
         "cameras.json",
+        &checkpoint,
         "config.toml",
         "per_view.json",
         &ply,

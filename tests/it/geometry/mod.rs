@@ -4,6 +4,7 @@
 mod candidates;
 mod policies;
 
+use std::ops::ControlFlow;
 use std::path::Path;
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
@@ -119,7 +120,9 @@ impl Known {
             background: [0.0; 3],
             sh_degree: 0,
         };
-        let scores = evaluate(last.as_mut(), &test, [0.0; 3], 0, |_| ()).expect("scores").mean();
+        let scores = evaluate(last.as_mut(), &test, [0.0; 3], 0, |_| ControlFlow::Continue(()))
+            .expect("scores")
+            .mean();
         let outcome = Outcome {
             geometry: geometry::measure(last.as_mut(), &ground, &train, &test).expect("measured"),
             psnr: scores.psnr,

@@ -1,0 +1,107 @@
+//! The native backend's state as named arrays. Each stage that keeps something between steps says
+//! what it is; lanes beyond the last row are nobody's and are left out.
+
+use densify_policies::policy::Candidate;
+
+use super::CpuBackend;
+use super::blocks::planes;
+use super::signals::Accumulators;
+use crate::backend::{StateError, Tensor};
+
+const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
+const AGES: &str = "ages";
+const CANDIDATES: &str = "candidates";
+/// Before the name of a signal.
+const SIGNAL: &str = "signals.";
+/// Before what is [summed](super::summed).
+const SUMMED: &str = "summed.";
+/// Numbers of a candidate.
+const CANDIDATE: usize = 8;
+
+impl CpuBackend {
+    pub(super) fn state_names(&self) -> Vec<String> {
+        let mut names: Vec<String> = MOMENTS.map(str::to_owned).to_vec();
+        names.push(AGES.to_owned());
+        names.extend(self.signals.state().map(|(name, _)| format!("{SIGNAL}{name}")));
+        if self.candidates.is_wanted() {
+            names.push(CANDIDATES.to_owned());
+        }
+        names.extend(self.summed.state().iter().map(|name| format!("{SUMMED}{name}")));
+        names
+    }
+
+    /// # Panics
+    /// When there is no such array: a bug in the caller.
+    pub(super) fn state_tensor(&self, name: &str) -> Tensor {
+        let rows = self.rows;
+        if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
+            let planes = planes(self.sh_degree);
+            return Tensor::f32(name, &[rows, planes], self.moments[i].to_rows(rows, 0..planes));
+        }
+        if name == AGES {
+            return Tensor::u16(name, &[rows], self.ages[..rows].to_vec());
+        }
+        if name == CANDIDATES {
+            let list = self.candidates.list();
+            let values = list.iter().flat_map(numbers).collect();
+            return Tensor::f32(name, &[list.len(), CANDIDATE], values);
+        }
+        if let Some(plane) = signal_plane(&self.signals, name) {
+            let values = self.signals.blocks.to_rows(rows, plane..plane + 1);
+            return Tensor::f32(name, &[rows], values);
+        }
+        let summed = name.strip_prefix(SUMMED).and_then(|part| self.summed.tensor(part, rows));
+        summed.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"))
+    }
+
+    pub(super) fn restore_tensor(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        let rows = self.rows;
+        let name = tensor.name.clone();
+        if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
+            let planes = planes(self.sh_degree);
+            let values = tensor.into_f32(&[rows, planes])?;
+            self.moments[i].set_rows(rows, 0..planes, &values);
+        } else if name == AGES {
+            let ages = tensor.into_u16(&[rows])?;
+            self.ages[..rows].copy_from_slice(&ages);
+        } else if name == CANDIDATES && self.candidates.is_wanted() {
+            let count = tensor.shape.first().copied().unwrap_or(0);
+            if count > self.candidates.capacity() {
+                let most = self.candidates.capacity();
+                return Err(tensor.error(format!("{count} of them; this run holds {most}")));
+            }
+            self.candidates.clear();
+            for from in tensor.into_f32(&[count, CANDIDATE])?.chunks_exact(CANDIDATE) {
+                self.candidates.push(candidate(from));
+            }
+        } else if let Some(plane) = signal_plane(&self.signals, &name) {
+            let values = tensor.into_f32(&[rows])?;
+            self.signals.blocks.set_rows(rows, plane..plane + 1, &values);
+        } else if let Some(part) = name.strip_prefix(SUMMED) {
+            self.summed.restore(part, rows, tensor)?;
+        } else {
+            return Err(tensor.error("this run keeps nothing of that name"));
+        }
+        Ok(())
+    }
+}
+
+fn signal_plane(signals: &Accumulators, name: &str) -> Option<usize> {
+    let name = name.strip_prefix(SIGNAL)?;
+    signals.state().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
+}
+
+fn numbers(c: &Candidate) -> [f32; CANDIDATE] {
+    let ([x, y, z], [r, g, b]) = (c.position, c.colour);
+    [x, y, z, r, g, b, c.pixel_size, c.error]
+}
+
+/// `from` has [`CANDIDATE`] numbers.
+fn candidate(from: &[f32]) -> Candidate {
+    Candidate {
+        position: [from[0], from[1], from[2]],
+        colour: [from[3], from[4], from[5]],
+        pixel_size: from[6],
+        error: from[7],
+    }
+}

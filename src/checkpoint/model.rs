@@ -1,0 +1,42 @@
+//! The model's arrays: from [`Gaussians`] and back.
+
+use super::CheckpointError;
+use crate::backend::{StateError, Tensor};
+use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
+
+/// Names of the arrays, in the order of the file.
+pub(super) const NAMES: [&str; 5] =
+    ["model.means", "model.log_scales", "model.quats", "model.opacity_logits", "model.sh"];
+
+/// One of [`NAMES`].
+pub(super) fn tensor(model: &Gaussians, which: usize) -> Tensor {
+    let rows = model.len();
+    let name = NAMES[which];
+    match which {
+        0 => Tensor::f32(name, &[rows, 3], model.means.as_flattened().to_vec()),
+        1 => Tensor::f32(name, &[rows, 3], model.log_scales.as_flattened().to_vec()),
+        2 => Tensor::f32(name, &[rows, 4], model.quats.as_flattened().to_vec()),
+        3 => Tensor::f32(name, &[rows], model.opacity_logits.clone()),
+        _ => Tensor::f32(name, &[rows, sh_coefficients(model.sh_degree), 3], model.sh.clone()),
+    }
+}
+
+/// The model of so many rows, from a source of arrays by name.
+pub(super) fn model(
+    rows: usize,
+    sh_degree: u8,
+    mut read: impl FnMut(&'static str) -> Result<Tensor, CheckpointError>,
+    fail: impl Fn(StateError) -> CheckpointError,
+) -> Result<Gaussians, CheckpointError> {
+    let coefficients = sh_coefficients(sh_degree.min(MAX_SH_DEGREE));
+    let mut next =
+        |which: usize, shape: &[usize]| read(NAMES[which])?.into_f32(shape).map_err(&fail);
+    Ok(Gaussians {
+        sh_degree,
+        means: next(0, &[rows, 3])?.as_chunks::<3>().0.to_vec(),
+        log_scales: next(1, &[rows, 3])?.as_chunks::<3>().0.to_vec(),
+        quats: next(2, &[rows, 4])?.as_chunks::<4>().0.to_vec(),
+        opacity_logits: next(3, &[rows])?,
+        sh: next(4, &[rows, coefficients, 3])?,
+    })
+}

@@ -1,0 +1,219 @@
+//! Processes that are killed or told to stop: nothing is lost but the steps since the last checkpoint,
+//! and the end is the same.
+//!
+//! `DENSIFY_KILLS=200 cargo test --test it killing` kills 200 times instead of 20.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde_json::Value;
+
+use super::{densify, files, model, read, records, scratch, text, train};
+use crate::photographs::Photographs;
+
+/// Kills where the environment does not say.
+const KILLS: usize = 20;
+const ITERATIONS: u32 = 120;
+/// Checkpoints at every third step, so that many kills hit the writing of one.
+const FLAGS: &str = "--budget 360 --checkpoint-every 3 --eval --save-iterations 31,77 \
+                     --test-iterations 50 --policy-set diet.grow_every=7";
+
+/// When to kill.
+#[derive(Debug, Clone, Copy)]
+enum Moment {
+    /// After so many looks at the folder.
+    Looks(u32),
+    /// When the log has so many records.
+    Records(usize),
+    /// When a file that is being written is seen for the so-many-th time.
+    Writing(u32),
+}
+
+impl Moment {
+    fn any(rng: &mut ChaCha8Rng) -> Self {
+        match rng.random_range(0..4) {
+            0 => Self::Looks(rng.random_range(0..100_000)),
+            1 => Self::Records(rng.random_range(1..ITERATIONS as usize / 10)),
+            _ => Self::Writing(rng.random_range(1..30)),
+        }
+    }
+
+    /// Looks on until the moment has come, or the child has ended by itself: whether it has come.
+    fn wait(self, child: &mut Child, run: &Path) -> bool {
+        let (mut looks, mut seen) = (0, 0);
+        while child.try_wait().expect("a child").is_none() {
+            looks += 1;
+            let come = match self {
+                Self::Looks(wanted) => looks >= wanted,
+                Self::Records(wanted) => lines(&run.join("stats/train.jsonl")) >= wanted,
+                Self::Writing(wanted) => {
+                    seen += u32::from(is_writing(&run.join("checkpoints")));
+                    seen >= wanted
+                }
+            };
+            if come {
+                return true;
+            }
+            std::thread::yield_now();
+        }
+        false
+    }
+}
+
+fn lines(path: &Path) -> usize {
+    std::fs::read(path).unwrap_or_default().iter().filter(|&&byte| byte == b'\n').count()
+}
+
+fn is_writing(folder: &Path) -> bool {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.map(|entry| entry.file_name()).any(|name| name.to_string_lossy().starts_with('.'))
+}
+
+/// Starts the program.
+fn spawn(arguments: &[&str]) -> Child {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
+    command.args(arguments).env_remove("RUST_LOG");
+    command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("it starts")
+}
+
+fn arguments<'a>(
+    scene: &'a Path,
+    run: &'a Path,
+    iterations: &'a str,
+    flags: &'a str,
+) -> Vec<&'a str> {
+    let mut words = vec!["train", text(scene), "-o", text(run), "--sh-degree", "1", "--quiet"];
+    words.extend(["--iterations", iterations]);
+    words.extend(flags.split_whitespace());
+    words
+}
+
+/// All that a run must end with, whatever has happened to it.
+fn outcome(run: &Path, iterations: u32) -> (Vec<Vec<u8>>, Vec<Value>) {
+    let exact =
+        ["stats/events.jsonl", "results.json", "per_view.json"].map(|name| read(&run.join(name)));
+    let mut exact = exact.to_vec();
+    exact.push(model(run, iterations));
+    let mut log = records(&run.join("stats/train.jsonl"));
+    for record in &mut log {
+        record["seconds"].take();
+    }
+    (exact, log)
+}
+
+#[test]
+fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
+    let kills = std::env::var("DENSIFY_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(KILLS);
+    let scene = Photographs::colmap_text();
+    let (root, whole) = scratch();
+    train(scene.path(), &whole, ITERATIONS, &format!("--quiet {FLAGS}")).ok();
+    let expected = outcome(&whole, ITERATIONS);
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    let (mut killed, mut within_a_write) = (0, 0);
+    for number in 0.. {
+        let run = root.path().join(format!("run{number}"));
+        // The same call again and again, as a supervisor would do it.
+        let iterations = ITERATIONS.to_string();
+        let words = [arguments(scene.path(), &run, &iterations, FLAGS), vec!["--resume"]].concat();
+        for _ in 0..rng.random_range(1..4) {
+            let mut child = spawn(&words);
+            let moment = Moment::any(&mut rng);
+            if moment.wait(&mut child, &run) {
+                child.kill().expect("it can be killed");
+                killed += 1;
+                within_a_write += usize::from(is_writing(&run.join("checkpoints")));
+            }
+            let ended = child.wait_with_output().expect("it ends");
+            let said = String::from_utf8_lossy(&ended.stderr);
+            assert!(said.is_empty(), "run {number}, {moment:?}: {said}");
+        }
+        densify(&words).ok();
+        assert!(outcome(&run, ITERATIONS) == expected, "run {number} of seed 11 differs");
+        let left = files(&run);
+        let hidden = left.keys().find(|name| name.split('/').any(|part| part.starts_with('.')));
+        assert_eq!(hidden, None, "run {number}: something half written is left");
+        std::fs::remove_dir_all(&run).expect("the run");
+        if killed >= kills {
+            break;
+        }
+    }
+    assert!(within_a_write > 0, "no kill hit the writing of a checkpoint");
+}
+
+/// Sends signals to a run that has begun, and waits for its end: exit code, message, folder.
+#[cfg(unix)]
+fn signalled(scene: &Photographs, run: &Path, signals: &[&str]) -> (Option<i32>, String) {
+    let flags = "--budget 360 --checkpoint-every 0";
+    let mut child = spawn(&arguments(scene.path(), run, LONG, flags));
+    assert!(Moment::Records(3).wait(&mut child, run), "it has ended by itself");
+    let id = child.id();
+    // By one shell, so that there is next to no time between them.
+    let calls: String = signals.iter().map(|signal| format!("kill {signal} {id};")).collect();
+    assert!(Command::new("sh").args(["-c", &calls]).status().expect("a shell").success());
+    let ended = child.wait_with_output().expect("it ends");
+    (ended.status.code(), String::from_utf8_lossy(&ended.stderr).into_owned())
+}
+
+#[cfg(unix)]
+const LONG: &str = "1500";
+
+#[cfg(unix)]
+fn checkpoints(run: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(run.join("checkpoints")).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).collect()
+}
+
+#[cfg(unix)]
+#[test]
+fn a_signal_ends_the_run_in_order_and_it_goes_on() {
+    let scene = Photographs::colmap_text();
+    let (root, whole) = scratch();
+    train(scene.path(), &whole, 1500, "--quiet --budget 360 --checkpoint-every 0").ok();
+    for (signal, name, code) in [("-INT", "SIGINT", 130), ("-TERM", "SIGTERM", 143)] {
+        let run = root.path().join(name);
+        let (ended, said) = signalled(&scene, &run, &[signal]);
+        assert_eq!(ended, Some(code), "{said}");
+        let kept = checkpoints(&run);
+        assert_eq!(kept.len(), 1, "{kept:?}");
+        for words in [&format!("error: stopped by {name} after step "), text(&kept[0]), "--resume"]
+        {
+            assert!(said.contains(words), "{words:?} is not in {said}");
+        }
+        let summary = super::json(&run.join("stats/summary.json"));
+        let done = summary["iterations"].as_u64().expect("a number");
+        assert!(summary["finished"] == false && (30..1500).contains(&done), "{summary}");
+        assert!(text(&kept[0]).ends_with(&format!("iteration_{done}.safetensors")));
+        densify(&["train", text(scene.path()), "-o", text(&run), "--resume", "--quiet"]).ok();
+        assert!(model(&run, 1500) == model(&whole, 1500), "{name}");
+        assert!(read(&run.join("stats/events.jsonl")) == read(&whole.join("stats/events.jsonl")));
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_run_that_goes_on_is_not_resumed() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let mut child = spawn(&arguments(scene.path(), &run, "100000", "--budget 360"));
+    assert!(Moment::Records(3).wait(&mut child, &run), "it has ended by itself");
+    let resume = || densify(&["train", text(scene.path()), "-o", text(&run), "--resume"]);
+    resume().refused("twice", &["another process is training"]);
+    child.kill().expect("it can be killed");
+    child.wait().expect("it ends");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_second_signal_ends_it_at_once() {
+    let scene = Photographs::colmap_text();
+    // The first may have been acted upon before the second comes, if the machine is busy.
+    let at_once = (0..20).any(|_| {
+        let (_root, run) = scratch();
+        let (ended, said) = signalled(&scene, &run, &["-INT", "-TERM"]);
+        assert!(matches!(ended, Some(130 | 143)), "{ended:?}: {said}");
+        said.is_empty()
+    });
+    assert!(at_once, "every time the run was ended in order");
+}
