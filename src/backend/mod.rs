@@ -4,6 +4,7 @@
 //! Signals come down when a policy is due, row operations go up; parameters stay where they are.
 
 pub mod cpu;
+pub mod gpu;
 
 use std::time::Duration;
 
@@ -143,6 +144,31 @@ pub enum BackendError {
         /// The largest side supported `[px]`.
         max: u32,
     },
+    /// No adapter does.
+    #[error("{0}; `densify devices` lists the adapters, and --backend cpu needs none")]
+    NoAdapter(String),
+    /// A buffer beyond what the device can bind, with the remedy.
+    #[error("{0}")]
+    OverLimit(String),
+    /// Something that this backend does not do, with the remedy.
+    #[error("{0}")]
+    Unsupported(String),
+    /// The device was lost: what was on it is gone.
+    #[error("the device {device} was lost ({why}); start again from what was saved, or use --backend cpu")]
+    DeviceLost {
+        /// Its name.
+        device: String,
+        /// The driver's words.
+        why: String,
+    },
+    /// The device has refused a command.
+    #[error("the device {device} has failed ({why}); try another driver, or --backend cpu")]
+    Device {
+        /// Its name.
+        device: String,
+        /// The driver's words.
+        why: String,
+    },
 }
 
 /// A differentiable rasteriser with its optimiser and the model's only copy.
@@ -210,7 +236,10 @@ pub trait Backend: Send {
     ) -> Result<Rendering, BackendError>;
 
     /// Copies the model to the host.
-    fn download(&self) -> Gaussians;
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn download(&self) -> Result<Gaussians, BackendError>;
 
     /// Wall time of each stage of the last step, in order; a stage that ran more than once stands
     /// there as often.

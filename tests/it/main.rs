@@ -13,6 +13,7 @@ mod declared;
 mod edits;
 mod extremes;
 mod geometry;
+mod gpu;
 mod gradients;
 mod invariants;
 mod loss;

@@ -384,8 +384,8 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
-    fn download(&self) -> Gaussians {
-        self.params.unpack(self.rows, self.sh_degree)
+    fn download(&self) -> Result<Gaussians, BackendError> {
+        Ok(self.params.unpack(self.rows, self.sh_degree))
     }
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {

@@ -111,7 +111,7 @@ impl Known {
             let report = trainer.step().expect("a step");
             assert!(report.rows <= run.budget, "{run:?}: {} rows", report.rows);
         }
-        let model = trainer.model();
+        let model = trainer.model().expect("a model");
         let mut last = backend(&model, model.len().max(1), geometry::needs());
         let ground = Ground {
             truth,
