@@ -3,8 +3,10 @@
 //! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
 //! Signals come down when a policy is due, row operations go up; parameters stay where they are.
 
+mod candidates;
 pub mod cpu;
 pub mod gpu;
+mod pixel_map;
 
 use std::time::Duration;
 
@@ -150,11 +152,10 @@ pub enum BackendError {
     /// A buffer beyond what the device can bind, with the remedy.
     #[error("{0}")]
     OverLimit(String),
-    /// Something that this backend does not do, with the remedy.
-    #[error("{0}")]
-    Unsupported(String),
     /// The device was lost: what was on it is gone.
-    #[error("the device {device} was lost ({why}); start again from what was saved, or use --backend cpu")]
+    #[error(
+        "the device {device} was lost ({why}); start again from what was saved, or use --backend cpu"
+    )]
     DeviceLost {
         /// Its name.
         device: String,

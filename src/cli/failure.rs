@@ -92,7 +92,6 @@ fn is_input(error: &BackendError) -> bool {
         BackendError::ImageTooLarge { .. }
             | BackendError::NoAdapter(_)
             | BackendError::OverLimit(_)
-            | BackendError::Unsupported(_)
     )
 }
 

@@ -143,12 +143,7 @@ impl Sizes {
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
         let channels = if self.more { 5 } else { 3 };
-        add(
-            Section::Renderer,
-            "image and image gradient",
-            "pixel gradient",
-            4 * channels * pixels,
-        );
+        add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
         add(Section::Renderer, "loss", "derivatives", 36 * pixels);
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {

@@ -196,7 +196,8 @@ impl GpuBackend {
     fn copy_rows(&self, pairs: &[[u32; 2]], buffers: &[&[RowBuffer]]) {
         for chunk in pairs.chunks(CHUNK / 2) {
             self.execute(chunk.as_flattened(), |to| {
-                for RowBuffer { launch, words, pitch: [row, word] } in buffers.iter().copied().flatten()
+                for RowBuffer { launch, words, pitch: [row, word] } in
+                    buffers.iter().copied().flatten()
                 {
                     let count = chunk.len() as u32;
                     to.run(launch, [count, *words, *row, *word], (count * words).div_ceil(256));

@@ -8,36 +8,39 @@
 //!
 //! Every sum has one order, so that the same device gives the same bytes twice.
 
+mod adapter;
 mod buffers;
+mod canary;
 mod device;
+mod differentiate;
 mod edits;
 mod frame;
+mod observe;
 mod passes;
 mod pipelines;
 mod readback;
 mod signals;
+mod step;
+mod transfer;
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{
-    Cadence, Candidate, LossTerms, Needs, NoiseTerm, Signal, Signals,
-};
+use densify_policies::policy::{Cadence, Candidate, LossTerms, Needs, NoiseTerm, Signal, Signals};
 
-use super::cpu::{ImageGradient, ModelGradient};
+use super::candidates::Candidates;
 use super::{AuxInput, AuxOutput, Backend, BackendError, Rendering, StepInput, StepOutput};
 use crate::camera::Camera;
-use crate::dataset::images::Image8;
-use crate::gaussians::{Gaussians, sh_coefficients};
-use crate::memory::Ledger;
-use crate::sh;
+use crate::gaussians::Gaussians;
+use crate::memory::{Ledger, Section};
 
-use buffers::{Buffers, MOST_ENTRIES, SH, Sizes, band_coefficients, bias_table};
+pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters};
+use buffers::{Buffers, MOST_ENTRIES, Sizes, bias_table};
 use device::Device;
-pub use device::{AdapterChoice, AdapterKind, AdapterSummary, GpuDevice, adapters};
+pub use device::GpuDevice;
 use edits::EditLaunches;
-use frame::{Frame, State, due, grid, target};
+use frame::{Frame, State};
 use passes::{Launches, Passes, Recorder, Shape};
 use pipelines::Pipelines;
 use signals::{Planes, record_stride};
@@ -68,13 +71,7 @@ impl GpuOptions {
     /// Options for models of at most `budget` rows.
     #[must_use]
     pub fn new(budget: usize) -> Self {
-        Self {
-            budget,
-            near: 0.01,
-            tile_cap: None,
-            largest_image: (0, 0),
-            needs: Needs::default(),
-        }
+        Self { budget, near: 0.01, tile_cap: None, largest_image: (0, 0), needs: Needs::default() }
     }
 }
 
@@ -103,16 +100,18 @@ pub struct GpuBackend {
     noise: Option<NoiseTerm>,
     cadence: Cadence,
     waiting: Waiting,
+    candidates: Candidates,
     /// Bands that are encoded for the next view.
     bands: u32,
     laps: Vec<(&'static str, Duration)>,
 }
 
 impl GpuBackend {
-    /// Takes over `model` and allocates everything for `options.budget` rows.
+    /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
+    /// shown on a small scene that it computes what the native backend does.
     ///
     /// # Errors
-    /// [`BackendError`]: a limit of the device, its memory, or needs that it cannot fulfil.
+    /// [`BackendError`]: a limit of the device, its memory, or a driver that computes wrongly.
     ///
     /// # Panics
     /// When the model has more rows than the budget: the caller subsamples before.
@@ -121,9 +120,17 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
+        canary::check(device, &options.needs)?;
+        Self::without_canary(model, options, device)
+    }
+
+    fn without_canary(
+        model: &Gaussians,
+        options: &GpuOptions,
+        device: &GpuDevice,
+    ) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
-        check_needs(&options.needs)?;
         let device = device.0.clone();
         let most = device.summary.largest_budget(model.sh_degree);
         if budget as u64 > most {
@@ -147,8 +154,19 @@ impl GpuBackend {
         let launches = device
             .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
+        let mut ledger = sizes.ledger();
+        let pixels = u64::from(image.0) * u64::from(image.1);
+        ledger.add_to(
+            Section::Policy,
+            "candidates",
+            Candidates::bytes(options.needs.candidates, pixels as usize),
+        );
+        if let Some(request) = &options.needs.aux {
+            let bytes = observe::host_bytes(request, pixels);
+            ledger.add_to(Section::Policy, "auxiliary views", bytes);
+        }
         let gpu = Self {
-            ledger: sizes.ledger(),
+            ledger,
             device,
             sizes,
             buffers,
@@ -163,6 +181,7 @@ impl GpuBackend {
             noise: options.needs.noise,
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
+            candidates: Candidates::new(options.needs.candidates),
             bands: 1,
             laps: Vec::new(),
         };
@@ -178,41 +197,16 @@ impl GpuBackend {
         &self.device.summary
     }
 
+    /// What of the ledger is on the device `[bytes]`.
+    #[must_use]
+    pub fn promised(&self) -> u64 {
+        self.sizes.planned().iter().map(|planned| planned.bytes).sum()
+    }
+
     /// What is allocated on the device now `[bytes]`.
     #[must_use]
     pub fn allocated(&self) -> u64 {
         self.buffers.bytes()
-    }
-
-    fn write(&self, name: &str, bytes: &[u8]) {
-        if !bytes.is_empty() {
-            self.device.queue.write_buffer(self.buffers.get(name), 0, bytes);
-        }
-    }
-
-    fn upload(&self, model: &Gaussians) {
-        let mut rows = Vec::with_capacity(12 * model.len());
-        for i in 0..model.len() {
-            rows.extend_from_slice(&model.means[i]);
-            rows.extend_from_slice(&model.log_scales[i]);
-            rows.extend_from_slice(&model.quats[i]);
-            rows.extend_from_slice(&[model.opacity_logits[i], 0.0]);
-        }
-        self.write("rows", bytemuck::cast_slice(&rows));
-        let mut first = 0;
-        for band in 0..=usize::from(model.sh_degree) {
-            let numbers = 3 * band_coefficients(band);
-            let of_row = |i| &model.sh_of(i)[first..first + numbers];
-            let values: Vec<f32> = (0..model.len()).flat_map(of_row).copied().collect();
-            self.write(SH[band], bytemuck::cast_slice(&values));
-            first += numbers;
-        }
-    }
-
-    fn read(&self, name: &str, from: u64, bytes: u64) -> Result<Vec<f32>, BackendError> {
-        let staging = self.buffers.get("read");
-        let bytes = readback::read(&self.device, staging, self.buffers.get(name), from, bytes)?;
-        Ok(bytemuck::pod_collect_to_vec(&bytes))
     }
 
     /// Makes room for images of this size.
@@ -233,8 +227,8 @@ impl GpuBackend {
         self.buffers.resize(&self.device, &self.sizes)?;
         let Self { device, sizes, pipelines, buffers, .. } = self;
         *pipelines = device.pipelines(sizes.detail, sizes.more)?;
-        self.launches = device
-            .guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers))?;
+        self.launches =
+            device.guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers))?;
         self.edits = EditLaunches::new(device, sizes, &self.planes, buffers, pipelines);
         Ok(())
     }
@@ -246,12 +240,12 @@ impl GpuBackend {
     }
 
     /// Encodes and submits a view's passes until the bands that were encoded do, and returns the
-    /// state that they left. `encode` records everything, with the bands that it is given.
+    /// state that they left, and how they were encoded. `encode` records everything.
     fn run(
         &mut self,
         frame: &Frame,
         encode: impl Fn(&Passes<'_>, &mut Recorder<'_, '_>),
-    ) -> Result<State, BackendError> {
+    ) -> Result<(State, Shape), BackendError> {
         self.write("frame", bytemuck::bytes_of(frame));
         let [rows, ..] = frame.model;
         let tiles = frame.image[3];
@@ -272,217 +266,13 @@ impl GpuBackend {
             let state: State = bytemuck::pod_read_unaligned(&bytes);
             if state.short == 0 {
                 self.bands = state.bands.max(1);
-                return Ok(state);
+                return Ok((state, shape));
             }
             // One band was tried: a guess. Several: now the device has counted how many.
             let guess = (2 * u64::from(state.total)).div_ceil(self.sizes.cap).max(2);
             let needed = if shape.bands == 1 { guess } else { u64::from(state.bands) };
             self.bands = needed.min(u64::from(tiles)) as u32;
         }
-    }
-
-    /// Packs a photograph and uploads it; returns the bits that say what it has.
-    fn upload_target(&self, image: &Image8) -> u32 {
-        let pixels = image.width as usize * image.height as usize;
-        let mut words = vec![0_u32; pixels];
-        for (word, rgb) in words.iter_mut().zip(image.rgb.as_chunks::<3>().0) {
-            *word = u32::from_le_bytes([rgb[0], rgb[1], rgb[2], 255]);
-        }
-        if let Some(alpha) = &image.alpha {
-            for (word, &a) in words.iter_mut().zip(alpha) {
-                *word = *word & 0x00ff_ffff | u32::from(a) << 24;
-            }
-        }
-        self.write("truth", bytemuck::cast_slice(&words));
-        if let Some(mask) = &image.mask {
-            let mut mask = mask.clone();
-            mask.resize(mask.len().next_multiple_of(4), 0);
-            self.write("mask", &mask);
-        }
-        (if image.alpha.is_some() { target::HAS_ALPHA } else { 0 })
-            | (if image.mask.is_some() { target::HAS_MASK } else { 0 })
-    }
-
-    /// The image of the last view rendered.
-    fn rendering(&self, width: u32, height: u32) -> Result<Rendering, BackendError> {
-        let pixels = width as usize * height as usize;
-        let canvas = self.read("canvas", 0, 16 * pixels as u64)?;
-        let finish = self.read("finish", 0, 8 * pixels as u64)?;
-        let canvas = canvas.as_chunks::<4>().0;
-        Ok(Rendering {
-            width,
-            height,
-            rgb: canvas.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]).collect(),
-            alpha: finish.as_chunks::<2>().0.iter().map(|[light, _]| 1.0 - light).collect(),
-            depth: canvas.iter().map(|[.., depth]| *depth).collect(),
-        })
-    }
-
-    /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
-    /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
-    ///
-    /// Needs records of full detail, so that it allocates more than the ledger says where the
-    /// policy's needs are smaller: it is a tool for tests and for research, not part of training.
-    ///
-    /// # Errors
-    /// [`BackendError`].
-    ///
-    /// # Panics
-    /// When `upstream` does not have the image's size.
-    pub fn differentiate(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        upstream: &ImageGradient,
-    ) -> Result<(Rendering, ModelGradient), BackendError> {
-        let pixels = camera.width as usize * camera.height as usize;
-        assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
-        assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
-        assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
-        if !self.sizes.more {
-            (self.sizes.more, self.sizes.detail) = (true, 2);
-            self.rebuild()?;
-        }
-        self.fit_image(camera.width, camera.height)?;
-        let channel = |c: usize| upstream.rgb.iter().skip(c).step_by(3).copied();
-        let planes = (0..3).flat_map(channel).chain(upstream.alpha.iter().copied());
-        let planes: Vec<f32> = planes.chain(upstream.depth.iter().copied()).collect();
-        self.write("pixel gradient", bytemuck::cast_slice(&planes));
-        let frame = self.frame(camera, background, sh_degree);
-        self.run(&frame, |passes, to| {
-            passes.forward(to);
-            passes.backward(to);
-            passes.differentiate(to);
-        })?;
-        let rendering = self.rendering(camera.width, camera.height)?;
-        Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
-    }
-
-    /// What stages 5 and 6 have left.
-    fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
-        let n = self.rows as u64;
-        let gradient = self.read("gradient", 0, 80 * n)?;
-        let sums = self.read("row sums", 0, 60 * n)?;
-        let splats = self.read("splats", 0, 48 * n)?;
-        let depths = self.read("depths", 0, 4 * n)?;
-        let planes = self.sizes.sh_numbers();
-        let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
-        let rows = gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<15>().0);
-        let rest = splats.as_chunks::<12>().0.iter().zip(depths);
-        for (row, ((g, sums), (splat, depth))) in rows.zip(rest).enumerate() {
-            let seen = depth.to_bits() != u32::MAX;
-            let sums = if seen { *sums } else { [0.0; 15] };
-            let l1 = if seen { splat[2] } else { 0.0 };
-            let unfold = 1.0 / 0.849_321_8_f32;
-            out.means.push([g[0], g[1], g[2]]);
-            out.log_scales.push([g[3], g[4], g[5]]);
-            out.quats.push([g[6], g[7], g[8], g[9]]);
-            out.opacity_logits.push(g[10]);
-            out.mean2d.push([g[11], g[15]]);
-            out.mean2d_abs.push([
-                l1 * unfold * unfold * sums[9],
-                unfold * unfold * sums[10],
-            ]);
-            out.colour.push([sums[6], sums[7], sums[8]]);
-            out.max_weight.push(sums[14]);
-            out.sum_weight.push(sums[11]);
-            out.pixel_count.push(sums[12] as u32);
-            out.visible.push(seen);
-            let mut y = [0.0_f32; 16];
-            y[0] = sh::C0;
-            sh::basis(degree, [g[16], g[17], g[18]], &mut y);
-            for k in 0..sh_coefficients(degree) {
-                for channel in 0..3 {
-                    out.sh[row * planes + 3 * k + channel] = y[k] * g[12 + channel];
-                }
-            }
-        }
-        Ok(out)
-    }
-
-    /// The training loss of a rendering against a target and its gradient by the rendering's
-    /// pixels. Shape of the gradient: `[height, width, 3]`.
-    ///
-    /// # Errors
-    /// [`BackendError`].
-    ///
-    /// # Panics
-    /// When rendering and target differ in size.
-    pub fn loss(
-        &mut self,
-        rendering: &Rendering,
-        target: &Image8,
-        background: [f32; 3],
-    ) -> Result<(StepOutput, Vec<f32>), BackendError> {
-        let (width, height) = (rendering.width, rendering.height);
-        assert_eq!((width, height), (target.width, target.height), "sizes differ");
-        self.fit_image(width, height)?;
-        let pixels = rendering.rgb.as_chunks::<3>().0;
-        let canvas: Vec<[f32; 4]> = pixels.iter().map(|&[r, g, b]| [r, g, b, 0.0]).collect();
-        self.write("canvas", bytemuck::cast_slice(&canvas));
-        let [columns, tiles] = grid(width, height);
-        let [r, g, b] = background;
-        let frame = Frame {
-            background: [r, g, b, 0.0],
-            image: [width, height, columns, tiles],
-            draw: [0, 0, 0, self.upload_target(target)],
-            ..bytemuck::Zeroable::zeroed()
-        };
-        // Nothing was counted in this run, so that there is nothing for which bands might not do.
-        self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
-        let state = self.run(&frame, |passes, to| passes.loss(to, [0.0; 2]))?;
-        let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;
-        let n = pixels.len();
-        let gradient = (0..3 * n).map(|i| planes[i % 3 * n + i / 3]).collect();
-        Ok((scalars(&state), gradient))
-    }
-
-    /// Who steps now and who waits, as bits of the frame, and who waits afterwards.
-    fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
-        let (step, cadence) = (input.step, input.cadence);
-        assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");
-        let [main, rest] = cadence.steps_at(step);
-        let bits = [
-            (main, due::MAIN_STEPS),
-            (rest, due::REST_STEPS),
-            (self.waiting.main, due::MAIN_WAITED),
-            (self.waiting.rest, due::REST_WAITED),
-            (self.cadence.sh_rest > 1, due::REST_AGES),
-        ];
-        let bits = bits.iter().filter(|(on, _)| *on).fold(0, |all, (_, bit)| all | bit);
-        (bits, Waiting { main: !main, rest: !rest })
-    }
-
-    /// A column of one plane of numbers.
-    fn column(&self, plane: u32) -> Result<Vec<f32>, BackendError> {
-        let pitch = 4 * self.sizes.budget;
-        self.read("signals", u64::from(plane) * pitch, 4 * self.rows as u64)
-    }
-
-    /// A column of present values; see `present` in `shaders/signals.wgsl`.
-    fn present(&self, which: u32) -> Result<Vec<f32>, BackendError> {
-        let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        let pass = encoder.begin_compute_pass(&Default::default());
-        let mut to = Recorder { pass, pipelines: &self.pipelines };
-        to.run(&self.launches.present, [which, 0, 0, 0], (self.rows as u32).div_ceil(256));
-        drop(to);
-        self.device.queue.submit([encoder.finish()]);
-        self.read("sums", 0, 4 * self.rows as u64)
-    }
-}
-
-/// What this backend cannot do yet.
-fn check_needs(needs: &Needs) -> Result<(), BackendError> {
-    let lacking = [
-        (needs.candidates.is_some(), "candidates for new rows (compensation)"),
-        (needs.aux.is_some(), "auxiliary views"),
-    ];
-    match lacking.iter().find(|(wanted, _)| *wanted) {
-        Some((_, what)) => Err(BackendError::Unsupported(format!(
-            "the policy needs {what}, which the GPU backend does not have; use --backend cpu"
-        ))),
-        None => Ok(()),
     }
 }
 
@@ -518,29 +308,7 @@ impl Backend for GpuBackend {
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, .. } = *input;
-        assert_eq!(
-            (camera.width, camera.height),
-            (target.width, target.height),
-            "camera and image differ in size"
-        );
-        let start = Instant::now();
-        self.fit_image(camera.width, camera.height)?;
-        let (due, waiting) = self.cadence_bits(input);
-        let mut frame = self.frame(camera, background, input.sh_degree);
-        frame.draw[3] = self.upload_target(target);
-        frame.for_step(input, due, (self.terms, self.noise), &self.planes);
-        let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
-        let state = self.run(&frame, |passes, to| {
-            passes.forward(to);
-            passes.loss(to, [0.0; 2]);
-            passes.backward(to);
-            passes.optimise(to, degree, signals);
-        })?;
-        self.waiting = waiting;
-        self.laps.clear();
-        self.laps.push(("device", start.elapsed()));
-        Ok(scalars(&state))
+        self.step(input)
     }
 
     fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
@@ -561,8 +329,8 @@ impl Backend for GpuBackend {
         Ok(())
     }
 
-    fn observe(&mut self, _: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
-        Err(BackendError::Unsupported("auxiliary views need --backend cpu".into()))
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        self.observe_view(input)
     }
 
     fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
@@ -594,7 +362,7 @@ impl Backend for GpuBackend {
         if let Some(plane) = self.planes.fresh() {
             self.clear_planes(&[plane]);
         }
-        Ok((signals, Vec::new()))
+        Ok((signals, self.candidates.list().to_vec()))
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
@@ -606,6 +374,9 @@ impl Backend for GpuBackend {
             panic!("a plan that breaks its own rules: {broken}");
         }
         self.edit(ops, seed, step);
+        if ops.reset_candidates {
+            self.candidates.clear();
+        }
         self.device.check()
     }
 
@@ -622,29 +393,7 @@ impl Backend for GpuBackend {
     }
 
     fn download(&self) -> Result<Gaussians, BackendError> {
-        let n = self.rows as u64;
-        let rows = self.read("rows", 0, 48 * n)?;
-        let rows = rows.as_chunks::<12>().0;
-        let sh_degree = self.sizes.sh_degree;
-        let planes = self.sizes.sh_numbers();
-        let mut sh = vec![0.0; planes * self.rows];
-        let mut first = 0;
-        for band in 0..=usize::from(sh_degree) {
-            let numbers = 3 * band_coefficients(band);
-            let values = self.read(SH[band], 0, 4 * n * numbers as u64)?;
-            for (row, values) in values.chunks_exact(numbers).enumerate() {
-                sh[row * planes + first..][..numbers].copy_from_slice(values);
-            }
-            first += numbers;
-        }
-        Ok(Gaussians {
-            sh_degree,
-            means: rows.iter().map(|r| [r[0], r[1], r[2]]).collect(),
-            log_scales: rows.iter().map(|r| [r[3], r[4], r[5]]).collect(),
-            quats: rows.iter().map(|r| [r[6], r[7], r[8], r[9]]).collect(),
-            opacity_logits: rows.iter().map(|r| r[10]).collect(),
-            sh,
-        })
+        self.model()
     }
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {

@@ -53,11 +53,15 @@ pub(super) struct Launches {
     accumulate: Launch,
     measure: Launch,
     pub(super) present: Launch,
+    surface: [Launch; 2],
+    replay: [Launch; 2],
+    gather_columns: Launch,
 }
 
 impl Launches {
     pub(super) fn new(device: &Device, pipelines: &Pipelines, buffers: &Buffers) -> Self {
-        let bind = |kernel, names: &[&'static str]| pipelines.launch(device, buffers, kernel, names);
+        let bind =
+            |kernel, names: &[&'static str]| pipelines.launch(device, buffers, kernel, names);
         let keys = ["keys 0", "keys 1"];
         let values = ["values 0", "values 1"];
         let both = |f: &dyn Fn(usize) -> Launch| [f(0), f(1)];
@@ -79,8 +83,7 @@ impl Launches {
             count_digits: both(&|i| bind(Kernel::CountDigits, &["state", keys[i], "sums"])),
             scatter: both(&|i| {
                 let (keys_to, values_to) = (keys[1 - i], values[1 - i]);
-                let names =
-                    ["state", keys[i], values[i], keys_to, values_to, "sums", "block sums"];
+                let names = ["state", keys[i], values[i], keys_to, values_to, "sums", "block sums"];
                 bind(Kernel::Scatter, &names)
             }),
             scatter_order: bind(
@@ -130,10 +133,7 @@ impl Launches {
             rasterize_bwd: both(&|i| {
                 let lists = [values[i], "row of slot", "tile starts"];
                 let pixels = ["splats", "finish", "pixel gradient", "records"];
-                bind(
-                    Kernel::RasterizeBwd,
-                    &[&["frame", "state"], &lists[..], &pixels[..]].concat(),
-                )
+                bind(Kernel::RasterizeBwd, &[&["frame", "state"], &lists[..], &pixels[..]].concat())
             }),
             gather: bind(
                 Kernel::Gather,
@@ -168,12 +168,24 @@ impl Launches {
                 Kernel::Accumulate,
                 &["frame", "state", "signals", "gradient", "row sums", "depths", "splats"],
             ),
-            measure: bind(
-                Kernel::Measure,
-                &["frame", "state", "signals", "row sums", "depths"],
-            ),
+            measure: bind(Kernel::Measure, &["frame", "state", "signals", "row sums", "depths"]),
             // The sums of the sorts are a buffer of enough numbers that nobody needs then.
             present: bind(Kernel::Present, &["frame", "sums", "rows", "ages"]),
+            // The gradients of the rows are a buffer that nobody needs between two steps.
+            surface: both(&|i| {
+                let lists = [values[i], "row of slot", "tile starts"];
+                let names = ["splats", "rows", "ops", "gradient"];
+                bind(Kernel::Surface, &[&["frame", "state"], &lists[..], &names[..]].concat())
+            }),
+            replay: both(&|i| {
+                let lists = [values[i], "row of slot", "tile starts"];
+                let names = ["splats", "pixel gradient", "records"];
+                bind(Kernel::Replay, &[&["frame", "state"], &lists[..], &names[..]].concat())
+            }),
+            gather_columns: bind(
+                Kernel::GatherColumns,
+                &["frame", "depths", "slots of row", "records", "row sums"],
+            ),
         }
     }
 }
@@ -339,6 +351,29 @@ impl Passes<'_> {
             to.run(&l.adam_bands[band], now, groups);
         }
         to.run(&l.adam_geometry, [0; 4], groups);
+    }
+
+    /// Surface points of the pixels whose numbers are uploaded, from place `first` on.
+    pub(super) fn surface(&self, to: &mut Recorder<'_, '_>, pixels: u32, mode: u32, first: u32) {
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            let now = [band, pixels, mode, first];
+            to.run(&self.launches.surface[self.sorted()], now, pixels.div_ceil(256));
+        }
+    }
+
+    /// Each row's sums over the pixels of a view that it is blended into.
+    pub(super) fn columns(&self, to: &mut Recorder<'_, '_>) {
+        let l = self.launches;
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            to.run(&l.replay[self.sorted()], [band, 0, 0, 0], self.shape.tiles);
+            to.run(&l.gather_columns, [band, 0, 0, 0], self.shape.rows.div_ceil(256));
+        }
     }
 
     /// Counts the view for the largest weight of fresh views.

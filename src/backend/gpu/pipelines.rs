@@ -18,7 +18,7 @@ const GAUSSIAN: &str = shader!("gaussian");
 const RANDOM: &str = shader!("random");
 
 /// The texts of each stage.
-pub(super) const STAGES: [(&str, &[&str]); 9] = [
+pub(super) const STAGES: [(&str, &[&str]); 11] = [
     ("project", &[VIEW, GAUSSIAN, shader!("project")]),
     ("tiles", &[VIEW, shader!("tiles")]),
     ("rasterize", &[VIEW, shader!("rasterize")]),
@@ -28,6 +28,8 @@ pub(super) const STAGES: [(&str, &[&str]); 9] = [
     ("adam", &[VIEW, RANDOM, shader!("adam")]),
     ("signals", &[VIEW, shader!("signals")]),
     ("apply", &[VIEW, RANDOM, shader!("apply")]),
+    ("candidates", &[VIEW, RANDOM, shader!("candidates")]),
+    ("observe", &[VIEW, shader!("observe")]),
 ];
 
 /// The text of a stage's module.
@@ -76,6 +78,9 @@ kernels! {
     Rewrite: "apply" "rewrite" [1, 3];
     Sow: "apply" "sow" [1, 3, 4];
     ClampOpacity: "apply" "clamp_opacity" [3, 5, 6, 7];
+    Surface: "candidates" "surface" [0, 1, 2, 3, 4, 5, 6, 7, 8];
+    Replay: "observe" "replay" [0, 1, 2, 3, 4, 5, 6, 7];
+    GatherColumns: "observe" "gather_columns" [0, 8, 9, 10, 11];
 }
 
 /// The kernels of a device, for records of one detail.

@@ -50,12 +50,11 @@ impl Planes {
         let current = next(requested.contains(Signal::WeightMax));
         let fresh = next(requested.contains(Signal::FreshWeightMax));
         let any = |signals: &[Signal]| signals.iter().any(|&s| requested.contains(s));
-        let detail =
-            if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
-                2
-            } else {
-                u32::from(any(&[Signal::WeightMax, Signal::FreshWeightMax]))
-            };
+        let detail = if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
+            2
+        } else {
+            u32::from(any(&[Signal::WeightMax, Signal::FreshWeightMax]))
+        };
         Self { sums, weight_max: previous.zip(current).map(|(a, b)| [a, b]), fresh, count, detail }
     }
 

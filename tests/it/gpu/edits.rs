@@ -87,10 +87,7 @@ fn an_edit_does_what_it_does_natively() {
     for device in subjects() {
         let mut table = Table::new("edits, GPU against CPU");
         let cpu = CpuOptions { needs: needs.clone(), ..CpuOptions::new(BUDGET) };
-        let gpu = GpuOptions {
-            needs: needs.clone(),
-            ..GpuOptions::new(BUDGET)
-        };
+        let gpu = GpuOptions { needs: needs.clone(), ..GpuOptions::new(BUDGET) };
         let mut cpu = CpuBackend::new(&model, &cpu).expect("a small model fits");
         let mut gpu = GpuBackend::new(&model, &gpu, device).expect("a small model fits");
         let both: [&mut dyn Backend; 2] = [&mut cpu, &mut gpu];

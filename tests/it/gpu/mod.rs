@@ -5,7 +5,9 @@
 //! `VK_DRIVER_FILES` chooses drivers, several if need be.
 
 mod edits;
+mod looking;
 mod oracle;
+mod policies;
 mod training;
 mod twins;
 

@@ -31,8 +31,7 @@ fn the_gpu_reproduces_stored_images_and_gradients() {
                     let outcome =
                         gpu.differentiate(camera, case.background, case.sh_degree, &upstream);
                     let (image, gradient) = outcome.expect("a small image is rendered");
-                    let classes =
-                        CLASSES.map(|class| subject::class(&gradient, class).to_vec());
+                    let classes = CLASSES.map(|class| subject::class(&gradient, class).to_vec());
                     if sums.is_empty() {
                         sums = classes.iter().map(|class| vec![0.0; class.len()]).collect();
                     }

@@ -7,9 +7,7 @@ use densify::backend::{Backend, LearningRates, StepInput, StepOutput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::policy::{
-    Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet,
-};
+use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 
 use super::{backend_for, options, subjects};
 use crate::compare::{Table, relative_error};
