@@ -292,3 +292,58 @@ impl GpuBackend {
         self.device.queue.submit([encoder.finish()]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use densify_policies::plan::{EditPlan, Offspring};
+
+    use super::*;
+
+    #[test]
+    fn families_cut_into_chunks_are_the_same_families() {
+        let mut plan = EditPlan::new(40, 400);
+        for row in 0..40 {
+            let offspring = Offspring {
+                children: 1 + row * row % 23,
+                parent: if row % 2 == 0 { ParentFate::BecomesChild } else { ParentFate::Stays },
+                placement: Placement::Sampled,
+                scale: ScaleRule::Uniform(0.5),
+                opacity: OpacityRule::Conserved,
+            };
+            let _ = plan.grow(row, offspring);
+        }
+        let ops = plan.compile();
+        assert!(ops.families.len() > 10);
+        for room in [40, 64, 1000, CHUNK] {
+            let mut found: Vec<(u32, Vec<u32>, u32)> = Vec::new();
+            for (count, words) in family_chunks(&ops, room) {
+                assert!(words.len() <= room, "{} words in room for {room}", words.len());
+                for op in words[..count * WORDS].as_chunks::<WORDS>().0 {
+                    let [parent, first, children, number, becomes, ..] = *op;
+                    let slots = &words[first as usize..][..children as usize];
+                    match found.last_mut().filter(|(row, ..)| *row == parent) {
+                        Some((_, all, rewritten)) => {
+                            // A part goes on where the last one ended, before the parent changed.
+                            assert_eq!((number as usize, *rewritten), (all.len() + 1, 0));
+                            all.extend_from_slice(slots);
+                            *rewritten = becomes;
+                        }
+                        None => {
+                            assert_eq!(number, 1);
+                            found.push((parent, slots.to_vec(), becomes));
+                        }
+                    }
+                }
+            }
+            let expected: Vec<_> = ops
+                .families
+                .iter()
+                .map(|family| {
+                    let becomes = family.offspring.parent == ParentFate::BecomesChild;
+                    (family.parent, ops.children(family).to_vec(), u32::from(becomes))
+                })
+                .collect();
+            assert_eq!(found, expected, "room for {room}");
+        }
+    }
+}

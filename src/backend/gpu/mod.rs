@@ -75,7 +75,7 @@ impl GpuOptions {
     }
 }
 
-/// What waits for an optimiser step.
+/// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
 #[derive(Debug, Clone, Copy, Default)]
 struct Waiting {
     main: bool,
@@ -144,8 +144,8 @@ impl GpuBackend {
         let cap = match options.tile_cap {
             Some(cap) => cap as u64,
             None => (16 * budget as u64).min(bindable),
-        };
-        let cap = cap.max(budget as u64).min(MOST_ENTRIES);
+        }
+        .clamp(budget as u64, MOST_ENTRIES);
         let (width, height) = options.largest_image;
         let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
         let sizes = Sizes::new(budget, cap, model.sh_degree, image, &options.needs);
@@ -342,17 +342,12 @@ impl Backend for GpuBackend {
                 Signal::ScaleProduct => self.present(2)?,
                 Signal::Age => self.present(3)?,
                 sum => {
-                    let mut most: Option<Vec<f32>> = None;
-                    for plane in self.planes.of(sum) {
-                        let column = self.column(plane)?;
-                        most = Some(match most {
-                            None => column,
-                            Some(most) => {
-                                most.iter().zip(&column).map(|(a, b)| a.max(*b)).collect()
-                            }
-                        });
-                    }
-                    most.unwrap_or_else(|| vec![0.0; self.rows])
+                    let planes = self.planes.of(sum).into_iter();
+                    let columns: Result<Vec<_>, _> = planes.map(|p| self.column(p)).collect();
+                    let most = |a: Vec<f32>, b: Vec<f32>| {
+                        a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect()
+                    };
+                    columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows])
                 }
             };
             if let Some(column) = signals.get_mut(signal) {
