@@ -4,7 +4,7 @@ use clap::{Args, ValueEnum};
 
 use super::console::Console;
 use super::failure::Failure;
-use crate::backend::gpu::{AdapterChoice, AdapterKind, GpuDevice, adapters};
+use crate::backend::gpu::{AdapterChoice, AdapterKind, AdapterSummary, GpuDevice, adapters};
 
 /// Where to compute.
 #[derive(Debug, Args)]
@@ -41,7 +41,7 @@ impl DeviceArgs {
             return Ok(None);
         }
         let is_asked_for = self.backend == Where::Gpu || self.gpu.is_some();
-        if !is_asked_for && !adapters().iter().any(|a| a.is_gpu()) {
+        if !is_asked_for && !adapters().iter().any(AdapterSummary::is_gpu) {
             console.say(
                 "device   processor (no GPU was found; `densify devices` shows what there is)",
             );

@@ -177,7 +177,8 @@ fn rows_opaque_enough_are_not_disturbed() {
     let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
     let mut backend = backend(&model, Needs { noise: Some(noise), ..Needs::default() }, 1);
     step(&mut backend, &away(), 1, RATES, EVERY);
-    let moved: Vec<bool> = backend.download().expect("a model").means.iter().map(|mean| *mean != [0.5; 3]).collect();
+    let moved: Vec<bool> =
+        backend.download().expect("a model").means.iter().map(|mean| *mean != [0.5; 3]).collect();
     assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
 }
 

@@ -6,7 +6,7 @@ use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
-use wgpu::{DeviceDescriptor, ErrorFilter, Features};
+use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
 use super::buffers::{Planned, Sizes};
@@ -74,6 +74,8 @@ impl Device {
             label: Some("densify"),
             required_features: Features::IMMEDIATES,
             required_limits: adapter.limits(),
+            // Buffers are few and made once: no pools beyond what the ledger says.
+            memory_hints: MemoryHints::MemoryUsage,
             ..DeviceDescriptor::default()
         };
         let (device, queue) = wait(adapter.request_device(&descriptor)).map_err(|e| {

@@ -84,9 +84,9 @@ impl GpuBackend {
             let mut y = [0.0_f32; 16];
             y[0] = sh::C0;
             sh::basis(degree, [g[16], g[17], g[18]], &mut y);
-            for k in 0..sh_coefficients(degree) {
+            for (k, basis) in y.iter().enumerate().take(sh_coefficients(degree)) {
                 for channel in 0..3 {
-                    out.sh[row * planes + 3 * k + channel] = y[k] * g[12 + channel];
+                    out.sh[row * planes + 3 * k + channel] = basis * g[12 + channel];
                 }
             }
         }

@@ -383,7 +383,9 @@ impl Backend for GpuBackend {
     ) -> Result<Rendering, BackendError> {
         self.fit_image(camera.width, camera.height)?;
         let frame = self.frame(camera, background, sh_degree);
-        self.run(&frame, |passes, to| passes.forward(to))?;
+        self.run(&frame, |passes, to| {
+            passes.forward(to);
+        })?;
         self.rendering(camera.width, camera.height)
     }
 

@@ -136,7 +136,9 @@ impl GpuBackend {
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
             self.write("pixel gradient", bytemuck::cast_slice(&map));
-            self.go_on(shape, |passes, to| passes.columns(to));
+            self.go_on(shape, |passes, to| {
+                passes.columns(to);
+            });
             self.columns(request)?
         };
         Ok(AuxOutput { loss, columns, points })

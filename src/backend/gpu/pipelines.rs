@@ -297,11 +297,11 @@ mod tests {
     #[test]
     fn structs_lie_as_the_shaders_read_them() {
         macro_rules! check {
-            ($offsets:expr, $ty:ty, $($field:ident)*) => {
+            ($offsets:expr, $ty:ty, $($field:ident)*) => {{
                 $(assert_eq!($offsets[stringify!($field)] as usize, offset_of!($ty, $field),
                     "{}", stringify!($field));)*
                 [$(stringify!($field)),*].len()
-            };
+            }};
         }
         let module = module(1);
         let (frame, span) = offsets(&module, "Frame");

@@ -25,11 +25,11 @@ impl GpuBackend {
         }
         self.write("rows", bytemuck::cast_slice(&rows));
         let mut first = 0;
-        for band in 0..=usize::from(model.sh_degree) {
+        for (band, name) in SH.into_iter().enumerate().take(usize::from(model.sh_degree) + 1) {
             let numbers = 3 * band_coefficients(band);
             let of_row = |i| &model.sh_of(i)[first..first + numbers];
             let values: Vec<f32> = (0..model.len()).flat_map(of_row).copied().collect();
-            self.write(SH[band], bytemuck::cast_slice(&values));
+            self.write(name, bytemuck::cast_slice(&values));
             first += numbers;
         }
     }
@@ -86,9 +86,9 @@ impl GpuBackend {
         let planes = self.sizes.sh_numbers();
         let mut sh = vec![0.0; planes * self.rows];
         let mut first = 0;
-        for band in 0..=usize::from(sh_degree) {
+        for (band, name) in SH.into_iter().enumerate().take(usize::from(sh_degree) + 1) {
             let numbers = 3 * band_coefficients(band);
-            let values = self.read(SH[band], 0, 4 * n * numbers as u64)?;
+            let values = self.read(name, 0, 4 * n * numbers as u64)?;
             for (row, values) in values.chunks_exact(numbers).enumerate() {
                 sh[row * planes + first..][..numbers].copy_from_slice(values);
             }

@@ -131,7 +131,7 @@ fn backend(
     (model, device): (Gaussians, Option<GpuDevice>),
     [views, test]: [&DatasetViews; 2],
 ) -> Result<(Box<dyn Backend>, Ledger), Failure> {
-    let before = resident();
+    let mut before = resident();
     let signals = needs.signals.iter().count() as u64;
     let candidates = needs.candidates.map_or(0, |request| request.capacity);
     // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
@@ -144,7 +144,10 @@ fn backend(
         Some(device) => {
             let tile_cap = args.tile_cap;
             let options = GpuOptions { budget: scene.budget, near, tile_cap, largest_image, needs };
-            Box::new(GpuBackend::new(&model, &options, &device)?)
+            let backend = GpuBackend::new(&model, &options, &device)?;
+            // A driver and its compiled kernels are part of the program.
+            before = resident();
+            Box::new(backend)
         }
         None => {
             let mut options = CpuOptions::new(scene.budget);

@@ -62,7 +62,7 @@ fn plan() -> RowOps {
         };
         let _ = plan.append(seed);
     }
-    plan.clamp_opacity(0.8);
+    plan.clamp_opacity(0.8).expect("a bound in range");
     plan.reset(Reset::Signals);
     plan.compile()
 }
