@@ -62,6 +62,8 @@ pub(super) struct Device {
     told: Arc<Mutex<Told>>,
     /// By detail of the records, and by whether alpha and depth have gradients.
     pipelines: Mutex<HashMap<(u32, bool), Arc<Pipelines>>>,
+    /// Details of the records for which the canary has sung.
+    proven: Mutex<Vec<u32>>,
 }
 
 impl Device {
@@ -89,7 +91,14 @@ impl Device {
         device.set_device_lost_callback(move |reason, message| {
             lock(&losses).lost.get_or_insert(format!("{reason:?}: {message}"));
         });
-        Ok(Self { device, queue, summary, told, pipelines: Mutex::default() })
+        Ok(Self {
+            device,
+            queue,
+            summary,
+            told,
+            pipelines: Mutex::default(),
+            proven: Mutex::default(),
+        })
     }
 
     /// The kernels, which are compiled once.
@@ -106,6 +115,20 @@ impl Device {
         let made = Arc::new(made);
         all.insert((detail, more), made.clone());
         Ok(made)
+    }
+
+    /// Runs `prove` once for each detail of the records.
+    pub(super) fn prove(
+        &self,
+        detail: u32,
+        prove: impl FnOnce() -> Result<(), BackendError>,
+    ) -> Result<(), BackendError> {
+        let mut proven = self.proven.lock().unwrap_or_else(PoisonError::into_inner);
+        if !proven.contains(&detail) {
+            prove()?;
+            proven.push(detail);
+        }
+        Ok(())
     }
 
     /// An error that the device has told since, if any. A lost device ignores what it is given.

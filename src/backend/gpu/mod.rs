@@ -120,7 +120,8 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        canary::check(device, &options.needs)?;
+        let detail = Planes::new(options.needs.signals).detail;
+        device.0.prove(detail, || canary::check(device, &options.needs))?;
         Self::without_canary(model, options, device)
     }
 

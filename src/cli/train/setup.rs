@@ -91,6 +91,7 @@ pub(super) fn prepare(args: &TrainArgs, console: &Console) -> Result<Prepared, F
             init,
             init_points,
             sh_every: args.sh_every,
+            adapter: device.as_ref().map(|device| device.adapter().name.clone()),
             learning_rates: rates,
         },
         policy: PolicyConfig {
