@@ -3,6 +3,8 @@
 // sorted by depth, ties by row. The footprint of a row was evaluated once, in project.wgsl; what
 // counts entries and what emits them are whole numbers, and cannot disagree.
 //
+// The file is one piece: lists, sums and sorts share their buffers and the counts that drive them.
+//
 // Sums and sorts are exact and have one order, so that nothing here depends on timing. An entry's
 // place before it is sorted is its slot: a row's slots lie side by side, tile after tile.
 
