@@ -61,12 +61,12 @@ fn run(
     target: &Image8,
 ) -> Result<(Vec<StepOutput>, Vec<f32>), BackendError> {
     let rates = LearningRates {
-        mean: 1e-3,
-        log_scale: 5e-3,
-        quat: 1e-3,
-        opacity: 0.05,
-        sh_dc: 0.01,
-        sh_rest: 1e-3,
+        mean: 5e-3,
+        log_scale: 0.05,
+        quat: 0.01,
+        opacity: 0.3,
+        sh_dc: 0.1,
+        sh_rest: 0.02,
     };
     let mut outputs = Vec::new();
     for step in 1..=2 {

@@ -119,7 +119,12 @@ fn wide(values: &[f32]) -> Vec<f64> {
 fn gradients_are_those_of_the_native_backend() {
     for device in subjects() {
         let mut table = Table::new("gradients, GPU against CPU");
-        for (name, model, camera) in scenes() {
+        for (name, mut model, camera) in scenes() {
+            // Rows whose covariance overflows are drawn by neither backend, but the native one counts
+            // them as visible and finds NaN in their gradients. Training keeps scales below that.
+            for scales in model.log_scales.iter_mut().filter(|scales| scales.contains(&90.0)) {
+                *scales = [-30.0, 6.0, -30.0];
+            }
             let boundary = boundaries(&model, &camera);
             let upstream = undecided_ignored(scenes::upstream(&camera, 9), &boundary);
             let mut cpu = subject::backend(&model, Resources::default());
@@ -147,12 +152,7 @@ fn gradients_are_those_of_the_native_backend() {
                 let flips = if what == "sum_weight" { close * Limits::CPU.step } else { 0.0 };
                 table.check(&name, what, relative_error(&found, &wide(&expected)), 2e-4 + flips);
             }
-            // A row whose covariance overflows is drawn by neither, but the native backend counts it.
-            for (row, scales) in model.log_scales.iter().enumerate() {
-                let agree = found.visible[row] == expected.visible[row];
-                let overflows = scales.contains(&90.0) && expected.pixel_count[row] == 0;
-                assert!(agree || overflows, "{name}: row {row} is visible on one backend only");
-            }
+            assert_eq!(found.visible, expected.visible, "{name}");
             let pixels = found.pixel_count.iter().zip(&expected.pixel_count);
             let most = pixels.map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
             table.check(&name, "pixel_count", f64::from(most), close);
