@@ -1,7 +1,8 @@
-//! Time per training step and stage on random scenes, on one thread and on two.
+//! Time per training step and stage on random scenes, on one thread, on two, and on every adapter.
 //!
-//! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are medians of processor time, so that a
-//! loaded machine distorts them little; the stage columns are wall time of one thread.
+//! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are
+//! medians of processor time, so that a loaded machine distorts them little; the stage columns are
+//! wall time. Software adapters take part in the small scenes only.
 
 #![expect(clippy::print_stdout, reason = "its output is a table")]
 
@@ -10,7 +11,10 @@ use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
 use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::{Backend, LearningRates, StepInput};
+use densify::backend::gpu::{
+    AdapterChoice, AdapterKind, GpuBackend, GpuDevice, GpuOptions, adapters,
+};
+use densify::backend::{Backend, BackendError, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
@@ -107,19 +111,79 @@ fn peak() -> (f64, f64) {
     rates
 }
 
+const RATES: LearningRates = LearningRates {
+    mean: 1e-6,
+    log_scale: 1e-6,
+    quat: 1e-6,
+    opacity: 1e-6,
+    sh_dc: 1e-6,
+    sh_rest: 1e-6,
+};
+
+/// Prints a line: medians over the steps but for the first two.
+fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u32, on: &str) {
+    let mut backend = match backend {
+        Ok(backend) => backend,
+        Err(error) => {
+            println!("{rows} rows on {on}: {error}");
+            return;
+        }
+    };
+    let (camera, target) = (camera(size), target(size));
+    let (mut cpu, mut wall) = (Vec::new(), Vec::new());
+    let mut stages: Vec<Vec<Duration>> = Vec::new();
+    let steps = (6_000_000 / rows).clamp(7, 60) as u32;
+    let mut entries = 0;
+    for step in 1..=steps {
+        let input = StepInput {
+            step,
+            camera: &camera,
+            target: &target,
+            background: [0.0; 3],
+            sh_degree: 3,
+            rates: RATES,
+            cadence: Cadence::default(),
+            seed: 1,
+        };
+        let (start, cpu_start) = (Instant::now(), ProcessTime::now());
+        match backend.train_step(&input) {
+            Ok(output) => entries = output.entries,
+            Err(error) => println!("{error}"),
+        }
+        if step > 2 {
+            cpu.push(cpu_start.elapsed());
+            wall.push(start.elapsed());
+            for (i, &(_, time)) in backend.stage_times().iter().enumerate() {
+                stages.resize(stages.len().max(i + 1), Vec::new());
+                stages[i].push(time);
+            }
+        }
+    }
+    let line: Vec<String> = backend
+        .stage_times()
+        .iter()
+        .zip(stages)
+        .map(|(&(name, _), times)| format!("{name} {:.2}", median(times)))
+        .collect();
+    println!(
+        "{rows:7} {size:5}² {entries:9} {on:>10} {:7.2} {:8.2}  {}",
+        median(cpu),
+        median(wall),
+        line.join(", ")
+    );
+}
+
 fn main() {
     let (flops, bytes) = peak();
     println!("one thread: at most {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
     let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
-    let rates = LearningRates {
-        mean: 1e-6,
-        log_scale: 1e-6,
-        quat: 1e-6,
-        opacity: 1e-6,
-        sh_dc: 1e-6,
-        sh_rest: 1e-6,
-    };
-    println!("   rows  image   entries threads  CPU ms  wall ms  stages [ms]");
+    let usable = adapters().into_iter().filter(|a| a.missing.is_empty());
+    let open = |name| GpuDevice::open(&AdapterChoice { name: Some(name) });
+    let devices: Vec<GpuDevice> = usable.filter_map(|a| open(a.name).ok()).collect();
+    for (i, device) in devices.iter().enumerate() {
+        println!("adapter {i}: {}, {}", device.adapter().name, device.adapter().driver);
+    }
+    println!("   rows  image   entries         on  CPU ms  wall ms  stages [ms]");
     for (rows, size) in [
         (10_000, 256),
         (10_000, 512),
@@ -131,6 +195,7 @@ fn main() {
         if !only.is_empty() && !only.contains(&format!("{rows}@{size}")) {
             continue;
         }
+        let model = scene(rows, 3);
         for threads in [1, 2] {
             let options = CpuOptions {
                 threads: Some(threads),
@@ -138,55 +203,18 @@ fn main() {
                 tile_cap: rows * 8,
                 ..CpuOptions::new(rows)
             };
-            let mut backend = match CpuBackend::new(&scene(rows, 3), &options) {
-                Ok(backend) => backend,
-                Err(error) => {
-                    println!("{rows} rows: {error}");
-                    continue;
-                }
-            };
-            let (camera, target) = (camera(size), target(size));
-            let (mut cpu, mut wall) = (Vec::new(), Vec::new());
-            let mut stages: Vec<Vec<Duration>> = Vec::new();
-            let steps = (6_000_000 / rows).clamp(7, 60) as u32;
-            let mut entries = 0;
-            for step in 1..=steps {
-                let input = StepInput {
-                    step,
-                    camera: &camera,
-                    target: &target,
-                    background: [0.0; 3],
-                    sh_degree: 3,
-                    rates,
-                    cadence: Cadence::default(),
-                    seed: 1,
-                };
-                let (start, cpu_start) = (Instant::now(), ProcessTime::now());
-                match backend.train_step(&input) {
-                    Ok(output) => entries = output.entries,
-                    Err(error) => println!("{error}"),
-                }
-                if step > 2 {
-                    cpu.push(cpu_start.elapsed());
-                    wall.push(start.elapsed());
-                    for (i, &(_, time)) in backend.stage_times().iter().enumerate() {
-                        stages.resize(stages.len().max(i + 1), Vec::new());
-                        stages[i].push(time);
-                    }
-                }
+            let backend = CpuBackend::new(&model, &options);
+            let on = if threads == 1 { "1 thread" } else { "2 threads" };
+            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, on);
+        }
+        for (i, device) in devices.iter().enumerate() {
+            if device.adapter().kind == AdapterKind::Software && rows > 50_000 {
+                continue;
             }
-            let line: Vec<String> = backend
-                .stage_times()
-                .iter()
-                .zip(stages)
-                .map(|(&(name, _), times)| format!("{name} {:.2}", median(times)))
-                .collect();
-            println!(
-                "{rows:7} {size:5}² {entries:9} {threads:7} {:7.2} {:8.2}  {}",
-                median(cpu),
-                median(wall),
-                line.join(", ")
-            );
+            let options = GpuOptions { largest_image: (size, size), ..GpuOptions::new(rows) };
+            let backend = GpuBackend::new(&model, &options, device);
+            let on = format!("adapter {i}");
+            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &on);
         }
     }
 }

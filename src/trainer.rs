@@ -348,8 +348,10 @@ impl<V: ViewSource> Trainer<V> {
     }
 
     /// A copy of the model as it is now, in the coordinates of training.
-    #[must_use]
-    pub fn model(&self) -> Gaussians {
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    pub fn model(&self) -> Result<Gaussians, BackendError> {
         self.backend.download()
     }
 

@@ -3,7 +3,10 @@
 //! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
 //! Signals come down when a policy is due, row operations go up; parameters stay where they are.
 
+mod candidates;
 pub mod cpu;
+pub mod gpu;
+mod pixel_map;
 mod state;
 
 use std::time::Duration;
@@ -145,6 +148,30 @@ pub enum BackendError {
         /// The largest side supported `[px]`.
         max: u32,
     },
+    /// No adapter does.
+    #[error("{0}; `densify devices` lists the adapters, and --backend cpu needs none")]
+    NoAdapter(String),
+    /// A buffer beyond what the device can bind, with the remedy.
+    #[error("{0}")]
+    OverLimit(String),
+    /// The device was lost: what was on it is gone.
+    #[error(
+        "the device {device} was lost ({why}); start again from what was saved, or use --backend cpu"
+    )]
+    DeviceLost {
+        /// Its name.
+        device: String,
+        /// The driver's words.
+        why: String,
+    },
+    /// The device has refused a command.
+    #[error("the device {device} has failed ({why}); try another driver, or --backend cpu")]
+    Device {
+        /// Its name.
+        device: String,
+        /// The driver's words.
+        why: String,
+    },
 }
 
 /// A differentiable rasteriser with its optimiser and the model's only copy.
@@ -212,7 +239,10 @@ pub trait Backend: Send {
     ) -> Result<Rendering, BackendError>;
 
     /// Copies the model to the host.
-    fn download(&self) -> Gaussians;
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn download(&self) -> Result<Gaussians, BackendError>;
 
     /// Names of the arrays that hold, beside the model, all that the future depends on: moments,
     /// ages, accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.

@@ -110,7 +110,7 @@ fn for_each_tensor(
     backend: &dyn Backend,
     mut f: impl FnMut(&Tensor) -> io::Result<()>,
 ) -> Result<(), Stop> {
-    let gaussians = backend.download();
+    let gaussians = backend.download().map_err(Stop::Backend)?;
     for which in 0..model::NAMES.len() {
         f(&model::tensor(&gaussians, which)).map_err(Stop::Io)?;
     }

@@ -101,6 +101,7 @@ fn header() -> Header {
                 init: InitChoice::Points,
                 init_points: None,
                 sh_every: None,
+                adapter: None,
                 learning_rates: RateOptions { mean_start: 1.0 / 3.0, ..RateOptions::default() },
             },
             policy: PolicyConfig { name: "told".into(), parameters: toml::toml! { a = 0.1 } },

@@ -7,9 +7,10 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
+use super::device::DeviceArgs;
 use super::failure::Failure;
 use super::number::grouped;
-use super::run_files::{SplitArg, iteration, open_run};
+use super::run_files::{Machine, SplitArg, iteration, open_run};
 use crate::evaluate::evaluate;
 use crate::metrics::geometry::{self, Geometry, Ground};
 use crate::output::{write_geometry, write_scores};
@@ -38,6 +39,8 @@ pub(super) struct EvalArgs {
     /// Processor threads to use `[default: all]`
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
+    #[command(flatten)]
+    device: DeviceArgs,
 }
 
 const EXAMPLES: &str = "\
@@ -51,7 +54,8 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     crate::output::RunConfig::read(run)?;
     let iteration = iteration(run, args.iteration)?;
     let moved_to = args.scene.clone();
-    let mut opened = open_run(run, iteration, moved_to, args.threads, geometry::needs(), console)?;
+    let machine = Machine { threads: args.threads, device: args.device.open(console)? };
+    let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
     let views = opened.views(args.split)?;
     let background = opened.scene.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);

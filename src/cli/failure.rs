@@ -81,12 +81,19 @@ impl From<PolicyError> for Failure {
 
 impl From<BackendError> for Failure {
     fn from(error: BackendError) -> Self {
-        let code = match error {
-            BackendError::ImageTooLarge { .. } => INPUT,
-            _ => DEVICE,
-        };
+        let code = if is_input(&error) { INPUT } else { DEVICE };
         Self { code, message: error.to_string() }
     }
+}
+
+/// Whether other arguments would do.
+fn is_input(error: &BackendError) -> bool {
+    matches!(
+        error,
+        BackendError::ImageTooLarge { .. }
+            | BackendError::NoAdapter(_)
+            | BackendError::OverLimit(_)
+    )
 }
 
 impl From<OutputError> for Failure {
@@ -103,7 +110,7 @@ impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
             TrainError::NoViews | TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
-            TrainError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
+            TrainError::Backend { source, .. } if is_input(source) => INPUT,
             TrainError::Backend { .. } => DEVICE,
             _ => OTHER,
         };
@@ -127,8 +134,11 @@ impl From<CheckpointError> for Failure {
 impl From<GeometryError> for Failure {
     fn from(error: GeometryError) -> Self {
         let code = match &error {
-            GeometryError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
-            GeometryError::Backend { .. } => DEVICE,
+            GeometryError::Backend { source, .. } | GeometryError::Model(source)
+                if !is_input(source) =>
+            {
+                DEVICE
+            }
             _ => INPUT,
         };
         Self { code, message: error.to_string() }
@@ -138,9 +148,8 @@ impl From<GeometryError> for Failure {
 impl From<EvaluateError> for Failure {
     fn from(error: EvaluateError) -> Self {
         let code = match &error {
-            EvaluateError::Backend { source: BackendError::ImageTooLarge { .. }, .. } => INPUT,
-            EvaluateError::Backend { .. } => DEVICE,
             EvaluateError::Stopped => OTHER,
+            EvaluateError::Backend { source, .. } if !is_input(source) => DEVICE,
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

@@ -15,6 +15,8 @@
 
 mod compare;
 mod console;
+mod device;
+mod devices;
 mod eval;
 mod failure;
 mod number;
@@ -65,6 +67,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(Box<render::RenderArgs>),
     Compare(compare::CompareArgs),
+    Devices(devices::DevicesArgs),
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
 }
@@ -96,6 +99,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),
+        Command::Devices(devices) => devices::run(&devices, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
     };

@@ -9,9 +9,10 @@ use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 
 use super::console::Console;
+use super::device::DeviceArgs;
 use super::failure::Failure;
 use super::number;
-use super::run_files::{Opened, SplitArg, iteration, open, open_run};
+use super::run_files::{Machine, Opened, SplitArg, iteration, open, open_run};
 use super::scene::{NEAR, SceneArgs};
 use crate::backend::Rendering;
 use crate::dataset::images::Image8;
@@ -60,6 +61,8 @@ pub(super) struct RenderArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     #[command(flatten)]
+    device: DeviceArgs,
+    #[command(flatten)]
     data: SceneArgs,
 }
 
@@ -107,11 +110,12 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
 }
 
 fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
+    let machine = Machine { threads: args.threads, device: args.device.open(console)? };
     if !args.model.is_file() {
         crate::output::RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;
         let moved_to = args.scene.clone();
-        return open_run(&args.model, iteration, moved_to, args.threads, Needs::default(), console);
+        return open_run(&args.model, iteration, moved_to, machine, Needs::default(), console);
     }
     let Some(scene) = &args.scene else {
         return Err(Failure::input(format!(
@@ -123,7 +127,7 @@ fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
         return Err(Failure::input("--iteration is for a run's folder; a file has only one model"));
     }
     let config = args.data.config(scene);
-    open(&args.model, scene, config, (args.near, args.threads), Needs::default(), console)
+    open(&args.model, scene, config, (args.near, machine), Needs::default(), console)
 }
 
 /// A file name without ending for each view. Names come from data files: no part of one may lead

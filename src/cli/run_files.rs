@@ -9,6 +9,7 @@ use super::failure::Failure;
 use super::scene;
 use crate::backend::Backend;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
 use crate::dataset::{Dataset, View};
 use crate::evaluate::Split;
 use crate::gaussians::Gaussians;
@@ -32,6 +33,15 @@ impl From<SplitArg> for Split {
             SplitArg::Train => Self::Train,
         }
     }
+}
+
+/// What a model is rendered on.
+#[derive(Debug, Default)]
+pub(super) struct Machine {
+    /// Processor threads; all without a number.
+    pub(super) threads: Option<u16>,
+    /// The device; the processor without one.
+    pub(super) device: Option<GpuDevice>,
 }
 
 /// A model with the dataset it belongs to, ready to render.
@@ -75,7 +85,7 @@ pub(super) fn open_run(
     run: &Path,
     iteration: u32,
     moved_to: Option<PathBuf>,
-    threads: Option<u16>,
+    machine: Machine,
     needs: Needs,
     console: &Console,
 ) -> Result<Opened, Failure> {
@@ -84,7 +94,7 @@ pub(super) fn open_run(
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
     let near = config.train.near;
-    open(&model, &path, config.scene, (near, threads), needs, console).map_err(|failure| {
+    open(&model, &path, config.scene, (near, machine), needs, console).map_err(|failure| {
         if was_moved || path.is_dir() {
             failure
         } else {
@@ -98,11 +108,11 @@ pub(super) fn open(
     model: &Path,
     dataset: &Path,
     config: SceneConfig,
-    (near, threads): (f64, Option<u16>),
+    (near, machine): (f64, Machine),
     needs: Needs,
     console: &Console,
 ) -> Result<Opened, Failure> {
-    use_threads(threads);
+    use_threads(machine.threads);
     let dataset = scene::load(dataset, &config, console)?;
     let file = read_splats(model)?;
     for (number, what) in [
@@ -114,17 +124,22 @@ pub(super) fn open(
         }
     }
     let model: Gaussians = dataset.normalisation.model_from_world(&file.gaussians);
-    let mut options = CpuOptions::new(model.len().max(1));
-    options.near = (near * dataset.extent()) as f32;
-    options.threads = threads.map(usize::from);
-    options.largest_image = scene::largest_image(&dataset);
-    options.needs = needs;
-    Ok(Opened {
-        sh_degree: model.sh_degree,
-        backend: Box::new(CpuBackend::new(&model, &options)?),
-        dataset,
-        scene: config,
-    })
+    let budget = model.len().max(1);
+    let near = (near * dataset.extent()) as f32;
+    let largest_image = scene::largest_image(&dataset);
+    let backend: Box<dyn Backend> = match machine.device {
+        Some(device) => {
+            let options = GpuOptions { near, largest_image, needs, ..GpuOptions::new(budget) };
+            Box::new(GpuBackend::new(&model, &options, &device)?)
+        }
+        None => {
+            let threads = machine.threads.map(usize::from);
+            let options =
+                CpuOptions { near, threads, largest_image, needs, ..CpuOptions::new(budget) };
+            Box::new(CpuBackend::new(&model, &options)?)
+        }
+    };
+    Ok(Opened { sh_degree: model.sh_degree, backend, dataset, scene: config })
 }
 
 impl Opened {

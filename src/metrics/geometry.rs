@@ -166,6 +166,9 @@ pub enum GeometryError {
         /// What the backend says.
         source: BackendError,
     },
+    /// The model could not be copied from the device.
+    #[error(transparent)]
+    Model(#[from] BackendError),
     /// There are more rows than can be searched.
     #[error("{0} rows are too many to search for neighbours")]
     TooManyRows(usize),
@@ -194,7 +197,7 @@ pub fn measure(
     train: &impl ViewSource,
     views: &impl ViewSource,
 ) -> Result<Geometry, GeometryError> {
-    let rows = Rows::new(&backend.download(), ground);
+    let rows = Rows::new(&backend.download()?, ground);
     let seen = Seen::by(backend, ground, &rows, train)?;
     let mut pixels = Pixels::new(&rows, ground)?;
     for view in 0..views.count() {

@@ -72,6 +72,8 @@ pub struct TrainConfig {
     pub init_points: Option<usize>,
     /// Iterations per optimiser step of spherical-harmonic bands 1–3; `None`: as the policy says.
     pub sh_every: Option<u32>,
+    /// The GPU adapter that trained; `None`: the processor.
+    pub adapter: Option<String>,
     /// Step sizes.
     pub learning_rates: RateOptions,
 }
@@ -167,6 +169,7 @@ mod tests {
                 init: InitChoice::Points,
                 sh_every: Some(16),
                 init_points: None,
+                adapter: None,
                 learning_rates: RateOptions::default(),
             },
             policy: PolicyConfig { name: "diet".into(), parameters: toml::toml! { rho = 0.2 } },

@@ -240,7 +240,7 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
         let needs = Needs { signals, ..Needs::default() };
         let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
         let of = |signal| signals.get(signal).expect("a requested signal").to_vec();
-        (backend.download(), of(Signal::ScreenGradient), of(Signal::WeightSum))
+        (backend.download().expect("a model"), of(Signal::ScreenGradient), of(Signal::WeightSum))
     };
     assert!(run(false) == run(true));
 }

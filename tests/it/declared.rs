@@ -97,7 +97,7 @@ fn terms_of_the_loss_pull_at_rows_that_no_view_shows() {
         let needs = Needs { loss_terms: LossTerms { opacity, scale }, ..Needs::default() };
         let mut backend = backend(&model, needs, 2);
         step(&mut backend, &camera, 1, RATES, EVERY);
-        let after = backend.download();
+        let after = backend.download().expect("a model");
         // The first step of Adam is one learning rate long, whatever the gradient.
         let moved = |on: f32, before: f32, after: f32, rate: f32| {
             let expected = if on > 0.0 { rate } else { 0.0 };
@@ -135,7 +135,7 @@ fn noise_has_the_declared_covariance() {
         let needs = Needs { noise: Some(noise), ..Needs::default() };
         let mut backend = backend(&model, needs, threads);
         step(&mut backend, &away(), at, RATES, EVERY);
-        backend.download()
+        backend.download().expect("a model")
     };
     let moved = run(1, 3);
     assert_eq!(moved, run(3, 3), "it depends on the threads");
@@ -177,7 +177,8 @@ fn rows_opaque_enough_are_not_disturbed() {
     let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
     let mut backend = backend(&model, Needs { noise: Some(noise), ..Needs::default() }, 1);
     step(&mut backend, &away(), 1, RATES, EVERY);
-    let moved: Vec<bool> = backend.download().means.iter().map(|mean| *mean != [0.5; 3]).collect();
+    let moved: Vec<bool> =
+        backend.download().expect("a model").means.iter().map(|mean| *mean != [0.5; 3]).collect();
     assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
 }
 
@@ -291,10 +292,10 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
         ];
         for number in 1..=8 {
             let camera = view(number % 3);
-            let before = backend.download();
+            let before = backend.download().expect("a model");
             let gradient = gradient(&before, &camera, number.into());
             step(&mut backend, &camera, number, RATES, cadence_at(number));
-            let after = backend.download();
+            let after = backend.download().expect("a model");
             let [main, rest] = cadence_at(number).steps_at(number);
             for (i, class) in classes.iter_mut().enumerate() {
                 let due = if i == 4 { rest } else { main };
@@ -318,7 +319,7 @@ fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
     ];
     for number in 1..=8 {
         let camera = if number % 2 == 0 { away() } else { view(number % 3) };
-        let before = backend.download();
+        let before = backend.download().expect("a model");
         let mut gradient = gradient(&before, &camera, number.into());
         for row in 0..ROWS {
             let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
@@ -329,7 +330,7 @@ fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
             }
         }
         step(&mut backend, &camera, number, RATES, EVERY);
-        let after = backend.download();
+        let after = backend.download().expect("a model");
         for class in &mut classes {
             let error = class.check(&before, &after, &gradient, true);
             assert!(error < 0.01, "step {number}, {}: {error} learning rates", class.class);
@@ -353,7 +354,7 @@ fn sums_move_with_their_rows_and_end_with_them() {
         }
         // Nothing is seen: only what waits is left.
         step(&mut backend, &away(), 2, RATES, cadence);
-        backend.download()
+        backend.download().expect("a model")
     };
     let (plain, edited) = (run(false), run(true));
     assert!(plain.means[19] != model.means[19] && plain.sh_of(19) != model.sh_of(19));
@@ -368,7 +369,7 @@ fn sums_move_with_their_rows_and_end_with_them() {
     plan.clamp_opacity(0.999).expect("the bound is sound");
     backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
     step(&mut backend, &away(), 2, RATES, cadence);
-    let after = backend.download();
+    let after = backend.download().expect("a model");
     assert_eq!(after.opacity_logits, model.opacity_logits);
     assert_eq!(after.means, plain.means);
 }
@@ -385,10 +386,10 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
     let update = Update { opacity, scale: ScaleRule::Uniform(1.0), keep_moments: false };
     plan.update(11, update).expect("the row is free");
     backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
-    let before = backend.download();
+    let before = backend.download().expect("a model");
     step(&mut backend, &view(0), 7, RATES, cadence);
     step(&mut backend, &view(1), 8, RATES, cadence);
-    let after = backend.download();
+    let after = backend.download().expect("a model");
     // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
     let moved = |row: usize| -> Vec<f32> {
         let pairs = after.sh_of(row).iter().zip(before.sh_of(row));
@@ -413,7 +414,7 @@ fn what_is_declared_is_in_the_ledger() {
     // A step of length zero, so that `STILL` is used as everywhere.
     let mut backend = backend(&model, with(5, 1), 1);
     step(&mut backend, &view(0), 5, STILL, Cadence { all: 5, sh_rest: 1 });
-    assert_eq!(backend.download().means, model.means);
+    assert_eq!(backend.download().expect("a model").means, model.means);
 }
 
 #[test]

@@ -96,7 +96,7 @@ fn compare(table: &mut Table, what: &str, found: &Rendering, image: &Image) {
 
 /// A loss that does not look where decisions are close, so that its gradient can be compared
 /// tightly everywhere.
-fn undecided_ignored(mut upstream: Upstream, boundary: &[bool]) -> Upstream {
+pub(crate) fn undecided_ignored(mut upstream: Upstream, boundary: &[bool]) -> Upstream {
     for (p, _) in boundary.iter().enumerate().filter(|(_, close)| **close) {
         upstream.rgb[3 * p..3 * p + 3].fill(0.0);
         upstream.alpha[p] = 0.0;

@@ -179,6 +179,23 @@ fn only_the_gpu_backend_names_wgpu() {
     );
 }
 
+#[test]
+fn every_shader_has_a_native_file_of_the_same_name() {
+    let names = |folder: &str, ending: &str| -> BTreeSet<String> {
+        let sources = sources().into_iter().map(|s| s.path);
+        let of = |path: String| Some(path.strip_prefix(folder)?.strip_suffix(ending)?.to_owned());
+        sources.filter_map(of).collect()
+    };
+    let mut shaders = names("shaders/", ".wgsl");
+    // Texts that stages share.
+    for shared in ["view", "gaussian", "random"] {
+        assert!(shaders.remove(shared), "there is no shaders/{shared}.wgsl");
+    }
+    assert!(shaders.len() >= 9, "{shaders:?}");
+    let native = names("src/backend/cpu/", ".rs");
+    assert!(shaders.is_subset(&native), "no native twin: {:?}", shaders.difference(&native));
+}
+
 /// Names under which policies are registered, and those the design promises.
 fn policy_names() -> BTreeSet<String> {
     let mut names: BTreeSet<String> =

@@ -4,7 +4,7 @@
 //! `oracle` holds both against stored float64 renders; `gradients`, `loss`, `signals` and
 //! `extremes` hold the backend against the reference on scenes of their own; `sameness` compares
 //! bits; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan to the backend and to a plain vector; `cli` runs the program on
-//! photographs of a small scene; `geometry` holds policies to surfaces that are known; `invariants` keeps the walls of ARCHITECTURE.md standing.
+//! photographs of a small scene; `gpu` holds the GPU backend against the native one; `geometry` holds policies to surfaces that are known; `invariants` keeps the walls of ARCHITECTURE.md standing.
 
 mod aux_views;
 mod cli;
@@ -13,6 +13,7 @@ mod declared;
 mod edits;
 mod extremes;
 mod geometry;
+mod gpu;
 mod gradients;
 mod invariants;
 mod loss;

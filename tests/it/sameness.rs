@@ -74,7 +74,7 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
             backend.train_step(&input).expect("a small image is rendered")
         })
         .collect();
-    (backend.download(), outputs)
+    (backend.download().expect("a model"), outputs)
 }
 
 #[test]

@@ -3,7 +3,6 @@
 use super::CpuOptions;
 use super::adam::BiasCorrection;
 use super::blocks::{Blocks, planes};
-use super::candidates::Candidates;
 use super::loss::LossBuffers;
 use super::observe;
 use super::project::Splat;
@@ -14,6 +13,7 @@ use super::simd::WIDTH;
 use super::summed::Summed;
 use super::tiles::{Grid, TileLists};
 use crate::backend::BackendError;
+use crate::backend::candidates::Candidates;
 use crate::memory::{Ledger, Section};
 
 /// A single tile's list holds each row at most once, so that the budget is always enough.

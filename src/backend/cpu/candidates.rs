@@ -1,5 +1,5 @@
-//! Per-pixel candidates for new rows: the worst pixels of a training view with their surface points
-//! (*Gaussians on a Diet*, arXiv 2604.20046, "compensation").
+//! The surface points of a view's worst pixels, which are candidates for new rows (*Gaussians on a
+//! Diet*, arXiv 2604.20046, "compensation").
 //!
 //! Only the chosen pixels are looked at again: each walks its tile's list once more, in plain
 //! scalar code, to find the Gaussian that stands for its surface. That is a few thousand
@@ -7,122 +7,13 @@
 
 use std::sync::atomic::AtomicU64;
 
-use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
+use densify_policies::policy::DepthMode;
 use glam::{Quat, Vec3};
 
 use super::blocks::{Blocks, plane};
 use super::project::{ALPHA_MIN, Splat, ViewParams};
 use super::rasterize::ALPHA_MAX;
 use super::tiles::Entry;
-
-/// The list, and what goes into it.
-#[derive(Debug)]
-pub(super) struct Candidates {
-    request: Option<CandidateRequest>,
-    list: Vec<Candidate>,
-    /// (error, pixel) of one view.
-    ranking: Vec<(f32, u32)>,
-}
-
-/// Pixels ranked beyond those wanted, so that enough remain after spacing.
-const SPARE: usize = 16;
-
-impl Candidates {
-    pub(super) fn new(request: Option<CandidateRequest>) -> Self {
-        let capacity = request.map_or(0, |r| r.capacity);
-        Self { request, list: Vec::with_capacity(capacity), ranking: Vec::new() }
-    }
-
-    /// Bytes of the list, and of the ranking of an image of so many pixels.
-    pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
-        let ranking = pixels * size_of::<(f32, u32)>();
-        request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
-    }
-
-    /// Whether a policy wants any.
-    pub(super) fn is_wanted(&self) -> bool {
-        self.request.is_some()
-    }
-
-    /// Most that are held at a time.
-    pub(super) fn capacity(&self) -> usize {
-        self.request.map_or(0, |r| r.capacity)
-    }
-
-    pub(super) fn list(&self) -> &[Candidate] {
-        &self.list
-    }
-
-    pub(super) fn push(&mut self, candidate: Candidate) {
-        self.list.push(candidate);
-    }
-
-    pub(super) fn clear(&mut self) {
-        self.list.clear();
-    }
-
-    /// What to take of the view of `step`, if anything: the request, and how many.
-    pub(super) fn open(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
-        let r = self.request.filter(|r| r.from < step && step < r.until)?;
-        let count = rows / r.rows_per_candidate.max(1) as usize;
-        let room = r.capacity.saturating_sub(self.list.len());
-        Some((r, count.min(room))).filter(|&(_, count)| count > 0)
-    }
-
-    /// The `count` worst pixels, worst first; `error(x, y)` is None where no candidate may be.
-    /// Equal errors are ordered by pixel number.
-    pub(super) fn worst(
-        &mut self,
-        width: usize,
-        height: usize,
-        count: usize,
-        spaced: bool,
-        error: impl Fn(usize, usize) -> Option<f32>,
-    ) -> Vec<(usize, usize, f32)> {
-        self.ranking.clear();
-        for y in 0..height {
-            for x in 0..width {
-                if let Some(e) = error(x, y).filter(|&e| e > 0.0) {
-                    self.ranking.push((e, (y * width + x) as u32));
-                }
-            }
-        }
-        let worse = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
-        let ranked = if spaced { count.saturating_mul(SPARE) } else { count };
-        if self.ranking.len() > ranked {
-            self.ranking.select_nth_unstable_by(ranked, worse);
-            self.ranking.truncate(ranked);
-        }
-        self.ranking.sort_unstable_by(worse);
-        let is_peak = |e: f32, pixel: u32| {
-            let (x, y) = (pixel as usize % width, pixel as usize / width);
-            let (x0, x1) = (x.saturating_sub(1), (x + 1).min(width - 1));
-            let (y0, y1) = (y.saturating_sub(1), (y + 1).min(height - 1));
-            (y0..=y1).all(|ny| {
-                (x0..=x1).all(|nx| {
-                    let other = (error(nx, ny).unwrap_or(0.0), (ny * width + nx) as u32);
-                    other.1 == pixel || worse(&(e, pixel), &other).is_lt()
-                })
-            })
-        };
-        self.ranking
-            .iter()
-            .filter(|&&(e, pixel)| !spaced || is_peak(e, pixel))
-            .take(count)
-            .map(|&(e, pixel)| (pixel as usize % width, pixel as usize / width, e))
-            .collect()
-    }
-}
-
-/// Whether the error of a pixel needs the loss's error map, and then its weights of |e| and
-/// 1 − SSIM.
-pub(super) fn error_weights(mode: ErrorMode) -> Option<[f32; 2]> {
-    match mode {
-        ErrorMode::Gradient => None,
-        ErrorMode::L1 => Some([1.0, 0.0]),
-        ErrorMode::L1Dssim => Some([0.8, 0.2]),
-    }
-}
 
 /// The row that stands for the surface at pixel centre `at`: the one with the largest blend weight
 /// or the one at which half the light is gone.

@@ -183,7 +183,7 @@ mod tests {
             let expected = taken(&mut plain, &needs, signal);
             assert!(taken(&mut measured, &needs, signal) == expected, "{signal:?}");
         }
-        assert_eq!(measured.download(), plain.download());
+        assert_eq!(measured.download().unwrap(), plain.download().unwrap());
     }
 
     #[test]

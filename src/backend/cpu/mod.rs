@@ -37,6 +37,7 @@ use densify_policies::policy::{Candidate, LossTerms, Needs, NoiseTerm, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
+use super::candidates::{Candidates, error_weights};
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
     Tensor,
@@ -47,7 +48,6 @@ use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 use adam::BiasCorrection;
 use blocks::{Blocks, planes};
-use candidates::Candidates;
 use loss::LossBuffers;
 use optimise::Differentiate;
 use passes::{for_each_pixel, scalars};
@@ -313,7 +313,7 @@ impl Backend for CpuBackend {
         );
         let frame = self.forward(camera, background, input.sh_degree, false)?;
         let picks = self.candidates.open(input.step, self.rows);
-        let weights = picks.and_then(|(request, _)| candidates::error_weights(request.error));
+        let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let value = self.image_loss(&frame.grid, target, background, weights);
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);
@@ -377,8 +377,8 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
-    fn download(&self) -> Gaussians {
-        self.params.unpack(self.rows, self.sh_degree)
+    fn download(&self) -> Result<Gaussians, BackendError> {
+        Ok(self.params.unpack(self.rows, self.sh_degree))
     }
 
     fn state(&self) -> Vec<String> {

@@ -8,8 +8,6 @@
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, PixelMap};
-use densify_policies::rng::PolicyRng;
-use densify_policies::sample::weighted;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -22,6 +20,7 @@ use super::rasterize::{
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
+use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::dataset::images::Image8;
 
 /// Numbers per record: sums of the map, of pixels, of weights, of distances.
@@ -29,11 +28,11 @@ const STRIDE: usize = 4;
 /// The plane of a tile's gradient that holds the pixel map meanwhile.
 const MAP: usize = 3;
 
-/// Bytes for an image of so many pixels: error, edge and luma, and the drawing of points.
+/// Bytes for an image of so many pixels: its colours, error, edge and luma, and the drawing of points.
 pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
     let drawing =
         if request.points > 0 { 2 * size_of::<f32>() + size_of::<(f64, u32)>() } else { 0 };
-    (pixels * (2 * size_of::<f32>() + 1 + drawing)) as u64
+    (pixels * (5 * size_of::<f32>() + 1 + drawing)) as u64
         + u64::from(request.points) * size_of::<Candidate>() as u64
 }
 
@@ -80,40 +79,23 @@ impl CpuBackend {
                 alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
             });
         }
-        // Views of one step draw apart from each other.
-        let of_view = (input.view as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        let rng = PolicyRng::new(input.seed ^ of_view, input.step);
-        let drawn = weighted(&alpha, input.request.points as usize, &rng);
-        let pixel = |at: u32| {
-            let at = at as usize;
-            (at % grid.width, at / grid.width, alpha[at])
-        };
-        let pixels: Vec<_> = drawn.into_iter().map(pixel).collect();
+        let pixels = draw_pixels(&alpha, grid.width, input);
         self.surface_points(frame, input.target, &pixels, DepthMode::MaxWeight)
     }
 
     /// Writes the pixel map to its plane.
     fn write_map(&mut self, grid: &Grid, target: &Image8, background: [f32; 3], map: PixelMap) {
-        let pixels = grid.width * grid.height;
-        let weight = |at: usize| target.mask.as_ref().map_or(1.0, |m| f32::from(m[at]) / 255.0);
-        let mut error = vec![0.0; pixels];
+        let mut rgb = vec![[0.0; 3]; grid.width * grid.height];
         for (tile, canvas) in self.canvas.iter().enumerate() {
             for_each_pixel(grid, tile, |patch, lane, at| {
-                let truth = target.composited(at % grid.width, at / grid.width, background);
-                let difference = |i: usize| (canvas.planes[i][patch][lane] - truth[i]).abs();
-                error[at] = weight(at) * (difference(0) + difference(1) + difference(2)) / 3.0;
+                rgb[at] = [0, 1, 2].map(|i| canvas.planes[i][patch][lane]);
             });
         }
-        let mut edge = edges(target, background);
-        for (at, edge) in edge.iter_mut().enumerate() {
-            *edge *= weight(at);
-        }
-        stretch(&mut error);
-        stretch(&mut edge);
+        let values = pixel_map(&rgb, target, background, map);
         for (tile, gradient) in self.gradient.iter_mut().enumerate() {
             gradient.planes[MAP] = DARK;
             for_each_pixel(grid, tile, |patch, lane, at| {
-                gradient.planes[MAP][patch][lane] = map.error * error[at] + map.edge * edge[at];
+                gradient.planes[MAP][patch][lane] = values[at];
             });
         }
     }
@@ -168,53 +150,10 @@ impl CpuBackend {
     }
 }
 
-/// Three standard deviations along the longer axis of a projected covariance, rounded up `[px]`.
+/// [`radius_px`] of a splat.
 fn radius(splat: &Splat) -> f32 {
     let unfold = super::project::FOLD;
-    // Of the factor l1 = √(c/det), l3 = 1/√c, r = b/c of the covariance [a b; b c].
-    let (inv_l1, inv_l3) = (unfold / splat.l1, unfold / splat.l3);
-    let c = inv_l3 * inv_l3;
-    let b = splat.shear * c;
-    let a = inv_l1 * inv_l1 + splat.shear * b;
-    let mid = 0.5 * (a + c);
-    // The root of mid² − det without its cancellation.
-    let root = (0.5 * (a - c)).hypot(b);
-    (3.0 * (mid + root).sqrt()).ceil()
-}
-
-/// 8-neighbour Laplacian of the 8-bit luma, clipped to 0..255; borders are repeated.
-/// Shape: `[height, width]`.
-fn edges(target: &Image8, background: [f32; 3]) -> Vec<f32> {
-    let (width, height) = (target.width as usize, target.height as usize);
-    let luma: Vec<u8> = (0..width * height)
-        .map(|at| {
-            let rgb = target.composited(at % width, at / width, background);
-            let [r, g, b] = rgb.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u32);
-            // ITU-R 601-2 in 16 bits: 0.299, 0.587, 0.114.
-            ((19_595 * r + 38_470 * g + 7_471 * b + 32_768) >> 16) as u8
-        })
-        .collect();
-    let at = |x: usize, y: usize| i32::from(luma[y * width + x]);
-    (0..width * height)
-        .map(|pixel| {
-            let (x, y) = (pixel % width, pixel / width);
-            let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
-            let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
-            let sum: i32 = rows.iter().flat_map(|&y| columns.map(|x| at(x, y))).sum();
-            (9 * at(x, y) - sum).clamp(0, 255) as f32
-        })
-        .collect()
-}
-
-/// Brings values to 0..1 by their least and their largest; all 0 where they are equal.
-fn stretch(values: &mut [f32]) {
-    let range = values
-        .iter()
-        .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), &x| (low.min(x), high.max(x)));
-    let (low, width) = (range.0, range.1 - range.0);
-    for x in values {
-        *x = if width > 0.0 { (*x - low) / width } else { 0.0 };
-    }
+    radius_px(unfold / splat.l1, splat.shear, unfold / splat.l3)
 }
 
 /// Replays the blending of one tile.
@@ -281,45 +220,5 @@ impl WithSimd for Replay<'_> {
                 to.store(sum.sum().to_bits(), Relaxed);
             }
         }
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::float_cmp, reason = "results are exact")]
-mod tests {
-    use super::*;
-
-    fn image(width: u32, grey: &[u8]) -> Image8 {
-        let height = grey.len() as u32 / width;
-        let rgb = grey.iter().flat_map(|&v| [v; 3]).collect();
-        Image8 { width, height, rgb, alpha: None, mask: None }
-    }
-
-    #[test]
-    fn edges_are_the_laplacian_of_the_luma() {
-        // A step from 10 to 30: 8·30 − (5·30 + 3·10) = 60 on the bright side, clipped to 0 on the dark.
-        let step = image(4, &[10, 10, 30, 30, 10, 10, 30, 30, 10, 10, 30, 30]);
-        let row = [0.0, 0.0, 60.0, 0.0];
-        assert_eq!(edges(&step, [0.0; 3]), [row, row, row].concat());
-        // A bright pixel: 8·200, clipped to 255. Its dark neighbours have none.
-        let dot = image(3, &[0, 0, 0, 0, 200, 0, 0, 0, 0]);
-        assert_eq!(edges(&dot, [0.0; 3])[4], 255.0);
-        assert_eq!(edges(&dot, [0.0; 3]).iter().sum::<f32>(), 255.0);
-        // Green counts most: 0.587·100 = 58.7.
-        let green = Image8 { rgb: vec![0, 0, 0, 0, 100, 0], ..image(2, &[0, 0]) };
-        assert_eq!(edges(&green, [0.0; 3]), [0.0, 177.0]);
-        let mut clear = image(2, &[0, 200]);
-        clear.alpha = Some(vec![255, 0]);
-        assert_eq!(edges(&clear, [0.0; 3]), [0.0, 0.0]);
-    }
-
-    #[test]
-    fn maps_are_stretched_to_one() {
-        let mut values = [3.0, 1.0, 2.0];
-        stretch(&mut values);
-        assert_eq!(values, [1.0, 0.0, 0.5]);
-        let mut flat = [4.0; 3];
-        stretch(&mut flat);
-        assert_eq!(flat, [0.0; 3]);
     }
 }

@@ -1,8 +1,6 @@
 //! The native backend's state as named arrays. Each stage that keeps something between steps says
 //! what it is; lanes beyond the last row are nobody's and are left out.
 
-use densify_policies::policy::Candidate;
-
 use super::CpuBackend;
 use super::blocks::planes;
 use super::signals::Accumulators;
@@ -15,8 +13,6 @@ const CANDIDATES: &str = "candidates";
 const SIGNAL: &str = "signals.";
 /// Before what is [summed](super::summed).
 const SUMMED: &str = "summed.";
-/// Numbers of a candidate.
-const CANDIDATE: usize = 8;
 
 impl CpuBackend {
     pub(super) fn state_names(&self) -> Vec<String> {
@@ -42,9 +38,7 @@ impl CpuBackend {
             return Tensor::u16(name, &[rows], self.ages[..rows].to_vec());
         }
         if name == CANDIDATES {
-            let list = self.candidates.list();
-            let values = list.iter().flat_map(numbers).collect();
-            return Tensor::f32(name, &[list.len(), CANDIDATE], values);
+            return self.candidates.tensor(name);
         }
         if let Some(plane) = signal_plane(&self.signals, name) {
             let values = self.signals.blocks.to_rows(rows, plane..plane + 1);
@@ -65,15 +59,7 @@ impl CpuBackend {
             let ages = tensor.into_u16(&[rows])?;
             self.ages[..rows].copy_from_slice(&ages);
         } else if name == CANDIDATES && self.candidates.is_wanted() {
-            let count = tensor.shape.first().copied().unwrap_or(0);
-            if count > self.candidates.capacity() {
-                let most = self.candidates.capacity();
-                return Err(tensor.error(format!("{count} of them; this run holds {most}")));
-            }
-            self.candidates.clear();
-            for from in tensor.into_f32(&[count, CANDIDATE])?.chunks_exact(CANDIDATE) {
-                self.candidates.push(candidate(from));
-            }
+            self.candidates.restore(tensor)?;
         } else if let Some(plane) = signal_plane(&self.signals, &name) {
             let values = tensor.into_f32(&[rows])?;
             self.signals.blocks.set_rows(rows, plane..plane + 1, &values);
@@ -89,19 +75,4 @@ impl CpuBackend {
 fn signal_plane(signals: &Accumulators, name: &str) -> Option<usize> {
     let name = name.strip_prefix(SIGNAL)?;
     signals.state().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
-}
-
-fn numbers(c: &Candidate) -> [f32; CANDIDATE] {
-    let ([x, y, z], [r, g, b]) = (c.position, c.colour);
-    [x, y, z, r, g, b, c.pixel_size, c.error]
-}
-
-/// `from` has [`CANDIDATE`] numbers.
-fn candidate(from: &[f32]) -> Candidate {
-    Candidate {
-        position: [from[0], from[1], from[2]],
-        colour: [from[3], from[4], from[5]],
-        pixel_size: from[6],
-        error: from[7],
-    }
 }

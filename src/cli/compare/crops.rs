@@ -13,7 +13,7 @@ use super::{Picture, Record, budgets_of, distinct, run_folder};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
-use crate::cli::run_files::{SplitArg, open_run};
+use crate::cli::run_files::{Machine, SplitArg, open_run};
 use crate::dataset::images::Image8;
 use crate::output::write_atomically;
 use crate::views::ViewSource;
@@ -59,7 +59,9 @@ pub(super) fn draw(
                 }
                 let quiet = Console::new(true);
                 let needs = Needs::default();
-                let mut opened = open_run(&folder, record.iterations, None, None, needs, &quiet)?;
+                let machine = Machine::default();
+                let mut opened =
+                    open_run(&folder, record.iterations, None, machine, needs, &quiet)?;
                 let views = opened.views(SplitArg::Test)?;
                 let background = opened.scene.background.fixed();
                 let image = |view: usize| {

@@ -13,6 +13,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 
 use super::console::Console;
+use super::device::DeviceArgs;
 use super::failure::Failure;
 use super::number;
 use super::scene::{NEAR, SceneArgs};
@@ -40,6 +41,8 @@ pub(super) struct TrainArgs {
 
     #[command(flatten)]
     data: SceneArgs,
+    #[command(flatten)]
+    device: DeviceArgs,
 
     /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
     /// `[default: 200k]`

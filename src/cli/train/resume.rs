@@ -175,6 +175,12 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Vec<OsString> {
     adopt("--resolution", scene.resolution.and_then(|resolution| text(&resolution)));
     adopt("--image-cache", text(&scene.image_cache));
     adopt("--background", text(&scene.background));
+    if !is_given(given, "backend") && !is_given(given, "gpu") {
+        match &train.adapter {
+            Some(name) => adopt("--gpu", text(name)),
+            None => adopt("--backend", text(&"cpu")),
+        }
+    }
     let split = is_given(given, "eval") || is_given(given, "test_every");
     if !split {
         adopt("--test-every", scene.test_every.and_then(|every| text(&every)));
@@ -241,6 +247,7 @@ fn flag(key: &str, policy: &str) -> String {
             Some(parameter) => format!("--policy-set {policy}.{parameter}"),
             None => key.to_owned(),
         },
+        ("train", "adapter") => "--gpu".to_owned(),
         ("train", name) => match name.strip_prefix("learning_rates.") {
             Some(rate) => format!("--lr {rate}"),
             None => format!("--{}", name.replace('_', "-")),

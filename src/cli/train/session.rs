@@ -233,7 +233,7 @@ impl<'a> Session<'a> {
                     Ok(path) => {
                         format!("the model as it was before is saved in {}", path.display())
                     }
-                    Err(e) => format!("the model could not be saved: {e}"),
+                    Err(e) => format!("the model could not be saved: {}", e.message),
                 };
                 Err(Failure::from(error).and(&saved))
             }
@@ -259,8 +259,9 @@ impl<'a> Session<'a> {
     }
 
     /// Writes the model in the dataset's own coordinates; returns where.
-    fn save(&mut self, step: u32) -> Result<PathBuf, OutputError> {
-        let model = self.run.dataset.normalisation.model_to_world(&self.run.trainer.model());
+    fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
+        let model = self.run.trainer.model()?;
+        let model = self.run.dataset.normalisation.model_to_world(&model);
         let path = model_path(&self.folder, step);
         write_atomically(&path, |mut out| write_splats(&model, &mut out))?;
         Ok(path)

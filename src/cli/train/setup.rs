@@ -12,6 +12,7 @@ use super::tally::Kept;
 use super::{DEFAULT_BUDGET, TrainArgs};
 use crate::backend::Backend;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
 use crate::checkpoint::{Checkpoint, Fingerprint};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
@@ -67,6 +68,7 @@ pub(super) fn prepare(
     check_iterations("--test-iterations", &args.test_iterations, last)?;
     let output = output(args);
     RunFolder::check(&output, args.overwrite || args.resume)?;
+    let device = args.device.open(console)?;
     use_threads(args.threads);
 
     let scene_config = args.data.config(&args.scene);
@@ -118,6 +120,7 @@ pub(super) fn prepare(
             init,
             init_points,
             sh_every: args.sh_every,
+            adapter: device.as_ref().map(|device| device.adapter().name.clone()),
             learning_rates: rates,
         },
         policy: PolicyConfig {
@@ -147,7 +150,7 @@ pub(super) fn prepare(
     };
     let needs = needs(policy.as_ref(), &scene, &options);
     let (backend, ledger) =
-        backend(args, &config, &dataset, needs, &scene, model, [&views, &test])?;
+        backend(args, &config, &dataset, needs, &scene, (model, device), [&views, &test])?;
     console.say(format_args!("memory promised\n{ledger}"));
     let mut trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
     let kept = checkpoint.map(|checkpoint| go_on(checkpoint, &mut trainer, last, console));
@@ -214,23 +217,37 @@ fn backend(
     dataset: &Dataset,
     needs: Needs,
     scene: &SceneInfo,
-    model: Gaussians,
+    (model, device): (Gaussians, Option<GpuDevice>),
     [views, test]: [&DatasetViews; 2],
 ) -> Result<(Box<dyn Backend>, Ledger), Failure> {
-    let before = resident();
+    let mut before = resident();
     let signals = needs.signals.iter().count() as u64;
     let candidates = needs.candidates.map_or(0, |request| request.capacity);
     // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
     let aux = needs.aux.as_ref();
     let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
     let points = aux.map_or(0, |r| u64::from(r.points) * u64::from(scene.train_views));
-    let mut options = CpuOptions::new(scene.budget);
-    options.near = (config.train.near * f64::from(scene.extent)) as f32;
-    options.tile_cap = args.tile_cap.unwrap_or(options.tile_cap);
-    options.threads = args.threads.map(usize::from);
-    options.largest_image = scene::largest_image(dataset);
-    options.needs = needs;
-    let backend = CpuBackend::new(&model, &options)?;
+    let near = (config.train.near * f64::from(scene.extent)) as f32;
+    let largest_image = scene::largest_image(dataset);
+    let backend: Box<dyn Backend> = match device {
+        Some(device) => {
+            let tile_cap = args.tile_cap;
+            let options = GpuOptions { budget: scene.budget, near, tile_cap, largest_image, needs };
+            let backend = GpuBackend::new(&model, &options, &device)?;
+            // A driver and its compiled kernels are part of the program.
+            before = resident();
+            Box::new(backend)
+        }
+        None => {
+            let mut options = CpuOptions::new(scene.budget);
+            options.near = near;
+            options.tile_cap = args.tile_cap.unwrap_or(options.tile_cap);
+            options.threads = args.threads.map(usize::from);
+            options.largest_image = largest_image;
+            options.needs = needs;
+            Box::new(CpuBackend::new(&model, &options)?)
+        }
+    };
     drop(model);
 
     let mut ledger = backend.ledger().clone();
@@ -251,7 +268,7 @@ fn backend(
     let row = float * (11 + 3 * sh_coefficients(config.train.sh_degree) as u64);
     ledger.add_to(Section::Passing, "export of the model, checkpoint", 2 * budget * row);
     if test.count() > 0 {
-        let (width, height) = options.largest_image;
+        let (width, height) = largest_image;
         let rendering = u64::from(width) * u64::from(height) * 5 * float;
         ledger.add_to(
             Section::Passing,
@@ -262,7 +279,7 @@ fn backend(
     if let Some(bytes) = before {
         ledger.add_to(Section::Process, "program and dataset", bytes);
     }
-    Ok((Box::new(backend), ledger))
+    Ok((backend, ledger))
 }
 
 /// The initial model in the coordinates of training, and how it was made.

@@ -100,7 +100,7 @@ fn trained(budget: usize) -> CpuBackend {
 }
 
 fn rows(backend: &mut CpuBackend) -> Vec<Row> {
-    let model = backend.download();
+    let model = backend.download().expect("a model");
     let (signals, _) = backend.take_signals(&needs()).expect("signals are there");
     let of = |signal, row: usize| signals.get(signal).expect("it was asked for")[row];
     let row = |row: usize| Row {
@@ -246,5 +246,5 @@ fn budget_one_row_is_kept() {
     plan.prune(0).expect("the row is free");
     plan.append(seed).expect("its slot is free now");
     backend.apply(&plan.compile(), SEED, 1).expect("a plan is applied");
-    assert_eq!((backend.rows(), backend.download().means[0]), (1, [0.0; 3]));
+    assert_eq!((backend.rows(), backend.download().expect("a model").means[0]), (1, [0.0; 3]));
 }

@@ -7,15 +7,17 @@ mod policies;
 use std::ops::ControlFlow;
 use std::path::Path;
 
+use densify::backend::Backend;
 use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::dataset::{Dataset, LoadOptions, Split, builtin};
 use densify::evaluate::evaluate;
+use densify::gaussians::Gaussians;
 use densify::init::{initialise, restart};
 use densify::metrics::geometry::{self, Geometry, Ground};
 use densify::schedule::{Background, RateOptions};
 use densify::trainer::{TrainOptions, Trainer, needs};
 use densify::views::DatasetViews;
-use densify_policies::policy::SceneInfo;
+use densify_policies::policy::{Needs, SceneInfo};
 use densify_policies::registry::find;
 use densify_scenegen::{Generated, GroundTruth, Options, PointOptions, Source, generate};
 use toml::Table;
@@ -37,6 +39,9 @@ pub(crate) struct Run<'a> {
     pub(crate) iterations: u32,
     pub(crate) seed: u64,
 }
+
+/// Makes a backend: model, budget, near plane, needs.
+pub(crate) type Make<'a> = &'a dyn Fn(&Gaussians, usize, f32, Needs) -> Box<dyn Backend>;
 
 /// What came of it.
 pub(crate) struct Outcome {
@@ -65,12 +70,20 @@ impl Known {
         Self { name, dataset, truth: GroundTruth::of_scene(scene) }
     }
 
-    /// Trains and measures. The budget is held at every step.
+    /// Trains and measures on the native backend.
+    pub(crate) fn train(&self, run: Run<'_>) -> Outcome {
+        self.train_on(run, &|model, budget, near, needs| {
+            let options = CpuOptions { near, needs, ..CpuOptions::new(budget) };
+            Box::new(CpuBackend::new(model, &options).expect("a small model fits"))
+        })
+    }
+
+    /// Trains and measures on backends that `make` makes. The budget is held at every step.
     #[expect(
         clippy::print_stderr,
         reason = "the numbers, where a test fails or is asked to show them"
     )]
-    pub(crate) fn train(&self, run: Run<'_>) -> Outcome {
+    pub(crate) fn train_on(&self, run: Run<'_>, make: Make<'_>) -> Outcome {
         let Self { dataset, truth, .. } = self;
         let entry = find(run.policy).expect("a policy");
         let (mut model, _) =
@@ -97,11 +110,8 @@ impl Known {
             prefetch: 0,
         };
         let near = (0.04 * dataset.extent()) as f32;
-        let backend = |model: &_, budget, needs| {
-            let options = CpuOptions { near, needs, ..CpuOptions::new(budget) };
-            Box::new(CpuBackend::new(model, &options).expect("a small model fits"))
-        };
-        let first = backend(&model, run.budget, needs(policy.as_ref(), &scene, &options));
+        let needs = needs(policy.as_ref(), &scene, &options);
+        let first = make(&model, run.budget, near, needs);
         let views =
             |views: &[densify::dataset::View]| DatasetViews::new(views.to_vec(), 1 << 30, 1);
         let (train, test) = (views(&dataset.train), views(&dataset.test));
@@ -112,8 +122,8 @@ impl Known {
             let report = trainer.step().expect("a step");
             assert!(report.rows <= run.budget, "{run:?}: {} rows", report.rows);
         }
-        let model = trainer.model();
-        let mut last = backend(&model, model.len().max(1), geometry::needs());
+        let model = trainer.model().expect("a model");
+        let mut last = make(&model, model.len().max(1), near, geometry::needs());
         let ground = Ground {
             truth,
             normalisation: &dataset.normalisation,

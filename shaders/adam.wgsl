@@ -1,0 +1,216 @@
+// Stage 7: Adam, with the bias correction of each row's own age; src/backend/cpu/adam.rs. One row
+// per invocation. Bands of colour come first, each buffer by itself: their gradient is the basis at
+// the direction of view times dL/dcolour, formed here and never stored. The geometry comes last, and
+// with it what a policy adds: terms of the loss, and noise on the means (regularise.rs); gradients
+// are summed over views where the optimiser steps less often than every iteration (summed.rs).
+
+@group(0) @binding(1) var<storage, read> state: State;
+// Parameters, moments, and the gradients summed so far.
+@group(0) @binding(2) var<storage, read_write> params: array<f32>;
+@group(0) @binding(3) var<storage, read_write> first: array<f32>;
+@group(0) @binding(4) var<storage, read_write> second: array<f32>;
+@group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
+// Lower half: steps of all but bands 1-3; upper half: of these, where they step apart.
+@group(0) @binding(6) var<storage, read_write> ages: array<u32>;
+// See project_bwd.wgsl.
+@group(0) @binding(7) var<storage, read> gradient: array<vec4<f32>>;
+// 1/(1 − β₁^age) and √(1/(1 − β₂^age)).
+@group(0) @binding(8) var<storage, read> bias: array<vec2<f32>>;
+
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPSILON: f32 = 1e-15;
+const LOGIT_MAX: f32 = 9.2;
+const LOG_SCALE_LEAST: f32 = -13.8;
+const LOG_SCALE_MOST: f32 = 2.3;
+const MATURE: u32 = 17400u;
+const LEAST_SHARE: f32 = 5.9604645e-8;
+
+// Bits of frame.draw.z.
+const MAIN_STEPS: u32 = 1u;
+const REST_STEPS: u32 = 2u;
+const MAIN_WAITED: u32 = 4u;
+const REST_WAITED: u32 = 8u;
+const REST_AGES: u32 = 16u;
+const TERMS: u32 = 32u;
+const NOISE: u32 = 64u;
+
+fn is_set(bit: u32) -> bool {
+    return (frame.draw.z & bit) != 0u;
+}
+
+// The gradient of parameter `at` together with what waits for it; or 0 where it goes on waiting.
+fn exchange(at: u32, g: f32, steps: bool, waited: bool) -> f32 {
+    if !steps {
+        waiting[at] += g;
+        return 0.0;
+    }
+    if waited {
+        let sum = g + waiting[at];
+        waiting[at] = 0.0;
+        return sum;
+    }
+    return g;
+}
+
+fn step(at: u32, g: f32, rate: f32, correction: vec2<f32>) {
+    let m = first[at] * BETA1 + g * (1.0 - BETA1);
+    let v = second[at] * BETA2 + g * g * (1.0 - BETA2);
+    first[at] = m;
+    second[at] = v;
+    params[at] -= m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
+}
+
+// The steps counted so far and the one at hand, of a half of `ages`.
+fn grown(age: u32) -> u32 {
+    return min(age + 1u, 0xffffu);
+}
+
+// Basis function k at the unit vector d.
+fn basis_of(k: u32, d: vec3<f32>) -> f32 {
+    let xx = d.x * d.x;
+    let yy = d.y * d.y;
+    let zz = d.z * d.z;
+    switch k {
+        case 0u: { return 0.28209479; }
+        case 1u: { return -0.48860251 * d.y; }
+        case 2u: { return 0.48860251 * d.z; }
+        case 3u: { return -0.48860251 * d.x; }
+        case 4u: { return 1.0925484 * d.x * d.y; }
+        case 5u: { return -1.0925484 * d.y * d.z; }
+        case 6u: { return 0.31539157 * (2.0 * zz - xx - yy); }
+        case 7u: { return -1.0925484 * d.x * d.z; }
+        case 8u: { return 0.5462742 * (xx - yy); }
+        case 9u: { return -0.5900436 * d.y * (3.0 * xx - yy); }
+        case 10u: { return 2.8906114 * d.x * d.y * d.z; }
+        case 11u: { return -0.4570458 * d.y * (4.0 * zz - xx - yy); }
+        case 12u: { return 0.37317633 * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy); }
+        case 13u: { return -0.4570458 * d.x * (4.0 * zz - xx - yy); }
+        case 14u: { return 1.4453057 * d.z * (xx - yy); }
+        default: { return -0.5900436 * d.x * (xx - 3.0 * yy); }
+    }
+}
+
+// One band; now.a: its first coefficient, now.b: coefficients.
+@compute @workgroup_size(256)
+fn adam_band(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row >= frame.model.x || state.short != 0u {
+        return;
+    }
+    let is_rest = now.a > 0u;
+    let steps = is_set(select(MAIN_STEPS, REST_STEPS, is_rest));
+    let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
+    let rate = select(frame.more_rates.x, frame.more_rates.y, is_rest);
+    let apart = is_rest && is_set(REST_AGES);
+    let age = grown(select(ages[row] & 0xffffu, ages[row] >> 16u, apart));
+    let correction = bias[min(age, MATURE)];
+    let by_colour = gradient[5u * row + 3u].xyz;
+    let d = gradient[5u * row + 4u].xyz;
+    for (var k = 0u; k < now.b; k++) {
+        let g = basis_of(now.a + k, d) * by_colour;
+        let at = 3u * (row * now.b + k);
+        for (var channel = 0u; channel < 3u; channel++) {
+            let sum = exchange(at + channel, g[channel], steps, waited);
+            if steps {
+                step(at + channel, sum, rate, correction);
+            }
+        }
+    }
+}
+
+// Everything but colour; counts the steps.
+@compute @workgroup_size(256)
+fn adam_geometry(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row >= frame.model.x || state.short != 0u {
+        return;
+    }
+    let steps = is_set(MAIN_STEPS);
+    let waited = is_set(MAIN_WAITED);
+    let age = ages[row];
+    let correction = bias[min(grown(age & 0xffffu), MATURE)];
+    let base = 12u * row;
+    var add = array<f32, 11>();
+    if is_set(TERMS) {
+        // e^x / (1 + e^x)² for x <= 0, and it is even: nothing cancels at either end.
+        let e = exp_exact(-abs(params[base + 10u]));
+        add[10] = e / ((1.0 + e) * (1.0 + e)) * frame.more_rates.z;
+        for (var k = 3u; k < 6u; k++) {
+            add[k] = exp_exact(params[base + k]) * frame.more_rates.w;
+        }
+    }
+    for (var k = 0u; k < 11u; k++) {
+        let g = gradient[5u * row + k / 4u][k % 4u] + add[k];
+        let sum = exchange(base + k, g, steps, waited);
+        if steps {
+            var rate = frame.rates.x;
+            if k >= 3u { rate = frame.rates.y; }
+            if k >= 6u { rate = frame.rates.z; }
+            if k >= 10u { rate = frame.rates.w; }
+            step(base + k, sum, rate, correction);
+        }
+    }
+    var main_age = age & 0xffffu;
+    var rest_age = age >> 16u;
+    if steps {
+        main_age = grown(main_age);
+        confine(base);
+        if is_set(NOISE) {
+            add_noise(row, base);
+        }
+    }
+    if is_set(REST_STEPS) && is_set(REST_AGES) {
+        rest_age = grown(rest_age);
+    }
+    ages[row] = main_age | rest_age << 16u;
+}
+
+// Brings the parameters of a row back to where they are safe.
+fn confine(base: u32) {
+    let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
+    let norm2 = dot(q, q);
+    // A quaternion this short has no direction left; it starts again without rotation.
+    var unit = vec4(1.0, 0.0, 0.0, 0.0);
+    if norm2 > 1e-12 {
+        unit = q / sqrt(norm2);
+    }
+    for (var k = 0u; k < 4u; k++) {
+        params[base + 6u + k] = unit[k];
+    }
+    for (var k = 3u; k < 6u; k++) {
+        params[base + k] = clamp(params[base + k], LOG_SCALE_LEAST, LOG_SCALE_MOST);
+    }
+    params[base + 10u] = clamp(params[base + 10u], -LOGIT_MAX, LOGIT_MAX);
+}
+
+// Δμ = R·S²·Rᵀ·ξ · share · factor.
+fn add_noise(row: u32, base: u32) {
+    let logit = params[base + 10u];
+    let e = exp_exact(-abs(logit));
+    let opacity = select(e, 1.0, logit >= 0.0) / (1.0 + e);
+    let share = 1.0 / (1.0 + exp_exact(frame.noise.y * (opacity - frame.noise.z)));
+    if share < LEAST_SHARE {
+        return;
+    }
+    let xi = normal3(row, frame.draw.y, frame.draw.x, PURPOSE_NOISE, 0u);
+    let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
+    let scale = vec3(
+        exp_exact(params[base + 3u]),
+        exp_exact(params[base + 4u]),
+        exp_exact(params[base + 5u]),
+    );
+    let local = rotate(vec4(q.x, -q.yzw), xi);
+    let move_by = rotate(q, scale * scale * local) * (frame.noise.x * share);
+    if below(move_by.x, LARGEST) && below(move_by.y, LARGEST) && below(move_by.z, LARGEST) {
+        for (var k = 0u; k < 3u; k++) {
+            params[base + k] += move_by[k];
+        }
+    }
+}

@@ -1,0 +1,229 @@
+// Stage 9: executes a compiled plan in place, in chunks of operations; src/backend/cpu/apply.rs.
+// Pass 1 writes families, updates and seeds, no row twice; pass 2 moves tail rows into holes. Each
+// buffer that has rows is edited by itself.
+
+// Numbers per operation.
+const WORDS: u32 = 16u;
+
+@group(0) @binding(1) var<storage, read> ops: array<u32>;
+// Any buffer with rows.
+@group(0) @binding(2) var<storage, read_write> buffer: array<u32>;
+// The geometry: twelve numbers per row.
+@group(0) @binding(3) var<storage, read_write> params: array<f32>;
+@group(0) @binding(4) var<storage, read_write> dc: array<f32>;
+@group(0) @binding(5) var<storage, read_write> first: array<f32>;
+@group(0) @binding(6) var<storage, read_write> second: array<f32>;
+@group(0) @binding(7) var<storage, read_write> waiting: array<f32>;
+
+// Operations (from, to): copies row `from`, or clears `to` where it is NONE. now.a: operations,
+// now.b: numbers per row, now.c: distance between rows, now.d: between the numbers of a row.
+@compute @workgroup_size(256)
+fn copy_rows(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    let op = i / now.b;
+    let word = i % now.b;
+    if op >= now.a {
+        return;
+    }
+    let source = ops[2u * op];
+    let to = ops[2u * op + 1u] * now.c + word * now.d;
+    if source == NONE {
+        buffer[to] = 0u;
+    } else {
+        buffer[to] = buffer[source * now.c + word * now.d];
+    }
+}
+
+fn longest(s: vec3<f32>) -> u32 {
+    var best = 0u;
+    if s.y > s[best] { best = 1u; }
+    if s.z > s[best] { best = 2u; }
+    return best;
+}
+
+// Rule 0: all by ln(a); 1: the longest by ln(a), the others by ln(b). `terms` are the logarithms.
+fn scales_of(s: vec3<f32>, rule: u32, terms: vec2<f32>) -> vec3<f32> {
+    if rule == 0u {
+        return s + terms.x;
+    }
+    var changed = s + terms.y;
+    let long = longest(s);
+    changed[long] = s[long] + terms.x;
+    return changed;
+}
+
+// ln(o / (1 − o)) where 1 − o is known to its last bit.
+fn logit_of(opacity: f32, complement: f32) -> f32 {
+    return log(opacity) - log(complement);
+}
+
+// Rule 0: the same, 1: this logit, 2: opacity times a factor, 3: conserved by so many siblings.
+fn logit_after(logit: f32, rule: u32, value: f32) -> f32 {
+    let e = exp_exact(-abs(logit));
+    let opacity = select(e, 1.0, logit >= 0.0) / (1.0 + e);
+    let complement = select(1.0, e, logit >= 0.0) / (1.0 + e);
+    switch rule {
+        case 1u: { return value; }
+        case 2u: {
+            // 1 − o·f = (1 − o) + o·(1 − f): nothing cancels.
+            return logit_of(opacity * value, complement + opacity * (1.0 - value));
+        }
+        case 3u: {
+            let left = pow(complement, 1.0 / value);
+            // 1 − left: for small opacities by its series, where the difference would cancel.
+            let ln_left = -minus_ln_complement(opacity, complement) / value;
+            let part = select(1.0 - left, -expm1_small(ln_left), ln_left > -0.1);
+            return logit_of(part, left);
+        }
+        default: { return logit; }
+    }
+}
+
+// −ln(1 − o).
+fn minus_ln_complement(opacity: f32, complement: f32) -> f32 {
+    if opacity < 0.1 {
+        let t = opacity / (2.0 - opacity);
+        let t2 = t * t;
+        return 2.0 * t * (1.0 + t2 * (1.0 / 3.0 + t2 * (1.0 / 5.0 + t2 * (1.0 / 7.0))));
+    }
+    return -log(complement);
+}
+
+// e^x − 1 for −0.1 < x <= 0.
+fn expm1_small(x: f32) -> f32 {
+    return x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0 + x * (1.0 / 120.0)))));
+}
+
+fn real(at: u32) -> f32 {
+    return bitcast<f32>(ops[at]);
+}
+
+fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: f32) {
+    let base = 12u * row;
+    for (var k = 0u; k < 3u; k++) {
+        params[base + k] = mean[k];
+        params[base + 3u + k] = log_scale[k];
+    }
+    for (var k = 0u; k < 4u; k++) {
+        params[base + 6u + k] = quat[k];
+    }
+    params[base + 10u] = logit;
+}
+
+// Families; now.a: how many, now.b: seed, now.c: step. An operation: parent, place of the first
+// child's slot in `ops`, children, number of the first, whether the parent becomes child 0,
+// placement (0: offset, 1: sampled, 2: along the longest axis), three numbers of it, scale rule, two
+// numbers of it, opacity rule, its number, unused ×2.
+@compute @workgroup_size(256)
+fn breed(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= now.a {
+        return;
+    }
+    let op = i * WORDS;
+    let parent = ops[op];
+    let base = 12u * parent;
+    let mean = vec3(params[base], params[base + 1u], params[base + 2u]);
+    let log_scale = vec3(params[base + 3u], params[base + 4u], params[base + 5u]);
+    let quat = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
+    let scales = scales_of(log_scale, ops[op + 9u], vec2(real(op + 10u), real(op + 11u)));
+    let logit = logit_after(params[base + 10u], ops[op + 12u], real(op + 13u));
+    let children = ops[op + 2u];
+    for (var k = 0u; k < children; k++) {
+        let at = mean + offset_of(op, ops[op + 3u] + k, parent, log_scale, quat);
+        put(ops[ops[op + 1u] + k], at, scales, quat, logit);
+    }
+    if ops[op + 4u] != 0u {
+        let at = mean + offset_of(op, 0u, parent, log_scale, quat);
+        put(parent, at, scales, quat, logit);
+    }
+}
+
+fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<f32>) -> vec3<f32> {
+    switch ops[op + 5u] {
+        case 0u: {
+            if child == 0u {
+                return vec3(0.0);
+            }
+            return vec3(real(op + 6u), real(op + 7u), real(op + 8u));
+        }
+        case 1u: {
+            let xi = normal3(parent, now.c, now.b, PURPOSE_PLACE, child);
+            let scale = vec3(exp_exact(log_scale.x), exp_exact(log_scale.y), exp_exact(log_scale.z));
+            return rotate(quat, scale * xi);
+        }
+        default: {
+            let long = longest(log_scale);
+            var local = vec3(0.0);
+            local[long] = select(-1.0, 1.0, child % 2u == 0u) * real(op + 6u) * exp_exact(log_scale[long]);
+            return rotate(quat, local);
+        }
+    }
+}
+
+// Updates; now.a: how many. An operation: row, scale rule, two numbers of it, opacity rule, its
+// number, unused ×10.
+@compute @workgroup_size(256)
+fn rewrite(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= now.a {
+        return;
+    }
+    let op = i * WORDS;
+    let base = 12u * ops[op];
+    let log_scale = vec3(params[base + 3u], params[base + 4u], params[base + 5u]);
+    let scales = scales_of(log_scale, ops[op + 1u], vec2(real(op + 2u), real(op + 3u)));
+    for (var k = 0u; k < 3u; k++) {
+        params[base + 3u + k] = scales[k];
+    }
+    params[base + 10u] = logit_after(params[base + 10u], ops[op + 4u], real(op + 5u));
+}
+
+// Seeds; now.a: how many. An operation: row, mean, log-scale, logit, three coefficients of band 0,
+// unused ×7. Their other coefficients were cleared before.
+@compute @workgroup_size(256)
+fn sow(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= now.a {
+        return;
+    }
+    let op = i * WORDS;
+    let row = ops[op];
+    let mean = vec3(real(op + 1u), real(op + 2u), real(op + 3u));
+    put(row, mean, vec3(real(op + 4u)), vec4(1.0, 0.0, 0.0, 0.0), real(op + 5u));
+    for (var k = 0u; k < 3u; k++) {
+        dc[3u * row + k] = real(op + 6u + k);
+    }
+}
+
+// Bounds all opacities and forgets their moments; now.a: rows, now.b: bits of the largest logit,
+// now.c: whether gradients of the opacity wait for a step.
+@compute @workgroup_size(256)
+fn clamp_opacity(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row >= now.a {
+        return;
+    }
+    let at = 12u * row + 10u;
+    params[at] = min(params[at], bitcast<f32>(now.b));
+    first[at] = 0.0;
+    second[at] = 0.0;
+    if now.c != 0u {
+        waiting[at] = 0.0;
+    }
+}

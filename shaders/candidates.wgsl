@@ -1,0 +1,94 @@
+// Surface points of chosen pixels, one per invocation; src/backend/cpu/candidates.rs.
+
+@group(0) @binding(1) var<storage, read> state: State;
+@group(0) @binding(2) var<storage, read> list: array<u32>;
+@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
+@group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
+@group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read> params: array<f32>;
+// Numbers of the pixels.
+@group(0) @binding(7) var<storage, read> pixels: array<u32>;
+// Where the surface is, and its depth; depth 0 where there is none.
+@group(0) @binding(8) var<storage, read_write> points: array<vec4<f32>>;
+
+const ALPHA_MIN: f32 = 1.0 / 255.0;
+const ALPHA_MAX: f32 = 0.99;
+
+// now.a: the band, now.b: how many pixels, now.c: the surface is at the largest blend weight (0) or
+// where half the light is gone (1), now.d: place of the first in `points`.
+@compute @workgroup_size(256)
+fn surface(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= now.b {
+        return;
+    }
+    let pixel = vec2(pixels[i] % frame.image.x, pixels[i] / frame.image.x);
+    let tile = pixel.y / TILE * frame.image.z + pixel.x / TILE;
+    if tile < state.cuts[now.a] || tile >= state.cuts[now.a + 1u] {
+        return;
+    }
+    let at = vec2<f32>(pixel) + 0.5;
+    let row = surface_row(tile, at, now.c == 1u);
+    var point = vec4(0.0);
+    if row != NONE {
+        point = closest_approach(row, at);
+    }
+    points[now.d + i] = point;
+}
+
+fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
+    var light = 1.0;
+    var best = NONE;
+    var most = 0.0;
+    for (var k = tile_starts[tile]; k < tile_starts[tile + 1u]; k++) {
+        let row = row_of_slot[list[k]];
+        let a = splats[3u * row];
+        let b = splats[3u * row + 1u];
+        let d = at - a.xy;
+        let u = a.z * (d.x - a.w * d.y);
+        let z = b.x * d.y;
+        let alpha = min(exp2(b.y - u * u - z * z), ALPHA_MAX);
+        if !(alpha >= ALPHA_MIN) {
+            continue;
+        }
+        let weight = alpha * light;
+        light -= weight;
+        if is_median {
+            if light < 0.5 {
+                return row;
+            }
+        } else if weight > most {
+            most = weight;
+            best = row;
+        }
+        if light <= 1e-4 {
+            break;
+        }
+    }
+    return best;
+}
+
+// Where the ray through `at` comes closest to the row, in its Mahalanobis metric; w: the depth there.
+fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
+    let ratio = (at - frame.lens.zw) / frame.lens.xy;
+    // Camera z along this vector is 1, so that the parameter of the ray is the depth.
+    let ray = frame.rotation[0].xyz * ratio.x + frame.rotation[1].xyz * ratio.y + frame.rotation[2].xyz;
+    let base = 12u * row;
+    let mean = vec3(params[base], params[base + 1u], params[base + 2u]);
+    let scale = vec3(
+        exp_exact(params[base + 3u]),
+        exp_exact(params[base + 4u]),
+        exp_exact(params[base + 5u]),
+    );
+    let back = vec4(params[base + 6u], -params[base + 7u], -params[base + 8u], -params[base + 9u]);
+    let direction = rotate(back, ray) / scale;
+    let offset = rotate(back, frame.centre.xyz - mean) / scale;
+    let depth = -dot(direction, offset) / dot(direction, direction);
+    if !below(depth, LARGEST) || depth <= frame.centre.w {
+        return vec4(0.0);
+    }
+    return vec4(frame.centre.xyz + ray * depth, depth);
+}

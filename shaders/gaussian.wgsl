@@ -1,0 +1,200 @@
+// A row's projection and its colour, for the forward and the backward pass: the functions of
+// src/backend/cpu/project.rs. Why the formulas are as they are is told there.
+
+@group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> sh0: array<f32>;
+@group(0) @binding(3) var<storage, read> sh1: array<f32>;
+@group(0) @binding(4) var<storage, read> sh2: array<f32>;
+@group(0) @binding(5) var<storage, read> sh3: array<f32>;
+
+const BLUR: f32 = 0.3;
+const LOG2_255: f32 = 7.9943534;
+const FOLD: f32 = 0.8493218;
+const COLOUR_MAX: f32 = 1e6;
+
+struct Row {
+    mean: vec3<f32>,
+    log_scale: vec3<f32>,
+    // w, x, y, z.
+    quat: vec4<f32>,
+    logit: f32,
+}
+
+fn load_row(row: u32) -> Row {
+    let a = rows[3u * row];
+    let b = rows[3u * row + 1u];
+    let c = rows[3u * row + 2u];
+    return Row(a.xyz, vec3(a.w, b.x, b.y), vec4(b.z, b.w, c.x, c.y), c.z);
+}
+
+// log2 of x in [1, 2]; absolute error below 3e-7.
+fn log2_of_1_to_2(x: f32) -> f32 {
+    let t = (x - 1.0) / (x + 1.0);
+    let t2 = t * t;
+    var p = fma(1.0 / 13.0, t2, 1.0 / 11.0);
+    p = fma(p, t2, 1.0 / 9.0);
+    p = fma(p, t2, 1.0 / 7.0);
+    p = fma(p, t2, 1.0 / 5.0);
+    p = fma(p, t2, 1.0 / 3.0);
+    p = fma(p, t2, 1.0);
+    return t * p * (2.0 * LOG2_E);
+}
+
+fn log2_sigmoid(x: f32) -> f32 {
+    return min(x, 0.0) * LOG2_E - log2_of_1_to_2(1.0 + exp_exact(-abs(x)));
+}
+
+// Everything of the forward projection that the backward pass needs again.
+struct Geometry {
+    scale: vec3<f32>,
+    quat: vec4<f32>,
+    quat_inv_norm: f32,
+    axis0: vec3<f32>,
+    axis1: vec3<f32>,
+    axis2: vec3<f32>,
+    p: vec3<f32>,
+    inv_z: f32,
+    ratio: vec2<f32>,
+    clamped: vec2<f32>,
+    // n[i][k] = (row i of J·W) · (axis k); V = n · scale.
+    n0: vec3<f32>,
+    n1: vec3<f32>,
+    // Covariance with blur (a, b, c), and its determinant.
+    cov: vec3<f32>,
+    det: f32,
+}
+
+// a·b − c·d with the rounding error of the second product given back (Kahan).
+fn difference_of_products(a: f32, b: f32, c: f32, d: f32) -> f32 {
+    let cd = c * d;
+    let error = fma(-c, d, cd);
+    return fma(a, b, -cd) + error;
+}
+
+fn geometry(row: Row) -> Geometry {
+    var g: Geometry;
+    g.scale = vec3(exp_exact(row.log_scale.x), exp_exact(row.log_scale.y), exp_exact(row.log_scale.z));
+    g.quat_inv_norm = 1.0 / sqrt(dot(row.quat, row.quat));
+    g.quat = row.quat * g.quat_inv_norm;
+    let w = g.quat.x;
+    let x = g.quat.y;
+    let y = g.quat.z;
+    let z = g.quat.w;
+    g.axis0 = vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y));
+    g.axis1 = vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x));
+    g.axis2 = vec3(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+    let r0 = frame.rotation[0];
+    let r1 = frame.rotation[1];
+    let r2 = frame.rotation[2];
+    g.p = vec3(
+        dot(r0.xyz, row.mean) + r0.w,
+        dot(r1.xyz, row.mean) + r1.w,
+        dot(r2.xyz, row.mean) + r2.w,
+    );
+    g.inv_z = 1.0 / g.p.z;
+    g.ratio = g.p.xy * g.inv_z;
+    g.clamped = min(max(g.ratio, frame.ratio.xy), frame.ratio.zw);
+    let b0 = frame.lens.x * g.inv_z * (r0.xyz - g.clamped.x * r2.xyz);
+    let b1 = frame.lens.y * g.inv_z * (r1.xyz - g.clamped.y * r2.xyz);
+    g.n0 = vec3(dot(b0, g.axis0), dot(b0, g.axis1), dot(b0, g.axis2));
+    g.n1 = vec3(dot(b1, g.axis0), dot(b1, g.axis1), dot(b1, g.axis2));
+    let v0 = g.n0 * g.scale;
+    let v1 = g.n1 * g.scale;
+    let a = dot(v0, v0);
+    let d = dot(v1, v1);
+    let across = vec3(
+        difference_of_products(v0.y, v1.z, v0.z, v1.y),
+        difference_of_products(v0.z, v1.x, v0.x, v1.z),
+        difference_of_products(v0.x, v1.y, v0.y, v1.x),
+    );
+    g.det = dot(across, across) + (a + d) * BLUR + BLUR * BLUR;
+    g.cov = vec3(a + BLUR, dot(v0, v1), d + BLUR);
+    return g;
+}
+
+// Unfolded conic factor (l1, r, l3).
+fn conic(g: Geometry) -> vec3<f32> {
+    return vec3(sqrt(g.cov.z / g.det), g.cov.y / g.cov.z, 1.0 / sqrt(g.cov.z));
+}
+
+// Unit vector from the camera to the mean; w: 1/distance. All 0 where they coincide.
+fn direction(mean: vec3<f32>) -> vec4<f32> {
+    let v = mean - frame.centre.xyz;
+    let norm2 = dot(v, v);
+    // Below this the square has lost its bits; the direction is then undefined and its gradient 0.
+    if norm2 > 1e-30 {
+        let inv = 1.0 / sqrt(norm2);
+        return vec4(v * inv, inv);
+    }
+    return vec4(0.0);
+}
+
+const C0: f32 = 0.28209479;
+const C1: f32 = 0.48860251;
+const C20: f32 = 1.0925484;
+const C22: f32 = 0.31539157;
+const C24: f32 = 0.5462742;
+const C30: f32 = -0.5900436;
+const C31: f32 = 2.8906114;
+const C32: f32 = -0.4570458;
+const C33: f32 = 0.37317633;
+const C35: f32 = 1.4453057;
+
+// Basis functions at the unit vector d; see src/sh.rs.
+fn basis(degree: u32, d: vec3<f32>) -> array<f32, 16> {
+    var y: array<f32, 16>;
+    y[0] = C0;
+    if degree >= 1u {
+        y[1] = -C1 * d.y;
+        y[2] = C1 * d.z;
+        y[3] = -C1 * d.x;
+    }
+    let xx = d.x * d.x;
+    let yy = d.y * d.y;
+    let zz = d.z * d.z;
+    if degree >= 2u {
+        y[4] = C20 * d.x * d.y;
+        y[5] = -C20 * d.y * d.z;
+        y[6] = C22 * (2.0 * zz - xx - yy);
+        y[7] = -C20 * d.x * d.z;
+        y[8] = C24 * (xx - yy);
+    }
+    if degree >= 3u {
+        y[9] = C30 * d.y * (3.0 * xx - yy);
+        y[10] = C31 * d.x * d.y * d.z;
+        y[11] = C32 * d.y * (4.0 * zz - xx - yy);
+        y[12] = C33 * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
+        y[13] = C32 * d.x * (4.0 * zz - xx - yy);
+        y[14] = C35 * d.z * (xx - yy);
+        y[15] = C30 * d.x * (xx - 3.0 * yy);
+    }
+    return y;
+}
+
+// Coefficient k of the three channels.
+fn coefficient(row: u32, k: u32) -> vec3<f32> {
+    if k == 0u {
+        let at = 3u * row;
+        return vec3(sh0[at], sh0[at + 1u], sh0[at + 2u]);
+    }
+    if k < 4u {
+        let at = 9u * row + 3u * (k - 1u);
+        return vec3(sh1[at], sh1[at + 1u], sh1[at + 2u]);
+    }
+    if k < 9u {
+        let at = 15u * row + 3u * (k - 4u);
+        return vec3(sh2[at], sh2[at + 1u], sh2[at + 2u]);
+    }
+    let at = 21u * row + 3u * (k - 9u);
+    return vec3(sh3[at], sh3[at + 1u], sh3[at + 2u]);
+}
+
+// 1/2 + the sum of Y_k·sh_k per channel, before the clamp at 0.
+fn raw_colour(row: u32, degree: u32, y: ptr<function, array<f32, 16>>) -> vec3<f32> {
+    var colour = vec3(0.5);
+    let count = (degree + 1u) * (degree + 1u);
+    for (var k = 0u; k < count; k++) {
+        colour += (*y)[k] * coefficient(row, k);
+    }
+    return colour;
+}

@@ -1,0 +1,155 @@
+// Stage 6: splat gradients to parameter gradients, one row per invocation;
+// src/backend/cpu/project_bwd.rs tells where the formulas come from.
+
+// Sums of the records, one record per row.
+@group(0) @binding(6) var<storage, read> row_sums: array<f32>;
+@group(0) @binding(7) var<storage, read> depths: array<u32>;
+// Five per row: by mean and log-scale x | log-scale y, z, quaternion w, x | quaternion y, z, logit,
+// projected mean x | colour (through its clamp), projected mean y | direction of view, unused.
+@group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
+
+override DETAIL: u32 = 0u;
+
+@compute @workgroup_size(256)
+fn project_bwd(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= frame.model.x {
+        return;
+    }
+    if depths[i] == NONE {
+        for (var k = 0u; k < 5u; k++) {
+            gradient[5u * i + k] = vec4(0.0);
+        }
+        return;
+    }
+    let stride = select(select(9u, 10u, DETAIL == 1u), 15u, DETAIL == 2u);
+    let at = i * stride;
+    let row = load_row(i);
+    let g = geometry(row);
+    let factor = conic(g);
+    let l1 = factor.x;
+    let shear = factor.y;
+    let l3 = factor.z;
+    // Out of the folded units of the rasteriser.
+    let unfold = 1.0 / FOLD;
+    let q = row_sums[at];
+    let qu = row_sums[at + 1u] * unfold;
+    let qz = row_sums[at + 2u] * unfold;
+    let muu = row_sums[at + 3u] * (unfold * unfold);
+    let muz = row_sums[at + 4u] * (unfold * unfold);
+    let mzz = row_sums[at + 5u] * (unfold * unfold);
+
+    // Projected mean: L·Σ q·(u, z).
+    let dm = vec2(l1 * qu, l3 * qz - l1 * shear * qu);
+    // Columns of W without their scales, M·n, and so on.
+    let n0 = l1 * (g.n0 - shear * g.n1);
+    let n1 = l3 * g.n1;
+    let mn0 = muu * n0 + muz * n1;
+    let mn1 = muz * n0 + mzz * n1;
+    let scale2 = g.scale * g.scale;
+    let by_log_scale = (n0 * mn0 + n1 * mn1) * scale2;
+    // About axis i, with j and k after it.
+    let turn = (n0.yzx * mn0.zxy + n1.yzx * mn1.zxy) * (scale2.yzx - scale2.zxy);
+    let v = g.quat.yzw;
+    let two = 2.0 * g.quat_inv_norm;
+    let by_w = -dot(v, turn) * two;
+    let by_v = (g.quat.x * turn + cross(v, turn)) * two;
+
+    // dL/d(row i of J·W) = Σ_k (L·M·n)[i][k]·sₖ²·axisₖ.
+    let d0 = l1 * mn0 * scale2;
+    let d1 = (l3 * mn1 - l1 * shear * mn0) * scale2;
+    let db0 = d0.x * g.axis0 + d0.y * g.axis1 + d0.z * g.axis2;
+    let db1 = d1.x * g.axis0 + d1.y * g.axis1 + d1.z * g.axis2;
+    let r0 = frame.rotation[0].xyz;
+    let r1 = frame.rotation[1].xyz;
+    let r2 = frame.rotation[2].xyz;
+    let j00 = dot(db0, r0);
+    let j02 = dot(db0, r2);
+    let j11 = dot(db1, r1);
+    let j12 = dot(db1, r2);
+    // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
+    let by_inv_z = frame.lens.x * (j00 - g.clamped.x * j02) + frame.lens.y * (j11 - g.clamped.y * j12);
+    let free = g.clamped == g.ratio;
+    let by_ratio = frame.lens.xy * (dm - select(vec2(0.0), g.inv_z * vec2(j02, j12), free));
+    var by_depth = 0.0;
+    if DETAIL == 2u {
+        by_depth = row_sums[at + 13u];
+    }
+    let dp = vec3(
+        by_ratio * g.inv_z,
+        by_depth - g.inv_z * (dot(by_ratio, g.ratio) + g.inv_z * by_inv_z),
+    );
+
+    // Colour: through the clamp at 0 to the coefficients, and through the direction to the mean.
+    let degree = frame.model.y;
+    let towards = direction(row.mean);
+    let d = towards.xyz;
+    var y = basis(degree, d);
+    let raw = raw_colour(i, degree, &y);
+    let by_colour = vec3(row_sums[at + 6u], row_sums[at + 7u], row_sums[at + 8u]);
+    let dc = select(vec3(0.0), by_colour, raw > vec3(0.0));
+    let by_d = direction_gradient(i, degree, d, dc);
+    let from_d = (by_d - dot(by_d, d) * d) * towards.w;
+    let by_mean = r0 * dp.x + r1 * dp.y + r2 * dp.z + from_d;
+
+    // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
+    let by_logit = q / (1.0 + exp_exact(row.logit));
+
+    gradient[5u * i] = vec4(by_mean, by_log_scale.x);
+    gradient[5u * i + 1u] = vec4(by_log_scale.yz, by_w, by_v.x);
+    gradient[5u * i + 2u] = vec4(by_v.yz, by_logit, dm.x);
+    gradient[5u * i + 3u] = vec4(dc, dm.y);
+    gradient[5u * i + 4u] = vec4(d, 0.0);
+}
+
+// Σ_k (dc·sh_k) ∇Y_k(d); see src/sh.rs.
+fn direction_gradient(row: u32, degree: u32, d: vec3<f32>, dc: vec3<f32>) -> vec3<f32> {
+    if degree == 0u {
+        return vec3(0.0);
+    }
+    var by = C1 * vec3(
+        -dot(dc, coefficient(row, 3u)),
+        -dot(dc, coefficient(row, 1u)),
+        dot(dc, coefficient(row, 2u)),
+    );
+    if degree == 1u {
+        return by;
+    }
+    let g4 = C20 * dot(dc, coefficient(row, 4u));
+    let g5 = -C20 * dot(dc, coefficient(row, 5u));
+    let g6 = 2.0 * C22 * dot(dc, coefficient(row, 6u));
+    let g7 = -C20 * dot(dc, coefficient(row, 7u));
+    let g8 = 2.0 * C24 * dot(dc, coefficient(row, 8u));
+    by += vec3(
+        g4 * d.y - g6 * d.x + g7 * d.z + g8 * d.x,
+        g4 * d.x + g5 * d.z - g6 * d.y - g8 * d.y,
+        g5 * d.y + 2.0 * g6 * d.z + g7 * d.x,
+    );
+    if degree == 2u {
+        return by;
+    }
+    let xx = d.x * d.x;
+    let yy = d.y * d.y;
+    let zz = d.z * d.z;
+    let xy = d.x * d.y;
+    let yz = d.y * d.z;
+    let xz = d.x * d.z;
+    let g9 = 3.0 * C30 * dot(dc, coefficient(row, 9u));
+    let g10 = C31 * dot(dc, coefficient(row, 10u));
+    let g11 = C32 * dot(dc, coefficient(row, 11u));
+    let g12 = 3.0 * C33 * dot(dc, coefficient(row, 12u));
+    let g13 = C32 * dot(dc, coefficient(row, 13u));
+    let g14 = C35 * dot(dc, coefficient(row, 14u));
+    let g15 = 3.0 * C30 * dot(dc, coefficient(row, 15u));
+    by += vec3(
+        2.0 * g9 * xy + g10 * yz - 2.0 * g11 * xy - 2.0 * g12 * xz
+            + g13 * (4.0 * zz - 3.0 * xx - yy) + 2.0 * g14 * xz + g15 * (xx - yy),
+        g9 * (xx - yy) + g10 * xz + g11 * (4.0 * zz - xx - 3.0 * yy) - 2.0 * g12 * yz
+            - 2.0 * g13 * xy - 2.0 * g14 * yz - 2.0 * g15 * xy,
+        g10 * xy + 8.0 * g11 * yz + g12 * (2.0 * zz - xx - yy) + 8.0 * g13 * xz + g14 * (xx - yy),
+    );
+    return by;
+}

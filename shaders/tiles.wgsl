@@ -1,0 +1,518 @@
+// Stage 2: splats to tile lists; src/backend/cpu/tiles.rs. The rows on screen are sorted by depth,
+// their entries emitted in that order, and these sorted by tile, stably: so each tile's list is
+// sorted by depth, ties by row. The footprint of a row was evaluated once, in project.wgsl; what
+// counts entries and what emits them are whole numbers, and cannot disagree.
+//
+// The file is one piece: lists, sums and sorts share their buffers and the counts that drive them.
+//
+// Sums and sorts are exact and have one order, so that nothing here depends on timing. An entry's
+// place before it is sorted is its slot: a row's slots lie side by side, tile after tile.
+
+@group(0) @binding(1) var<storage, read_write> state: State;
+// Groups of indirect dispatches, three numbers each; see ARGS_*.
+@group(0) @binding(2) var<storage, read_write> groups_of: array<u32>;
+@group(0) @binding(3) var<storage, read> depths: array<u32>;
+@group(0) @binding(4) var<storage, read> footprints: array<vec4<u32>>;
+@group(0) @binding(5) var<storage, read> keys_in: array<u32>;
+@group(0) @binding(6) var<storage, read> values_in: array<u32>;
+@group(0) @binding(7) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(8) var<storage, read_write> values_out: array<u32>;
+// Numbers to be summed, then the sums within their block of 2,048.
+@group(0) @binding(9) var<storage, read_write> sums: array<u32>;
+// Sums of the blocks before each block.
+@group(0) @binding(10) var<storage, read_write> block_sums: array<u32>;
+// Rows on screen, front to back.
+@group(0) @binding(11) var<storage, read> order: array<u32>;
+@group(0) @binding(12) var<storage, read_write> row_of_slot: array<u32>;
+// First slot and number of slots of each row.
+@group(0) @binding(13) var<storage, read_write> slots_of_row: array<vec2<u32>>;
+@group(0) @binding(14) var<storage, read_write> tile_starts: array<u32>;
+@group(0) @binding(15) var<storage, read_write> tile_counts: array<atomic<u32>>;
+
+// Items per group in sums and sorts.
+const BLOCK: u32 = 2048u;
+const EACH: u32 = 8u;
+// Where sums saturate: beyond any cap.
+const MOST: u32 = 0x40000000u;
+
+// Places in groups_of.
+const ARGS_ROWS: u32 = 0u;
+const ARGS_ROW_BLOCKS: u32 = 3u;
+const ARGS_ROW_DIGITS: u32 = 6u;
+const ARGS_ENTRY_BLOCKS: u32 = 9u;
+const ARGS_ENTRY_DIGITS: u32 = 12u;
+
+// What is summed (now.a of scan_blocks and scan_sums).
+const FLAGS: u32 = 0u;
+const COUNTS_ALL: u32 = 1u;
+const COUNTS_BAND: u32 = 2u;
+const COUNTS_AGAIN: u32 = 3u;
+const DIGITS_OF_ROWS: u32 = 4u;
+const DIGITS_OF_ENTRIES: u32 = 5u;
+
+fn ceil_div(a: u32, b: u32) -> u32 {
+    return (a + b - 1u) / b;
+}
+
+fn set_groups(at: u32, count: u32) {
+    groups_of[at] = min(count, ACROSS);
+    groups_of[at + 1u] = ceil_div(count, ACROSS);
+    groups_of[at + 2u] = 1u;
+}
+
+// --- Sums ---------------------------------------------------------------------------------------
+
+var<workgroup> partial: array<u32, 256>;
+
+fn saturating(a: u32, b: u32) -> u32 {
+    return min(a + b, MOST);
+}
+
+// The sum of the values of the invocations before this one; the sum of all is then partial[255].
+fn sum_before(lane: u32, value: u32) -> u32 {
+    partial[lane] = value;
+    workgroupBarrier();
+    for (var step = 1u; step < GROUP; step *= 2u) {
+        var sum = partial[lane];
+        if lane >= step {
+            sum = saturating(sum, partial[lane - step]);
+        }
+        workgroupBarrier();
+        partial[lane] = sum;
+        workgroupBarrier();
+    }
+    var before = 0u;
+    if lane > 0u {
+        before = partial[lane - 1u];
+    }
+    return before;
+}
+
+// How many numbers are summed.
+fn count_of(what: u32) -> u32 {
+    switch what {
+        case FLAGS: { return frame.model.x; }
+        case DIGITS_OF_ROWS: { return 16u * ceil_div(state.visible, BLOCK); }
+        case DIGITS_OF_ENTRIES: { return 16u * ceil_div(state.held, BLOCK); }
+        default: { return state.visible; }
+    }
+}
+
+@compute @workgroup_size(256)
+fn scan_blocks(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let block = group_of(id);
+    let count = count_of(now.a);
+    let first = block * BLOCK + lane * EACH;
+    var values: array<u32, 8>;
+    var sum = 0u;
+    for (var k = 0u; k < EACH; k++) {
+        let i = first + k;
+        var value = 0u;
+        if i < count {
+            if now.a == FLAGS {
+                value = select(0u, 1u, depths[i] != NONE);
+            } else {
+                value = sums[i];
+            }
+        }
+        values[k] = value;
+        sum = saturating(sum, value);
+    }
+    var before = sum_before(lane, sum);
+    for (var k = 0u; k < EACH; k++) {
+        let i = first + k;
+        if i < count {
+            sums[i] = before;
+        }
+        before = saturating(before, values[k]);
+    }
+    if lane == 255u && block * BLOCK < count {
+        block_sums[block] = before;
+    }
+}
+
+// One group: sums over blocks, and what follows from the total.
+@compute @workgroup_size(256)
+fn scan_sums(@builtin(local_invocation_index) lane: u32) {
+    let blocks = ceil_div(count_of(now.a), BLOCK);
+    var carry = 0u;
+    for (var start = 0u; start < blocks; start += BLOCK) {
+        let first = start + lane * EACH;
+        var values: array<u32, 8>;
+        var sum = 0u;
+        for (var k = 0u; k < EACH; k++) {
+            var value = 0u;
+            if first + k < blocks {
+                value = block_sums[first + k];
+            }
+            values[k] = value;
+            sum = saturating(sum, value);
+        }
+        var before = saturating(carry, sum_before(lane, sum));
+        carry = saturating(carry, partial[255]);
+        for (var k = 0u; k < EACH; k++) {
+            if first + k < blocks {
+                block_sums[first + k] = before;
+            }
+            before = saturating(before, values[k]);
+        }
+        workgroupBarrier();
+    }
+    if lane == 0u {
+        conclude(carry);
+    }
+}
+
+// now.b: bands that were encoded.
+fn conclude(total: u32) {
+    switch now.a {
+        case FLAGS: {
+            state.visible = total;
+            set_groups(ARGS_ROWS, ceil_div(total, GROUP));
+            let blocks = ceil_div(total, BLOCK);
+            set_groups(ARGS_ROW_BLOCKS, blocks);
+            set_groups(ARGS_ROW_DIGITS, ceil_div(16u * blocks, BLOCK));
+            state.entries_low = 0u;
+            state.entries_high = 0u;
+            state.short = 0u;
+            state.bands = 1u;
+        }
+        case COUNTS_ALL: {
+            state.total = total;
+            if now.b == 1u {
+                // One band was encoded. If it does not do, there are no entries, and nobody steps.
+                let fits = total <= frame.model.z;
+                state.short = select(1u, 0u, fits);
+                state.cuts[0] = 0u;
+                state.cuts[1] = frame.image.w;
+                hold(select(0u, total, fits), true);
+            }
+        }
+        case COUNTS_BAND: { hold(total, true); }
+        case COUNTS_AGAIN: { hold(total, false); }
+        default: {}
+    }
+}
+
+// Sets the number of entries of the band at hand.
+fn hold(held: u32, is_news: bool) {
+    state.held = held;
+    let blocks = ceil_div(held, BLOCK);
+    set_groups(ARGS_ENTRY_BLOCKS, blocks);
+    set_groups(ARGS_ENTRY_DIGITS, ceil_div(16u * blocks, BLOCK));
+    if is_news {
+        let low = state.entries_low + held;
+        state.entries_high += select(0u, 1u, low < held);
+        state.entries_low = low;
+    }
+}
+
+fn summed(i: u32) -> u32 {
+    return saturating(sums[i], block_sums[i / BLOCK]);
+}
+
+// --- Rows ---------------------------------------------------------------------------------------
+
+// Rows on screen, in order of their numbers, with their depths.
+@compute @workgroup_size(256)
+fn compact(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row < frame.model.x && depths[row] != NONE {
+        let to = summed(row);
+        keys_out[to] = depths[row];
+        values_out[to] = row;
+    }
+}
+
+// A run of tiles of one line of a footprint: columns first..=last.
+struct Run {
+    first: u32,
+    last: u32,
+}
+
+// Block `bit` of a line of blocks, as far as it lies in the footprint and in the band's tiles
+// low..high; empty (first > last) if it does not. `before` is the line's first tile.
+fn run_of(x0: u32, x1: u32, wide: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
+    var first = x0 + (bit << wide);
+    var last = min(first + (1u << wide) - 1u, x1);
+    if before + last < low || before + first >= high {
+        return Run(1u, 0u);
+    }
+    if before + first < low {
+        first = low - before;
+    }
+    if before + last >= high {
+        last = high - 1u - before;
+    }
+    return Run(first, last);
+}
+
+// The band's tiles; now.a: the band, NONE for the whole image.
+fn band() -> vec2<u32> {
+    if now.a == NONE {
+        return vec2(0u, frame.image.w);
+    }
+    return vec2(state.cuts[now.a], state.cuts[now.a + 1u]);
+}
+
+// Entries per row, front to back.
+@compute @workgroup_size(256)
+fn count_entries(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= state.visible {
+        return;
+    }
+    let f = footprints[order[i]];
+    let tiles = band();
+    let y0 = f.y & 0xffffu;
+    var count = 0u;
+    for (var y = y0; y <= f.y >> 16u; y++) {
+        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
+        while bits != 0u {
+            let bit = countTrailingZeros(bits);
+            bits &= bits - 1u;
+            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, y * frame.image.z, tiles.x, tiles.y);
+            if run.first <= run.last {
+                count += run.last - run.first + 1u;
+            }
+        }
+    }
+    sums[i] = min(count, MOST);
+}
+
+// Writes the entries: tile and row per slot, slots per row.
+@compute @workgroup_size(256)
+fn emit_entries(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    // With more entries than fit, none was held.
+    if i >= state.visible || state.held == 0u {
+        if i < state.visible {
+            slots_of_row[order[i]] = vec2(0u, 0u);
+        }
+        return;
+    }
+    let row = order[i];
+    let f = footprints[row];
+    let tiles = band();
+    let y0 = f.y & 0xffffu;
+    let first_slot = summed(i);
+    var slot = first_slot;
+    for (var y = y0; y <= f.y >> 16u; y++) {
+        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
+        while bits != 0u {
+            let bit = countTrailingZeros(bits);
+            bits &= bits - 1u;
+            let before = y * frame.image.z;
+            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, tiles.x, tiles.y);
+            for (var x = run.first; x <= run.last; x++) {
+                keys_out[slot] = before + x;
+                row_of_slot[slot] = row;
+                slot++;
+            }
+        }
+    }
+    slots_of_row[row] = vec2(first_slot, slot - first_slot);
+}
+
+// --- Bands --------------------------------------------------------------------------------------
+
+// Entries per tile of the whole image.
+@compute @workgroup_size(256)
+fn count_tiles(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    if i >= state.visible {
+        return;
+    }
+    let f = footprints[order[i]];
+    let y0 = f.y & 0xffffu;
+    for (var y = y0; y <= f.y >> 16u; y++) {
+        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
+        while bits != 0u {
+            let bit = countTrailingZeros(bits);
+            bits &= bits - 1u;
+            let before = y * frame.image.z;
+            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, 0u, frame.image.w);
+            for (var x = run.first; x <= run.last; x++) {
+                atomicAdd(&tile_counts[before + x], 1u);
+            }
+        }
+    }
+}
+
+// Cuts the tiles into bands whose lists fit the cap; now.b: bands that were encoded. A single list
+// always fits, since the cap is at least the budget.
+@compute @workgroup_size(1)
+fn cut_bands() {
+    let cap = frame.model.z;
+    var held = 0u;
+    var band = 0u;
+    state.cuts[0] = 0u;
+    for (var tile = 0u; tile < frame.image.w; tile++) {
+        let here = atomicLoad(&tile_counts[tile]);
+        if held + here > cap {
+            band++;
+            held = 0u;
+            if band < now.b {
+                state.cuts[band] = tile;
+            }
+        }
+        held += here;
+    }
+    state.bands = band + 1u;
+    let fits = band < now.b;
+    state.short = select(1u, 0u, fits);
+    for (var k = 0u; k <= now.b; k++) {
+        if !fits {
+            state.cuts[k] = 0u;
+        } else if k > band {
+            state.cuts[k] = frame.image.w;
+        }
+    }
+}
+
+// --- Stable sort, four bits at a time; now.a: shift, now.b: 1 to sort entries, 0 to sort rows,
+// now.c: 1 where the values are the places -----------------------------------------------------------
+
+var<workgroup> histogram: array<atomic<u32>, 16>;
+
+fn items() -> u32 {
+    return select(state.visible, state.held, now.b == 1u);
+}
+
+fn digit_of(key: u32) -> u32 {
+    return (key >> now.a) & 15u;
+}
+
+@compute @workgroup_size(256)
+fn count_digits(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let block = group_of(id);
+    let count = items();
+    if lane < 16u {
+        atomicStore(&histogram[lane], 0u);
+    }
+    workgroupBarrier();
+    let first = block * BLOCK + lane * EACH;
+    for (var k = 0u; k < EACH; k++) {
+        if first + k < count {
+            atomicAdd(&histogram[digit_of(keys_in[first + k])], 1u);
+        }
+    }
+    workgroupBarrier();
+    let blocks = ceil_div(count, BLOCK);
+    if lane < 16u && block < blocks {
+        sums[lane * blocks + block] = atomicLoad(&histogram[lane]);
+    }
+}
+
+// Counters of digits d and d + 8 of each invocation, in the halves of one word.
+var<workgroup> counters: array<u32, 2048>;
+// Place of each digit within its block.
+var<workgroup> digit_starts: array<u32, 16>;
+
+@compute @workgroup_size(256)
+fn scatter(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let block = group_of(id);
+    let count = items();
+    let first = block * BLOCK + lane * EACH;
+    for (var k = 0u; k < 8u; k++) {
+        counters[k * GROUP + lane] = 0u;
+    }
+    var keys: array<u32, 8>;
+    for (var k = 0u; k < EACH; k++) {
+        if first + k < count {
+            keys[k] = keys_in[first + k];
+            let digit = digit_of(keys[k]);
+            counters[(digit & 7u) * GROUP + lane] += 1u << (16u * (digit >> 3u));
+        }
+    }
+    workgroupBarrier();
+    // Sums over digits first, then invocations; the upper halves go on where the lower ones end.
+    var sum = 0u;
+    for (var k = 0u; k < 8u; k++) {
+        sum += counters[lane * 8u + k];
+    }
+    partial[lane] = sum;
+    workgroupBarrier();
+    for (var step = 1u; step < GROUP; step *= 2u) {
+        var value = partial[lane];
+        if lane >= step {
+            value += partial[lane - step];
+        }
+        workgroupBarrier();
+        partial[lane] = value;
+        workgroupBarrier();
+    }
+    var running = partial[lane] - sum + (partial[255] << 16u);
+    for (var k = 0u; k < 8u; k++) {
+        let value = counters[lane * 8u + k];
+        counters[lane * 8u + k] = running;
+        running += value;
+    }
+    workgroupBarrier();
+    if lane < 16u {
+        digit_starts[lane] = (counters[(lane & 7u) * GROUP] >> (16u * (lane >> 3u))) & 0xffffu;
+    }
+    workgroupBarrier();
+    let blocks = ceil_div(count, BLOCK);
+    for (var k = 0u; k < EACH; k++) {
+        let i = first + k;
+        if i < count {
+            let digit = digit_of(keys[k]);
+            let word = (digit & 7u) * GROUP + lane;
+            let half = 16u * (digit >> 3u);
+            let place = (counters[word] >> half) & 0xffffu;
+            counters[word] += 1u << half;
+            let to = summed(digit * blocks + block) + place - digit_starts[digit];
+            keys_out[to] = keys[k];
+            if now.c == 1u {
+                values_out[to] = i;
+            } else {
+                values_out[to] = values_in[i];
+            }
+        }
+    }
+}
+
+// The first entry of each tile, by bisection of the sorted keys; one more for the end.
+@compute @workgroup_size(256)
+fn find_tiles(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let tile = group_of(id) * GROUP + lane;
+    if tile > frame.image.w {
+        return;
+    }
+    var low = 0u;
+    var high = state.held;
+    while low < high {
+        let middle = (low + high) / 2u;
+        if keys_in[middle] < tile {
+            low = middle + 1u;
+        } else {
+            high = middle;
+        }
+    }
+    tile_starts[tile] = low;
+}

@@ -1,0 +1,99 @@
+// What all stages share: the view at hand and the numbers of a step (one uniform buffer), the
+// scalars that stay on the device (one storage buffer), how work is numbered, and e^x.
+
+struct Frame {
+    // Rows of camera_from_world's rotation; w: its translation.
+    rotation: array<vec4<f32>, 3>,
+    // The camera's centre; w: near plane.
+    centre: vec4<f32>,
+    // Focal lengths, principal point [px].
+    lens: vec4<f32>,
+    // Least and greatest x/z, y/z in J: (x, y, x, y).
+    ratio: vec4<f32>,
+    background: vec4<f32>,
+    // Width, height [px], columns of tiles, tiles.
+    image: vec4<u32>,
+    // Rows, degree evaluated now, cap on tile entries, budget.
+    model: vec4<u32>,
+    // Step sizes: mean, log-scale, quaternion, opacity.
+    rates: vec4<f32>,
+    // Step sizes of band 0 and of bands 1-3; derivative of the opacity and of the scale term per row.
+    more_rates: vec4<f32>,
+    // Strength times step size, sharpness, opacity.
+    noise: vec4<f32>,
+    // Seed, step, bits of what is due (see adam.wgsl), kind of target (see loss.wgsl).
+    draw: vec4<u32>,
+    // Planes of the signals' accumulators, NONE where not asked for.
+    planes: array<vec4<u32>, 4>,
+}
+
+struct State {
+    // Rows on screen.
+    visible: u32,
+    // Entries of the whole image, saturated at 2^30.
+    total: u32,
+    // Bands that the image needs.
+    bands: u32,
+    // 1: more bands are needed than were encoded; the step must change nothing.
+    short: u32,
+    // Entries of all bands, as one number of 64 bits.
+    entries_low: u32,
+    entries_high: u32,
+    // Entries of the band at hand.
+    held: u32,
+    spare: u32,
+    // Means over pixels and channels.
+    l1: f32,
+    ssim: f32,
+    spare_f: vec2<f32>,
+    // Band b has the tiles cuts[b]..cuts[b + 1].
+    cuts: array<u32>,
+}
+
+// What differs between dispatches of one kernel.
+struct Now {
+    a: u32,
+    b: u32,
+    c: u32,
+    d: u32,
+}
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+var<immediate> now: Now;
+
+const NONE: u32 = 0xffffffffu;
+const TILE: u32 = 16u;
+const GROUP: u32 = 256u;
+
+// Workgroups in the first of two dimensions, each of which has at most 65,535 of them. It is a
+// constant because DX12 does not tell an indirect dispatch how many there are.
+const ACROSS: u32 = 32768u;
+
+fn group_of(id: vec3<u32>) -> u32 {
+    return id.x + id.y * ACROSS;
+}
+
+// |x| <= most; false for NaN and infinity. By bits: WGSL may assume that there is no NaN.
+fn below(x: f32, most: f32) -> bool {
+    return (bitcast<u32>(x) & 0x7fffffffu) <= bitcast<u32>(most);
+}
+
+const LARGEST: f32 = 3.4028234e38;
+
+const LOG2_E: f32 = 1.44269504;
+
+// e^x, x clamped to [-87, 88]; relative error below 2e-7, where a device's own may lose more.
+fn exp_exact(wide: f32) -> f32 {
+    let x = clamp(wide, -87.0, 88.0);
+    let n = round(x * LOG2_E);
+    // ln 2 in two parts (Cody and Waite): the first has few bits, so n times it is exact.
+    let f = fma(-n, 1.4286068e-6, fma(-n, 0.69314575, x));
+    var p = fma(1.984127e-4, f, 1.3888889e-3);
+    p = fma(p, f, 8.333334e-3);
+    p = fma(p, f, 4.1666666e-2);
+    p = fma(p, f, 1.6666667e-1);
+    p = fma(p, f, 0.5);
+    p = fma(p, f, 1.0);
+    p = fma(p, f, 1.0);
+    return bitcast<f32>(bitcast<u32>(p) + (bitcast<u32>(i32(n)) << 23u));
+}

@@ -1,0 +1,141 @@
+//! Candidates for new rows, as every backend lists them: which pixels of a view are the worst
+//! (*Gaussians on a Diet*, arXiv 2604.20046, "compensation").
+
+use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
+
+use super::{StateError, Tensor};
+
+/// The list, and what goes into it.
+#[derive(Debug)]
+pub(super) struct Candidates {
+    request: Option<CandidateRequest>,
+    list: Vec<Candidate>,
+    /// (error, pixel) of one view.
+    ranking: Vec<(f32, u32)>,
+}
+
+/// Pixels ranked beyond those wanted, so that enough remain after spacing.
+const SPARE: usize = 16;
+/// Numbers of a candidate in a checkpoint.
+const NUMBERS: usize = 8;
+
+impl Candidates {
+    pub(super) fn new(request: Option<CandidateRequest>) -> Self {
+        let capacity = request.map_or(0, |r| r.capacity);
+        Self { request, list: Vec::with_capacity(capacity), ranking: Vec::new() }
+    }
+
+    /// Bytes of the list, and of the ranking of an image of so many pixels.
+    pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
+        let ranking = pixels * size_of::<(f32, u32)>();
+        request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
+    }
+
+    pub(super) fn list(&self) -> &[Candidate] {
+        &self.list
+    }
+
+    pub(super) fn push(&mut self, candidate: Candidate) {
+        self.list.push(candidate);
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.list.clear();
+    }
+
+    /// Whether a policy wants any.
+    pub(super) fn is_wanted(&self) -> bool {
+        self.request.is_some()
+    }
+
+    /// The list as an array of a backend's state.
+    pub(super) fn tensor(&self, name: &str) -> Tensor {
+        let numbers = |c: &Candidate| {
+            let ([x, y, z], [r, g, b]) = (c.position, c.colour);
+            [x, y, z, r, g, b, c.pixel_size, c.error]
+        };
+        let values = self.list.iter().flat_map(numbers).collect();
+        Tensor::f32(name, &[self.list.len(), NUMBERS], values)
+    }
+
+    /// Takes back what [`tensor`](Self::tensor) returned.
+    pub(super) fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        let most = self.request.map_or(0, |r| r.capacity);
+        let count = tensor.shape.first().copied().unwrap_or(0);
+        if count > most {
+            return Err(tensor.error(format!("{count} of them; this run holds {most}")));
+        }
+        let values = tensor.into_f32(&[count, NUMBERS])?;
+        let candidate = |&[x, y, z, r, g, b, pixel_size, error]: &[f32; NUMBERS]| Candidate {
+            position: [x, y, z],
+            colour: [r, g, b],
+            pixel_size,
+            error,
+        };
+        self.list.clear();
+        self.list.extend(values.as_chunks().0.iter().map(candidate));
+        Ok(())
+    }
+
+    /// What to take of the view of `step`, if anything: the request, and how many.
+    pub(super) fn open(&self, step: u32, rows: usize) -> Option<(CandidateRequest, usize)> {
+        let r = self.request.filter(|r| r.from < step && step < r.until)?;
+        let count = rows / r.rows_per_candidate.max(1) as usize;
+        let room = r.capacity.saturating_sub(self.list.len());
+        Some((r, count.min(room))).filter(|&(_, count)| count > 0)
+    }
+
+    /// The `count` worst pixels, worst first; `error(x, y)` is None where no candidate may be.
+    /// Equal errors are ordered by pixel number.
+    pub(super) fn worst(
+        &mut self,
+        width: usize,
+        height: usize,
+        count: usize,
+        spaced: bool,
+        error: impl Fn(usize, usize) -> Option<f32>,
+    ) -> Vec<(usize, usize, f32)> {
+        self.ranking.clear();
+        for y in 0..height {
+            for x in 0..width {
+                if let Some(e) = error(x, y).filter(|&e| e > 0.0) {
+                    self.ranking.push((e, (y * width + x) as u32));
+                }
+            }
+        }
+        let worse = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
+        let ranked = if spaced { count.saturating_mul(SPARE) } else { count };
+        if self.ranking.len() > ranked {
+            self.ranking.select_nth_unstable_by(ranked, worse);
+            self.ranking.truncate(ranked);
+        }
+        self.ranking.sort_unstable_by(worse);
+        let is_peak = |e: f32, pixel: u32| {
+            let (x, y) = (pixel as usize % width, pixel as usize / width);
+            let (x0, x1) = (x.saturating_sub(1), (x + 1).min(width - 1));
+            let (y0, y1) = (y.saturating_sub(1), (y + 1).min(height - 1));
+            (y0..=y1).all(|ny| {
+                (x0..=x1).all(|nx| {
+                    let other = (error(nx, ny).unwrap_or(0.0), (ny * width + nx) as u32);
+                    other.1 == pixel || worse(&(e, pixel), &other).is_lt()
+                })
+            })
+        };
+        self.ranking
+            .iter()
+            .filter(|&&(e, pixel)| !spaced || is_peak(e, pixel))
+            .take(count)
+            .map(|&(e, pixel)| (pixel as usize % width, pixel as usize / width, e))
+            .collect()
+    }
+}
+
+/// Whether the error of a pixel needs the loss's error map, and then its weights of |e| and
+/// 1 − SSIM.
+pub(super) fn error_weights(mode: ErrorMode) -> Option<[f32; 2]> {
+    match mode {
+        ErrorMode::Gradient => None,
+        ErrorMode::L1 => Some([1.0, 0.0]),
+        ErrorMode::L1Dssim => Some([0.8, 0.2]),
+    }
+}

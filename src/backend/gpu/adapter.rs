@@ -1,0 +1,227 @@
+//! The adapters that there are: what they are, what they lack, and which one is taken.
+
+use wgpu::{
+    Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
+};
+
+use super::device::wait;
+use crate::backend::BackendError;
+
+/// What an adapter is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AdapterKind {
+    /// A graphics card.
+    Discrete,
+    /// Graphics that share the processor's memory.
+    Integrated,
+    /// A card that a virtual machine is lent.
+    Virtual,
+    /// A program on the processor.
+    Software,
+    /// The driver does not say.
+    Unknown,
+}
+
+/// An adapter and the limits that matter.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AdapterSummary {
+    /// As the driver names it.
+    pub name: String,
+    /// The interface: vulkan, metal, dx12.
+    pub interface: String,
+    /// The driver and its version.
+    pub driver: String,
+    /// What it is.
+    pub kind: AdapterKind,
+    /// Largest buffer that a kernel can use `[bytes]`.
+    pub largest_binding: u64,
+    /// Largest buffer `[bytes]`.
+    pub largest_buffer: u64,
+    /// What it lacks to be used, if anything.
+    pub missing: Vec<String>,
+}
+
+impl AdapterSummary {
+    fn new(adapter: &Adapter) -> Self {
+        let info = adapter.get_info();
+        let limits = adapter.limits();
+        Self {
+            kind: match info.device_type {
+                DeviceType::DiscreteGpu => AdapterKind::Discrete,
+                DeviceType::IntegratedGpu => AdapterKind::Integrated,
+                DeviceType::VirtualGpu => AdapterKind::Virtual,
+                DeviceType::Cpu => AdapterKind::Software,
+                DeviceType::Other => AdapterKind::Unknown,
+            },
+            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            interface: info.backend.to_string(),
+            name: info.name,
+            largest_binding: limits.max_storage_buffer_binding_size,
+            largest_buffer: limits.max_buffer_size,
+            missing: missing(&limits, adapter.features()),
+        }
+    }
+
+    /// Largest budget whose parameters this adapter can hold in one piece each, at a degree: one
+    /// band of the coefficients, or the geometry, or the gradients of a row.
+    #[must_use]
+    pub fn largest_budget(&self, sh_degree: u8) -> u64 {
+        let per_row = if sh_degree >= 3 { 84 } else { 80 };
+        (self.largest_binding.min(self.largest_buffer) / per_row).min(MOST_ROWS)
+    }
+
+    /// Whether `auto` may take it: a GPU that lacks nothing.
+    #[must_use]
+    pub fn is_gpu(&self) -> bool {
+        self.kind != AdapterKind::Software && self.missing.is_empty()
+    }
+}
+
+/// Rows that the numbering of work allows: 2³² bytes of nothing are indexed beyond.
+const MOST_ROWS: u64 = 1 << 25;
+
+/// What every kernel is written for; all of it is what WebGPU promises everywhere.
+const STORAGE_BUFFERS: u32 = 8;
+const INVOCATIONS: u32 = 256;
+const SHARED_BYTES: u32 = 16_384;
+const GROUPS: u32 = 65_535;
+const IMMEDIATE_BYTES: u32 = 16;
+
+fn missing(limits: &Limits, features: Features) -> Vec<String> {
+    let mut missing = Vec::new();
+    let mut need = |what: &str, has: u32, needs: u32| {
+        if has < needs {
+            missing.push(format!("{what}: {needs} needed, {has} there"));
+        }
+    };
+    need(
+        "storage buffers per kernel",
+        limits.max_storage_buffers_per_shader_stage,
+        STORAGE_BUFFERS,
+    );
+    need("invocations per workgroup", limits.max_compute_invocations_per_workgroup, INVOCATIONS);
+    need("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, SHARED_BYTES);
+    need("workgroups per dimension", limits.max_compute_workgroups_per_dimension, GROUPS);
+    need("bytes of immediate data", limits.max_immediate_size, IMMEDIATE_BYTES);
+    if !features.contains(Features::IMMEDIATES) {
+        missing.push("immediate data (push constants)".into());
+    }
+    missing
+}
+
+fn instance() -> Instance {
+    let mut descriptor = InstanceDescriptor::new_without_display_handle();
+    descriptor.backends =
+        Backends::from_env().unwrap_or(Backends::VULKAN | Backends::METAL | Backends::DX12);
+    // Indirect dispatches take numbers that our own kernels have bounded.
+    descriptor.flags = InstanceFlags::empty();
+    Instance::new(descriptor)
+}
+
+pub(super) fn enumerate() -> Vec<(Adapter, AdapterSummary)> {
+    let all = wait(instance().enumerate_adapters(Backends::all()));
+    all.into_iter()
+        .map(|a| {
+            let s = AdapterSummary::new(&a);
+            (a, s)
+        })
+        .collect()
+}
+
+/// All adapters, as `WGPU_BACKEND` and the drivers' own variables let them be seen.
+#[must_use]
+pub fn adapters() -> Vec<AdapterSummary> {
+    enumerate().into_iter().map(|(_, summary)| summary).collect()
+}
+
+/// Which adapter to take.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct AdapterChoice {
+    /// Part of its name or its driver's, in any case of letters; the best there is without one.
+    pub name: Option<String>,
+}
+
+impl AdapterChoice {
+    fn matches(&self, summary: &AdapterSummary) -> bool {
+        let Some(name) = &self.name else { return true };
+        let name = name.to_lowercase();
+        [&summary.name, &summary.driver].iter().any(|s| s.to_lowercase().contains(&name))
+    }
+}
+
+/// The place of the adapter to take: the best of those that match and lack nothing. Software comes
+/// last.
+///
+/// # Errors
+/// [`BackendError::NoAdapter`] with what there is and what it lacks.
+pub(super) fn choose(
+    all: &[AdapterSummary],
+    choice: &AdapterChoice,
+) -> Result<usize, BackendError> {
+    let rank = |kind: AdapterKind| match kind {
+        AdapterKind::Discrete => 0,
+        AdapterKind::Integrated => 1,
+        AdapterKind::Virtual => 2,
+        AdapterKind::Unknown => 3,
+        AdapterKind::Software => 4,
+    };
+    let matching: Vec<usize> = (0..all.len()).filter(|&i| choice.matches(&all[i])).collect();
+    let usable = matching.iter().copied().filter(|&i| all[i].missing.is_empty());
+    if let Some(best) = usable.min_by_key(|&i| (rank(all[i].kind), i)) {
+        return Ok(best);
+    }
+    let describe = |i: &usize| {
+        let AdapterSummary { name, missing, .. } = &all[*i];
+        format!("{name} ({})", missing.join("; "))
+    };
+    let names: Vec<&str> = all.iter().map(|s| &*s.name).collect();
+    Err(BackendError::NoAdapter(match (&choice.name, matching.is_empty()) {
+        (_, false) => {
+            let lacking: Vec<String> = matching.iter().map(describe).collect();
+            format!("no adapter can do what is needed: {}", lacking.join(", "))
+        }
+        (Some(name), true) if !all.is_empty() => {
+            format!("no adapter is called `{name}`; there are: {}", names.join(", "))
+        }
+        _ => "no adapter was found; install a Vulkan, Metal or DX12 driver".into(),
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn adapter(name: &str, kind: AdapterKind, missing: &[&str]) -> AdapterSummary {
+        AdapterSummary {
+            name: name.into(),
+            interface: "vulkan".into(),
+            driver: "mesa".into(),
+            kind,
+            largest_binding: 128 << 20,
+            largest_buffer: 256 << 20,
+            missing: missing.iter().map(|&m| m.to_owned()).collect(),
+        }
+    }
+
+    #[test]
+    fn the_best_adapter_that_matches_is_taken() {
+        let all = [
+            adapter("llvmpipe (LLVM 15)", AdapterKind::Software, &[]),
+            adapter("Old Card", AdapterKind::Discrete, &["workgroups per dimension"]),
+            adapter("Shared", AdapterKind::Integrated, &[]),
+            adapter("Card", AdapterKind::Discrete, &[]),
+        ];
+        let named = |name: &str| AdapterChoice { name: Some(name.into()) };
+        assert_eq!(choose(&all, &AdapterChoice::default()).unwrap(), 3);
+        assert_eq!(choose(&all[..3], &AdapterChoice::default()).unwrap(), 2);
+        assert_eq!(choose(&all[..2], &AdapterChoice::default()).unwrap(), 0);
+        assert_eq!(choose(&all, &named("LLVMPIPE")).unwrap(), 0);
+        let told = |all: &[AdapterSummary], choice| choose(all, &choice).unwrap_err().to_string();
+        assert!(told(&all, named("old")).contains("workgroups per dimension"));
+        assert!(told(&all, named("geforce")).contains("Shared"));
+        assert!(told(&[], named("x")).contains("install"));
+        assert!(all[3].is_gpu() && !all[0].is_gpu() && !all[1].is_gpu());
+        // 128 MiB: the seven coefficients of band 3 decide.
+        assert_eq!(all[0].largest_budget(3), (128 << 20) / 84);
+    }
+}

@@ -1,0 +1,205 @@
+//! An open device with its kernels, and how its errors become ours.
+
+use std::collections::HashMap;
+use std::future::Future;
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll, Waker};
+
+use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
+
+use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
+use super::buffers::{Planned, Sizes};
+use super::pipelines::Pipelines;
+use crate::backend::BackendError;
+use crate::memory::Bytes;
+
+/// Runs a future of wgpu's to its end; on native systems they are ready at once.
+pub(super) fn wait<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+            return value;
+        }
+        std::thread::yield_now();
+    }
+}
+
+/// What a device tells outside of any call.
+#[derive(Debug, Default)]
+struct Told {
+    lost: Option<String>,
+    error: Option<String>,
+}
+
+/// An open device with its kernels, which several backends may share, one after the other.
+#[derive(Debug, Clone)]
+pub struct GpuDevice(pub(super) Arc<Device>);
+
+impl GpuDevice {
+    /// Opens an adapter.
+    ///
+    /// # Errors
+    /// [`BackendError::NoAdapter`] with what there is and what it lacks.
+    pub fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
+        Ok(Self(Arc::new(Device::open(choice)?)))
+    }
+
+    /// The adapter.
+    #[must_use]
+    pub fn adapter(&self) -> &AdapterSummary {
+        &self.0.summary
+    }
+}
+
+/// An open device.
+#[derive(Debug)]
+pub(super) struct Device {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    pub(super) summary: AdapterSummary,
+    told: Arc<Mutex<Told>>,
+    /// By detail of the records, and by whether alpha and depth have gradients.
+    pipelines: Mutex<HashMap<(u32, bool), Arc<Pipelines>>>,
+    /// Details of the records for which the canary has sung.
+    proven: Mutex<Vec<u32>>,
+}
+
+impl Device {
+    /// Opens the adapter of choice with all of its limits.
+    pub(super) fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
+        let mut all = enumerate();
+        let summaries: Vec<_> = all.iter().map(|(_, summary)| summary.clone()).collect();
+        let (adapter, summary) = all.swap_remove(choose(&summaries, choice)?);
+        let descriptor = DeviceDescriptor {
+            label: Some("densify"),
+            required_features: Features::IMMEDIATES,
+            required_limits: adapter.limits(),
+            // Buffers are few and made once: no pools beyond what the ledger says.
+            memory_hints: MemoryHints::MemoryUsage,
+            ..DeviceDescriptor::default()
+        };
+        let (device, queue) = wait(adapter.request_device(&descriptor)).map_err(|e| {
+            BackendError::NoAdapter(format!("{} cannot be opened: {e}", summary.name))
+        })?;
+        let told = Arc::new(Mutex::new(Told::default()));
+        let (errors, losses) = (told.clone(), told.clone());
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            lock(&errors).error.get_or_insert(error.to_string());
+        }));
+        device.set_device_lost_callback(move |reason, message| {
+            lock(&losses).lost.get_or_insert(format!("{reason:?}: {message}"));
+        });
+        Ok(Self {
+            device,
+            queue,
+            summary,
+            told,
+            pipelines: Mutex::default(),
+            proven: Mutex::default(),
+        })
+    }
+
+    /// The kernels, which are compiled once.
+    pub(super) fn pipelines(
+        &self,
+        detail: u32,
+        more: bool,
+    ) -> Result<Arc<Pipelines>, BackendError> {
+        let mut all = self.pipelines.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(pipelines) = all.get(&(detail, more)) {
+            return Ok(pipelines.clone());
+        }
+        let made = self.guarded("the kernels", 0, |device| Pipelines::new(device, detail, more))?;
+        let made = Arc::new(made);
+        all.insert((detail, more), made.clone());
+        Ok(made)
+    }
+
+    /// Runs `prove` once for each detail of the records.
+    pub(super) fn prove(
+        &self,
+        detail: u32,
+        prove: impl FnOnce() -> Result<(), BackendError>,
+    ) -> Result<(), BackendError> {
+        let mut proven = self.proven.lock().unwrap_or_else(PoisonError::into_inner);
+        if !proven.contains(&detail) {
+            prove()?;
+            proven.push(detail);
+        }
+        Ok(())
+    }
+
+    /// An error that the device has told since, if any. A lost device ignores what it is given.
+    pub(super) fn check(&self) -> Result<(), BackendError> {
+        let told = lock(&self.told);
+        let device = self.summary.name.clone();
+        if let Some(why) = &told.lost {
+            return Err(BackendError::DeviceLost { device, why: why.clone() });
+        }
+        match &told.error {
+            Some(why) => Err(BackendError::Device { device, why: why.clone() }),
+            None => Ok(()),
+        }
+    }
+
+    /// Runs `create`, with the device's errors as ours.
+    pub(super) fn guarded<T>(
+        &self,
+        what: &'static str,
+        bytes: u64,
+        create: impl FnOnce(&wgpu::Device) -> T,
+    ) -> Result<T, BackendError> {
+        let memory = self.device.push_error_scope(ErrorFilter::OutOfMemory);
+        let internal = self.device.push_error_scope(ErrorFilter::Internal);
+        let validation = self.device.push_error_scope(ErrorFilter::Validation);
+        let made = create(&self.device);
+        let broken = wait(validation.pop()).or(wait(internal.pop()));
+        if wait(memory.pop()).is_some() {
+            return Err(BackendError::OutOfMemory { what, bytes });
+        }
+        if let Some(error) = broken {
+            let device = self.summary.name.clone();
+            return Err(BackendError::Device { device, why: format!("{what}: {error}") });
+        }
+        self.check()?;
+        Ok(made)
+    }
+
+    /// Refuses what this device could not bind: a driver may take it and fail later.
+    pub(super) fn check_sizes(
+        &self,
+        planned: &[Planned],
+        sizes: &Sizes,
+    ) -> Result<(), BackendError> {
+        let most = self.largest_binding();
+        let Some(worst) = planned.iter().max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
+            return Ok(());
+        };
+        let device = &self.summary.name;
+        let (needs, has) = (Bytes(worst.bytes), Bytes(most));
+        let remedy = match worst.name {
+            "records" | "keys 0" | "sums" => {
+                format!("use --tile-cap {}", most / (worst.bytes / sizes.cap).max(1))
+            }
+            "canvas" | "finish" | "pixel gradient" | "derivatives" => {
+                "shrink the images with --resolution".into()
+            }
+            _ => format!("use --budget {}", self.summary.largest_budget(sizes.sh_degree)),
+        };
+        Err(BackendError::OverLimit(format!(
+            "{}: {needs} in one buffer, but {device} takes {has} at most; {remedy}",
+            worst.what
+        )))
+    }
+
+    /// Largest buffer that a kernel can use `[bytes]`.
+    pub(super) fn largest_binding(&self) -> u64 {
+        self.summary.largest_binding.min(self.summary.largest_buffer)
+    }
+}
+
+fn lock(told: &Mutex<Told>) -> std::sync::MutexGuard<'_, Told> {
+    told.lock().unwrap_or_else(PoisonError::into_inner)
+}

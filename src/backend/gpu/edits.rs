@@ -1,0 +1,349 @@
+//! A compiled plan on its way to the device: operations as numbers, in chunks of fixed size, and the
+//! dispatches that execute them in place. See `shaders/apply.wgsl` for the numbers' meaning.
+
+use densify_policies::plan::{OpacityRule, ParentFate, Placement, RowOps, ScaleRule};
+
+use super::GpuBackend;
+use super::buffers::{
+    Buffers, FIRST_SH, OPS_BYTES, SECOND_SH, SH, Sizes, WAITING_SH, band_coefficients,
+};
+use super::device::Device;
+use super::frame::folded_seed;
+use super::passes::Recorder;
+use super::pipelines::{Kernel, Launch, Pipelines};
+use super::signals::Planes;
+use crate::gaussians::{logit, rgb_to_dc};
+
+/// Numbers that fit one chunk.
+const CHUNK: usize = (OPS_BYTES / 4) as usize;
+/// Numbers per operation.
+const WORDS: usize = 16;
+/// In place of a source: clear the row.
+const NOTHING: u32 = u32::MAX;
+
+/// A buffer with rows: how many numbers a row has, how far apart rows are, and a row's numbers.
+#[derive(Debug)]
+pub(super) struct RowBuffer {
+    launch: Launch,
+    words: u32,
+    pitch: [u32; 2],
+}
+
+/// The edits' kernels with their buffers.
+#[derive(Debug)]
+pub(super) struct EditLaunches {
+    /// The geometry, and the bands of colour.
+    rows: RowBuffer,
+    bands: Vec<RowBuffer>,
+    /// What a newborn row has none of: moments, gradients that wait, age, signals.
+    past: Vec<RowBuffer>,
+    breed: Launch,
+    rewrite: Launch,
+    sow: Launch,
+    clamp: Launch,
+}
+
+impl EditLaunches {
+    pub(super) fn new(
+        device: &Device,
+        sizes: &Sizes,
+        planes: &Planes,
+        buffers: &Buffers,
+        pipelines: &Pipelines,
+    ) -> Self {
+        let bind = |kernel, names: &[&'static str]| {
+            pipelines.launch(&device.device, buffers, kernel, names)
+        };
+        let dense = |name: &'static str, words: usize| RowBuffer {
+            launch: bind(Kernel::CopyRows, &["ops", name]),
+            words: words as u32,
+            pitch: [words as u32, 1],
+        };
+        let bands = 0..=usize::from(sizes.sh_degree);
+        let [main_waits, rest_waits] = sizes.waits();
+        let mut past = vec![dense("first rows", 12), dense("second rows", 12), dense("ages", 1)];
+        if main_waits {
+            past.push(dense("waiting rows", 12));
+        }
+        for band in bands.clone() {
+            let words = 3 * band_coefficients(band);
+            past.push(dense(FIRST_SH[band], words));
+            past.push(dense(SECOND_SH[band], words));
+            if if band == 0 { main_waits } else { rest_waits } {
+                past.push(dense(WAITING_SH[band], words));
+            }
+        }
+        if planes.count > 0 {
+            past.push(RowBuffer {
+                launch: bind(Kernel::CopyRows, &["ops", "signals"]),
+                words: planes.count,
+                pitch: [1, sizes.budget as u32],
+            });
+        }
+        Self {
+            rows: dense("rows", 12),
+            bands: bands.map(|band| dense(SH[band], 3 * band_coefficients(band))).collect(),
+            past,
+            breed: bind(Kernel::Breed, &["ops", "rows"]),
+            rewrite: bind(Kernel::Rewrite, &["ops", "rows"]),
+            sow: bind(Kernel::Sow, &["ops", "rows", SH[0]]),
+            clamp: bind(
+                Kernel::ClampOpacity,
+                &["rows", "first rows", "second rows", "waiting rows"],
+            ),
+        }
+    }
+}
+
+fn scale_words(rule: ScaleRule) -> [u32; 3] {
+    match rule {
+        ScaleRule::Uniform(factor) => [0, factor.ln().to_bits(), 0],
+        ScaleRule::LongAxis { long, other } => [1, long.ln().to_bits(), other.ln().to_bits()],
+    }
+}
+
+fn opacity_words(rule: OpacityRule, siblings: u32) -> [u32; 2] {
+    match rule {
+        OpacityRule::Same => [0, 0],
+        OpacityRule::Set(opacity) => [1, logit(opacity).to_bits()],
+        OpacityRule::Scaled(factor) => [2, factor.to_bits()],
+        OpacityRule::Conserved => [3, (siblings.max(1) as f32).to_bits()],
+    }
+}
+
+/// Families cut into chunks of `room` numbers: operations first, then the slots of their children. A
+/// family too large for one chunk is cut; only its last part rewrites the parent.
+fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
+    let mut chunks = Vec::new();
+    let mut heads: Vec<[u32; WORDS]> = Vec::new();
+    let mut slots: Vec<u32> = Vec::new();
+    let mut close = |heads: &mut Vec<[u32; WORDS]>, slots: &mut Vec<u32>| {
+        if heads.is_empty() {
+            return;
+        }
+        let base = (heads.len() * WORDS) as u32;
+        let mut words = Vec::with_capacity(room);
+        for head in heads.iter_mut() {
+            head[1] += base;
+            words.extend_from_slice(head);
+        }
+        words.append(slots);
+        chunks.push((heads.len(), words));
+        heads.clear();
+    };
+    for family in &ops.families {
+        let offspring = family.offspring;
+        let mut children = ops.children(family);
+        let mut number = 1;
+        let (placement, of) = match offspring.placement {
+            Placement::Offset(offset) => (0, offset.map(f32::to_bits)),
+            Placement::Sampled => (1, [0; 3]),
+            Placement::LongAxis { sigmas } => (2, [sigmas.to_bits(), 0, 0]),
+        };
+        let [scale, a, b] = scale_words(offspring.scale);
+        let [opacity, value] = opacity_words(offspring.opacity, offspring.siblings());
+        loop {
+            let used = heads.len() * WORDS + slots.len();
+            if used + WORDS >= room {
+                close(&mut heads, &mut slots);
+                continue;
+            }
+            let now = children.len().min(room - used - WORDS);
+            let is_last = now == children.len();
+            let becomes = is_last && offspring.parent == ParentFate::BecomesChild;
+            let first = slots.len() as u32;
+            heads.push([
+                family.parent,
+                first,
+                now as u32,
+                number,
+                u32::from(becomes),
+                placement,
+                of[0],
+                of[1],
+                of[2],
+                scale,
+                a,
+                b,
+                opacity,
+                value,
+                0,
+                0,
+            ]);
+            slots.extend_from_slice(&children[..now]);
+            children = &children[now..];
+            number += now as u32;
+            if is_last {
+                break;
+            }
+        }
+    }
+    close(&mut heads, &mut slots);
+    chunks
+}
+
+impl GpuBackend {
+    /// Uploads one chunk of operations and executes what `encode` records.
+    fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_, '_>)) {
+        self.device.queue.write_buffer(self.buffers.get("ops"), 0, bytemuck::cast_slice(words));
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        let pass = encoder.begin_compute_pass(&Default::default());
+        encode(&mut Recorder { pass, pipelines: &self.pipelines });
+        self.device.queue.submit([encoder.finish()]);
+    }
+
+    /// Copies rows (from, to), or clears them, in all of these buffers.
+    fn copy_rows(&self, pairs: &[[u32; 2]], buffers: &[&[RowBuffer]]) {
+        for chunk in pairs.chunks(CHUNK / 2) {
+            self.execute(chunk.as_flattened(), |to| {
+                for RowBuffer { launch, words, pitch: [row, word] } in
+                    buffers.iter().copied().flatten()
+                {
+                    let count = chunk.len() as u32;
+                    to.run(launch, [count, *words, *row, *word], (count * words).div_ceil(256));
+                }
+            });
+        }
+    }
+
+    /// Executes operations of [`WORDS`] numbers each.
+    fn run_ops(&self, launch: &Launch, ops: &[[u32; WORDS]]) {
+        for chunk in ops.chunks(CHUNK / WORDS) {
+            let count = chunk.len() as u32;
+            self.execute(chunk.as_flattened(), |to| {
+                to.run(launch, [count, 0, 0, 0], count.div_ceil(256));
+            });
+        }
+    }
+
+    /// Executes a plan that holds, in the order of [`RowOps`].
+    pub(super) fn edit(&mut self, ops: &RowOps, seed: u64, step: u32) {
+        let edits = &self.edits;
+        let clear = |row: u32| [NOTHING, row];
+        for (count, words) in family_chunks(ops, CHUNK) {
+            let now = [count as u32, folded_seed(seed), step, 0];
+            self.execute(&words, |to| to.run(&edits.breed, now, (count as u32).div_ceil(256)));
+        }
+        let mut births: Vec<[u32; 2]> = Vec::new();
+        let mut reborn: Vec<[u32; 2]> = Vec::new();
+        for family in &ops.families {
+            let children = ops.children(family);
+            births.extend(children.iter().map(|&slot| [family.parent, slot]));
+            reborn.extend(children.iter().map(|&slot| clear(slot)));
+            if family.offspring.parent == ParentFate::BecomesChild {
+                reborn.push(clear(family.parent));
+            }
+        }
+        self.copy_rows(&births, &[&edits.bands]);
+        let updates: Vec<_> = ops
+            .updates
+            .iter()
+            .map(|&(row, update)| {
+                let mut words = [0; WORDS];
+                words[0] = row;
+                words[1..4].copy_from_slice(&scale_words(update.scale));
+                words[4..6].copy_from_slice(&opacity_words(update.opacity, 1));
+                words
+            })
+            .collect();
+        self.run_ops(&edits.rewrite, &updates);
+        reborn.extend(ops.updates.iter().filter(|(_, u)| !u.keep_moments).map(|u| clear(u.0)));
+        let seeded: Vec<_> = ops.seeds.iter().map(|&(row, _)| clear(row)).collect();
+        self.copy_rows(&seeded, &[&edits.bands]);
+        let seeds: Vec<_> = ops
+            .seeds
+            .iter()
+            .map(|&(row, seed)| {
+                let mut words = [0; WORDS];
+                words[0] = row;
+                words[1..4].copy_from_slice(&seed.position.map(f32::to_bits));
+                words[4] = seed.scale.ln().to_bits();
+                words[5] = logit(seed.opacity).to_bits();
+                words[6..9].copy_from_slice(&seed.colour.map(|c| rgb_to_dc(c).to_bits()));
+                words
+            })
+            .collect();
+        self.run_ops(&edits.sow, &seeds);
+        reborn.extend(seeded);
+        self.copy_rows(&reborn, &[&edits.past]);
+        let moves: Vec<_> = ops.moves.iter().map(|&(from, to)| [from, to]).collect();
+        self.copy_rows(&moves, &[std::slice::from_ref(&edits.rows), &edits.bands, &edits.past]);
+        if let Some(most) = ops.clamp_opacity {
+            let rows = ops.rows_after as u32;
+            let waits = u32::from(self.sizes.waits()[0]);
+            let now = [rows, logit(most).to_bits(), waits, 0];
+            self.execute(&[0], |to| to.run(&edits.clamp, now, rows.div_ceil(256)));
+        }
+        if ops.reset_signals {
+            let planes: Vec<u32> = self.planes.sums().collect();
+            self.clear_planes(&planes);
+        }
+        self.rows = ops.rows_after;
+    }
+
+    /// Sets planes of the signals to 0.
+    pub(super) fn clear_planes(&self, planes: &[u32]) {
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        let bytes = 4 * self.sizes.budget;
+        for &plane in planes {
+            let from = u64::from(plane) * bytes;
+            encoder.clear_buffer(self.buffers.get("signals"), from, Some(bytes));
+        }
+        self.device.queue.submit([encoder.finish()]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use densify_policies::plan::{EditPlan, Offspring};
+
+    use super::*;
+
+    #[test]
+    fn families_cut_into_chunks_are_the_same_families() {
+        let mut plan = EditPlan::new(40, 400);
+        for row in 0..40 {
+            let offspring = Offspring {
+                children: 1 + row * row % 23,
+                parent: if row % 2 == 0 { ParentFate::BecomesChild } else { ParentFate::Stays },
+                placement: Placement::Sampled,
+                scale: ScaleRule::Uniform(0.5),
+                opacity: OpacityRule::Conserved,
+            };
+            let _ = plan.grow(row, offspring);
+        }
+        let ops = plan.compile();
+        assert!(ops.families.len() > 10);
+        for room in [40, 64, 1000, CHUNK] {
+            let mut found: Vec<(u32, Vec<u32>, u32)> = Vec::new();
+            for (count, words) in family_chunks(&ops, room) {
+                assert!(words.len() <= room, "{} words in room for {room}", words.len());
+                for op in words[..count * WORDS].as_chunks::<WORDS>().0 {
+                    let [parent, first, children, number, becomes, ..] = *op;
+                    let slots = &words[first as usize..][..children as usize];
+                    match found.last_mut().filter(|(row, ..)| *row == parent) {
+                        Some((_, all, rewritten)) => {
+                            // A part goes on where the last one ended, before the parent changed.
+                            assert_eq!((number as usize, *rewritten), (all.len() + 1, 0));
+                            all.extend_from_slice(slots);
+                            *rewritten = becomes;
+                        }
+                        None => {
+                            assert_eq!(number, 1);
+                            found.push((parent, slots.to_vec(), becomes));
+                        }
+                    }
+                }
+            }
+            let expected: Vec<_> = ops
+                .families
+                .iter()
+                .map(|family| {
+                    let becomes = family.offspring.parent == ParentFate::BecomesChild;
+                    (family.parent, ops.children(family).to_vec(), u32::from(becomes))
+                })
+                .collect();
+            assert_eq!(found, expected, "room for {room}");
+        }
+    }
+}

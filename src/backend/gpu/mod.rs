@@ -1,0 +1,416 @@
+//! The GPU backend: the native backend's stages as WGSL, through wgpu, on Vulkan, Metal and DX12.
+//!
+//! Parameters stay on the device. A step is encoded once and submitted once; what differs between
+//! views (rows on screen, entries, bands) is counted there and drives indirect dispatches, and a few
+//! scalars come back with the loss. Where a view has more tile entries than the cap, the image is
+//! processed in bands: as many are encoded as the step before needed, and a step for which these do
+//! not do changes nothing, says so, and is taken again with enough.
+//!
+//! Every sum has one order, so that the same device gives the same bytes twice.
+
+mod adapter;
+mod buffers;
+mod canary;
+mod device;
+mod differentiate;
+mod edits;
+mod frame;
+mod observe;
+mod passes;
+mod pipelines;
+mod readback;
+mod signals;
+mod state;
+mod step;
+mod transfer;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use densify_policies::plan::RowOps;
+use densify_policies::policy::{Cadence, Candidate, LossTerms, Needs, NoiseTerm, Signal, Signals};
+
+use super::candidates::Candidates;
+use super::{
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
+    Tensor,
+};
+use crate::camera::Camera;
+use crate::gaussians::Gaussians;
+use crate::memory::{Ledger, Section};
+
+pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters};
+use buffers::{Buffers, MOST_ENTRIES, Sizes, bias_table};
+use device::Device;
+pub use device::GpuDevice;
+use edits::EditLaunches;
+use frame::{Frame, State};
+use passes::{Launches, Passes, Recorder, Shape};
+use pipelines::Pipelines;
+use signals::{Planes, record_stride};
+
+/// Largest image side `[px]`; at this size every index of the stages still fits its type.
+const MAX_SIDE: u32 = 16_384;
+/// Weight of 1 − SSIM in the loss; L1 has the rest.
+const SSIM_WEIGHT: f32 = 0.2;
+
+/// How to set up a [`GpuBackend`].
+#[derive(Debug, Clone)]
+pub struct GpuOptions {
+    /// Most rows there may ever be, >= 1 and >= the model's.
+    pub budget: usize,
+    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
+    pub near: f32,
+    /// Most (row, tile) entries held at a time; beyond it the image is processed in bands. `None`:
+    /// 16 per row of the budget, or as many as the device can bind. Raised to the budget.
+    pub tile_cap: Option<usize>,
+    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
+    /// memory than the ledger says.
+    pub largest_image: (u32, u32),
+    /// Signals and candidates to collect.
+    pub needs: Needs,
+}
+
+impl GpuOptions {
+    /// Options for models of at most `budget` rows.
+    #[must_use]
+    pub fn new(budget: usize) -> Self {
+        Self { budget, near: 0.01, tile_cap: None, largest_image: (0, 0), needs: Needs::default() }
+    }
+}
+
+/// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
+#[derive(Debug, Clone, Copy, Default)]
+struct Waiting {
+    main: bool,
+    rest: bool,
+}
+
+/// The GPU backend.
+#[derive(Debug)]
+pub struct GpuBackend {
+    device: Arc<Device>,
+    sizes: Sizes,
+    buffers: Buffers,
+    pipelines: Arc<Pipelines>,
+    launches: Launches,
+    edits: EditLaunches,
+    ledger: Ledger,
+    budget: usize,
+    rows: usize,
+    near: f32,
+    planes: Planes,
+    terms: LossTerms,
+    noise: Option<NoiseTerm>,
+    cadence: Cadence,
+    waiting: Waiting,
+    candidates: Candidates,
+    /// Bands that are encoded for the next view.
+    bands: u32,
+    laps: Vec<(&'static str, Duration)>,
+}
+
+impl GpuBackend {
+    /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
+    /// shown on a small scene that it computes what the native backend does.
+    ///
+    /// # Errors
+    /// [`BackendError`]: a limit of the device, its memory, or a driver that computes wrongly.
+    ///
+    /// # Panics
+    /// When the model has more rows than the budget: the caller subsamples before.
+    pub fn new(
+        model: &Gaussians,
+        options: &GpuOptions,
+        device: &GpuDevice,
+    ) -> Result<Self, BackendError> {
+        let detail = Planes::new(options.needs.signals).detail;
+        device.0.prove(detail, || canary::check(device, &options.needs))?;
+        Self::without_canary(model, options, device)
+    }
+
+    fn without_canary(
+        model: &Gaussians,
+        options: &GpuOptions,
+        device: &GpuDevice,
+    ) -> Result<Self, BackendError> {
+        let budget = options.budget.max(1);
+        assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
+        let device = device.0.clone();
+        let most = device.summary.largest_budget(model.sh_degree);
+        if budget as u64 > most {
+            return Err(BackendError::OverLimit(format!(
+                "a budget of {budget} rows: {} takes {most} at degree {}; use --budget {most}",
+                device.summary.name, model.sh_degree
+            )));
+        }
+        let planes = Planes::new(options.needs.signals);
+        let bindable = device.largest_binding() / (4 * record_stride(planes.detail));
+        let cap = match options.tile_cap {
+            Some(cap) => cap as u64,
+            None => (16 * budget as u64).min(bindable),
+        }
+        .clamp(budget as u64, MOST_ENTRIES);
+        let (width, height) = options.largest_image;
+        let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
+        let sizes = Sizes::new(budget, cap, model.sh_degree, image, &options.needs);
+        let buffers = Buffers::new(&device, &sizes)?;
+        let pipelines = device.pipelines(sizes.detail, sizes.more)?;
+        let launches = device
+            .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
+        let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
+        let mut ledger = sizes.ledger();
+        let pixels = u64::from(image.0) * u64::from(image.1);
+        ledger.add_to(
+            Section::Policy,
+            "candidates",
+            Candidates::bytes(options.needs.candidates, pixels as usize),
+        );
+        if let Some(request) = &options.needs.aux {
+            let bytes = observe::host_bytes(request, pixels);
+            ledger.add_to(Section::Policy, "auxiliary views", bytes);
+        }
+        let gpu = Self {
+            ledger,
+            device,
+            sizes,
+            buffers,
+            pipelines,
+            launches,
+            edits,
+            budget,
+            rows: model.len(),
+            near: options.near,
+            planes,
+            terms: options.needs.loss_terms,
+            noise: options.needs.noise,
+            cadence: options.needs.cadence,
+            waiting: Waiting::default(),
+            candidates: Candidates::new(options.needs.candidates),
+            bands: 1,
+            laps: Vec::new(),
+        };
+        gpu.write("bias", bytemuck::cast_slice(&bias_table()));
+        gpu.upload(model);
+        gpu.device.check()?;
+        Ok(gpu)
+    }
+
+    /// The adapter that was taken.
+    #[must_use]
+    pub fn adapter(&self) -> &AdapterSummary {
+        &self.device.summary
+    }
+
+    /// What of the ledger is on the device `[bytes]`.
+    #[must_use]
+    pub fn promised(&self) -> u64 {
+        self.sizes.planned().iter().map(|planned| planned.bytes).sum()
+    }
+
+    /// What is allocated on the device now `[bytes]`.
+    #[must_use]
+    pub fn allocated(&self) -> u64 {
+        self.buffers.bytes()
+    }
+
+    /// Makes room for images of this size.
+    fn fit_image(&mut self, width: u32, height: u32) -> Result<(), BackendError> {
+        if width > MAX_SIDE || height > MAX_SIDE {
+            return Err(BackendError::ImageTooLarge { width, height, max: MAX_SIDE });
+        }
+        let (most_wide, most_high) = self.sizes.image;
+        if width > most_wide || height > most_high {
+            self.sizes.image = (most_wide.max(width), most_high.max(height));
+            self.rebuild()?;
+        }
+        Ok(())
+    }
+
+    /// Allocates buffers whose size has changed, and binds all of them anew.
+    fn rebuild(&mut self) -> Result<(), BackendError> {
+        self.buffers.resize(&self.device, &self.sizes)?;
+        let Self { device, sizes, pipelines, buffers, .. } = self;
+        *pipelines = device.pipelines(sizes.detail, sizes.more)?;
+        self.launches =
+            device.guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers))?;
+        self.edits = EditLaunches::new(device, sizes, &self.planes, buffers, pipelines);
+        Ok(())
+    }
+
+    fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
+        let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
+        let of_model = [self.rows as u32, degree, self.sizes.cap as u32, self.budget as u32];
+        Frame::of_view(camera, background, self.near, of_model)
+    }
+
+    /// Encodes and submits a view's passes until the bands that were encoded do, and returns the
+    /// state that they left, and how they were encoded. `encode` records everything.
+    fn run(
+        &mut self,
+        frame: &Frame,
+        encode: impl Fn(&Passes<'_>, &mut Recorder<'_, '_>),
+    ) -> Result<(State, Shape), BackendError> {
+        self.write("frame", bytemuck::bytes_of(frame));
+        let [rows, ..] = frame.model;
+        let tiles = frame.image[3];
+        loop {
+            let shape = Shape { rows, tiles, bands: self.bands };
+            let groups = self.buffers.get("groups");
+            let passes = Passes { launches: &self.launches, groups, shape };
+            let mut encoder = self.device.device.create_command_encoder(&Default::default());
+            if shape.bands > 1 {
+                encoder.clear_buffer(self.buffers.get("tile counts"), 0, None);
+            }
+            let pass = encoder.begin_compute_pass(&Default::default());
+            encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
+            let staging = self.buffers.get("read");
+            let bytes = size_of::<State>() as u64;
+            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, bytes);
+            let bytes = readback::finish(&self.device, staging, encoder, bytes)?;
+            let state: State = bytemuck::pod_read_unaligned(&bytes);
+            if state.short == 0 {
+                self.bands = state.bands.max(1);
+                return Ok((state, shape));
+            }
+            // One band was tried: a guess. Several: now the device has counted how many.
+            let guess = (2 * u64::from(state.total)).div_ceil(self.sizes.cap).max(2);
+            let needed = if shape.bands == 1 { guess } else { u64::from(state.bands) };
+            self.bands = needed.min(u64::from(tiles)) as u32;
+        }
+    }
+}
+
+fn scalars(state: &State) -> StepOutput {
+    let State { l1, ssim, .. } = *state;
+    StepOutput {
+        loss: (1.0 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1.0 - ssim),
+        l1,
+        ssim,
+        visible: state.visible as usize,
+        entries: state.entries(),
+        bands: state.bands,
+    }
+}
+
+impl Backend for GpuBackend {
+    fn rows(&self) -> usize {
+        self.rows
+    }
+
+    fn budget(&self) -> usize {
+        self.budget
+    }
+
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    fn begin_epoch(&mut self) {
+        if let Some(plane) = self.planes.begin_epoch() {
+            self.clear_planes(&[plane]);
+        }
+    }
+
+    fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        self.step(input)
+    }
+
+    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
+        if self.planes.fresh().is_none() {
+            return Ok(());
+        }
+        self.fit_image(camera.width, camera.height)?;
+        let mut frame = self.frame(camera, [0.0; 3], sh_degree);
+        frame.planes = self.planes.in_frame();
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        encoder.clear_buffer(self.buffers.get("pixel gradient"), 0, None);
+        self.device.queue.submit([encoder.finish()]);
+        self.run(&frame, |passes, to| {
+            passes.forward(to);
+            passes.backward(to);
+            passes.measure(to);
+        })?;
+        Ok(())
+    }
+
+    fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        self.observe_view(input)
+    }
+
+    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
+        let mut signals = Signals::zeros(self.rows, needs.signals);
+        for signal in needs.signals.iter() {
+            let values = match signal {
+                Signal::Opacity => self.present(0)?,
+                Signal::ScaleMax => self.present(1)?,
+                Signal::ScaleProduct => self.present(2)?,
+                Signal::Age => self.present(3)?,
+                sum => {
+                    let planes = self.planes.of(sum).into_iter();
+                    let columns: Result<Vec<_>, _> = planes.map(|p| self.column(p)).collect();
+                    let most = |a: Vec<f32>, b: Vec<f32>| {
+                        a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect()
+                    };
+                    columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows])
+                }
+            };
+            if let Some(column) = signals.get_mut(signal) {
+                column.copy_from_slice(&values);
+            }
+        }
+        if let Some(plane) = self.planes.fresh() {
+            self.clear_planes(&[plane]);
+        }
+        Ok((signals, self.candidates.list().to_vec()))
+    }
+
+    fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
+        // Kept in release builds: this is the promise.
+        assert_eq!(ops.rows_before, self.rows, "a plan for another number of rows");
+        assert_eq!(ops.budget, self.budget, "a plan for another budget");
+        assert!(ops.rows_after <= self.budget, "{} rows over the budget", ops.rows_after);
+        if let Err(broken) = ops.check() {
+            panic!("a plan that breaks its own rules: {broken}");
+        }
+        self.edit(ops, seed, step);
+        if ops.reset_candidates {
+            self.candidates.clear();
+        }
+        self.device.check()
+    }
+
+    fn render(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<Rendering, BackendError> {
+        self.fit_image(camera.width, camera.height)?;
+        let frame = self.frame(camera, background, sh_degree);
+        self.run(&frame, |passes, to| {
+            passes.forward(to);
+        })?;
+        self.rendering(camera.width, camera.height)
+    }
+
+    fn download(&self) -> Result<Gaussians, BackendError> {
+        self.model()
+    }
+
+    fn state(&self) -> Vec<String> {
+        self.state_names()
+    }
+
+    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
+        self.state_tensor(name)
+    }
+
+    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        self.restore_tensor(tensor)
+    }
+
+    fn stage_times(&self) -> &[(&'static str, Duration)] {
+        &self.laps
+    }
+}

@@ -1,0 +1,179 @@
+//! What a policy looks at in a view beside the signals: candidates for new rows while training, and
+//! auxiliary views at its events. Pixels are chosen on the host, from a copy of the view's error or
+//! image; the device then finds their surface points, and the sums over each row's pixels.
+
+use densify_policies::policy::ErrorMode;
+use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
+
+use super::GpuBackend;
+use super::buffers::OPS_BYTES;
+use super::frame::Frame;
+use super::passes::{Passes, Recorder, Shape};
+use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
+use crate::backend::{AuxInput, AuxOutput, BackendError};
+use crate::dataset::images::Image8;
+
+/// √(½·log₂ e): folded into the splats' factors.
+const FOLD: f32 = 0.849_321_8;
+
+/// A view whose passes have run, so that its lists and its image are on the device.
+pub(super) struct Seen<'a> {
+    pub(super) frame: Frame,
+    pub(super) shape: Shape,
+    pub(super) target: &'a Image8,
+}
+
+impl GpuBackend {
+    /// Encodes more passes over the view at hand and submits them.
+    pub(super) fn go_on(
+        &self,
+        shape: Shape,
+        encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_, '_>),
+    ) {
+        let groups = self.buffers.get("groups");
+        let passes = Passes { launches: &self.launches, groups, shape };
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        let pass = encoder.begin_compute_pass(&Default::default());
+        encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
+        self.device.queue.submit([encoder.finish()]);
+    }
+
+    /// Adds the worst pixels of the view to the candidates.
+    pub(super) fn collect_candidates(
+        &mut self,
+        seen: &Seen<'_>,
+        request: &CandidateRequest,
+        count: usize,
+    ) -> Result<(), BackendError> {
+        let [width, height, ..] = seen.frame.image.map(|n| n as usize);
+        let pixels = width * height;
+        let finish = self.read("finish", 0, 8 * pixels as u64)?;
+        let error: Vec<f32> = match request.error {
+            ErrorMode::Gradient => {
+                let planes = self.read("pixel gradient", 0, 12 * pixels as u64)?;
+                let square = |i: usize| planes[i] * planes[i];
+                (0..pixels)
+                    .map(|i| (square(i) + square(pixels + i) + square(2 * pixels + i)).sqrt())
+                    .collect()
+            }
+            ErrorMode::L1 | ErrorMode::L1Dssim => self.read("error", 0, 4 * pixels as u64)?,
+        };
+        let at = |x: usize, y: usize| {
+            let pixel = y * width + x;
+            (1.0 - finish[2 * pixel] >= request.min_alpha).then(|| error[pixel])
+        };
+        let worst = self.candidates.worst(width, height, count, request.spaced, at);
+        for candidate in self.surface_points(seen, &worst, request.depth)? {
+            self.candidates.push(candidate);
+        }
+        Ok(())
+    }
+
+    /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel
+    /// that shows no surface.
+    fn surface_points(
+        &self,
+        seen: &Seen<'_>,
+        pixels: &[(usize, usize, f32)],
+        mode: DepthMode,
+    ) -> Result<Vec<Candidate>, BackendError> {
+        let Seen { frame, shape, target } = seen;
+        let [width, ..] = frame.image;
+        let [r, g, b, _] = frame.background;
+        let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
+        let which = u32::from(mode == DepthMode::Median);
+        let mut found = Vec::new();
+        // What fits the upload, and five points per row of the budget that come back.
+        let room = (OPS_BYTES / 4).min(5 * self.sizes.budget) as usize;
+        for chunk in pixels.chunks(room) {
+            let numbers: Vec<u32> =
+                chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();
+            self.write("ops", bytemuck::cast_slice(&numbers));
+            self.go_on(*shape, |passes, to| passes.surface(to, numbers.len() as u32, which, 0));
+            let points = self.read("gradient", 0, 16 * chunk.len() as u64)?;
+            for (&(x, y, error), &[px, py, pz, depth]) in
+                chunk.iter().zip(points.as_chunks::<4>().0)
+            {
+                if depth > 0.0 {
+                    found.push(Candidate {
+                        position: [px, py, pz],
+                        colour: target.composited(x, y, [r, g, b]),
+                        pixel_size: depth / focal,
+                        error,
+                    });
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Measures one view.
+    pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
+        let AuxInput { camera, target, background, request, .. } = *input;
+        assert_eq!(
+            (camera.width, camera.height),
+            (target.width, target.height),
+            "camera and image differ in size"
+        );
+        self.fit_image(camera.width, camera.height)?;
+        let mut frame = self.frame(camera, background, input.sh_degree);
+        frame.draw[3] = self.upload_target(target);
+        let (state, shape) = self.run(&frame, |passes, to| {
+            passes.forward(to);
+            passes.loss(to, [0.0; 2]);
+        })?;
+        let loss = super::scalars(&state).loss;
+        let image = self.rendering(camera.width, camera.height)?;
+        let seen = Seen { frame, shape, target };
+        let points = if request.points == 0 {
+            Vec::new()
+        } else {
+            let pixels = draw_pixels(&image.alpha, camera.width as usize, input);
+            self.surface_points(&seen, &pixels, DepthMode::MaxWeight)?
+        };
+        let columns = if request.columns.is_empty() {
+            Vec::new()
+        } else {
+            let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
+            self.write("pixel gradient", bytemuck::cast_slice(&map));
+            self.go_on(shape, |passes, to| {
+                passes.columns(to);
+            });
+            self.columns(request)?
+        };
+        Ok(AuxOutput { loss, columns, points })
+    }
+
+    /// The columns that the last passes have left.
+    fn columns(&self, request: &AuxRequest) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
+        let n = self.rows as u64;
+        let sums = self.read("row sums", 0, 16 * n)?;
+        let splats = self.read("splats", 0, 48 * n)?;
+        let depths = self.read("depths", 0, 4 * n)?;
+        let value = |column: AuxColumn, row: usize| {
+            if depths[row].to_bits() == u32::MAX {
+                return 0.0;
+            }
+            match column {
+                AuxColumn::MapSum => sums[4 * row],
+                AuxColumn::PixelCount => sums[4 * row + 1],
+                AuxColumn::WeightSum => sums[4 * row + 2],
+                AuxColumn::DistanceSum => sums[4 * row + 3],
+                AuxColumn::Depth => depths[row],
+                AuxColumn::Radius => {
+                    let [_, _, l1, shear, l3] = [0, 1, 2, 3, 4].map(|i| splats[12 * row + i]);
+                    radius_px(FOLD / l1, shear, FOLD / l3)
+                }
+            }
+        };
+        let of = |c: AuxColumn| (c, (0..self.rows).map(|row| value(c, row)).collect());
+        Ok(request.columns.iter().map(|&c| of(c)).collect())
+    }
+}
+
+/// Bytes that the host holds meanwhile, for an image of so many pixels.
+pub(super) fn host_bytes(request: &AuxRequest, pixels: u64) -> u64 {
+    let drawing = if request.points > 0 { 20 } else { 0 };
+    // The image as copied, its map, error, edge and luma.
+    pixels * (20 + 24 + 13 + drawing) + u64::from(request.points) * size_of::<Candidate>() as u64
+}

@@ -1,0 +1,383 @@
+//! A view's passes as commands: forward, image loss, backward, optimiser. What is encoded depends on
+//! the image's size and on the number of bands only; everything else the device counts itself.
+
+use wgpu::{ComputePass, Device};
+
+use super::buffers::{BLOCK, Buffers, FIRST_SH, SECOND_SH, SH, WAITING_SH, band_coefficients};
+use super::pipelines::{Kernel, Launch, Pipelines};
+
+/// Workgroups in the first of two dimensions; see `shaders/view.wgsl`.
+const ACROSS: u32 = 32_768;
+/// Places of indirect dispatches `[bytes]`; see `shaders/tiles.wgsl`.
+mod args {
+    pub(super) const ROWS: u64 = 0;
+    pub(super) const ROW_BLOCKS: u64 = 12;
+    pub(super) const ROW_DIGITS: u64 = 24;
+    pub(super) const ENTRY_BLOCKS: u64 = 36;
+    pub(super) const ENTRY_DIGITS: u64 = 48;
+}
+/// What is summed; see `shaders/tiles.wgsl`.
+const FLAGS: u32 = 0;
+const COUNTS_ALL: u32 = 1;
+const COUNTS_BAND: u32 = 2;
+const COUNTS_AGAIN: u32 = 3;
+const DIGITS_OF_ROWS: u32 = 4;
+const DIGITS_OF_ENTRIES: u32 = 5;
+/// In place of a band: the whole image.
+const WHOLE: u32 = u32::MAX;
+
+/// All kernels with their buffers. Of pairs, the first reads `keys 0` and `values 0`.
+#[derive(Debug)]
+pub(super) struct Launches {
+    project: Launch,
+    scan_blocks: Launch,
+    scan_sums: Launch,
+    compact: Launch,
+    count_digits: [Launch; 2],
+    scatter: [Launch; 2],
+    scatter_order: Launch,
+    count_entries: Launch,
+    emit_entries: Launch,
+    count_tiles: Launch,
+    cut_bands: Launch,
+    find_tiles: [Launch; 2],
+    rasterize: [Launch; 2],
+    similarity: Launch,
+    pixel_gradient: Launch,
+    loss_total: Launch,
+    rasterize_bwd: [Launch; 2],
+    gather: Launch,
+    project_bwd: Launch,
+    adam_bands: [Launch; 4],
+    adam_geometry: Launch,
+    accumulate: Launch,
+    measure: Launch,
+    pub(super) present: Launch,
+    surface: [Launch; 2],
+    replay: [Launch; 2],
+    gather_columns: Launch,
+}
+
+impl Launches {
+    pub(super) fn new(device: &Device, pipelines: &Pipelines, buffers: &Buffers) -> Self {
+        let bind =
+            |kernel, names: &[&'static str]| pipelines.launch(device, buffers, kernel, names);
+        let keys = ["keys 0", "keys 1"];
+        let values = ["values 0", "values 1"];
+        let both = |f: &dyn Fn(usize) -> Launch| [f(0), f(1)];
+        let [sh0, sh1, sh2, sh3] = SH;
+        Self {
+            project: bind(
+                Kernel::Project,
+                &["frame", "rows", sh0, sh1, sh2, sh3, "splats", "footprints", "depths"],
+            ),
+            scan_blocks: bind(
+                Kernel::ScanBlocks,
+                &["frame", "state", "depths", "sums", "block sums"],
+            ),
+            scan_sums: bind(Kernel::ScanSums, &["frame", "state", "groups", "block sums"]),
+            compact: bind(
+                Kernel::Compact,
+                &["frame", "depths", "keys 0", "values 0", "sums", "block sums"],
+            ),
+            count_digits: both(&|i| bind(Kernel::CountDigits, &["state", keys[i], "sums"])),
+            scatter: both(&|i| {
+                let (keys_to, values_to) = (keys[1 - i], values[1 - i]);
+                let names = ["state", keys[i], values[i], keys_to, values_to, "sums", "block sums"];
+                bind(Kernel::Scatter, &names)
+            }),
+            scatter_order: bind(
+                Kernel::Scatter,
+                &["state", "keys 1", "values 1", "keys 0", "order", "sums", "block sums"],
+            ),
+            count_entries: bind(
+                Kernel::CountEntries,
+                &["frame", "state", "footprints", "sums", "order"],
+            ),
+            emit_entries: bind(
+                Kernel::EmitEntries,
+                &[
+                    "frame",
+                    "state",
+                    "footprints",
+                    "keys 0",
+                    "sums",
+                    "block sums",
+                    "order",
+                    "row of slot",
+                    "slots of row",
+                ],
+            ),
+            count_tiles: bind(
+                Kernel::CountTiles,
+                &["frame", "state", "footprints", "order", "tile counts"],
+            ),
+            cut_bands: bind(Kernel::CutBands, &["frame", "state", "tile counts"]),
+            find_tiles: both(&|i| {
+                bind(Kernel::FindTiles, &["frame", "state", keys[i], "tile starts"])
+            }),
+            rasterize: both(&|i| {
+                let lists = [values[i], "row of slot", "tile starts"];
+                let names = [&["frame", "state"], &lists[..], &["splats", "canvas", "finish"]];
+                bind(Kernel::Rasterize, &names.concat())
+            }),
+            similarity: bind(
+                Kernel::Similarity,
+                &["frame", "canvas", "truth", "mask", "derivatives", "tile sums", "error"],
+            ),
+            pixel_gradient: bind(
+                Kernel::PixelGradient,
+                &["frame", "canvas", "truth", "mask", "derivatives", "pixel gradient"],
+            ),
+            loss_total: bind(Kernel::LossTotal, &["frame", "state", "tile sums"]),
+            rasterize_bwd: both(&|i| {
+                let lists = [values[i], "row of slot", "tile starts"];
+                let pixels = ["splats", "finish", "pixel gradient", "records"];
+                bind(Kernel::RasterizeBwd, &[&["frame", "state"], &lists[..], &pixels[..]].concat())
+            }),
+            gather: bind(
+                Kernel::Gather,
+                &["frame", "depths", "slots of row", "records", "row sums"],
+            ),
+            project_bwd: bind(
+                Kernel::ProjectBwd,
+                &["frame", "rows", sh0, sh1, sh2, sh3, "row sums", "depths", "gradient"],
+            ),
+            adam_bands: std::array::from_fn(|i| {
+                let own = [SH[i], FIRST_SH[i], SECOND_SH[i], WAITING_SH[i]];
+                bind(
+                    Kernel::AdamBand,
+                    &[&["frame", "state"], &own[..], &["ages", "gradient", "bias"]].concat(),
+                )
+            }),
+            adam_geometry: bind(
+                Kernel::AdamGeometry,
+                &[
+                    "frame",
+                    "state",
+                    "rows",
+                    "first rows",
+                    "second rows",
+                    "waiting rows",
+                    "ages",
+                    "gradient",
+                    "bias",
+                ],
+            ),
+            accumulate: bind(
+                Kernel::Accumulate,
+                &["frame", "state", "signals", "gradient", "row sums", "depths", "splats"],
+            ),
+            measure: bind(Kernel::Measure, &["frame", "state", "signals", "row sums", "depths"]),
+            // The sums of the sorts are a buffer of enough numbers that nobody needs then.
+            present: bind(Kernel::Present, &["frame", "sums", "rows", "ages"]),
+            // The gradients of the rows are a buffer that nobody needs between two steps.
+            surface: both(&|i| {
+                let lists = [values[i], "row of slot", "tile starts"];
+                let names = ["splats", "rows", "ops", "gradient"];
+                bind(Kernel::Surface, &[&["frame", "state"], &lists[..], &names[..]].concat())
+            }),
+            replay: both(&|i| {
+                let lists = [values[i], "row of slot", "tile starts"];
+                let names = ["splats", "pixel gradient", "records"];
+                bind(Kernel::Replay, &[&["frame", "state"], &lists[..], &names[..]].concat())
+            }),
+            gather_columns: bind(
+                Kernel::GatherColumns,
+                &["frame", "depths", "slots of row", "records", "row sums"],
+            ),
+        }
+    }
+}
+
+/// What decides which commands are encoded.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shape {
+    pub(super) rows: u32,
+    pub(super) tiles: u32,
+    /// Bands to encode; more than needed do nothing.
+    pub(super) bands: u32,
+}
+
+impl Shape {
+    /// Passes of four bits that sort the entries by tile.
+    fn tile_passes(&self) -> u32 {
+        (u32::BITS - (self.tiles - 1).leading_zeros()).div_ceil(4).max(1)
+    }
+}
+
+/// Encodes dispatches into one pass.
+pub(super) struct Recorder<'a, 'e> {
+    pub(super) pass: ComputePass<'e>,
+    pub(super) pipelines: &'a Pipelines,
+}
+
+impl Recorder<'_, '_> {
+    fn set(&mut self, launch: &Launch, now: [u32; 4]) {
+        self.pass.set_pipeline(self.pipelines.pipeline(launch.kernel));
+        self.pass.set_bind_group(0, &launch.bindings, &[]);
+        self.pass.set_immediates(0, bytemuck::bytes_of(&now));
+    }
+
+    /// Dispatches so many workgroups.
+    pub(super) fn run(&mut self, launch: &Launch, now: [u32; 4], groups: u32) {
+        if groups > 0 {
+            self.set(launch, now);
+            self.pass.dispatch_workgroups(groups.min(ACROSS), groups.div_ceil(ACROSS), 1);
+        }
+    }
+
+    /// Dispatches as many workgroups as the device has counted.
+    fn run_counted(&mut self, launch: &Launch, now: [u32; 4], groups: &wgpu::Buffer, at: u64) {
+        self.set(launch, now);
+        self.pass.dispatch_workgroups_indirect(groups, at);
+    }
+}
+
+/// The passes of one view.
+pub(super) struct Passes<'a> {
+    pub(super) launches: &'a Launches,
+    pub(super) groups: &'a wgpu::Buffer,
+    pub(super) shape: Shape,
+}
+
+impl Passes<'_> {
+    /// One digit of a stable sort. `items` is 1 for entries and 0 for rows.
+    fn sort_digit(&self, to: &mut Recorder<'_, '_>, pass: u32, items: u32, scatter: &Launch) {
+        let l = self.launches;
+        let source = (pass % 2) as usize;
+        let (blocks, digits, what) = if items == 1 {
+            (args::ENTRY_BLOCKS, args::ENTRY_DIGITS, DIGITS_OF_ENTRIES)
+        } else {
+            (args::ROW_BLOCKS, args::ROW_DIGITS, DIGITS_OF_ROWS)
+        };
+        let now = [4 * pass, items, u32::from(items == 1 && pass == 0), 0];
+        to.run_counted(&l.count_digits[source], now, self.groups, blocks);
+        to.run_counted(&l.scan_blocks, [what, 0, 0, 0], self.groups, digits);
+        to.run(&l.scan_sums, [what, 0, 0, 0], 1);
+        to.run_counted(scatter, now, self.groups, blocks);
+    }
+
+    /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band, the lists hold
+    /// its entries.
+    pub(super) fn forward(&self, to: &mut Recorder<'_, '_>) {
+        let l = self.launches;
+        let Shape { rows, bands, .. } = self.shape;
+        to.run(&l.project, [0; 4], rows.div_ceil(256));
+        to.run(&l.scan_blocks, [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
+        to.run(&l.scan_sums, [FLAGS, bands, 0, 0], 1);
+        to.run(&l.compact, [0; 4], rows.div_ceil(256));
+        for pass in 0..8 {
+            let scatter =
+                if pass == 7 { &l.scatter_order } else { &l.scatter[(pass % 2) as usize] };
+            self.sort_digit(to, pass, 0, scatter);
+        }
+        self.count(to, WHOLE, COUNTS_ALL);
+        if bands > 1 {
+            to.run_counted(&l.count_tiles, [0; 4], self.groups, args::ROWS);
+            to.run(&l.cut_bands, [0, bands, 0, 0], 1);
+        }
+        for band in 0..bands {
+            self.lists(to, band, COUNTS_BAND);
+            to.run(&l.rasterize[self.sorted()], [band, 0, 0, 0], self.shape.tiles);
+        }
+    }
+
+    fn count(&self, to: &mut Recorder<'_, '_>, band: u32, what: u32) {
+        let l = self.launches;
+        to.run_counted(&l.count_entries, [band, 0, 0, 0], self.groups, args::ROWS);
+        to.run_counted(&l.scan_blocks, [what, 0, 0, 0], self.groups, args::ROW_BLOCKS);
+        to.run(&l.scan_sums, [what, self.shape.bands, 0, 0], 1);
+    }
+
+    /// Which of the two key buffers holds the sorted entries.
+    fn sorted(&self) -> usize {
+        (self.shape.tile_passes() % 2) as usize
+    }
+
+    /// The lists of a band. With one band its entries are counted already.
+    fn lists(&self, to: &mut Recorder<'_, '_>, band: u32, what: u32) {
+        let l = self.launches;
+        let several = self.shape.bands > 1;
+        if several {
+            self.count(to, band, what);
+        }
+        let tiles = if several { band } else { WHOLE };
+        to.run_counted(&l.emit_entries, [tiles, 0, 0, 0], self.groups, args::ROWS);
+        for pass in 0..self.shape.tile_passes() {
+            self.sort_digit(to, pass, 1, &l.scatter[(pass % 2) as usize]);
+        }
+        let groups = (self.shape.tiles + 1).div_ceil(256);
+        to.run(&l.find_tiles[self.sorted()], [0; 4], groups);
+    }
+
+    /// Stage 4, with the weights of |e| and 1 − SSIM in the error per pixel.
+    pub(super) fn loss(&self, to: &mut Recorder<'_, '_>, error_weights: [f32; 2]) {
+        let l = self.launches;
+        let [a, b] = error_weights.map(f32::to_bits);
+        to.run(&l.similarity, [a, b, 0, 0], self.shape.tiles);
+        to.run(&l.pixel_gradient, [0; 4], self.shape.tiles);
+        to.run(&l.loss_total, [0; 4], 1);
+    }
+
+    /// Stage 5: from the pixels' gradients to one record per row.
+    pub(super) fn backward(&self, to: &mut Recorder<'_, '_>) {
+        let l = self.launches;
+        let Shape { rows, tiles, bands } = self.shape;
+        for band in 0..bands {
+            if bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            to.run(&l.rasterize_bwd[self.sorted()], [band, 0, 0, 0], tiles);
+            to.run(&l.gather, [band, 0, 0, 0], rows.div_ceil(256));
+        }
+    }
+
+    /// Stage 6.
+    pub(super) fn differentiate(&self, to: &mut Recorder<'_, '_>) {
+        to.run(&self.launches.project_bwd, [0; 4], self.shape.rows.div_ceil(256));
+    }
+
+    /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends.
+    pub(super) fn optimise(&self, to: &mut Recorder<'_, '_>, sh_degree: u8, signals: bool) {
+        let l = self.launches;
+        let groups = self.shape.rows.div_ceil(256);
+        self.differentiate(to);
+        if signals {
+            to.run(&l.accumulate, [0; 4], groups);
+        }
+        for band in 0..=usize::from(sh_degree) {
+            let now = [(band * band) as u32, band_coefficients(band) as u32, 0, 0];
+            to.run(&l.adam_bands[band], now, groups);
+        }
+        to.run(&l.adam_geometry, [0; 4], groups);
+    }
+
+    /// Surface points of the pixels whose numbers are uploaded, from place `first` on.
+    pub(super) fn surface(&self, to: &mut Recorder<'_, '_>, pixels: u32, mode: u32, first: u32) {
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            let now = [band, pixels, mode, first];
+            to.run(&self.launches.surface[self.sorted()], now, pixels.div_ceil(256));
+        }
+    }
+
+    /// Each row's sums over the pixels of a view that it is blended into.
+    pub(super) fn columns(&self, to: &mut Recorder<'_, '_>) {
+        let l = self.launches;
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            to.run(&l.replay[self.sorted()], [band, 0, 0, 0], self.shape.tiles);
+            to.run(&l.gather_columns, [band, 0, 0, 0], self.shape.rows.div_ceil(256));
+        }
+    }
+
+    /// Counts the view for the largest weight of fresh views.
+    pub(super) fn measure(&self, to: &mut Recorder<'_, '_>) {
+        to.run(&self.launches.measure, [0; 4], self.shape.rows.div_ceil(256));
+    }
+}

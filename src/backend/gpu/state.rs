@@ -1,0 +1,111 @@
+//! The GPU backend's state as named arrays: its buffers row by row, as the device holds them.
+//!
+//! They are named after the device, so that the native backend, whose sums have another order, does
+//! not go on from them unasked.
+
+use super::GpuBackend;
+use super::buffers::{FIRST_SH, SECOND_SH, WAITING_SH, band_coefficients};
+use crate::backend::{BackendError, StateError, Tensor};
+
+/// Before the name of a buffer.
+const BUFFER: &str = "device.";
+/// Before the name of a signal.
+const SIGNAL: &str = "device.signals.";
+const WAITS: &str = "device.waits";
+const CANDIDATES: &str = "candidates";
+/// The buffer whose numbers are whole.
+const AGES: &str = "ages";
+
+impl GpuBackend {
+    /// The buffers that outlive a step, beside the model: name and numbers per row.
+    fn kept(&self) -> Vec<(&'static str, usize)> {
+        let mut all = vec![("first rows", 12), ("second rows", 12), (AGES, 1)];
+        let bands = usize::from(self.sizes.sh_degree) + 1;
+        for names in [FIRST_SH, SECOND_SH] {
+            let names = names.into_iter().take(bands).enumerate();
+            all.extend(names.map(|(band, name)| (name, 3 * band_coefficients(band))));
+        }
+        let [main_waits, rest_waits] = self.sizes.waits();
+        if main_waits {
+            all.push(("waiting rows", 12));
+        }
+        for (band, name) in WAITING_SH.into_iter().take(bands).enumerate() {
+            if if band == 0 { main_waits } else { rest_waits } {
+                all.push((name, 3 * band_coefficients(band)));
+            }
+        }
+        all
+    }
+
+    fn buffer(&self, name: &str) -> Option<(&'static str, usize)> {
+        let name = name.strip_prefix(BUFFER)?;
+        self.kept().into_iter().find(|(known, _)| *known == name)
+    }
+
+    fn signal(&self, name: &str) -> Option<u32> {
+        let name = name.strip_prefix(SIGNAL)?;
+        self.planes.kept().find(|(known, _)| known == name).map(|(_, plane)| plane)
+    }
+
+    pub(super) fn state_names(&self) -> Vec<String> {
+        let buffers = self.kept().into_iter().map(|(name, _)| format!("{BUFFER}{name}"));
+        let signals = self.planes.kept().map(|(name, _)| format!("{SIGNAL}{name}"));
+        let mut names: Vec<String> = buffers.chain(signals).collect();
+        names.push(WAITS.to_owned());
+        if self.candidates.is_wanted() {
+            names.push(CANDIDATES.to_owned());
+        }
+        names
+    }
+
+    /// # Panics
+    /// When there is no such array: a bug in the caller.
+    pub(super) fn state_tensor(&self, name: &str) -> Result<Tensor, BackendError> {
+        if name == WAITS {
+            let waits = [self.waiting.main, self.waiting.rest].map(u8::from);
+            return Ok(Tensor::u8(name, &[2], waits.to_vec()));
+        }
+        if name == CANDIDATES {
+            return Ok(self.candidates.tensor(name));
+        }
+        if let Some(plane) = self.signal(name) {
+            return Ok(Tensor::f32(name, &[self.rows], self.column(plane)?));
+        }
+        let found = self.buffer(name);
+        let (buffer, numbers) =
+            found.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
+        // Ages are whole numbers in the same four bytes.
+        let values = self.read(buffer, 0, 4 * (numbers * self.rows) as u64)?;
+        if buffer == AGES {
+            let bytes = bytemuck::cast_slice(&values).to_vec();
+            return Ok(Tensor::u8(name, &[self.rows, 4], bytes));
+        }
+        Ok(Tensor::f32(name, &[self.rows, numbers], values))
+    }
+
+    pub(super) fn restore_tensor(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        let rows = self.rows;
+        let name = tensor.name.clone();
+        if name == WAITS {
+            let waits = tensor.into_u8(&[2])?;
+            let [main, rest] = [0, 1].map(|i| waits[i] != 0);
+            self.waiting = super::Waiting { main, rest };
+        } else if name == CANDIDATES && self.candidates.is_wanted() {
+            self.candidates.restore(tensor)?;
+        } else if let Some(plane) = self.signal(&name) {
+            let values = tensor.into_f32(&[rows])?;
+            self.write_at("signals", u64::from(plane) * 4 * self.sizes.budget, &values);
+        } else if let Some((buffer, numbers)) = self.buffer(&name) {
+            if buffer == AGES {
+                let ages = tensor.into_u8(&[rows, 4])?;
+                self.write(buffer, &ages);
+            } else {
+                let values = tensor.into_f32(&[rows, numbers])?;
+                self.write_at(buffer, 0, &values);
+            }
+        } else {
+            return Err(tensor.error("this run keeps nothing of that name"));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,74 @@
+//! One training step: what it needs in the uniform buffer, and which passes it takes.
+
+use std::time::Instant;
+
+use super::frame::{due, target as of_target};
+use super::observe::Seen;
+use super::passes::{Passes, Recorder};
+use super::{GpuBackend, Waiting, scalars};
+use crate::backend::candidates::error_weights;
+use crate::backend::{BackendError, StepInput, StepOutput};
+
+impl GpuBackend {
+    /// Who steps now and who waits, as bits of the frame, and who waits afterwards.
+    fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
+        let (step, cadence) = (input.step, input.cadence);
+        assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");
+        let [main, rest] = cadence.steps_at(step);
+        let bits = [
+            (main, due::MAIN_STEPS),
+            (rest, due::REST_STEPS),
+            (self.waiting.main, due::MAIN_WAITED),
+            (self.waiting.rest, due::REST_WAITED),
+            (self.cadence.sh_rest > 1, due::REST_AGES),
+        ];
+        let bits = bits.iter().filter(|(on, _)| *on).fold(0, |all, (_, bit)| all | bit);
+        (bits, Waiting { main: !main, rest: !rest })
+    }
+
+    /// Forward pass, loss, backward pass and optimiser.
+    pub(super) fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        let StepInput { camera, target, background, .. } = *input;
+        assert_eq!(
+            (camera.width, camera.height),
+            (target.width, target.height),
+            "camera and image differ in size"
+        );
+        let start = Instant::now();
+        self.fit_image(camera.width, camera.height)?;
+        let (due, waiting) = self.cadence_bits(input);
+        let mut frame = self.frame(camera, background, input.sh_degree);
+        frame.draw[3] = self.upload_target(target);
+        frame.for_step(input, due, (self.terms, self.noise), &self.planes);
+        let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
+        let step = |passes: &Passes<'_>, to: &mut Recorder<'_, '_>| {
+            passes.backward(to);
+            passes.optimise(to, degree, signals);
+        };
+        let state = if let Some((request, count)) = self.candidates.open(input.step, self.rows) {
+            let weights = error_weights(request.error);
+            if weights.is_some() {
+                frame.draw[3] |= of_target::WITH_ERROR;
+            }
+            let (state, shape) = self.run(&frame, |passes, to| {
+                passes.forward(to);
+                passes.loss(to, weights.unwrap_or_default());
+            })?;
+            let seen = Seen { frame, shape, target };
+            self.collect_candidates(&seen, &request, count)?;
+            self.go_on(shape, step);
+            state
+        } else {
+            let run = self.run(&frame, |passes, to| {
+                passes.forward(to);
+                passes.loss(to, [0.0; 2]);
+                step(passes, to);
+            })?;
+            run.0
+        };
+        self.waiting = waiting;
+        self.laps.clear();
+        self.laps.push(("device", start.elapsed()));
+        Ok(scalars(&state))
+    }
+}

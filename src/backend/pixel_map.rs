@@ -1,0 +1,139 @@
+//! What backends measure in an auxiliary view in the same way: the pixel map, the pixels whose
+//! surface points a policy wants, and a row's radius. On the host, for every backend: it happens at a policy's events only.
+
+use densify_policies::policy::PixelMap;
+use densify_policies::rng::PolicyRng;
+use densify_policies::sample::weighted;
+
+use super::AuxInput;
+use crate::dataset::images::Image8;
+
+/// The pixel map of a rendering; see [`PixelMap`]. Shapes: `[height, width]`.
+pub(super) fn pixel_map(
+    rgb: &[[f32; 3]],
+    target: &Image8,
+    background: [f32; 3],
+    map: PixelMap,
+) -> Vec<f32> {
+    let width = target.width as usize;
+    let weight = |at: usize| target.mask.as_ref().map_or(1.0, |m| f32::from(m[at]) / 255.0);
+    let mut error: Vec<f32> = rgb
+        .iter()
+        .enumerate()
+        .map(|(at, rendered)| {
+            let truth = target.composited(at % width, at / width, background);
+            let difference = |i: usize| (rendered[i] - truth[i]).abs();
+            weight(at) * (difference(0) + difference(1) + difference(2)) / 3.0
+        })
+        .collect();
+    let mut edge = edges(target, background);
+    for (at, edge) in edge.iter_mut().enumerate() {
+        *edge *= weight(at);
+    }
+    stretch(&mut error);
+    stretch(&mut edge);
+    error.iter().zip(&edge).map(|(e, g)| map.error * e + map.edge * g).collect()
+}
+
+/// Pixels (x, y, alpha) drawn without replacement in proportion to their alpha.
+pub(super) fn draw_pixels(
+    alpha: &[f32],
+    width: usize,
+    input: &AuxInput<'_>,
+) -> Vec<(usize, usize, f32)> {
+    // Views of one step draw apart from each other.
+    let of_view = (input.view as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let rng = PolicyRng::new(input.seed ^ of_view, input.step);
+    let drawn = weighted(alpha, input.request.points as usize, &rng);
+    drawn
+        .into_iter()
+        .map(|at| (at as usize % width, at as usize / width, alpha[at as usize]))
+        .collect()
+}
+
+/// Three standard deviations along the longer axis of a projected covariance [a b; b c], rounded up
+/// `[px]`; of its factor 1/l1 = √(det/c), r = b/c, 1/l3 = √c.
+pub(super) fn radius_px(inv_l1: f32, shear: f32, inv_l3: f32) -> f32 {
+    let c = inv_l3 * inv_l3;
+    let b = shear * c;
+    let a = inv_l1 * inv_l1 + shear * b;
+    let mid = 0.5 * (a + c);
+    // The root of mid² − det without its cancellation.
+    let root = (0.5 * (a - c)).hypot(b);
+    (3.0 * (mid + root).sqrt()).ceil()
+}
+
+/// 8-neighbour Laplacian of the 8-bit luma, clipped to 0..255; borders are repeated.
+/// Shape: `[height, width]`.
+fn edges(target: &Image8, background: [f32; 3]) -> Vec<f32> {
+    let (width, height) = (target.width as usize, target.height as usize);
+    let luma: Vec<u8> = (0..width * height)
+        .map(|at| {
+            let rgb = target.composited(at % width, at / width, background);
+            let [r, g, b] = rgb.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u32);
+            // ITU-R 601-2 in 16 bits: 0.299, 0.587, 0.114.
+            ((19_595 * r + 38_470 * g + 7_471 * b + 32_768) >> 16) as u8
+        })
+        .collect();
+    let at = |x: usize, y: usize| i32::from(luma[y * width + x]);
+    (0..width * height)
+        .map(|pixel| {
+            let (x, y) = (pixel % width, pixel / width);
+            let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
+            let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
+            let sum: i32 = rows.iter().flat_map(|&y| columns.map(|x| at(x, y))).sum();
+            (9 * at(x, y) - sum).clamp(0, 255) as f32
+        })
+        .collect()
+}
+
+/// Brings values to 0..1 by their least and their largest; all 0 where they are equal.
+fn stretch(values: &mut [f32]) {
+    let range = values
+        .iter()
+        .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), &x| (low.min(x), high.max(x)));
+    let (low, width) = (range.0, range.1 - range.0);
+    for x in values {
+        *x = if width > 0.0 { (*x - low) / width } else { 0.0 };
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "results are exact")]
+mod tests {
+    use super::*;
+
+    fn image(width: u32, grey: &[u8]) -> Image8 {
+        let height = grey.len() as u32 / width;
+        let rgb = grey.iter().flat_map(|&v| [v; 3]).collect();
+        Image8 { width, height, rgb, alpha: None, mask: None }
+    }
+
+    #[test]
+    fn edges_are_the_laplacian_of_the_luma() {
+        // A step from 10 to 30: 8·30 − (5·30 + 3·10) = 60 on the bright side, clipped to 0 on the dark.
+        let step = image(4, &[10, 10, 30, 30, 10, 10, 30, 30, 10, 10, 30, 30]);
+        let row = [0.0, 0.0, 60.0, 0.0];
+        assert_eq!(edges(&step, [0.0; 3]), [row, row, row].concat());
+        // A bright pixel: 8·200, clipped to 255. Its dark neighbours have none.
+        let dot = image(3, &[0, 0, 0, 0, 200, 0, 0, 0, 0]);
+        assert_eq!(edges(&dot, [0.0; 3])[4], 255.0);
+        assert_eq!(edges(&dot, [0.0; 3]).iter().sum::<f32>(), 255.0);
+        // Green counts most: 0.587·100 = 58.7.
+        let green = Image8 { rgb: vec![0, 0, 0, 0, 100, 0], ..image(2, &[0, 0]) };
+        assert_eq!(edges(&green, [0.0; 3]), [0.0, 177.0]);
+        let mut clear = image(2, &[0, 200]);
+        clear.alpha = Some(vec![255, 0]);
+        assert_eq!(edges(&clear, [0.0; 3]), [0.0, 0.0]);
+    }
+
+    #[test]
+    fn maps_are_stretched_to_one() {
+        let mut values = [3.0, 1.0, 2.0];
+        stretch(&mut values);
+        assert_eq!(values, [1.0, 0.0, 0.5]);
+        let mut flat = [4.0; 3];
+        stretch(&mut flat);
+        assert_eq!(flat, [0.0; 3]);
+    }
+}

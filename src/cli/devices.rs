@@ -1,0 +1,47 @@
+//! `densify devices`: the adapters, and what fits them.
+
+use clap::Args;
+
+use super::console::Console;
+use super::failure::Failure;
+use super::number::grouped;
+use crate::backend::gpu::{AdapterKind, adapters};
+use crate::gaussians::MAX_SH_DEGREE;
+use crate::memory::Bytes;
+
+/// Lists the adapters that can train and render, with their limits.
+///
+/// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; how
+/// much memory there is in all, drivers do not say. `WGPU_BACKEND` (vulkan, metal, dx12) and, for
+/// Vulkan, `VK_DRIVER_FILES` decide which drivers are asked.
+#[derive(Debug, Args)]
+pub(super) struct DevicesArgs {}
+
+pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
+    let all = adapters();
+    for adapter in &all {
+        let kind = match adapter.kind {
+            AdapterKind::Discrete => "graphics card",
+            AdapterKind::Integrated => "integrated GPU",
+            AdapterKind::Virtual => "virtual GPU",
+            AdapterKind::Software => "software; taken only if asked for",
+            AdapterKind::Unknown => "of unknown kind",
+        };
+        console.result(format_args!("{}", adapter.name));
+        console.result(format_args!("  {kind}; {}, {}", adapter.interface, adapter.driver));
+        let largest = adapter.largest_binding.min(adapter.largest_buffer);
+        console.result(format_args!("  largest buffer  {}", Bytes(largest)));
+        let budgets = (0..=MAX_SH_DEGREE).map(|degree| {
+            format!("{} at degree {degree}", grouped(adapter.largest_budget(degree) as usize))
+        });
+        let budgets: Vec<_> = budgets.collect();
+        console.result(format_args!("  largest budget  {}", budgets.join(", ")));
+        for missing in &adapter.missing {
+            console.result(format_args!("  cannot be used: {missing}"));
+        }
+    }
+    if all.is_empty() {
+        console.result("There is no adapter; the native backend trains on the processor.");
+    }
+    Ok(())
+}
