@@ -4,7 +4,9 @@ use clap::{Args, ValueEnum};
 
 use super::console::Console;
 use super::failure::Failure;
-use crate::backend::gpu::{AdapterChoice, AdapterKind, AdapterSummary, GpuDevice, adapters};
+use crate::backend::gpu::{
+    AdapterChoice, AdapterKind, AdapterSummary, GpuDevice, adapters, may_be_present,
+};
 
 /// Where to compute.
 #[derive(Debug, Args)]
@@ -41,7 +43,8 @@ impl DeviceArgs {
             return Ok(None);
         }
         let is_asked_for = self.backend == Where::Gpu || self.gpu.is_some();
-        if !is_asked_for && !adapters().iter().any(AdapterSummary::is_gpu) {
+        let is_there = || may_be_present() && adapters().iter().any(AdapterSummary::is_gpu);
+        if !is_asked_for && !is_there() {
             console.say(
                 "device   processor (no GPU was found; `densify devices` shows what there is)",
             );

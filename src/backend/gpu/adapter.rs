@@ -77,6 +77,15 @@ impl AdapterSummary {
     }
 }
 
+/// Whether there may be a GPU: on Linux, whether the kernel shows a device. To ask the drivers costs
+/// time, and memory that is never given back, software drivers' included.
+#[must_use]
+pub fn may_be_present() -> bool {
+    const NODES: [&str; 6] =
+        ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0", "/dev/kfd"];
+    !cfg!(target_os = "linux") || NODES.iter().any(|node| std::path::Path::new(node).exists())
+}
+
 /// Rows that the numbering of work allows: 2³² bytes of nothing are indexed beyond.
 const MOST_ROWS: u64 = 1 << 25;
 

@@ -39,7 +39,7 @@ use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 use crate::memory::{Ledger, Section};
 
-pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters};
+pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
 use buffers::{Buffers, MOST_ENTRIES, Sizes, bias_table};
 use device::Device;
 pub use device::GpuDevice;

@@ -8,6 +8,7 @@ mod edits;
 mod looking;
 mod oracle;
 mod policies;
+mod resuming;
 mod training;
 mod twins;
 

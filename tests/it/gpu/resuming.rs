@@ -1,0 +1,96 @@
+//! What a checkpoint holds of a GPU backend is all that its future depends on.
+
+use densify::backend::{Backend, Tensor, Values};
+use densify_policies::policy::{
+    Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, Signal, SignalSet,
+};
+
+use super::training::step;
+use super::{backend_for, subjects};
+use crate::scenes;
+
+const CADENCE: Cadence = Cadence { all: 2, sh_rest: 3 };
+/// Steps before the state is taken: no optimiser step is due, and all have sums that wait.
+const BEFORE: u32 = 7;
+
+fn needs() -> Needs {
+    let signals = [Signal::VisibleCount, Signal::ScreenGradient, Signal::WeightMax, Signal::Age];
+    Needs {
+        signals: SignalSet::of(&signals),
+        cadence: CADENCE,
+        loss_terms: LossTerms { opacity: 0.01, scale: 0.0 },
+        candidates: Some(CandidateRequest {
+            from: 0,
+            until: 100,
+            rows_per_candidate: 20,
+            capacity: 100,
+            error: ErrorMode::L1Dssim,
+            depth: DepthMode::MaxWeight,
+            spaced: true,
+            min_alpha: 0.1,
+        }),
+        ..Needs::default()
+    }
+}
+
+/// Four more steps, with a new epoch among them, and everything that can be seen of the backend.
+fn future(backend: &mut dyn Backend) -> impl PartialEq + std::fmt::Debug + use<> {
+    let camera = scenes::camera(48, 40, 51);
+    for i in BEFORE + 1..BEFORE + 5 {
+        if i == BEFORE + 3 {
+            backend.begin_epoch();
+        }
+        step(backend, &camera, i, CADENCE);
+    }
+    let (signals, candidates) = backend.take_signals(&needs()).expect("signals");
+    let bits = |s: Signal| -> Vec<u32> {
+        signals.get(s).expect("it was asked for").iter().map(|v| v.to_bits()).collect()
+    };
+    let columns: Vec<_> = needs().signals.iter().map(|s| (s, bits(s))).collect();
+    (backend.download().expect("the model"), columns, candidates)
+}
+
+fn is_zero(tensor: &Tensor) -> bool {
+    match &tensor.values {
+        Values::F32(values) => values.iter().all(|v| v.to_bits() == 0),
+        Values::U16(values) => values.iter().all(|&v| v == 0),
+        Values::U8(values) => values.iter().all(|&v| v == 0),
+    }
+}
+
+#[test]
+fn a_backend_that_took_back_its_state_has_the_same_future() {
+    let camera = scenes::camera(48, 40, 51);
+    let model = scenes::cloud(200, 3, &camera, 52);
+    for device in subjects() {
+        let mut whole = backend_for(&model, device, &needs());
+        whole.begin_epoch();
+        for i in 1..=BEFORE {
+            step(&mut whole, &camera, i, CADENCE);
+        }
+        let saved = |name: &String| whole.save(name).expect("an array of the state");
+        let state: Vec<Tensor> = whole.state().iter().map(saved).collect();
+        let model = whole.download().expect("the model");
+        let expected = future(&mut whole);
+
+        let without = |left_out: &str| {
+            let mut backend = backend_for(&model, device, &needs());
+            for tensor in state.iter().filter(|t| t.name != left_out) {
+                backend.restore(tensor.clone()).expect("it is this backend's");
+            }
+            future(&mut backend)
+        };
+        let name = &device.adapter().name;
+        assert!(without("") == expected, "{name}");
+        // None of it is idle.
+        let told: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();
+        assert!(told.len() > 15, "{name}: only {} arrays say anything", told.len());
+        for tensor in told {
+            assert!(without(&tensor.name) != expected, "{name}: {}", tensor.name);
+        }
+
+        let mut other = backend_for(&model, device, &Needs::default());
+        let waiting = state.iter().find(|t| t.name.contains("waiting")).expect("sums that wait");
+        assert!(other.restore(waiting.clone()).is_err(), "a run without sums took them");
+    }
+}
