@@ -138,11 +138,10 @@ mod tests {
         let mut options = CpuOptions::new(model.len());
         options.threads = Some(1);
         let mut cpu = CpuBackend::new(&model, &options).unwrap();
-        let (outputs, image) = run(&mut cpu, &camera, &target).unwrap();
+        let (outputs, _) = run(&mut cpu, &camera, &target).unwrap();
         // Rows on screen and off it, several tiles, and steps that matter beyond the tolerance.
         assert!(outputs[0].visible > 30 && outputs[0].visible < model.len(), "{outputs:?}");
         assert!(outputs[0].entries > 100, "{outputs:?}");
         assert!(outputs[0].loss - outputs[1].loss > 3.0 * LOSS_TOLERANCE, "{outputs:?}");
-        assert!(image.iter().any(|c| *c > 0.5) && image.iter().any(|c| *c < 0.2));
     }
 }
