@@ -85,6 +85,14 @@ pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     Ok(error / weight)
 }
 
+/// Most that a thread holds while it compares images of this width `[bytes]`: in `f64` eight planes
+/// of the rows that a block sees and seven of its own rows, and what is [seen](Seen) in two images.
+pub(super) fn bytes_per_thread(width: u64) -> u64 {
+    let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().reach()) as u64);
+    let float = size_of::<f64>() as u64;
+    width * (8 * lines * float + rows * (7 * float + 2 * size_of::<Seen>() as u64))
+}
+
 /// What the eye makes of a pixel.
 struct Seen {
     /// Lightness and Hunt-adjusted chroma of the filtered image.
@@ -338,7 +346,7 @@ mod tests {
     #[test]
     fn the_authors_program_says_the_same() {
         let black = target(9, 9, |_, _, _| 0.0);
-        let dot = target(9, 9, |x, y, _| if x == 4.0 && y == 4.0 { 1.0 } else { 0.0 });
+        let dot = target(9, 9, |x, y, _| if (x - 4.0).hypot(y - 4.0) < 0.5 { 1.0 } else { 0.0 });
         let cases = [
             ("waves", between(&waves(0.3), &waves(0.0)), 0.350_385_308),
             ("black and white", between(&target(9, 9, |_, _, _| 1.0), &black), 0.967_388_868),

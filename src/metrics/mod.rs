@@ -19,6 +19,13 @@ pub use ssim::ssim;
 
 use crate::dataset::images::Image8;
 
+/// Memory that scoring an image of this width takes on so many threads `[bytes]`: that of [`flip()`],
+/// which takes the most.
+#[must_use]
+pub fn scratch_bytes(width: u32, threads: usize) -> u64 {
+    flip::bytes_per_thread(u64::from(width)) * threads as u64
+}
+
 /// Why two images cannot be compared.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MetricError {

@@ -1,6 +1,7 @@
 //! Skies from images against gradients, by direction, and as files.
 
 use std::fs;
+use std::path::PathBuf;
 
 use image::codecs::{hdr::HdrEncoder, openexr::OpenExrEncoder};
 use image::{ExtendedColorType, ImageEncoder, Rgb};
@@ -95,17 +96,21 @@ fn a_bright_pixel_shines_from_where_it_is() {
     }
 }
 
-/// The same pixels in both formats.
-fn files(folder: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> [std::path::PathBuf; 2] {
-    let paths = ["sky.hdr", "sky.exr"].map(|name| folder.join(name));
+/// The same pixels, all of them finite, in both formats.
+fn files(folder: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> [PathBuf; 2] {
+    let path = folder.join("sky.hdr");
     let colours: Vec<Rgb<f32>> = pixels.iter().map(|&p| Rgb(p)).collect();
-    let file = fs::File::create(&paths[0]).expect("a file");
+    let file = fs::File::create(&path).expect("a file");
     HdrEncoder::new(file).encode(&colours, width as usize, height as usize).expect("HDR");
+    [path, exr(folder, width, height, pixels)]
+}
+
+fn exr(folder: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> PathBuf {
+    let path = folder.join("sky.exr");
     let bytes: Vec<u8> = pixels.iter().flatten().flat_map(|v| v.to_ne_bytes()).collect();
-    let file = fs::File::create(&paths[1]).expect("a file");
-    let encoder = OpenExrEncoder::new(file);
+    let encoder = OpenExrEncoder::new(fs::File::create(&path).expect("a file"));
     encoder.write_image(&bytes, width, height, ExtendedColorType::Rgb32F).expect("EXR");
-    paths
+    path
 }
 
 #[test]
@@ -119,8 +124,7 @@ fn files_of_both_formats_are_read_and_made_sane() {
         assert_eq!(sky.image.values[31], Vec3::new(0.5, 1.0, 2.0));
     }
     pixels[0] = [f32::NAN, f32::INFINITY, -1.0];
-    let [_, exr] = files(folder.path(), 8, 4, &pixels);
-    let sky = Panorama::load(&exr).expect("a sky");
+    let sky = Panorama::load(&exr(folder.path(), 8, 4, &pixels)).expect("a sky");
     assert_eq!(sky.image.values[0], Vec3::new(0.0, BRIGHTEST, 0.0));
 }
 

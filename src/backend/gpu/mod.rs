@@ -16,6 +16,7 @@ mod differentiate;
 mod edits;
 mod frame;
 mod observe;
+mod options;
 mod passes;
 mod pipelines;
 mod readback;
@@ -45,6 +46,7 @@ use device::Device;
 pub use device::GpuDevice;
 use edits::EditLaunches;
 use frame::{Frame, State};
+pub use options::GpuOptions;
 use passes::{Launches, Passes, Recorder, Shape};
 use pipelines::Pipelines;
 use signals::{Planes, record_stride};
@@ -53,31 +55,6 @@ use signals::{Planes, record_stride};
 const MAX_SIDE: u32 = 16_384;
 /// Weight of 1 − SSIM in the loss; L1 has the rest.
 const SSIM_WEIGHT: f32 = 0.2;
-
-/// How to set up a [`GpuBackend`].
-#[derive(Debug, Clone)]
-pub struct GpuOptions {
-    /// Most rows there may ever be, >= 1 and >= the model's.
-    pub budget: usize,
-    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
-    pub near: f32,
-    /// Most (row, tile) entries held at a time; beyond it the image is processed in bands. `None`:
-    /// 16 per row of the budget, or as many as the device can bind. Raised to the budget.
-    pub tile_cap: Option<usize>,
-    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
-    /// memory than the ledger says.
-    pub largest_image: (u32, u32),
-    /// Signals and candidates to collect.
-    pub needs: Needs,
-}
-
-impl GpuOptions {
-    /// Options for models of at most `budget` rows.
-    #[must_use]
-    pub fn new(budget: usize) -> Self {
-        Self { budget, near: 0.01, tile_cap: None, largest_image: (0, 0), needs: Needs::default() }
-    }
-}
 
 /// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
 #[derive(Debug, Clone, Copy, Default)]

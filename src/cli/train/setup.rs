@@ -23,6 +23,7 @@ use crate::dataset::Dataset;
 use crate::gaussians::{Gaussians, sh_coefficients};
 use crate::init::{initialise, random_points, restart};
 use crate::memory::{Ledger, Section, resident};
+use crate::metrics::scratch_bytes;
 use crate::output::{InitChoice, PolicyConfig, RunConfig, RunFolder, TrainConfig};
 use crate::schedule::Background;
 use crate::trainer::{TrainOptions, Trainer, needs};
@@ -273,7 +274,9 @@ fn backend(
         ledger.add_to(
             Section::Passing,
             "measuring a test view",
-            rendering + test.cache().bytes_needed(),
+            rendering
+                + test.cache().bytes_needed()
+                + scratch_bytes(width, rayon::current_num_threads()),
         );
     }
     if let Some(bytes) = before {

@@ -1,0 +1,28 @@
+//! How a GPU backend is set up.
+
+use densify_policies::policy::Needs;
+
+/// How to set up a [`GpuBackend`](super::GpuBackend).
+#[derive(Debug, Clone)]
+pub struct GpuOptions {
+    /// Most rows there may ever be, >= 1 and >= the model's.
+    pub budget: usize,
+    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
+    pub near: f32,
+    /// Most (row, tile) entries held at a time; beyond it the image is processed in bands. `None`:
+    /// 16 per row of the budget, or as many as the device can bind. Raised to the budget.
+    pub tile_cap: Option<usize>,
+    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
+    /// memory than the ledger says.
+    pub largest_image: (u32, u32),
+    /// Signals and candidates to collect.
+    pub needs: Needs,
+}
+
+impl GpuOptions {
+    /// Options for models of at most `budget` rows.
+    #[must_use]
+    pub fn new(budget: usize) -> Self {
+        Self { budget, near: 0.01, tile_cap: None, largest_image: (0, 0), needs: Needs::default() }
+    }
+}
