@@ -1,0 +1,88 @@
+//! FLIP against the authors' program, and what must make no difference.
+
+use super::*;
+
+fn target(width: u32, height: u32, of: impl Fn(f64, f64, f64) -> f64) -> Image8 {
+    let mut rgb = Vec::new();
+    for y in 0..height {
+        for x in 0..width {
+            for c in 0..3 {
+                let value = of(f64::from(x), f64::from(y), f64::from(c));
+                rgb.push((255.0 * value).round() as u8);
+            }
+        }
+    }
+    Image8 { width, height, rgb, alpha: None, mask: None }
+}
+
+fn as_render(image: &Image8) -> Vec<f32> {
+    image.rgb.iter().map(|&v| f32::from(v) / 255.0).collect()
+}
+
+fn waves(phase: f64) -> Image8 {
+    target(37, 24, |x, y, c| {
+        0.5 + 0.45 * (phase + 0.31 * x * (c + 1.0) + 0.17 * y * (3.0 - c)).sin()
+    })
+}
+
+fn between(render: &Image8, truth: &Image8) -> f64 {
+    flip(&as_render(render), truth, [0.0; 3]).unwrap()
+}
+
+/// Means by the authors' own program, version 1.7, at its default distance.
+#[test]
+fn the_authors_program_says_the_same() {
+    let black = target(9, 9, |_, _, _| 0.0);
+    let dot = target(9, 9, |x, y, _| if (x - 4.0).hypot(y - 4.0) < 0.5 { 1.0 } else { 0.0 });
+    let cases = [
+        ("waves", between(&waves(0.3), &waves(0.0)), 0.350_385_308),
+        ("black and white", between(&target(9, 9, |_, _, _| 1.0), &black), 0.967_388_868),
+        ("a dot", between(&dot, &black), 0.176_478_878),
+    ];
+    for (case, measured, expected) in cases {
+        // The program works in float32.
+        assert!((measured - expected).abs() < 2e-5, "{case}: {measured} for {expected}");
+    }
+}
+
+#[test]
+fn equal_images_do_not_differ_and_order_does_not_matter() {
+    // The render is in f32, and small distances count more than in proportion.
+    assert!(between(&waves(0.0), &waves(0.0)) < 1e-4);
+    let (there, back) = (between(&waves(0.3), &waves(0.0)), between(&waves(0.0), &waves(0.3)));
+    assert!((there - back).abs() < 1e-5, "{there} and {back}");
+}
+
+#[test]
+fn blocks_of_rows_do_not_show() {
+    // A picture of 100 rows that repeats 1 column: as wide or as high, the error is the same.
+    let tall = |phase: f64| target(1, 100, |_, y, c| 0.5 + 0.4 * (phase + 0.2 * y + c).sin());
+    let wide = |phase: f64| target(100, 1, |x, _, c| 0.5 + 0.4 * (phase + 0.2 * x + c).sin());
+    let (a, b) = (between(&tall(0.5), &tall(0.0)), between(&wide(0.5), &wide(0.0)));
+    assert!((a - b).abs() < 1e-12 && a > 0.01, "{a} and {b}");
+}
+
+#[test]
+fn masks_coverage_and_nan() {
+    let mut half = waves(0.0);
+    let right = |p: usize| p % 37 >= 18;
+    half.mask = Some((0..37 * 24).map(|p| if right(p) { 0 } else { 255 }).collect());
+    let mut render = as_render(&half);
+    for (i, value) in render.iter_mut().enumerate() {
+        if right(i / 3) {
+            *value = f32::NAN;
+        }
+    }
+    // What is ignored neither counts nor leaks into its neighbours.
+    assert!(flip(&render, &half, [0.0; 3]).unwrap() < 1e-4);
+    render[0] = f32::NAN;
+    assert!(flip(&render, &half, [0.0; 3]).unwrap().is_nan());
+    half.mask = Some(vec![0; 37 * 24]);
+    assert_eq!(flip(&render, &half, [0.0; 3]), Err(MetricError::NothingToCompare));
+
+    let mut covered = target(9, 9, |_, _, _| 1.0);
+    covered.alpha = Some(vec![0; 81]);
+    let grey = flip(&[0.5; 243], &covered, [0.5; 3]).unwrap();
+    assert!(grey.abs() < 1e-12, "{grey}");
+    assert!(flip(&[0.5; 11], &covered, [0.5; 3]).is_err());
+}
