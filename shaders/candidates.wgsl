@@ -12,7 +12,6 @@
 @group(0) @binding(8) var<storage, read_write> points: array<vec4<f32>>;
 
 const ALPHA_MIN: f32 = 1.0 / 255.0;
-const ALPHA_MAX: f32 = 0.99;
 
 // now.a: the band, now.b: how many pixels, now.c: the surface is at the largest blend weight (0) or
 // where half the light is gone (1), now.d: place of the first in `points`.

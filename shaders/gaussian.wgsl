@@ -8,7 +8,6 @@
 @group(0) @binding(5) var<storage, read> sh3: array<f32>;
 
 const BLUR: f32 = 0.3;
-const LOG2_255: f32 = 7.9943534;
 const FOLD: f32 = 0.8493218;
 const COLOUR_MAX: f32 = 1e6;
 

@@ -11,9 +11,6 @@
 // Per slot: sums of the map, of pixels, of weights, of distances.
 @group(0) @binding(7) var<storage, read_write> records: array<vec4<f32>>;
 
-const ALPHA_MAX: f32 = 0.99;
-const TRANSMITTANCE_MIN: f32 = 1e-4;
-const LOG2_255: f32 = 7.9943534;
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 16u;
 const SHARE: u32 = 64u;
@@ -23,12 +20,6 @@ var<workgroup> weights: array<f32, 1024>;
 var<workgroup> map_of: array<f32, 256>;
 var<workgroup> batch: array<vec4<f32>, 32>;
 var<workgroup> slots: array<u32, 16>;
-
-fn pixel_of(lane: u32) -> vec2<u32> {
-    let x = (lane & 1u) | ((lane >> 1u) & 2u) | ((lane >> 2u) & 4u) | ((lane >> 3u) & 8u);
-    let y = ((lane >> 1u) & 1u) | ((lane >> 2u) & 2u) | ((lane >> 3u) & 4u) | ((lane >> 4u) & 8u);
-    return vec2(x, y);
-}
 
 // now.a: the band.
 @compute @workgroup_size(256)

@@ -13,24 +13,12 @@
 // did not.
 @group(0) @binding(7) var<storage, read_write> finish: array<vec2<u32>>;
 
-const ALPHA_MAX: f32 = 0.99;
-const TRANSMITTANCE_MIN: f32 = 1e-4;
-const LOG2_255: f32 = 7.9943534;
-
 // Splats of a batch: mean within the tile, l1, shear | l3, log2 of the opacity, depth | colour.
 var<workgroup> batch_a: array<vec4<f32>, 256>;
 var<workgroup> batch_b: array<vec4<f32>, 256>;
 var<workgroup> batch_c: array<vec4<f32>, 256>;
 var<workgroup> stopped: atomic<u32>;
 var<workgroup> all_stopped: u32;
-
-// The pixel of an invocation within its tile: neighbours in number are neighbours in the image, so
-// that those that run together mostly agree.
-fn pixel_of(lane: u32) -> vec2<u32> {
-    let x = (lane & 1u) | ((lane >> 1u) & 2u) | ((lane >> 2u) & 4u) | ((lane >> 3u) & 8u);
-    let y = ((lane >> 1u) & 1u) | ((lane >> 2u) & 2u) | ((lane >> 3u) & 4u) | ((lane >> 4u) & 8u);
-    return vec2(x, y);
-}
 
 // now.a: the band.
 @compute @workgroup_size(256)

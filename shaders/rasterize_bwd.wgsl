@@ -22,8 +22,6 @@ override DETAIL: u32 = 0u;
 // Whether alpha and depth have gradients.
 override MORE: bool = false;
 
-const ALPHA_MAX: f32 = 0.99;
-const LOG2_255: f32 = 7.9943534;
 // Splats at a time, and loaded at a time.
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 16u;
@@ -39,12 +37,6 @@ var<workgroup> batch: array<vec4<f32>, 48>;
 var<workgroup> slots: array<u32, 16>;
 var<workgroup> last_stop: atomic<u32>;
 var<workgroup> list_end: u32;
-
-fn pixel_of(lane: u32) -> vec2<u32> {
-    let x = (lane & 1u) | ((lane >> 1u) & 2u) | ((lane >> 2u) & 4u) | ((lane >> 3u) & 8u);
-    let y = ((lane >> 1u) & 1u) | ((lane >> 2u) & 2u) | ((lane >> 3u) & 4u) | ((lane >> 4u) & 8u);
-    return vec2(x, y);
-}
 
 struct Upstream {
     rgb: vec3<f32>,

@@ -65,6 +65,19 @@ const NONE: u32 = 0xffffffffu;
 const TILE: u32 = 16u;
 const GROUP: u32 = 256u;
 
+// Blending: the largest alpha; the transmittance at which a pixel stops; −log2 of the smallest alpha.
+const ALPHA_MAX: f32 = 0.99;
+const TRANSMITTANCE_MIN: f32 = 1e-4;
+const LOG2_255: f32 = 7.9943534;
+
+// The pixel of an invocation within its tile: neighbours in number are neighbours in the image, so
+// that those that run together mostly agree.
+fn pixel_of(lane: u32) -> vec2<u32> {
+    let x = (lane & 1u) | ((lane >> 1u) & 2u) | ((lane >> 2u) & 4u) | ((lane >> 3u) & 8u);
+    let y = ((lane >> 1u) & 1u) | ((lane >> 2u) & 2u) | ((lane >> 3u) & 4u) | ((lane >> 4u) & 8u);
+    return vec2(x, y);
+}
+
 // Workgroups in the first of two dimensions, each of which has at most 65,535 of them. It is a
 // constant because DX12 does not tell an indirect dispatch how many there are.
 const ACROSS: u32 = 32768u;

@@ -7,6 +7,7 @@ mod candidates;
 pub mod cpu;
 pub mod gpu;
 mod pixel_map;
+mod signal_planes;
 mod state;
 
 use std::time::Duration;

@@ -10,10 +10,10 @@ use super::project::ViewParams;
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::{Detail, field};
 use super::regularise::{Noise, Terms};
-use super::signals::Layout;
 use super::simd::WIDTH;
 use super::summed::{Due, TaskSums};
 use crate::backend::LearningRates;
+use crate::backend::signal_planes::SignalPlanes;
 use crate::gaussians::sh_coefficients;
 
 /// One optimiser step for a run of whole blocks.
@@ -25,7 +25,7 @@ pub(super) struct Optimise<'a> {
     pub(super) ages: &'a mut [u16],
     /// Accumulators of these blocks; empty if no sum is requested.
     pub(super) signals: &'a mut [f32],
-    pub(super) layout: Layout,
+    pub(super) layout: SignalPlanes,
     /// Shape: `[rows, detail.stride()]`.
     pub(super) sums: &'a [f32],
     pub(super) detail: Detail,

@@ -9,38 +9,14 @@ use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::{Detail, field};
 use super::simd::{V, WIDTH, each};
-
-/// Signals that are sums over views, in plane order.
-const SUMS: [Signal; 10] = [
-    Signal::VisibleCount,
-    Signal::ScreenGradient,
-    Signal::ScreenGradientAbs,
-    Signal::ColourGradient,
-    Signal::MeanGradientX,
-    Signal::MeanGradientY,
-    Signal::MeanGradientZ,
-    Signal::MeanGradientNorm,
-    Signal::WeightSum,
-    Signal::PixelCount,
-];
+use crate::backend::signal_planes::{SUMS, SignalPlanes};
 
 /// The accumulators of the requested signals.
 #[derive(Debug)]
 pub(super) struct Accumulators {
     requested: SignalSet,
-    layout: Layout,
+    layout: SignalPlanes,
     pub(super) blocks: Blocks,
-}
-
-/// Which plane holds which signal.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Layout {
-    sums: [Option<usize>; SUMS.len()],
-    /// Largest weight of the previous epoch, and of the current one.
-    weight_max: Option<[usize; 2]>,
-    /// Largest weight of the views measured since signals were last taken.
-    fresh_weight_max: Option<usize>,
-    planes: usize,
 }
 
 #[inline(always)]
@@ -53,24 +29,10 @@ fn norm3<S: Simd>(v: [V<S>; 3]) -> V<S> {
     dot(v, v).sqrt()
 }
 
-impl Layout {
-    fn new(requested: SignalSet) -> Self {
-        let mut planes = 0;
-        let mut next = |wanted: bool| {
-            planes += usize::from(wanted);
-            wanted.then(|| planes - 1)
-        };
-        let sums = SUMS.map(|signal| next(requested.contains(signal)));
-        let previous = next(requested.contains(Signal::WeightMax));
-        let current = next(requested.contains(Signal::WeightMax));
-        let weight_max = previous.zip(current).map(|(a, b)| [a, b]);
-        let fresh_weight_max = next(requested.contains(Signal::FreshWeightMax));
-        Self { sums, weight_max, fresh_weight_max, planes }
-    }
-
+impl SignalPlanes {
     /// Adds one view's contribution to the accumulators of a block.
     #[inline(always)]
-    pub(super) fn accumulate<S: Simd>(
+    pub(in crate::backend::cpu) fn accumulate<S: Simd>(
         &self,
         s: S,
         block: &mut [f32],
@@ -122,30 +84,16 @@ impl Layout {
 
 impl Accumulators {
     pub(super) fn new(budget: usize, requested: SignalSet) -> Self {
-        let layout = Layout::new(requested);
-        Self { requested, layout, blocks: Blocks::zeros(budget, layout.planes) }
+        let layout = SignalPlanes::new(requested);
+        Self { requested, layout, blocks: Blocks::zeros(budget, layout.count) }
     }
 
     pub(super) fn bytes(budget: usize, requested: SignalSet) -> u64 {
-        Blocks::bytes(budget, Layout::new(requested).planes)
+        Blocks::bytes(budget, SignalPlanes::new(requested).count)
     }
 
-    pub(super) fn layout(&self) -> Layout {
+    pub(super) fn layout(&self) -> SignalPlanes {
         self.layout
-    }
-
-    /// What is kept between steps, by name and plane. Weights of fresh views are not: they are
-    /// measured and taken within one event.
-    pub(super) fn state(&self) -> impl Iterator<Item = (String, usize)> {
-        let sums = SUMS.iter().zip(self.layout.sums);
-        let sums = sums.filter_map(|(signal, plane)| Some((format!("{signal:?}"), plane?)));
-        let epochs = ["WeightMax.previous", "WeightMax.current"].map(str::to_owned);
-        sums.chain(
-            self.layout
-                .weight_max
-                .into_iter()
-                .flat_map(move |planes| epochs.clone().into_iter().zip(planes)),
-        )
     }
 
     /// Which record fields the requested signals need.

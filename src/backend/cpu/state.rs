@@ -18,7 +18,7 @@ impl CpuBackend {
     pub(super) fn state_names(&self) -> Vec<String> {
         let mut names: Vec<String> = MOMENTS.map(str::to_owned).to_vec();
         names.push(AGES.to_owned());
-        names.extend(self.signals.state().map(|(name, _)| format!("{SIGNAL}{name}")));
+        names.extend(self.signals.layout().kept().map(|(name, _)| format!("{SIGNAL}{name}")));
         if self.candidates.is_wanted() {
             names.push(CANDIDATES.to_owned());
         }
@@ -74,5 +74,5 @@ impl CpuBackend {
 
 fn signal_plane(signals: &Accumulators, name: &str) -> Option<usize> {
     let name = name.strip_prefix(SIGNAL)?;
-    signals.state().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
+    signals.layout().kept().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
 }
