@@ -71,8 +71,14 @@ fn accumulate(
     let at = row * select(select(9u, 10u, DETAIL == 1u), 15u, DETAIL == 2u);
     let by_colour = vec3(row_sums[at + 6u], row_sums[at + 7u], row_sums[at + 8u]);
     add(VISIBLE_COUNT, row, 1.0);
-    add(SCREEN_GRADIENT, row, norm2(by_projected * half));
-    add(COLOUR_GRADIENT, row, norm3(by_colour));
+    let depth = bitcast<f32>(depths[row]);
+    let full = frame.background.w;
+    var weight = 1.0;
+    if depth < full {
+        weight = (depth / full) * (depth / full);
+    }
+    add(SCREEN_GRADIENT, row, weight * norm2(by_projected * half));
+    add(COLOUR_GRADIENT, row, weight * norm3(by_colour));
     for (var k = 0u; k < 3u; k++) {
         add(MEAN_GRADIENT + k, row, by_mean[k]);
     }
@@ -82,7 +88,7 @@ fn accumulate(
         let unfold = 1.0 / FOLD;
         let l1 = splats[3u * row].z * unfold;
         let abs_gradient = vec2(l1 * unfold * row_sums[at + 9u], unfold * unfold * row_sums[at + 10u]);
-        add(SCREEN_GRADIENT_ABS, row, norm2(abs_gradient * half));
+        add(SCREEN_GRADIENT_ABS, row, weight * norm2(abs_gradient * half));
         add(WEIGHT_SUM, row, row_sums[at + 11u]);
         add(PIXEL_COUNT, row, row_sums[at + 12u]);
     }

@@ -10,6 +10,7 @@ struct Frame {
     lens: vec4<f32>,
     // Least and greatest x/z, y/z in J: (x, y, x, y).
     ratio: vec4<f32>,
+    // w: depth from which signals of gradients count in full.
     background: vec4<f32>,
     // Width, height [px], columns of tiles, tiles.
     image: vec4<u32>,

@@ -28,6 +28,16 @@ impl Window {
     pub fn is_due(&self, step: u32) -> bool {
         self.every > 0 && self.from < step && step < self.until && step.is_multiple_of(self.every)
     }
+
+    /// How often it has happened by the end of `step` (1-based).
+    #[must_use]
+    pub fn count(&self, step: u32) -> u32 {
+        let last = step.min(self.until.saturating_sub(1));
+        match self.every {
+            0 => 0,
+            every => (last / every).saturating_sub(self.from / every),
+        }
+    }
 }
 
 /// The original's opacity resets: regular ones, and one more for scenes on a white background.
@@ -179,7 +189,17 @@ mod tests {
         let window = Window { from: 500, until: 1000, every: 100 };
         let due: Vec<u32> = (0..2000).filter(|&step| window.is_due(step)).collect();
         assert_eq!(due, [600, 700, 800, 900]);
-        assert!((0..2000).all(|step| !Window { every: 0, ..window }.is_due(step)));
+        let never = Window { every: 0, ..window };
+        assert!((0..2000).all(|step| !never.is_due(step) && never.count(step) == 0));
+        for window in
+            [window, Window { from: 450, until: 1001, every: 7 }, Window { until: 0, ..window }]
+        {
+            let mut count = 0;
+            for step in 0..2000 {
+                count += u32::from(window.is_due(step));
+                assert_eq!(window.count(step), count, "{window:?}, step {step}");
+            }
+        }
     }
 
     #[test]

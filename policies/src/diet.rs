@@ -9,10 +9,11 @@
 //! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. Candidates are rows
 //! with g >= `tau`, where g = g_p + `colour_weight` · g_c; g_p and g_c are the means, over the views
 //! that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
-//! colour. Dead rows (less opaque than `min_opacity`; after step `max_scale_from` also larger than
+//! colour; a view from which the row is nearer than `full_depth` counts in them by the square of the
+//! ratio (as in *Pixel-GS*, Zhang et al. 2024). Dead rows (less opaque than `min_opacity`; after step `max_scale_from` also larger than
 //! `max_scale` · scene extent) are pruned; they are no candidates. If there are more candidates than
-//! room, up to `rho` · budget of them are paid for by as many victims. Then the candidates grow, the
-//! largest g first: small ones (up to `small` · scene extent) are cloned, the others split in two
+//! room, some are paid for by as many victims, in all growths together up to `rho` · budget, in each
+//! an equal part of it. Then the candidates grow, the largest g first: small ones (up to `small` · scene extent) are cloned, the others split in two
 //! (`split`). What is left over is counted as denied. The statistics start anew.
 //!
 //! **Victims** are the least important rows, candidates excepted: those whose largest blend weight
@@ -23,16 +24,16 @@
 //! **Compensation**, every `insert_every` steps between `compensate_from` and `compensate_until`:
 //! during the window each step collects the pixels of its view with the largest error, one per
 //! `rows_per_candidate` rows, with the point of the surface that they show. The worst of those
-//! collected since the last insertion, up to `rho_c` · budget, become new rows of the pixel's
-//! ground-truth colour; if there is no room, victims make it. The list then starts anew.
+//! collected since the last insertion become new rows of the pixel's ground-truth colour, in all
+//! insertions together up to `rho_c` · budget, in each an equal part; if there is no room, victims
+//! make it. The list then starts anew.
 //!
 //! **Pruning**, every `prune_every` steps until both have ended: rows above the budget are pruned,
 //! the least important first. (There are none, unless a model was loaded that is too large.)
 //!
-//! Two defaults are not those of paper and code, by measurement in runs of 2,000 and 3,000 steps:
-//! `rho` is 0.03, since with 0.1 ten events replace a whole model (0.1 to 0.5 dB in four pairs of
-//! runs); `split` is `long-axis` (+0.2, +0.5, +0.6, +0.3, +1.3 and −0.1 dB in six pairs on four
-//! scenes, and a better SSIM in each).
+//! Some defaults are not those of paper and code, by measurement (`docs/comparison.md`): `split` is
+//! `long-axis`; `full_depth` keeps out fog that explains single photographs; `rho` and `rho_c` are
+//! for the whole run, as who exchanges the model many times over learns photographs by heart.
 //!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;
@@ -91,11 +92,12 @@
 //! | grow_from | 500 | >= 0 | step | start of growth and pruning (exclusive) |
 //! | grow_until | 10000 | >= 0 | step | end of growth (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
-//! | tau | 0.0004 | >= 0 | 1 / NDC | gradient from which a row grows |
+//! | tau | 0.0003 | >= 0 | 1 / NDC | gradient from which a row grows |
 //! | mixed_gradient | true | | | g = g_p + colour_weight · g_c rather than 2 g_p |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient |
+//! | full_depth | 0.8 | >= 0 | scene extent | nearer views of a row count less in g; 0: all in full |
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
-//! | rho | 0.03 | 0 to 1 | budget | most rows that one growth exchanges |
+//! | rho | 0.25 | >= 0 | budget | most rows that all growths exchange |
 //! | small | 0.01 | >= 0 | scene extent | up to this size a row is cloned, beyond it split |
 //! | split | "long-axis" | random, long-axis | | how a large row is split |
 //! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales, for `random` |
@@ -114,7 +116,7 @@
 //! | compensate_from | 10000 | >= 0 | step | start of compensation (exclusive) |
 //! | compensate_until | 15000 | >= 0 | step | end of compensation (exclusive) |
 //! | insert_every | 500 | >= 0 | steps | interval of insertions; 0: no compensation |
-//! | rho_c | 0.05 | 0 to 1 | budget | most rows that one insertion adds; 0: no compensation |
+//! | rho_c | 0.1 | >= 0 | budget | most rows that all insertions add; 0: no compensation |
 //! | rows_per_candidate | 3000 | >= 1 | rows | one candidate pixel per step for so many rows |
 //! | error | "l1-dssim" | l1-dssim, l1, grad | | what makes a pixel a bad one |
 //! | depth | "max-weight" | max-weight, median | | where on a pixel's ray the surface is |
@@ -134,8 +136,8 @@
 //! `protect = 0`, exact importance `importance = "epochs"` (the default), turnover `rho = 0`,
 //! compensation `rho_c = 0`, spacing `nms = false`, re-initialisation `reinit_at = 0` (the default).
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
-//! down to 100 steps at most, and `protect`, which counts views, not at all.
+//! Defaults that are steps are for runs of 30,000 and scale with the length, intervals (`…_every`)
+//! down to 100 at most, and `protect`, which counts views, not at all.
 
 use crate::adc::{Mortality, Window, mean_over_views, spare_one};
 use crate::plan::{EditPlan, Reset};
@@ -146,11 +148,13 @@ use crate::policy::{
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
+use shares::part;
 
 mod compensate;
 mod offspring;
 mod parameters;
 mod reinit;
+mod shares;
 mod victims;
 
 pub use parameters::{CloneOpacity, DietParams, Growth, Importance, NewbornSize, Shift, Split};
@@ -248,6 +252,7 @@ impl DensityPolicy for Diet {
             signals,
             candidates: self.candidate_request(scene),
             fresh_views,
+            full_depth: self.scene_units(self.params.full_depth, scene),
             aux: self.surface_request(scene),
             ..Needs::default()
         }
@@ -265,8 +270,7 @@ impl DensityPolicy for Diet {
             return false;
         }
         let grown = if self.grow.is_due(step) { rows } else { 0 };
-        let inserted =
-            if self.insert.is_due(step) { fraction(self.params.rho_c, budget) } else { 0 };
+        let inserted = part(self.params.rho_c, self.insert, step, budget);
         rows + grown + inserted > budget
     }
 
@@ -312,7 +316,7 @@ impl DensityPolicy for Diet {
         if grows {
             let beyond = candidates.len().saturating_sub(plan.room());
             let most = match self.params.growth {
-                Growth::Turnover => fraction(self.params.rho, plan.budget()),
+                Growth::Turnover => part(self.params.rho, self.grow, now.step, plan.budget()),
                 Growth::All => usize::MAX,
             };
             self.prune_victims(now, plan, beyond.min(most), &is_candidate)?;
@@ -340,12 +344,6 @@ impl DensityPolicy for Diet {
 
 const MEAN_GRADIENT: [Signal; 3] =
     [Signal::MeanGradientX, Signal::MeanGradientY, Signal::MeanGradientZ];
-
-/// ⌊`of` · `budget`⌋.
-fn fraction(of: f64, budget: usize) -> usize {
-    // 0.29 · 100 is 28.999999999999996, but 29 is meant: a product is off by at most 2⁻⁵³ of itself.
-    (of * budget as f64 * (1.0 + f64::EPSILON)).floor() as usize
-}
 
 impl Diet {
     /// g of every row. Shape: `[rows]`.

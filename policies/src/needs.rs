@@ -12,6 +12,13 @@ use crate::policy::{Candidate, CandidateRequest, PolicyError, SignalSet};
 pub struct Needs {
     /// Per-row statistics.
     pub signals: SignalSet,
+    /// Camera depth z₀ from which on a view counts in full in the signals of gradients on screen and
+    /// by colour `[scene units]`, >= 0: it counts min(1, z/z₀)² times where the row's mean is at depth
+    /// z. 0: all views count in full.
+    ///
+    /// What is near a camera moves far on its image, but few other views show it; such rows are
+    /// mostly fog that explains one photograph (*Pixel-GS*, Zhang et al. 2024, section 3.3).
+    pub full_depth: f32,
     /// Per-pixel candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
     /// Training views, drawn at random without replacement, that are rendered anew for each event
@@ -51,6 +58,7 @@ impl Needs {
             }
             _ => Ok(()),
         };
+        finite("full_depth", self.full_depth.into(), 0.0)?;
         finite("loss_terms.opacity", self.loss_terms.opacity.into(), 0.0)?;
         finite("loss_terms.scale", self.loss_terms.scale.into(), 0.0)?;
         if let Some(noise) = self.noise {

@@ -112,7 +112,8 @@ pub struct SceneInfo {
 pub enum Signal {
     /// Number of views that blended the row or could have: its projection is on screen. >= 0.
     VisibleCount,
-    /// Sum over views of ‖dL/d(mean in NDC)‖₂, >= 0. NDC gradient = pixel gradient · (W/2, H/2).
+    /// Sum over views of ‖dL/d(mean in NDC)‖₂, >= 0. NDC gradient = pixel gradient · (W/2, H/2). This
+    /// sum, and the next two, weigh near views less where [`Needs::full_depth`] says so.
     ScreenGradient,
     /// Sum over views of ‖Σ over pixels |dL/d(mean in NDC)|‖₂ (absolute per axis, AbsGS), >= 0.
     ScreenGradientAbs,

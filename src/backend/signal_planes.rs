@@ -1,6 +1,7 @@
-//! Which plane of a backend's accumulators holds which signal. Only requested signals have one.
+//! Which plane of a backend's accumulators holds which signal, and how views are weighed there.
+//! Only requested signals have a plane.
 
-use densify_policies::policy::{Signal, SignalSet};
+use densify_policies::policy::{Needs, Signal};
 
 /// Signals that are sums over views, in plane order.
 pub(super) const SUMS: [Signal; 10] = [
@@ -26,10 +27,13 @@ pub(super) struct SignalPlanes {
     pub(super) fresh_weight_max: Option<usize>,
     /// How many there are.
     pub(super) count: usize,
+    /// See [`Needs::full_depth`].
+    pub(super) full_depth: f32,
 }
 
 impl SignalPlanes {
-    pub(super) fn new(requested: SignalSet) -> Self {
+    pub(super) fn new(needs: &Needs) -> Self {
+        let requested = needs.signals;
         let mut count = 0;
         let mut next = |wanted: bool| {
             count += usize::from(wanted);
@@ -40,7 +44,7 @@ impl SignalPlanes {
         let current = next(requested.contains(Signal::WeightMax));
         let weight_max = previous.zip(current).map(|(a, b)| [a, b]);
         let fresh_weight_max = next(requested.contains(Signal::FreshWeightMax));
-        Self { sums, weight_max, fresh_weight_max, count }
+        Self { sums, weight_max, fresh_weight_max, count, full_depth: needs.full_depth }
     }
 
     /// What is kept between steps, by name and plane. Weights of fresh views are not: they are

@@ -6,6 +6,7 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
+use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -95,7 +96,12 @@ fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64
 
 /// Runs one step per view and takes the signals.
 fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
-    let needs = Needs { signals: SignalSet::of(wanted), ..Needs::default() };
+    collect_from(views, wanted, 0.0)
+}
+
+/// The same, where views count in full from this depth on.
+fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBackend, Vec<Vec<f32>>) {
+    let needs = Needs { signals: SignalSet::of(wanted), full_depth, ..Needs::default() };
     let mut options = subject::options(views.model.len(), Resources::default());
     options.needs = needs.clone();
     let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
@@ -154,6 +160,40 @@ fn every_signal_whatever_else_is_asked_for() {
             let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
             table.check(&what, &format!("{signal:?}"), error, TOLERANCE + flips);
         }
+    }
+    table.finish();
+}
+
+/// Gradients on screen and by colour; nothing else.
+#[test]
+fn near_views_weigh_less_where_asked_for() {
+    let views = views();
+    let gradients: Vec<Gradient> = (0..views.cameras.len()).map(|v| reference(&views, v)).collect();
+    let depth = |camera: &Camera, row: usize| {
+        let mean = views.model.means[row].map(f64::from);
+        (camera.rotation * DVec3::from_array(mean) + camera.translation).z
+    };
+    let rows = 0..views.model.len();
+    let mut depths: Vec<f64> = rows.clone().map(|row| depth(&views.cameras[0], row)).collect();
+    depths.sort_by(f64::total_cmp);
+    let full_depth = depths[rows.len() / 2] as f32;
+    let weighed = [Signal::ScreenGradient, Signal::ScreenGradientAbs, Signal::ColourGradient];
+    let others = [Signal::VisibleCount, Signal::MeanGradientNorm, Signal::WeightSum];
+    let wanted = [weighed, others].concat();
+
+    let mut table = Table::new("signals of near views");
+    let (_, columns) = collect_from(&views, &wanted, full_depth);
+    for (signal, column) in wanted.into_iter().zip(columns) {
+        let mut expected = vec![0.0; rows.len()];
+        for (gradient, camera) in gradients.iter().zip(&views.cameras) {
+            let parts = contribution(signal, gradient, camera);
+            for (row, part) in parts.into_iter().enumerate() {
+                let near = (depth(camera, row) / f64::from(full_depth)).min(1.0);
+                expected[row] += if weighed.contains(&signal) { near * near * part } else { part };
+            }
+        }
+        let error = relative_error(&column, &expected);
+        table.check("from the median depth on", &format!("{signal:?}"), error, TOLERANCE);
     }
     table.finish();
 }

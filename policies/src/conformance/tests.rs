@@ -38,7 +38,7 @@ fn every_choice_of_the_built_in_policies_conforms() {
         ("mcmc", "min_opacity = 0.5\nmost_shares = 2"),
         ("diet", "mixed_gradient = false\nshift = \"none\"\nprotect = 0"),
         ("diet", "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\""),
-        ("diet", "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 1.0\nrho_c = 1.0"),
+        ("diet", "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 20.0\nrho_c = 9.0"),
         ("diet", "rho_c = 0.0\nrho = 0.0\ntau = 0.0"),
         // All windows at once.
         ("diet", "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3"),

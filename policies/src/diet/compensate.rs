@@ -1,6 +1,7 @@
 //! Compensation: badly explained pixels become rows.
 
-use super::{Diet, NewbornSize, fraction};
+use super::shares::part;
+use super::{Diet, NewbornSize};
 use crate::adc::Window;
 use crate::plan::{EditPlan, Seed};
 use crate::policy::{CandidateRequest, PolicyError, SceneInfo, Signal, Snapshot};
@@ -55,7 +56,7 @@ impl Diet {
             let _ = plan.append(seed);
         }
         let errors: Vec<f32> = sound.iter().map(|(error, _)| *error).collect();
-        let worst = top_k(&errors, fraction(self.params.rho_c, plan.budget()));
+        let worst = top_k(&errors, part(self.params.rho_c, self.insert, now.step, plan.budget()));
         self.prune_victims(now, plan, worst.len().saturating_sub(plan.room()), spared)?;
         for index in worst {
             let _ = plan.append(sound[index as usize].1);

@@ -18,6 +18,7 @@ pub struct DietParams {
     pub tau: f64,
     pub mixed_gradient: bool,
     pub colour_weight: f64,
+    pub full_depth: f64,
     pub growth: Growth,
     pub rho: f64,
     pub small: f64,
@@ -55,7 +56,7 @@ pub struct DietParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Growth {
-    /// As many as there is room for, and `rho` · budget in exchange for victims.
+    /// As many as there is room for, and its part of `rho` · budget in exchange for victims.
     Turnover,
     /// As many as there are room and victims for.
     All,
@@ -121,11 +122,12 @@ impl Default for DietParams {
             grow_from: 500,
             grow_until: 10_000,
             grow_every: 100,
-            tau: 4e-4,
+            tau: 3e-4,
             mixed_gradient: true,
             colour_weight: 30.0,
+            full_depth: 0.8,
             growth: Growth::Turnover,
-            rho: 0.03,
+            rho: 0.25,
             small: 0.01,
             split: Split::LongAxis,
             split_factor: 1.6,
@@ -144,7 +146,7 @@ impl Default for DietParams {
             compensate_from: 10_000,
             compensate_until: 15_000,
             insert_every: 500,
-            rho_c: 0.05,
+            rho_c: 0.1,
             rows_per_candidate: 3000,
             error: ErrorMode::L1Dssim,
             depth: DepthMode::MaxWeight,
@@ -164,7 +166,8 @@ impl DietParams {
     pub(super) fn check(&self) -> Result<(), PolicyError> {
         in_range("tau", self.tau, 0.0..)?;
         in_range("colour_weight", self.colour_weight, 0.0..)?;
-        in_range("rho", self.rho, 0.0..=1.0)?;
+        in_range("full_depth", self.full_depth, 0.0..)?;
+        in_range("rho", self.rho, 0.0..)?;
         in_range("small", self.small, 0.0..)?;
         in_range("split_factor", self.split_factor, 1.0..=100.0)?;
         in_range("split_share", self.split_share, (Excluded(0.0), Excluded(1.0)))?;
@@ -175,7 +178,7 @@ impl DietParams {
         in_range("fresh_views", f64::from(self.fresh_views), 1.0..)?;
         // `Signal::Age` goes no further.
         in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;
-        in_range("rho_c", self.rho_c, 0.0..=1.0)?;
+        in_range("rho_c", self.rho_c, 0.0..)?;
         in_range("rows_per_candidate", f64::from(self.rows_per_candidate), 1.0..)?;
         in_range("min_alpha", self.min_alpha, 0.0..=1.0)?;
         in_range("size_pixels", self.size_pixels, (Excluded(0.0), Unbounded))?;

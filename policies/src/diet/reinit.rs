@@ -1,7 +1,8 @@
 //! Re-initialisation: the whole model is replaced by points of the surfaces that the views show
 //! (*Mini-Splatting*, Fang and Wang 2024, "depth reinitialization", as the code of diet does it).
 
-use super::{Diet, fraction};
+use super::Diet;
+use super::shares::fraction;
 use crate::neighbours::mean_square_distances;
 use crate::plan::{EditPlan, Reset, Seed};
 use crate::policy::{AuxRequest, Candidate, SceneInfo};

@@ -1,6 +1,7 @@
 //! The rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
 
 use super::offspring::conserving_scale;
+use super::shares::fraction;
 use super::*;
 use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::event::{Event, Outcome, View};
@@ -37,6 +38,9 @@ fn wanting(rows: usize, listed: &[usize]) -> Vec<f32> {
     sums
 }
 
+// `rho` and `rho_c` are for the whole run: a growth at step 600 is the first of 94, an insertion at
+// step 10,500 the first of 9.
+
 fn candidate(error: f32, pixel_size: f32) -> Candidate {
     Candidate { position: [error, 0.0, 0.0], colour: [error, 0.5, 1.0], pixel_size, error }
 }
@@ -47,31 +51,47 @@ fn the_gradient_mixes_screen_and_colour() {
     let event = event(600, 5, 100)
         .with(Signal::ScreenGradient, &[16.01e-4, 8.01e-4, 8.01e-4, 0.0, 7.6e-4])
         .with(Signal::ColourGradient, &[0.0, 2.8e-5, 2.4e-5, 5.6e-5, 0.0]);
-    let done = run(&event, "");
+    let done = run(&event, "tau = 4e-4");
     assert_eq!(done.cloned, [3, 1, 0]);
     assert!(done.ops.reset_signals && !done.ops.reset_candidates);
     assert_eq!(done.ops.cause, "grow");
     // Without colour: twice 4e-4, 2e-4, 2e-4, 0, 1.9e-4.
-    assert_eq!(run(&event, "mixed_gradient = false").cloned, [0, 1, 2]);
+    assert_eq!(run(&event, "tau = 4e-4\nmixed_gradient = false").cloned, [0, 1, 2]);
 }
 
 #[test]
 fn at_the_budget_a_tenth_is_exchanged() {
     // Budget 20, so two victims: of rows 0, 1, 2, … the least important that are no candidates.
     let event = event(600, 20, 20).with(Signal::ScreenGradient, &wanting(20, &[0, 2, 9, 12, 19]));
-    let done = run(&event, "rho = 0.1");
+    let done = run(&event, "rho = 9.4");
     assert_eq!(done.pruned, [1, 3]);
     assert_eq!(done.cloned, [19, 12]);
     assert_eq!(done.ops.counts, EditCounts { removed: 2, added: 2, updated: 0, denied: 3 });
-    assert_eq!(run(&event, "rho = 0.2").pruned, [1, 3, 4, 5]);
-    // A product just below the integer that is meant.
-    assert_eq!(fraction(0.29, 100), 29);
-    assert_eq!(fraction(0.1, 29), 2);
+    assert_eq!(run(&event, "rho = 18.8").pruned, [1, 3, 4, 5]);
     let none = run(&event, "rho = 0.0");
     assert!(none.pruned.is_empty() && none.cloned.is_empty());
     assert_eq!(none.ops.counts.denied, 5);
     let all = run(&event, "growth = \"all\"");
     assert_eq!((all.cloned.len(), all.pruned), (5, vec![1, 3, 4, 5, 6]));
+}
+
+#[test]
+fn all_events_together_exchange_the_share() {
+    let window = Window { from: 500, until: 10_000, every: 100 };
+    let parts = |of: f64, window: Window, budget: usize| -> Vec<usize> {
+        let steps = (1..=30_000).filter(|&step| window.is_due(step));
+        steps.map(|step| part(of, window, step, budget)).collect()
+    };
+    let quarter = parts(0.25, window, 200_000);
+    assert_eq!((quarter.len(), quarter.iter().sum()), (94, 50_000));
+    assert!(quarter.iter().all(|part| (531..=532).contains(part)));
+    // Less than one per event.
+    assert_eq!(parts(0.25, window, 100).iter().sum::<usize>(), 25);
+    // Products just below the integer that is meant.
+    assert_eq!((fraction(0.29, 100), fraction(0.1, 29)), (29, 2));
+    let once = Window { from: 500, until: 601, every: 100 };
+    assert_eq!((parts(0.29, once, 100), parts(0.1, once, 29)), (vec![29], vec![2]));
+    assert_eq!(part(1.0, window, 650, 100), 0);
 }
 
 #[test]
@@ -82,7 +102,7 @@ fn the_dead_and_the_room_come_first() {
     let event = event(600, 19, 20)
         .with(Signal::ScreenGradient, &wanting(19, &[7, 10, 11, 12, 13, 14]))
         .with(Signal::Opacity, &opacity);
-    let done = run(&event, "rho = 0.1");
+    let done = run(&event, "rho = 9.4");
     assert_eq!(done.pruned, [0, 1, 7]);
     assert_eq!(done.cloned, [14, 13, 12, 11]);
     assert_eq!(done.ops.counts.denied, 1);
@@ -117,19 +137,19 @@ fn importance_may_be_that_of_fresh_views() {
     let event = event(600, 8, 8)
         .with(Signal::ScreenGradient, &wanting(8, &[4, 7]))
         .with(Signal::FreshWeightMax, &fresh);
-    assert_eq!(run(&event, "rho = 0.25").pruned, [0, 1]);
-    assert_eq!(run(&event, "rho = 0.25\nimportance = \"fresh\"").pruned, [2, 6]);
+    assert_eq!(run(&event, "rho = 23.5").pruned, [0, 1]);
+    assert_eq!(run(&event, "rho = 23.5\nimportance = \"fresh\"").pruned, [2, 6]);
     let over = Event { budget: 5, ..event.clone() };
     assert_eq!(run(&over, "rho = 0\nimportance = \"fresh\"").pruned, [2, 4, 6]);
     let mut inserting = Event { step: 10_500, ..event };
     inserting.candidates = vec![candidate(0.1, 0.01), candidate(0.2, 0.01)];
-    assert_eq!(run(&inserting, "rho_c = 0.25\nimportance = \"fresh\"").pruned, [4, 6]);
+    assert_eq!(run(&inserting, "rho_c = 2.25\nimportance = \"fresh\"").pruned, [4, 6]);
 }
 
 #[test]
 fn fresh_views_are_wanted_where_victims_may_fall() {
     let scene = Event::new(1, 1, 100).scene;
-    let policy = diet(&scene, "importance = \"fresh\"");
+    let policy = diet(&scene, "importance = \"fresh\"\nrho_c = 0.45");
     let wants = |step, rows| policy.wants_fresh(step, rows, 100);
     // Growth may double the rows.
     assert_eq!([50, 51, 100].map(|rows| wants(600, rows)), [false, true, true]);
@@ -137,7 +157,7 @@ fn fresh_views_are_wanted_where_victims_may_fall() {
     assert_eq!([95, 96, 100].map(|rows| wants(10_500, rows)), [false, true, true]);
     // Pruning is for models that are too large.
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
-    let both = diet(&scene, "importance = \"fresh\"\ncompensate_from = 500");
+    let both = diet(&scene, "importance = \"fresh\"\nrho_c = 1.4\ncompensate_from = 500");
     assert_eq!([47, 48].map(|rows| both.wants_fresh(1000, rows, 100)), [false, true]);
     // Where all rows are replaced nobody has to fall.
     let replaces = diet(&scene, "importance = \"fresh\"\nreinit_at = 600");
@@ -152,11 +172,11 @@ fn newborns_are_protected_for_an_epoch() {
         .with(Signal::ScreenGradient, &wanting(20, &[18, 19]))
         .with(Signal::Age, &age);
     event.scene.train_views = 300;
-    assert_eq!(run(&event, "rho = 0.1").pruned, [2, 5]);
-    assert_eq!(run(&event, "rho = 0.1\nprotect = 0").pruned, [0, 1]);
-    assert_eq!(run(&event, "rho = 0.1\nprotect = 30").pruned, [1, 2]);
+    assert_eq!(run(&event, "rho = 9.4").pruned, [2, 5]);
+    assert_eq!(run(&event, "rho = 9.4\nprotect = 0").pruned, [0, 1]);
+    assert_eq!(run(&event, "rho = 9.4\nprotect = 30").pruned, [1, 2]);
     event.scene.train_views = 30;
-    assert_eq!(run(&event, "rho = 0.1").pruned, [1, 2]);
+    assert_eq!(run(&event, "rho = 9.4").pruned, [1, 2]);
 }
 
 #[test]
@@ -165,7 +185,7 @@ fn where_all_are_newborn_the_oldest_fall() {
     let event = event(600, 6, 6)
         .with(Signal::ScreenGradient, &wanting(6, &[5]))
         .with(Signal::Age, &[10.0, 60.0, 60.0, 59.0, 200.0, 0.0]);
-    assert_eq!(run(&event, "rho = 0.5").pruned, [4]);
+    assert_eq!(run(&event, "rho = 47").pruned, [4]);
     let event = Event { budget: 3, ..event };
     let over = run(&event, "rho = 0.0");
     assert_eq!(over.pruned, [1, 2, 4]);
@@ -266,7 +286,7 @@ fn a_model_too_large_is_cut_to_the_budget() {
 fn what_goes_for_the_budget_does_not_grow() {
     // Two of six rows are too many; candidate 0 is one of them, so one victim is enough.
     let event = event(600, 6, 4).with(Signal::ScreenGradient, &wanting(6, &[0, 5]));
-    let done = run(&event, "rho = 0.5");
+    let done = run(&event, "rho = 47");
     assert_eq!(done.pruned, [0, 1, 2]);
     assert_eq!((done.cloned, done.ops.counts.denied), (vec![5], 0));
 }
@@ -276,7 +296,7 @@ fn the_worst_pixels_become_rows() {
     // Budget 40: two rows per insertion. 39 rows: one victim.
     let mut event = event(10_500, 39, 40);
     event.candidates = vec![candidate(0.1, 0.01), candidate(0.3, 0.02), candidate(0.2, 0.03)];
-    let done = run(&event, "");
+    let done = run(&event, "rho_c = 0.45");
     assert_eq!(done.pruned, [0]);
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
     let seed = |error, scale| Seed {
@@ -289,9 +309,10 @@ fn the_worst_pixels_become_rows() {
     assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 2, updated: 0, denied: 0 });
     assert!(done.ops.reset_candidates && !done.ops.reset_signals);
     assert_eq!(done.ops.cause, "insert");
-    assert_eq!(run(&Event { budget: 41, ..event.clone() }, "").pruned, [0_u32; 0]);
+    let roomy = Event { budget: 41, ..event.clone() };
+    assert_eq!(run(&roomy, "rho_c = 0.45").pruned, [0_u32; 0]);
     event.candidates.clear();
-    let idle = run(&event, "");
+    let idle = run(&event, "rho_c = 0.45");
     assert!(!idle.ops.edits_rows() && idle.ops.reset_candidates);
 }
 
@@ -300,7 +321,7 @@ fn nobody_dies_for_a_pixel_without_a_point() {
     let mut event = event(10_500, 40, 40);
     let nowhere = Candidate { position: [f32::NAN; 3], ..candidate(0.9, 0.01) };
     event.candidates = vec![nowhere, candidate(0.1, 0.0), candidate(0.2, 0.01)];
-    let done = run(&event, "");
+    let done = run(&event, "rho_c = 0.45");
     assert_eq!(done.pruned, [0]);
     assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 1, updated: 0, denied: 2 });
 }
@@ -309,7 +330,7 @@ fn nobody_dies_for_a_pixel_without_a_point() {
 fn the_size_of_the_code_is_the_squared_geometric_mean() {
     let mut event = event(10_500, 3, 40).with(Signal::ScaleMax, &[0.1, 0.4, f32::NAN]);
     event.candidates = vec![candidate(0.1, 7.0)];
-    let scale = |set| run(&event, set).ops.seeds[0].1.scale;
+    let scale = |set| run(&event, &format!("rho_c = 1\n{set}")).ops.seeds[0].1.scale;
     assert!((scale("newborn_size = \"code\"") - 0.04).abs() < 1e-6);
     assert!((scale("size_pixels = 0.5") - 3.5).abs() < 1e-6);
 }
@@ -319,7 +340,7 @@ fn growth_pruning_and_insertion_can_fall_on_one_step() {
     // 44 rows, budget 40: four go; three candidates want room, two rows are to be inserted.
     let mut event = event(1000, 44, 40).with(Signal::ScreenGradient, &wanting(44, &[5, 40, 41]));
     event.candidates = (1..9).map(|i| candidate(i as f32 / 10.0, 0.01)).collect();
-    let done = run(&event, "rho = 0.1\ncompensate_from = 500");
+    let done = run(&event, "rho = 9.4\nrho_c = 1.4\ncompensate_from = 500");
     assert_eq!(done.ops.cause, "grow+prune+insert");
     assert_eq!(done.pruned, [0, 1, 2, 3, 4, 6, 7, 8, 9]);
     assert_eq!(done.cloned, [41, 40, 5]);
@@ -359,6 +380,10 @@ fn only_what_is_used_is_asked_for() {
     assert_eq!((request.error, request.depth), (ErrorMode::L1Dssim, DepthMode::MaxWeight));
     assert!(request.spaced && request.rows_per_candidate == 3000);
     assert!((request.min_alpha - 0.5).abs() < 1e-9);
+
+    // 0.8 extents.
+    assert!((full.full_depth - 0.8 * scene.extent).abs() < 1e-6 * scene.extent);
+    assert!(needs("full_depth = 0.0").full_depth.abs() < 1e-9);
 
     let lean = needs("shift = \"none\"\nmixed_gradient = false\nprotect = 0\nrho_c = 0.0");
     let listed: Vec<Signal> = lean.signals.iter().collect();
@@ -400,7 +425,7 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
     for set in [
         "tau = -1",
         "colour_weight = inf",
-        "rho = 1.1",
+        "rho = -0.1",
         "small = -0.1",
         "split_factor = 0",
         "kappa = -0.1",
@@ -409,7 +434,7 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
         "protect = 65536",
         "fresh_views = 0",
         "importance = \"views\"",
-        "rho_c = 2",
+        "rho_c = inf",
         "rows_per_candidate = 0",
         "min_alpha = 1.5",
         "size_pixels = 0",
@@ -494,7 +519,7 @@ fn every_ingredient_can_be_switched_off() {
     growing.scene.budget = 30_000;
     let mut inserting = event(10_500, 39, 40);
     inserting.candidates = vec![candidate(0.3, 0.02)];
-    let rho = "rho = 0.1";
+    let shares = "rho = 9.4\nrho_c = 0.45";
     let switches = [
         (&growing, "mixed_gradient = false"),
         (&growing, "shift = \"none\""),
@@ -513,7 +538,10 @@ fn every_ingredient_can_be_switched_off() {
         (event.run(&mut *policy).unwrap().ops, needs)
     };
     for (event, off) in switches {
-        let full = if off.starts_with("rho = ") { off.to_owned() } else { format!("{rho}\n{off}") };
-        assert_ne!(outcome(event, &full), outcome(event, rho), "{off}");
+        let (name, _) = off.split_once(' ').expect("a name");
+        let kept: Vec<&str> =
+            shares.lines().filter(|s| s.split_once(' ').unwrap().0 != name).collect();
+        let full = format!("{}\n{off}", kept.join("\n"));
+        assert_ne!(outcome(event, &full), outcome(event, shares), "{off}");
     }
 }

@@ -26,7 +26,7 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let budget = options.budget.max(1);
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
-    let stride = Accumulators::new(1, needs.signals).detail().stride();
+    let stride = Accumulators::new(1, needs).detail().stride();
     let per_row = planes(sh_degree);
     let padded = budget.next_multiple_of(WIDTH) as u64;
     let (width, height) = options.largest_image;
@@ -48,7 +48,7 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
         let bytes = observe::bytes(request, grid.width * grid.height);
         ledger.add_to(Section::Policy, "auxiliary views", bytes);
     }
-    ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs.signals));
+    ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs));
     ledger.add_to(
         Section::Policy,
         "candidates",

@@ -156,7 +156,7 @@ impl CpuBackend {
             .map_err(|error| BackendError::Threads(error.to_string()))?;
         let ledger = budget::ledger(model.sh_degree, options, pool.current_num_threads());
         budget::reserve(&ledger)?;
-        let signals = Accumulators::new(budget, options.needs.signals);
+        let signals = Accumulators::new(budget, &options.needs);
         let stride = signals.detail().stride();
         let cap = budget::tile_cap(options);
         let blocks = budget.div_ceil(WIDTH);

@@ -32,6 +32,8 @@ pub(super) struct BlockGradient {
     /// dL/d(projected mean) `[1/px]`, and the sum over pixels of its absolute value.
     pub(super) mean2d: [[f32; WIDTH]; 2],
     pub(super) mean2d_abs: [[f32; WIDTH]; 2],
+    /// 1 / depth in the camera `[1/scene unit]`.
+    pub(super) inv_z: [f32; WIDTH],
     /// The record sums, field after field.
     pub(super) sums: [[f32; WIDTH]; field::ALL],
     /// 1 for visible rows, 0 for others.
@@ -43,6 +45,7 @@ impl BlockGradient {
         params: [0.0; plane::MOST * WIDTH],
         mean2d: [[0.0; WIDTH]; 2],
         mean2d_abs: [[0.0; WIDTH]; 2],
+        inv_z: [0.0; WIDTH],
         sums: [[0.0; WIDTH]; field::ALL],
         visible: [0.0; WIDTH],
     };
@@ -110,6 +113,7 @@ impl BlockGradient {
         let (muu, muz, mzz) =
             (sum!(field::UU) * unfold2, sum!(field::UZ) * unfold2, sum!(field::ZZ) * unfold2);
 
+        seen.keep(g.inv_z).store(&mut self.inv_z[at..]);
         // Projected mean: L·Σ q·(u, z).
         let dm = [l1 * qu, l3 * qz - l1 * shear * qu];
         for (slot, x) in self.mean2d.iter_mut().zip(dm) {

@@ -1,6 +1,6 @@
 //! Stage 8: what policies ask for, summed over views. Only requested signals have memory.
 
-use densify_policies::policy::{Signal, SignalSet, Signals};
+use densify_policies::policy::{Needs, Signal, SignalSet, Signals};
 use pulp::Simd;
 use rayon::prelude::*;
 
@@ -53,17 +53,24 @@ impl SignalPlanes {
                 };
             }
             let mean = each!(i in 3 => lanes(s, &g.params, plane::MEAN + i, at));
+            // Infinite, so 1, where all depths count in full.
+            let one = V::splat(s, 1.0);
+            let depth = (one / (line!(g.inv_z) * self.full_depth)).min(one);
+            let weight = depth * depth;
             for (signal, plane) in SUMS.iter().zip(self.sums) {
                 let Some(plane) = plane else { continue };
                 let x = match signal {
                     Signal::VisibleCount => line!(g.visible),
                     Signal::ScreenGradient => {
-                        norm2(line!(g.mean2d[0]) * half[0], line!(g.mean2d[1]) * half[1])
+                        weight * norm2(line!(g.mean2d[0]) * half[0], line!(g.mean2d[1]) * half[1])
                     }
                     Signal::ScreenGradientAbs => {
-                        norm2(line!(g.mean2d_abs[0]) * half[0], line!(g.mean2d_abs[1]) * half[1])
+                        let abs = [0, 1].map(|i| line!(g.mean2d_abs[i]) * half[i]);
+                        weight * norm2(abs[0], abs[1])
                     }
-                    Signal::ColourGradient => norm3(each!(i in 3 => sum!(field::COLOUR + i))),
+                    Signal::ColourGradient => {
+                        weight * norm3(each!(i in 3 => sum!(field::COLOUR + i)))
+                    }
                     Signal::MeanGradientX => mean[0],
                     Signal::MeanGradientY => mean[1],
                     Signal::MeanGradientZ => mean[2],
@@ -83,13 +90,13 @@ impl SignalPlanes {
 }
 
 impl Accumulators {
-    pub(super) fn new(budget: usize, requested: SignalSet) -> Self {
-        let layout = SignalPlanes::new(requested);
-        Self { requested, layout, blocks: Blocks::zeros(budget, layout.count) }
+    pub(super) fn new(budget: usize, needs: &Needs) -> Self {
+        let layout = SignalPlanes::new(needs);
+        Self { requested: needs.signals, layout, blocks: Blocks::zeros(budget, layout.count) }
     }
 
-    pub(super) fn bytes(budget: usize, requested: SignalSet) -> u64 {
-        Blocks::bytes(budget, SignalPlanes::new(requested).count)
+    pub(super) fn bytes(budget: usize, needs: &Needs) -> u64 {
+        Blocks::bytes(budget, SignalPlanes::new(needs).count)
     }
 
     pub(super) fn layout(&self) -> SignalPlanes {

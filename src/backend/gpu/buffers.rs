@@ -70,7 +70,7 @@ impl Sizes {
         image: (u32, u32),
         needs: &Needs,
     ) -> Self {
-        let planes = Planes::new(needs.signals);
+        let planes = Planes::new(needs);
         Self {
             budget: budget as u64,
             cap,

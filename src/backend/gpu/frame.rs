@@ -135,6 +135,7 @@ impl Frame {
             | (if noise.is_some() { due::NOISE } else { 0 });
         self.draw = [folded_seed(input.seed), input.step, due | adds, self.draw[3]];
         self.planes = planes.in_frame();
+        self.background[3] = planes.full_depth();
     }
 }
 

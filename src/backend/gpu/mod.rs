@@ -101,7 +101,7 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        let detail = Planes::new(options.needs.signals).detail;
+        let detail = Planes::new(&options.needs).detail;
         device.0.prove(detail, || canary::check(device, &options.needs))?;
         Self::without_canary(model, options, device)
     }
@@ -121,7 +121,7 @@ impl GpuBackend {
                 device.summary.name, model.sh_degree
             )));
         }
-        let planes = Planes::new(options.needs.signals);
+        let planes = Planes::new(&options.needs);
         let bindable = device.largest_binding() / (4 * record_stride(planes.detail));
         let cap = match options.tile_cap {
             Some(cap) => cap as u64,

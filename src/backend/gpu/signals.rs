@@ -1,6 +1,6 @@
 //! Which plane of the accumulators holds which signal, and which fields of the records they need.
 
-use densify_policies::policy::{Signal, SignalSet};
+use densify_policies::policy::{Needs, Signal};
 
 use crate::backend::signal_planes::{SUMS, SignalPlanes};
 
@@ -25,15 +25,20 @@ pub(super) const fn record_stride(detail: u32) -> u64 {
 }
 
 impl Planes {
-    pub(super) fn new(requested: SignalSet) -> Self {
-        let planes = SignalPlanes::new(requested);
-        let any = |signals: &[Signal]| signals.iter().any(|&s| requested.contains(s));
+    pub(super) fn new(needs: &Needs) -> Self {
+        let planes = SignalPlanes::new(needs);
+        let any = |signals: &[Signal]| signals.iter().any(|&s| needs.signals.contains(s));
         let detail = if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
             2
         } else {
             u32::from(any(&[Signal::WeightMax, Signal::FreshWeightMax]))
         };
         Self { planes, count: planes.count as u32, detail }
+    }
+
+    /// See [`Needs::full_depth`].
+    pub(super) fn full_depth(&self) -> f32 {
+        self.planes.full_depth
     }
 
     /// As the shaders read them.

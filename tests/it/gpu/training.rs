@@ -90,11 +90,18 @@ fn steps_are_those_of_the_native_backend() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
     let all = SignalSet::of(&Signal::ALL);
+    // Half of the rows are nearer.
+    let full_depth = 3.5;
     let some = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
     let noise = NoiseTerm { strength: 5e3, sharpness: 100.0, opacity: 0.3 };
     let runs = [
         ("plain", Needs::default(), Cadence::default()),
         ("all signals", Needs { signals: all, ..Needs::default() }, Cadence::default()),
+        (
+            "near views weigh less",
+            Needs { signals: all, full_depth, ..Needs::default() },
+            Cadence::default(),
+        ),
         (
             "terms and noise",
             Needs {
