@@ -10,6 +10,7 @@ use densify_scenegen::GroundTruth;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use super::contender::Contender;
 use super::{POINTS, run_folder};
 use crate::cli::failure::{Failure, INPUT, OTHER};
 use crate::cli::number::grouped;
@@ -22,6 +23,7 @@ use crate::output::{Mean, OutputError, geometry_of, write_atomically};
 pub(super) struct Cell {
     pub(super) scene: PathBuf,
     pub(super) label: String,
+    /// A [`Contender`].
     pub(super) policy: String,
     pub(super) budget: usize,
     pub(super) seed: u32,
@@ -89,8 +91,8 @@ impl Cell {
         let tests: Vec<String> =
             (1..POINTS).map(|i| (self.iterations * i / POINTS).max(1).to_string()).collect();
         let mut arguments = vec!["train".to_owned(), self.scene.to_string_lossy().into_owned()];
+        arguments.extend(Contender::new(&self.policy).options());
         let mut set = |name: &str, value: String| arguments.extend([name.to_owned(), value]);
-        set("--policy", self.policy.clone());
         set("--budget", self.budget.to_string());
         set("--seed", self.seed.to_string());
         set("--iterations", self.iterations.to_string());
@@ -105,7 +107,7 @@ impl Cell {
 
     fn run(&self) -> String {
         let Self { label, policy, budget, seed, .. } = self;
-        format!("{label}-{policy}-{budget}-seed{seed}")
+        format!("{label}-{}-{budget}-seed{seed}", Contender::new(policy).folder())
     }
 
     /// Trains in a process of its own, whose memory is then the run's and nobody else's.

@@ -1,6 +1,7 @@
 //! `densify compare`.
 
 mod cell;
+mod contender;
 mod crops;
 mod difference;
 mod plots;
@@ -11,7 +12,6 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use densify_policies::registry::find;
 
 use super::console::Console;
 use super::failure::Failure;
@@ -19,6 +19,7 @@ use super::number;
 use crate::dataset::builtin;
 use crate::output::write_atomically;
 use cell::{Cell, Record, Records};
+use contender::Contender;
 
 /// Trains a scene with several policies, under the same conditions, and says which did best.
 ///
@@ -38,7 +39,8 @@ pub(super) struct CompareArgs {
     /// Folders of the scenes, or built-in scenes (scene:NAME)
     #[arg(required = true)]
     scenes: Vec<PathBuf>,
-    /// Policies, separated by commas; the others are compared with the first
+    /// Policies, separated by commas; the others are compared with the first. A policy with
+    /// parameters of its own is one more: diet:rho=0, or diet:rho=0:split=random
     #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
     policies: Vec<String>,
     /// Budgets in Gaussians, separated by commas; SCENE=ROWS for one scene alone, by its folder's
@@ -90,6 +92,7 @@ Examples:
   densify compare data/room data/cup --policies diet,taming,mcmc --budget 15k,30k,60k --seeds 5
   densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2
   densify compare data/room data/cup --policies vanilla,diet --budget room=28k,30k
+  densify compare data/garden --policies diet,diet:rho=0,diet:full_depth=0 --budget 200k
   densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
 
 /// Options of `densify train` that are the comparison's to set.
@@ -155,11 +158,12 @@ fn cells(args: &CompareArgs) -> Result<Vec<Cell>, Failure> {
     }
     unique(&args.policies, "--policies")?;
     unique(&args.budget, "--budget")?;
-    for name in &args.policies {
-        find(name)?;
-    }
     let labels = labels(&args.scenes)?;
     let budgets = budgets(&args.budget, &labels)?;
+    for policy in &args.policies {
+        Contender::new(policy)
+            .check(budgets.concat().into_iter().min().unwrap_or(1), args.iterations)?;
+    }
     let mut cells = Vec::new();
     for seed in 0..args.seeds {
         for ((scene, label), budgets) in args.scenes.iter().zip(&labels).zip(&budgets) {

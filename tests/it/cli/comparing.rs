@@ -64,6 +64,27 @@ fn every_run_is_there_once_and_in_the_table() {
 }
 
 #[test]
+fn a_policy_competes_with_itself_by_its_parameters() {
+    let scene = Photographs::colmap_text();
+    let (_root, output) = scratch();
+    let call = ["compare", text(scene.path()), "-o", text(&output), "--seeds", "1"];
+    let variant = "diet:min_opacity=0.5:rho=0";
+    let policies = format!("diet,{variant}");
+    let more = ["--policies", &policies, "--budget", "320", "--iterations", "400"];
+    densify(&[&call[..], &more].concat()).ok();
+    let all = records(&output.join("compare.jsonl"));
+    assert_eq!([&all[0]["policy"], &all[1]["policy"]], ["diet", variant]);
+    assert_ne!(all[0]["psnr"], all[1]["psnr"], "the parameters do nothing");
+    let run = all[1]["run"].as_str().expect("a name");
+    assert!(
+        run.ends_with("diet-min_opacity-0.5-rho-0-320-seed0")
+            && output.join("runs").join(run).is_dir()
+    );
+    let table = String::from_utf8(read(&output.join("compare.md"))).expect("UTF-8");
+    assert!(table.contains(&format!("| {variant} |")), "{table}");
+}
+
+#[test]
 fn bad_comparisons_are_refused_before_anything_runs() {
     let scene = Photographs::colmap_text();
     let (root, output) = scratch();
@@ -96,6 +117,8 @@ fn bad_comparisons_are_refused_before_anything_runs() {
         ])
     };
     policies("diet,dite").refused("unknown policy", &["dite", "diet"]);
+    policies("diet,diet:rhoo=0").refused("unknown parameter", &["rhoo", "diet"]);
+    policies("diet,diet:rho").refused("no value", &["--policies", "diet.rho"]);
     policies("diet,diet").refused("twice", &["--policies", "diet", "twice"]);
     assert!(!output.join("compare.md").exists());
 }

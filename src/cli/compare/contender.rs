@@ -1,0 +1,95 @@
+//! Who competes: a policy, or a policy with parameters of its own.
+
+use densify_policies::parameters::parse_overrides;
+use densify_policies::policy::SceneInfo;
+use densify_policies::registry::find;
+
+use crate::cli::failure::Failure;
+
+/// A policy as it is named on the command line: `NAME`, or `NAME:PARAMETER=VALUE`, with as many
+/// parameters as wanted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Contender<'a> {
+    name: &'a str,
+    settings: Vec<&'a str>,
+}
+
+impl<'a> Contender<'a> {
+    pub(super) fn new(text: &'a str) -> Self {
+        let mut parts = text.split(':');
+        Self { name: parts.next().unwrap_or_default(), settings: parts.collect() }
+    }
+
+    /// Values of `--policy-set`.
+    fn overrides(&self) -> Vec<String> {
+        self.settings.iter().map(|setting| format!("{}.{setting}", self.name)).collect()
+    }
+
+    /// Options of `densify train`.
+    pub(super) fn options(&self) -> Vec<String> {
+        let set = self.overrides().into_iter().flat_map(|set| ["--policy-set".to_owned(), set]);
+        ["--policy".to_owned(), self.name.to_owned()].into_iter().chain(set).collect()
+    }
+
+    /// A name for folders.
+    pub(super) fn folder(&self) -> String {
+        let plain = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+        let parts = std::iter::once(&self.name).chain(&self.settings);
+        let parts: Vec<String> = parts.map(|part| part.replace(|c| !plain(c), "-")).collect();
+        parts.join("-")
+    }
+
+    /// Checks that there is such a policy, and that it takes these parameters in a run of so many
+    /// iterations.
+    ///
+    /// # Errors
+    /// What is unknown or out of range.
+    pub(super) fn check(&self, budget: usize, iterations: u32) -> Result<(), Failure> {
+        let entry = find(self.name)?;
+        let tables = parse_overrides(&self.overrides())
+            .map_err(|error| Failure::input(format!("--policies: {error}")))?;
+        // Of a scene parameters only have to fit the length and the budget.
+        let scene = SceneInfo {
+            extent: 1.0,
+            train_views: 1,
+            budget,
+            initial_rows: 1,
+            iterations,
+            white_background: false,
+        };
+        entry.build(&tables.get(self.name).cloned().unwrap_or_default(), &scene)?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parameters_follow_the_name() {
+        let plain = Contender::new("diet");
+        assert_eq!(
+            (plain.options(), plain.folder()),
+            (vec!["--policy".into(), "diet".into()], "diet".into())
+        );
+        let set = Contender::new("diet:rho=0:split=random");
+        assert_eq!(
+            set.options(),
+            ["--policy", "diet", "--policy-set", "diet.rho=0", "--policy-set", "diet.split=random"]
+        );
+        assert_eq!(set.folder(), "diet-rho-0-split-random");
+    }
+
+    #[test]
+    fn what_a_policy_does_not_take_is_refused() {
+        let refused =
+            |text| Contender::new(text).check(100, 7000).map_err(|f| f.message).unwrap_err();
+        assert!(Contender::new("diet:rho=0.5:error=l1").check(100, 7000).is_ok());
+        assert!(refused("dite").contains("diet"));
+        assert!(refused("diet:rhoo=1").contains("rhoo"));
+        assert!(refused("diet:rho=-1").contains("rho"));
+        assert!(refused("diet:rho").contains("--policies"));
+        assert!(refused("diet:").contains("--policies"));
+    }
+}
