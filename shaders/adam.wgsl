@@ -176,18 +176,26 @@ fn adam_geometry(
 fn confine(base: u32) {
     let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
     let norm2 = dot(q, q);
-    // A quaternion this short has no direction left; it starts again without rotation.
-    var unit = vec4(1.0, 0.0, 0.0, 0.0);
-    if norm2 > 1e-12 {
-        unit = q / sqrt(norm2);
+    // A quaternion this short has no direction left; it starts again without rotation. Here and
+    // below, NaN stays NaN: an audit shall find it.
+    var unit = q / sqrt(norm2);
+    if below(norm2, 1e-12) {
+        unit = vec4(1.0, 0.0, 0.0, 0.0);
     }
     for (var k = 0u; k < 4u; k++) {
         params[base + 6u + k] = unit[k];
     }
     for (var k = 3u; k < 6u; k++) {
-        params[base + k] = clamp(params[base + k], LOG_SCALE_LEAST, LOG_SCALE_MOST);
+        confine_to(base + k, LOG_SCALE_LEAST, LOG_SCALE_MOST);
     }
-    params[base + 10u] = clamp(params[base + 10u], -LOGIT_MAX, LOGIT_MAX);
+    confine_to(base + 10u, -LOGIT_MAX, LOGIT_MAX);
+}
+
+fn confine_to(at: u32, least: f32, most: f32) {
+    let x = params[at];
+    if below(x, LARGEST) {
+        params[at] = clamp(x, least, most);
+    }
 }
 
 // Δμ = R·S²·Rᵀ·ξ · share · factor.

@@ -9,7 +9,7 @@
 //! use densify::dataset::{Dataset, LoadOptions};
 //! use densify::init::initialise;
 //! use densify::schedule::{Background, RateOptions};
-//! use densify::trainer::{TrainOptions, Trainer};
+//! use densify::trainer::{OnNan, TrainOptions, Trainer};
 //! use densify::views::DatasetViews;
 //! use densify_policies::policy::SceneInfo;
 //! use densify_policies::registry::find;
@@ -39,11 +39,12 @@
 //!     rates: RateOptions::default(),
 //!     sh_every: None,
 //!     prefetch: 4,
+//!     on_nan: OnNan::Prune,
 //! };
 //! let mut trainer = Trainer::new(views, Box::new(backend), ("diet", policy), scene, options)?;
 //! for _ in 0..iterations {
 //!     let report = trainer.step()?;
-//!     if let Some(event) = report.event {
+//!     for event in report.events {
 //!         println!("step {}: {} rows, {} denied", event.step, event.after, event.denied);
 //!     }
 //! }

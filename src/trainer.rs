@@ -9,6 +9,8 @@ mod check;
 mod error;
 mod fresh;
 mod guard;
+mod options;
+mod quarantine;
 mod state;
 
 use std::time::{Duration, Instant};
@@ -21,32 +23,14 @@ use serde::{Deserialize, Serialize};
 use crate::backend::{Backend, BackendError, StepInput, StepOutput};
 use crate::dataset::images::SharedImage;
 use crate::gaussians::Gaussians;
-use crate::schedule::{self, Background, RateOptions};
+use crate::schedule;
 use crate::views::ViewSource;
 use check::check;
 pub use error::TrainError;
 use guard::asked;
+pub use options::{OnNan, TrainOptions};
+use quarantine::AUDIT_EVERY;
 pub use state::TrainerState;
-
-/// How a run goes, beside its scene and its policy.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrainOptions {
-    /// Length of the run in steps, >= 1; schedules scale with it.
-    pub iterations: u32,
-    /// Seed of everything that is drawn.
-    pub seed: u64,
-    /// Highest spherical-harmonic degree trained, <= the model's.
-    pub sh_degree: u8,
-    /// What lies behind the Gaussians.
-    pub background: Background,
-    /// Step sizes.
-    pub rates: RateOptions,
-    /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, if not the
-    /// policy's choice; >= 1.
-    pub sh_every: Option<u32>,
-    /// How many views ahead are announced to the [`ViewSource`].
-    pub prefetch: usize,
-}
 
 /// What a run with this policy needs of its backend: the policy's needs, and room for the options'
 /// cadence.
@@ -70,8 +54,9 @@ pub struct StepReport {
     pub output: StepOutput,
     /// Rows after the step.
     pub rows: usize,
-    /// The edit of this step, if the policy was due and had something to do.
-    pub event: Option<EditEvent>,
+    /// The edits of this step: of rows that hold a number that is none, and the policy's, where it was
+    /// due and had something to do.
+    pub events: Vec<EditEvent>,
 }
 
 /// One edit of the rows.
@@ -193,10 +178,16 @@ impl<V: ViewSource> Trainer<V> {
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
         let is_due = asked(|| self.policy.is_due(step)).map_err(|e| self.refused(step, e))?;
+        let mut events = Vec::new();
+        if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
+            events.extend(self.quarantine(step)?);
+        }
         let start = Instant::now();
-        let event = if is_due { self.edit(step)? } else { None };
+        if is_due {
+            events.extend(self.edit(step)?);
+        }
         self.policy_time = self.policy_time.saturating_add(start.elapsed());
-        Ok(StepReport { step, view, output, rows: self.backend.rows(), event })
+        Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
     fn image(&self, step: u32, view: usize) -> Result<SharedImage, TrainError> {
@@ -247,8 +238,8 @@ impl<V: ViewSource> Trainer<V> {
         self.order[place]
     }
 
-    /// Asks the policy for a plan and executes it. A plan that changes no row and was refused
-    /// nothing is no event: policies may be due at steps at which they find nothing to do.
+    /// Asks the policy for a plan and executes it; policies may be due at steps at which they find
+    /// nothing to do.
     fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
         let needs = self.measure_fresh(step)?;
@@ -261,6 +252,11 @@ impl<V: ViewSource> Trainer<V> {
         let rng = PolicyRng::new(self.options.seed, step);
         let planned = asked(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         planned.map_err(|source| self.refused(step, source))?;
+        self.execute(step, plan)
+    }
+
+    /// Executes a plan. One that changes no row and was refused nothing is no event.
+    fn execute(&mut self, step: u32, plan: EditPlan) -> Result<Option<EditEvent>, TrainError> {
         let ops = plan.compile();
         self.check_plan(step, &ops)?;
         self.backend.apply(&ops, self.options.seed, step).map_err(|e| self.stopped(step, e))?;

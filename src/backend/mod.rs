@@ -3,6 +3,7 @@
 //! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
 //! Signals come down when a policy is due, row operations go up; parameters stay where they are.
 
+mod audit;
 mod candidates;
 pub mod cpu;
 pub mod gpu;
@@ -19,6 +20,7 @@ use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
+pub use audit::{Attribute, Kept, Unsound};
 pub use state::{StateError, Tensor, Values};
 
 /// Step sizes of one iteration, one per parameter class.
@@ -227,6 +229,13 @@ pub trait Backend: Send {
     /// When `ops` was made for another number of rows or another budget: that is a bug in the
     /// caller, and going on would exceed the budget or corrupt the model.
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError>;
+
+    /// The rows with a parameter or a moment that is NaN or infinite, in order. Until they are
+    /// removed they are not rendered, and nothing else depends on them.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError>;
 
     /// Renders a view.
     ///

@@ -38,6 +38,22 @@ pub enum TrainError {
         /// The loss.
         loss: f32,
     },
+    /// Rows hold numbers that are none: more of them than a sound run has, or any where none is
+    /// wanted.
+    #[error(
+        "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \
+         lower the learning rates, and check the scene's scale and cameras"
+    )]
+    Unsound {
+        /// Iteration.
+        step: u32,
+        /// How many rows.
+        count: usize,
+        /// Of how many.
+        rows: usize,
+        /// The first of them, and its number.
+        first: String,
+    },
     /// The policy reported an error.
     #[error("step {step}: policy `{policy}`: {source}")]
     Policy {

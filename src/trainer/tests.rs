@@ -11,10 +11,13 @@ use densify_policies::policy::{
 use glam::{DMat3, DVec3};
 
 use super::*;
-use crate::backend::{AuxInput, AuxOutput, Rendering, StateError, Tensor};
+use crate::backend::{
+    Attribute, AuxInput, AuxOutput, Kept, Rendering, StateError, Tensor, Unsound,
+};
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
+use crate::schedule::{Background, RateOptions};
 use crate::views::ViewError;
 
 /// Everything that was asked of the fakes, in order.
@@ -28,6 +31,7 @@ struct CountingBackend {
     rows: usize,
     budget: usize,
     lost_at: u32,
+    unsound: u32,
     diary: Diary,
     ledger: Ledger,
 }
@@ -72,7 +76,12 @@ impl Backend for CountingBackend {
         note(&self.diary, format!("apply {step}"));
         assert_eq!(ops.rows_before, self.rows);
         self.rows = ops.rows_after;
+        self.unsound = 0;
         Ok(())
+    }
+    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+        let unsound = |row| Unsound { row, attribute: Attribute::Opacity, kept: Kept::Moment };
+        Ok((0..self.unsound).map(unsound).collect())
     }
     fn render(
         &mut self,
@@ -240,6 +249,7 @@ struct Case {
     aux_views: u32,
     cadence: Cadence,
     lost_at: u32,
+    unsound: u32,
     unreadable: Option<usize>,
 }
 
@@ -252,6 +262,7 @@ const CASE: Case = Case {
     aux_views: 0,
     cadence: Cadence { all: 1, sh_rest: 1 },
     lost_at: 0,
+    unsound: 0,
     unreadable: None,
 };
 
@@ -283,6 +294,7 @@ const OPTIONS: TrainOptions = TrainOptions {
     },
     sh_every: None,
     prefetch: 2,
+    on_nan: OnNan::Prune,
 };
 
 fn build(
@@ -306,6 +318,7 @@ fn build(
         rows: case.rows,
         budget: case.budget,
         lost_at: case.lost_at,
+        unsound: case.unsound,
         diary: diary.clone(),
         ledger: Ledger::default(),
     };
@@ -357,7 +370,7 @@ fn every_epoch_shows_every_view_once_and_is_announced() {
 #[test]
 fn edits_are_reported_and_the_budget_holds() {
     let (mut trainer, ..) = trainer(&CASE);
-    let events: Vec<EditEvent> = (0..9).filter_map(|_| trainer.step().unwrap().event).collect();
+    let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
     let short: Vec<_> =
         events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
     assert_eq!(short, [(2, 3, 3, 0, 6), (4, 6, 4, 2, 10), (6, 10, 0, 10, 10), (8, 10, 0, 10, 10)]);
@@ -412,7 +425,7 @@ fn fresh_signals_are_there_only_where_they_are_wanted() {
 #[test]
 fn a_plan_that_does_nothing_is_no_event() {
     let (mut trainer, diary, _) = trainer(&Case { what: Told::Nothing, ..CASE });
-    assert!((0..9).all(|_| trainer.step().unwrap().event.is_none()));
+    assert!((0..9).all(|_| trainer.step().unwrap().events.is_empty()));
     assert!(trainer.events().is_empty());
     // It may reset statistics and is executed all the same.
     assert!(diary.lock().unwrap().contains(&"apply 2".to_owned()));
@@ -478,7 +491,7 @@ fn options_that_disagree_are_refused() {
 fn auxiliary_views_are_shown_before_the_plan() {
     let case = Case { aux_views: 2, ..CASE };
     let (mut trainer, diary, _) = trainer(&case);
-    let events: Vec<EditEvent> = (0..9).filter_map(|_| trainer.step().unwrap().event).collect();
+    let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
     let views = schedule::fresh_views(3, 2, 7, 4);
     let degree = schedule::sh_degree(4, 9, 3);
     let shown = |view: &usize| format!("observe {view}, pixel {view}, degree {degree}");
@@ -531,4 +544,46 @@ fn the_cadence_is_the_policys_unless_the_options_say_otherwise() {
     assert!(undeclared.starts_with("step 6: policy `told`: it wants"), "{undeclared}");
     let senseless = noted(every, Some(0)).unwrap_err().to_string();
     assert!(senseless.contains("cadence.sh_rest is 0"), "{senseless}");
+}
+
+#[test]
+fn rows_that_are_unsound_go_before_the_policy_is_asked() {
+    let case = Case { rows: 2000, budget: 2000, unsound: 2, what: Told::Halve, ..CASE };
+    let (mut trainer, diary, _) = trainer(&case);
+    assert!(trainer.step().unwrap().events.is_empty());
+    let events = trainer.step().unwrap().events;
+    let short: Vec<_> = events.iter().map(|e| (&*e.cause, e.before, e.removed)).collect();
+    assert_eq!(short, [("not finite", 2000, 2), ("told", 1998, 999)]);
+    assert_eq!(diary.lock().unwrap().iter().filter(|d| *d == "apply 2").count(), 2);
+    assert_eq!(trainer.events(), events);
+}
+
+#[test]
+fn rows_that_are_unsound_go_at_the_end_too() {
+    let (mut trainer, ..) = trainer(&Case { unsound: 1, every: 100, ..CASE });
+    let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
+    assert_eq!((events.len(), events[0].step, events[0].after), (1, 9, 2));
+}
+
+#[test]
+fn many_unsound_rows_end_the_run_and_so_does_one_where_none_is_wanted() {
+    // One in a thousand may go, and one always.
+    for (rows, unsound, ends) in
+        [(3, 1, false), (3, 2, true), (3000, 3, false), (3000, 4, true), (1, 1, true)]
+    {
+        let case = Case { rows, budget: 3000, unsound, every: 100, ..CASE };
+        let (mut trainer, ..) = trainer(&case);
+        let error = (0..9).find_map(|_| trainer.step().err());
+        assert_eq!(error.is_some(), ends, "{unsound} of {rows}");
+        if let Some(error) = error {
+            let said = error.to_string();
+            let count = format!("step 9: {unsound} of {rows} rows");
+            assert!(said.starts_with(&count) && said.contains("opacity of row 0"), "{said}");
+            assert_eq!((trainer.rows(), trainer.steps_done()), (rows, 9));
+        }
+    }
+    let case = Case { rows: 2000, budget: 2000, unsound: 1, ..CASE };
+    let options = TrainOptions { on_nan: OnNan::Stop, ..OPTIONS };
+    let (mut trainer, ..) = build(&case, 3, scene(&case, 3), options).unwrap();
+    assert!(trainer.step().is_ok() && trainer.step().is_err());
 }

@@ -129,7 +129,7 @@ fn without<T: Clone>(values: &[T], row: usize, per_row: usize) -> Vec<T> {
     [&values[..row * per_row], &values[(row + 1) * per_row..]].concat()
 }
 
-fn remove(model: &Gaussians, row: usize) -> Gaussians {
+pub(crate) fn remove(model: &Gaussians, row: usize) -> Gaussians {
     let per_row = model.sh.len() / model.len();
     Gaussians {
         sh_degree: model.sh_degree,
@@ -212,7 +212,7 @@ fn place(slot: usize) -> &'static str {
 }
 
 /// The 59 numbers of a row: mean, log-scale, quaternion, opacity, coefficients.
-fn slot_of(model: &mut Gaussians, row: usize, slot: usize) -> &mut f32 {
+pub(crate) fn slot_of(model: &mut Gaussians, row: usize, slot: usize) -> &mut f32 {
     match slot {
         0..3 => &mut model.means[row][slot],
         3..6 => &mut model.log_scales[row][slot - 3],

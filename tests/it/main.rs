@@ -19,6 +19,7 @@ mod invariants;
 mod loss;
 mod oracle;
 mod photographs;
+mod quarantine;
 mod reference;
 mod sameness;
 mod scenes;

@@ -112,18 +112,27 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32]) {
         let at = |p: usize| p * WIDTH + lane;
         let q = each!(i in 4 => V::load(s, &params[at(plane::QUAT + i)..]));
         let norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-        // A quaternion this short has no direction left; it starts again without rotation.
-        let sound = c(1e-12).lt(norm2);
+        // A quaternion this short has no direction left; it starts again without rotation. Here and
+        // below, NaN stays NaN: an audit shall find it.
+        let lost = norm2.le(c(1e-12));
         let inv = c(1.0) / norm2.sqrt();
         for (i, x) in q.into_iter().enumerate() {
             let identity = if i == 0 { 1.0 } else { 0.0 };
-            sound.select(x * inv, c(identity)).store(&mut params[at(plane::QUAT + i)..]);
+            lost.select(c(identity), x * inv).store(&mut params[at(plane::QUAT + i)..]);
         }
         for p in plane::LOG_SCALE..plane::QUAT {
             let x = V::load(s, &params[at(p)..]);
-            x.max(c(LOG_SCALE_RANGE[0])).min(c(LOG_SCALE_RANGE[1])).store(&mut params[at(p)..]);
+            clamp(s, x, LOG_SCALE_RANGE).store(&mut params[at(p)..]);
         }
         let x = V::load(s, &params[at(plane::OPACITY)..]);
-        x.max(c(-LOGIT_MAX)).min(c(LOGIT_MAX)).store(&mut params[at(plane::OPACITY)..]);
+        clamp(s, x, [-LOGIT_MAX, LOGIT_MAX]).store(&mut params[at(plane::OPACITY)..]);
     }
+}
+
+/// x in [least, most]; NaN stays NaN.
+#[inline(always)]
+fn clamp<S: Simd>(s: S, x: V<S>, [least, most]: [f32; 2]) -> V<S> {
+    let [least, most] = [least, most].map(|bound| V::splat(s, bound));
+    let x = x.lt(least).select(least, x);
+    most.lt(x).select(most, x)
 }

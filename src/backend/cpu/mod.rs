@@ -8,6 +8,7 @@
 
 mod adam;
 mod apply;
+mod audit;
 mod blocks;
 mod budget;
 mod candidates;
@@ -16,6 +17,7 @@ mod fresh;
 mod loss;
 mod observe;
 mod optimise;
+mod options;
 mod passes;
 mod project;
 mod project_bwd;
@@ -40,7 +42,7 @@ use pulp::Arch;
 use super::candidates::{Candidates, error_weights};
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
-    Tensor,
+    Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -61,46 +63,13 @@ use summed::Summed;
 use tiles::{Grid, TileLists};
 
 pub use optimise::{ImageGradient, ModelGradient};
+pub use options::CpuOptions;
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
 /// Blocks per task: 256 rows, about a megabyte of parameters and moments at degree 3.
 const BLOCKS_PER_TASK: usize = 16;
 const ROWS_PER_TASK: usize = BLOCKS_PER_TASK * WIDTH;
-
-/// How to set up a [`CpuBackend`].
-#[derive(Debug, Clone)]
-pub struct CpuOptions {
-    /// Most rows there may ever be, >= 1 and >= the model's.
-    pub budget: usize,
-    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
-    pub near: f32,
-    /// Most (row, tile) entries held at a time; beyond it the image is processed in bands.
-    /// At least one tile's list must fit, so it is raised to the budget.
-    pub tile_cap: usize,
-    /// Worker threads; `None` takes all cores.
-    pub threads: Option<usize>,
-    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
-    /// memory than the ledger says.
-    pub largest_image: (u32, u32),
-    /// Signals and candidates to collect.
-    pub needs: Needs,
-}
-
-impl CpuOptions {
-    /// Options for models of at most `budget` rows: entries for sixteen tiles per row.
-    #[must_use]
-    pub fn new(budget: usize) -> Self {
-        Self {
-            budget,
-            near: 0.01,
-            tile_cap: budget.saturating_mul(16),
-            threads: None,
-            largest_image: (0, 0),
-            needs: Needs::default(),
-        }
-    }
-}
 
 /// The native backend.
 #[derive(Debug)]
@@ -365,6 +334,10 @@ impl Backend for CpuBackend {
             self.candidates.clear();
         }
         Ok(())
+    }
+
+    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+        Ok(self.unsound())
     }
 
     fn render(

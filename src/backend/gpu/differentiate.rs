@@ -1,7 +1,7 @@
 //! Gradients and losses on their own, without a step: what tests and research look at.
 
+use super::GpuBackend;
 use super::frame::{Frame, State, grid};
-use super::{GpuBackend, scalars};
 use crate::backend::cpu::{ImageGradient, ModelGradient};
 use crate::backend::{BackendError, Rendering, StepOutput};
 use crate::camera::Camera;
@@ -127,6 +127,6 @@ impl GpuBackend {
         let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;
         let n = pixels.len();
         let gradient = (0..3 * n).map(|i| planes[i % 3 * n + i / 3]).collect();
-        Ok((scalars(&state), gradient))
+        Ok((state.output(), gradient))
     }
 }

@@ -5,13 +5,15 @@ use bytemuck::{Pod, Zeroable};
 use densify_policies::policy::{LossTerms, NoiseTerm};
 
 use super::signals::Planes;
-use crate::backend::StepInput;
+use crate::backend::{StepInput, StepOutput};
 use crate::camera::Camera;
 
 /// Side of a tile `[px]`.
 pub(super) const TILE: u32 = 16;
 /// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size.
 const FOV_MARGIN: f64 = 0.15;
+/// Weight of 1 − SSIM in the loss; L1 has the rest.
+const SSIM_WEIGHT: f32 = 0.2;
 
 /// See `Frame` in `shaders/view.wgsl`.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
@@ -52,6 +54,19 @@ impl State {
     /// (row, tile) pairs of all bands.
     pub(super) fn entries(&self) -> u64 {
         u64::from(self.entries_high) << 32 | u64::from(self.entries_low)
+    }
+
+    /// What comes back of a step.
+    pub(super) fn output(&self) -> StepOutput {
+        let Self { l1, ssim, visible, bands, .. } = *self;
+        StepOutput {
+            loss: (1.0 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1.0 - ssim),
+            l1,
+            ssim,
+            visible: visible as usize,
+            entries: self.entries(),
+            bands,
+        }
     }
 }
 

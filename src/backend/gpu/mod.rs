@@ -9,6 +9,7 @@
 //! Every sum has one order, so that the same device gives the same bytes twice.
 
 mod adapter;
+mod audit;
 mod buffers;
 mod canary;
 mod device;
@@ -34,13 +35,14 @@ use densify_policies::policy::{Cadence, Candidate, LossTerms, Needs, NoiseTerm, 
 use super::candidates::Candidates;
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
-    Tensor,
+    Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 use crate::memory::{Ledger, Section};
 
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
+use audit::Audited;
 use buffers::{Buffers, MOST_ENTRIES, Sizes, bias_table};
 use device::Device;
 pub use device::GpuDevice;
@@ -53,8 +55,6 @@ use signals::{Planes, record_stride};
 
 /// Largest image side `[px]`; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
-/// Weight of 1 − SSIM in the loss; L1 has the rest.
-const SSIM_WEIGHT: f32 = 0.2;
 
 /// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
 #[derive(Debug, Clone, Copy, Default)]
@@ -72,6 +72,7 @@ pub struct GpuBackend {
     pipelines: Arc<Pipelines>,
     launches: Launches,
     edits: EditLaunches,
+    audited: Vec<Audited>,
     ledger: Ledger,
     budget: usize,
     rows: usize,
@@ -136,6 +137,7 @@ impl GpuBackend {
         let launches = device
             .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
+        let audited = audit::launches(&device, &sizes, &buffers, &pipelines);
         let mut ledger = sizes.ledger();
         let pixels = u64::from(image.0) * u64::from(image.1);
         ledger.add_to(
@@ -155,6 +157,7 @@ impl GpuBackend {
             pipelines,
             launches,
             edits,
+            audited,
             budget,
             rows: model.len(),
             near: options.near,
@@ -212,6 +215,7 @@ impl GpuBackend {
         self.launches =
             device.guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers))?;
         self.edits = EditLaunches::new(device, sizes, &self.planes, buffers, pipelines);
+        self.audited = audit::launches(device, sizes, buffers, pipelines);
         Ok(())
     }
 
@@ -255,18 +259,6 @@ impl GpuBackend {
             let needed = if shape.bands == 1 { guess } else { u64::from(state.bands) };
             self.bands = needed.min(u64::from(tiles)) as u32;
         }
-    }
-}
-
-fn scalars(state: &State) -> StepOutput {
-    let State { l1, ssim, .. } = *state;
-    StepOutput {
-        loss: (1.0 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1.0 - ssim),
-        l1,
-        ssim,
-        visible: state.visible as usize,
-        entries: state.entries(),
-        bands: state.bands,
     }
 }
 
@@ -355,6 +347,10 @@ impl Backend for GpuBackend {
             self.candidates.clear();
         }
         self.device.check()
+    }
+
+    fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
+        self.unsound()
     }
 
     fn render(

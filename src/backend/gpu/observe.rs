@@ -122,7 +122,7 @@ impl GpuBackend {
             passes.forward(to);
             passes.loss(to, [0.0; 2]);
         })?;
-        let loss = super::scalars(&state).loss;
+        let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height)?;
         let seen = Seen { frame, shape, target };
         let points = if request.points == 0 {

@@ -18,7 +18,7 @@ const GAUSSIAN: &str = shader!("gaussian");
 const RANDOM: &str = shader!("random");
 
 /// The texts of each stage.
-pub(super) const STAGES: [(&str, &[&str]); 11] = [
+pub(super) const STAGES: [(&str, &[&str]); 12] = [
     ("project", &[VIEW, GAUSSIAN, shader!("project")]),
     ("tiles", &[VIEW, shader!("tiles")]),
     ("rasterize", &[VIEW, shader!("rasterize")]),
@@ -30,6 +30,7 @@ pub(super) const STAGES: [(&str, &[&str]); 11] = [
     ("apply", &[VIEW, RANDOM, shader!("apply")]),
     ("candidates", &[VIEW, RANDOM, shader!("candidates")]),
     ("observe", &[VIEW, shader!("observe")]),
+    ("audit", &[VIEW, shader!("audit")]),
 ];
 
 /// The text of a stage's module.
@@ -81,6 +82,7 @@ kernels! {
     Surface: "candidates" "surface" [0, 1, 2, 3, 4, 5, 6, 7, 8];
     Replay: "observe" "replay" [0, 1, 2, 3, 4, 5, 6, 7];
     GatherColumns: "observe" "gather_columns" [0, 8, 9, 10, 11];
+    Audit: "audit" "audit" [1, 2];
 }
 
 /// The kernels of a device, for records of one detail, in the order of [`Kernel`].
@@ -215,186 +217,4 @@ fn bind_group_layout(
 }
 
 #[cfg(test)]
-mod tests {
-    use std::collections::BTreeMap;
-    use std::mem::offset_of;
-
-    use naga::valid::{Capabilities, ValidationFlags, Validator};
-    use naga::{AddressSpace, Module, TypeInner};
-
-    use densify_policies::rng::{PolicyRng, Purpose};
-
-    use super::super::adapter::AdapterChoice;
-    use super::super::device::Device as Opened;
-    use super::super::frame::{Frame, State, folded_seed};
-    use super::super::readback;
-    use super::*;
-
-    fn module(stage: usize) -> Module {
-        let text = text(stage);
-        naga::front::wgsl::parse_str(&text)
-            .unwrap_or_else(|e| panic!("{}: {}", STAGES[stage].0, e.emit_to_string(&text)))
-    }
-
-    #[test]
-    fn every_shader_is_valid_and_binds_what_the_table_says() {
-        for (stage, (name, _)) in STAGES.iter().enumerate() {
-            let module = module(stage);
-            let info = Validator::new(ValidationFlags::all(), Capabilities::IMMEDIATES)
-                .validate(&module)
-                .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text(stage))));
-            let of_stage: Vec<_> = KERNELS.iter().filter(|(of, ..)| of == name).collect();
-            assert_eq!(of_stage.len(), module.entry_points.len(), "{name}: kernels");
-            for (i, entry) in module.entry_points.iter().enumerate() {
-                let (_, _, bindings) = of_stage
-                    .iter()
-                    .find(|(_, kernel, _)| *kernel == entry.name)
-                    .unwrap_or_else(|| panic!("{name}: {} is in no table", entry.name));
-                let uses = info.get_entry_point(i);
-                let mut used: Vec<u32> = Vec::new();
-                let (mut storage, mut shared) = (0, 0);
-                for (handle, variable) in module.global_variables.iter() {
-                    if uses[handle].is_empty() {
-                        continue;
-                    }
-                    if let Some(binding) = &variable.binding {
-                        used.push(binding.binding);
-                        let writes = match variable.space {
-                            AddressSpace::Storage { access } => {
-                                Some(access.contains(naga::StorageAccess::STORE))
-                            }
-                            _ => None,
-                        };
-                        let bound = match binding_type(&text(stage), binding.binding) {
-                            wgpu::BufferBindingType::Uniform => None,
-                            wgpu::BufferBindingType::Storage { read_only } => Some(!read_only),
-                        };
-                        assert_eq!(bound, writes, "{name}: binding {}", binding.binding);
-                    }
-                    storage += u32::from(matches!(variable.space, AddressSpace::Storage { .. }));
-                    if variable.space == AddressSpace::WorkGroup {
-                        shared += module.types[variable.ty].inner.size(module.to_ctx());
-                    }
-                }
-                used.sort_unstable();
-                assert_eq!(&used[..], *bindings, "{name}: {}", entry.name);
-                // What every device has: the portable limits of WebGPU.
-                assert!(storage <= 8, "{}: {storage} storage buffers", entry.name);
-                assert!(shared <= 16_384, "{}: {shared} bytes of shared memory", entry.name);
-                assert!(entry.workgroup_size.iter().product::<u32>() <= 256, "{}", entry.name);
-            }
-        }
-    }
-
-    fn offsets(module: &Module, name: &str) -> (BTreeMap<String, u32>, u32) {
-        let found = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some(name));
-        let Some((_, ty)) = found else { panic!("no struct {name}") };
-        let TypeInner::Struct { members, span } = &ty.inner else { panic!("{name} is no struct") };
-        let of = |m: &naga::StructMember| (m.name.clone().unwrap_or_default(), m.offset);
-        (members.iter().map(of).collect(), *span)
-    }
-
-    #[test]
-    fn structs_lie_as_the_shaders_read_them() {
-        macro_rules! check {
-            ($offsets:expr, $ty:ty, $($field:ident)*) => {{
-                $(assert_eq!($offsets[stringify!($field)] as usize, offset_of!($ty, $field),
-                    "{}", stringify!($field));)*
-                [$(stringify!($field)),*].len()
-            }};
-        }
-        let module = module(1);
-        let (frame, span) = offsets(&module, "Frame");
-        let fields = check!(frame, Frame, rotation centre lens ratio background image model rates
-            more_rates noise draw planes);
-        assert_eq!((fields, span as usize), (frame.len(), size_of::<Frame>()));
-        let (state, _) = offsets(&module, "State");
-        let fields = check!(state, State, visible total bands short entries_low entries_high held
-            spare l1 ssim spare_f);
-        assert_eq!(state["cuts"] as usize, size_of::<State>());
-        assert_eq!(fields + 1, state.len());
-    }
-
-    const DRAWS: &str = "
-        @group(0) @binding(1) var<storage, read_write> drawn: array<vec4<u32>>;
-        @compute @workgroup_size(64)
-        fn draws(@builtin(global_invocation_id) id: vec3<u32>) {
-            let i = id.x;
-            drawn[2u * i] = draw_bits(i * 7919u, now.b, now.a, PURPOSE_PLACE, i % 5u);
-            let normal = normal3(i * 7919u, now.b, now.a, PURPOSE_PLACE, i % 5u);
-            drawn[2u * i + 1u] = bitcast<vec4<u32>>(vec4(normal, 0.0));
-        }";
-
-    /// What the shader draws. Shape: `[rows, 2 × 4]`, bits and normals.
-    fn drawn(device: &Opened, rows: u32, now: [u32; 4]) -> Vec<[u32; 8]> {
-        let (gpu, text) = (&device.device, [VIEW, RANDOM, DRAWS].concat());
-        let module = gpu.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: None,
-            source: wgpu::ShaderSource::Wgsl((&text).into()),
-        });
-        let layout = bind_group_layout(gpu, "draws", &text, &[1]);
-        let all = gpu.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: None,
-            bind_group_layouts: &[Some(&layout)],
-            immediate_size: NOW_BYTES,
-        });
-        let pipeline = gpu.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: None,
-            layout: Some(&all),
-            module: &module,
-            entry_point: Some("draws"),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            cache: None,
-        });
-        let size = 32 * u64::from(rows);
-        let buffer = |usage| {
-            let descriptor =
-                wgpu::BufferDescriptor { label: None, size, usage, mapped_at_creation: false };
-            gpu.create_buffer(&descriptor)
-        };
-        let found = buffer(wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
-        let staging = buffer(wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
-        let bindings = gpu.create_bind_group(&BindGroupDescriptor {
-            label: None,
-            layout: &layout,
-            entries: &[BindGroupEntry { binding: 1, resource: found.as_entire_binding() }],
-        });
-        let mut encoder = gpu.create_command_encoder(&Default::default());
-        {
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            pass.set_pipeline(&pipeline);
-            pass.set_bind_group(0, &bindings, &[]);
-            pass.set_immediates(0, bytemuck::bytes_of(&now));
-            pass.dispatch_workgroups(rows / 64, 1, 1);
-        }
-        encoder.copy_buffer_to_buffer(&found, 0, &staging, 0, size);
-        let bytes = readback::finish(device, &staging, encoder, size);
-        bytemuck::pod_collect_to_vec(&bytes.expect("the draws are read"))
-    }
-
-    #[test]
-    #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
-    fn draws_are_those_of_the_policies() {
-        let device = match Opened::open(&AdapterChoice::default()) {
-            Ok(device) => device,
-            Err(error) => {
-                assert!(std::env::var_os("DENSIFY_REQUIRE_GPU").is_none(), "{error}");
-                eprintln!("skipped: {error}");
-                return;
-            }
-        };
-        for (seed, step) in [(42, 600), (0, 0), (u64::MAX - 7, 30_000)] {
-            let rng = PolicyRng::new(seed, step);
-            let now = [folded_seed(seed), step, 0, 0];
-            for (i, found) in (0..1024_u32).zip(drawn(&device, 1024, now)) {
-                let row = i.wrapping_mul(7919);
-                assert_eq!(found[..4], rng.bits(row, Purpose::Place, i % 5), "row {row}");
-                let normal = rng.normal3(row, Purpose::Place, i % 5);
-                for (found, expected) in found[4..].iter().zip(normal) {
-                    let found = f32::from_bits(*found);
-                    assert!((found - expected).abs() < 2e-6, "row {row}: {found} {expected}");
-                }
-            }
-        }
-    }
-}
+mod tests;

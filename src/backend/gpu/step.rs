@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::frame::{due, target as of_target};
 use super::observe::Seen;
 use super::passes::{Passes, Recorder};
-use super::{GpuBackend, Waiting, scalars};
+use super::{GpuBackend, Waiting};
 use crate::backend::candidates::error_weights;
 use crate::backend::{BackendError, StepInput, StepOutput};
 
@@ -69,6 +69,6 @@ impl GpuBackend {
         self.waiting = waiting;
         self.laps.clear();
         self.laps.push(("device", start.elapsed()));
-        Ok(scalars(&state))
+        Ok(state.output())
     }
 }

@@ -18,6 +18,7 @@ use super::failure::Failure;
 use super::number;
 use super::scene::{NEAR, SceneArgs};
 use crate::output::InitChoice;
+use crate::trainer::OnNan;
 use resume::Start;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
@@ -95,6 +96,10 @@ pub(super) struct TrainArgs {
     /// `[default: the policy's choice, mostly 1]`
     #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u32).range(1..=1000))]
     sh_every: Option<u32>,
+    /// What becomes of Gaussians with a number that is not finite, found every 100 iterations at
+    /// least
+    #[arg(long, value_name = "WHAT", help_heading = "Training", default_value = "prune")]
+    on_nan: NanArg,
     /// Everything random follows from this number; equal numbers give equal results
     #[arg(long, value_name = "N", help_heading = "Training", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     seed: u64,
@@ -138,6 +143,23 @@ Examples:
   densify train data/garden --resume";
 
 /// Spelling of [`InitChoice`] on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum NanArg {
+    /// Stop the run, with a checkpoint
+    Stop,
+    /// Remove them; stop only if they are more than 0.1 % at once
+    Prune,
+}
+
+impl From<NanArg> for OnNan {
+    fn from(choice: NanArg) -> Self {
+        match choice {
+            NanArg::Stop => Self::Stop,
+            NanArg::Prune => Self::Prune,
+        }
+    }
+}
+
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Init {
     /// On the points of the dataset's reconstruction

@@ -202,7 +202,13 @@ impl<'a> Session<'a> {
     /// Ends the run in order, so that it can go on later.
     fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
         let step = self.run.trainer.steps_done();
-        let kept = match self.keep() {
+        let kept = self.kept();
+        Failure { code: exit_code, message: format!("stopped by {name} after step {step}; {kept}") }
+    }
+
+    /// Writes a checkpoint of a run that ends here; says where.
+    fn kept(&mut self) -> String {
+        match self.keep() {
             Ok(path) => format!(
                 "the run is kept in {}; go on with: densify train {} -o {} --resume",
                 path.display(),
@@ -210,11 +216,11 @@ impl<'a> Session<'a> {
                 self.folder.display()
             ),
             Err(error) => format!("no checkpoint could be written: {error}"),
-        };
-        Failure { code: exit_code, message: format!("stopped by {name} after step {step}; {kept}") }
+        }
     }
 
-    /// One iteration with its records. On a policy's error the model is saved first.
+    /// One iteration with its records. On a policy's error the model is saved first, and
+    /// where rows are unsound the run is kept.
     fn step(&mut self) -> Result<StepReport, Failure> {
         let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
         let stepped = self.run.trainer.step();
@@ -237,13 +243,17 @@ impl<'a> Session<'a> {
                 };
                 Err(Failure::from(error).and(&saved))
             }
+            Err(error @ TrainError::Unsound { .. }) => {
+                let kept = self.kept();
+                Err(Failure::from(error).and(&kept))
+            }
             Err(error) => Err(error.into()),
         }
     }
 
     fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
         let Self { logs, tally, run, .. } = self;
-        if let Some(event) = &report.event {
+        for event in &report.events {
             logs.events.append(event)?;
         }
         tally.step(&report.output);

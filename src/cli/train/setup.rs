@@ -148,6 +148,7 @@ pub(super) fn prepare(
         rates,
         sh_every: args.sh_every,
         prefetch: AHEAD,
+        on_nan: args.on_nan.into(),
     };
     let needs = needs(policy.as_ref(), &scene, &options);
     let (backend, ledger) =

@@ -142,6 +142,26 @@ fn resume(scene: &Photographs, run: &Path, flags: &str) -> Outcome {
     densify(&arguments)
 }
 
+/// Steps of colour so long that their squares are infinite: every row is unsound at the first audit.
+#[test]
+fn a_run_that_diverges_is_kept() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let diverges = |outcome: Outcome| {
+        let Outcome { code, stderr, .. } = &outcome;
+        assert_eq!(*code, Some(1), "{outcome:?}");
+        for word in ["step 100: ", "rows hold numbers that are not finite", "--resume", "row 0"] {
+            assert!(stderr.contains(word), "{word:?} is not in {stderr}");
+        }
+    };
+    diverges(train(scene.path(), &run, 200, "--budget 330 --lr sh_dc=1e38 --policy mcmc"));
+    let names: Vec<String> = files(&run.join("checkpoints")).into_keys().collect();
+    assert_eq!(names, ["iteration_100.safetensors"]);
+    // Nothing has become of it meanwhile: it ends at the next audit.
+    let again = resume(&scene, &run, "--on-nan stop");
+    assert!(again.code == Some(1) && again.stderr.contains("step 200: "), "{again:?}");
+}
+
 #[test]
 fn the_two_newest_are_kept() {
     let scene = Photographs::colmap_text();

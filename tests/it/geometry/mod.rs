@@ -15,7 +15,7 @@ use densify::gaussians::Gaussians;
 use densify::init::{initialise, restart};
 use densify::metrics::geometry::{self, Geometry, Ground};
 use densify::schedule::{Background, RateOptions};
-use densify::trainer::{TrainOptions, Trainer, needs};
+use densify::trainer::{OnNan, TrainOptions, Trainer, needs};
 use densify::views::DatasetViews;
 use densify_policies::policy::{Needs, SceneInfo};
 use densify_policies::registry::find;
@@ -108,6 +108,7 @@ impl Known {
             rates: RateOptions::for_run(run.iterations).with(&declared.rates),
             sh_every: None,
             prefetch: 0,
+            on_nan: OnNan::Prune,
         };
         let near = (0.04 * dataset.extent()) as f32;
         let needs = needs(policy.as_ref(), &scene, &options);

@@ -8,6 +8,7 @@ mod edits;
 mod looking;
 mod oracle;
 mod policies;
+mod quarantine;
 mod resuming;
 mod training;
 mod twins;

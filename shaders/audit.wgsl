@@ -1,0 +1,26 @@
+// Looks for rows that hold a number that is none; src/backend/audit.rs. Numbers are read as bits:
+// WGSL may assume that there is no NaN. One row per invocation.
+
+// 0, or 1 + the place of the row's first such number.
+@group(0) @binding(1) var<storage, read_write> marks: array<u32>;
+@group(0) @binding(2) var<storage, read> numbers: array<u32>;
+
+const NOT_FINITE: u32 = 0x7f800000u;
+
+// now.a: rows; now.b: numbers per row; now.c: place of the first.
+@compute @workgroup_size(256)
+fn audit(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row >= now.a || marks[row] != 0u {
+        return;
+    }
+    for (var k = 0u; k < now.b; k++) {
+        if (numbers[row * now.b + k] & NOT_FINITE) == NOT_FINITE {
+            marks[row] = now.c + k + 1u;
+            return;
+        }
+    }
+}

@@ -1,0 +1,35 @@
+//! How a run goes.
+
+use crate::schedule::{Background, RateOptions};
+
+/// How a run goes, beside its scene and its policy.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrainOptions {
+    /// Length of the run in steps, >= 1; schedules scale with it.
+    pub iterations: u32,
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+    /// Highest spherical-harmonic degree trained, <= the model's.
+    pub sh_degree: u8,
+    /// What lies behind the Gaussians.
+    pub background: Background,
+    /// Step sizes.
+    pub rates: RateOptions,
+    /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, if not the
+    /// policy's choice; >= 1.
+    pub sh_every: Option<u32>,
+    /// How many views ahead are announced to the [`ViewSource`].
+    pub prefetch: usize,
+    /// What becomes of rows that hold a number that is none.
+    pub on_nan: OnNan,
+}
+
+/// What becomes of rows with a parameter or a moment that is NaN or infinite.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum OnNan {
+    /// They are removed; only many of them at once end the run.
+    #[default]
+    Prune,
+    /// They end the run.
+    Stop,
+}
