@@ -116,6 +116,7 @@ impl Texture {
     #[must_use]
     pub fn sample(&self, uv: Vec2, sampler: &Sampler, footprint: f32) -> Vec4 {
         let uv = Vec2::new(wrapped(uv.x, sampler.wrap_u), wrapped(uv.y, sampler.wrap_v));
+        let values = Values::of(self.srgb);
         let first = &self.levels[0];
         let texels = footprint * ((first.width * first.height) as f32).sqrt();
         let level = if sampler.mipmaps { texels.log2() } else { 0.0 };
@@ -123,49 +124,50 @@ impl Texture {
         if level.is_nan() || level <= 0.0 {
             let nearest = sampler.nearest;
             return if nearest {
-                first.nearest(uv, self.srgb)
+                first.nearest(uv, values)
             } else {
-                first.linear(uv, sampler, self.srgb)
+                first.linear(uv, sampler, values)
             };
         }
         let last = self.levels.len() - 1;
         let level = level.min(last as f32);
-        let (lower, share) = (level as usize, level.fract());
-        let a = self.levels[lower].linear(uv, sampler, self.srgb);
+        let lower = level as usize;
+        let share = level - lower as f32;
+        let a = self.levels[lower].linear(uv, sampler, values);
         if share == 0.0 || lower == last {
             return a;
         }
-        a.lerp(self.levels[lower + 1].linear(uv, sampler, self.srgb), share)
+        a.lerp(self.levels[lower + 1].linear(uv, sampler, values), share)
     }
 }
 
 impl Level {
     #[inline]
-    fn texel(&self, x: u32, y: u32, srgb: bool) -> Vec4 {
+    fn texel(&self, x: u32, y: u32, Values { colour, alpha }: Values) -> Vec4 {
         let at = 4 * (y as usize * self.width as usize + x as usize);
-        let t = &self.texels[at..at + 4];
-        let linear = |v: u8| if srgb { decoded()[v as usize] } else { f32::from(v) / 255.0 };
-        Vec4::new(linear(t[0]), linear(t[1]), linear(t[2]), f32::from(t[3]) / 255.0)
+        let [r, g, b, a] = [0, 1, 2, 3].map(|i| usize::from(self.texels[at + i]));
+        Vec4::new(colour[r], colour[g], colour[b], alpha[a])
     }
 
-    fn nearest(&self, uv: Vec2, srgb: bool) -> Vec4 {
+    fn nearest(&self, uv: Vec2, values: Values) -> Vec4 {
         let x = ((uv.x * self.width as f32) as u32).min(self.width - 1);
         let y = ((uv.y * self.height as f32) as u32).min(self.height - 1);
-        self.texel(x, y, srgb)
+        self.texel(x, y, values)
     }
 
     #[inline]
-    fn linear(&self, uv: Vec2, sampler: &Sampler, srgb: bool) -> Vec4 {
+    fn linear(&self, uv: Vec2, sampler: &Sampler, values: Values) -> Vec4 {
         let (x0, x1, fx) = neighbours(uv.x, self.width, sampler.wrap_u);
         let (y0, y1, fy) = neighbours(uv.y, self.height, sampler.wrap_v);
-        let upper = self.texel(x0, y0, srgb).lerp(self.texel(x1, y0, srgb), fx);
-        let lower = self.texel(x0, y1, srgb).lerp(self.texel(x1, y1, srgb), fx);
+        let upper = self.texel(x0, y0, values).lerp(self.texel(x1, y0, values), fx);
+        let lower = self.texel(x0, y1, values).lerp(self.texel(x1, y1, values), fx);
         upper.lerp(lower, fy)
     }
 
     /// The image at half its size, averaged in linear light.
     fn halved(&self, srgb: bool) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
+        let values = Values::of(srgb);
         let mut texels = Vec::with_capacity(4 * width as usize * height as usize);
         for y in 0..height {
             for x in 0..width {
@@ -175,7 +177,7 @@ impl Level {
                 let mut sum = Vec4::ZERO;
                 for v in y0..y1 {
                     for u in x0..x1 {
-                        sum += self.texel(u, v, srgb);
+                        sum += self.texel(u, v, values);
                     }
                 }
                 let mean = sum / ((x1 - x0) * (y1 - y0)) as f32;
@@ -208,14 +210,15 @@ fn wrapped(x: f32, wrap: Wrap) -> f32 {
 /// The two texels about a coordinate in `[0, 1]` and the second one's weight.
 fn neighbours(u: f32, size: u32, wrap: Wrap) -> (u32, u32, f32) {
     let x = u * size as f32 - 0.5;
-    let floor = x.floor();
+    let first = if x < 0.0 { -1 } else { x as i64 };
     let last = i64::from(size) - 1;
-    let index = |i: i64| match wrap {
-        Wrap::Repeat => i.rem_euclid(i64::from(size)) as u32,
-        // Mirrored, the neighbour beyond the edge is the edge itself.
+    // Of two neighbours at most one is beyond an edge, by one. Mirrored, it is the edge itself.
+    let at = |i: i64, repeated: i64| match wrap {
+        _ if (0..=last).contains(&i) => i as u32,
+        Wrap::Repeat => repeated as u32,
         Wrap::Clamp | Wrap::Mirror => i.clamp(0, last) as u32,
     };
-    (index(floor as i64), index(floor as i64 + 1), x - floor)
+    (at(first, last), at(first + 1, 0), x - first as f32)
 }
 
 fn to_u8(v: f32) -> u8 {
@@ -234,10 +237,22 @@ pub fn srgb_from_linear(v: f64) -> f64 {
     if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Linear light of each sRGB byte.
-fn decoded() -> &'static [f32; 256] {
-    static TABLE: OnceLock<[f32; 256]> = OnceLock::new();
-    TABLE.get_or_init(|| std::array::from_fn(|i| linear_from_srgb(i as f64 / 255.0) as f32))
+/// What the bytes of a texel mean: linear light, and coverage.
+#[derive(Debug, Clone, Copy)]
+struct Values {
+    colour: &'static [f32; 256],
+    alpha: &'static [f32; 256],
+}
+
+impl Values {
+    fn of(srgb: bool) -> Self {
+        static TABLES: OnceLock<[[f32; 256]; 2]> = OnceLock::new();
+        let [plain, decoded] = TABLES.get_or_init(|| {
+            let decoded = |i: usize| linear_from_srgb(i as f64 / 255.0) as f32;
+            [std::array::from_fn(|i| i as f32 / 255.0), std::array::from_fn(decoded)]
+        });
+        Self { colour: if srgb { decoded } else { plain }, alpha: plain }
+    }
 }
 
 /// The sRGB byte nearest to linear light: rounded half up in the encoded space, values outside
