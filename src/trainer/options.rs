@@ -18,7 +18,7 @@ pub struct TrainOptions {
     /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, if not the
     /// policy's choice; >= 1.
     pub sh_every: Option<u32>,
-    /// How many views ahead are announced to the [`ViewSource`].
+    /// How many views ahead are announced to the [`ViewSource`](crate::views::ViewSource).
     pub prefetch: usize,
     /// What becomes of rows that hold a number that is none.
     pub on_nan: OnNan,
