@@ -7,14 +7,15 @@
 //! ## What it does
 //!
 //! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. Candidates are rows
-//! with g >= `tau`, where g = g_p + `colour_weight` · g_c; g_p and g_c are the means, over the views
-//! that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
-//! colour; a view from which the row is nearer than `full_depth` counts in them by the square of the
-//! ratio (as in *Pixel-GS*, Zhang et al. 2024). Dead rows (less opaque than `min_opacity`; after step `max_scale_from` also larger than
-//! `max_scale` · scene extent) are pruned; they are no candidates. If there are more candidates than
-//! room, some are paid for by as many victims, in all growths together up to `rho` · budget, in each
-//! an equal part of it. Then the candidates grow, the largest g first: small ones (up to `small` · scene extent) are cloned, the others split in two
-//! (`split`). What is left over is counted as denied. The statistics start anew.
+//! with g >= `tau`, where g = g_p + `colour_weight` · g_c; g_p and g_c are the means, over the
+//! views that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
+//! colour; a view from which the row is nearer than `full_depth` counts in them by the square of
+//! the ratio (as in *Pixel-GS*, Zhang et al. 2024). Dead rows (less opaque than `min_opacity`;
+//! after step `max_scale_from` also larger than `max_scale` · scene extent) are pruned; they are no
+//! candidates. If there are more candidates than room, some are paid for by as many victims, in all
+//! growths together up to `rho` · budget, in each an equal part of it. Then the candidates grow,
+//! the largest g first: small ones (up to `small` · scene extent) are cloned, the others split in
+//! two (`split`). What is left over is counted as denied. The statistics start anew.
 //!
 //! **Victims** are the least important rows, candidates excepted: those whose largest blend weight
 //! α·T, over all pixels of the views of `importance`, is smallest. Newborns are protected until
@@ -31,9 +32,10 @@
 //! **Pruning**, every `prune_every` steps until both have ended: rows above the budget are pruned,
 //! the least important first. (There are none, unless a model was loaded that is too large.)
 //!
-//! Some defaults are not those of paper and code, by measurement (`docs/comparison.md`): `split` is
-//! `long-axis`; `full_depth` keeps out fog that explains single photographs; `rho` and `rho_c` are
-//! for the whole run, as who exchanges the model many times over learns photographs by heart.
+//! Some defaults are not those of paper and code, by measurement in runs of 2,000 to 7,000 steps:
+//! `split` is `long-axis`; `full_depth` keeps out fog that explains single photographs; `rho` and
+//! `rho_c` are for the whole run, as who exchanges the model many times over learns photographs by
+//! heart.
 //!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;
@@ -131,7 +133,7 @@
 //! ## Switching ingredients off
 //!
 //! For an ablation, each ingredient has a value without it: the colour gradient
-//! `mixed_gradient = false`, the shift `shift = "none"`, the error map `error = "grad"`, the guard of
+//! `mixed_gradient = false`, the weighing of depths `full_depth = 0`, the shift `shift = "none"`, the error map `error = "grad"`, the guard of
 //! depths `min_alpha = 0`, the size rule `newborn_size = "code"`, the protection of newborns
 //! `protect = 0`, exact importance `importance = "epochs"` (the default), turnover `rho = 0`,
 //! compensation `rho_c = 0`, spacing `nms = false`, re-initialisation `reinit_at = 0` (the default).

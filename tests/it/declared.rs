@@ -15,17 +15,10 @@ use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{scenes, subject};
+use crate::scenes;
+use crate::subject::{self, RATES};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
-const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    log_scale: 5e-3,
-    quat: 1e-3,
-    opacity: 0.025,
-    sh_dc: 2.5e-3,
-    sh_rest: 1.25e-4,
-};
 const STILL: LearningRates =
     LearningRates { mean: 0.0, log_scale: 0.0, quat: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
 const EVERY: Cadence = Cadence { all: 1, sh_rest: 1 };

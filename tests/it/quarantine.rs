@@ -1,16 +1,15 @@
 //! Rows that hold a number that is none: every one is found, none is lost sight of, and no other row
 //! notices. The same for every backend.
 
-use densify::backend::{Attribute, Backend, Kept, LearningRates, StepInput, Unsound, Values};
+use densify::backend::{Attribute, Backend, Kept, StepInput, Unsound, Values};
 use densify::camera::Camera;
-use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::Cadence;
 
 use crate::extremes::{remove, slot_of};
 use crate::scenes;
-use crate::subject::{self, Resources};
+use crate::subject::{self, RATES, Resources};
 
 const NONE: [f32; 4] = [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
 /// Numbers of a row of degree 3.
@@ -39,13 +38,7 @@ fn audit(backend: &mut dyn Backend) -> Vec<Unsound> {
 }
 
 fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) {
-    let target = Image8 {
-        width: camera.width,
-        height: camera.height,
-        rgb: (0..3 * camera.width * camera.height).map(|i| (i * 37 % 251) as u8).collect(),
-        alpha: None,
-        mask: None,
-    };
+    let target = scenes::target(camera);
     for step in 1..=steps {
         let input = StepInput {
             step,
@@ -53,14 +46,7 @@ fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) {
             target: &target,
             background: [0.2, 0.1, 0.4],
             sh_degree: 3,
-            rates: LearningRates {
-                mean: 1e-3,
-                log_scale: 5e-3,
-                quat: 1e-3,
-                opacity: 0.025,
-                sh_dc: 2.5e-3,
-                sh_rest: 1.25e-4,
-            },
+            rates: RATES,
             cadence: Cadence::default(),
             seed: 3,
         };

@@ -2,7 +2,7 @@
 //! running twice.
 
 use densify::backend::cpu::ModelGradient;
-use densify::backend::{Backend, LearningRates, Rendering, StepInput, StepOutput};
+use densify::backend::{Backend, Rendering, StepInput, StepOutput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::reference::CLASSES;
 use crate::scenes;
-use crate::subject::{self, Resources};
+use crate::subject::{self, RATES, Resources};
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 
@@ -45,15 +45,6 @@ fn target(camera: &Camera, seed: u64) -> Image8 {
     let rgb = (0..n).map(|_| rng.random()).collect();
     Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
 }
-
-const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    log_scale: 5e-3,
-    quat: 1e-3,
-    opacity: 0.025,
-    sh_dc: 2.5e-3,
-    sh_rest: 1.25e-4,
-};
 
 /// The model after some steps, and the scalars of each.
 fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians, Vec<StepOutput>) {

@@ -1,6 +1,7 @@
 //! Small scenes to test with: deterministic, in front of a camera in general position.
 
 use densify::camera::Camera;
+use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
 use glam::{DMat3, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -94,6 +95,13 @@ pub(crate) fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gauss
     let quat = [0.9, -0.3, 0.4, 0.2];
     push(&mut model, world(camera, local), scale, quat, 1.0, |k| 0.3 - 0.05 * k as f32);
     model
+}
+
+/// A photograph of a camera's size in which neighbouring pixels differ.
+pub(crate) fn target(camera: &Camera) -> Image8 {
+    let n = 3 * camera.width * camera.height;
+    let rgb = (0..n).map(|i| (i * 37 % 251) as u8).collect();
+    Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
 }
 
 /// A loss that weighs every pixel of every image, with both signs.

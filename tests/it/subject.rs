@@ -1,12 +1,22 @@
 //! The backend under test, behind one door: tests name what they vary, and nothing else.
 
 use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
-use densify::backend::{Rendering, StepOutput};
+use densify::backend::{LearningRates, Rendering, StepOutput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 
 use crate::reference::Upstream;
+
+/// Step sizes of tests that train: those of the schedule, with means in scene units.
+pub(crate) const RATES: LearningRates = LearningRates {
+    mean: 1e-3,
+    log_scale: 5e-3,
+    quat: 1e-3,
+    opacity: 0.025,
+    sh_dc: 2.5e-3,
+    sh_rest: 1.25e-4,
+};
 
 /// What must not change the outcome.
 #[derive(Debug, Clone, Copy, Default)]

@@ -125,10 +125,14 @@ impl Default for DietParams {
             tau: 3e-4,
             mixed_gradient: true,
             colour_weight: 30.0,
+            // Of 0, 0.37, 0.7, 0.8, 1 and 2: 2 costs room256 0.9 dB, and 1 starves scenes that are seen
+            // from all around.
             full_depth: 0.8,
             growth: Growth::Turnover,
             rho: 0.25,
             small: 0.01,
+            // +0.2, +0.5, +0.6, +0.3, +1.3 and -0.1 dB in six pairs on four scenes, and a better SSIM in
+            // each.
             split: Split::LongAxis,
             split_factor: 1.6,
             split_share: 0.45,

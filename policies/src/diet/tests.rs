@@ -522,6 +522,7 @@ fn every_ingredient_can_be_switched_off() {
     let shares = "rho = 9.4\nrho_c = 0.45";
     let switches = [
         (&growing, "mixed_gradient = false"),
+        (&growing, "full_depth = 0"),
         (&growing, "shift = \"none\""),
         (&growing, "protect = 0"),
         (&growing, "importance = \"fresh\""),

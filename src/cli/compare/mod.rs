@@ -160,9 +160,9 @@ fn cells(args: &CompareArgs) -> Result<Vec<Cell>, Failure> {
     unique(&args.budget, "--budget")?;
     let labels = labels(&args.scenes)?;
     let budgets = budgets(&args.budget, &labels)?;
+    let least = budgets.iter().flatten().copied().min().unwrap_or(1);
     for policy in &args.policies {
-        Contender::new(policy)
-            .check(budgets.concat().into_iter().min().unwrap_or(1), args.iterations)?;
+        Contender::new(policy).check(least, args.iterations)?;
     }
     let mut cells = Vec::new();
     for seed in 0..args.seeds {

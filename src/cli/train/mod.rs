@@ -142,7 +142,7 @@ Examples:
   densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2
   densify train data/garden --resume";
 
-/// Spelling of [`InitChoice`] on the command line.
+/// Spelling of [`OnNan`] on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum NanArg {
     /// Stop the run, with a checkpoint
@@ -160,6 +160,7 @@ impl From<NanArg> for OnNan {
     }
 }
 
+/// Spelling of [`InitChoice`] on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Init {
     /// On the points of the dataset's reconstruction

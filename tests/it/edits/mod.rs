@@ -13,9 +13,8 @@ mod plain;
 use std::sync::OnceLock;
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::{Backend, LearningRates, StepInput};
+use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
-use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::plan::{EditPlan, OpacityRule, RowOps, ScaleRule, Seed, Update};
 use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
@@ -24,19 +23,12 @@ use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 
 use crate::scenes;
+use crate::subject::RATES;
 use calls::{Call, call, enter};
 use plain::{Row, execute};
 
 const ROWS: usize = 37;
 const SEED: u64 = 9;
-const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    log_scale: 5e-3,
-    quat: 1e-3,
-    opacity: 0.025,
-    sh_dc: 2.5e-3,
-    sh_rest: 1.25e-4,
-};
 /// Signals whose sums are carried along, and age.
 const SIGNALS: [Signal; 3] = [Signal::ScreenGradient, Signal::WeightMax, Signal::Age];
 const SAME: Update =
@@ -60,18 +52,10 @@ fn needs() -> Needs {
 }
 
 fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
-    let n = (3 * camera.width * camera.height) as usize;
-    let target = Image8 {
-        width: camera.width,
-        height: camera.height,
-        rgb: (0..n).map(|i| (i * 37 % 251) as u8).collect(),
-        alpha: None,
-        mask: None,
-    };
     let input = StepInput {
         step,
         camera,
-        target: &target,
+        target: &scenes::target(camera),
         background: [0.2; 3],
         sh_degree: 1,
         rates: RATES,

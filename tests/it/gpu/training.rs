@@ -3,31 +3,17 @@
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::backend::gpu::{GpuBackend, GpuOptions};
-use densify::backend::{Backend, LearningRates, StepInput, StepOutput};
+use densify::backend::{Backend, StepInput, StepOutput};
 use densify::camera::Camera;
-use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 
 use super::{backend_for, options, subjects};
 use crate::compare::{Table, relative_error};
 use crate::scenes;
+use crate::subject::RATES;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
-const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    log_scale: 5e-3,
-    quat: 1e-3,
-    opacity: 0.025,
-    sh_dc: 2.5e-3,
-    sh_rest: 1.25e-4,
-};
-
-pub(super) fn target(camera: &Camera) -> Image8 {
-    let n = 3 * camera.width * camera.height;
-    let rgb = (0..n).map(|i| (i * 37 % 251) as u8).collect();
-    Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
-}
 
 pub(super) fn step(
     backend: &mut dyn Backend,
@@ -38,7 +24,7 @@ pub(super) fn step(
     let input = StepInput {
         step,
         camera,
-        target: &target(camera),
+        target: &scenes::target(camera),
         background: GREY,
         sh_degree: (step / 2).min(3) as u8,
         rates: RATES,
