@@ -19,6 +19,7 @@ mod camera;
 mod error;
 mod gltf;
 mod intersect;
+mod lines;
 pub mod mesh;
 mod nearest;
 mod obj;
@@ -35,6 +36,7 @@ mod sky;
 mod surface;
 pub mod texture;
 mod trace;
+mod tree;
 mod truth;
 mod write;
 

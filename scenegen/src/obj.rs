@@ -9,7 +9,7 @@
 //! normals of the group's faces there, weighted by their angles (Thürmer and Wüthrich, "Computing
 //! Vertex Normals from Polygonal Facets", 1998).
 //!
-//! One piece: geometry and materials share line reading and faults.
+//! One piece: geometry and materials share the reader and its faults.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 use glam::{DVec2, DVec3, Vec2, Vec3, Vec4};
 
 use crate::error::Error;
+use crate::lines::Lines;
 use crate::mesh::{AlphaMode, Material, Model, Reflection};
 use crate::resource::{self, Folder};
 use crate::texture::{Texture, TextureRef, Wrap};
@@ -57,7 +58,7 @@ struct Reader<'a> {
 
 /// Loads a file with its materials.
 pub(crate) fn load(path: &Path) -> Result<Model, Error> {
-    let bytes = resource::read(path)?;
+    let mut lines = Lines::open(path)?;
     let mut reader = Reader {
         path,
         folder: Folder::of(path)?,
@@ -75,7 +76,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     };
     reader.model.name =
         path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    for (number, line) in lines(&bytes) {
+    while let Some((number, line)) = lines.next()? {
         reader.line(&line, number)?;
     }
     if reader.model.triangles.is_empty() {
@@ -83,24 +84,6 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     }
     reader.close_groups();
     Ok(reader.model)
-}
-
-/// Lines with their numbers, without comments, joined where one ends with a backslash.
-fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, String)> + '_ {
-    let mut rest = bytes.split(|&b| b == b'\n').enumerate();
-    std::iter::from_fn(move || {
-        let (number, first) = rest.next()?;
-        let mut line = String::from_utf8_lossy(first).trim_end().to_owned();
-        while line.ends_with('\\') {
-            line.pop();
-            let Some((_, next)) = rest.next() else {
-                break;
-            };
-            line.push(' ');
-            line += String::from_utf8_lossy(next).trim_end();
-        }
-        Some((number + 1, line))
-    })
 }
 
 impl Reader<'_> {
@@ -308,8 +291,7 @@ impl Reader<'_> {
         for name in names {
             let path = self.folder.resolve(&element, &slashed(name))?;
             if path.is_file() {
-                let bytes = resource::read(&path)?;
-                self.read_materials(&path, &bytes)?;
+                self.read_materials(&path)?;
             } else {
                 let name: String = name.chars().take(80).collect();
                 self.model.notes.push(format!("there is no {name}; its materials are grey"));
@@ -318,9 +300,10 @@ impl Reader<'_> {
         Ok(())
     }
 
-    fn read_materials(&mut self, path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    fn read_materials(&mut self, path: &Path) -> Result<(), Error> {
+        let mut lines = Lines::open(path)?;
         let mut open: Option<(Material, Maps)> = None;
-        for (number, line) in lines(bytes) {
+        while let Some((number, line)) = lines.next()? {
             let line = line.trim_start();
             let (key, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
             if key == "newmtl" {

@@ -41,6 +41,10 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
         return Err(too_large());
     }
     let mut bytes = Vec::new();
+    // A buffer that grew would end at twice the size.
+    bytes
+        .try_reserve_exact(known.len() as usize + 1)
+        .map_err(|_| Error::io(path)(std::io::ErrorKind::OutOfMemory.into()))?;
     file.take(MAX_FILE + 1).read_to_end(&mut bytes).map_err(Error::io(path))?;
     if bytes.len() as u64 > MAX_FILE { Err(too_large()) } else { Ok(bytes) }
 }

@@ -402,7 +402,7 @@ impl<'a> Matter<'a> {
 
     /// Whether a triangle hides what is behind it: for shadows and sampled light, from both sides,
     /// where its alpha is at least one half.
-    fn is_solid(&self, slot: u32, at: &Meeting) -> bool {
+    pub(crate) fn is_solid(&self, slot: u32, at: &Meeting) -> bool {
         if !self.traits.get(slot as usize).is_some_and(|t| t.see_through) {
             return true;
         }

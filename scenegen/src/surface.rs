@@ -16,17 +16,14 @@
 use glam::{DVec3, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
-use obvhs::bvh2::leaf_collapser::collapse;
 use obvhs::bvh2::node::Bvh2Node;
-use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::faststack::{FastStack, HeapStack, StackStack};
-use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 use obvhs::ray::{Ray, RayHit};
 
 use crate::error::Error;
 use crate::intersect::{Meeting, ShearedRay};
 use crate::mesh::Model;
-use crate::nearest;
+use crate::{nearest, tree};
 
 /// Largest half side of the geometry in local coordinates.
 const HALF_SIDE: f64 = 1024.0;
@@ -119,10 +116,11 @@ impl Surface {
             if half > 0.0 && (HALF_SIDE / half).is_finite() { HALF_SIDE / half } else { 1.0 };
         let local = |i: u32| ((model.positions[i as usize] - centre) * scale).as_vec3();
         let triangle = |corners: &[u32; 3]| corners.map(local);
-        let bvh = build(model.triangles.iter().map(|t| padded(&triangle(t))).collect());
+        let box_of = |id: u32| padded(&triangle(&model.triangles[id as usize]));
+        let bvh = tree::build(model.triangles.len(), box_of);
         let in_leaves = bvh.primitive_indices.iter().map(|&id| &model.triangles[id as usize]);
         let triangles = in_leaves.map(triangle).collect();
-        let depth = depth(&bvh);
+        let depth = tree::depth(&bvh);
         let build_seconds = start.elapsed().as_secs_f64();
         Ok(Self { bvh, triangles, centre, scale, depth, bounds, build_seconds })
     }
@@ -243,29 +241,34 @@ impl Surface {
     /// single precision is spent on the geometry, not on the way to it. Its parameter counts from
     /// there. None where it misses the box.
     pub(crate) fn enter(&self, origin: DVec3, direction: DVec3, range: f64) -> Option<LocalRay> {
+        self.enter_after(origin, direction, range).map(|(ray, _)| ray)
+    }
+
+    /// [`Surface::enter`], and the length of the way to the box `[local units]`.
+    pub(crate) fn enter_after(
+        &self,
+        origin: DVec3,
+        direction: DVec3,
+        range: f64,
+    ) -> Option<(LocalRay, f32)> {
         let (o, d) = (self.to_local(origin), direction * self.scale);
         let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
-        let (mut near, mut far) = (0.0_f64, range);
-        for axis in 0..3 {
-            if d[axis] == 0.0 {
-                if o[axis].abs() > half[axis] {
-                    return None;
-                }
-                continue;
-            }
-            let a = (-half[axis] - o[axis]) / d[axis];
-            let b = (half[axis] - o[axis]) / d[axis];
-            near = near.max(a.min(b));
-            far = far.min(a.max(b));
-        }
+        // Along an axis that the ray does not move on, these are infinite; on the box's very rim,
+        // which is not the geometry's, they are none, and then it misses.
+        let inverse = d.recip();
+        let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
+        let near = a.min(b).max_element().max(0.0);
+        let far = a.max(b).min_element().min(range);
         let length = d.length();
         if !(near <= far && length > 0.0 && length.is_finite()) {
             return None;
         }
-        let direction = (d / length).as_vec3();
+        let way = near * length;
+        let direction = (d * length.recip()).as_vec3();
         // Half an ulp more than the exact range: callers compare again in f64.
-        let tmax = ((far - near) * length * (1.0 + 1e-6)) as f32;
-        Some(LocalRay { origin: (o + near * d).as_vec3(), direction, tmin: 0.0, tmax })
+        let tmax = ((far * length - way) * (1.0 + 1e-6)) as f32;
+        let origin = (o + near * d).as_vec3();
+        Some((LocalRay { origin, direction, tmin: 0.0, tmax }, way as f32))
     }
 
     /// The hit in world coordinates; its parameter comes from the triangle's plane in f64 and
@@ -416,43 +419,6 @@ fn box_ray(ray: &LocalRay) -> Ray {
 pub(crate) fn padded([a, b, c]: &[Vec3; 3]) -> Aabb {
     let [a, b, c] = [Vec3A::from(*a), Vec3A::from(*b), Vec3A::from(*c)];
     Aabb::new(a.min(b).min(c) - PADDING, a.max(b).max(c) + PADDING)
-}
-
-fn build(boxes: Vec<Aabb>) -> Bvh2 {
-    // The library's medium preset, step by step: its own function validates in debug builds and
-    // panics for the degenerate trees that hostile meshes have.
-    let mut bvh = PlocBuilder::with_capacity(boxes.len()).build(
-        PlocSearchDistance::Medium,
-        &boxes,
-        (0..boxes.len() as u32).collect(),
-        SortPrecision::U64,
-        3,
-    );
-    drop(boxes);
-    let mut optimiser = ReinsertionOptimizer::default();
-    optimiser.run(&mut bvh, 0.05, None);
-    collapse(&mut bvh, 8, 3.0);
-    optimiser.run(&mut bvh, 0.1, None);
-    // The builder made one leaf per triangle, and needs parents where tracing does not.
-    bvh.nodes.shrink_to_fit();
-    bvh.parents = Vec::new();
-    bvh
-}
-
-/// Number of levels below the root, plus one: the library's own bound is that of the tree before it
-/// was improved, and its stacks panic when full.
-fn depth(bvh: &Bvh2) -> usize {
-    let mut deepest = 1;
-    let mut open = vec![(0_u32, 1_usize)];
-    while let Some((index, level)) = open.pop() {
-        deepest = deepest.max(level);
-        if let Some(node) = bvh.nodes.get(index as usize)
-            && !node.is_leaf()
-        {
-            open.extend([(node.first_index, level + 1), (node.first_index + 1, level + 1)]);
-        }
-    }
-    deepest
 }
 
 impl std::fmt::Debug for Surface {

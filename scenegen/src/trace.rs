@@ -74,8 +74,7 @@ impl Rays {
 
     /// Adds one if it comes near the surface.
     fn add(&mut self, surface: &Surface, index: u32, origin: DVec3, direction: DVec3) {
-        if let Some(ray) = surface.enter(origin, direction, f64::INFINITY) {
-            let entry = (ray.origin.as_dvec3() - surface.to_local(origin)).length() as f32;
+        if let Some((ray, entry)) = surface.enter_after(origin, direction, f64::INFINITY) {
             self.rays[self.count] = ray;
             self.index[self.count] = index;
             self.entry[self.count] = entry;
@@ -224,7 +223,7 @@ impl Tracer<'_> {
                 colour = alpha * radiance.next().unwrap_or_default();
             }
             if transmittance > MIN_TRANSMITTANCE {
-                self.layers(&rays.rays[lane], Some(*hit), None, |hit| {
+                self.layers(&rays.rays[lane], *hit, |hit| {
                     let (point, alpha) = rays.read(&matter, lane, &hit);
                     if alpha > 0.0 {
                         let seen = [rays.seen(lane, point)];
@@ -253,41 +252,29 @@ impl Tracer<'_> {
         hint: Option<u32>,
     ) -> Option<(f64, DVec3, u32)> {
         let matter = self.matter();
-        let mut first = None;
         let ray = self.surface.enter(origin, direction, f64::INFINITY)?;
-        self.layers(&ray, None, hint, |hit| {
-            let (_, alpha) = Point::read(&matter, &ray, &hit, 0.0);
-            if alpha >= 0.5 {
-                let hit = self.surface.describe(origin, direction, hit);
-                let normal = if hit.normal.dot(direction) > 0.0 { -hit.normal } else { hit.normal };
-                first = Some((hit.t, normal, hit.triangle));
-            }
-            first.is_none()
-        });
-        first
+        let solid = |slot, at: &Meeting| matter.is_visible(slot, at) && matter.is_solid(slot, at);
+        let hit = self.surface.closest(&ray, None, hint, solid)?;
+        let hit = self.surface.describe(origin, direction, hit);
+        let normal = if hit.normal.dot(direction) > 0.0 { -hit.normal } else { hit.normal };
+        Some((hit.t, normal, hit.triangle))
     }
 
-    /// Visits the visible surfaces along a ray, front to back, behind `last` if there is one, while
-    /// `go_on` says so.
-    fn layers(
-        &self,
-        ray: &LocalRay,
-        last: Option<LocalHit>,
-        hint: Option<u32>,
-        mut go_on: impl FnMut(LocalHit) -> bool,
-    ) {
+    /// Visits the visible surfaces along a ray behind its first, front to back, while `go_on` says
+    /// so.
+    fn layers(&self, ray: &LocalRay, first: LocalHit, mut go_on: impl FnMut(LocalHit) -> bool) {
         let matter = self.matter();
         let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
-        let passed = |hit: LocalHit| (hit.at.t, self.surface.triangle_of(hit.slot));
-        let mut after = last.map(passed);
-        for _ in usize::from(after.is_some())..MAX_LAYERS {
-            let Some(hit) = self.surface.closest(ray, after, hint, visible) else {
+        let mut last = first;
+        for _ in 1..MAX_LAYERS {
+            let after = (last.at.t, self.surface.triangle_of(last.slot));
+            let Some(hit) = self.surface.closest(ray, Some(after), None, visible) else {
                 return;
             };
-            if !go_on(hit) || self.traits.is_empty() {
+            if !go_on(hit) {
                 return;
             }
-            after = Some(passed(hit));
+            last = hit;
         }
     }
 }

@@ -1,0 +1,202 @@
+//! The tree over a mesh's triangles, built in parts: the library's builder takes three times the
+//! memory of what it makes, so it is given a part of the mesh at a time.
+//!
+//! Parts are halves of halves, cut at the median triangle across the widest axis. They hang from the
+//! nodes of those cuts, and the library's optimiser then moves what lies badly, across parts too.
+
+use obvhs::aabb::Aabb;
+use obvhs::bvh2::Bvh2;
+use obvhs::bvh2::leaf_collapser::collapse;
+use obvhs::bvh2::node::Bvh2Node;
+use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
+use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
+
+/// Most triangles of a part. The builder takes some 200 bytes for each.
+const PART: usize = 1 << 16;
+/// Share of all nodes, those with the largest boxes, that the last improvement looks at.
+const IMPROVED: f32 = 0.1;
+
+/// The tree over `count` triangles, whose boxes `box_of` tells. Leaves hold up to eight triangles,
+/// `primitive_indices` their numbers.
+pub(crate) fn build(count: usize, box_of: impl Fn(u32) -> Aabb) -> Bvh2 {
+    grow(count, PART, &box_of)
+}
+
+fn grow(count: usize, part: usize, box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
+    let mut ids: Vec<u32> = (0..count as u32).collect();
+    let mut tree = Bvh2::default();
+    tree.nodes.push(Bvh2Node::default());
+    tree.primitive_indices.reserve_exact(count);
+    hang(&mut tree, 0, &mut ids, part, box_of);
+    drop(ids);
+    // The optimiser's stacks are sized by it.
+    tree.max_depth = tree.max_depth.max(depth(&tree));
+    improve(&mut tree);
+    // The optimiser needs parents, tracing does not.
+    tree.parents = Vec::new();
+    tree
+}
+
+/// Puts the tree over `ids` at a node that is there already.
+fn hang(
+    tree: &mut Bvh2,
+    place: usize,
+    ids: &mut [u32],
+    part: usize,
+    box_of: &impl Fn(u32) -> Aabb,
+) {
+    if ids.len() <= part {
+        graft(tree, place, &build_part(ids, box_of), ids);
+        return;
+    }
+    let mut centres = Aabb::empty();
+    for &id in &*ids {
+        centres.extend(box_of(id).center());
+    }
+    let size = centres.diagonal();
+    let axis = (0..3).fold(0, |widest, axis| if size[axis] > size[widest] { axis } else { widest });
+    let along = |id: u32| box_of(id).center()[axis];
+    let half = ids.len() / 2;
+    ids.select_nth_unstable_by(half, |&a, &b| along(a).total_cmp(&along(b)).then(a.cmp(&b)));
+    let (left, right) = ids.split_at_mut(half);
+    let pair = tree.nodes.len();
+    tree.nodes.extend([Bvh2Node::default(); 2]);
+    hang(tree, pair, left, part, box_of);
+    hang(tree, pair + 1, right, part, box_of);
+    let around = tree.nodes[pair].aabb().union(tree.nodes[pair + 1].aabb());
+    tree.nodes[place] = Bvh2Node::new(around, 0, pair as u32);
+}
+
+/// Moves the tree of a part into the whole, its root to `place`.
+fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
+    // The root's slot is there already, so the part's node i comes to i + nodes.
+    let (nodes, primitives) = (tree.nodes.len() - 1, tree.primitive_indices.len());
+    let moved = |node: &Bvh2Node| {
+        let shift = if node.is_leaf() { primitives } else { nodes };
+        Bvh2Node::new(*node.aabb(), node.prim_count, node.first_index + shift as u32)
+    };
+    tree.nodes[place] = moved(&part.nodes[0]);
+    tree.nodes.reserve_exact(part.nodes.len() - 1);
+    tree.nodes.extend(part.nodes[1..].iter().map(moved));
+    tree.primitive_indices.extend(part.primitive_indices.iter().map(|&i| ids[i as usize]));
+    tree.max_depth = tree.max_depth.max(part.max_depth);
+}
+
+/// The library's medium preset up to its last improvement, step by step: its own function validates
+/// in debug builds and panics for the degenerate trees that hostile meshes have. Its triangles are
+/// numbered by their places in `ids`.
+fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
+    let boxes: Vec<Aabb> = ids.iter().map(|&id| box_of(id)).collect();
+    let mut part = PlocBuilder::with_capacity(boxes.len()).build(
+        PlocSearchDistance::Medium,
+        &boxes,
+        (0..boxes.len() as u32).collect(),
+        SortPrecision::U64,
+        3,
+    );
+    drop(boxes);
+    ReinsertionOptimizer::default().run(&mut part, 0.05, None);
+    collapse(&mut part, 8, 3.0);
+    part
+}
+
+/// What the optimiser does by itself, but for nodes in any order: it looks for the largest boxes in
+/// the first nodes alone.
+fn improve(tree: &mut Bvh2) {
+    let mut optimiser = ReinsertionOptimizer::default();
+    let mut largest: Vec<(f32, u32)> = Vec::new();
+    for part in (1..32).step_by(2) {
+        let count = (tree.nodes.len() as f32 * IMPROVED / part as f32) as usize;
+        if count == 0 {
+            break;
+        }
+        let nodes = tree.nodes.iter().enumerate().skip(1);
+        largest.clear();
+        largest.extend(nodes.map(|(i, node)| (node.aabb().half_area(), i as u32)));
+        let order = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
+        if count < largest.len() {
+            largest.select_nth_unstable_by(count, order);
+            largest.truncate(count);
+        }
+        let candidates: Vec<u32> = largest.iter().map(|&(_, node)| node).collect();
+        optimiser.run_with_candidates(tree, &candidates, 1);
+    }
+}
+
+/// Number of levels below the root, plus one: the library's own bound is that of the tree before it
+/// was improved, and its stacks panic when full.
+pub(crate) fn depth(bvh: &Bvh2) -> usize {
+    let mut deepest = 1;
+    let mut open = vec![(0_u32, 1_usize)];
+    while let Some((index, level)) = open.pop() {
+        deepest = deepest.max(level);
+        if let Some(node) = bvh.nodes.get(index as usize)
+            && !node.is_leaf()
+        {
+            open.extend([(node.first_index, level + 1), (node.first_index + 1, level + 1)]);
+        }
+    }
+    deepest
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3A;
+
+    use super::*;
+
+    /// Boxes on a bent line, some at one place.
+    fn box_of(id: u32) -> Aabb {
+        let along = (id / 3) as f32;
+        let at = Vec3A::new(along, (0.1 * along).sin(), 0.01 * along * along);
+        Aabb::new(at - 0.4, at + 0.4)
+    }
+
+    /// Every triangle is in one leaf, and every box holds those below it.
+    fn check(tree: &Bvh2, count: u32) {
+        let mut seen = vec![false; count as usize];
+        let mut open = vec![0_u32];
+        while let Some(index) = open.pop() {
+            let node = &tree.nodes[index as usize];
+            let holds = |inner: &Aabb| {
+                assert!(inner.min.cmpge(node.aabb().min).all());
+                assert!(inner.max.cmple(node.aabb().max).all());
+            };
+            if !node.is_leaf() {
+                for child in [node.first_index, node.first_index + 1] {
+                    holds(tree.nodes[child as usize].aabb());
+                    open.push(child);
+                }
+                continue;
+            }
+            for slot in node.first_index..node.first_index + node.prim_count {
+                let id = tree.primitive_indices[slot as usize];
+                holds(&box_of(id));
+                assert!(!std::mem::replace(&mut seen[id as usize], true), "{id} twice");
+            }
+        }
+        assert!(seen.iter().all(|&seen| seen));
+    }
+
+    #[test]
+    fn parts_make_one_tree() {
+        for count in [1, 2, 7, 8, 9, 100, 1000] {
+            for part in [1, 3, 64, 1000] {
+                let tree = grow(count as usize, part, &box_of);
+                check(&tree, count);
+                assert_eq!(tree.primitive_indices.len(), count as usize);
+            }
+        }
+    }
+
+    #[test]
+    fn a_tree_in_parts_is_as_good() {
+        // What a ray that meets the outermost box meets of the others on average, by their areas.
+        let cost = |tree: &Bvh2| {
+            let areas: f32 = tree.nodes.iter().map(|node| node.aabb().half_area()).sum();
+            areas / tree.nodes[0].aabb().half_area()
+        };
+        let (whole, parts) = (grow(5000, 5000, &box_of), grow(5000, 500, &box_of));
+        assert!(cost(&parts) < 1.05 * cost(&whole), "{} {}", cost(&parts), cost(&whole));
+    }
+}

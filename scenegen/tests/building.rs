@@ -1,0 +1,52 @@
+//! The tree is built in little more memory than it takes. A program of its own, as the peak is the
+//! process's.
+#![allow(clippy::print_stderr, reason = "tests say why they skip")]
+
+use densify_scenegen::Surface;
+use densify_scenegen::mesh::Model;
+use glam::DVec3;
+
+/// What the library's builder may hold for the part at work: 65,536 triangles of 300 bytes.
+const PART_BYTES: u64 = 20 << 20;
+/// Of each triangle: its number while parts are cut, and candidates of the last improvement.
+const TRIANGLE_BYTES: u64 = 4 + 8;
+
+/// A line of `/proc/self/status` `[bytes]`, where the system has one.
+fn status(key: &str) -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix(key))?;
+    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
+}
+
+/// A wavy sheet of `2 side²` triangles.
+fn sheet(side: u32) -> Model {
+    let corner = |k: u32| {
+        let (x, y) = (f64::from(k % (side + 1)), f64::from(k / (side + 1)));
+        DVec3::new(x, y, (0.1 * x).sin() * (0.07 * y).cos())
+    };
+    let corners: Vec<DVec3> = (0..(side + 1) * (side + 1)).map(corner).collect();
+    let mut triangles = Vec::new();
+    for cell in 0..side * side {
+        let at = cell / side * (side + 1) + cell % side;
+        let above = at + side + 1;
+        triangles.extend([[at, at + 1, above], [at + 1, above + 1, above]]);
+    }
+    let mut model = Model::default();
+    model.add(&corners, &[], &[], &triangles, 0);
+    model
+}
+
+#[test]
+fn building_takes_little_more_than_the_tree() {
+    let model = sheet(600);
+    let Some(before) = status("VmRSS:") else {
+        eprintln!("skipped: this system does not tell a process's memory");
+        return;
+    };
+    let surface = Surface::new(&model).expect("triangles");
+    let peak = status("VmHWM:").expect("it was told before");
+    let allowed = surface.bytes() as u64 + surface.len() as u64 * TRIANGLE_BYTES + PART_BYTES;
+    let taken = peak - before;
+    assert!(taken < allowed, "{taken} bytes taken, {allowed} allowed");
+    assert!(taken > surface.bytes() as u64 / 2, "{taken} bytes: the peak was reached before");
+}
