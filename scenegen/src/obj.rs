@@ -12,6 +12,7 @@
 //! One piece: geometry and materials share the reader and its faults.
 
 use std::collections::HashMap;
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec2, DVec3, Vec2, Vec3, Vec4};
@@ -28,14 +29,28 @@ const MAX_TRIANGLES: usize = 1 << 26;
 const MAX_EARS: usize = 256;
 const REMEDY: &str = "correct the file or export it again";
 
-/// A face's corner: what numbers of the file it names.
+/// A vertex, texture coordinate or normal of the file, by its number there: the first is 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+struct Index(NonZeroU32);
+
+impl Index {
+    fn of<T: Copy>(self, list: &[T]) -> T {
+        list[self.place()]
+    }
+
+    fn place(self) -> usize {
+        self.0.get() as usize - 1
+    }
+}
+
+/// A face's corner: what it names. There is one for each vertex of the model, so it is small.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Corner {
-    position: usize,
-    uv: Option<usize>,
-    normal: Option<usize>,
+    position: Index,
+    uv: Option<Index>,
+    normal: Option<Index>,
     /// Smoothing group, where the corner has no normal and one is to be found.
-    group: Option<u32>,
+    group: Option<NonZeroU32>,
 }
 
 struct Reader<'a> {
@@ -50,9 +65,9 @@ struct Reader<'a> {
     textures: HashMap<(PathBuf, bool), u32>,
     current: Option<u32>,
     /// Smoothing group of the faces to come.
-    group: Option<u32>,
+    group: Option<NonZeroU32>,
     /// Sums of face normals by angle, by position and group.
-    smooth: HashMap<(usize, u32), DVec3>,
+    smooth: HashMap<(Index, NonZeroU32), DVec3>,
     model: Model,
 }
 
@@ -138,9 +153,9 @@ impl Reader<'_> {
                 let word = without_comment(rest).trim();
                 self.group = match word {
                     "off" | "" => None,
-                    "on" => Some(1),
-                    _ => match word.parse::<u32>() {
-                        Ok(group) => (group > 0).then_some(group),
+                    "on" => Some(NonZeroU32::MIN),
+                    _ => match word.parse() {
+                        Ok(group) => NonZeroU32::new(group),
                         Err(_) => {
                             let word: String = word.chars().take(40).collect();
                             let problem = format!("{word:?} is no smoothing group");
@@ -184,7 +199,7 @@ impl Reader<'_> {
             return Ok(());
         }
         let vertices: Vec<u32> = corners.iter().map(|&corner| self.vertex(corner)).collect();
-        let places: Vec<DVec3> = corners.iter().map(|c| self.positions[c.position]).collect();
+        let places: Vec<DVec3> = corners.iter().map(|c| c.position.of(&self.positions)).collect();
         let material = match self.current {
             Some(material) => material,
             None => self.stand_in(),
@@ -222,10 +237,11 @@ impl Reader<'_> {
                 .parse()
                 .map_err(|_| self.fault(number, format!("{text:?} is no {what} index")))?;
             // Negative ones count back from the last.
-            let found = if value > 0 { value - 1 } else { count as i64 + value };
-            let valid = value != 0 && (0..count as i64).contains(&found);
+            let found = if value > 0 { value } else { count as i64 + 1 + value };
+            let valid = value != 0 && (1..=count as i64).contains(&found);
+            let found = u32::try_from(found).ok().filter(|_| valid).and_then(NonZeroU32::new);
             let problem = || self.fault(number, format!("{what} index {value} of {count}"));
-            valid.then_some(Some(found as usize)).ok_or_else(problem)
+            found.map(|found| Some(Index(found))).ok_or_else(problem)
         };
         let position = index(self.positions.len(), "vertex")?;
         let uv = index(self.uvs.len(), "texture")?;
@@ -238,7 +254,7 @@ impl Reader<'_> {
 
     /// Adds a triangle's normal to those of its corners' groups.
     fn smoothen(&mut self, corners: [Corner; 3]) {
-        let place = corners.map(|corner| self.positions[corner.position]);
+        let place = corners.map(|corner| corner.position.of(&self.positions));
         for i in 0..3 {
             let Some(group) = corners[i].group else { continue };
             let (u, v) = (place[(i + 1) % 3] - place[i], place[(i + 2) % 3] - place[i]);
@@ -267,12 +283,12 @@ impl Reader<'_> {
         let model = &mut self.model;
         *self.vertices.entry(corner).or_insert_with(|| {
             let first = model.positions.len();
-            model.positions.push(self.positions[corner.position]);
-            let colour = self.colours.get(corner.position).map(|c| c.extend(1.0));
+            model.positions.push(corner.position.of(&self.positions));
+            let colour = self.colours.get(corner.position.place()).map(|c| c.extend(1.0));
             let colour = colour.or((!self.colours.is_empty()).then_some(Vec4::ONE));
             push(&mut model.colours, first, colour, Vec4::ONE);
-            push(&mut model.uvs[0], first, corner.uv.map(|i| self.uvs[i]), Vec2::ZERO);
-            let normal = corner.normal.map(|i| self.normals[i]);
+            push(&mut model.uvs[0], first, corner.uv.map(|i| i.of(&self.uvs)), Vec2::ZERO);
+            let normal = corner.normal.map(|i| i.of(&self.normals));
             push(&mut model.normals, first, normal, Vec3::ZERO);
             first as u32
         })

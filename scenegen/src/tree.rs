@@ -71,13 +71,15 @@ fn hang(
 fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
     // The root's slot is there already, so the part's node i comes to i + nodes.
     let (nodes, primitives) = (tree.nodes.len() - 1, tree.primitive_indices.len());
-    let moved = |node: &Bvh2Node| {
+    let mut moved = part.nodes.iter().map(|node| {
         let shift = if node.is_leaf() { primitives } else { nodes };
         Bvh2Node::new(*node.aabb(), node.prim_count, node.first_index + shift as u32)
-    };
-    tree.nodes[place] = moved(&part.nodes[0]);
-    tree.nodes.reserve_exact(part.nodes.len() - 1);
-    tree.nodes.extend(part.nodes[1..].iter().map(moved));
+    });
+    if let Some(root) = moved.next() {
+        tree.nodes[place] = root;
+    }
+    tree.nodes.reserve_exact(moved.len());
+    tree.nodes.extend(moved);
     tree.primitive_indices.extend(part.primitive_indices.iter().map(|&i| ids[i as usize]));
     tree.max_depth = tree.max_depth.max(part.max_depth);
 }
