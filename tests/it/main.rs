@@ -3,8 +3,10 @@
 //! `reference` is a second renderer in `f64` that shares no arithmetic with the backends;
 //! `oracle` holds both against stored float64 renders; `gradients`, `loss`, `signals` and
 //! `extremes` hold the backend against the reference on scenes of their own; `sameness` compares
-//! bits; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan to the backend and to a plain vector; `cli` runs the program on
-//! photographs of a small scene; `gpu` holds the GPU backend against the native one; `geometry` holds policies to surfaces that are known; `invariants` keeps the walls of ARCHITECTURE.md standing.
+//! bits; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan
+//! to the backend and to a plain vector; `cli` runs the program on photographs of a small scene;
+//! `fuzz` damages files; `gpu` holds the GPU backend against the native one; `geometry` holds policies
+//! to surfaces that are known; `invariants` keeps the walls of ARCHITECTURE.md standing.
 
 mod aux_views;
 mod cli;
@@ -12,6 +14,7 @@ mod compare;
 mod declared;
 mod edits;
 mod extremes;
+mod fuzz;
 mod geometry;
 mod gpu;
 mod gradients;
