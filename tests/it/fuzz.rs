@@ -5,6 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 #[path = "../fuzz/formats.rs"]
+#[expect(unreachable_pub, reason = "the fuzz targets reach it")]
 mod formats;
 
 /// Damaged copies of each file.

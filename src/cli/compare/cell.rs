@@ -131,7 +131,7 @@ impl Cell {
             // In a process of its own too: the memory of the run stays the run's.
             let mut call = Command::new(&program);
             call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene);
-            call.args(self.threads());
+            call.args(shared_with_eval(&self.train));
             self.wait_for(&mut call)?;
         }
         self.record(&folder, run)
@@ -151,14 +151,6 @@ impl Cell {
         let code = child.status.code().and_then(|code| u8::try_from(code).ok());
         Err(Failure { code: code.unwrap_or(OTHER), message }
             .and(&format!("this was the run {self}; the same command goes on from here")))
-    }
-
-    /// The threads that runs are granted, as options of `densify eval`.
-    fn threads(&self) -> &[String] {
-        let at = self.train.iter().position(|flag| flag.split('=').next() == Some("--threads"));
-        let Some(at) = at else { return &[] };
-        let end = if self.train[at].contains('=') { at + 1 } else { at + 2 };
-        &self.train[at..end.min(self.train.len())]
     }
 
     fn record(&self, folder: &Path, run: String) -> Result<Record, Failure> {
@@ -202,6 +194,23 @@ impl Cell {
             geometry: geometry_of(folder, self.iterations)?,
         })
     }
+}
+
+/// Options of `densify train` that `densify eval` has too, and that say where and on what to compute.
+const SHARED: [&str; 3] = ["--threads", "--backend", "--gpu"];
+
+/// Those of the options of a run that its measurement takes as well.
+fn shared_with_eval(train: &[String]) -> Vec<&String> {
+    let mut shared = Vec::new();
+    let mut words = train.iter();
+    while let Some(word) = words.next() {
+        let (flag, with_value) = word.split_once('=').map_or((&**word, false), |(f, _)| (f, true));
+        if SHARED.contains(&flag) {
+            shared.push(word);
+            shared.extend((!with_value).then(|| words.next()).flatten());
+        }
+    }
+    shared
 }
 
 /// Whether the surface of a scene is known.
@@ -273,4 +282,23 @@ pub(super) fn rows_over_time(output: &Path, record: &Record) -> Vec<(u32, f64)> 
         Some((iteration, step["rows"].as_f64()?))
     };
     steps.filter_map(point).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_and_their_measurements_use_the_same_device() {
+        let words =
+            |text: &str| -> Vec<String> { text.split_whitespace().map(str::to_owned).collect() };
+        for (train, shared) in [
+            ("", ""),
+            ("--threads 1 -r 4 --backend gpu", "--threads 1 --backend gpu"),
+            ("--near=0.1 --gpu=lavapipe --threads=2", "--gpu=lavapipe --threads=2"),
+            ("--sh-degree 2 --backend", "--backend"),
+        ] {
+            assert_eq!(shared_with_eval(&words(train)), words(shared).iter().collect::<Vec<_>>());
+        }
+    }
 }
