@@ -88,6 +88,37 @@ pub struct GpuBackend {
     laps: Vec<(&'static str, Duration)>,
 }
 
+fn most_pairs(device: &Device, needs: &Needs) -> u64 {
+    let stride = record_stride(Planes::new(needs).detail);
+    (device.largest_binding() / (4 * stride)).min(MOST_ENTRIES)
+}
+
+fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Sizes {
+    let budget = options.budget.max(1);
+    let cap = match options.tile_cap {
+        Some(cap) => cap as u64,
+        None => (16 * budget as u64).min(most_pairs(device, &options.needs)),
+    };
+    let (width, height) = options.largest_image;
+    let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
+    // The adapter takes fewer rows than the sums do entries.
+    let cap = cap.min(MOST_ENTRIES).max(budget as u64);
+    Sizes::new(budget, cap, sh_degree, image, &options.needs)
+}
+
+/// What is on the device, and what the host holds for it.
+fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
+    let mut ledger = sizes.ledger();
+    let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);
+    let candidates = Candidates::bytes(needs.candidates, pixels as usize);
+    ledger.add_to(Section::Policy, "candidates", candidates);
+    if let Some(request) = &needs.aux {
+        let bytes = observe::host_bytes(request, pixels);
+        ledger.add_to(Section::Policy, "auxiliary views", bytes);
+    }
+    ledger
+}
+
 impl GpuBackend {
     /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
     /// shown on a small scene that it computes what the native backend does.
@@ -107,6 +138,19 @@ impl GpuBackend {
         Self::without_canary(model, options, device)
     }
 
+    /// Bytes per buffer of a backend made with these options for models of this degree; nothing is
+    /// allocated.
+    #[must_use]
+    pub fn promise(sh_degree: u8, options: &GpuOptions, device: &GpuDevice) -> Ledger {
+        ledger(&sizes(&device.0, sh_degree, options), &options.needs)
+    }
+
+    /// Most (row, tile) pairs that this device can hold at a time for such needs.
+    #[must_use]
+    pub fn most_pairs(needs: &Needs, device: &GpuDevice) -> u64 {
+        most_pairs(&device.0, needs)
+    }
+
     fn without_canary(
         model: &Gaussians,
         options: &GpuOptions,
@@ -123,32 +167,14 @@ impl GpuBackend {
             )));
         }
         let planes = Planes::new(&options.needs);
-        let bindable = device.largest_binding() / (4 * record_stride(planes.detail));
-        let cap = match options.tile_cap {
-            Some(cap) => cap as u64,
-            None => (16 * budget as u64).min(bindable),
-        }
-        .clamp(budget as u64, MOST_ENTRIES);
-        let (width, height) = options.largest_image;
-        let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
-        let sizes = Sizes::new(budget, cap, model.sh_degree, image, &options.needs);
+        let sizes = sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
         let pipelines = device.pipelines(sizes.detail, sizes.more)?;
         let launches = device
             .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
         let audited = audit::launches(&device, &sizes, &buffers, &pipelines);
-        let mut ledger = sizes.ledger();
-        let pixels = u64::from(image.0) * u64::from(image.1);
-        ledger.add_to(
-            Section::Policy,
-            "candidates",
-            Candidates::bytes(options.needs.candidates, pixels as usize),
-        );
-        if let Some(request) = &options.needs.aux {
-            let bytes = observe::host_bytes(request, pixels);
-            ledger.add_to(Section::Policy, "auxiliary views", bytes);
-        }
+        let ledger = ledger(&sizes, &options.needs);
         let gpu = Self {
             ledger,
             device,
