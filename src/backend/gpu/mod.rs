@@ -20,6 +20,7 @@ mod observe;
 mod options;
 mod passes;
 mod pipelines;
+mod promise;
 mod readback;
 mod signals;
 mod state;
@@ -39,11 +40,11 @@ use super::{
 };
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
-use crate::memory::{Ledger, Section};
+use crate::memory::Ledger;
 
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
 use audit::Audited;
-use buffers::{Buffers, MOST_ENTRIES, Sizes, bias_table};
+use buffers::{Buffers, Sizes, bias_table};
 use device::Device;
 pub use device::GpuDevice;
 use edits::EditLaunches;
@@ -51,7 +52,7 @@ use frame::{Frame, State};
 pub use options::GpuOptions;
 use passes::{Launches, Passes, Recorder, Shape};
 use pipelines::Pipelines;
-use signals::{Planes, record_stride};
+use signals::Planes;
 
 /// Largest image side `[px]`; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
@@ -88,37 +89,6 @@ pub struct GpuBackend {
     laps: Vec<(&'static str, Duration)>,
 }
 
-fn most_pairs(device: &Device, needs: &Needs) -> u64 {
-    let stride = record_stride(Planes::new(needs).detail);
-    (device.largest_binding() / (4 * stride)).min(MOST_ENTRIES)
-}
-
-fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Sizes {
-    let budget = options.budget.max(1);
-    let cap = match options.tile_cap {
-        Some(cap) => cap as u64,
-        None => (16 * budget as u64).min(most_pairs(device, &options.needs)),
-    };
-    let (width, height) = options.largest_image;
-    let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
-    // The adapter takes fewer rows than the sums do entries.
-    let cap = cap.min(MOST_ENTRIES).max(budget as u64);
-    Sizes::new(budget, cap, sh_degree, image, &options.needs)
-}
-
-/// What is on the device, and what the host holds for it.
-fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
-    let mut ledger = sizes.ledger();
-    let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);
-    let candidates = Candidates::bytes(needs.candidates, pixels as usize);
-    ledger.add_to(Section::Policy, "candidates", candidates);
-    if let Some(request) = &needs.aux {
-        let bytes = observe::host_bytes(request, pixels);
-        ledger.add_to(Section::Policy, "auxiliary views", bytes);
-    }
-    ledger
-}
-
 impl GpuBackend {
     /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
     /// shown on a small scene that it computes what the native backend does.
@@ -138,19 +108,6 @@ impl GpuBackend {
         Self::without_canary(model, options, device)
     }
 
-    /// Bytes per buffer of a backend made with these options for models of this degree; nothing is
-    /// allocated.
-    #[must_use]
-    pub fn promise(sh_degree: u8, options: &GpuOptions, device: &GpuDevice) -> Ledger {
-        ledger(&sizes(&device.0, sh_degree, options), &options.needs)
-    }
-
-    /// Most (row, tile) pairs that this device can hold at a time for such needs.
-    #[must_use]
-    pub fn most_pairs(needs: &Needs, device: &GpuDevice) -> u64 {
-        most_pairs(&device.0, needs)
-    }
-
     fn without_canary(
         model: &Gaussians,
         options: &GpuOptions,
@@ -167,14 +124,14 @@ impl GpuBackend {
             )));
         }
         let planes = Planes::new(&options.needs);
-        let sizes = sizes(&device, model.sh_degree, options);
+        let sizes = promise::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
         let pipelines = device.pipelines(sizes.detail, sizes.more)?;
         let launches = device
             .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
         let audited = audit::launches(&device, &sizes, &buffers, &pipelines);
-        let ledger = ledger(&sizes, &options.needs);
+        let ledger = promise::ledger(&sizes, &options.needs);
         let gpu = Self {
             ledger,
             device,

@@ -3,10 +3,10 @@
 
 use std::path::Path;
 
-use densify_policies::registry::policies;
+use densify_policies::registry::{find, policies};
 use serde_json::Value;
 
-use super::{Outcome, densify, files, json, read, records, scratch, text};
+use super::{Outcome, densify, files, json, often, read, records, scratch, text};
 use crate::photographs::Photographs;
 
 const MIB: u64 = 1 << 20;
@@ -79,13 +79,13 @@ fn grouped(number: u64) -> String {
 #[test]
 fn a_run_takes_no_more_than_it_is_given() {
     let scene = Photographs::transforms();
-    for (memory, flags) in [
-        (48, "--policy diet --init-points 17k"),
-        (64, "--policy taming --init-points 30k"),
-        (64, "--policy mcmc --init-points 100k"),
-    ] {
+    for (memory, policy, points) in
+        [(48, "diet", "17k"), (64, "taming", "30k"), (64, "mcmc", "100k")]
+    {
         let (_root, run) = scratch();
-        // Every row is there from the start, so that all of the promise is needed.
+        // Every row is there from the start, and edits come, so that all of the promise is needed.
+        let often = often(find(policy).expect("it is registered"));
+        let flags = format!("--policy {policy} {often} --init-points {points}");
         let flags = format!("{flags} --memory {memory}MiB --eval --iterations 12");
         train(scene.path(), &run, &format!("{flags} --test-iterations 3 --checkpoint-every 5"))
             .ok();
