@@ -85,8 +85,7 @@ pub fn initialise(
         return Err(InitError::ShDegree(sh_degree));
     }
     let mut report = InitReport { points: points.len(), ..InitReport::default() };
-    let mut chosen: Vec<usize> =
-        (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect();
+    let mut chosen = finite(points);
     report.unusable = points.len() - chosen.len();
     let usable = chosen.len();
     drop_duplicates(&mut chosen, &points.positions);
@@ -119,6 +118,18 @@ pub fn initialise(
         sh,
     };
     Ok((gaussians, report))
+}
+
+/// Rows that [`initialise`] makes of these points where the budget has room for all.
+#[must_use]
+pub fn usable_points(points: &PointCloud) -> usize {
+    let mut chosen = finite(points);
+    drop_duplicates(&mut chosen, &points.positions);
+    chosen.len()
+}
+
+fn finite(points: &PointCloud) -> Vec<usize> {
+    (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect()
 }
 
 /// Changes initial rows as a policy wants them.

@@ -3,9 +3,13 @@
 //! Every buffer of a run has its size before the first step, because it is allocated once, at the
 //! budget. The ledger lists them, so that a user learns before training whether a run fits.
 
+mod fit;
+
 use std::fmt;
 
 use serde::Serialize;
+
+pub use fit::{Fit, Setting, Wishes, fit, least_memory};
 
 /// What is allocated, line by line.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -23,6 +27,14 @@ pub struct LedgerLine {
     pub what: String,
     /// Its size `[bytes]`.
     pub bytes: u64,
+    /// Whether it lies in the memory of a GPU.
+    #[serde(skip_serializing_if = "is_false")]
+    pub on_device: bool,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde's interface")]
+fn is_false(flag: &bool) -> bool {
+    !flag
 }
 
 /// What a buffer belongs to. The table lists sections in this order.
@@ -70,7 +82,20 @@ impl Ledger {
 
     /// Adds a buffer to a section.
     pub fn add_to(&mut self, section: Section, what: impl Into<String>, bytes: u64) {
-        self.lines.push(LedgerLine { section, what: what.into(), bytes });
+        self.lines.push(LedgerLine { section, what: what.into(), bytes, on_device: false });
+    }
+
+    /// Adds a buffer in the memory of a GPU to a section, or its bytes to the line of that name.
+    pub fn add_on_device(&mut self, section: Section, what: &str, bytes: u64) {
+        let same =
+            |line: &&mut LedgerLine| line.on_device && line.section == section && line.what == what;
+        match self.lines.iter_mut().find(same) {
+            Some(line) => line.bytes = line.bytes.saturating_add(bytes),
+            None => {
+                let what = what.to_owned();
+                self.lines.push(LedgerLine { section, what, bytes, on_device: true });
+            }
+        }
     }
 
     /// Adds all lines of another ledger.
@@ -87,6 +112,13 @@ impl Ledger {
         let lasting = lasting.iter().fold(0_u64, |sum, line| sum.saturating_add(line.bytes));
         lasting.saturating_add(passing.iter().map(|line| line.bytes).max().unwrap_or(0))
     }
+
+    /// Sum of what lies in the memory of a GPU `[bytes]`, where all of it lasts.
+    #[must_use]
+    pub fn on_device(&self) -> u64 {
+        let lines = self.lines.iter().filter(|line| line.on_device);
+        lines.fold(0, |sum, line| sum.saturating_add(line.bytes))
+    }
 }
 
 /// A table: section, buffer, size; the total below.
@@ -94,8 +126,9 @@ impl fmt::Display for Ledger {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut lines: Vec<_> = self.lines.iter().collect();
         lines.sort_by_key(|line| line.section);
+        let least = if self.on_device() > 0 { "on the device".len() } else { 5 };
         let what_width =
-            lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(5);
+            lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(least);
         let mut previous = None;
         for line in lines {
             let name = if previous == Some(line.section) { "" } else { line.section.name() };
@@ -104,7 +137,14 @@ impl fmt::Display for Ledger {
             writeln!(f, "  {name:<11} {what:<what_width$} {:>12}", Bytes(*bytes).to_string())?;
         }
         let total = Bytes(self.total()).to_string();
-        write!(f, "  {:<11} {:<what_width$} {total:>12}", "total", "")
+        write!(f, "  {:<11} {:<what_width$} {total:>12}", "total", "")?;
+        match self.on_device() {
+            0 => Ok(()),
+            bytes => {
+                let bytes = Bytes(bytes).to_string();
+                write!(f, "\n  {:<11} {:<what_width$} {bytes:>12}", "", "on the device")
+            }
+        }
     }
 }
 

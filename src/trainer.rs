@@ -32,12 +32,12 @@ pub use options::{OnNan, TrainOptions};
 use quarantine::AUDIT_EVERY;
 pub use state::TrainerState;
 
-/// What a run with this policy needs of its backend: the policy's needs, and room for the options'
-/// cadence.
+/// What a run with this policy needs of its backend: the policy's needs, and room for the cadence of
+/// [`TrainOptions::sh_every`].
 #[must_use]
-pub fn needs(policy: &dyn DensityPolicy, scene: &SceneInfo, options: &TrainOptions) -> Needs {
+pub fn needs(policy: &dyn DensityPolicy, scene: &SceneInfo, sh_every: Option<u32>) -> Needs {
     let mut needs = policy.needs(scene);
-    if let Some(every) = options.sh_every {
+    if let Some(every) = sh_every {
         needs.cadence.sh_rest = every;
     }
     needs
@@ -112,6 +112,7 @@ pub struct Trainer<V> {
     extra_forwards: u64,
     policy_time: Duration,
     views_time: Duration,
+    images_time: Duration,
     events: Vec<EditEvent>,
 }
 
@@ -139,6 +140,7 @@ impl<V: ViewSource> Trainer<V> {
             extra_forwards: 0,
             policy_time: Duration::ZERO,
             views_time: Duration::ZERO,
+            images_time: Duration::ZERO,
             views,
             backend,
             policy,
@@ -158,7 +160,9 @@ impl<V: ViewSource> Trainer<V> {
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let step = self.step + 1;
         let view = self.next_view();
+        let start = Instant::now();
         let image = self.image(step, view)?;
+        self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
         let TrainOptions { iterations, seed, sh_degree, background, rates, .. } = self.options;
         let input = StepInput {
@@ -325,6 +329,12 @@ impl<V: ViewSource> Trainer<V> {
         (self.policy_time.saturating_sub(self.views_time), self.views_time)
     }
 
+    /// Wall time that steps have waited for their images so far.
+    #[must_use]
+    pub fn images_time(&self) -> Duration {
+        self.images_time
+    }
+
     /// All edits so far.
     #[must_use]
     pub fn events(&self) -> &[EditEvent] {
@@ -372,7 +382,7 @@ fn checked_needs(
     scene: &SceneInfo,
     options: &TrainOptions,
 ) -> Result<Needs, TrainError> {
-    let needs = needs(policy, scene, options);
+    let needs = needs(policy, scene, options.sh_every);
     let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
     needs.check().map_err(bad)?;
     Ok(needs)

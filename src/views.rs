@@ -45,12 +45,6 @@ impl DatasetViews {
         let sources = views.iter().map(|view| view.source.clone()).collect();
         Self { cache: ImageCache::new(sources, cache_bytes, threads), views }
     }
-
-    /// The images and what is needed to decode them `[bytes]`.
-    #[must_use]
-    pub fn cache(&self) -> &ImageCache {
-        &self.cache
-    }
 }
 
 impl ViewSource for DatasetViews {

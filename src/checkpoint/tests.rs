@@ -92,6 +92,7 @@ fn header() -> Header {
             },
             train: TrainConfig {
                 budget: ROWS + 3,
+                memory: None,
                 iterations: 2_000,
                 extended_to: None,
                 seed: i64::MAX as u64,

@@ -52,6 +52,7 @@ Examples:
   densify train scene:spheres -i 2000                      train on a built-in scene: no file needed
   densify train data/garden --eval                         train, hold out every 8th photograph
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
+  densify plan data/garden --memory 512MiB                 how large a model that memory holds
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
   densify compare data/garden --policies vanilla,diet --budget 200k
@@ -61,9 +62,21 @@ Examples:
 
 `densify COMMAND --help` explains every option of a command.";
 
+const PLAN_EXAMPLES: &str = "\
+Examples:
+  densify plan data/garden --memory 512MiB
+  densify plan data/garden --budget 1.5M --policy taming --eval -r 2";
+
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(Box<train::TrainArgs>),
+    /// Says what a run would take in memory, without training.
+    ///
+    /// Takes the options of `densify train` and prints what that would promise: the ledger, buffer by
+    /// buffer, and then how many Gaussians the same memory holds at each degree of colour and with
+    /// images of full, half and quarter size. Writes nothing.
+    #[command(after_help = PLAN_EXAMPLES)]
+    Plan(Box<train::TrainArgs>),
     Eval(eval::EvalArgs),
     Render(Box<render::RenderArgs>),
     Compare(compare::CompareArgs),
@@ -89,13 +102,17 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
             return u8::try_from(help_or_error.exit_code()).unwrap_or(failure::INPUT);
         }
     };
-    let quiet = matches!(&arguments.command, Command::Train(train) if train.quiet);
+    let quiet = matches!(
+        &arguments.command,
+        Command::Train(train) | Command::Plan(train) if train.quiet
+    );
     let console = Console::new(quiet);
     let done = match arguments.command {
         Command::Train(train) => {
             let after = words.iter().skip(1).skip_while(|word| *word != "train").skip(1);
             train::run(&after.cloned().collect::<Vec<_>>(), *train, &console)
         }
+        Command::Plan(train) => train::plan::run(&train, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),

@@ -31,15 +31,17 @@ pub(super) fn rows(text: &str) -> Result<usize, String> {
 
 /// Parses a number of bytes: `1GiB`, `512MiB`, `800MB`, `1000000`.
 pub(super) fn bytes(text: &str) -> Result<u64, String> {
-    const UNITS: [(&str, f64); 8] = [
+    const UNITS: [(&str, f64); 10] = [
         ("KiB", 1024.0),
         ("MiB", 1024.0 * 1024.0),
         ("GiB", 1024.0 * 1024.0 * 1024.0),
         ("TiB", 1024.0 * 1024.0 * 1024.0 * 1024.0),
         ("kB", 1e3),
+        ("KB", 1e3),
         ("MB", 1e6),
         ("GB", 1e9),
         ("TB", 1e12),
+        ("B", 1.0),
     ];
     let wrong =
         || format!("`{text}` is no number of bytes; write it as 1GiB, 512MiB, 800MB or 1000000");
@@ -129,11 +131,14 @@ mod tests {
             ("0.5 KiB", 512),
             ("512MiB", 512 << 20),
             ("800MB", 800_000_000),
+            ("5KB", 5_000),
+            ("5kB", 5_000),
+            ("12 B", 12),
         ];
         for (text, number) in good {
             assert_eq!(bytes(text), Ok(number), "{text}");
         }
-        for text in ["", "GiB", "-1", "1G", "1Gib", "1e300GiB", "NaN", "much"] {
+        for text in ["", "GiB", "-1", "1G", "1Gib", "1MiBB", "B", "1e300GiB", "NaN", "much"] {
             assert!(bytes(text).unwrap_err().contains("1GiB"), "{text}");
         }
     }

@@ -18,6 +18,9 @@ use crate::schedule::Background;
 /// 10 dB to it.
 pub(super) const NEAR: f64 = 0.04;
 
+/// Memory for decoded photographs, where nothing else is said `[bytes]`.
+pub(super) const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
+
 /// How to read a dataset.
 #[derive(Debug, Args)]
 pub(super) struct SceneArgs {
@@ -36,8 +39,9 @@ pub(super) struct SceneArgs {
     #[arg(short, long, value_name = "N", help_heading = "Scene", value_parser = resolution)]
     pub(super) resolution: Option<u32>,
     /// Memory for decoded photographs; those beyond it are decoded again when their turn comes
-    #[arg(long, value_name = "BYTES", help_heading = "Memory", default_value = "1GiB", value_parser = number::bytes)]
-    pub(super) image_cache: u64,
+    /// `[default: 1GiB, or chosen for --memory]`
+    #[arg(long, value_name = "BYTES", help_heading = "Memory", value_parser = number::bytes)]
+    pub(super) image_cache: Option<u64>,
     /// What lies behind the scene, and behind transparent images: black, white, random (another
     /// colour at every step) or #rrggbb
     #[arg(long, value_name = "COLOUR", help_heading = "Scene", default_value = "black")]
@@ -59,7 +63,7 @@ impl SceneArgs {
             resolution: self.resolution,
             eval: self.eval || self.test_every.is_some(),
             test_every: self.test_every.map(NonZeroU32::get),
-            image_cache: self.image_cache,
+            image_cache: self.image_cache.unwrap_or(DEFAULT_IMAGE_CACHE),
             background: self.background,
         }
     }
@@ -71,6 +75,15 @@ pub(super) fn load(
     config: &SceneConfig,
     console: &Console,
 ) -> Result<Dataset, Failure> {
+    let dataset = read(path, config)?;
+    for note in &dataset.notes {
+        console.say(format_args!("note: {note}"));
+    }
+    Ok(dataset)
+}
+
+/// Reads the dataset at `path`.
+pub(super) fn read(path: &Path, config: &SceneConfig) -> Result<Dataset, Failure> {
     let resolution = config.resolution.map(|number| number.to_string().parse::<Resolution>());
     let split = match config.test_every.map(NonZeroU32::new) {
         Some(Some(every)) => Split::Every(every),
@@ -83,11 +96,7 @@ pub(super) fn load(
         resolution: resolution.transpose().map_err(Failure::input)?,
         split,
     };
-    let dataset = Dataset::load(path, &options)?;
-    for note in &dataset.notes {
-        console.say(format_args!("note: {note}"));
-    }
-    Ok(dataset)
+    Ok(Dataset::load(path, &options)?)
 }
 
 /// Width and height that hold every view of the dataset `[px]`.

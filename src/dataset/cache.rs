@@ -65,7 +65,7 @@ impl ImageCache {
     /// `threads` decode what [`Self::prefetch`] announces; with 0, all is decoded on demand.
     #[must_use]
     pub fn new(sources: Vec<ImageSource>, cache_bytes: u64, threads: usize) -> Self {
-        let capacity = cache_bytes.max(2 * largest(&sources, ImageSource::loaded_bytes));
+        let capacity = ImageDemand::of(sources.iter()).capacity(cache_bytes);
         let slots = sources.iter().map(|_| Slot::default()).collect();
         let state = Mutex::new(State { slots, ..State::default() });
         let shared = Arc::new(Shared {
@@ -99,30 +99,6 @@ impl ImageCache {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.shared.sources.is_empty()
-    }
-
-    /// Most bytes of decoded images held at a time, one handed out and evicted since included.
-    #[must_use]
-    pub fn held_bytes(&self) -> u64 {
-        let all = self.shared.sources.iter().map(ImageSource::loaded_bytes).sum::<u64>();
-        let handed_out = largest(&self.shared.sources, ImageSource::loaded_bytes);
-        all.min(self.shared.capacity + handed_out)
-    }
-
-    /// Most bytes in use for decoding: one image per thread, and one on demand.
-    #[must_use]
-    pub fn decode_bytes(&self) -> u64 {
-        let beyond_result = |source: &ImageSource| {
-            source.working_bytes() - source.loaded_bytes().min(source.working_bytes())
-        };
-        (self.threads.len() as u64 + 1) * largest(&self.shared.sources, beyond_result)
-            + largest(&self.shared.sources, ImageSource::loaded_bytes)
-    }
-
-    /// Most bytes in use for images at any time: those held, and those being decoded.
-    #[must_use]
-    pub fn bytes_needed(&self) -> u64 {
-        self.held_bytes() + self.decode_bytes()
     }
 
     /// Announces the images needed next, in order; replaces what was announced before.
@@ -267,8 +243,47 @@ impl State {
     }
 }
 
-fn largest(sources: &[ImageSource], bytes: impl Fn(&ImageSource) -> u64) -> u64 {
-    sources.iter().map(bytes).max().unwrap_or(0)
+/// What decides how much memory images take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageDemand {
+    /// Bytes of all images decoded.
+    pub all: u64,
+    /// Bytes of the largest one.
+    pub largest: u64,
+    /// Most bytes in use while one is loaded, beyond its own.
+    pub working: u64,
+}
+
+impl ImageDemand {
+    /// That of these images.
+    #[must_use]
+    pub fn of<'a>(sources: impl Iterator<Item = &'a ImageSource>) -> Self {
+        sources.fold(Self { all: 0, largest: 0, working: 0 }, |sum, source| {
+            let loaded = source.loaded_bytes();
+            Self {
+                all: sum.all.saturating_add(loaded),
+                largest: sum.largest.max(loaded),
+                working: sum.working.max(source.working_bytes().saturating_sub(loaded)),
+            }
+        })
+    }
+
+    /// Most bytes of decoded images that a cache made with `cache_bytes` holds at a time, one handed
+    /// out and evicted since included.
+    #[must_use]
+    pub fn held(&self, cache_bytes: u64) -> u64 {
+        self.all.min(self.capacity(cache_bytes).saturating_add(self.largest))
+    }
+
+    /// Most bytes in use for decoding with so many threads: one image per thread, and one on demand.
+    #[must_use]
+    pub fn decoding(&self, threads: usize) -> u64 {
+        (threads as u64 + 1) * self.working + self.largest
+    }
+
+    fn capacity(&self, cache_bytes: u64) -> u64 {
+        cache_bytes.max(2 * self.largest)
+    }
 }
 
 /// Loads, and turns a decoder's panic on a hostile file into an error.
@@ -392,10 +407,11 @@ mod tests {
     #[test]
     fn the_accounting_covers_what_is_held() {
         let folder = tempfile::tempdir().unwrap();
-        let few = ImageCache::new(sources(folder.path(), 4), 1 << 30, 1);
-        assert_eq!(few.held_bytes(), 4 * 768, "all images, not the cache's size");
-        let many = ImageCache::new(sources(folder.path(), 9), 3 * 768, 1);
-        assert_eq!(many.held_bytes(), 4 * 768);
-        assert!(many.bytes_needed() >= many.held_bytes() + 2 * 768);
+        let demand = |count| ImageDemand::of(sources(folder.path(), count).iter());
+        assert_eq!(demand(4).held(1 << 30), 4 * 768, "all images, not the cache's size");
+        assert_eq!(demand(9).held(3 * 768), 4 * 768);
+        assert_eq!(demand(9).held(0), 3 * 768, "two, and one handed out");
+        assert!(demand(9).decoding(1) >= 2 * 768);
+        assert_eq!(demand(0), ImageDemand { all: 0, largest: 0, working: 0 });
     }
 }

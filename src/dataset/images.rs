@@ -10,7 +10,7 @@ use std::sync::Arc;
 use image::error::ImageFormatHint;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
-pub use super::cache::ImageCache;
+pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
 use super::resample;
 use super::undistort::Undistortion;

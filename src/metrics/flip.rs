@@ -7,9 +7,7 @@
 
 use std::f64::consts::PI;
 
-use rayon::prelude::*;
-
-use super::{MetricError, Pair};
+use super::{BLOCK, MetricError, Pair, by_blocks};
 use crate::dataset::images::Image8;
 
 /// Pixels per degree of the visual field: a monitor 0.7 m wide with 3840 px, seen from 0.7 m; the
@@ -31,8 +29,6 @@ const SMALL_RANGE: f64 = 0.95;
 const FEATURE_WIDTH: f64 = 0.082;
 /// Exponent of feature differences, q_f.
 const FEATURE_EXPONENT: f64 = 0.5;
-/// Rows of pixels filtered together, as in [`super::ssim()`].
-const BLOCK: usize = 32;
 
 /// Linear sRGB to CIE XYZ, D65.
 const XYZ_OF_RGB: [[f64; 3]; 3] = [
@@ -60,23 +56,18 @@ pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     let filters = Filters::new();
     let largest = largest_distance();
     // One sum per block of rows, added in order: the same bits at any thread count.
-    let sums: Vec<[f64; 2]> = (0..pair.height.div_ceil(BLOCK))
-        .into_par_iter()
-        .map(|block| {
-            let first = block * BLOCK;
-            let last = (first + BLOCK).min(pair.height);
-            let [truth, render] = [false, true].map(|r| seen(&pair, &filters, first, last, r));
-            let pixels = first * pair.width..last * pair.width;
-            pixels.zip(truth.iter().zip(&render)).fold([0.0; 2], |sum, (p, (a, b))| {
-                let weight = pair.weight(p);
-                if weight > 0.0 {
-                    [sum[0] + weight * difference(a, b, largest), sum[1] + weight]
-                } else {
-                    sum
-                }
-            })
+    let sums = by_blocks(pair.height, |rows| {
+        let pixels = rows.start * pair.width..rows.end * pair.width;
+        let [truth, render] = [false, true].map(|r| seen(&pair, &filters, rows.start, rows.end, r));
+        pixels.zip(truth.iter().zip(&render)).fold([0.0; 2], |sum, (p, (a, b))| {
+            let weight = pair.weight(p);
+            if weight > 0.0 {
+                [sum[0] + weight * difference(a, b, largest), sum[1] + weight]
+            } else {
+                sum
+            }
         })
-        .collect();
+    });
     let [error, weight] =
         sums.iter().fold([0.0; 2], |sum, block| [sum[0] + block[0], sum[1] + block[1]]);
     if weight == 0.0 {
@@ -85,9 +76,9 @@ pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     Ok(error / weight)
 }
 
-/// Most that a thread holds while it compares images of this width `[bytes]`: in `f64` eight planes
-/// of the rows that a block sees and seven of its own rows, and what is [seen](Seen) in two images.
-pub(super) fn bytes_per_thread(width: u64) -> u64 {
+/// Most that a block of images of this width takes `[bytes]`: in `f64` eight planes of the rows that
+/// it sees and seven of its own rows, and what is [seen](Seen) in two images.
+pub(super) fn bytes_per_block(width: u64) -> u64 {
     let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().reach()) as u64);
     let float = size_of::<f64>() as u64;
     width * (8 * lines * float + rows * (7 * float + 2 * size_of::<Seen>() as u64))

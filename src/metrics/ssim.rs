@@ -12,9 +12,7 @@
 //!
 //! One piece although over 400 lines: two thirds are tests, which need the private map.
 
-use rayon::prelude::*;
-
-use super::{MetricError, Pair};
+use super::{MetricError, Pair, by_blocks};
 use crate::dataset::images::Image8;
 
 /// Pixels from the window's centre to its edge.
@@ -25,9 +23,6 @@ const SIGMA: f64 = 1.5;
 const C1: f64 = 0.01 * 0.01;
 /// (0.03 · peak)².
 const C2: f64 = 0.03 * 0.03;
-/// Rows of pixels filtered together: few enough that the intermediate rows of every thread take
-/// a few megabytes, many enough that the 2·REACH rows filtered twice are a third of the work.
-const BLOCK: usize = 32;
 
 /// Mean SSIM of a render against a target, <= 1.
 ///
@@ -41,23 +36,18 @@ pub fn ssim(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     let pair = Pair::new(rendered, target, background)?;
     let window = window();
     // One sum per block of rows, added in order: the same bits at any thread count.
-    let sums: Vec<[f64; 2]> = (0..pair.height.div_ceil(BLOCK))
-        .into_par_iter()
-        .map(|block| {
-            let first = block * BLOCK;
-            let last = (first + BLOCK).min(pair.height);
-            let map = block_map(&pair, &window, first, last);
-            let pixels = first * pair.width..last * pair.width;
-            pixels.zip(map.chunks_exact(3)).fold([0.0; 2], |sum, (p, ssim)| {
-                let weight = pair.weight(p);
-                if weight > 0.0 {
-                    [sum[0] + weight * ssim.iter().sum::<f64>(), sum[1] + weight]
-                } else {
-                    sum
-                }
-            })
+    let sums = by_blocks(pair.height, |rows| {
+        let map = block_map(&pair, &window, rows.start, rows.end);
+        let pixels = rows.start * pair.width..rows.end * pair.width;
+        pixels.zip(map.chunks_exact(3)).fold([0.0; 2], |sum, (p, ssim)| {
+            let weight = pair.weight(p);
+            if weight > 0.0 {
+                [sum[0] + weight * ssim.iter().sum::<f64>(), sum[1] + weight]
+            } else {
+                sum
+            }
         })
-        .collect();
+    });
     let [similarity, weight] =
         sums.iter().fold([0.0; 2], |sum, block| [sum[0] + block[0], sum[1] + block[1]]);
     if weight == 0.0 {
@@ -146,6 +136,7 @@ fn similarity([e, y, e_squared, squares]: Moments) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::BLOCK;
     use super::*;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;

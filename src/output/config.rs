@@ -52,6 +52,10 @@ pub struct SceneConfig {
 pub struct TrainConfig {
     /// Most rows there may ever be.
     pub budget: usize,
+    /// The memory that budget, degree, tile lists and image cache were chosen for, if they were
+    /// `[bytes]`.
+    #[serde(default)]
+    pub memory: Option<u64>,
     /// Length of the run in steps.
     pub iterations: u32,
     /// Step to which the run was extended beyond its length. Schedules do not know of it: step sizes
@@ -160,6 +164,7 @@ mod tests {
             },
             train: TrainConfig {
                 budget: 28_000,
+                memory: Some(1 << 28),
                 iterations: 2_000,
                 extended_to: None,
                 seed: i64::MAX as u64,

@@ -124,6 +124,9 @@ pub struct StepRecord {
     pub rows: usize,
     /// Wall time since the first step `[s]`.
     pub seconds: f64,
+    /// Resident memory of the process now `[bytes]`, where the system says.
+    #[serde(default)]
+    pub resident_bytes: Option<u64>,
 }
 
 /// `stats/summary.json`.
@@ -147,14 +150,16 @@ pub struct Summary {
     pub extra_forwards: u64,
     /// Largest resident memory of the process `[bytes]`, where the system says.
     pub peak_bytes: Option<u64>,
+    /// The memory that was given with `--memory` `[bytes]`.
+    pub memory: Option<u64>,
     /// The ledger's total `[bytes]`.
     pub ledger_bytes: u64,
     /// The ledger.
     pub ledger: Ledger,
     /// Wall time of all steps `[s]`.
     pub seconds: f64,
-    /// Wall time of each stage of the steps, of the policy's events, and of the views rendered for
-    /// these, summed `[s]`.
+    /// Wall time of each stage of the steps, of the policy's events, of the views rendered for these,
+    /// and of waiting for images, summed `[s]`.
     pub stage_seconds: BTreeMap<String, f64>,
     /// CPU time of all steps, all threads together `[s]`, where the system says.
     pub cpu_seconds: Option<f64>,
@@ -346,8 +351,15 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("stats/train.jsonl");
         let mut log = RecordLog::create(&path).unwrap();
-        let record =
-            StepRecord { step: 1, loss: 0.5, l1: 0.25, ssim: 0.75, rows: 9, seconds: 0.125 };
+        let record = StepRecord {
+            step: 1,
+            loss: 0.5,
+            l1: 0.25,
+            ssim: 0.75,
+            rows: 9,
+            seconds: 0.125,
+            resident_bytes: Some(4096),
+        };
         log.append(&record).unwrap();
         log.append(&StepRecord { step: 2, ..record }).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();

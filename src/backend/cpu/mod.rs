@@ -108,6 +108,13 @@ pub struct CpuBackend {
 }
 
 impl CpuBackend {
+    /// Bytes per buffer of a backend made with these options for models of this degree, on so many
+    /// threads; [`CpuOptions::threads`] is not looked at.
+    #[must_use]
+    pub fn promise(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
+        budget::ledger(sh_degree, options, threads)
+    }
+
     /// Takes over `model` and allocates everything for `options.budget` rows.
     ///
     /// # Errors

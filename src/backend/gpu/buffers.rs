@@ -171,7 +171,7 @@ impl Sizes {
             BufferUsages::STORAGE | BufferUsages::INDIRECT,
         );
         add_as(
-            Section::Passing,
+            Section::Renderer,
             "copies to the host",
             "read",
             READ_BYTES,
@@ -184,10 +184,7 @@ impl Sizes {
     pub(super) fn ledger(&self) -> Ledger {
         let mut ledger = Ledger::default();
         for Planned { section, what, bytes, .. } in self.planned() {
-            match ledger.lines.iter_mut().find(|l| l.section == section && l.what == what) {
-                Some(line) => line.bytes += bytes,
-                None => ledger.add_to(section, what, bytes),
-            }
+            ledger.add_on_device(section, what, bytes);
         }
         ledger
     }

@@ -20,6 +20,7 @@ mod observe;
 mod options;
 mod passes;
 mod pipelines;
+mod promise;
 mod readback;
 mod signals;
 mod state;
@@ -39,11 +40,11 @@ use super::{
 };
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
-use crate::memory::{Ledger, Section};
+use crate::memory::Ledger;
 
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
 use audit::Audited;
-use buffers::{Buffers, MOST_ENTRIES, Sizes, bias_table};
+use buffers::{Buffers, Sizes, bias_table};
 use device::Device;
 pub use device::GpuDevice;
 use edits::EditLaunches;
@@ -51,7 +52,7 @@ use frame::{Frame, State};
 pub use options::GpuOptions;
 use passes::{Launches, Passes, Recorder, Shape};
 use pipelines::Pipelines;
-use signals::{Planes, record_stride};
+use signals::Planes;
 
 /// Largest image side `[px]`; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
@@ -123,32 +124,14 @@ impl GpuBackend {
             )));
         }
         let planes = Planes::new(&options.needs);
-        let bindable = device.largest_binding() / (4 * record_stride(planes.detail));
-        let cap = match options.tile_cap {
-            Some(cap) => cap as u64,
-            None => (16 * budget as u64).min(bindable),
-        }
-        .clamp(budget as u64, MOST_ENTRIES);
-        let (width, height) = options.largest_image;
-        let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
-        let sizes = Sizes::new(budget, cap, model.sh_degree, image, &options.needs);
+        let sizes = promise::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
         let pipelines = device.pipelines(sizes.detail, sizes.more)?;
         let launches = device
             .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
         let audited = audit::launches(&device, &sizes, &buffers, &pipelines);
-        let mut ledger = sizes.ledger();
-        let pixels = u64::from(image.0) * u64::from(image.1);
-        ledger.add_to(
-            Section::Policy,
-            "candidates",
-            Candidates::bytes(options.needs.candidates, pixels as usize),
-        );
-        if let Some(request) = &options.needs.aux {
-            let bytes = observe::host_bytes(request, pixels);
-            ledger.add_to(Section::Policy, "auxiliary views", bytes);
-        }
+        let ledger = promise::ledger(&sizes, &options.needs);
         let gpu = Self {
             ledger,
             device,

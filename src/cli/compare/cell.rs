@@ -272,14 +272,14 @@ impl Records {
     }
 }
 
-/// (iteration, rows) along a run, from its log.
-pub(super) fn rows_over_time(output: &Path, record: &Record) -> Vec<(u32, f64)> {
+/// (iteration, value) of a field of the run's log; nothing where it has none.
+pub(super) fn over_time(output: &Path, record: &Record, field: &str) -> Vec<(u32, f64)> {
     let path = run_folder(output, record).join("stats/train.jsonl");
     let text = fs::read_to_string(path).unwrap_or_default();
     let steps = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let point = |step: Value| {
         let iteration = u32::try_from(step["step"].as_u64()?).ok()?;
-        Some((iteration, step["rows"].as_f64()?))
+        Some((iteration, step[field].as_f64()?))
     };
     steps.filter_map(point).collect()
 }

@@ -1,4 +1,4 @@
-//! Plots as SVG: quality against budget, and rows above PSNR along the runs.
+//! Plots as SVG: quality against budget; rows, PSNR and memory along the runs.
 
 use std::ops::Range;
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::path::Path;
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::prelude::*;
 
-use super::cell::rows_over_time;
+use super::cell::over_time;
 use super::{Picture, Record, budgets_of, distinct};
 use crate::cli::failure::{Failure, OTHER};
 use crate::cli::number::grouped;
@@ -88,12 +88,19 @@ pub(super) fn draw(
                     points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
                 }),
             };
-            let panels = [
-                panel("rows", &|r| rows_over_time(output, r)),
+            let memory = |r: &Record| {
+                let bytes = over_time(output, r, "resident_bytes").into_iter();
+                bytes.map(|(step, bytes)| (step, bytes / f64::from(1 << 20))).collect()
+            };
+            let mut panels = vec![
+                panel("rows", &|r| over_time(output, r, "rows")),
                 panel("PSNR (dB)", &|r| r.curve.clone()),
+                panel("resident memory (MiB)", &memory),
             ];
+            // Not every system says.
+            panels.retain(|panel| bounds(panel).is_some());
             let caption = format!(
-                "{scene}, {} rows: rows and PSNR over iterations, first seed",
+                "{scene}, {} rows: rows, PSNR and memory over iterations, first seed",
                 grouped(budget)
             );
             put(format!("growth-{scene}-{budget}.svg"), caption, &panels)?;

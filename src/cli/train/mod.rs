@@ -1,10 +1,13 @@
 //! `densify train`.
 
 mod choices;
+mod demand;
 mod interrupt;
+pub(super) mod plan;
 mod resume;
 mod session;
 mod setup;
+mod size;
 mod tally;
 
 use std::ffi::OsString;
@@ -24,6 +27,8 @@ use resume::Start;
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
 /// a room or an object; large outdoor scenes want more.
 const DEFAULT_BUDGET: usize = 200_000;
+/// Degree, where neither `--sh-degree` nor `--memory` says otherwise.
+const DEFAULT_SH_DEGREE: u8 = 3;
 
 /// Trains a scene.
 ///
@@ -46,11 +51,21 @@ pub(super) struct TrainArgs {
     device: DeviceArgs,
 
     /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
-    /// `[default: 200k]`
+    /// `[default: 200k, or as many as --memory holds]`
     #[arg(short, long, value_name = "ROWS", help_heading = "Memory", value_parser = number::rows)]
     budget: Option<usize>,
+    /// Memory that the run may take, all included: 512MiB, 1.5GiB, 800MB. It is the device's on a
+    /// GPU, else the process's.
+    ///
+    /// Options that are given are kept: --budget (the smaller of the two limits holds), --sh-degree,
+    /// --tile-cap, --image-cache. The others are chosen: Gaussians as many as fit; the degree is 3
+    /// unless fewer fit than the scene starts with, then it is lowered until they do; decoded
+    /// photographs take at most a quarter, and those beyond it are decoded again; tile lists hold 4
+    /// pairs per Gaussian, up to 16 where --budget leaves room. `densify plan` shows what comes of it
+    #[arg(long, value_name = "BYTES", help_heading = "Memory", value_parser = number::bytes)]
+    memory: Option<u64>,
     /// Most (Gaussian, tile) pairs held at a time; views with more are processed in bands, which
-    /// is exact but slower `[default: 16 per Gaussian of the budget]`
+    /// is exact but slower `[default: 16 per Gaussian of the budget, or chosen for --memory]`
     #[arg(long, value_name = "PAIRS", help_heading = "Memory", value_parser = number::rows)]
     tile_cap: Option<usize>,
 
@@ -74,8 +89,9 @@ pub(super) struct TrainArgs {
     #[arg(short, long, value_name = "N", help_heading = "Training", default_value_t = 30_000, value_parser = clap::value_parser!(u32).range(1..))]
     iterations: u32,
     /// How colours may depend on the direction of view: 0 not at all, 3 most
-    #[arg(long, value_name = "DEGREE", help_heading = "Training", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
-    sh_degree: u8,
+    /// `[default: 3, or lower where --memory requires it]`
+    #[arg(long, value_name = "DEGREE", help_heading = "Training", value_parser = clap::value_parser!(u8).range(0..=3))]
+    sh_degree: Option<u8>,
     /// Where the first Gaussians are placed [default: points where the dataset has any, else
     /// random]
     #[arg(long, value_enum, value_name = "HOW", help_heading = "Training")]
@@ -138,6 +154,7 @@ Examples:
   densify train scene:spheres --iterations 2000
   densify train data/garden
   densify train data/garden --eval -r 4 --budget 1.5M -o runs/garden
+  densify train data/garden --memory 512MiB
   densify train data/chair --background white --init-points 50k
   densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2
   densify train data/garden --resume";

@@ -159,6 +159,7 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Vec<OsString> {
     let text = |value: &dyn ToString| Some(OsString::from(value.to_string()));
     adopt("--policy", text(&policy.name));
     adopt("--budget", text(&train.budget));
+    adopt("--memory", train.memory.and_then(|bytes| text(&bytes)));
     adopt("--iterations", text(&train.iterations));
     adopt("--seed", text(&train.seed));
     adopt("--sh-degree", text(&train.sh_degree));

@@ -312,9 +312,10 @@ impl<'a> Session<'a> {
     fn write_summary(&self, finished: bool) -> Result<(), OutputError> {
         let Prepared { config, trainer, test, ledger, .. } = &self.run;
         let (events, views) = trainer.policy_times();
-        let policy = [("policy events", events), ("policy views", views)];
-        let policy = policy.map(|(stage, time)| (stage.to_owned(), time));
-        let stages = self.tally.stages.clone().into_iter().chain(policy);
+        let images = trainer.images_time();
+        let more = [("policy events", events), ("policy views", views), ("images", images)];
+        let more = more.map(|(stage, time)| (stage.to_owned(), time));
+        let stages = self.tally.stages.clone().into_iter().chain(more);
         let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
         let summary = Summary {
             densify: config.densify.clone(),
@@ -326,6 +327,7 @@ impl<'a> Session<'a> {
             budget: config.train.budget,
             extra_forwards: trainer.extra_forwards(),
             peak_bytes: self.tally.peak_bytes(),
+            memory: config.train.memory,
             ledger_bytes: ledger.total(),
             ledger: ledger.clone(),
             seconds: self.tally.wall.as_secs_f64(),

@@ -9,7 +9,7 @@ use cpu_time::ProcessTime;
 use serde::{Deserialize, Serialize};
 
 use crate::backend::StepOutput;
-use crate::memory::peak_resident;
+use crate::memory::{peak_resident, resident};
 use crate::output::{Mean, OutputError, RecordLog, StepRecord, TensorBoard};
 
 /// Sums and scores so far.
@@ -77,6 +77,7 @@ impl Tally {
             ssim: mean(ssim),
             rows,
             seconds: self.wall.as_secs_f64(),
+            resident_bytes: resident(),
         }
     }
 

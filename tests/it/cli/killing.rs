@@ -99,6 +99,7 @@ fn outcome(run: &Path, iterations: u32) -> (Vec<Vec<u8>>, Vec<Value>) {
     let mut log = records(&run.join("stats/train.jsonl"));
     for record in &mut log {
         record["seconds"].take();
+        record["resident_bytes"].take();
     }
     (exact, log)
 }

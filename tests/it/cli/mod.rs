@@ -5,6 +5,7 @@ mod faults;
 mod generated;
 mod killing;
 mod looking;
+mod memory;
 mod resuming;
 mod same;
 mod training;

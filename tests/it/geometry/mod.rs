@@ -111,7 +111,7 @@ impl Known {
             on_nan: OnNan::Prune,
         };
         let near = (0.04 * dataset.extent()) as f32;
-        let needs = needs(policy.as_ref(), &scene, &options);
+        let needs = needs(policy.as_ref(), &scene, options.sh_every);
         let first = make(&model, run.budget, near, needs);
         let views =
             |views: &[densify::dataset::View]| DatasetViews::new(views.to_vec(), 1 << 30, 1);

@@ -20,7 +20,7 @@ use densify::gaussians::Gaussians;
 use densify_policies::policy::Needs;
 
 /// The devices under test, opened once; none, said aloud, where there is no driver.
-fn subjects() -> &'static [GpuDevice] {
+pub(crate) fn subjects() -> &'static [GpuDevice] {
     static DEVICES: OnceLock<Vec<GpuDevice>> = OnceLock::new();
     DEVICES.get_or_init(open)
 }

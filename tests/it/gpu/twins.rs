@@ -251,6 +251,8 @@ fn what_is_allocated_is_what_the_ledger_says() {
         let promised = gpu.promised();
         let lines: u64 = gpu.ledger().lines.iter().map(|line| line.bytes).sum();
         assert_eq!((gpu.allocated(), lines), (promised, promised));
+        assert_eq!(gpu.ledger().on_device(), promised);
+        assert_eq!(&GpuBackend::promise(model.sh_degree, &options, device), gpu.ledger());
         gpu.render(&camera, GREY, 1).expect("a rendering");
         assert_eq!(gpu.allocated(), promised);
     }

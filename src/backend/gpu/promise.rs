@@ -1,0 +1,56 @@
+//! What a backend of given options takes, before anything is allocated.
+
+use densify_policies::policy::Needs;
+
+use super::buffers::{MOST_ENTRIES, Sizes};
+use super::device::{Device, GpuDevice};
+use super::signals::{Planes, record_stride};
+use super::{GpuBackend, GpuOptions, MAX_SIDE, observe};
+use crate::backend::candidates::Candidates;
+use crate::memory::{Ledger, Section};
+
+fn most_pairs(device: &Device, needs: &Needs) -> u64 {
+    let stride = record_stride(Planes::new(needs).detail);
+    (device.largest_binding() / (4 * stride)).min(MOST_ENTRIES)
+}
+
+pub(super) fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Sizes {
+    let budget = options.budget.max(1);
+    let cap = match options.tile_cap {
+        Some(cap) => cap as u64,
+        None => (16 * budget as u64).min(most_pairs(device, &options.needs)),
+    };
+    let (width, height) = options.largest_image;
+    let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
+    // The adapter takes fewer rows than the sums do entries.
+    let cap = cap.min(MOST_ENTRIES).max(budget as u64);
+    Sizes::new(budget, cap, sh_degree, image, &options.needs)
+}
+
+/// What is on the device, and what the host holds for it.
+pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
+    let mut ledger = sizes.ledger();
+    let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);
+    let candidates = Candidates::bytes(needs.candidates, pixels as usize);
+    ledger.add_to(Section::Policy, "candidates", candidates);
+    if let Some(request) = &needs.aux {
+        let bytes = observe::host_bytes(request, pixels);
+        ledger.add_to(Section::Policy, "auxiliary views", bytes);
+    }
+    ledger
+}
+
+impl GpuBackend {
+    /// Bytes per buffer of a backend made with these options for models of this degree; nothing is
+    /// allocated.
+    #[must_use]
+    pub fn promise(sh_degree: u8, options: &GpuOptions, device: &GpuDevice) -> Ledger {
+        ledger(&sizes(&device.0, sh_degree, options), &options.needs)
+    }
+
+    /// Most (row, tile) pairs that this device can hold at a time for such needs.
+    #[must_use]
+    pub fn most_pairs(needs: &Needs, device: &GpuDevice) -> u64 {
+        most_pairs(&device.0, needs)
+    }
+}

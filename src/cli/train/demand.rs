@@ -1,0 +1,248 @@
+//! What a run takes, buffer by buffer, for any size of it, before anything of it is allocated. The
+//! ledger of a run and that of `densify plan` are made here, so that they cannot disagree.
+
+use densify_policies::policy::{Needs, SceneInfo};
+use densify_policies::registry::{PolicyEntry, find};
+use glam::DVec3;
+use toml::Table;
+
+use super::TrainArgs;
+use super::choices::parameters;
+use super::setup::{DECODERS, random_count};
+use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
+use crate::cli::console::Console;
+use crate::cli::failure::Failure;
+use crate::cli::run_files::use_threads;
+use crate::cli::scene;
+use crate::dataset::images::ImageDemand;
+use crate::dataset::{Dataset, View};
+use crate::gaussians::sh_coefficients;
+use crate::init::usable_points;
+use crate::memory::{Ledger, Section, Setting, peak_resident, resident};
+use crate::metrics::scratch_bytes;
+use crate::output::{InitChoice, SceneConfig};
+use crate::schedule::Background;
+use crate::trainer::needs;
+
+/// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
+/// Measured at 10 to 13 MiB.
+const PROGRAM: u64 = 14 << 20;
+/// A program that takes more, such as one with a driver in it, is taken at what it has, in these
+/// steps: what is promised should not change from call to call.
+const PROGRAM_STEP: u64 = 8 << 20;
+/// What the system's allocator keeps between two uses of a piece. Measured at up to 5 MiB.
+const KEPT: u64 = 6 << 20;
+/// A point with its colour.
+const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
+
+/// What is known of a run before its size is.
+pub(super) struct Survey {
+    pub(super) entry: &'static PolicyEntry,
+    /// The policy's parameters as set.
+    pub(super) parameters: Table,
+    pub(super) device: Option<GpuDevice>,
+    pub(super) scene: SceneConfig,
+    pub(super) dataset: Dataset,
+    /// What training and test images take.
+    images: [ImageDemand; 2],
+    /// Rows that a start on the dataset's points would have, were there no limit.
+    usable: usize,
+    /// Resident memory when the dataset was loaded, and the most until then.
+    resident: Option<u64>,
+    peak: Option<u64>,
+}
+
+impl Survey {
+    /// Loads the dataset and opens the device.
+    pub(super) fn of(args: &TrainArgs, console: &Console) -> Result<Self, Failure> {
+        let entry = find(&args.policy)?;
+        let parameters = parameters(args, entry)?;
+        let device = args.device.open(console)?;
+        use_threads(args.threads);
+        let scene = args.data.config(&args.scene);
+        let dataset = scene::load(&args.scene, &scene, console)?;
+        console.say(scene::describe(&args.scene, &dataset));
+        let usable = usable_points(&dataset.points);
+        let images = images(&dataset);
+        let (resident, peak) = (resident(), peak_resident());
+        Ok(Self { entry, parameters, device, scene, dataset, images, usable, resident, peak })
+    }
+
+    /// The same with images of another size; `None` where there are none of it.
+    pub(super) fn at_resolution(&self, args: &TrainArgs, resolution: u32) -> Option<Self> {
+        let scene = SceneConfig { resolution: Some(resolution), ..self.scene.clone() };
+        let dataset = scene::read(&args.scene, &scene).ok()?;
+        let parameters = self.parameters.clone();
+        let device = self.device.clone();
+        let images = images(&dataset);
+        Some(Self { dataset, images, scene, parameters, device, ..*self })
+    }
+
+    /// How the first rows are placed, unless a checkpoint says.
+    pub(super) fn init(&self, args: &TrainArgs) -> InitChoice {
+        match args.init {
+            Some(init) => init.into(),
+            None if self.dataset.points.is_empty() || args.init_points.is_some() => {
+                InitChoice::Random
+            }
+            None => InitChoice::Points,
+        }
+    }
+
+    /// Rows that the scene starts with, were there no limit; `None` where the limit decides.
+    pub(super) fn start(&self, args: &TrainArgs) -> Option<usize> {
+        match self.init(args) {
+            InitChoice::Points => Some(self.usable),
+            InitChoice::Random => args.init_points,
+        }
+    }
+
+    fn initial_rows(&self, args: &TrainArgs, budget: usize) -> usize {
+        self.start(args).unwrap_or_else(|| random_count(budget)).min(budget)
+    }
+
+    /// The scene as policies see it.
+    pub(super) fn info(
+        &self,
+        args: &TrainArgs,
+        budget: usize,
+        initial_rows: usize,
+    ) -> Result<SceneInfo, Failure> {
+        Ok(SceneInfo {
+            extent: self.dataset.extent() as f32,
+            train_views: u32::try_from(self.dataset.train.len())
+                .map_err(|_| Failure::input("the scene has more than 4 billion views"))?,
+            budget,
+            initial_rows,
+            iterations: args.iterations,
+            white_background: self.scene.background == Background::White,
+        })
+    }
+
+    /// What a run with so many rows needs of its backend.
+    pub(super) fn needs(&self, args: &TrainArgs, rows: usize) -> Result<Needs, Failure> {
+        let scene = self.info(args, rows, self.initial_rows(args, rows))?;
+        let policy = self.entry.build(&self.parameters, &scene)?;
+        Ok(needs(policy.as_ref(), &scene, args.sh_every))
+    }
+
+    /// How the native backend is made.
+    pub(super) fn cpu(&self, args: &TrainArgs, setting: &Setting, needs: Needs) -> CpuOptions {
+        CpuOptions {
+            budget: setting.rows,
+            near: self.near(args),
+            tile_cap: setting.tile_cap,
+            threads: args.threads.map(usize::from),
+            largest_image: scene::largest_image(&self.dataset),
+            needs,
+        }
+    }
+
+    /// How the GPU backend is made.
+    pub(super) fn gpu(&self, args: &TrainArgs, setting: &Setting, needs: Needs) -> GpuOptions {
+        GpuOptions {
+            budget: setting.rows,
+            near: self.near(args),
+            tile_cap: Some(setting.tile_cap),
+            largest_image: scene::largest_image(&self.dataset),
+            needs,
+        }
+    }
+
+    fn near(&self, args: &TrainArgs) -> f32 {
+        (args.near * self.dataset.extent()) as f32
+    }
+
+    /// Everything that a run takes with these needs, on so many threads.
+    pub(super) fn ledger(
+        &self,
+        args: &TrainArgs,
+        setting: &Setting,
+        needs: &Needs,
+        threads: usize,
+    ) -> Ledger {
+        let degree = setting.sh_degree;
+        let mut ledger = match &self.device {
+            Some(device) => {
+                GpuBackend::promise(degree, &self.gpu(args, setting, needs.clone()), device)
+            }
+            None => CpuBackend::promise(degree, &self.cpu(args, setting, needs.clone()), threads),
+        };
+        let [train, test] = self.images;
+        let held = train.held(setting.image_cache);
+        ledger.add_to(Section::Images, "decoded training views", held);
+        ledger.add_to(Section::Images, "decoding", train.decoding(DECODERS));
+        let budget = setting.rows as u64;
+        let float = size_of::<f32>() as u64;
+        let row = float * (11 + 3 * sh_coefficients(degree) as u64);
+        let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
+        // Points, their order, neighbours in f64, and the rows before the backend has them.
+        let first = self.initial_rows(args, setting.rows) as u64;
+        let points = args.init_points.unwrap_or(self.dataset.points.len()) as u64;
+        pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
+        pass("a policy's event", self.event_bytes(setting, needs));
+        // The model as downloaded and as exported.
+        pass("export of the model, checkpoint", 2 * budget * row);
+        if !self.dataset.test.is_empty() {
+            let (width, height) = scene::largest_image(&self.dataset);
+            let rendering = u64::from(width) * u64::from(height) * 5 * float;
+            let image = test.held(0) + test.decoding(1);
+            pass("measuring a test view", rendering + image + scratch_bytes(width, threads));
+        }
+        let process = self.process_bytes();
+        if let Some(beyond) = self.peak.and_then(|peak| peak.checked_sub(process)) {
+            ledger.add_to(Section::Passing, "loading the scene", beyond);
+        }
+        ledger.add_to(Section::Process, "program and dataset", process);
+        ledger
+    }
+
+    /// Signals and candidates on the host; fates, families and slots of the plan.
+    fn event_bytes(&self, setting: &Setting, needs: &Needs) -> u64 {
+        let float = size_of::<f32>() as u64;
+        let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
+        let seed = size_of::<densify_policies::plan::Seed>() as u64;
+        let signals = needs.signals.iter().count() as u64;
+        let candidates = needs.candidates.map_or(0, |request| request.capacity) as u64;
+        // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
+        let aux = needs.aux.as_ref();
+        let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
+        let points = aux.map_or(0, |request| u64::from(request.points));
+        // A point is kept by the policy, becomes a seed, and is compiled.
+        setting.rows as u64 * ((signals + columns) * float + 64)
+            + candidates * candidate
+            + points * self.dataset.train.len() as u64 * (candidate + 3 * seed)
+    }
+
+    /// The program and the dataset, but for what the ledger has besides. A number that does not
+    /// depend on what else the process has done, where it takes no more than expected.
+    fn process_bytes(&self) -> u64 {
+        let Dataset { train, test, points, .. } = &self.dataset;
+        let views = train.iter().chain(test);
+        let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
+        // A view's name and path; it is there once more for its images.
+        let view = |view: &View| (3 * size_of::<View>() + 512) as u64 + rendered(view);
+        let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT;
+        let program = match self.resident {
+            Some(resident) if resident > expected => resident.next_multiple_of(PROGRAM_STEP),
+            _ => expected,
+        };
+        program + KEPT
+    }
+
+    /// What of a ledger `--memory` bounds: the device where there is one, else all of it.
+    pub(super) fn bounded(&self, ledger: &Ledger) -> u64 {
+        if self.device.is_some() { ledger.on_device() } else { ledger.total() }
+    }
+
+    /// Bytes of all training images decoded.
+    pub(super) fn all_images(&self) -> u64 {
+        self.images[0].all
+    }
+}
+
+fn images(dataset: &Dataset) -> [ImageDemand; 2] {
+    let of = |views: &[View]| ImageDemand::of(views.iter().map(|view| &view.source));
+    [of(&dataset.train), of(&dataset.test)]
+}

@@ -1,0 +1,177 @@
+//! What the solver promises, on any run whose bytes grow as those of a backend do.
+
+use std::convert::Infallible;
+
+use proptest::prelude::*;
+
+use super::*;
+
+/// Bytes of a run that is none: what matters is how they grow.
+#[derive(Debug, Clone)]
+struct Model {
+    fixed: u64,
+    per_row: u64,
+    per_coefficient: u64,
+    per_pair: u64,
+    largest_image: u64,
+    all_images: u64,
+}
+
+impl Model {
+    fn bytes(&self, setting: &Setting) -> u64 {
+        let Setting { rows, sh_degree, tile_cap, image_cache } = *setting;
+        let coefficients = (u64::from(sh_degree) + 1).pow(2);
+        let rows = rows.next_multiple_of(16) as u64;
+        let held = image_cache.max(2 * self.largest_image) + self.largest_image;
+        self.fixed
+            + rows * (self.per_row + coefficients * self.per_coefficient)
+            + tile_cap as u64 * self.per_pair
+            + held.min(self.all_images)
+    }
+
+    fn fit(&self, wishes: &Wishes) -> Option<Fit> {
+        let bytes = |setting: &Setting| Ok::<_, Infallible>(self.bytes(setting));
+        fit(wishes, bytes).unwrap_or_else(|never| match never {})
+    }
+}
+
+fn models() -> impl Strategy<Value = Model> {
+    let sizes = (0..50_000_000_u64, 1..500_u64, 1..100_u64, 1..80_u64, 1..1_000_000_u64);
+    (sizes, 1..300_u64).prop_map(|(sizes, views)| {
+        let (fixed, per_row, per_coefficient, per_pair, largest_image) = sizes;
+        let all_images = views * largest_image;
+        Model { fixed, per_row, per_coefficient, per_pair, largest_image, all_images }
+    })
+}
+
+fn wishes(model: &Model, memory: u64) -> Wishes {
+    Wishes {
+        memory,
+        least_rows: 1_000,
+        enough_rows: 20_000,
+        most_rows: u32::MAX as usize,
+        sh_degree: 0..=3,
+        tile_cap: None,
+        most_pairs: u32::MAX as usize,
+        image_cache: None,
+        all_images: model.all_images,
+    }
+}
+
+proptest! {
+    #[test]
+    fn what_is_found_fits_and_a_row_more_does_not(
+        model in models(),
+        memory in 0..2_000_000_000_u64,
+        most in prop_oneof![Just(u32::MAX as usize), 1..200_000_usize],
+        tile_cap in prop_oneof![Just(None), (1..500_000_usize).prop_map(Some)],
+        image_cache in prop_oneof![Just(None), (0..200_000_000_u64).prop_map(Some)],
+        lowest in 0..=3_u8,
+    ) {
+        let wishes = Wishes {
+            most_rows: most,
+            tile_cap,
+            image_cache,
+            sh_degree: lowest..=3,
+            ..wishes(&model, memory)
+        };
+        let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(&wishes) else {
+            let least = wishes.setting(1_000.min(most), lowest, PAIRS[0]);
+            prop_assert!(model.bytes(&least) > memory);
+            return Ok(());
+        };
+        prop_assert!(model.bytes(&setting) <= memory);
+        prop_assert!(setting.rows <= most && setting.rows <= setting.tile_cap);
+        prop_assert_eq!(by_memory, setting.rows < most);
+        // What was given is kept.
+        prop_assert!(setting.sh_degree >= lowest);
+        prop_assert!(tile_cap.is_none_or(|cap| setting.tile_cap == cap.max(setting.rows)));
+        prop_assert!(image_cache.is_none_or(|cache| setting.image_cache == cache));
+        if by_memory {
+            let more = wishes.setting(setting.rows + 1, setting.sh_degree, PAIRS[0]);
+            prop_assert!(model.bytes(&more) > memory);
+        } else {
+            let more = wishes.setting(setting.rows, setting.sh_degree, PAIRS[2]);
+            prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
+            let images = Setting { image_cache: model.all_images, ..setting };
+            prop_assert!(
+                image_cache.is_some()
+                    || setting.image_cache == model.all_images
+                    || model.bytes(&images) > memory
+            );
+        }
+        // A lower degree needs a reason.
+        let enough = 20_000.min(most);
+        prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
+        if setting.sh_degree < 3 {
+            let higher = wishes.setting(enough, setting.sh_degree + 1, PAIRS[0]);
+            prop_assert!(model.bytes(&higher) > memory);
+        }
+    }
+
+    #[test]
+    fn more_memory_is_never_a_smaller_model(
+        model in models(),
+        memory in 0..2_000_000_000_u64,
+        more in 0..200_000_000_u64,
+    ) {
+        let size = |memory| {
+            let fit = model.fit(&wishes(&model, memory));
+            fit.map(|fit| (fit.setting.sh_degree, fit.setting.rows))
+        };
+        prop_assert!(size(memory) <= size(memory + more));
+    }
+
+    #[test]
+    fn the_least_memory_is_the_least(model in models(), step in 1..2_000_000_u64) {
+        let wishes = wishes(&model, 0);
+        let bytes = |setting: &Setting| Ok::<_, Infallible>(model.bytes(setting));
+        let least = least_memory(&wishes, step, bytes).unwrap_or_else(|never| match never {});
+        let least = least.expect("a number");
+        prop_assert!(least.is_multiple_of(step));
+        let fits = |memory| model.fit(&Wishes { memory, ..wishes.clone() }).is_some();
+        prop_assert!(fits(least));
+        prop_assert!(least < step || !fits(least - step));
+    }
+}
+
+#[test]
+fn a_degree_is_lowered_only_for_the_rows_that_the_scene_starts_with() {
+    let model = Model {
+        fixed: 0,
+        per_row: 100,
+        per_coefficient: 36,
+        per_pair: 0,
+        largest_image: 0,
+        all_images: 0,
+    };
+    // 676, 424, 244 and 136 bytes a row at degrees 3 to 0.
+    for (memory, degree, rows) in [
+        (20_000 * 676, 3, 20_000),
+        (20_000 * 676 - 1, 2, 31_872),
+        (20_000 * 244, 1, 20_000),
+        (19_999 * 136, 0, 19_984),
+        (1_008 * 136, 0, 1_008),
+    ] {
+        let found = model.fit(&wishes(&model, memory)).expect("it fits").setting;
+        assert_eq!((found.sh_degree, found.rows), (degree, rows), "{memory}");
+    }
+    assert_eq!(model.fit(&wishes(&model, 1_008 * 136 - 1)), None);
+}
+
+#[test]
+fn errors_are_passed_on() {
+    let wishes = wishes(
+        &Model {
+            fixed: 0,
+            per_row: 1,
+            per_coefficient: 1,
+            per_pair: 1,
+            largest_image: 1,
+            all_images: 1,
+        },
+        100,
+    );
+    assert_eq!(fit(&wishes, |_| Err::<u64, _>("no")), Err("no"));
+    assert_eq!(least_memory(&wishes, 1, |_| Err::<u64, _>("no")), Err("no"));
+}

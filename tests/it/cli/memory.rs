@@ -1,0 +1,219 @@
+//! `--memory` and `densify plan`: what is promised is kept, plan and train agree, and what fits no
+//! model is refused with what would.
+
+use std::path::Path;
+
+use densify_policies::registry::{find, policies};
+use serde_json::Value;
+
+use super::{Outcome, densify, files, json, often, read, records, scratch, text};
+use crate::photographs::Photographs;
+
+const MIB: u64 = 1 << 20;
+
+fn call(command: &str, scene: &Path, flags: &str) -> Outcome {
+    let mut arguments = vec![command, text(scene), "--backend", "cpu"];
+    arguments.extend(flags.split_whitespace());
+    densify(&arguments)
+}
+
+fn train(scene: &Path, run: &Path, flags: &str) -> Outcome {
+    call("train", scene, &format!("-o {} {flags}", text(run)))
+}
+
+/// The ledger in what was said.
+fn ledger(outcome: &Outcome) -> &str {
+    let start = outcome.stdout.find("memory promised").expect("a ledger");
+    let table = &outcome.stdout[start..];
+    let total = table.find("\n  total").expect("its total");
+    let end = table[total + 1..].find('\n').map_or(table.len(), |end| total + 1 + end);
+    &table[..end]
+}
+
+/// The line that says how many rows there may be.
+fn budget(outcome: &Outcome) -> &str {
+    let mut lines = outcome.stdout.lines();
+    lines.find(|line| line.starts_with("budget ")).expect("a budget")
+}
+
+fn count(value: &Value, key: &str) -> u64 {
+    value[key].as_u64().unwrap_or_else(|| panic!("no count {key} in {value}"))
+}
+
+#[test]
+fn plan_says_what_train_promises_and_writes_nothing() {
+    let scene = Photographs::colmap_text();
+    let mut cases = vec![
+        "--memory 48MiB --eval".to_owned(),
+        "--memory 64MiB --sh-degree 1 --tile-cap 90k --image-cache 10kB -r 2".to_owned(),
+        "--memory 256MiB --budget 3k --init random --threads 1".to_owned(),
+        "--budget 700 --test-every 5 --init-points 50".to_owned(),
+        String::new(),
+    ];
+    let all = policies().expect("the registry is sound");
+    cases.extend(all.iter().map(|entry| format!("--policy {} --memory 80MiB --eval", entry.name)));
+    for flags in cases {
+        let (root, run) = scratch();
+        let flags = format!("{flags} --iterations 2");
+        let planned = call("plan", scene.path(), &format!("-o {} {flags}", text(&run))).ok();
+        assert!(files(root.path()).is_empty(), "{flags}: {:?}", files(root.path()).keys());
+        let trained = train(scene.path(), &run, &flags).ok();
+        assert_eq!(ledger(&planned), ledger(&trained), "{flags}");
+        assert_eq!(budget(&planned), budget(&trained), "{flags}");
+        let summary = json(&run.join("stats/summary.json"));
+        let rows = format!("budget   {}", grouped(count(&summary, "budget")));
+        assert!(budget(&planned).starts_with(&rows), "{flags}: {}", budget(&planned));
+        for said in ["rows that --memory", "-r 1 (48x40)", "-r 4 (12x10)", "degree 3"] {
+            assert!(planned.stdout.contains(said), "{flags}: {said:?} in {}", planned.stdout);
+        }
+    }
+}
+
+fn grouped(number: u64) -> String {
+    match (number / 1000, number % 1000) {
+        (0, rest) => rest.to_string(),
+        (thousands, rest) => format!("{},{rest:03}", grouped(thousands)),
+    }
+}
+
+#[test]
+fn a_run_takes_no_more_than_it_is_given() {
+    let scene = Photographs::transforms();
+    for (memory, policy, points) in
+        [(48, "diet", "17k"), (64, "taming", "30k"), (64, "mcmc", "100k")]
+    {
+        let (_root, run) = scratch();
+        // Every row is there from the start, and edits come, so that all of the promise is needed.
+        let often = often(find(policy).expect("it is registered"));
+        let flags = format!("--policy {policy} {often} --init-points {points}");
+        let flags = format!("{flags} --memory {memory}MiB --eval --iterations 12");
+        train(scene.path(), &run, &format!("{flags} --test-iterations 3 --checkpoint-every 5"))
+            .ok();
+        let summary = json(&run.join("stats/summary.json"));
+        let (budget, promised) = (count(&summary, "budget"), count(&summary, "ledger_bytes"));
+        assert_eq!(count(&summary, "memory"), memory * MIB, "{flags}");
+        assert!(promised <= memory * MIB, "{flags}: {promised} promised");
+        // As many as fit: a tenth more would not.
+        assert!(
+            budget > 5_000 && promised > memory * MIB * 9 / 10,
+            "{flags}: {budget}, {promised}"
+        );
+        assert!(count(&summary, "peak_rows") > budget / 2, "{flags}: {summary}");
+        if let Some(peak) = summary["peak_bytes"].as_u64() {
+            assert!(peak <= memory * MIB, "{flags}: a peak of {peak}");
+            assert!(peak * 100 <= promised * 105, "{flags}: a peak of {peak}, {promised} promised");
+            let log = records(&run.join("stats/train.jsonl"));
+            let resident = count(&log[log.len() - 1], "resident_bytes");
+            assert!(resident > MIB && resident <= peak, "{flags}: {resident} of {peak}");
+        }
+    }
+}
+
+#[test]
+fn on_a_gpu_it_bounds_what_is_on_the_device() {
+    let scene = Photographs::colmap_text();
+    for device in crate::gpu::subjects() {
+        let (root, run) = scratch();
+        let name = &device.adapter().name;
+        let flags = ["--gpu", name, "--memory", "48MiB", "--iterations", "2", "--eval"];
+        let call = |command: &str| {
+            let arguments = [command, text(scene.path()), "-o", text(&run)];
+            densify(&[&arguments[..], &flags].concat())
+        };
+        let planned = call("plan").ok();
+        assert!(files(root.path()).is_empty(), "{name}");
+        let trained = call("train").ok();
+        assert_eq!(budget(&planned), budget(&trained), "{name}");
+        let summary = json(&run.join("stats/summary.json"));
+        let lines = summary["ledger"]["lines"].as_array().expect("lines");
+        let on_device = lines.iter().filter(|line| line["on_device"] == true);
+        let bytes: u64 = on_device.map(|line| count(line, "bytes")).sum();
+        // What the backend allocates is the ledger: `what_is_allocated_is_what_the_ledger_says`.
+        assert!(bytes <= 48 * MIB && bytes > 47 * MIB, "{name}: {bytes}");
+        assert!(planned.stdout.contains("on the device"), "{name}: {}", planned.stdout);
+    }
+}
+
+#[test]
+fn the_smaller_of_two_limits_holds() {
+    let scene = Photographs::colmap_text();
+    let plan = |flags: &str| call("plan", scene.path(), flags).ok();
+    let by_budget = plan("--budget 500 --memory 1GiB");
+    assert_eq!(
+        budget(&by_budget),
+        "budget   500 rows: --memory 1.0 GiB would hold as many or more"
+    );
+    let by_memory = plan("--budget 3M --memory 64MiB");
+    assert!(budget(&by_memory).ends_with("holds fewer than --budget 3,000,000"));
+    assert_eq!(budget(&plan("--memory 64MiB")), budget(&plan("--memory 64MiB --threads 5")));
+    assert_ne!(budget(&plan("--memory 64MiB")), budget(&plan("--memory 65MiB")));
+}
+
+#[test]
+fn the_degree_is_lowered_for_the_points_of_the_scene_only() {
+    let scene = Photographs::colmap_text();
+    let plan = |flags: &str| call("plan", scene.path(), flags).ok().stdout;
+    assert!(plan("--memory 40MiB").contains("degree 3,"));
+    let lowered = plan("--memory 64MiB --init-points 45k");
+    assert!(!lowered.contains("degree 3,") && lowered.contains("instead of 3"), "{lowered}");
+    let kept = plan("--memory 64MiB --init-points 45k --sh-degree 3");
+    assert!(kept.contains("degree 3,") && !kept.contains("instead"), "{kept}");
+}
+
+#[test]
+fn a_memory_that_holds_no_model_is_refused_with_one_that_does() {
+    let scene = Photographs::colmap_text();
+    for flags in
+        ["", "--eval --sh-degree 3", "--tile-cap 100k", "--policy taming --image-cache 1MiB"]
+    {
+        let (root, run) = scratch();
+        let outcome = train(scene.path(), &run, &format!("--memory 1MiB {flags}"));
+        outcome.refused(flags, &["--memory 1.0 MiB", "1,000 rows", "give --memory"]);
+        assert!(files(root.path()).is_empty(), "{flags}");
+        let told = outcome.stderr.split("give --memory ").nth(1).expect("a remedy");
+        let mib = told.split("MiB").next().expect("a number");
+        let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{told}: {e}"));
+        let plan = |mib: u64| call("plan", scene.path(), &format!("--memory {mib}MiB {flags}"));
+        plan(mib).ok();
+        plan(mib - 1).refused(flags, &["give --memory"]);
+    }
+    let refused = |flags: &str, words| call("plan", scene.path(), flags).refused(flags, words);
+    refused("--memory 1MiB --tile-cap 900k", &["without --tile-cap"]);
+    refused("--memory 0", &["--memory 0 B"]);
+    refused("--memory plenty", &["--memory", "plenty", "512MiB"]);
+    refused("--resume", &["--resume"]);
+}
+
+#[test]
+fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let flags = "--iterations 6 --checkpoint-every 3";
+    train(scene.path(), &run, &format!("--memory 48MiB {flags}")).ok();
+    let before = files(&run);
+    let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
+    let config: toml::Table = config.parse().expect("config.toml is TOML");
+    let chosen = |table: &str, key: &str| config[table][key].as_integer();
+    assert_eq!(chosen("train", "memory"), Some(48 << 20));
+    let rows = chosen("train", "budget").expect("a budget");
+    assert_eq!(chosen("train", "tile_cap"), Some(4 * rows));
+    assert!(chosen("scene", "image_cache").is_some());
+    for (flags, words) in [
+        ("--memory 49MiB", ["--memory: 51380224 now", "50331648 in the checkpoint"]),
+        ("--budget 300", ["--budget: 300 now", "in the checkpoint"]),
+        ("--sh-degree 2", ["--sh-degree: 2 now", "3 in the checkpoint"]),
+        // It changes no byte of the result, but is more than was allowed.
+        ("--tile-cap 10M", ["--memory 48.0 MiB", "lower --tile-cap"]),
+    ] {
+        train(scene.path(), &run, &format!("--resume {flags}")).refused(flags, &words);
+        assert!(files(&run) == before, "{flags} touched the run");
+    }
+    let last = "checkpoints/iteration_6.safetensors";
+    let model = "point_cloud/iteration_6/point_cloud.ply";
+    for file in [last, model] {
+        std::fs::remove_file(run.join(file)).expect("it was there");
+    }
+    train(scene.path(), &run, "--resume --memory 48MiB --checkpoint-every 3").ok();
+    assert!(files(&run)[model] == before[model]);
+    assert!(files(&run)["config.toml"] == before["config.toml"]);
+}
