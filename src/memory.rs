@@ -4,12 +4,14 @@
 //! budget. The ledger lists them, so that a user learns before training whether a run fits.
 
 mod fit;
+mod grant;
 
 use std::fmt;
 
 use serde::Serialize;
 
 pub use fit::{Fit, Setting, Wishes, fit, least_memory};
+pub use grant::{Grant, grant};
 
 /// What is allocated, line by line.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -111,6 +113,12 @@ impl Ledger {
             self.lines.iter().partition(|line| line.section == Section::Passing);
         let lasting = lasting.iter().fold(0_u64, |sum, line| sum.saturating_add(line.bytes));
         lasting.saturating_add(passing.iter().map(|line| line.bytes).max().unwrap_or(0))
+    }
+
+    /// What of the [total](Self::total) does not lie in the memory of a GPU `[bytes]`.
+    #[must_use]
+    pub fn on_host(&self) -> u64 {
+        self.total().saturating_sub(self.on_device())
     }
 
     /// Sum of what lies in the memory of a GPU `[bytes]`, where all of it lasts.

@@ -79,6 +79,8 @@ pub(super) fn prepare(
         None => Size::choose(args, &survey)?,
     };
     let setting = size.setting;
+    let needed = survey.needs(args, setting.rows)?;
+    size::check_grant(args, &survey.ledger(args, &setting, &needed, size::threads(args)))?;
     let (mut model, init, init_points) = match &mut checkpoint {
         None => first_model(args, &survey, &setting, console)?,
         Some(checkpoint) => {

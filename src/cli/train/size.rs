@@ -1,12 +1,15 @@
 //! How large a run is: as the options say, or solved for `--memory`.
 
 use super::demand::Survey;
+use super::setup::DECODERS;
 use super::{DEFAULT_BUDGET, DEFAULT_SH_DEGREE, TrainArgs};
 use crate::backend::gpu::GpuBackend;
-use crate::cli::failure::Failure;
+use crate::cli::failure::{DEVICE, Failure};
 use crate::cli::number::grouped;
 use crate::cli::scene::DEFAULT_IMAGE_CACHE;
-use crate::memory::{Bytes, Fit, Ledger, Setting, Wishes, fit, least_memory};
+use crate::memory::{
+    Bytes, Fit, Grant, Ledger, Setting, Wishes, fit, grant, least_memory, resident,
+};
 
 /// (Row, tile) pairs per row of the budget, where memory is not given.
 const PAIRS_PER_ROW: usize = 16;
@@ -118,6 +121,27 @@ pub(super) fn check(args: &TrainArgs, survey: &Survey, ledger: &Ledger) -> Resul
         ))),
         _ => Ok(()),
     }
+}
+
+/// Fails where the system does not grant this process what a run takes.
+pub(super) fn check_grant(args: &TrainArgs, ledger: &Ledger) -> Result<(), Failure> {
+    let granted = grant(threads(args) + DECODERS);
+    let (Some(Grant { left, by }), Some(now)) = (granted, resident()) else { return Ok(()) };
+    let more = ledger.on_host().saturating_sub(now);
+    if more <= left {
+        return Ok(());
+    }
+    Err(Failure {
+        code: DEVICE,
+        message: format!(
+            "this run takes {} of the host's memory, of which the process has {}; {by} leaves it {}; \
+             give --memory {}MiB, or lower --budget",
+            Bytes(ledger.on_host()),
+            Bytes(now),
+            Bytes(left),
+            (now + left) / MIB
+        ),
+    })
 }
 
 /// The rows that fit in `memory` at a degree, where nothing else limits them.

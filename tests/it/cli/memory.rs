@@ -217,3 +217,37 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
     assert!(files(&run)[model] == before[model]);
     assert!(files(&run)["config.toml"] == before["config.toml"]);
 }
+
+/// From far too little to plenty, each limit of the address space `[KiB]` ends in a message or in a
+/// model.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_system_that_grants_too_little_is_named_and_nothing_is_written() {
+    let scene = Photographs::colmap_text();
+    let mut refused = 0;
+    let mut trained = 0;
+    for limit in (150_000..=1_350_000).step_by(100_000) {
+        let (root, run) = scratch();
+        let program = env!("CARGO_BIN_EXE_densify");
+        let call = format!(
+            "ulimit -v {limit} && exec {program} train {} -o {} --budget 150k --init random \
+             --iterations 1 --threads 2 --backend cpu --quiet",
+            text(scene.path()),
+            text(&run)
+        );
+        let outcome = std::process::Command::new("sh").args(["-c", &call]).output();
+        let outcome = outcome.expect("a shell");
+        let said = String::from_utf8_lossy(&outcome.stderr);
+        match outcome.status.code() {
+            Some(0) => trained += 1,
+            Some(3) => {
+                assert!(said.starts_with("error: "), "{limit}: {said}");
+                assert!(files(root.path()).is_empty(), "{limit}: {:?}", files(root.path()));
+                let by_limit = said.contains("ulimit -v") && said.contains("give --memory");
+                refused += usize::from(by_limit);
+            }
+            other => panic!("{limit} KiB end in {other:?}: {said}"),
+        }
+    }
+    assert!(refused >= 3 && trained >= 2, "{refused} refused, {trained} trained");
+}
