@@ -20,6 +20,9 @@ pub enum Bench {
     },
     /// A GPU, or what stands for one.
     Gpu(GpuDevice),
+    /// The native backend, which errs on purpose.
+    #[cfg(test)]
+    Sabotaged(super::sabotage::Sabotage),
 }
 
 /// What a backend is made for, beside its model. The default is what the model needs.
@@ -103,6 +106,8 @@ impl Bench {
     pub fn name(&self) -> String {
         match self {
             Self::Native { .. } => "native".into(),
+            #[cfg(test)]
+            Self::Sabotaged(how) => format!("native, with errors in {how:?}"),
             Self::Gpu(device) => {
                 let adapter = device.adapter();
                 format!("{} ({}, {})", adapter.name, adapter.interface, adapter.driver)
@@ -131,6 +136,14 @@ impl Bench {
                 (options.largest_image, options.needs) = (largest_image, needs);
                 Ok(Box::new(CpuBackend::new(model, &options)?))
             }
+            #[cfg(test)]
+            Self::Sabotaged(how) => {
+                let mut options = CpuOptions::new(budget);
+                options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
+                options.needs = needs;
+                let inner = CpuBackend::new(model, &options)?;
+                Ok(Box::new(super::sabotage::Saboteur::new(inner, *how)))
+            }
             Self::Gpu(device) => {
                 let options =
                     GpuOptions { tile_cap, largest_image, needs, ..GpuOptions::new(budget) };
@@ -143,8 +156,8 @@ impl Bench {
     /// exponential of WGSL may be off by 3 + 2·|x| units in the last place.
     pub(super) fn limits(&self) -> Limits {
         match self {
-            Self::Native { .. } => Limits::CPU,
             Self::Gpu(_) => Limits { interior: 1e-4, ..Limits::CPU },
+            _ => Limits::CPU,
         }
     }
 
@@ -153,8 +166,8 @@ impl Bench {
     /// cancellation and none for a wrong term.
     pub(super) fn gradient(&self) -> f64 {
         match self {
-            Self::Native { .. } => 1e-4,
             Self::Gpu(_) => 1e-3,
+            _ => 1e-4,
         }
     }
 }

@@ -10,6 +10,8 @@
 mod bench;
 mod cases;
 mod report;
+#[cfg(test)]
+mod sabotage;
 mod trial;
 pub mod values;
 

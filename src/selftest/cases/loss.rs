@@ -20,8 +20,8 @@ const SIDES: (u32, u32) = (48, 40);
 /// value. Flat images lose most, as C₂ is small beside the rounding of their squares.
 fn tolerances(bench: &Bench) -> (f64, f64) {
     match bench {
-        Bench::Native { .. } => (1e-6, 5e-5),
         Bench::Gpu(_) => (2e-6, 1e-4),
+        _ => (1e-6, 5e-5),
     }
 }
 
@@ -125,7 +125,7 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let (found, gradient) = measure(&mut *backend, &rendered, &target, [0.0; 3])?;
         let off = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
         // The GPU divides by 255 within 2.5 units in the last place.
-        let tolerance = if matches!(trial.bench, Bench::Native { .. }) { 0.0 } else { 3e-7 };
+        let tolerance = if matches!(trial.bench, Bench::Gpu(_)) { 3e-7 } else { 0.0 };
         trial.figure(&what, "loss of equal images", off, tolerance);
         if tolerance == 0.0 {
             let pulled = gradient.iter().filter(|g| g.abs() > 1e-12).count();
