@@ -88,8 +88,8 @@ impl Subject for Saboteur {
             let ModelGradient { means, log_scales, quats, opacity_logits, sh, .. } = &mut gradient;
             let rows = means.as_flattened_mut().iter_mut().chain(log_scales.as_flattened_mut());
             let rest = quats.as_flattened_mut().iter_mut().chain(opacity_logits).chain(sh);
-            let ModelGradient { mean2d, colour, max_weight, .. } = &mut gradient;
             rows.chain(rest).for_each(|g| *g = 1.5 * *g + 0.1);
+            let ModelGradient { mean2d, colour, max_weight, .. } = &mut gradient;
             let statistics = mean2d.as_flattened_mut().iter_mut().chain(colour.as_flattened_mut());
             statistics.chain(max_weight).for_each(|g| *g = 1.5 * *g + 0.1);
             gradient.pixel_count.iter_mut().for_each(|n| *n += 5000);

@@ -36,7 +36,9 @@ pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = straight(5, 4);
     // σ(−5.53) is a little above 1/255.
-    for (rows, logit) in [(2_400_usize, -5.53_f32), (600, -3.0), (20_000, -5.0), (100_000, -5.53)] {
+    let all = [(600_usize, -3.0_f32), (20_000, -5.0), (2_400, -5.53), (100_000, -5.53)];
+    let possible = if trial.bench.ends_loops_early() { 2 } else { all.len() };
+    for &(rows, logit) in &all[..possible] {
         let mut model = Gaussians::default();
         for row in 0..rows {
             let z = 1.0 + row as f32 / rows as f32;
@@ -72,7 +74,7 @@ pub(super) fn behind(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = Gaussians::default();
         for row in 0..41_u8 {
             let z = 1.0 + 0.02 * f32::from(row);
-            let shade = |k: usize| f32::from((row * 7 + k as u8 * 5) % 11) * 0.1 - 0.5;
+            let shade = |k: usize| ((usize::from(row) * 7 + k * 5) % 11) as f32 * 0.1 - 0.5;
             let logit = if row == 0 { logit(opacity) } else { -3.0 };
             let place = [0.02 * z, -0.01 * z, z];
             scenes::push(&mut model, place, [0.4 * z; 3], UPRIGHT, logit, shade);
