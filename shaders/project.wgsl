@@ -57,8 +57,10 @@ fn project(
     let half_height = radius * sqrt(g.cov.z);
     let u = g.ratio.x * frame.lens.x + frame.lens.z;
     let v = g.ratio.y * frame.lens.y + frame.lens.w;
-    sound = below(half_width, LARGEST) && below(half_height, LARGEST) && below(u, LARGEST)
-        && below(v, LARGEST) && below(factor.x, LARGEST) && below(factor.y, LARGEST);
+    // The determinant leaves f32 where a row is some 4e9 px wide; its factors are none then.
+    sound = below(g.det, LARGEST) && below(half_width, LARGEST) && below(half_height, LARGEST)
+        && below(u, LARGEST) && below(v, LARGEST) && below(factor.x, LARGEST)
+        && below(factor.y, LARGEST);
     if !(sound && reaches(u, half_width, frame.image.x) && reaches(v, half_height, frame.image.y)) {
         return;
     }

@@ -26,6 +26,7 @@ mod render;
 mod run_files;
 mod scene;
 mod scenegen;
+mod selftest;
 mod train;
 
 use std::ffi::OsString;
@@ -59,6 +60,7 @@ Examples:
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
   densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
+  densify selftest                                         whether this machine computes what it should
 
 `densify COMMAND --help` explains every option of a command.";
 
@@ -83,6 +85,7 @@ enum Command {
     Devices(devices::DevicesArgs),
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
+    Selftest(selftest::SelftestArgs),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -102,10 +105,12 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
             return u8::try_from(help_or_error.exit_code()).unwrap_or(failure::INPUT);
         }
     };
-    let quiet = matches!(
-        &arguments.command,
-        Command::Train(train) | Command::Plan(train) if train.quiet
-    );
+    let quiet = match &arguments.command {
+        Command::Train(train) | Command::Plan(train) => train.quiet,
+        // Its runs are not the user's, and it names the device itself.
+        Command::Selftest(_) => true,
+        _ => false,
+    };
     let console = Console::new(quiet);
     let done = match arguments.command {
         Command::Train(train) => {
@@ -119,6 +124,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Devices(devices) => devices::run(&devices, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
+        Command::Selftest(selftest) => selftest::run(&selftest, &console),
     };
     match done.and_then(|()| console.finish()) {
         Ok(()) => 0,

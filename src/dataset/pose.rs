@@ -77,9 +77,14 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), D
         }
         let degrees = 2.0 * (0.5 * side / focal).atan().to_degrees();
         if !FIELD_OF_VIEW.contains(&degrees) {
+            let wide = if degrees > *FIELD_OF_VIEW.end() {
+                "; a lens this wide is a fisheye, which is not supported: undistort its images to a pinhole"
+            } else {
+                ""
+            };
             return fault(format!(
                 "the focal length {name} = {focal} px at {side} px means a field of view of {degrees:.2} degrees, \
-                 outside of {FIELD_OF_VIEW:?}"
+                 outside of {FIELD_OF_VIEW:?}{wide}"
             ));
         }
     }
@@ -107,6 +112,29 @@ mod tests {
         assert!(
             checked_pose(Path::new("f"), "g", exact, DVec3::new(0.0, f64::INFINITY, 0.0)).is_err()
         );
+    }
+
+    #[test]
+    fn fields_of_view_that_no_pinhole_has_are_refused() {
+        let check = |degrees: f64| {
+            let focal = 50.0 / (0.5 * degrees.to_radians()).tan();
+            let lens = Lens {
+                width: 100,
+                height: 100,
+                focal: DVec2::splat(focal),
+                // Outside of the image, which is no fault.
+                principal: DVec2::new(-70.0, 130.0),
+                distortion: [0.0; 4],
+            };
+            check_lens(Path::new("f"), "camera 7", &lens)
+        };
+        for degrees in [0.51, 1.0, 120.0, 159.9] {
+            assert!(check(degrees).is_ok(), "{degrees}");
+        }
+        for (degrees, word) in [(0.4, "field of view"), (175.0, "fisheye"), (180.0, "fisheye")] {
+            let message = check(degrees).unwrap_err().to_string();
+            assert!(message.contains(word) && message.contains("camera 7"), "{message}");
+        }
     }
 
     #[test]

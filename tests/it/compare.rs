@@ -8,6 +8,8 @@
 
 use std::fmt::Write as _;
 
+use densify::backend::cpu::ModelGradient;
+
 /// How far two images may differ.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Limits {
@@ -104,6 +106,18 @@ pub(crate) fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f6
     if worst == 0.0 { 0.0 } else { worst / largest }
 }
 
+/// All values of a parameter class of a gradient, row after row.
+pub(crate) fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
+    match name {
+        "means" => gradient.means.as_flattened(),
+        "log_scales" => gradient.log_scales.as_flattened(),
+        "quats" => gradient.quats.as_flattened(),
+        "opacity_logits" => &gradient.opacity_logits,
+        "sh" => &gradient.sh,
+        _ => panic!("no parameter class is called {name}"),
+    }
+}
+
 /// Collects comparisons, so that a failing test shows all of them at once.
 #[derive(Debug)]
 pub(crate) struct Table {
@@ -143,8 +157,7 @@ impl Table {
 
     /// Everything that failed, or `None`.
     fn failures(&self) -> Option<String> {
-        let failed: Vec<_> =
-            self.rows.iter().filter(|row| row.2.is_nan() || row.2 > row.3).collect();
+        let failed: Vec<_> = self.rows().filter(|row| row.2.is_nan() || row.2 > row.3).collect();
         if failed.is_empty() && self.messages.is_empty() {
             return None;
         }
@@ -157,10 +170,22 @@ impl Table {
         for (case, quantity, error, tolerance) in failed {
             let _ = writeln!(text, "  {case:<28} {quantity:<26} {error:9.2e} > {tolerance:.2e}");
         }
-        for message in &self.messages {
+        for message in self.messages() {
             let _ = writeln!(text, "  {message}");
         }
         Some(text)
+    }
+
+    /// All comparisons: case, quantity, error, tolerance.
+    pub(crate) fn rows(&self) -> impl Iterator<Item = (&str, &str, f64, f64)> {
+        self.rows.iter().map(|(case, quantity, error, tolerance)| {
+            (case.as_str(), quantity.as_str(), *error, *tolerance)
+        })
+    }
+
+    /// All failures that have no error to show.
+    pub(crate) fn messages(&self) -> impl Iterator<Item = &str> {
+        self.messages.iter().map(String::as_str)
     }
 
     /// The largest error in units of its tolerance.

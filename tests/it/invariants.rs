@@ -66,8 +66,11 @@ fn words(text: &str) -> impl Iterator<Item = &str> {
     text.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|w| !w.is_empty())
 }
 
+/// Files of the program; those of the tests that `src/selftest/mod.rs` takes into it are among them.
 fn is_production(path: &str) -> bool {
-    ["src/", "policies/src/", "scenegen/src/"].iter().any(|p| path.starts_with(p))
+    let of_tests = ["tests/it/reference/", "tests/it/compare.rs", "tests/it/scenes.rs"];
+    let mut folders = ["src/", "policies/src/", "scenegen/src/"].iter().chain(&of_tests);
+    folders.any(|p| path.starts_with(p))
         && path.ends_with(".rs")
         && !path.ends_with("/tests.rs")
         && !path.contains("/tests/")

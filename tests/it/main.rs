@@ -1,14 +1,16 @@
 //! The integration tests: one binary, so that it links once.
 //!
-//! `reference` is a second renderer in `f64` that shares no arithmetic with the backends;
-//! `oracle` holds both against stored float64 renders; `gradients`, `loss`, `signals` and
-//! `extremes` hold the backend against the reference on scenes of their own; `sameness` compares
+//! `reference` is a second renderer in `f64` that shares no arithmetic with the backends; `central`
+//! checks it by central differences, and `oracle` holds both against stored float64 renders;
+//! `extremes` runs the cases of the selftest and says where every extreme is tested; `signals` and
+//! `loss` hold the rest against the reference; `properties` are of any scene; `sameness` compares
 //! bits; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan
 //! to the backend and to a plain vector; `cli` runs the program on photographs of a small scene;
 //! `fuzz` damages files; `gpu` holds the GPU backend against the native one; `geometry` holds policies
 //! to surfaces that are known; `invariants` keeps the walls of ARCHITECTURE.md standing.
 
 mod aux_views;
+mod central;
 mod cli;
 mod compare;
 mod declared;
@@ -17,11 +19,11 @@ mod extremes;
 mod fuzz;
 mod geometry;
 mod gpu;
-mod gradients;
 mod invariants;
 mod loss;
 mod oracle;
 mod photographs;
+mod properties;
 mod quarantine;
 mod reference;
 mod sameness;

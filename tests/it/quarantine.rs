@@ -4,16 +4,13 @@
 use densify::backend::{Attribute, Backend, Kept, StepInput, Unsound, Values};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
+use densify::selftest::values::{POISON, SLOTS, remove, slot_of};
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::Cadence;
 
-use crate::extremes::{remove, slot_of};
 use crate::scenes;
 use crate::subject::{self, RATES, Resources};
 
-const NONE: [f32; 4] = [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
-/// Numbers of a row of degree 3.
-const SLOTS: usize = 59;
 /// The row that is poisoned where it is one.
 const POISONED: usize = 11;
 /// A slot of each class.
@@ -61,7 +58,7 @@ pub(crate) fn every_number_that_is_none_is_found(make: Make<'_>) {
     let model = scenes::cloud(SLOTS + 3, 3, &camera, 72);
     let mut clean = make(&model);
     assert!(audit(&mut *clean).is_empty());
-    for value in NONE {
+    for value in POISON {
         let mut poisoned = model.clone();
         for slot in 0..SLOTS {
             *slot_of(&mut poisoned, slot, slot) = value;
@@ -89,7 +86,7 @@ pub(crate) fn every_number_that_is_none_is_found(make: Make<'_>) {
         let numbers = sound.shape[1];
         let Values::F32(values) = &mut poisoned.values else { panic!("{name} holds no numbers") };
         for row in 0..numbers {
-            values[row * numbers + row] = NONE[row % 4];
+            values[row * numbers + row] = POISON[row % 4];
         }
         clean.restore(poisoned).expect("they are taken back");
         let found = audit(&mut *clean);

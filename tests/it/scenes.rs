@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::reference::Upstream;
+use super::reference::Upstream;
 
 /// A camera with an arbitrary pose and a principal point off the image's middle.
 pub(crate) fn camera(width: u32, height: u32, seed: u64) -> Camera {

@@ -1,22 +1,14 @@
 //! The backend under test, behind one door: tests name what they vary, and nothing else.
 
 use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
-use densify::backend::{LearningRates, Rendering, StepOutput};
+use densify::backend::{Rendering, StepOutput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 
+pub(crate) use crate::compare::class;
 use crate::reference::Upstream;
-
-/// Step sizes of tests that train: those of the schedule, with means in scene units.
-pub(crate) const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    log_scale: 5e-3,
-    quat: 1e-3,
-    opacity: 0.025,
-    sh_dc: 2.5e-3,
-    sh_rest: 1.25e-4,
-};
+pub(crate) use densify::selftest::values::RATES;
 
 /// What must not change the outcome.
 #[derive(Debug, Clone, Copy, Default)]
@@ -75,16 +67,4 @@ pub(crate) fn loss(
     };
     let empty = Gaussians::default();
     backend(&empty, Resources::default()).loss(&rendering, target, background)
-}
-
-/// All values of a parameter class of a gradient, row after row.
-pub(crate) fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
-    match name {
-        "means" => gradient.means.as_flattened(),
-        "log_scales" => gradient.log_scales.as_flattened(),
-        "quats" => gradient.quats.as_flattened(),
-        "opacity_logits" => &gradient.opacity_logits,
-        "sh" => &gradient.sh,
-        _ => panic!("no parameter class is called {name}"),
-    }
 }

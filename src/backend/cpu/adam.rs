@@ -136,3 +136,68 @@ fn clamp<S: Simd>(s: S, x: V<S>, [least, most]: [f32; 2]) -> V<S> {
     let x = x.lt(least).select(least, x);
     most.lt(x).select(most, x)
 }
+
+#[cfg(test)]
+mod tests {
+    use pulp::{Arch, WithSimd};
+
+    use super::*;
+    use crate::selftest::values::RATES;
+
+    /// Steps of one plane of means, each lane with a gradient of its own.
+    struct Steps<'a> {
+        gradients: [f32; WIDTH],
+        count: usize,
+        bias: &'a BiasCorrection,
+        /// The parameters after each step, and the moments at the end.
+        path: &'a mut Vec<[f32; WIDTH]>,
+        moments: &'a mut [[f32; WIDTH]; 2],
+    }
+
+    impl WithSimd for Steps<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, s: S) {
+            let Self { gradients, count, bias, path, moments: [m, v] } = self;
+            let (mut params, mut ages) = ([0.0; WIDTH], [0; WIDTH]);
+            for _ in 0..count {
+                let moments = [&mut m[..], &mut v[..]];
+                step(s, &mut params, moments, &mut ages, &gradients, 0..1, &RATES, bias);
+                path.push(params);
+            }
+        }
+    }
+
+    /// With a gradient that stays the same, whatever its size, each step is one learning rate long:
+    /// unless its square is nothing in f32, when it is shorter, or infinite, when there is none and the
+    /// moment says so.
+    #[test]
+    fn a_thousand_steps_of_any_size() {
+        let sizes = [0.0, 1e-45, 1e-23, 1e-15, 1e-6, 1.0, 1e19, 1e30];
+        let mut gradients = [0.0; WIDTH];
+        for (lane, gradient) in gradients.iter_mut().enumerate() {
+            *gradient = sizes[lane % 8] * if lane < 8 { 1.0 } else { -1.0 };
+        }
+        let bias = BiasCorrection::new();
+        let (mut path, mut moments) = (vec![[0.0; WIDTH]], [[0.0; WIDTH]; 2]);
+        let count = 1000;
+        let steps = Steps { gradients, count, bias: &bias, path: &mut path, moments: &mut moments };
+        Arch::new().dispatch(steps);
+        for (lane, gradient) in gradients.into_iter().enumerate() {
+            let rate = f64::from(RATES.mean);
+            for (n, pair) in path.windows(2).enumerate() {
+                let length = f64::from(pair[0][lane] - pair[1][lane]) / rate;
+                assert!(length.abs() <= 1.01, "step {n} of {gradient:e}: {length}");
+                if (1e-12..=1e19).contains(&gradient.abs()) {
+                    let off = (length - f64::from(gradient.signum())).abs();
+                    // A sum of a thousand rates of 1e-3 has an error of 2⁻²⁵ in each of them.
+                    assert!(off < 5e-3, "step {n} of {gradient:e}: {length}");
+                }
+            }
+            let is_lost = !moments[1][lane].is_finite();
+            assert_eq!(is_lost, gradient.abs() > 2e19, "{gradient:e}: {:e}", moments[1][lane]);
+            assert!(path[count][lane].is_finite());
+        }
+    }
+}

@@ -78,3 +78,28 @@ pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
     };
     Vec::<u8>::new().try_reserve_exact(size).map_err(|_| failed)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::cpu::CpuBackend;
+    use crate::gaussians::Gaussians;
+
+    /// Around 2³¹ and 2³² rows, and as many as a slot can name and more.
+    #[test]
+    fn huge_budgets_are_refused_and_do_not_wrap() {
+        let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
+        for budget in [1 << 31, (1_usize << 32) - 1, 1 << 32, 1 << 40] {
+            let options = CpuOptions { threads: Some(1), ..CpuOptions::new(budget) };
+            let ledger = ledger(3, &options, 1);
+            // Parameters and moments: 59 numbers of four bytes, three times.
+            let model_bytes = 3 * 59 * 4 * budget as u128;
+            assert!(u128::from(ledger.total()) >= model_bytes, "{budget} rows");
+            assert!(tile_cap(&options) <= u32::MAX as usize, "a slot is a u32");
+        }
+        // More than there are addresses for: refused before anything is allocated.
+        let options = CpuOptions { threads: Some(1), ..CpuOptions::new(1 << 40) };
+        let refused = CpuBackend::new(&model, &options).expect_err("a petabyte");
+        assert!(matches!(refused, BackendError::OutOfMemory { .. }), "{refused}");
+    }
+}

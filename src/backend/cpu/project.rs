@@ -314,7 +314,8 @@ impl WithSimd for Project<'_> {
                 // How far the exponent may fall; <= 0 where even the centre is below 1/255.
                 let reach = log2_opacity + LOG2_255;
                 let opaque = V::zero(s).lt(reach);
-                let alive = in_front.and(opaque).and(sound);
+                // The determinant leaves f32 where a row is some 4·10⁹ px wide; its factors are none then.
+                let alive = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
                 if !alive.any() {
                     continue;
                 }

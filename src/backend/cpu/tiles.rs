@@ -137,21 +137,11 @@ impl TileLists {
     pub(super) fn bands(&mut self, visible: Visible<'_>, grid: &Grid) -> (Vec<Range<usize>>, u64) {
         let tiles = grid.tiles();
         self.count(visible, grid, 0..tiles);
-        let cap = self.cap() as u64;
-        let mut bands = Vec::with_capacity(1);
-        let (mut start, mut held, mut total) = (0, 0, 0);
-        for tile in 0..tiles {
+        let entries = (0..tiles).map(|tile| {
             let counters = self.counters[tile..].iter().step_by(tiles);
-            let here: u64 = counters.map(|&n| u64::from(n)).sum();
-            if held + here > cap {
-                bands.push(start..tile);
-                (start, held) = (tile, 0);
-            }
-            held += here;
-            total += here;
-        }
-        bands.push(start..tiles);
-        (bands, total)
+            counters.map(|&n| u64::from(n)).sum()
+        });
+        cut(entries, self.cap() as u64)
     }
 
     /// Fills the lists for one band. `counted` says that the counters already hold this band.
@@ -265,8 +255,66 @@ impl TileLists {
     }
 }
 
+/// Runs of consecutive tiles with these numbers of entries, of which each run has at most `cap` (a tile
+/// alone never has more), and all entries.
+fn cut(entries: impl Iterator<Item = u64>, cap: u64) -> (Vec<Range<usize>>, u64) {
+    let mut bands = Vec::with_capacity(1);
+    let (mut start, mut end, mut held, mut total) = (0, 0, 0, 0);
+    for here in entries {
+        if held + here > cap {
+            bands.push(start..end);
+            (start, held) = (end, 0);
+        }
+        held += here;
+        total += here;
+        end += 1;
+    }
+    bands.push(start..end);
+    (bands, total)
+}
+
 /// Rows per chunk, whole blocks: independent of the number of threads.
 fn chunk_rows(rows: usize, tiles: usize) -> usize {
     let chunks = (MOST_COUNTERS / tiles.max(1)).clamp(1, MOST_CHUNKS);
     rows.div_ceil(chunks).max(512).next_multiple_of(WIDTH)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Full-HD images that rows fill: the first numbers of them whose entries pass 31 bits, and 32.
+    #[test]
+    fn bands_are_cut_without_overflow() {
+        const TILES: u64 = 120 * 68;
+        for rows in [263_172_u64, 526_344, u64::from(u32::MAX)] {
+            let entries = || std::iter::repeat_n(rows, TILES as usize);
+            for cap in [rows, 16 * rows, u64::from(u32::MAX)] {
+                let (bands, total) = cut(entries(), cap);
+                assert_eq!(total, rows * TILES);
+                let most = bands.iter().map(|band| band.len() as u64 * rows).max();
+                assert!(most.is_some_and(|most| most <= cap), "{rows} rows, cap {cap}");
+                let tiles: usize = bands.iter().map(Range::len).sum();
+                let whole = bands.windows(2).all(|pair| pair[0].end == pair[1].start);
+                assert!(whole && bands[0].start == 0 && tiles as u64 == TILES);
+                // No more than are needed.
+                let per_band = cap / rows;
+                assert_eq!(bands.len() as u64, TILES.div_ceil(per_band));
+            }
+        }
+        let (none, total) = cut(std::iter::empty(), 5);
+        assert!(none.len() == 1 && none[0].is_empty() && total == 0);
+    }
+
+    #[test]
+    fn chunks_cover_any_number_of_rows() {
+        for rows in [0, 1, 511, 512, 1 << 31, (1_usize << 32) - 1, 1 << 40] {
+            for tiles in [0, 1, 8160, 1 << 20] {
+                let chunk = chunk_rows(rows, tiles);
+                assert!(chunk.is_multiple_of(WIDTH) && chunk >= 512);
+                let chunks = rows.div_ceil(chunk);
+                assert!(chunks <= MOST_CHUNKS && chunks * tiles <= MOST_COUNTERS.max(tiles));
+            }
+        }
+    }
 }

@@ -1,4 +1,4 @@
-//! `densify eval`, `render` and `policies`: looking at what was trained.
+//! `densify eval`, `render`, `policies` and `selftest`: looking at what was trained, and at what trains.
 
 use std::path::Path;
 
@@ -114,6 +114,21 @@ fn a_bare_model_renders_as_its_run() {
     let nowhere = root.path().join("c");
     densify(&["render", ply, "-o", text(&nowhere)]).refused("no cameras", &["--scene"]);
     assert!(!nowhere.exists());
+}
+
+#[test]
+fn the_selftest_prints_its_figures_and_writes_them() {
+    let (root, _) = scratch();
+    let file = root.path().join("deep/figures.md");
+    let outcome =
+        densify(&["selftest", "--backend", "cpu", "1", "16", "--markdown", text(&file)]).ok();
+    for words in ["on native", "no row", "ok", "depths one bit apart", "within their tolerances"] {
+        assert!(outcome.stdout.contains(words), "{words}: {}", outcome.stdout);
+    }
+    let written = std::fs::read_to_string(&file).expect("it was written");
+    assert!(written.contains("## native") && written.contains("| 16 | depths"), "{written}");
+    densify(&["selftest", "99"]).refused("no such case", &["no case 99", "30"]);
+    densify(&["selftest", "--all", "--gpu", "x"]).refused("two choices", &["--all"]);
 }
 
 #[test]

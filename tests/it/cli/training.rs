@@ -153,6 +153,17 @@ fn more_points_than_the_budget_are_subsampled_and_it_is_said() {
 }
 
 #[test]
+fn a_budget_of_one_row_trains() {
+    let scene = Photographs::colmap_binary();
+    for policy in ["diet", "vanilla", "taming", "mcmc", "igs"] {
+        let (_root, run) = scratch();
+        train(scene.path(), &run, 100, &format!("--budget 1 --policy {policy} --quiet")).ok();
+        let summary = json(&run.join("stats/summary.json"));
+        assert_eq!((count(&summary, "rows"), count(&summary, "peak_rows")), (1, 1), "{policy}");
+    }
+}
+
+#[test]
 fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
     let scene = Photographs::colmap_binary();
     let (_root, run) = scratch();

@@ -1,10 +1,11 @@
 //! The GPU backend against the native one, on every adapter that there is: stage by stage, over
-//! training runs, and against the stored float64 arrays.
+//! training runs, against the stored float64 arrays, and where numbers are hardest.
 //!
 //! Where there is no adapter, each test says so and passes, unless `DENSIFY_REQUIRE_GPU` is set.
 //! `VK_DRIVER_FILES` chooses drivers, several if need be.
 
 mod edits;
+mod extremes;
 mod looking;
 mod oracle;
 mod policies;

@@ -47,7 +47,8 @@ fn trace(splats: &[Splat], order: &[usize], x: u32, y: u32, rules: &Rules) -> Pi
             continue;
         }
         pixel.boundary |= close(raw, rules.alpha_max, CLOSE_ALPHA);
-        pixel.boundary |= close(splat.depth, last_depth, CLOSE_DEPTH);
+        // Equal depths are no close decision: every renderer takes the first row first.
+        pixel.boundary |= splat.depth > last_depth && close(splat.depth, last_depth, CLOSE_DEPTH);
         last_depth = splat.depth;
         let alpha = raw.min(rules.alpha_max);
         let after = pixel.transmittance * (1.0 - alpha);
@@ -72,39 +73,61 @@ fn visible_colour(splat: &Splat) -> [f64; 3] {
     splat.colour.map(|c| c.max(0.0))
 }
 
+/// One pixel of an [`Image`].
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Sample {
+    pub(crate) rgb: [f64; 3],
+    pub(crate) alpha: f64,
+    pub(crate) depth: f64,
+    pub(crate) transmittance: f64,
+    /// Rows blended.
+    pub(crate) blended: u32,
+    /// Some decision was close.
+    pub(crate) boundary: bool,
+}
+
+/// Renders one pixel of splats in the given order.
+pub(crate) fn sample(
+    splats: &[Splat],
+    order: &[usize],
+    view: View<'_>,
+    rules: &Rules,
+    [x, y]: [u32; 2],
+) -> Sample {
+    let pixel = trace(splats, order, x, y, rules);
+    let mut rgb = view.background.map(|b| b * pixel.transmittance);
+    let mut depth = 0.0;
+    for hit in &pixel.contributions {
+        let weight = hit.alpha * hit.transmittance;
+        let colour = visible_colour(&splats[hit.row]);
+        for c in 0..3 {
+            rgb[c] += weight * colour[c];
+        }
+        depth += weight * splats[hit.row].depth;
+    }
+    Sample {
+        rgb,
+        alpha: 1.0 - pixel.transmittance,
+        depth,
+        transmittance: pixel.transmittance,
+        blended: pixel.contributions.len() as u32,
+        boundary: pixel.boundary,
+    }
+}
+
 /// Renders splats in the given order.
 pub(crate) fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
-    let pixels = (view.camera.width * view.camera.height) as usize;
-    let mut image = Image {
-        rgb: Vec::with_capacity(3 * pixels),
-        alpha: Vec::with_capacity(pixels),
-        depth: Vec::with_capacity(pixels),
-        transmittance: Vec::with_capacity(pixels),
-        blended: Vec::with_capacity(pixels),
-        boundary: Vec::with_capacity(pixels),
-    };
-    for y in 0..view.camera.height {
-        for x in 0..view.camera.width {
-            let pixel = trace(splats, order, x, y, rules);
-            let mut rgb = view.background.map(|b| b * pixel.transmittance);
-            let mut depth = 0.0;
-            for hit in &pixel.contributions {
-                let weight = hit.alpha * hit.transmittance;
-                let colour = visible_colour(&splats[hit.row]);
-                for c in 0..3 {
-                    rgb[c] += weight * colour[c];
-                }
-                depth += weight * splats[hit.row].depth;
-            }
-            image.rgb.extend(rgb);
-            image.alpha.push(1.0 - pixel.transmittance);
-            image.depth.push(depth);
-            image.transmittance.push(pixel.transmittance);
-            image.blended.push(pixel.contributions.len() as u32);
-            image.boundary.push(pixel.boundary);
-        }
+    let (width, height) = (view.camera.width, view.camera.height);
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
+    let samples: Vec<Sample> = pixels.map(|at| sample(splats, order, view, rules, at)).collect();
+    Image {
+        rgb: samples.iter().flat_map(|s| s.rgb).collect(),
+        alpha: samples.iter().map(|s| s.alpha).collect(),
+        depth: samples.iter().map(|s| s.depth).collect(),
+        transmittance: samples.iter().map(|s| s.transmittance).collect(),
+        blended: samples.iter().map(|s| s.blended).collect(),
+        boundary: samples.iter().map(|s| s.boundary).collect(),
     }
-    image
 }
 
 /// Calls `f(pixel, row, weight, distance of the pixel's centre to the projected mean [px])` for every

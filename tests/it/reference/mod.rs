@@ -4,11 +4,11 @@
 //! *3D Gaussian Splatting*, ACM TOG 42(4), 2023): every pixel looks at every row, covariance and
 //! conic are plain matrices, and the spherical harmonics are a table of monomials. The backends
 //! do none of that, which is the point: an error in one is not an error in the other.
-//! `central` checks its gradients by central differences, `oracle` checks it against stored
-//! arrays.
+//! `tests/it/central.rs` checks its gradients by central differences, `tests/it/oracle/` checks it
+//! against stored arrays. `densify selftest` holds backends to it on users' machines, so it is part of
+//! the program too (`src/selftest/mod.rs`).
 
 pub(crate) mod blend;
-mod central;
 pub(crate) mod loss;
 pub(crate) mod project;
 
@@ -131,6 +131,18 @@ pub(crate) struct Upstream {
     pub(crate) rgb: Vec<f64>,
     pub(crate) alpha: Vec<f64>,
     pub(crate) depth: Vec<f64>,
+}
+
+impl Upstream {
+    /// The same where no decision is close, so that a gradient can be compared tightly everywhere.
+    pub(crate) fn ignoring(mut self, boundary: &[bool]) -> Self {
+        for (p, _) in boundary.iter().enumerate().filter(|(_, close)| **close) {
+            self.rgb[3 * p..3 * p + 3].fill(0.0);
+            self.alpha[p] = 0.0;
+            self.depth[p] = 0.0;
+        }
+        self
+    }
 }
 
 /// A render. Fields as in `backend::Rendering`, and what a test wants to know besides.

@@ -1,14 +1,14 @@
-//! The reference against central differences of itself: step 1e-6, in `f64`, without the steps
+//! The reference renderer against central differences of itself: step 1e-6, in `f64`, without the steps
 //! that make a render discontinuous, and with the order of the rows held fixed.
 
 use densify::camera::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::loss::loss;
-use super::project::{by_depth, project};
-use super::{CLASSES, Model, Rules, Upstream, View, blend, differentiate};
 use crate::compare::Table;
+use crate::reference::loss::loss;
+use crate::reference::project::{by_depth, project};
+use crate::reference::{CLASSES, Model, Rules, Upstream, View, blend, differentiate};
 use crate::scenes;
 
 /// Half the distance between the two evaluations.
@@ -121,6 +121,7 @@ fn gradient_of_the_loss() {
 fn equal_images_have_no_loss_and_no_gradient() {
     let image: Vec<f64> = (0..3 * 12 * 9).map(|i| f64::from(i % 7) / 7.0).collect();
     let same = loss(&image, &image, 12, 9);
-    assert!(same.loss.abs() < 1e-15 && (same.ssim - 1.0).abs() < 1e-15, "{}", same.loss);
+    assert!(same.loss.abs() < 1e-15 && same.l1.abs() < 1e-15, "{} {}", same.loss, same.l1);
+    assert!((same.ssim - 1.0).abs() < 1e-15, "{}", same.ssim);
     assert!(same.gradient.iter().all(|g| g.abs() < 1e-15));
 }

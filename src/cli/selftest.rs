@@ -1,0 +1,159 @@
+//! `densify selftest`: whether this machine and its drivers compute what they should.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::console::Console;
+use super::device::DeviceArgs;
+use super::failure::{Failure, OTHER};
+use crate::backend::gpu::{AdapterChoice, GpuDevice, adapters};
+use crate::output::write_atomically;
+use crate::selftest::{Bench, Case, Finding, Tested, cases, markdown, table};
+
+/// Holds this machine against a renderer in float64, where numbers are hardest.
+///
+/// Needles, thousands of layers, saturated opacities, images of one pixel, rows that hold NaN: images,
+/// gradients, losses and steps of the optimiser are compared with those of a second renderer, which
+/// shares no arithmetic with the first. Prints the largest error of each kind beside its tolerance, and
+/// where it is. A report of an error begins with this table.
+///
+/// The exit code is 1 if anything is beyond its tolerance.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct SelftestArgs {
+    /// Only these cases, by number
+    #[arg(value_name = "CASE")]
+    only: Vec<u8>,
+    /// Run cases in full that take minutes: half a million rows as large as the image, which takes
+    /// some 2 GiB, and runs of 30,000 steps
+    #[arg(long)]
+    long: bool,
+    /// Write the table as Markdown
+    #[arg(long, value_name = "FILE")]
+    markdown: Option<PathBuf>,
+    /// On every backend that there is: the processor, and all adapters, software drivers included
+    #[arg(long, conflicts_with_all = ["backend", "gpu"])]
+    all: bool,
+    /// Processor threads to use `[default: all]`
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+    #[command(flatten)]
+    device: DeviceArgs,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  densify selftest                              on a GPU if there is one, else on the processor
+  densify selftest --backend cpu 7 13           only needles and layers
+  densify selftest --gpu radeon                 on this adapter
+  densify selftest --all --long --markdown selftest.md
+                                                on all of them, in full, into a file";
+
+pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
+    let chosen = chosen(&args.only)?;
+    let mut tested: Vec<Tested> = Vec::new();
+    for bench in benches(args, console)? {
+        console.result(format_args!(
+            "densify {} on {}: {}, {}",
+            env!("CARGO_PKG_VERSION"),
+            bench.name(),
+            std::env::consts::OS,
+            std::env::consts::ARCH
+        ));
+        let mut here = Tested { bench: bench.name(), cases: Vec::new() };
+        for &case in &chosen {
+            let findings = case.run(&bench, args.long);
+            console.result(table(&case, &findings));
+            here.cases.push((case, findings));
+        }
+        tested.push(here);
+    }
+    if let Some(path) = &args.markdown {
+        let text = markdown(&tested);
+        write_atomically(path, |out| out.write_all(text.as_bytes()))?;
+    }
+    let count = verdict(&tested)?;
+    console.result(format_args!("All {count} figures are within their tolerances."));
+    Ok(())
+}
+
+/// The number of figures, if all are within their tolerances.
+fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
+    let findings: Vec<&Finding> = tested.iter().flat_map(Tested::findings).collect();
+    let failed = findings.iter().filter(|finding| !finding.holds()).count();
+    let count = findings.len();
+    if failed == 0 {
+        return Ok(count);
+    }
+    Err(Failure {
+        code: OTHER,
+        message: format!(
+            "{failed} of {count} figures are beyond their tolerances; please report the table above, and \
+             where it is a GPU that fails, train with --backend cpu until it is known why"
+        ),
+    })
+}
+
+/// What is to be tested.
+fn benches(args: &SelftestArgs, console: &Console) -> Result<Vec<Bench>, Failure> {
+    let native = Bench::Native { threads: args.threads.map(usize::from) };
+    if !args.all {
+        return Ok(vec![args.device.open(console)?.map_or(native, Bench::Gpu)]);
+    }
+    let mut benches = vec![native];
+    for adapter in adapters().into_iter().filter(|adapter| adapter.missing.is_empty()) {
+        let device = GpuDevice::open(&AdapterChoice { name: Some(adapter.name) })?;
+        benches.push(Bench::Gpu(device));
+    }
+    Ok(benches)
+}
+
+/// The cases with these numbers, or all.
+fn chosen(only: &[u8]) -> Result<Vec<Case>, Failure> {
+    let numbers: Vec<u8> = cases().iter().map(|case| case.number).collect();
+    if let Some(unknown) = only.iter().find(|number| !numbers.contains(number)) {
+        let numbers: Vec<String> = numbers.iter().map(u8::to_string).collect();
+        return Err(Failure::input(format!(
+            "there is no case {unknown}; there are {}",
+            numbers.join(", ")
+        )));
+    }
+    let is_wanted = |case: &&Case| only.is_empty() || only.contains(&case.number);
+    Ok(cases().iter().filter(is_wanted).copied().collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cases_are_chosen_by_number() {
+        assert_eq!(chosen(&[]).unwrap().len(), cases().len());
+        let two: Vec<u8> = chosen(&[13, 7]).unwrap().iter().map(|case| case.number).collect();
+        assert_eq!(two, [7, 13]);
+        let refused = chosen(&[7, 4]).unwrap_err();
+        assert!(refused.message.contains("no case 4") && refused.code == 2, "{refused:?}");
+    }
+
+    #[test]
+    fn figures_beyond_their_tolerance_have_code_1() {
+        let finding = |error| Finding {
+            number: 7,
+            kind: "image".into(),
+            place: "here".into(),
+            error,
+            tolerance: 1e-5,
+        };
+        let tested = |errors: &[f64]| {
+            let findings = errors.iter().map(|&error| finding(error)).collect();
+            vec![Tested { bench: "native".into(), cases: vec![(cases()[0], findings)] }]
+        };
+        assert_eq!(verdict(&tested(&[0.0, 1e-5])).unwrap(), 2);
+        for wrong in [1.1e-5, f64::NAN, f64::INFINITY] {
+            let failure = verdict(&tested(&[0.0, wrong])).unwrap_err();
+            assert_eq!(failure.code, OTHER);
+            assert!(failure.message.starts_with("1 of 2 figures"), "{}", failure.message);
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! What holds for any scene, camera and size.
+
+use densify::backend::{Backend, Rendering};
+use densify::camera::Camera;
+use densify::gaussians::{Gaussians, sh_coefficients};
+use densify::selftest::values::SIZES;
+use proptest::prelude::*;
+
+use crate::scenes;
+use crate::subject::{self, Resources};
+
+const GREY: [f32; 3] = [0.3, 0.4, 0.6];
+
+/// A row: position in the camera's axes as shares of the image and depth, log-scales, quaternion,
+/// opacity logit, and what its colours are drawn from.
+type Row = ([f64; 3], [f32; 3], [f32; 4], f32, f32);
+
+fn row() -> impl Strategy<Value = Row> {
+    (
+        [-0.5..1.5_f64, -0.5..1.5_f64, -2.0..20.0_f64],
+        // From far below a pixel to far beyond the image.
+        prop::array::uniform3(-12.0..3.0_f32),
+        prop::array::uniform4(-1e3..1e3_f32),
+        -12.0..12.0_f32,
+        -3.0..3.0_f32,
+    )
+}
+
+fn view() -> impl Strategy<Value = Camera> {
+    // The longest image is for the cases of the selftest.
+    (0..SIZES.len() - 1, any::<u64>())
+        .prop_map(|(size, seed)| scenes::camera(SIZES[size].0, SIZES[size].1, seed))
+}
+
+fn model(camera: &Camera, sh_degree: u8, rows: &[Row]) -> Gaussians {
+    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
+    for (i, ([u, v, z], scale, quat, logit, shade)) in rows.iter().enumerate() {
+        // No two at one depth, where the order of the rows would count.
+        let z = z + 1e-3 * i as f64;
+        let x = (u * f64::from(camera.width) - camera.cx) / camera.fx * z;
+        let y = (v * f64::from(camera.height) - camera.cy) / camera.fy * z;
+        let mean = scenes::world(camera, [x, y, z]);
+        let colour = |k: usize| shade * (1.7 * k as f32 + i as f32).sin();
+        scenes::push(&mut model, mean, scale.map(f32::exp), *quat, *logit, colour);
+    }
+    model
+}
+
+fn render(
+    model: &Gaussians,
+    camera: &Camera,
+    background: [f32; 3],
+    cap: Option<usize>,
+) -> Rendering {
+    let resources = Resources { tile_cap: cap, threads: Some(1) };
+    let mut backend = subject::backend(model, resources);
+    backend.render(camera, background, model.sh_degree).expect("a small image is rendered")
+}
+
+fn bits(image: &Rendering) -> Vec<u32> {
+    let all = image.rgb.iter().chain(&image.alpha).chain(&image.depth);
+    all.map(|v| v.to_bits()).collect()
+}
+
+/// Depths as a backend has them: rows at the same one are drawn in their order.
+fn depths(model: &Gaussians, camera: &Camera) -> Vec<f64> {
+    let depth = |mean: &[f32; 3]| camera.project(mean.map(f64::from).into()).1;
+    let mut depths: Vec<f64> = model.means.iter().map(depth).collect();
+    depths.sort_by(f64::total_cmp);
+    depths
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 96, failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn any_finite_scene_is_rendered_in_any_order_and_in_any_bands(
+        camera in view(),
+        degree in 0..=3_u8,
+        rows in prop::collection::vec(row(), 0..60),
+        by in 0..60_usize,
+        cap in 1..400_usize,
+    ) {
+        let whole = model(&camera, degree, &rows);
+        let image = render(&whole, &camera, GREY, None);
+        prop_assert!(image.rgb.iter().chain(&image.depth).all(|v| v.is_finite()));
+        prop_assert!(image.alpha.iter().all(|a| (0.0..=1.0).contains(a)));
+        prop_assert!(bits(&render(&whole, &camera, GREY, Some(cap))) == bits(&image), "bands");
+        let depths = depths(&whole, &camera);
+        if depths.windows(2).all(|pair| pair[1] - pair[0] > 1e-5 * pair[1].abs()) {
+            let mut turned = whole.clone();
+            let by = by % whole.len().max(1);
+            turned.means.rotate_left(by);
+            turned.log_scales.rotate_left(by);
+            turned.quats.rotate_left(by);
+            turned.opacity_logits.rotate_left(by);
+            turned.sh.rotate_left(by * 3 * sh_coefficients(degree));
+            prop_assert!(bits(&render(&turned, &camera, GREY, None)) == bits(&image), "order");
+        }
+    }
+
+    #[test]
+    fn what_is_not_seen_changes_nothing_and_the_background_enters_linearly(
+        camera in view(),
+        rows in prop::collection::vec(row(), 0..40),
+        background in prop::array::uniform3(0.0..1.0_f32),
+        place in 0..3_usize,
+    ) {
+        let seen = model(&camera, 1, &rows);
+        let on_black = render(&seen, &camera, [0.0; 3], None);
+        let mut more = seen.clone();
+        let (local, logit) =
+            [([0.0, 0.0, -1.0], 1.0), ([500.0, 0.0, 2.0], 1.0), ([0.0, 0.0, 2.0], -6.0)][place];
+        let mean = scenes::world(&camera, local);
+        scenes::push(&mut more, mean, [0.1; 3], [1.0, 0.0, 0.0, 0.0], logit, |_| 0.3);
+        prop_assert!(bits(&render(&more, &camera, [0.0; 3], None)) == bits(&on_black));
+
+        let on_colour = render(&seen, &camera, background, None);
+        for (p, alpha) in on_black.alpha.iter().enumerate() {
+            for (c, background) in background.iter().enumerate() {
+                let black = on_black.rgb[3 * p + c];
+                let expected = black + (1.0 - alpha) * background;
+                let off = (on_colour.rgb[3 * p + c] - expected).abs();
+                prop_assert!(off <= 1e-6 * (1.0 + black.abs()), "pixel {p}: {off:e}");
+            }
+        }
+    }
+}
