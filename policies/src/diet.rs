@@ -35,7 +35,7 @@
 //! Some defaults are not those of paper and code, by measurement in runs of 2,000 to 7,000 steps:
 //! `split` is `long-axis`; `full_depth` keeps out fog that explains single photographs; `rho` and
 //! `rho_c` are for the whole run, as who exchanges the model many times over learns photographs by
-//! heart.
+//! heart. The repository's docs/comparison.md has the figures.
 //!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;

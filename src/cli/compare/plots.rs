@@ -174,6 +174,7 @@ fn draw_panel(
     builder
         .caption(&panel.title, ("sans-serif", 17))
         .margin(8)
+        .margin_right(28)
         .x_label_area_size(42)
         .y_label_area_size(70);
     let ticks = if panel.log_x { ticks_at_points(panel) } else { even_ticks(x1) };
