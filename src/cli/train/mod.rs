@@ -60,7 +60,7 @@ pub(super) struct TrainArgs {
     /// Options that are given are kept: --budget (the smaller of the two limits holds), --sh-degree,
     /// --tile-cap, --image-cache. The others are chosen: Gaussians as many as fit; the degree is 3
     /// unless fewer fit than the scene starts with, then it is lowered until they do; decoded
-    /// photographs take at most a quarter, and those beyond it are decoded again; tile lists hold 4
+    /// photographs take at most an eighth, and those beyond it are decoded again; tile lists hold 4
     /// pairs per Gaussian, up to 16 where --budget leaves room. `densify plan` shows what comes of it
     #[arg(long, value_name = "BYTES", help_heading = "Memory", value_parser = number::bytes)]
     memory: Option<u64>,
