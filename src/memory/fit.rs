@@ -108,8 +108,13 @@ pub fn fit<E>(
             }
         }
         if wishes.image_cache.is_none() {
+            let all = Setting { image_cache: wishes.all_images, ..setting };
             let left = wishes.memory.saturating_sub(bytes(&setting)?);
-            setting.image_cache = setting.image_cache.saturating_add(left).min(wishes.all_images);
+            // What is in use at a time is counted even where the cache holds less.
+            setting.image_cache = match bytes(&all)? <= wishes.memory {
+                true => wishes.all_images,
+                false => setting.image_cache.saturating_add(left).min(wishes.all_images),
+            };
         }
     }
     let at_wanted_degree = at_wanted_degree.unwrap_or(rows);

@@ -36,7 +36,7 @@ pub fn table(case: &Case, findings: &[Finding]) -> String {
 const HEAD: &str = "\
 # Figures of the selftest
 
-Written by `densify selftest --all --markdown FILE`; of each case and
+Written by `densify selftest --markdown FILE`, with `--all` for every backend; of each case and
 kind of figure the worst that was measured, beside the tolerance. Images are compared with those of a
 renderer in float64 where no decision is close; gradients relative to the largest of their class; what
 must never happen is counted. The numbers of the cases are those of `tests/it/extremes.rs`.
@@ -85,7 +85,7 @@ mod tests {
         let case = cases()[0];
         let findings = vec![finding(1.5e-5, 2e-5), finding(3.0, 0.0), finding(f64::NAN, 1.0)];
         let text = table(&case, &findings);
-        assert!(text.contains("ok      1.5e-5 of   2.0e-5"), "{text}");
+        assert!(text.contains("ok       1.5e-5 of   2.0e-5"), "{text}");
         assert!(text.contains("FAILED        3 of        0"), "{text}");
         assert!(text.contains("FAILED        - of"), "{text}");
         let text = markdown(&[Tested { bench: "native".into(), cases: vec![(case, findings)] }]);

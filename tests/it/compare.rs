@@ -146,7 +146,10 @@ impl Table {
     ) {
         match outcome {
             Ok(error) => self.check(case, quantity, error, limits.interior),
-            Err(message) => self.fail(format!("{case}: {quantity}: {message}")),
+            Err(message) => {
+                self.check(case, quantity, f64::NAN, limits.interior);
+                self.fail(format!("{case}: {quantity}: {message}"));
+            }
         }
     }
 

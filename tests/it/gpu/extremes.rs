@@ -5,9 +5,13 @@ use densify::selftest::Bench;
 use super::subjects;
 use crate::extremes::check;
 
+/// Cases that take software drivers a minute or more each; `densify selftest --gpu NAME 11 21 30`
+/// runs them.
+const SLOW: [u8; 3] = [11, 21, 30];
+
 #[test]
 fn every_case_holds_on_every_device() {
     for device in subjects() {
-        check(&Bench::Gpu(device.clone()));
+        check(&Bench::Gpu(device.clone()), &SLOW);
     }
 }
