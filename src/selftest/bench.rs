@@ -128,21 +128,18 @@ impl Bench {
     ) -> Result<Box<dyn Subject>, BackendError> {
         let Room { budget, tile_cap, largest_image, needs } = room;
         let budget = budget.max(model.len()).max(1);
+        let native = |threads: Option<usize>, needs| {
+            let mut options = CpuOptions::new(budget);
+            options.threads = threads;
+            options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
+            (options.largest_image, options.needs) = (largest_image, needs);
+            CpuBackend::new(model, &options)
+        };
         match self {
-            Self::Native { threads } => {
-                let mut options = CpuOptions::new(budget);
-                options.threads = *threads;
-                options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
-                (options.largest_image, options.needs) = (largest_image, needs);
-                Ok(Box::new(CpuBackend::new(model, &options)?))
-            }
+            Self::Native { threads } => Ok(Box::new(native(*threads, needs)?)),
             #[cfg(test)]
             Self::Sabotaged(how) => {
-                let mut options = CpuOptions::new(budget);
-                options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
-                options.needs = needs;
-                let inner = CpuBackend::new(model, &options)?;
-                Ok(Box::new(super::sabotage::Saboteur::new(inner, *how)))
+                Ok(Box::new(super::sabotage::Saboteur::new(native(None, needs)?, *how)))
             }
             Self::Gpu(device) => {
                 let options =

@@ -6,12 +6,10 @@ use densify_policies::policy::Cadence;
 
 use super::bench::{Bench, Subject};
 use super::compare::{Limits, Table, class, compare_images, relative_error};
-use super::reference::{
-    CLASSES, Image, Model, Rules, ScreenGradient, Upstream, View, blend, project,
-};
+use super::reference::{CLASSES, Image, Model, Rules, ScreenGradient, View, blend, project};
 use super::scenes;
 use super::values::RATES;
-use crate::backend::cpu::{ImageGradient, ModelGradient};
+use crate::backend::cpu::ModelGradient;
 use crate::backend::{BackendError, Rendering, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -75,7 +73,7 @@ impl<'a> Trial<'a> {
         let expected = project::backward(&exact, view, &splats, &screen);
 
         let mut backend = self.bench.backend(model)?;
-        let upstream = narrowed(&upstream);
+        let upstream = scenes::narrowed(&upstream);
         let (found, measured) = backend.differentiate(camera, background, sh_degree, &upstream)?;
         self.images(what, &found, &image);
         for name in CLASSES {
@@ -202,16 +200,6 @@ pub(super) fn step(
 /// Values that are none.
 pub(super) fn count_broken(arrays: &[&[f32]]) -> usize {
     arrays.iter().flat_map(|values| values.iter()).filter(|v| !v.is_finite()).count()
-}
-
-/// As a backend takes it.
-pub(super) fn narrowed(upstream: &Upstream) -> ImageGradient {
-    let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
-    ImageGradient {
-        rgb: narrow(&upstream.rgb),
-        alpha: narrow(&upstream.alpha),
-        depth: narrow(&upstream.depth),
-    }
 }
 
 /// The bits of an image and of every gradient and statistic.

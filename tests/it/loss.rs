@@ -1,26 +1,12 @@
 //! What the loss of the backend has in common with the metric, and what a mask does to it. Cases 23
 //! and 24 of the [selftest](densify::selftest) hold it against the reference's.
 
-use densify::dataset::images::Image8;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-
+use crate::scenes::noisy;
 use crate::subject;
-
-fn random(width: u32, height: u32, noise: f32, seed: u64) -> (Vec<f32>, Image8) {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let n = 3 * (width * height) as usize;
-    let rgb: Vec<u8> = (0..n).map(|_| rng.random()).collect();
-    let rendered = rgb
-        .iter()
-        .map(|&v| f32::from(v) / 255.0 + noise * rng.random_range(-1.0_f32..1.0))
-        .collect();
-    (rendered, Image8 { width, height, rgb, alpha: None, mask: None })
-}
 
 #[test]
 fn a_masked_pixel_gets_no_gradient() {
-    let (rendered, mut target) = random(30, 20, 0.3, 78);
+    let (rendered, mut target) = noisy((30, 20), 0.3, 78);
     let mask: Vec<u8> = (0..600).map(|p| if p % 3 == 0 { 0 } else { 255 }).collect();
     target.mask = Some(mask.clone());
     let (_, gradient) = subject::loss(&rendered, &target, [0.0; 3]);
@@ -31,7 +17,7 @@ fn a_masked_pixel_gets_no_gradient() {
 
 #[test]
 fn the_loss_and_the_metric_have_one_ssim() {
-    let (rendered, target) = random(53, 41, 0.2, 79);
+    let (rendered, target) = noisy((53, 41), 0.2, 79);
     let rendered: Vec<f32> = rendered.iter().map(|v| v.clamp(0.0, 1.0)).collect();
     let (scalars, _) = subject::loss(&rendered, &target, [0.0; 3]);
     let metric = densify::metrics::ssim(&rendered, &target, [0.0; 3]).unwrap();

@@ -1,5 +1,7 @@
 //! Small scenes to test with: deterministic, in front of a camera in general position.
 
+use densify::backend::Rendering;
+use densify::backend::cpu::ImageGradient;
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
@@ -113,4 +115,38 @@ pub(crate) fn upstream(camera: &Camera, seed: u64) -> Upstream {
         (0..n).map(|_| f64::from(scale * rng.random_range(-1.0_f32..1.0))).collect()
     };
     Upstream { rgb: noise(3 * pixels, 1.0), alpha: noise(pixels, 1.0), depth: noise(pixels, 0.3) }
+}
+
+/// The same, as a backend takes it.
+pub(crate) fn narrowed(upstream: &Upstream) -> ImageGradient {
+    let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
+    ImageGradient {
+        rgb: narrow(&upstream.rgb),
+        alpha: narrow(&upstream.alpha),
+        depth: narrow(&upstream.depth),
+    }
+}
+
+/// A random photograph, and the colours of a rendering of it with noise.
+pub(crate) fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, Image8) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let n = 3 * (width * height) as usize;
+    let rgb: Vec<u8> = (0..n).map(|_| rng.random()).collect();
+    let rendered = rgb
+        .iter()
+        .map(|&v| f32::from(v) / 255.0 + noise * rng.random_range(-1.0_f32..1.0))
+        .collect();
+    (rendered, Image8 { width, height, rgb, alpha: None, mask: None })
+}
+
+/// A rendering with these colours, of a photograph's size: opaque, at depth 1.
+pub(crate) fn opaque(rgb: &[f32], target: &Image8) -> Rendering {
+    let pixels = rgb.len() / 3;
+    Rendering {
+        width: target.width,
+        height: target.height,
+        rgb: rgb.to_vec(),
+        alpha: vec![1.0; pixels],
+        depth: vec![1.0; pixels],
+    }
 }

@@ -1,6 +1,6 @@
 //! The backend under test, behind one door: tests name what they vary, and nothing else.
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
+use densify::backend::cpu::{CpuBackend, CpuOptions, ModelGradient};
 use densify::backend::{Rendering, StepOutput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
@@ -8,6 +8,7 @@ use densify::gaussians::Gaussians;
 
 pub(crate) use crate::compare::class;
 use crate::reference::Upstream;
+use crate::scenes;
 pub(crate) use densify::selftest::values::RATES;
 
 /// What must not change the outcome.
@@ -41,13 +42,7 @@ pub(crate) fn differentiate(
     sh_degree: u8,
     upstream: &Upstream,
 ) -> (Rendering, ModelGradient) {
-    let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
-    let upstream = ImageGradient {
-        rgb: narrow(&upstream.rgb),
-        alpha: narrow(&upstream.alpha),
-        depth: narrow(&upstream.depth),
-    };
-    let outcome = backend.differentiate(camera, background, sh_degree, &upstream);
+    let outcome = backend.differentiate(camera, background, sh_degree, &scenes::narrowed(upstream));
     outcome.expect("a small image is rendered")
 }
 
@@ -57,14 +52,10 @@ pub(crate) fn loss(
     target: &Image8,
     background: [f32; 3],
 ) -> (StepOutput, Vec<f32>) {
-    let pixels = rendered.len() / 3;
-    let rendering = Rendering {
-        width: target.width,
-        height: target.height,
-        rgb: rendered.to_vec(),
-        alpha: vec![1.0; pixels],
-        depth: vec![1.0; pixels],
-    };
     let empty = Gaussians::default();
-    backend(&empty, Resources::default()).loss(&rendering, target, background)
+    backend(&empty, Resources::default()).loss(
+        &scenes::opaque(rendered, target),
+        target,
+        background,
+    )
 }

@@ -6,7 +6,7 @@ use crate::gaussians::Gaussians;
 use crate::selftest::compare::class;
 use crate::selftest::reference::{CLASSES, Model, Rules, View, render};
 use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, narrowed};
+use crate::selftest::trial::{Trial, count_broken};
 
 /// The logit of an opacity, in f64, so that opacities next to 1 have one.
 fn logit(opacity: f64) -> f32 {
@@ -52,7 +52,7 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let view = View { camera: &camera, background: [1.0; 3], sh_degree: 0 };
         let exact = render(&Model::of(&model), view, &Rules::STANDARD);
         let mut backend = trial.bench.backend(&model)?;
-        let upstream = narrowed(&scenes::upstream(&camera, 4));
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
         let (found, gradient) = backend.differentiate(&camera, [1.0; 3], 0, &upstream)?;
         let left = exact.transmittance.iter().zip(found.rgb.chunks_exact(3)).zip(&exact.boundary);
         let off = left.filter(|(_, close)| !**close).map(|((exact, rgb), _)| {
@@ -101,7 +101,7 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, 1.0], [0.05; 3], UPRIGHT, logit, |_| 0.0);
         let mut backend = trial.bench.backend(&model)?;
-        let mut upstream = narrowed(&scenes::upstream(&camera, 1));
+        let mut upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
         upstream.rgb.fill(0.0);
         upstream.depth.fill(0.0);
         upstream.alpha.fill(0.0);

@@ -10,7 +10,7 @@ use crate::init::initialise;
 use crate::selftest::compare::class;
 use crate::selftest::reference::CLASSES;
 use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, narrowed, step};
+use crate::selftest::trial::{Trial, count_broken, step};
 use crate::selftest::values::without;
 
 pub(super) fn colours(trial: &mut Trial<'_>) -> Result<(), BackendError> {
@@ -29,7 +29,7 @@ fn any_coefficient(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for value in [1e4, -1e4, 1e20, -1e20, 1e38, -1e38] {
         let mut model = scenes::cloud(16, 3, &camera, 23);
         model.sh[5 * 48..6 * 48].fill(value);
-        let upstream = narrowed(&scenes::upstream(&camera, 5));
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let mut backend = trial.bench.backend(&model)?;
         let (image, gradient) = backend.differentiate(&camera, GREY, 3, &upstream)?;
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);

@@ -6,7 +6,7 @@ use crate::gaussians::Gaussians;
 use crate::selftest::compare::class;
 use crate::selftest::reference::CLASSES;
 use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, bits, count_broken, count_different, narrowed};
+use crate::selftest::trial::{Trial, bits, count_broken, count_different};
 
 /// The near plane of a backend's default options.
 const NEAR: f32 = 0.01;
@@ -74,7 +74,7 @@ pub(super) fn coincident(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             model.log_scales[row] = [0.7, 0.0, 2.0];
         }
         let mut backend = trial.bench.backend(&model)?;
-        let upstream = narrowed(&scenes::upstream(&camera, 5));
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let (image, gradient) = backend.differentiate(&camera, GREY, 2, &upstream)?;
         let gradients = CLASSES.map(|name| class(&gradient, name));
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
@@ -94,7 +94,7 @@ pub(super) fn ties(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let place = scenes::world(&camera, [0.0, 0.0, 3.0]);
     model.means.fill(place);
     trial.check("1000 rows at one place", &model, &camera, GREY, 0)?;
-    let upstream = narrowed(&scenes::upstream(&camera, 12));
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 12));
     let run = || trial.bench.backend(&model)?.differentiate(&camera, GREY, 0, &upstream);
     let first = bits(&run()?);
     let mut different = 0;

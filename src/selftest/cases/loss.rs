@@ -3,7 +3,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::backend::{BackendError, Rendering, StepOutput};
+use crate::backend::BackendError;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::selftest::bench::{Bench, Subject};
@@ -23,18 +23,6 @@ fn tolerances(bench: &Bench) -> (f64, f64) {
         Bench::Gpu(_) => (2e-6, 1e-4),
         _ => (1e-6, 5e-5),
     }
-}
-
-/// A random photograph, and a rendering of it with noise.
-fn random((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, Image8) {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let n = 3 * (width * height) as usize;
-    let rgb: Vec<u8> = (0..n).map(|_| rng.random()).collect();
-    let rendered = rgb
-        .iter()
-        .map(|&v| f32::from(v) / 255.0 + noise * rng.random_range(-1.0_f32..1.0))
-        .collect();
-    (rendered, Image8 { width, height, rgb, alpha: None, mask: None })
 }
 
 fn flat_image(value: u8) -> Image8 {
@@ -64,23 +52,6 @@ fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
     loss
 }
 
-fn measure(
-    backend: &mut dyn Subject,
-    rendered: &[f32],
-    target: &Image8,
-    background: [f32; 3],
-) -> Result<(StepOutput, Vec<f32>), BackendError> {
-    let pixels = rendered.len() / 3;
-    let rendering = Rendering {
-        width: target.width,
-        height: target.height,
-        rgb: rendered.to_vec(),
-        alpha: vec![1.0; pixels],
-        depth: vec![1.0; pixels],
-    };
-    backend.loss(&rendering, target, background)
-}
-
 fn check(
     trial: &mut Trial<'_>,
     backend: &mut dyn Subject,
@@ -90,7 +61,7 @@ fn check(
 ) -> Result<(), BackendError> {
     let background = [0.1, 0.5, 0.9];
     let expected = expected(rendered, target, background);
-    let (found, gradient) = measure(backend, rendered, target, background)?;
+    let (found, gradient) = backend.loss(&scenes::opaque(rendered, target), target, background)?;
     let (value, slope) = tolerances(trial.bench);
     let scalars = [
         ("loss", found.loss, expected.loss),
@@ -108,7 +79,7 @@ fn check(
 
 pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut backend = trial.bench.backend(&Gaussians::default())?;
-    let (noisy, photograph) = random(SIDES, 0.2, 23);
+    let (noisy, photograph) = scenes::noisy(SIDES, 0.2, 23);
     let transparent = Image8 { alpha: Some(vec![0; photograph.rgb.len() / 3]), ..photograph };
     let targets = [
         ("black", flat_image(0)),
@@ -122,7 +93,8 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for value in [0, 1, 153, 255] {
         let (what, target) = (format!("equal to {value}"), flat_image(value));
         let rendered = vec![f32::from(value) * (1.0 / 255.0); target.rgb.len()];
-        let (found, gradient) = measure(&mut *backend, &rendered, &target, [0.0; 3])?;
+        let (found, gradient) =
+            backend.loss(&scenes::opaque(&rendered, &target), &target, [0.0; 3])?;
         let off = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
         // The GPU divides by 255 within 2.5 units in the last place.
         let tolerance = if matches!(trial.bench, Bench::Gpu(_)) { 3e-7 } else { 0.0 };
@@ -149,12 +121,12 @@ pub(super) fn flat(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     // The reference's loss is too slow for the longest image.
     for (seed, size) in SIZES.into_iter().filter(|size| size.1 < 1000).enumerate() {
         for noise in [0.05, 1.0] {
-            let (rendered, target) = random(size, noise, seed as u64);
+            let (rendered, target) = scenes::noisy(size, noise, seed as u64);
             let what = format!("{}x{}, noise {noise}", size.0, size.1);
             check(trial, &mut *backend, &what, &rendered, &target)?;
         }
     }
-    let (rendered, target) = random(SIDES, 0.3, 77);
+    let (rendered, target) = scenes::noisy(SIDES, 0.3, 77);
     let (width, pixels) = (target.width as usize, target.rgb.len() / 3);
     let ramp: Vec<u8> = (0..pixels).map(|p| (p % 256) as u8).collect();
     let half: Vec<u8> = (0..pixels).map(|p| if p % width < width / 2 { 255 } else { 0 }).collect();
@@ -181,7 +153,9 @@ pub(super) fn flat(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         check(trial, &mut *backend, what, &rendered, &flat_image(value))?;
     }
     // A hair apart: the sign of the difference is the whole gradient, and SSIM stays at 1.
-    let (found, _) = measure(&mut *backend, &vec![0.600_000_1; n], &flat_image(153), [0.0; 3])?;
+    let target = flat_image(153);
+    let hair = scenes::opaque(&vec![0.600_000_1; n], &target);
+    let (found, _) = backend.loss(&hair, &target, [0.0; 3])?;
     trial.figure("0.6 + 1e-7", "SSIM below 1", f64::from(1.0 - found.ssim), 1e-6);
     trial.never("0.6 + 1e-7", "SSIM beyond 1", usize::from(found.ssim > 1.0));
     Ok(())

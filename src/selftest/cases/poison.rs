@@ -6,7 +6,7 @@ use crate::selftest::bench::Subject;
 use crate::selftest::compare::class;
 use crate::selftest::reference::CLASSES;
 use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, count_different, narrowed};
+use crate::selftest::trial::{Trial, count_broken, count_different};
 use crate::selftest::values::{EXTREMES, POISON, SLOTS, name_of_slot, remove, slot_of};
 
 const GREY: [f32; 3] = [0.2, 0.5, 0.3];
@@ -31,7 +31,7 @@ fn with_each_slot(model: &Gaussians, value: f32) -> Gaussians {
 pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(49, 40, 19);
     let model = scenes::cloud(SOUND, 3, &camera, 32);
-    let upstream = narrowed(&scenes::upstream(&camera, 5));
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
     let run = |backend: &mut dyn Subject| backend.differentiate(&camera, GREY, 3, &upstream);
     // Of the image, and of the gradients of the rows that are sound.
     let bits = |backend: &mut dyn Subject| -> Result<Vec<u32>, BackendError> {

@@ -9,7 +9,7 @@ use crate::selftest::bench::Room;
 use crate::selftest::compare::class;
 use crate::selftest::reference::CLASSES;
 use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, narrowed, step};
+use crate::selftest::trial::{Trial, count_broken, step};
 
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 
@@ -23,7 +23,7 @@ pub(super) fn none(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(21, 13, 1);
     let model = Gaussians { sh_degree: 2, ..Gaussians::default() };
     let mut backend = trial.bench.with(&model, Room { budget: 3, ..Room::default() })?;
-    let upstream = narrowed(&scenes::upstream(&camera, 1));
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 2, &upstream)?;
     trial.never("0 rows", "pixels other than the background", drawn(&image));
     let numbers = CLASSES.iter().map(|name| class(&gradient, name).len()).sum();
@@ -67,7 +67,7 @@ pub(super) fn invisible(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     // σ(−5.6) = 0.0037, below 1/255.
     model.opacity_logits.fill(-5.6);
     let mut backend = trial.bench.backend(&model)?;
-    let upstream = narrowed(&scenes::upstream(&camera, 1));
+    let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 1, &upstream)?;
     trial.never("all rows", "pixels other than the background", drawn(&image));
     let pulled = |name: &&str| class(&gradient, name).iter().filter(|g| **g != 0.0).count();

@@ -7,7 +7,7 @@ use crate::gaussians::Gaussians;
 use crate::selftest::compare::class;
 use crate::selftest::reference::CLASSES;
 use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, narrowed};
+use crate::selftest::trial::{Trial, count_broken};
 
 pub(super) fn ordinary(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for degree in 0..=3 {
@@ -41,7 +41,7 @@ pub(super) fn scales(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for value in [12.0, 20.0, 44.0, 60.0, 88.0, 89.0, 120.0] {
         let model = of_scale(&camera, value);
         let mut backend = trial.bench.backend(&model)?;
-        let upstream = narrowed(&scenes::upstream(&camera, 5));
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let (image, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
         broken += CLASSES.iter().map(|name| count_broken(&[class(&gradient, name)])).sum::<usize>();
@@ -69,7 +69,7 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let model = scaled(length);
         trial.check(&what, &model, &camera, GREY, 0)?;
         // Turning does not depend on the length, so that nothing pulls along it.
-        let upstream = narrowed(&scenes::upstream(&camera, 5));
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let mut backend = trial.bench.backend(&model)?;
         let (_, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
         let wide = |q: &[f32; 4]| q.map(f64::from);
