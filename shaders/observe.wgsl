@@ -14,12 +14,22 @@
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 16u;
 const SHARE: u32 = 64u;
+const ROUND: u32 = 32u;
 
 var<workgroup> parts: array<vec4<f32>, 256>;
 var<workgroup> weights: array<f32, 1024>;
 var<workgroup> map_of: array<f32, 256>;
 var<workgroup> batch: array<vec4<f32>, 32>;
 var<workgroup> slots: array<u32, 16>;
+
+// ROUND parts in order, added to what is given.
+fn added(given: vec4<f32>, first: u32) -> vec4<f32> {
+    var total = given;
+    for (var i = 0u; i < ROUND; i++) {
+        total += parts[first + i];
+    }
+    return total;
+}
 
 // now.a: the band.
 @compute @workgroup_size(256)
@@ -97,11 +107,8 @@ fn replay(
             parts[lane] = sums;
             workgroupBarrier();
             if lane < SPLATS && base + lane < count {
-                var total = vec4(0.0);
-                for (var j = 0u; j < SHARE; j++) {
-                    total += parts[lane * SHARE + j];
-                }
-                records[slots[base + lane]] = total;
+                let half = added(vec4(0.0), lane * SHARE);
+                records[slots[base + lane]] = added(half, lane * SHARE + ROUND);
             }
             workgroupBarrier();
         }

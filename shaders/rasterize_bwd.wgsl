@@ -28,6 +28,9 @@ const BATCH: u32 = 16u;
 // Invocations that sum for one splat, and pixels that each sums.
 const SHARE: u32 = 64u;
 const PIXELS: u32 = 4u;
+// Half a share. So many rounds of a loop compilers unroll, and it matters: llvmpipe ends all loops of
+// an invocation after 65,535 rounds together, which a tile of 3,000 splats would reach otherwise.
+const ROUND: u32 = 32u;
 // Fields of the longest record.
 const FIELDS: u32 = 15u;
 
@@ -56,6 +59,16 @@ fn upstream(pixel: vec2<u32>) -> Upstream {
         }
     }
     return g;
+}
+
+// ROUND values in order, added to one that is given, or the largest of all.
+fn reduced(given: f32, first: u32, is_maximum: bool) -> f32 {
+    var total = given;
+    for (var i = 0u; i < ROUND; i++) {
+        let x = shared_f[first + i];
+        total = select(total + x, max(total, x), is_maximum);
+    }
+    return total;
 }
 
 fn fields() -> u32 {
@@ -215,12 +228,9 @@ fn rasterize_bwd(
                 let which = top - 1 - i32(k);
                 if which >= 0 {
                     let is_maximum = (DETAIL == 1u && f == 9u) || (DETAIL == 2u && f == 14u);
-                    var total = 0.0;
-                    for (var j = 0u; j < SHARE; j++) {
-                        let x = shared_f[f * GROUP + k * SHARE + j];
-                        total = select(total + x, max(total, x), is_maximum);
-                    }
-                    records[slots[which] * stride + f] = total;
+                    let first = f * GROUP + k * SHARE;
+                    let half = reduced(0.0, first, is_maximum);
+                    records[slots[which] * stride + f] = reduced(half, first + ROUND, is_maximum);
                 }
             }
             workgroupBarrier();

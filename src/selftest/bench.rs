@@ -4,7 +4,7 @@ use densify_policies::policy::Needs;
 
 use super::compare::Limits;
 use crate::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
-use crate::backend::gpu::{AdapterKind, GpuBackend, GpuDevice, GpuOptions};
+use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
 use crate::backend::{Backend, BackendError, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -147,12 +147,6 @@ impl Bench {
                 Ok(Box::new(GpuBackend::new(model, &options, device)?))
             }
         }
-    }
-
-    /// Whether loops end early: llvmpipe ends all loops of an invocation after 65,535 rounds together,
-    /// so that in a tile from which more than some 2,000 rows are taken the foremost get no gradient.
-    pub(super) fn ends_loops_early(&self) -> bool {
-        matches!(self, Self::Gpu(device) if device.adapter().kind == AdapterKind::Software)
     }
 
     /// How far an image may be from the reference's. The functions of a GPU are less accurate: an

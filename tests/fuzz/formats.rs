@@ -135,7 +135,10 @@ pub fn scene(bytes: &[u8]) -> bool {
         model.means.push(std::array::from_fn(|_| numbers.within(1e6)));
         // Its square overflows from 44 on; the optimiser keeps it below 2.3.
         model.log_scales.push(std::array::from_fn(|_| numbers.within(40.0)));
-        model.quats.push(std::array::from_fn(|_| numbers.within(1e10)));
+        // Shorter ones no file brings in (`src/ply/splats.rs`): a gradient is as many times longer.
+        let quat = DQuat::from_array(std::array::from_fn(|_| f64::from(numbers.within(1e10))));
+        let quat = if quat.length() > 1e-6 { quat } else { DQuat::IDENTITY };
+        model.quats.push(quat.to_array().map(|v| v as f32));
         model.opacity_logits.push(numbers.within(100.0));
         model.sh.extend((0..12).map(|_| numbers.within(1e6)));
     }

@@ -133,6 +133,8 @@ impl Device {
 
     /// An error that the device has told since, if any. A lost device ignores what it is given.
     pub(super) fn check(&self) -> Result<(), BackendError> {
+        #[cfg(test)]
+        faults::lose(&self.device);
         let told = lock(&self.told);
         let device = self.summary.name.clone();
         if let Some(why) = &told.lost {
@@ -202,4 +204,36 @@ impl Device {
 
 fn lock(told: &Mutex<Told>) -> std::sync::MutexGuard<'_, Told> {
     told.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+pub(crate) mod faults {
+    //! Devices that are lost on demand, as by a driver's reset, for the thread that asks for it.
+
+    use std::cell::Cell;
+
+    thread_local! {
+        /// Checks until the loss.
+        static LEFT: Cell<Option<u32>> = const { Cell::new(None) };
+    }
+
+    /// Runs `f`; the device that it uses is lost at the check after so many. Returns whether it was.
+    pub(crate) fn with_device_lost_after<T>(checks: u32, f: impl FnOnce() -> T) -> (T, bool) {
+        LEFT.set(Some(checks));
+        let done = f();
+        (done, LEFT.take().is_none())
+    }
+
+    pub(super) fn lose(device: &wgpu::Device) {
+        match LEFT.get() {
+            Some(0) => {
+                LEFT.set(None);
+                device.destroy();
+                // The callback comes with the next poll.
+                let _ = device.poll(wgpu::PollType::Poll);
+            }
+            Some(left) => LEFT.set(Some(left - 1)),
+            None => {}
+        }
+    }
 }

@@ -47,6 +47,8 @@ use audit::Audited;
 use buffers::{Buffers, Sizes, bias_table};
 use device::Device;
 pub use device::GpuDevice;
+#[cfg(test)]
+pub(crate) use device::faults::with_device_lost_after;
 use edits::EditLaunches;
 use frame::{Frame, State};
 pub use options::GpuOptions;

@@ -38,7 +38,7 @@ struct Session<'a> {
     logs: Logs,
     tally: Tally,
     interrupts: Interrupts,
-    /// Step of the last checkpoint that this process has written.
+    /// Step of the last checkpoint that this process has written, or gone on from.
     checkpoint: Option<u32>,
 }
 
@@ -90,9 +90,17 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
         // What led here is told first; what cannot be written besides is no news.
         Err(failure) => {
             let _ = session.write_summary(false);
+            let (scene, kept) = (session.run.config.scene.path.clone(), session.checkpoint);
             drop(session);
             let path = folder.abandon();
-            Err(failure.and(&format!("what was written until then is in {}", path.display())))
+            let (scene, path) = (scene.display(), path.display());
+            let kept = kept.map_or_else(String::new, |step| {
+                format!(
+                    ", with a checkpoint of step {step}; go on with: densify train {scene} \
+                     -o {path} --resume"
+                )
+            });
+            Err(failure.and(&format!("what was written until then is in {path}{kept}")))
         }
     }
 }
@@ -119,9 +127,11 @@ impl<'a> Session<'a> {
         write_atomically(&folder.join("cameras.json"), |out| {
             out.write_all(cameras_json(cameras)?.as_bytes())
         })?;
+        let mut checkpoint = None;
         let (logs, tally) = match run.kept.take() {
             None => (Logs::create(folder)?, Tally::new()),
             Some(kept) => {
+                checkpoint = Some(run.trainer.steps_done());
                 let (logs, tally, lost) = Logs::resume(folder, kept)?;
                 for name in lost {
                     console.say(format_args!("note: {name} has lost records; they stay missing"));
@@ -130,7 +140,7 @@ impl<'a> Session<'a> {
             }
         };
         let folder = folder.to_owned();
-        Ok(Self { run, console, folder, logs, tally, interrupts, checkpoint: None })
+        Ok(Self { run, console, folder, logs, tally, interrupts, checkpoint })
     }
 
     /// All steps that are left.
@@ -178,12 +188,11 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Writes a checkpoint of the run as it is now; returns where.
-    fn keep(&mut self) -> Result<PathBuf, CheckpointError> {
+    /// Writes a checkpoint of the run as it is now.
+    fn keep(&mut self) -> Result<(), CheckpointError> {
         let step = self.run.trainer.steps_done();
-        let path = checkpoint_path(&self.folder, step);
         if self.checkpoint == Some(step) {
-            return Ok(path);
+            return Ok(());
         }
         let trainer = self.run.trainer.state();
         let header = Header {
@@ -193,29 +202,24 @@ impl<'a> Session<'a> {
             trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
             session: self.logs.keep(&self.tally)?,
         };
-        write(&path, &header, self.run.trainer.backend())?;
+        write(&checkpoint_path(&self.folder, step), &header, self.run.trainer.backend())?;
         tidy(&self.folder, step);
         self.checkpoint = Some(step);
-        Ok(path)
+        Ok(())
     }
 
     /// Ends the run in order, so that it can go on later.
     fn interrupted(&mut self, Interrupt { name, exit_code }: Interrupt) -> Failure {
         let step = self.run.trainer.steps_done();
-        let kept = self.kept();
-        Failure { code: exit_code, message: format!("stopped by {name} after step {step}; {kept}") }
+        let message = format!("stopped by {name} after step {step}");
+        self.kept(Failure { code: exit_code, message })
     }
 
-    /// Writes a checkpoint of a run that ends here; says where.
-    fn kept(&mut self) -> String {
+    /// Writes a checkpoint of a run that ends here.
+    fn kept(&mut self, failure: Failure) -> Failure {
         match self.keep() {
-            Ok(path) => format!(
-                "the run is kept in {}; go on with: densify train {} -o {} --resume",
-                path.display(),
-                self.run.config.scene.path.display(),
-                self.folder.display()
-            ),
-            Err(error) => format!("no checkpoint could be written: {error}"),
+            Ok(()) => failure,
+            Err(error) => failure.and(&format!("no checkpoint could be written: {error}")),
         }
     }
 
@@ -243,10 +247,7 @@ impl<'a> Session<'a> {
                 };
                 Err(Failure::from(error).and(&saved))
             }
-            Err(error @ TrainError::Unsound { .. }) => {
-                let kept = self.kept();
-                Err(Failure::from(error).and(&kept))
-            }
+            Err(error @ TrainError::Unsound { .. }) => Err(self.kept(error.into())),
             Err(error) => Err(error.into()),
         }
     }

@@ -1,4 +1,4 @@
-//! Faults of the disk: `docs/errors.md` says what becomes of each, and these tests hold it to it.
+//! Faults of the disk and of the device: `docs/errors.md` says what becomes of each, and these tests hold it to it.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,8 @@ use clap::{Args, Command, FromArgMatches};
 use tempfile::TempDir;
 
 use super::*;
-use crate::cli::failure::{INPUT, OTHER};
+use crate::backend::gpu::{AdapterKind, adapters, with_device_lost_after};
+use crate::cli::failure::{DEVICE, INPUT, OTHER};
 use crate::dataset::tests::write::Made;
 use crate::output::disk::{Fault, Operation, with_fault};
 use crate::output::model_path;
@@ -177,6 +178,58 @@ fn what_stops_a_run_leaves_what_it_goes_on_from() {
             assert!(case.model() == expected, "{what}");
             assert!(is_there(&case.run(), "stats/summary.json"), "{what}");
         }
+    }
+}
+
+/// The software drivers among the adapters, which are there where the tests of the GPU are run.
+#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
+fn software_drivers() -> Vec<String> {
+    let names: Vec<String> = adapters()
+        .into_iter()
+        .filter(|adapter| adapter.kind == AdapterKind::Software && adapter.missing.is_empty())
+        .map(|adapter| adapter.name)
+        .collect();
+    if names.is_empty() {
+        let needed = std::env::var_os("DENSIFY_REQUIRE_GPU").is_some();
+        assert!(!needed, "DENSIFY_REQUIRE_GPU is set, but there is no software driver");
+        eprintln!("skipped: there is no software driver whose device could be lost");
+    }
+    names
+}
+
+#[test]
+fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
+    for driver in software_drivers() {
+        let case = Case::new();
+        let on_gpu = format!("--backend gpu --gpu {}", driver.split(' ').next().unwrap());
+        case.train(&on_gpu).unwrap();
+        let expected = case.model();
+        let (mut before, mut after) = (0, 0);
+        for checks in [1, 12, 24, 40, 80] {
+            case.clear();
+            let (done, lost) = with_device_lost_after(checks, || case.train(&on_gpu));
+            if !lost {
+                assert!(done.is_ok() && after > 0, "{driver}: {checks} checks are too many");
+                continue;
+            }
+            let Failure { code, message } = done.unwrap_err();
+            let what = format!("{driver}, {checks} checks: {message}");
+            assert_eq!(code, DEVICE, "{what}");
+            assert!(message.contains("was lost") && message.contains(&driver), "{what}");
+            case.nothing_half_written();
+            let kept = case.checkpoints();
+            match kept.last() {
+                None => before += 1,
+                Some(step) => {
+                    after += 1;
+                    let words = format!("with a checkpoint of step {step}; go on with: ");
+                    assert!(message.contains(&words), "{what}");
+                    case.train("--resume").unwrap_or_else(|e| panic!("{what}: {}", e.message));
+                    assert!(case.model() == expected, "{what}");
+                }
+            }
+        }
+        assert!(before > 0 && after > 0, "{driver}: {before} before a checkpoint, {after} after");
     }
 }
 
