@@ -137,6 +137,7 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
     for step in 1..=steps {
         let input = StepInput {
             step,
+            view: 0,
             camera: &camera,
             target: &target,
             background: [0.0; 3],

@@ -10,6 +10,7 @@ use std::fmt;
 
 use serde::Serialize;
 
+pub(crate) use fit::IMAGES;
 pub use fit::{Fit, Setting, Wishes, fit, least_memory};
 pub use grant::{Grant, grant};
 

@@ -167,6 +167,7 @@ impl<V: ViewSource> Trainer<V> {
         let TrainOptions { iterations, seed, sh_degree, background, rates, .. } = self.options;
         let input = StepInput {
             step,
+            view,
             camera: self.views.camera(view),
             target: &image,
             background: background.at(seed, step),

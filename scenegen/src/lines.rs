@@ -51,15 +51,20 @@ impl<'a> Lines<'a> {
         }
         self.read += 1;
         if line.len() as u64 > MAX_LINE {
-            return Err(Error::Malformed {
-                path: self.path.to_owned(),
-                element: format!("line {}", self.read),
-                problem: "it is longer than 16 MiB".into(),
-                remedy: "correct the file or export it again",
-            });
+            return Err(fault(self.path, self.read, "it is longer than 16 MiB"));
         }
         line.truncate(line.trim_ascii_end().len());
         Ok(true)
+    }
+}
+
+/// Something is wrong in a line.
+pub(crate) fn fault(path: &Path, line: usize, problem: impl Into<String>) -> Error {
+    Error::Malformed {
+        path: path.to_owned(),
+        element: format!("line {line}"),
+        problem: problem.into(),
+        remedy: "correct the file or export it again",
     }
 }
 

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use glam::{DVec2, DVec3, Vec2, Vec3, Vec4};
 
 use crate::error::Error;
-use crate::lines::Lines;
+use crate::lines::{Lines, fault};
 use crate::mesh::{AlphaMode, Material, Model, Reflection};
 use crate::resource::{self, Folder};
 use crate::texture::{Texture, TextureRef, Wrap};
@@ -27,7 +27,6 @@ use crate::texture::{Texture, TextureRef, Wrap};
 const MAX_TRIANGLES: usize = 1 << 26;
 /// Corners up to which a polygon is cut ear by ear, which takes the cube of their number.
 const MAX_EARS: usize = 256;
-const REMEDY: &str = "correct the file or export it again";
 
 /// A vertex, texture coordinate or normal of the file, by its number there: the first is 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -541,15 +540,6 @@ impl Map {
 fn cut(text: &str) -> (&str, &str) {
     let (word, rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
     (word, rest.trim_start())
-}
-
-fn fault(path: &Path, line: usize, problem: impl Into<String>) -> Error {
-    Error::Malformed {
-        path: path.to_owned(),
-        element: format!("line {line}"),
-        problem: problem.into(),
-        remedy: REMEDY,
-    }
 }
 
 fn without_comment(text: &str) -> &str {

@@ -2,21 +2,17 @@
 //! process's.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
+mod process;
+
 use densify_scenegen::Surface;
 use densify_scenegen::mesh::Model;
 use glam::DVec3;
+use process::status;
 
 /// What the library's builder may hold for the part at work: 65,536 triangles of 300 bytes.
 const PART_BYTES: u64 = 20 << 20;
 /// Of each triangle: its number while parts are cut, and candidates of the last improvement.
 const TRIANGLE_BYTES: u64 = 4 + 8;
-
-/// A line of `/proc/self/status` `[bytes]`, where the system has one.
-fn status(key: &str) -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix(key))?;
-    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
-}
 
 /// A wavy sheet of `2 side²` triangles.
 fn sheet(side: u32) -> Model {

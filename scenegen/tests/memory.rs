@@ -2,18 +2,14 @@
 //! as the peak is the process's.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
+mod process;
+
 use densify_scenegen::{Options, PointOptions, Scene, Source, write};
+use process::status;
 
 const SIDE: u32 = 256;
 /// Colour, depth, normal and triangle.
 const PIXEL_BYTES: u64 = 4 + 4 + 12 + 4;
-
-/// Most memory this process ever held `[bytes]`, where the system tells.
-fn peak() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
-}
 
 fn write_views(train: u32) {
     let options = Options {
@@ -33,12 +29,12 @@ fn write_views(train: u32) {
 #[test]
 fn the_number_of_views_makes_no_difference() {
     write_views(3);
-    let Some(few) = peak() else {
+    let Some(few) = status("VmHWM:") else {
         eprintln!("skipped: this system does not tell a process's peak");
         return;
     };
     write_views(60);
-    let many = peak().expect("it was told before");
+    let many = status("VmHWM:").expect("it was told before");
     let image = u64::from(SIDE * SIDE) * PIXEL_BYTES;
     // Held, they would be sixty; four are left to the allocator's moods.
     assert!(

@@ -45,6 +45,8 @@ pub struct LearningRates {
 pub struct StepInput<'a> {
     /// Iteration, 1-based.
     pub step: u32,
+    /// The view's number; a view has one image, which a backend may keep.
+    pub view: usize,
     /// The view's camera.
     pub camera: &'a Camera,
     /// The view's image, of the camera's size.

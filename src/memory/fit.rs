@@ -57,7 +57,7 @@ pub struct Fit {
 /// has three per row; one that has more is rendered in bands, to the same bits.
 const PAIRS: [usize; 3] = [4, 8, 16];
 /// The share of the memory that decoded images may have: one part in so many.
-const IMAGES: u64 = 8;
+pub(crate) const IMAGES: u64 = 8;
 
 impl Wishes {
     /// Where the search begins: the fewest pairs, and no more images than their share.

@@ -187,6 +187,7 @@ pub(super) fn step(
 ) -> Result<StepOutput, BackendError> {
     backend.train_step(&StepInput {
         step: number,
+        view: 0,
         camera,
         target,
         background,

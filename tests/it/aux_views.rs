@@ -223,6 +223,7 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
             };
             let input = StepInput {
                 step,
+                view: 0,
                 camera: &scene.camera,
                 target: &scene.target,
                 background: BACKGROUND,

@@ -71,6 +71,7 @@ fn step(
     let target = target(camera, step.into());
     let input = StepInput {
         step,
+        view: 0,
         camera,
         target: &target,
         background: BACKGROUND,

@@ -4,6 +4,9 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
 #[path = "../fuzz/formats.rs"]
 #[expect(unreachable_pub, reason = "the fuzz targets reach it")]
 mod formats;
@@ -29,15 +32,13 @@ fn corpus(format: &str) -> Vec<(String, Vec<u8>)> {
     files
 }
 
-/// Draws that depend on nothing but their seed (Steele et al. 2014, SplitMix).
-struct Draws(u64);
+/// Draws that depend on nothing but their seed.
+struct Draws(ChaCha8Rng);
 
 impl Draws {
+    /// Below `bound`, and 0 where nothing is.
     fn below(&mut self, bound: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ z >> 31) % bound.max(1) as u64) as usize
+        self.0.random_range(0..bound.max(1))
     }
 }
 
@@ -104,7 +105,7 @@ fn damaged_files_are_refused_or_read() {
         for (name, file) in corpus(format) {
             for copy in 0..=COPIES {
                 let mut bytes = file.clone();
-                let mut draws = Draws(copy);
+                let mut draws = Draws(ChaCha8Rng::seed_from_u64(copy));
                 // The first copy is whole.
                 for _ in 0..copy.min(1 + copy % 4) {
                     damage(&mut bytes, &mut draws);

@@ -39,6 +39,7 @@ fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) {
     for step in 1..=steps {
         let input = StepInput {
             step,
+            view: 0,
             camera,
             target: &target,
             background: [0.2, 0.1, 0.4],

@@ -54,6 +54,7 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
         .map(|step| {
             let input = StepInput {
                 step,
+                view: 0,
                 camera,
                 target: &target,
                 background: GREY,

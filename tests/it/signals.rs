@@ -108,6 +108,7 @@ fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBacken
     for (v, (camera, target)) in views.cameras.iter().zip(&views.targets).enumerate() {
         let input = StepInput {
             step: v as u32 + 1,
+            view: 0,
             camera,
             target,
             background: BACKGROUND,

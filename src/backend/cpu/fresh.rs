@@ -116,6 +116,7 @@ mod tests {
         let background = [0.2; 3];
         let input = StepInput {
             step,
+            view: 0,
             camera: &camera,
             target: &target,
             background,

@@ -8,6 +8,7 @@ use wgpu::{Buffer, BufferDescriptor, BufferUsages};
 
 use super::device::Device;
 use super::frame::{Frame, State, grid};
+use super::photographs::KeptPhotographs;
 use super::signals::{Planes, record_stride};
 use crate::backend::BackendError;
 use crate::gaussians::sh_coefficients;
@@ -43,6 +44,7 @@ pub(super) struct Sizes {
     pub(super) cap: u64,
     pub(super) sh_degree: u8,
     pub(super) image: (u32, u32),
+    pub(super) photographs: KeptPhotographs,
     pub(super) planes: u64,
     /// Records and their sums.
     pub(super) detail: u32,
@@ -76,6 +78,7 @@ impl Sizes {
             cap,
             sh_degree,
             image,
+            photographs: KeptPhotographs::default(),
             planes: u64::from(planes.count),
             detail: planes.detail,
             more: false,
@@ -151,6 +154,10 @@ impl Sizes {
         }
         add(Section::Images, "photograph on the device", "truth", 4 * pixels);
         add(Section::Images, "photograph on the device", "mask", pixels.next_multiple_of(4));
+        let kept = self.photographs.count as u64 * self.photograph_bytes().iter().sum::<u64>();
+        if kept > 0 {
+            add(Section::Images, "photographs kept on the device", "photographs", kept);
+        }
         add(Section::Policy, "operations of an edit", "ops", OPS_BYTES);
         add(Section::Renderer, "small buffers", "nothing", 16);
         let mut add_as = |section, what, name, bytes, usage| {

@@ -72,6 +72,7 @@ fn run(
     for step in 1..=2 {
         outputs.push(backend.train_step(&StepInput {
             step,
+            view: 0,
             camera,
             target,
             background: BACKGROUND,

@@ -176,7 +176,9 @@ impl Device {
         sizes: &Sizes,
     ) -> Result<(), BackendError> {
         let most = self.largest_binding();
-        let Some(worst) = planned.iter().max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
+        // Photographs that are kept are copied only, and as many as a buffer holds.
+        let bound = planned.iter().filter(|p| p.name != "photographs");
+        let Some(worst) = bound.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
             return Ok(());
         };
         let device = &self.summary.name;

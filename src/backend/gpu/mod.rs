@@ -19,6 +19,7 @@ mod frame;
 mod observe;
 mod options;
 mod passes;
+mod photographs;
 mod pipelines;
 mod promise;
 mod readback;
@@ -53,6 +54,8 @@ use edits::EditLaunches;
 use frame::{Frame, State};
 pub use options::GpuOptions;
 use passes::{Launches, Passes, Recorder, Shape};
+use photographs::Kept;
+pub use photographs::KeptPhotographs;
 use pipelines::Pipelines;
 use signals::Planes;
 
@@ -86,6 +89,7 @@ pub struct GpuBackend {
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
+    kept: Kept,
     /// Bands that are encoded for the next view.
     bands: u32,
     laps: Vec<(&'static str, Duration)>,
@@ -152,6 +156,7 @@ impl GpuBackend {
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),
+            kept: Kept::default(),
             bands: 1,
             laps: Vec::new(),
         };
@@ -187,6 +192,7 @@ impl GpuBackend {
         let (most_wide, most_high) = self.sizes.image;
         if width > most_wide || height > most_high {
             self.sizes.image = (most_wide.max(width), most_high.max(height));
+            self.kept.clear();
             self.rebuild()?;
         }
         Ok(())

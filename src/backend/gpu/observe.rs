@@ -117,7 +117,7 @@ impl GpuBackend {
         );
         self.fit_image(camera.width, camera.height)?;
         let mut frame = self.frame(camera, background, input.sh_degree);
-        frame.draw[3] = self.upload_target(target);
+        frame.draw[3] = self.bring_photograph(input.view, target);
         let (state, shape) = self.run(&frame, |passes, to| {
             passes.forward(to);
             passes.loss(to, [0.0; 2]);

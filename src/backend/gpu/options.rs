@@ -2,6 +2,8 @@
 
 use densify_policies::policy::Needs;
 
+use super::photographs::KeptPhotographs;
+
 /// How to set up a [`GpuBackend`](super::GpuBackend).
 #[derive(Debug, Clone)]
 pub struct GpuOptions {
@@ -15,6 +17,8 @@ pub struct GpuOptions {
     /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
     /// memory than the ledger says.
     pub largest_image: (u32, u32),
+    /// Photographs that stay on the device instead of being uploaded at every step.
+    pub photographs: KeptPhotographs,
     /// Signals and candidates to collect.
     pub needs: Needs,
 }
@@ -23,6 +27,13 @@ impl GpuOptions {
     /// Options for models of at most `budget` rows.
     #[must_use]
     pub fn new(budget: usize) -> Self {
-        Self { budget, near: 0.01, tile_cap: None, largest_image: (0, 0), needs: Needs::default() }
+        Self {
+            budget,
+            near: 0.01,
+            tile_cap: None,
+            largest_image: (0, 0),
+            photographs: KeptPhotographs::default(),
+            needs: Needs::default(),
+        }
     }
 }

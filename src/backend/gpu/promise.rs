@@ -24,7 +24,13 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Siz
     let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
     // The adapter takes fewer rows than the sums do entries.
     let cap = cap.min(MOST_ENTRIES).max(budget as u64);
-    Sizes::new(budget, cap, sh_degree, image, &options.needs)
+    let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs);
+    sizes.photographs = options.photographs;
+    // They lie in one buffer, which nothing binds.
+    let one = sizes.photograph_bytes().iter().sum::<u64>();
+    let most = usize::try_from(device.summary.largest_buffer / one).unwrap_or(usize::MAX);
+    sizes.photographs.count = sizes.photographs.count.min(most);
+    sizes
 }
 
 /// What is on the device, and what the host holds for it.

@@ -38,7 +38,7 @@ impl GpuBackend {
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);
-        frame.draw[3] = self.upload_target(target);
+        frame.draw[3] = self.bring_photograph(input.view, target);
         frame.for_step(input, due, (self.terms, self.noise), &self.planes);
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_, '_>| {

@@ -10,7 +10,7 @@ use super::TrainArgs;
 use super::choices::parameters;
 use super::setup::{DECODERS, random_count};
 use crate::backend::cpu::{CpuBackend, CpuOptions};
-use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
+use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions, KeptPhotographs};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::run_files::use_threads;
@@ -19,7 +19,7 @@ use crate::dataset::images::ImageDemand;
 use crate::dataset::{Dataset, View};
 use crate::gaussians::sh_coefficients;
 use crate::init::usable_points;
-use crate::memory::{Ledger, Section, Setting, peak_resident, resident};
+use crate::memory::{IMAGES, Ledger, Section, Setting, peak_resident, resident};
 use crate::metrics::scratch_bytes;
 use crate::output::{InitChoice, SceneConfig};
 use crate::schedule::Background;
@@ -146,8 +146,20 @@ impl Survey {
             near: self.near(args),
             tile_cap: Some(setting.tile_cap),
             largest_image: scene::largest_image(&self.dataset),
+            photographs: self.kept_photographs(args, setting),
             needs,
         }
+    }
+
+    /// What of the training images stays on a GPU: as much as decoded images may take on the host, and
+    /// no more than their share of the device's memory.
+    fn kept_photographs(&self, args: &TrainArgs, setting: &Setting) -> KeptPhotographs {
+        let train = &self.dataset.train;
+        let with_masks = train.iter().any(|view| view.source.mask.is_some());
+        let one = KeptPhotographs::bytes(scene::largest_image(&self.dataset), with_masks);
+        let room = args.memory.map_or(u64::MAX, |memory| memory / IMAGES).min(setting.image_cache);
+        let count = usize::try_from(room / one.iter().sum::<u64>().max(1)).unwrap_or(usize::MAX);
+        KeptPhotographs { count: count.min(train.len()), with_masks }
     }
 
     fn near(&self, args: &TrainArgs) -> f32 {

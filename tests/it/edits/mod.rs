@@ -54,6 +54,7 @@ fn needs() -> Needs {
 fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
     let input = StepInput {
         step,
+        view: 0,
         camera,
         target: &scenes::target(camera),
         background: [0.2; 3],

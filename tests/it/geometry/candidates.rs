@@ -90,6 +90,7 @@ fn candidates(model: &Gaussians, target: &Image8, request: CandidateRequest) -> 
     };
     let input = StepInput {
         step: 1,
+        view: 0,
         camera: &camera(),
         target,
         background: GREY,

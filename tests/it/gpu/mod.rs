@@ -8,6 +8,7 @@ mod edits;
 mod extremes;
 mod looking;
 mod oracle;
+mod photographs;
 mod policies;
 mod quarantine;
 mod resuming;

@@ -23,6 +23,7 @@ pub(super) fn step(
 ) -> StepOutput {
     let input = StepInput {
         step,
+        view: 0,
         camera,
         target: &scenes::target(camera),
         background: GREY,

@@ -1,0 +1,95 @@
+//! Photographs that stay on the device.
+
+use densify::backend::gpu::{GpuBackend, GpuOptions, KeptPhotographs};
+use densify::backend::{Backend, StepInput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::Gaussians;
+use densify_policies::policy::Cadence;
+
+use super::{options, subjects};
+use crate::scenes;
+use crate::subject::RATES;
+
+/// A view of this size, with a random image.
+fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {
+    (scenes::camera(size.0, size.1, 60), scenes::noisy(size, 0.0, seed).1)
+}
+
+fn options_for(model: &Gaussians, count: usize, with_masks: bool) -> GpuOptions {
+    let photographs = KeptPhotographs { count, with_masks };
+    GpuOptions { photographs, largest_image: (41, 30), ..options(model) }
+}
+
+fn step(backend: &mut GpuBackend, step: u32, view: usize, (camera, target): &(Camera, Image8)) {
+    let input = StepInput {
+        step,
+        view,
+        camera,
+        target,
+        background: [0.3, 0.4, 0.6],
+        sh_degree: 0,
+        rates: RATES,
+        cadence: Cadence::default(),
+        seed: 3,
+    };
+    backend.train_step(&input).expect("a small image is rendered");
+}
+
+#[test]
+fn to_keep_photographs_changes_nothing_but_memory() {
+    let mut views = [view((41, 27), 1), view((30, 30), 2), view((41, 30), 3), view((17, 5), 4)];
+    let plane =
+        |seed, size| scenes::noisy(size, 0.0, seed).1.rgb[..(size.0 * size.1) as usize].to_vec();
+    views[1].1.alpha = Some(plane(5, (30, 30)));
+    views[2].1.mask = Some(plane(6, (41, 30)));
+    views[3].1.mask = Some(plane(7, (17, 5)));
+    let model = scenes::cloud(60, 0, &views[0].0, 8);
+    for device in subjects() {
+        let run = |count, with_masks| {
+            let options = options_for(&model, count, with_masks);
+            let mut backend = GpuBackend::new(&model, &options, device).expect("it fits");
+            for number in 0..12 {
+                let view = number * 7 % 4;
+                step(&mut backend, number as u32 + 1, view, &views[view]);
+            }
+            assert_eq!(backend.allocated(), backend.promised());
+            (backend.download().expect("a model"), backend.allocated())
+        };
+        let (expected, least) = run(0, false);
+        for (count, with_masks, bytes) in [
+            (1, false, 4 * 1230),
+            (4, false, 4 * 4 * 1230),
+            (3, true, 3 * (4 * 1230 + 1232)),
+            (9, true, 9 * (4 * 1230 + 1232)),
+        ] {
+            let (found, taken) = run(count, with_masks);
+            assert!(found == expected, "{count} kept, with masks: {with_masks}");
+            assert_eq!(taken - least, u64::next_multiple_of(bytes, 16), "{count}, {with_masks}");
+        }
+    }
+}
+
+/// A view has one image, so that another one shows whether the one before was kept.
+#[test]
+fn what_is_kept_is_not_uploaded_again() {
+    let (camera, first) = view((41, 30), 1);
+    let (_, second) = view((41, 30), 2);
+    let model = scenes::cloud(40, 0, &camera, 9);
+    let (first, second) = ((camera.clone(), first), (camera, second));
+    for device in subjects() {
+        let run = |count, order: [&(Camera, Image8); 3]| {
+            let options = options_for(&model, count, false);
+            let mut backend = GpuBackend::new(&model, &options, device).expect("it fits");
+            for (number, view) in (1..).zip(order) {
+                // The third step is of a view for which there is no room.
+                step(&mut backend, number, usize::from(number == 3), view);
+            }
+            backend.download().expect("a model")
+        };
+        let expected = run(0, [&first, &first, &second]);
+        assert!(run(1, [&first, &second, &second]) == expected);
+        assert!(run(0, [&first, &second, &second]) != expected);
+        assert!(run(1, [&first, &second, &first]) != expected);
+    }
+}
