@@ -38,7 +38,8 @@ pub(super) struct SceneArgs {
     /// they exist); any larger number: their width in pixels
     #[arg(short, long, value_name = "N", help_heading = "Scene", value_parser = resolution)]
     pub(super) resolution: Option<u32>,
-    /// Memory for decoded photographs; those beyond it are decoded again when their turn comes
+    /// Memory for decoded photographs, and on a GPU as much of its own; those beyond it are decoded,
+    /// and uploaded, again when their turn comes
     /// `[default: 1GiB, or chosen for --memory]`
     #[arg(long, value_name = "BYTES", help_heading = "Memory", value_parser = number::bytes)]
     pub(super) image_cache: Option<u64>,
