@@ -1,6 +1,8 @@
 //! Candidates for new rows, as every backend lists them: which pixels of a view are the worst
 //! (*Gaussians on a Diet*, arXiv 2604.20046, "compensation").
 
+use std::collections::HashMap;
+
 use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
 
 use super::{StateError, Tensor};
@@ -103,8 +105,35 @@ impl Candidates {
                 }
             }
         }
+        self.worst_ranked([width, height], count, spaced, error)
+    }
+
+    /// The same, where the pixels that may be among them are known, and their errors: at least
+    /// [`ranked`] of the worst.
+    pub(super) fn worst_of(
+        &mut self,
+        size: [usize; 2],
+        count: usize,
+        spaced: bool,
+        known: impl IntoIterator<Item = (f32, u32)>,
+    ) -> Vec<(usize, usize, f32)> {
+        self.ranking.clear();
+        self.ranking.extend(known);
+        let errors: HashMap<u32, f32> = self.ranking.iter().map(|&(e, pixel)| (pixel, e)).collect();
+        // What is not known is less.
+        let error = |x: usize, y: usize| errors.get(&((y * size[0] + x) as u32)).copied();
+        self.worst_ranked(size, count, spaced, error)
+    }
+
+    fn worst_ranked(
+        &mut self,
+        [width, height]: [usize; 2],
+        count: usize,
+        spaced: bool,
+        error: impl Fn(usize, usize) -> Option<f32>,
+    ) -> Vec<(usize, usize, f32)> {
         let worse = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
-        let ranked = if spaced { count.saturating_mul(SPARE) } else { count };
+        let ranked = ranked(count, spaced);
         if self.ranking.len() > ranked {
             self.ranking.select_nth_unstable_by(ranked, worse);
             self.ranking.truncate(ranked);
@@ -128,6 +157,11 @@ impl Candidates {
             .map(|&(e, pixel)| (pixel as usize % width, pixel as usize / width, e))
             .collect()
     }
+}
+
+/// How many of the worst pixels are looked at for `count` candidates.
+pub(super) fn ranked(count: usize, spaced: bool) -> usize {
+    if spaced { count.saturating_mul(SPARE) } else { count }
 }
 
 /// Whether the error of a pixel needs the loss's error map, and then its weights of |e| and

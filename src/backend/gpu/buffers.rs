@@ -160,6 +160,7 @@ impl Sizes {
         }
         add(Section::Policy, "operations of an edit", "ops", OPS_BYTES);
         add(Section::Renderer, "small buffers", "nothing", 16);
+        add(Section::Renderer, "small buffers", "selection", 4 * (4 + 256));
         let mut add_as = |section, what, name, bytes, usage| {
             all.push(Planned { name, section, what, bytes, usage });
         };

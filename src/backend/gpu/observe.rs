@@ -1,6 +1,7 @@
 //! What a policy looks at in a view beside the signals: candidates for new rows while training, and
-//! auxiliary views at its events. Pixels are chosen on the host, from a copy of the view's error or
-//! image; the device then finds their surface points, and the sums over each row's pixels.
+//! auxiliary views at its events. The device lists the worst pixels of a view, of which the host takes
+//! those that are spaced; of auxiliary views the host chooses them, from a copy of the image. The
+//! device then finds their surface points, and the sums over each row's pixels.
 
 use densify_policies::policy::ErrorMode;
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
@@ -8,7 +9,8 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateReques
 use super::GpuBackend;
 use super::buffers::OPS_BYTES;
 use super::frame::Frame;
-use super::passes::{Passes, Recorder, Shape};
+use super::passes::{Passes, Recorder, Search, Shape};
+use crate::backend::candidates::ranked;
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::backend::{AuxInput, AuxOutput, BackendError};
 use crate::dataset::images::Image8;
@@ -38,13 +40,78 @@ impl GpuBackend {
         self.device.queue.submit([encoder.finish()]);
     }
 
-    /// Adds the worst pixels of the view to the candidates.
+    /// What to look for in a view of this size, if the device has room for what is found.
+    pub(super) fn search(
+        &self,
+        request: &CandidateRequest,
+        count: usize,
+        [width, height, ..]: [u32; 4],
+    ) -> Option<Search> {
+        let room = self.found_room();
+        let wanted = ranked(count, request.spaced);
+        (wanted <= room).then_some(Search {
+            pixels: width * height,
+            wanted: wanted as u32,
+            room: room as u32,
+            min_alpha: request.min_alpha,
+            of_gradient: request.error == ErrorMode::Gradient,
+        })
+    }
+
+    /// Pixels of which the gradients of the rows have room, beside their number.
+    fn found_room(&self) -> usize {
+        (10 * self.budget - 1).min(u32::MAX as usize)
+    }
+
+    /// Adds the worst pixels of the view to the candidates; `search` is what was looked for, if it was.
     pub(super) fn collect_candidates(
         &mut self,
         seen: &Seen<'_>,
         request: &CandidateRequest,
         count: usize,
+        search: Option<Search>,
     ) -> Result<(), BackendError> {
+        let found = match search {
+            Some(search) => self.found(&search)?,
+            None => None,
+        };
+        let worst = match found {
+            Some(found) => {
+                let [width, height, ..] = seen.frame.image.map(|n| n as usize);
+                self.candidates.worst_of([width, height], count, request.spaced, found)
+            }
+            None => self.worst_of_all(seen, request, count)?,
+        };
+        for candidate in self.surface_points(seen, &worst, request.depth)? {
+            self.candidates.push(candidate);
+        }
+        Ok(())
+    }
+
+    /// The pixels that a search has found, with their errors; `None` where there are more than there
+    /// was room for, as of an image with one error everywhere.
+    fn found(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
+        // As many as are wanted, and a few that are as bad as the last.
+        let likely = (search.wanted + 63).min(search.room);
+        let mut read = self.read("gradient", 0, 8 * (1 + u64::from(likely)))?;
+        let count = read[0].to_bits();
+        if count > search.room {
+            return Ok(None);
+        }
+        if count > likely {
+            read = self.read("gradient", 0, 8 * (1 + u64::from(count)))?;
+        }
+        let pairs = read.as_chunks::<2>().0[1..].iter().take(count as usize);
+        Ok(Some(pairs.map(|[error, pixel]| (*error, pixel.to_bits())).collect()))
+    }
+
+    /// The worst pixels, chosen on the host from a copy of all errors.
+    fn worst_of_all(
+        &mut self,
+        seen: &Seen<'_>,
+        request: &CandidateRequest,
+        count: usize,
+    ) -> Result<Vec<(usize, usize, f32)>, BackendError> {
         let [width, height, ..] = seen.frame.image.map(|n| n as usize);
         let pixels = width * height;
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
@@ -62,11 +129,7 @@ impl GpuBackend {
             let pixel = y * width + x;
             (1.0 - finish[2 * pixel] >= request.min_alpha).then(|| error[pixel])
         };
-        let worst = self.candidates.worst(width, height, count, request.spaced, at);
-        for candidate in self.surface_points(seen, &worst, request.depth)? {
-            self.candidates.push(candidate);
-        }
-        Ok(())
+        Ok(self.candidates.worst(width, height, count, request.spaced, at))
     }
 
     /// The surface points of some pixels (x, y, error) of the view, in their order; none for a pixel

@@ -26,6 +26,9 @@ const DIGITS_OF_ENTRIES: u32 = 5;
 /// In place of a band: the whole image.
 const WHOLE: u32 = u32::MAX;
 
+/// What errors are read from: the loss's error per pixel, or its gradient.
+const MAPS: [&str; 2] = ["error", "pixel gradient"];
+
 /// All kernels with their buffers. Of pairs, the first reads `keys 0` and `values 0`.
 #[derive(Debug)]
 pub(super) struct Launches {
@@ -54,6 +57,9 @@ pub(super) struct Launches {
     measure: Launch,
     pub(super) present: Launch,
     surface: [Launch; 2],
+    count_errors: [Launch; 2],
+    narrow: Launch,
+    write_worst: [Launch; 2],
     replay: [Launch; 2],
     gather_columns: Launch,
 }
@@ -177,6 +183,14 @@ impl Launches {
                 let names = ["splats", "rows", "ops", "gradient"];
                 bind(Kernel::Surface, &[&["frame", "state"], &lists[..], &names[..]].concat())
             }),
+            count_errors: both(&|i| {
+                bind(Kernel::CountErrors, &["frame", "finish", MAPS[i], "selection"])
+            }),
+            narrow: bind(Kernel::Narrow, &["selection", "gradient"]),
+            write_worst: both(&|i| {
+                let names = ["frame", "finish", MAPS[i], "selection", "gradient"];
+                bind(Kernel::WriteWorst, &names)
+            }),
             replay: both(&|i| {
                 let lists = [values[i], "row of slot", "tile starts"];
                 let names = ["splats", "pixel gradient", "records"];
@@ -204,6 +218,20 @@ impl Shape {
     fn tile_passes(&self) -> u32 {
         (u32::BITS - (self.tiles - 1).leading_zeros()).div_ceil(4).max(1)
     }
+}
+
+/// Which pixels of a view are looked for.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Search {
+    /// Of the image.
+    pub(super) pixels: u32,
+    pub(super) wanted: u32,
+    /// Most that can be written down.
+    pub(super) room: u32,
+    /// Least alpha of a pixel.
+    pub(super) min_alpha: f32,
+    /// Whether the error is the length of the loss's gradient.
+    pub(super) of_gradient: bool,
 }
 
 /// Encodes dispatches into one pass.
@@ -351,6 +379,23 @@ impl Passes<'_> {
             to.run(&l.adam_bands[band], now, groups);
         }
         to.run(&l.adam_geometry, [0; 4], groups);
+    }
+
+    /// Writes the `wanted` worst pixels, and those as bad as the last of them, to the gradients of the
+    /// rows: how many there are, then bits of the error and number of each, as far as there is room.
+    pub(super) fn worst(&self, to: &mut Recorder<'_, '_>, search: &Search) {
+        let l = self.launches;
+        let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
+        let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
+        let of_pixel = [min_alpha.to_bits(), u32::from(of_gradient)];
+        let now = |a, b| [a, b, of_pixel[0], of_pixel[1]];
+        to.run(&l.narrow, [0, wanted, 0, 0], 1);
+        for shift in [24, 16, 8, 0] {
+            to.run(&l.count_errors[map], now(shift, u32::from(shift == 24)), groups);
+            to.run(&l.narrow, [1, 0, 0, 0], 1);
+        }
+        to.run(&l.write_worst[map], now(0, room), groups);
+        to.run(&l.narrow, [2, 0, 0, 0], 1);
     }
 
     /// Surface points of the pixels whose numbers are uploaded, from place `first` on.

@@ -80,6 +80,9 @@ kernels! {
     Sow: "apply" "sow" [1, 3, 4];
     ClampOpacity: "apply" "clamp_opacity" [3, 5, 6, 7];
     Surface: "candidates" "surface" [0, 1, 2, 3, 4, 5, 6, 7, 8];
+    CountErrors: "candidates" "count_errors" [0, 9, 10, 11];
+    Narrow: "candidates" "narrow" [11, 12];
+    WriteWorst: "candidates" "write_worst" [0, 9, 10, 11, 12];
     Replay: "observe" "replay" [0, 1, 2, 3, 4, 5, 6, 7];
     GatherColumns: "observe" "gather_columns" [0, 8, 9, 10, 11];
     Audit: "audit" "audit" [1, 2];

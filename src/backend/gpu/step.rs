@@ -50,12 +50,16 @@ impl GpuBackend {
             if weights.is_some() {
                 frame.draw[3] |= of_target::WITH_ERROR;
             }
+            let search = self.search(&request, count, frame.image);
             let (state, shape) = self.run(&frame, |passes, to| {
                 passes.forward(to);
                 passes.loss(to, weights.unwrap_or_default());
+                if let Some(search) = &search {
+                    passes.worst(to, search);
+                }
             })?;
             let seen = Seen { frame, shape, target };
-            self.collect_candidates(&seen, &request, count)?;
+            self.collect_candidates(&seen, &request, count, search)?;
             self.go_on(shape, step);
             state
         } else {

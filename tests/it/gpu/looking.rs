@@ -2,7 +2,7 @@
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::backend::gpu::{GpuBackend, GpuOptions};
-use densify::backend::{AuxInput, AuxOutput, Backend};
+use densify::backend::{AuxInput, AuxOutput, Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
@@ -15,6 +15,7 @@ use super::training::step;
 use super::{backend_for, subjects};
 use crate::compare::{Table, relative_error};
 use crate::scenes;
+use crate::subject::RATES;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 
@@ -106,16 +107,19 @@ fn candidates_are_those_of_the_native_backend() {
     let (model, camera, _) = scene();
     for device in subjects() {
         let mut table = Table::new("candidates, GPU against CPU");
-        for (error, depth, spaced) in [
-            (ErrorMode::Gradient, DepthMode::MaxWeight, false),
-            (ErrorMode::L1, DepthMode::Median, true),
-            (ErrorMode::L1Dssim, DepthMode::MaxWeight, true),
+        for (error, depth, spaced, rows_per_candidate) in [
+            (ErrorMode::Gradient, DepthMode::MaxWeight, false, 3),
+            (ErrorMode::L1, DepthMode::Median, true, 3),
+            (ErrorMode::L1Dssim, DepthMode::MaxWeight, true, 3),
+            (ErrorMode::L1Dssim, DepthMode::Median, true, 50),
+            // More than the device has room to list.
+            (ErrorMode::Gradient, DepthMode::Median, true, 1),
         ] {
             let request = CandidateRequest {
                 from: 0,
                 until: 10,
-                rows_per_candidate: 3,
-                capacity: 70,
+                rows_per_candidate,
+                capacity: 200,
                 error,
                 depth,
                 min_alpha: 0.3,
@@ -132,10 +136,92 @@ fn candidates_are_those_of_the_native_backend() {
                 step(backend, &camera, 2, Cadence::default());
                 (first, backend.take_signals(&needs).expect("signals").1)
             });
-            let what = format!("{error:?}, {depth:?}, spaced {spaced}");
+            let what =
+                format!("{error:?}, {depth:?}, spaced {spaced}, of {rows_per_candidate} rows");
             compare_points(&mut table, &what, &found.0, &expected.0);
             compare_points(&mut table, &format!("{what}, two steps"), &found.1, &expected.1);
         }
+        table.finish();
+    }
+}
+
+/// What the device lists is what the host finds in all errors: with a larger budget there is room for
+/// the list.
+#[test]
+fn the_device_finds_the_pixels_that_the_host_would() {
+    let (model, camera, _) = scene();
+    for device in subjects() {
+        for error in [ErrorMode::Gradient, ErrorMode::L1, ErrorMode::L1Dssim] {
+            let request = CandidateRequest {
+                from: 0,
+                until: 10,
+                rows_per_candidate: 1,
+                capacity: 500,
+                error,
+                depth: DepthMode::MaxWeight,
+                min_alpha: 0.3,
+                spaced: true,
+            };
+            let needs = Needs { candidates: Some(request), ..Needs::default() };
+            let [by_host, by_device] = [1, 2].map(|times| {
+                let options =
+                    GpuOptions { needs: needs.clone(), ..GpuOptions::new(times * model.len()) };
+                let mut gpu = GpuBackend::new(&model, &options, device).expect("it fits");
+                for number in 1..4 {
+                    step(&mut gpu, &camera, number, Cadence::default());
+                }
+                places(&gpu.take_signals(&needs).expect("signals").1)
+            });
+            assert!(by_host.len() > 8 * 30, "{error:?}: {} numbers", by_host.len());
+            assert_eq!(by_device, by_host, "{error:?}");
+        }
+    }
+}
+
+/// One row before everything, so that all pixels are equally wrong: more than the device can list.
+#[test]
+fn where_all_pixels_are_equally_wrong_the_first_is_taken() {
+    let camera = Camera {
+        rotation: glam::DMat3::IDENTITY,
+        translation: glam::DVec3::ZERO,
+        ..scenes::camera(24, 20, 3)
+    };
+    let mut model = Gaussians::default();
+    scenes::push(&mut model, [0.0, 0.0, 2.0], [1e6; 3], [1.0, 0.0, 0.0, 0.0], 0.0, |_| 0.3);
+    let black = Image8 { rgb: vec![0; 3 * 24 * 20], ..scenes::target(&camera) };
+    let request = CandidateRequest {
+        from: 0,
+        until: 10,
+        rows_per_candidate: 1,
+        capacity: 4,
+        error: ErrorMode::L1,
+        depth: DepthMode::MaxWeight,
+        min_alpha: 0.3,
+        spaced: false,
+    };
+    let needs = Needs { candidates: Some(request), ..Needs::default() };
+    let options = CpuOptions { needs: needs.clone(), ..CpuOptions::new(1) };
+    for device in subjects() {
+        let mut cpu = CpuBackend::new(&model, &options).expect("a small model fits");
+        let mut gpu = backend_for(&model, device, &needs);
+        let both: [&mut dyn Backend; 2] = [&mut cpu, &mut gpu];
+        let [expected, found] = both.map(|backend| {
+            let input = StepInput {
+                step: 1,
+                view: 0,
+                camera: &camera,
+                target: &black,
+                background: [0.0; 3],
+                sh_degree: 0,
+                rates: RATES,
+                cadence: Cadence::default(),
+                seed: 1,
+            };
+            backend.train_step(&input).expect("a small image is rendered");
+            backend.take_signals(&needs).expect("signals").1
+        });
+        let mut table = Table::new("a candidate among equals, GPU against CPU");
+        compare_points(&mut table, "the first pixel", &found, &expected);
         table.finish();
     }
 }
