@@ -76,7 +76,7 @@ fn what_is_kept_is_not_uploaded_again() {
     let (camera, first) = view((41, 30), 1);
     let (_, second) = view((41, 30), 2);
     let model = scenes::cloud(40, 0, &camera, 9);
-    let (first, second) = ((camera.clone(), first), (camera, second));
+    let (first, second) = ((camera, first), (camera, second));
     for device in subjects() {
         let run = |count, order: [&(Camera, Image8); 3]| {
             let options = options_for(&model, count, false);
