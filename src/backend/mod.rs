@@ -10,6 +10,7 @@ pub mod gpu;
 mod pixel_map;
 mod signal_planes;
 mod state;
+mod storage;
 
 use std::time::Duration;
 
@@ -22,6 +23,7 @@ use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
 pub use state::{StateError, Tensor, Values};
+pub use storage::{MomentStorage, ParameterStorage, Storage};
 
 /// Step sizes of one iteration, one per parameter class.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -104,9 +104,10 @@ pub(super) fn step<S: Simd>(
     }
 }
 
-/// Brings the parameters of a block back to where they are safe.
+/// Brings the parameters of a block back to where they are safe. Quaternions whose squared length is
+/// no farther from 1 than `slack` stay.
 #[inline(always)]
-pub(super) fn confine<S: Simd>(s: S, params: &mut [f32]) {
+pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
     let c = |x: f32| V::splat(s, x);
     for lane in (0..WIDTH).step_by(S::F32_LANES) {
         let at = |p: usize| p * WIDTH + lane;
@@ -115,7 +116,7 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32]) {
         // A quaternion this short has no direction left; it starts again without rotation. Here and
         // below, NaN stays NaN: an audit shall find it.
         let lost = norm2.le(c(1e-12));
-        let inv = c(1.0) / norm2.sqrt();
+        let inv = (norm2 - c(1.0)).abs().le(c(slack)).select(c(1.0), c(1.0) / norm2.sqrt());
         for (i, x) in q.into_iter().enumerate() {
             let identity = if i == 0 { 1.0 } else { 0.0 };
             lost.select(c(identity), x * inv).store(&mut params[at(plane::QUAT + i)..]);

@@ -2,9 +2,11 @@
 
 use super::CpuOptions;
 use super::adam::BiasCorrection;
-use super::blocks::{Blocks, planes};
+use super::blocks::planes;
 use super::loss::LossBuffers;
+use super::moments::Moments;
 use super::observe;
+use super::parameters::Parameters;
 use super::project::Splat;
 use super::rasterize::TileCanvas;
 use super::rasterize_bwd::TileGradient;
@@ -33,8 +35,10 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let grid = Grid::new(width, height);
     let float = size_of::<f32>() as u64;
     let mut ledger = Ledger::default();
-    ledger.add_to(Section::Model, "parameters", Blocks::bytes(budget, per_row));
-    ledger.add_to(Section::Model, "optimiser moments", 2 * Blocks::bytes(budget, per_row));
+    let parameters = Parameters::bytes(budget, per_row, options.storage.parameters);
+    ledger.add_to(Section::Model, "parameters", parameters);
+    let moments = Moments::bytes(budget, per_row, options.storage.moments);
+    ledger.add_to(Section::Model, "optimiser moments", moments);
     ledger.add_to(
         Section::Model,
         "optimiser ages and bias tables",

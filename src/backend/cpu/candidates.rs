@@ -10,7 +10,8 @@ use std::sync::atomic::AtomicU64;
 use densify_policies::policy::DepthMode;
 use glam::{Quat, Vec3};
 
-use super::blocks::{Blocks, plane};
+use super::blocks::plane;
+use super::parameters::Parameters;
 use super::project::{ALPHA_MIN, Splat, ViewParams};
 use super::rasterize::ALPHA_MAX;
 use super::tiles::Entry;
@@ -53,7 +54,7 @@ pub(super) fn surface_row(
 /// Where the ray through pixel centre `at` comes closest to the Gaussian of `row`, in its
 /// Mahalanobis metric, with the depth there. `None` where that is not in front of `near`.
 pub(super) fn closest_approach(
-    params: &Blocks,
+    params: &Parameters,
     row: usize,
     view: &ViewParams,
     at: [f32; 2],

@@ -15,9 +15,12 @@ mod candidates;
 mod footprint;
 mod fresh;
 mod loss;
+mod moments;
+mod narrow;
 mod observe;
 mod optimise;
 mod options;
+mod parameters;
 mod passes;
 mod project;
 mod project_bwd;
@@ -49,9 +52,11 @@ use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 use adam::BiasCorrection;
-use blocks::{Blocks, planes};
+use blocks::planes;
 use loss::LossBuffers;
+use moments::Moments;
 use optimise::Differentiate;
+use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
 use project::Splat;
 use rasterize::{DARK, TileCanvas};
@@ -81,8 +86,8 @@ pub struct CpuBackend {
     rows: usize,
     sh_degree: u8,
     near: f32,
-    params: Blocks,
-    moments: [Blocks; 2],
+    params: Parameters,
+    moments: Moments,
     ages: Vec<u16>,
     bias: BiasCorrection,
     summed: Summed,
@@ -137,7 +142,8 @@ impl CpuBackend {
         let cap = budget::tile_cap(options);
         let blocks = budget.div_ceil(WIDTH);
         let per_row = planes(model.sh_degree);
-        let mut params = Blocks::zeros(budget, per_row);
+        let storage = options.storage;
+        let mut params = Parameters::zeros(budget, per_row, storage.parameters);
         params.pack(model);
         Ok(Self {
             arch: Arch::new(),
@@ -148,7 +154,7 @@ impl CpuBackend {
             sh_degree: model.sh_degree,
             near: options.near,
             params,
-            moments: [Blocks::zeros(budget, per_row), Blocks::zeros(budget, per_row)],
+            moments: Moments::zeros(budget, per_row, storage.moments),
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
             summed: Summed::new(budget, per_row, options.needs.cadence),
@@ -211,8 +217,7 @@ impl CpuBackend {
         self.backward(&frame, detail);
         let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
         self.arch.dispatch(Differentiate {
-            params: self.params.of_rows(self.rows),
-            stride: self.params.stride(),
+            params: self.params.view(self.rows),
             sums: &self.sums,
             visible: &self.visible,
             view: &frame.view,
@@ -330,7 +335,7 @@ impl Backend for CpuBackend {
         }
         let mut model = apply::Model {
             params: &mut self.params,
-            moments: self.moments.each_mut(),
+            moments: &mut self.moments,
             ages: &mut self.ages,
             signals: &mut self.signals,
             summed: &mut self.summed,

@@ -2,6 +2,8 @@
 
 use densify_policies::policy::Needs;
 
+use crate::backend::Storage;
+
 /// How to set up a [`CpuBackend`](super::CpuBackend).
 #[derive(Debug, Clone)]
 pub struct CpuOptions {
@@ -17,6 +19,8 @@ pub struct CpuOptions {
     /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
     /// memory than the ledger says.
     pub largest_image: (u32, u32),
+    /// How parameters and moments are stored.
+    pub storage: Storage,
     /// Signals and candidates to collect.
     pub needs: Needs,
 }
@@ -31,6 +35,7 @@ impl CpuOptions {
             tile_cap: budget.saturating_mul(16),
             threads: None,
             largest_image: (0, 0),
+            storage: Storage::default(),
             needs: Needs::default(),
         }
     }

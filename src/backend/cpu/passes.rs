@@ -4,6 +4,7 @@
 use std::ops::Range;
 
 use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
+use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
 use super::candidates;
@@ -75,17 +76,17 @@ impl CpuBackend {
             self;
         clock.start();
         let (rows, arch) = (*rows, *arch);
-        let stride = params.stride();
+        let params = params.view(rows);
         pool.install(|| {
             (
-                params.of_rows(rows).par_chunks(stride * BLOCKS_PER_TASK),
                 splats[..rows].par_chunks_mut(ROWS_PER_TASK),
                 seen.par_chunks_mut(BLOCKS_PER_TASK),
             )
                 .into_par_iter()
-                .for_each(|(params, splats, seen)| {
-                    let rows = splats.len();
-                    arch.dispatch(Project { view: &view, params, stride, rows, splats, seen });
+                .enumerate()
+                .for_each(|(task, (splats, seen))| {
+                    let (params, rows) = (params.task(task), splats.len());
+                    arch.dispatch(Project { view: &view, params, rows, splats, seen });
                 });
             clock.lap("project");
             let visible = Visible { splats: &splats[..rows], seen };
@@ -269,19 +270,20 @@ impl CpuBackend {
         let terms = Terms::new(self.terms, rows);
         let noise = self.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
-        let [m, v] = moments;
         let layout = signals.layout();
-        let (stride, signal_stride) = (params.stride(), signals.blocks.stride());
+        let signal_stride = signals.blocks.stride();
+        let storing = PolicyRng::new(input.seed, input.step);
         let blocks = rows.div_ceil(WIDTH);
         let tasks = blocks.div_ceil(BLOCKS_PER_TASK);
         let per_task = signal_stride * BLOCKS_PER_TASK;
         let mut signal_blocks = parts(signals.blocks.of_rows_mut(rows), per_task, tasks);
         let mut summed = self.summed.tasks(rows, tasks);
+        let mut param_tasks = params.tasks(rows, tasks);
+        let mut moment_tasks = moments.tasks(rows, tasks);
         pool.install(|| {
             (
-                params.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
-                m.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
-                v.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
+                param_tasks.par_iter_mut(),
+                moment_tasks.par_iter_mut(),
                 ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
                 signal_blocks.par_iter_mut(),
                 sums[..blocks * WIDTH * detail.stride()]
@@ -291,11 +293,11 @@ impl CpuBackend {
             )
                 .into_par_iter()
                 .for_each(
-                    |(params, m, v, ages, signals, sums, visible, (task, summed))| {
+                    |(params, moments, ages, signals, sums, visible, (task, summed))| {
                         arch.dispatch(Optimise {
                             params,
-                            moments: [m, v],
-                            stride,
+                            moments,
+                            storing: &storing,
                             ages,
                             signals,
                             layout,

@@ -12,7 +12,8 @@
 use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};
 
-use super::blocks::plane;
+use super::blocks::{Scratch, plane, planes};
+use super::parameters::ParameterView;
 use super::simd::{Mask, V, WIDTH, each};
 use crate::camera::Camera;
 use crate::gaussians::sh_coefficients;
@@ -283,8 +284,7 @@ fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
 pub(super) struct Project<'a> {
     pub(super) view: &'a ViewParams,
     /// Parameter blocks of these rows.
-    pub(super) params: &'a [f32],
-    pub(super) stride: usize,
+    pub(super) params: ParameterView<'a>,
     /// Number of rows (the last block may be partly empty).
     pub(super) rows: usize,
     /// Shape: `[rows]`.
@@ -299,7 +299,10 @@ impl WithSimd for Project<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let view = self.view;
-        for (b, block) in self.params.chunks_exact(self.stride).enumerate() {
+        let needed = planes(view.sh_degree);
+        let mut scratch = Scratch::ZERO;
+        for b in 0..self.params.blocks() {
+            let block = self.params.open(b, needed, &mut scratch);
             let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];
             for at in (0..WIDTH).step_by(S::F32_LANES) {

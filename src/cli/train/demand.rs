@@ -9,6 +9,7 @@ use toml::Table;
 use super::TrainArgs;
 use super::choices::parameters;
 use super::setup::{DECODERS, random_count};
+use crate::backend::Storage;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
 use crate::cli::console::Console;
@@ -135,6 +136,7 @@ impl Survey {
             tile_cap: setting.tile_cap,
             threads: args.threads.map(usize::from),
             largest_image: scene::largest_image(&self.dataset),
+            storage: Storage::default(),
             needs,
         }
     }
