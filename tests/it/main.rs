@@ -30,4 +30,5 @@ mod sameness;
 mod scenes;
 mod signals;
 mod source_text;
+mod storage;
 mod subject;

@@ -99,6 +99,21 @@ fn bands_change_nothing() {
     }
 }
 
+/// Records that do not fit are made in parts: within a band, and within a tile.
+#[test]
+fn room_for_records_changes_nothing() {
+    let camera = scenes::camera(140, 120, 32);
+    let model = scenes::cloud(150, 1, &camera, 42);
+    let whole = Resources::default();
+    let (image, trained) = (run(&model, &camera, whole), train(&model, &camera, whole));
+    assert!(trained.1[0].entries > 1_500 && trained.1[0].bands == 1, "{:?}", trained.1[0]);
+    for (tile_cap, record_cap) in [(None, 1_500), (None, 100), (None, 7), (Some(500), 100)] {
+        let some = Resources { tile_cap, record_cap: Some(record_cap), ..whole };
+        assert!(bits(&run(&model, &camera, some)) == bits(&image), "{some:?}");
+        assert!(train(&model, &camera, some).0 == trained.0, "{some:?}, training");
+    }
+}
+
 #[test]
 fn running_twice_changes_nothing() {
     let camera = scenes::camera(60, 50, 33);

@@ -23,6 +23,11 @@ pub(super) fn tile_cap(options: &CpuOptions) -> usize {
     options.tile_cap.max(options.budget).max(1).min(u32::MAX as usize)
 }
 
+/// As many as there are entries, at most.
+pub(super) fn record_cap(options: &CpuOptions) -> usize {
+    options.record_cap.clamp(1, tile_cap(options))
+}
+
 /// Bytes per buffer for these options.
 pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
     let budget = options.budget.max(1);
@@ -65,7 +70,8 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     );
     ledger.add_to(Section::Gradients, "splat gradients", padded * stride as u64 * float);
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
-    ledger.add_to(Section::Tiles, "gradients per entry", cap * stride as u64 * float);
+    let records = record_cap(options) as u64 * stride as u64 * float;
+    ledger.add_to(Section::Tiles, "gradients per entry", records);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
     ledger.add_to(Section::Renderer, "loss", LossBuffers::bytes(grid.width, grid.height, threads));

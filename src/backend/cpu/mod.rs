@@ -26,6 +26,7 @@ mod project;
 mod project_bwd;
 mod rasterize;
 mod rasterize_bwd;
+mod records;
 mod regularise;
 mod signals;
 mod simd;
@@ -105,8 +106,10 @@ pub struct CpuBackend {
     /// Shape: `[tiles]`.
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// Bits of one record per slot. Shape: `[tile cap, stride of the signals' detail]`.
+    /// Bits of one record per entry, as far as there is room. Shape: `[record cap, stride of the
+    /// signals' detail]`.
     records: Vec<AtomicU32>,
+    record_cap: usize,
     /// One record per row. Shape: `[budget, stride of the signals' detail]`.
     sums: Vec<f32>,
     clock: StageClock,
@@ -139,7 +142,7 @@ impl CpuBackend {
         budget::reserve(&ledger)?;
         let signals = Accumulators::new(budget, &options.needs);
         let stride = signals.detail().stride();
-        let cap = budget::tile_cap(options);
+        let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let blocks = budget.div_ceil(WIDTH);
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
@@ -168,7 +171,8 @@ impl CpuBackend {
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
-            records: atomic_zeros(cap * stride),
+            records: atomic_zeros(record_cap * stride),
+            record_cap,
             sums: vec![0.0; blocks * WIDTH * stride],
             clock: StageClock::default(),
         })
@@ -197,7 +201,7 @@ impl CpuBackend {
         assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
         assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
         let detail = Detail::All;
-        let records = self.lists.cap() * detail.stride();
+        let records = self.record_cap * detail.stride();
         if self.records.len() < records {
             self.records = atomic_zeros(records);
         }

@@ -191,3 +191,6 @@ pub(super) fn ratios(first: &[f32], second: &[Bf16], to: &mut [i8], draws: &mut 
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -5,7 +5,7 @@
 //! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
 //! map the plane of the image gradient that belongs to alpha.
 
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, PixelMap};
 use pulp::{Simd, WithSimd};
@@ -17,6 +17,7 @@ use super::rasterize::{
     ALPHA_MAX, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane, TRANSMITTANCE,
     TRANSMITTANCE_MIN, TilePlace, Within,
 };
+use super::records::{TileRecords, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
@@ -113,28 +114,25 @@ impl CpuBackend {
                 if bands.len() > 1 {
                     lists.refill(Visible { splats: &splats[..rows], seen: visible }, grid, band);
                 }
-                (0..band.len()).into_par_iter().for_each(|i| {
-                    let tile = band.start + i;
-                    arch.dispatch(Replay {
-                        splats,
-                        list: lists.of_tile(i),
-                        place: TilePlace::new(grid, tile),
-                        map: &gradient[tile].planes[MAP],
-                        records,
+                for part in parts(lists, band.len(), records.len() / STRIDE) {
+                    part.tiles.clone().into_par_iter().for_each(|i| {
+                        let tile = band.start + i;
+                        arch.dispatch(Replay {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(grid, tile),
+                            map: &gradient[tile].planes[MAP],
+                            records: part.records(lists, i, records, STRIDE),
+                        });
                     });
-                });
-                let records = &records[..];
-                sums.par_chunks_mut(STRIDE).enumerate().for_each(|(row, sums)| {
-                    if is_seen(row) {
-                        let slots = lists.slots_of_row(row);
-                        let mine = &records[slots.start * STRIDE..slots.end * STRIDE];
-                        for record in mine.chunks_exact(STRIDE) {
+                    part.gather(lists, records, sums, visible, (STRIDE, false), |sums, records| {
+                        for record in records.chunks_exact(STRIDE) {
                             for (sum, x) in sums.iter_mut().zip(record) {
                                 *sum += f32::from_bits(x.load(Relaxed));
                             }
                         }
-                    }
-                });
+                    });
+                }
             }
         });
         let value = |column: AuxColumn, row: usize| match column {
@@ -163,8 +161,8 @@ struct Replay<'a> {
     list: &'a [AtomicU64],
     place: TilePlace,
     map: &'a Plane,
-    /// Bits of one record per slot; this tile writes those of its own entries.
-    records: &'a [AtomicU32],
+    /// This tile writes the records of its own entries, those that are held.
+    records: TileRecords<'a>,
 }
 
 impl WithSimd for Replay<'_> {
@@ -178,7 +176,7 @@ impl WithSimd for Replay<'_> {
         // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
         let (mut light, mut alive) = place.inside();
         let mut patches = Patches::EMPTY;
-        for entry in list {
+        for (i, entry) in list.iter().enumerate() {
             let entry = Entry::load(entry);
             let splat = &splats[entry.row];
             let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
@@ -215,8 +213,7 @@ impl WithSimd for Replay<'_> {
                     alive &= !(1 << p);
                 }
             }
-            let record = &records[entry.slot * STRIDE..(entry.slot + 1) * STRIDE];
-            for (to, sum) in record.iter().zip(sums) {
+            for (to, sum) in records.of(entry, i).into_iter().flatten().zip(sums) {
                 to.store(sum.sum().to_bits(), Relaxed);
             }
         }

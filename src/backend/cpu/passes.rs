@@ -15,6 +15,7 @@ use super::rasterize::{
     CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
 use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
+use super::records::parts as parts_of_records;
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
@@ -137,39 +138,30 @@ impl CpuBackend {
                 if bands.len() > 1 {
                     lists.refill(Visible { splats: &splats[..*rows], seen: visible }, grid, band);
                 }
-                (0..band.len()).into_par_iter().for_each(|i| {
-                    let tile = band.start + i;
-                    let [r, g, b, alpha, depth] = &gradient[tile].planes;
-                    arch.dispatch(RasterizeBwd {
-                        splats,
-                        list: lists.of_tile(i),
-                        place: TilePlace::new(grid, tile),
-                        background: *background,
-                        canvas: &canvas[tile],
-                        upstream: [r, g, b],
-                        upstream_more: (detail == Detail::All).then_some([alpha, depth]),
-                        detail,
-                        records,
+                let mut fresh = band.start == 0;
+                for part in parts_of_records(lists, band.len(), records.len() / stride) {
+                    part.tiles.clone().into_par_iter().for_each(|i| {
+                        let tile = band.start + i;
+                        let [r, g, b, alpha, depth] = &gradient[tile].planes;
+                        arch.dispatch(RasterizeBwd {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(grid, tile),
+                            background: *background,
+                            canvas: &canvas[tile],
+                            upstream: [r, g, b],
+                            upstream_more: (detail == Detail::All).then_some([alpha, depth]),
+                            detail,
+                            records: part.records(lists, i, records, stride),
+                        });
                     });
-                });
-                clock.lap("rasterize_bwd");
-                let first = band.start == 0;
-                let records = &records[..];
-                sums.par_chunks_mut(stride * WIDTH).zip(&visible[..]).enumerate().for_each(
-                    |(block, (sums, &seen))| {
-                        for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
-                            if first {
-                                sum.fill(0.0);
-                            }
-                            if seen >> lane & 1 == 1 {
-                                let slots = lists.slots_of_row(block * WIDTH + lane);
-                                let mine = &records[slots.start * stride..slots.end * stride];
-                                gather(sum, detail, mine);
-                            }
-                        }
-                    },
-                );
-                clock.lap("gather");
+                    clock.lap("rasterize_bwd");
+                    part.gather(lists, records, sums, visible, (stride, fresh), |sum, records| {
+                        gather(sum, detail, records);
+                    });
+                    fresh = false;
+                    clock.lap("gather");
+                }
             }
         });
     }

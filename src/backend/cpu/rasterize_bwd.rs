@@ -22,6 +22,7 @@ use super::project::{LOG2_255, Splat};
 use super::rasterize::{
     ALPHA_MAX, Aligned, BATCH, DARK, Patches, Plane, TRANSMITTANCE, TileCanvas, TilePlace, Within,
 };
+use super::records::TileRecords;
 use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 
@@ -99,9 +100,8 @@ pub(super) struct RasterizeBwd<'a> {
     /// Alpha and depth, for [`Detail::All`].
     pub(super) upstream_more: Option<[&'a Plane; 2]>,
     pub(super) detail: Detail,
-    /// Bits of one record per slot; this tile writes those of its own entries.
-    /// Shape: `[cap, detail.stride()]`.
-    pub(super) records: &'a [AtomicU32],
+    /// This tile writes the records of its own entries, those that are held.
+    pub(super) records: TileRecords<'a>,
 }
 
 impl WithSimd for RasterizeBwd<'_> {
@@ -130,8 +130,7 @@ struct Sums<S: Simd> {
 impl RasterizeBwd<'_> {
     #[inline(always)]
     fn run<S: Simd, const DETAIL: u8>(self, s: S) {
-        let Self { splats, list, place, background, canvas, upstream, records, detail, .. } = self;
-        let stride = detail.stride();
+        let Self { splats, list, place, background, canvas, upstream, records, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb] = upstream;
         let [ga, gd] = self.upstream_more.unwrap_or([&DARK, &DARK]);
@@ -152,8 +151,8 @@ impl RasterizeBwd<'_> {
             *end = canvas.stop[p].iter().copied().max().unwrap_or(0).min(list.len() as u32);
         }
         let list_end = patch_end.iter().copied().max().unwrap_or(0) as usize;
-        for entry in &list[list_end..] {
-            write(record_of(records, entry, stride), &[0.0; field::ALL]);
+        for (i, entry) in list[list_end..].iter().enumerate() {
+            write(records.of(Entry::load(entry), list_end + i), &[0.0; field::ALL]);
         }
 
         let mut batch = [Splat::default(); BATCH];
@@ -259,21 +258,15 @@ impl RasterizeBwd<'_> {
                     }
                     _ => {}
                 }
-                write(record_of(records, &chunk[i], stride), &record);
+                write(records.of(Entry::load(&chunk[i]), first + i), &record);
             }
         }
     }
 }
 
 #[inline(always)]
-fn record_of<'a>(records: &'a [AtomicU32], entry: &AtomicU64, stride: usize) -> &'a [AtomicU32] {
-    let slot = Entry::load(entry).slot;
-    &records[slot * stride..(slot + 1) * stride]
-}
-
-#[inline(always)]
-fn write(to: &[AtomicU32], record: &[f32; field::ALL]) {
-    for (to, x) in to.iter().zip(record) {
+fn write(to: Option<&[AtomicU32]>, record: &[f32; field::ALL]) {
+    for (to, x) in to.into_iter().flatten().zip(record) {
         to.store(x.to_bits(), Relaxed);
     }
 }

@@ -134,6 +134,7 @@ impl Survey {
             budget: setting.rows,
             near: self.near(args),
             tile_cap: setting.tile_cap,
+            record_cap: usize::MAX,
             threads: args.threads.map(usize::from),
             largest_image: scene::largest_image(&self.dataset),
             storage: Storage::default(),
