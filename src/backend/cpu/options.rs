@@ -2,6 +2,8 @@
 
 use densify_policies::policy::Needs;
 
+use crate::backend::Shortcuts;
+
 /// How to set up a [`CpuBackend`](super::CpuBackend).
 #[derive(Debug, Clone)]
 pub struct CpuOptions {
@@ -19,6 +21,8 @@ pub struct CpuOptions {
     pub largest_image: (u32, u32),
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Where to compute less than could be.
+    pub shortcuts: Shortcuts,
 }
 
 impl CpuOptions {
@@ -32,6 +36,7 @@ impl CpuOptions {
             threads: None,
             largest_image: (0, 0),
             needs: Needs::default(),
+            shortcuts: Shortcuts::default(),
         }
     }
 }
