@@ -65,6 +65,7 @@ pub mod dataset;
 pub mod evaluate;
 pub mod gaussians;
 pub mod init;
+pub mod knobs;
 pub mod memory;
 pub mod metrics;
 pub mod output;

@@ -10,7 +10,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-pub use fit::{Fit, Setting, Wishes, fit, least_memory};
+pub use fit::{Fit, PAIRS, Setting, Wishes, fit, least_memory};
 pub use grant::{Grant, grant};
 
 /// What is allocated, line by line.

@@ -8,6 +8,7 @@ mod candidates;
 pub mod cpu;
 pub mod gpu;
 mod pixel_map;
+mod shortcuts;
 mod signal_planes;
 mod state;
 mod storage;
@@ -22,6 +23,7 @@ use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
+pub use shortcuts::{Exp2, Shortcuts, Stepped};
 pub use state::{StateError, Tensor, Values};
 pub use storage::{MomentStorage, ParameterStorage, Storage};
 

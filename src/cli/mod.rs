@@ -19,6 +19,7 @@ mod device;
 mod devices;
 mod eval;
 mod failure;
+mod knobs;
 mod number;
 mod policies;
 mod progress;
@@ -59,6 +60,7 @@ Examples:
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
+  densify knobs                                            what trades speed or memory for accuracy
   densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
   densify selftest                                         whether this machine computes what it should
 
@@ -83,6 +85,7 @@ enum Command {
     Render(Box<render::RenderArgs>),
     Compare(compare::CompareArgs),
     Devices(devices::DevicesArgs),
+    Knobs(knobs::KnobsArgs),
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
@@ -113,15 +116,14 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     };
     let console = Console::new(quiet);
     let done = match arguments.command {
-        Command::Train(train) => {
-            let after = words.iter().skip(1).skip_while(|word| *word != "train").skip(1);
-            train::run(&after.cloned().collect::<Vec<_>>(), *train, &console)
-        }
-        Command::Plan(train) => train::plan::run(&train, &console),
+        Command::Train(train) => train::run(&after(&words, "train"), &train, &console),
+        Command::Plan(_) => train::arguments(&after(&words, "plan"))
+            .and_then(|train| train::plan::run(&train, &console)),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),
         Command::Devices(devices) => devices::run(&devices, &console),
+        Command::Knobs(knobs) => knobs::run(&knobs, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
@@ -133,6 +135,11 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
             failure.code
         }
     }
+}
+
+/// The words after that of a subcommand.
+fn after(words: &[OsString], subcommand: &str) -> Vec<OsString> {
+    words.iter().skip(1).skip_while(|word| *word != subcommand).skip(1).cloned().collect()
 }
 
 #[cfg(test)]

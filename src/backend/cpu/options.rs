@@ -2,7 +2,7 @@
 
 use densify_policies::policy::Needs;
 
-use crate::backend::Storage;
+use crate::backend::{Shortcuts, Storage};
 
 /// How to set up a [`CpuBackend`](super::CpuBackend).
 #[derive(Debug, Clone)]
@@ -26,6 +26,8 @@ pub struct CpuOptions {
     pub storage: Storage,
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Where to compute less than could be.
+    pub shortcuts: Shortcuts,
 }
 
 impl CpuOptions {
@@ -41,6 +43,7 @@ impl CpuOptions {
             largest_image: (0, 0),
             storage: Storage::default(),
             needs: Needs::default(),
+            shortcuts: Shortcuts::default(),
         }
     }
 }

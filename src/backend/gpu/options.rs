@@ -2,6 +2,8 @@
 
 use densify_policies::policy::Needs;
 
+use crate::backend::Shortcuts;
+
 /// How to set up a [`GpuBackend`](super::GpuBackend).
 #[derive(Debug, Clone)]
 pub struct GpuOptions {
@@ -17,12 +19,21 @@ pub struct GpuOptions {
     pub largest_image: (u32, u32),
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Where to compute less than could be.
+    pub shortcuts: Shortcuts,
 }
 
 impl GpuOptions {
     /// Options for models of at most `budget` rows.
     #[must_use]
     pub fn new(budget: usize) -> Self {
-        Self { budget, near: 0.01, tile_cap: None, largest_image: (0, 0), needs: Needs::default() }
+        Self {
+            budget,
+            near: 0.01,
+            tile_cap: None,
+            largest_image: (0, 0),
+            needs: Needs::default(),
+            shortcuts: Shortcuts::default(),
+        }
     }
 }

@@ -8,6 +8,7 @@ mod resume;
 mod session;
 mod setup;
 mod size;
+mod spelling;
 mod tally;
 
 use std::ffi::OsString;
@@ -112,6 +113,10 @@ pub(super) struct TrainArgs {
     /// `[default: the policy's choice, mostly 1]`
     #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u32).range(1..=1000))]
     sh_every: Option<u32>,
+    /// Set a knob of the trade between speed, memory and accuracy, such as alpha_min=1/128;
+    /// `densify knobs` lists them. May be repeated
+    #[arg(long, value_name = "NAME=VALUE", help_heading = "Training")]
+    knob: Vec<String>,
     /// What becomes of Gaussians with a number that is not finite, found every 100 iterations at
     /// least
     #[arg(long, value_name = "WHAT", help_heading = "Training", default_value = "prune")]
@@ -196,19 +201,24 @@ impl From<Init> for InitChoice {
 }
 
 /// Trains. `words` are those after `train` on the command line, which `args` was parsed from.
-pub(super) fn run(words: &[OsString], args: TrainArgs, console: &Console) -> Result<(), Failure> {
+pub(super) fn run(words: &[OsString], args: &TrainArgs, console: &Console) -> Result<(), Failure> {
     let (args, resumed) = match args.resume {
-        true => match resume::start(words, &args, console)? {
-            Start::Anew => (args, None),
+        true => match resume::start(words, args, console)? {
+            Start::Anew => (arguments(words)?, None),
             Start::From(run) => {
                 let (args, resumed) = *run;
                 (args, Some(resumed))
             }
         },
-        false => (args, None),
+        false => (arguments(words)?, None),
     };
     let prepared = setup::prepare(&args, resumed, console)?;
     session::train(&args, prepared, console)
+}
+
+/// The arguments in the words of a call, its knobs spelled out.
+pub(super) fn arguments(words: &[OsString]) -> Result<TrainArgs, Failure> {
+    spelling::arguments(&spelling::spelled(words, None)?)
 }
 
 #[cfg(test)]

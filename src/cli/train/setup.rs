@@ -128,6 +128,7 @@ pub(super) fn prepare(
             parameters: entry.effective(parameters, &scene)?,
         },
         scene: SceneConfig { image_cache: setting.image_cache, ..survey.scene.clone() },
+        knobs: survey.settings.clone(),
     };
     let fingerprint = Fingerprint::of(&survey.dataset);
     if let Some(checkpoint) = &checkpoint {

@@ -52,6 +52,7 @@ fn wishes(model: &Model, memory: u64) -> Wishes {
         most_rows: u32::MAX as usize,
         sh_degree: 0..=3,
         tile_cap: None,
+        pairs: PAIRS,
         most_pairs: u32::MAX as usize,
         image_cache: None,
         all_images: model.all_images,
@@ -67,16 +68,18 @@ proptest! {
         tile_cap in prop_oneof![Just(None), (1..500_000_usize).prop_map(Some)],
         image_cache in prop_oneof![Just(None), (0..200_000_000_u64).prop_map(Some)],
         lowest in 0..=3_u8,
+        pairs in prop_oneof![Just(PAIRS), Just([1; 3]), Just([4; 3])],
     ) {
         let wishes = Wishes {
             most_rows: most,
             tile_cap,
+            pairs,
             image_cache,
             sh_degree: lowest..=3,
             ..wishes(&model, memory)
         };
         let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(&wishes) else {
-            let least = wishes.setting(1_000.min(most), lowest, PAIRS[0]);
+            let least = wishes.setting(1_000.min(most), lowest, pairs[0]);
             prop_assert!(model.bytes(&least) > memory);
             return Ok(());
         };
