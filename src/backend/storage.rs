@@ -19,8 +19,9 @@ pub enum ParameterStorage {
     /// 4 bytes each.
     #[default]
     F32,
-    /// Means 4 bytes each, all others 2 (IEEE 754 binary16: 11 significant bits up to 65,504, far
-    /// beyond any log-scale, opacity logit, quaternion or coefficient in use).
+    /// Means 4 bytes each, all others 2. Coefficients of colour are IEEE 754 binary16: 11 significant
+    /// bits, up to 65,504. Log-scales and opacity logits (within ±16) and quaternions (±2), which are
+    /// bounded, are in fixed point, steps of 2⁻¹¹ and 2⁻¹⁴.
     F16,
 }
 

@@ -133,6 +133,77 @@ impl Narrow for Bf16 {
     }
 }
 
+/// The upper `digits` of some random bits as a number in [0, 1).
+#[inline(always)]
+fn unit(random: u32, digits: u32) -> f32 {
+    // A signed number, as vectors of those become floats in one instruction.
+    (random >> (32 - digits)) as i32 as f32 * (1.0 / (1_u32 << digits) as f32)
+}
+
+/// One of the two whole numbers next to `x`, which is within ±32,767, in the lower bits: the one that
+/// is farther where `draw` is below the distance to the nearer.
+#[inline(always)]
+fn whole(x: f32, draw: f32) -> i32 {
+    // 1.5·2²³, whose last digits then are the nearest whole number.
+    const SHIFT: f32 = 12_582_912.0;
+    let shifted = x + SHIFT;
+    let beside = x - (shifted - SHIFT);
+    let away = if beside > 0.0 { 1 } else { -1 };
+    let away = if draw < beside.abs() { away } else { 0 };
+    shifted.to_bits() as i32 + away
+}
+
+/// A number that is no more than a few, in 16 bits with so many after the point: distances are the
+/// same at 9 as at 0, where those of f16 grow to 2⁻⁷.
+pub(super) mod fixed {
+    /// What is not finite.
+    const NONE: i16 = i16::MIN;
+    const MOST: f32 = i16::MAX as f32;
+
+    /// Exact.
+    #[inline(always)]
+    pub(in super::super) fn to_f32(stored: i16, digits: u32) -> f32 {
+        let x = f32::from(stored) * (1.0 / (1_u32 << digits) as f32);
+        if stored == NONE { f32::NAN } else { x }
+    }
+
+    /// One of the two neighbours of `x`, or the end of the range that is nearer; NaN for what is not
+    /// finite.
+    #[inline(always)]
+    pub(in super::super) fn between(x: f32, digits: u32, random: u32) -> i16 {
+        let scaled = (x * (1_u32 << digits) as f32).clamp(-MOST, MOST);
+        let whole = super::whole(scaled, super::unit(random, 23)) as i16;
+        if x.is_finite() { whole } else { NONE }
+    }
+
+    /// The nearest; of two, the even one.
+    pub(in super::super) fn nearest(x: f32, digits: u32) -> i16 {
+        between(x, digits, 1 << 31)
+    }
+}
+
+/// The numbers of a plane from fixed point.
+#[inline(always)]
+pub(super) fn widen_fixed(from: &[i16; WIDTH], to: &mut [f32; WIDTH], digits: u32) {
+    for lane in 0..WIDTH {
+        to[lane] = fixed::to_f32(from[lane], digits);
+    }
+}
+
+/// Stores the numbers of a plane in fixed point, rounded at random.
+#[inline(always)]
+pub(super) fn narrow_fixed(
+    from: &[f32; WIDTH],
+    to: &mut [i16; WIDTH],
+    digits: u32,
+    draws: &mut Draws,
+) {
+    let random = draws.next();
+    for lane in 0..WIDTH {
+        to[lane] = fixed::between(from[lane], digits, random[lane]);
+    }
+}
+
 /// The numbers of whole planes from what is stored.
 #[inline(always)]
 pub(super) fn widen<T: Narrow>(from: &[T], to: &mut [f32]) {
@@ -172,8 +243,8 @@ pub(super) fn first_moments(ratios: &[i8], seconds: &[f32], to: &mut [f32]) {
 
 /// First moments as multiples of the roots of the second ones *as stored*, rounded at random.
 ///
-/// Draws are the middles of 2,048 steps: so far from both ends that the rounding of the division
-/// does not move a ratio that is one already.
+/// Draws are the middles of 2,048 steps, and so never as small as the rounding of the division: a ratio
+/// that is one already stays.
 #[inline(always)]
 pub(super) fn ratios(first: &[f32], second: &[Bf16], to: &mut [i8], draws: &mut Draws) {
     let (first, second) = (first.as_chunks::<WIDTH>().0, second.as_chunks::<WIDTH>().0);
@@ -182,12 +253,11 @@ pub(super) fn ratios(first: &[f32], second: &[Bf16], to: &mut [i8], draws: &mut 
         let random = draws.next();
         for lane in 0..WIDTH {
             let root = RATIO_STEP * second[lane].to_f32().sqrt();
-            let up = ((random[lane] >> 21) as f32 + 0.5) * (1.0 / 2048.0);
+            let draw = unit(random[lane], 11) + 0.5 / 2048.0;
             // Of nothing, nothing: also where the square has vanished in f32. NaN becomes 0, and
             // NaN again with its second moment.
             let ratio = if root > 0.0 { first[lane] / root } else { 0.0 };
-            let ratio = ratio.clamp(-127.0, 127.0) + 128.0 + up;
-            to[lane] = (ratio as i32 - 128).clamp(-127, 127) as i8;
+            to[lane] = whole(ratio.clamp(-127.0, 127.0), draw) as i8;
         }
     }
 }

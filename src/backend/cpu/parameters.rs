@@ -1,11 +1,16 @@
-//! The model's parameters: f32 in blocks, or the means so and all other planes as f16.
+//! The model's parameters: f32 in blocks; or the means so, and all other planes in 16 bits. Colour
+//! then is f16. Log-scales, quaternions and opacity logits, which the optimiser keeps within bounds,
+//! are in fixed point: of f16, log-scales of −5 would lie 0.004 apart, four times an ordinary step, and
+//! the rounding of it would be more than the step.
 //!
 //! Kernels read and write planes of f32. Where a block is f32 they get the block itself; else its
 //! planes are widened to an array ([`open`](ParameterTask::open)) and stored from it, rounded at
 //! random ([`close`](ParameterTask::close)). Edits, which happen once, are rounded to the nearest.
 
+use std::ops::Range;
+
 use super::blocks::{Blocks, Scratch, plane};
-use super::narrow::{Draws, F16, Narrow, narrow, widen};
+use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
 use super::passes::parts;
 use super::simd::WIDTH;
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
@@ -14,56 +19,82 @@ use crate::gaussians::{Gaussians, sh_coefficients};
 
 /// Planes of means: the ones that are f32 in any case.
 const MEANS: usize = plane::LOG_SCALE;
+/// Planes of what is bounded.
+const BOUNDED: usize = plane::SH - plane::LOG_SCALE;
+
+/// Digits after the point of the bounded planes: from −16 to 16, and quaternions from −2 to 2.
+const fn digits(bounded: usize) -> u32 {
+    match bounded + MEANS {
+        plane::QUAT..plane::OPACITY => 14,
+        _ => 11,
+    }
+}
 
 /// The parameters of all rows.
 #[derive(Debug)]
 pub(super) struct Parameters {
     /// All planes, or the means.
     wide: Blocks,
-    /// None, or all planes after the means.
-    narrow: Blocks<F16>,
+    /// None, or the bounded planes.
+    fixed: Blocks<i16>,
+    /// None, or the planes of colour.
+    half: Blocks<F16>,
 }
 
-/// Planes of f32 and of f16.
-fn split(planes: usize, storage: ParameterStorage) -> [usize; 2] {
+/// Planes of f32, in fixed point, and of f16.
+fn split(planes: usize, storage: ParameterStorage) -> [usize; 3] {
     match storage {
-        ParameterStorage::F32 => [planes, 0],
-        ParameterStorage::F16 => [MEANS, planes - MEANS],
+        ParameterStorage::F32 => [planes, 0, 0],
+        ParameterStorage::F16 => [MEANS, BOUNDED, planes - plane::SH],
     }
 }
 
 impl Parameters {
     pub(super) fn zeros(capacity: usize, planes: usize, storage: ParameterStorage) -> Self {
-        let [wide, narrow] = split(planes, storage);
-        Self { wide: Blocks::zeros(capacity, wide), narrow: Blocks::zeros(capacity, narrow) }
+        let [wide, fixed, half] = split(planes, storage);
+        Self {
+            wide: Blocks::zeros(capacity, wide),
+            fixed: Blocks::zeros(capacity, fixed),
+            half: Blocks::zeros(capacity, half),
+        }
     }
 
     /// Bytes for `capacity` rows.
     pub(super) fn bytes(capacity: usize, planes: usize, storage: ParameterStorage) -> u64 {
-        let [wide, narrow] = split(planes, storage);
-        Blocks::<f32>::bytes(capacity, wide) + Blocks::<F16>::bytes(capacity, narrow)
+        let [wide, fixed, half] = split(planes, storage);
+        Blocks::<f32>::bytes(capacity, wide)
+            + Blocks::<i16>::bytes(capacity, fixed)
+            + Blocks::<F16>::bytes(capacity, half)
     }
 
-    /// Planes of f32; where there are more, they are f16.
-    fn wide_planes(&self) -> usize {
-        self.wide.stride() / WIDTH
+    /// Numbers per block of the three.
+    fn strides(&self) -> [usize; 3] {
+        [self.wide.stride(), self.fixed.stride(), self.half.stride()]
     }
 
-    fn planes(&self) -> usize {
-        (self.wide.stride() + self.narrow.stride()) / WIDTH
+    fn is_wide(&self, plane: usize) -> bool {
+        plane < MEANS || self.fixed.stride() == 0
     }
 
     pub(super) fn get(&self, row: usize, plane: usize) -> f32 {
-        match plane.checked_sub(self.wide_planes()) {
-            None => self.wide.get(row, plane),
-            Some(plane) => self.narrow.get(row, plane).to_f32(),
+        match plane.checked_sub(plane::SH) {
+            _ if self.is_wide(plane) => self.wide.get(row, plane),
+            None => {
+                let bounded = plane - MEANS;
+                fixed::to_f32(self.fixed.get(row, bounded), digits(bounded))
+            }
+            Some(colour) => self.half.get(row, colour).to_f32(),
         }
     }
 
     pub(super) fn set(&mut self, row: usize, plane: usize, value: f32) {
-        match plane.checked_sub(self.wide_planes()) {
-            None => self.wide.set(row, plane, value),
-            Some(plane) => self.narrow.set(row, plane, F16::nearest(value)),
+        match plane.checked_sub(plane::SH) {
+            _ if self.is_wide(plane) => self.wide.set(row, plane, value),
+            None => {
+                let bounded = plane - MEANS;
+                self.fixed.set(row, bounded, fixed::nearest(value, digits(bounded)));
+            }
+            Some(colour) => self.half.set(row, colour, F16::nearest(value)),
         }
     }
 
@@ -81,12 +112,14 @@ impl Parameters {
     /// Copies what is stored, to the bit.
     pub(super) fn copy_row(&mut self, from: usize, to: usize) {
         self.wide.copy_row(from, to);
-        self.narrow.copy_row(from, to);
+        self.fixed.copy_row(from, to);
+        self.half.copy_row(from, to);
     }
 
     pub(super) fn clear_row(&mut self, row: usize) {
         self.wide.clear_row(row);
-        self.narrow.clear_row(row);
+        self.fixed.clear_row(row);
+        self.half.clear_row(row);
     }
 
     /// Packs a host model; `self` must have room and the model's planes.
@@ -120,50 +153,58 @@ impl Parameters {
     /// The blocks of the first `rows` rows, to read.
     pub(super) fn view(&self, rows: usize) -> ParameterView<'_> {
         ParameterView {
-            planes: self.planes(),
-            strides: [self.wide.stride(), self.narrow.stride()],
+            strides: self.strides(),
             wide: self.wide.of_rows(rows),
-            narrow: self.narrow.of_rows(rows),
+            fixed: self.fixed.of_rows(rows),
+            half: self.half.of_rows(rows),
         }
     }
 
     /// The blocks of the first `rows` rows, cut for so many of the optimiser's tasks.
     pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<ParameterTask<'_>> {
-        let strides = [self.wide.stride(), self.narrow.stride()];
-        let wide = parts(self.wide.of_rows_mut(rows), strides[0] * BLOCKS_PER_TASK, tasks);
-        let narrow = parts(self.narrow.of_rows_mut(rows), strides[1] * BLOCKS_PER_TASK, tasks);
-        let both = wide.into_iter().zip(narrow);
-        both.map(|(wide, narrow)| ParameterTask { strides, wide, narrow }).collect()
+        let strides = self.strides();
+        let per_task = strides.map(|stride| stride * BLOCKS_PER_TASK);
+        let wide = parts(self.wide.of_rows_mut(rows), per_task[0], tasks);
+        let fixed = parts(self.fixed.of_rows_mut(rows), per_task[1], tasks);
+        let half = parts(self.half.of_rows_mut(rows), per_task[2], tasks);
+        let all = wide.into_iter().zip(fixed).zip(half);
+        all.map(|((wide, fixed), half)| ParameterTask { strides, wide, fixed, half }).collect()
     }
 }
 
 /// Some blocks, to read.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ParameterView<'a> {
-    planes: usize,
-    /// Numbers per block of the two below.
-    strides: [usize; 2],
+    /// Numbers per block of the three below.
+    strides: [usize; 3],
     wide: &'a [f32],
-    narrow: &'a [F16],
+    fixed: &'a [i16],
+    half: &'a [F16],
+}
+
+/// Numbers of a block.
+fn of(block: usize, stride: usize) -> Range<usize> {
+    block * stride..(block + 1) * stride
 }
 
 impl<'a> ParameterView<'a> {
     /// The blocks of task `i`, each of `ROWS_PER_TASK` rows but the last.
     pub(super) fn task(self, i: usize) -> Self {
-        let from = |len: usize, stride: usize| {
-            let per_task = stride * BLOCKS_PER_TASK;
-            (i * per_task).min(len)..((i + 1) * per_task).min(len)
-        };
+        fn cut<T>(all: &[T], i: usize, stride: usize) -> &[T] {
+            let Range { start, end } = of(i, stride * BLOCKS_PER_TASK);
+            &all[start.min(all.len())..end.min(all.len())]
+        }
         Self {
-            wide: &self.wide[from(self.wide.len(), self.strides[0])],
-            narrow: &self.narrow[from(self.narrow.len(), self.strides[1])],
-            ..self
+            strides: self.strides,
+            wide: cut(self.wide, i, self.strides[0]),
+            fixed: cut(self.fixed, i, self.strides[1]),
+            half: cut(self.half, i, self.strides[2]),
         }
     }
 
     /// Planes of a row.
     pub(super) fn planes(&self) -> usize {
-        self.planes
+        self.strides.iter().sum::<usize>() / WIDTH
     }
 
     pub(super) fn blocks(&self) -> usize {
@@ -181,12 +222,12 @@ impl<'a> ParameterView<'a> {
     where
         'a: 'b,
     {
-        let wide = &self.wide[block * self.strides[0]..(block + 1) * self.strides[0]];
-        if self.strides[1] == 0 {
-            return wide;
+        let [wide, fixed, half] = self.strides;
+        if fixed == 0 {
+            return &self.wide[of(block, wide)];
         }
-        let narrow = &self.narrow[block * self.strides[1]..(block + 1) * self.strides[1]];
-        to_scratch(wide, narrow, planes, scratch);
+        let narrow = (&self.fixed[of(block, fixed)], &self.half[of(block, half)]);
+        to_scratch(&self.wide[of(block, wide)], narrow, planes, scratch);
         &scratch.0
     }
 }
@@ -194,15 +235,16 @@ impl<'a> ParameterView<'a> {
 /// Some blocks, to change.
 #[derive(Debug)]
 pub(super) struct ParameterTask<'a> {
-    strides: [usize; 2],
+    strides: [usize; 3],
     wide: &'a mut [f32],
-    narrow: &'a mut [F16],
+    fixed: &'a mut [i16],
+    half: &'a mut [F16],
 }
 
 impl ParameterTask<'_> {
     /// Numbers per block.
     pub(super) fn stride(&self) -> usize {
-        self.strides[0] + self.strides[1]
+        self.strides.iter().sum()
     }
 
     /// Whether what is stored is not what was computed.
@@ -219,12 +261,12 @@ impl ParameterTask<'_> {
         planes: usize,
         scratch: &'b mut Scratch,
     ) -> &'b mut [f32] {
-        let wide = &mut self.wide[block * self.strides[0]..(block + 1) * self.strides[0]];
-        if self.strides[1] == 0 {
-            return wide;
+        let [wide, fixed, half] = self.strides;
+        if fixed == 0 {
+            return &mut self.wide[of(block, wide)];
         }
-        let narrow = &self.narrow[block * self.strides[1]..(block + 1) * self.strides[1]];
-        to_scratch(wide, narrow, planes, scratch);
+        let narrow = (&self.fixed[of(block, fixed)], &self.half[of(block, half)]);
+        to_scratch(&self.wide[of(block, wide)], narrow, planes, scratch);
         &mut scratch.0
     }
 
@@ -237,22 +279,33 @@ impl ParameterTask<'_> {
         scratch: &Scratch,
         draws: &mut Draws,
     ) {
-        if self.strides[1] == 0 {
+        let [wide, fixed, half] = self.strides;
+        if fixed == 0 {
             return;
         }
-        let wide = &mut self.wide[block * self.strides[0]..(block + 1) * self.strides[0]];
-        let to = &mut self.narrow[block * self.strides[1]..(block + 1) * self.strides[1]];
-        let (means, rest) = scratch.0[..planes * WIDTH].split_at(wide.len());
-        wide.copy_from_slice(means);
-        narrow(rest, &mut to[..rest.len()], draws);
+        let all = &scratch.0[..planes * WIDTH];
+        let (means, rest) = all.split_at(MEANS * WIDTH);
+        let (bounded, colour) = rest.split_at(BOUNDED * WIDTH);
+        self.wide[of(block, wide)].copy_from_slice(means);
+        let to = self.fixed[of(block, fixed)].as_chunks_mut().0;
+        for (i, (from, to)) in bounded.as_chunks().0.iter().zip(to).enumerate() {
+            narrow_fixed(from, to, digits(i), draws);
+        }
+        narrow(colour, &mut self.half[of(block, half)][..colour.len()], draws);
     }
 }
 
 #[inline(always)]
-fn to_scratch(wide: &[f32], narrow: &[F16], planes: usize, scratch: &mut Scratch) {
-    let (means, rest) = scratch.0[..planes * WIDTH].split_at_mut(wide.len());
+fn to_scratch(wide: &[f32], narrow: (&[i16], &[F16]), planes: usize, scratch: &mut Scratch) {
+    let all = &mut scratch.0[..planes * WIDTH];
+    let (means, rest) = all.split_at_mut(MEANS * WIDTH);
+    let (bounded, colour) = rest.split_at_mut(BOUNDED * WIDTH);
     means.copy_from_slice(wide);
-    widen(&narrow[..rest.len()], rest);
+    let (fixed, half) = narrow;
+    for (i, (from, to)) in fixed.as_chunks().0.iter().zip(bounded.as_chunks_mut().0).enumerate() {
+        widen_fixed(from, to, digits(i));
+    }
+    widen(&half[..colour.len()], colour);
 }
 
 const _: () = assert!(ROWS_PER_TASK == BLOCKS_PER_TASK * WIDTH, "a task is whole blocks");

@@ -91,7 +91,7 @@ proptest! {
         prop_assert!(tile_cap.is_none_or(|cap| setting.tile_cap == cap.max(setting.rows)));
         prop_assert!(image_cache.is_none_or(|cache| setting.image_cache == cache));
         if by_memory {
-            let more = wishes.setting(setting.rows + 1, setting.sh_degree, PAIRS[0]);
+            let more = wishes.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
             prop_assert!(model.bytes(&more) > memory);
         } else {
             let more = wishes.setting(setting.rows, setting.sh_degree, PAIRS[2]);
@@ -107,7 +107,7 @@ proptest! {
         let enough = 20_000.min(most);
         prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
         if setting.sh_degree < 3 {
-            let higher = wishes.setting(enough, setting.sh_degree + 1, PAIRS[0]);
+            let higher = wishes.setting(enough, setting.sh_degree + 1, pairs[0]);
             prop_assert!(model.bytes(&higher) > memory);
         }
     }

@@ -95,6 +95,43 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
     is_fair(Bf16, BF16_MAX as u16);
 }
 
+/// Fixed point: all that is stored comes back, and what lies between is fair.
+#[test]
+fn fixed_point_is_fair_and_stays() {
+    for (digits, most) in [(11, 16.0_f32), (14, 2.0)] {
+        let step = most / 32768.0;
+        for stored in -i16::MAX..=i16::MAX {
+            let x = fixed::to_f32(stored, digits);
+            assert_eq!(f64::from(x), f64::from(stored) * f64::from(step));
+            for random in [0, 1, 1 << 31, u32::MAX] {
+                assert_eq!(fixed::between(x, digits, random), stored, "{x}");
+            }
+        }
+        for x in [0.1_f32, -0.1, 1e-6, -3e-5, 0.7311, -1.9, 0.99 * most] {
+            let low = (x / step).floor();
+            let mut ups = 0;
+            for random in (0..1 << 14).map(|k| k << 18) {
+                let stored = f32::from(fixed::between(x, digits, random));
+                assert!(stored == low || stored == low + 1.0, "{x}: {stored}");
+                ups += u32::from(stored > low);
+            }
+            let (found, share) = (f64::from(ups) / 16384.0, f64::from(x / step - low));
+            assert!((found - share).abs() < 2e-4, "{x}: {found} instead of {share}");
+            let near = fixed::to_f32(fixed::nearest(x, digits), digits) - x;
+            assert!(near.abs() <= 0.5 * step, "{x}: the nearest is off by {near}");
+        }
+        for random in [0, u32::MAX] {
+            for x in [most, 9e9, f32::MAX] {
+                assert_eq!(fixed::between(x, digits, random), i16::MAX);
+                assert_eq!(fixed::between(-x, digits, random), -i16::MAX);
+            }
+            for x in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                assert!(fixed::to_f32(fixed::between(x, digits, random), digits).is_nan());
+            }
+        }
+    }
+}
+
 #[test]
 fn what_is_no_number_stays_none() {
     for random in [0, 1 << 31, u32::MAX] {
