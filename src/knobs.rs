@@ -5,11 +5,13 @@
 //! policy by another name ([`How`]); the others are set by `--knob` alone, and stand in `[knobs]` of
 //! `config.toml`. [`Settings`] holds these.
 
+mod presets;
 mod settings;
 mod table;
 
 use std::fmt;
 
+pub use presets::{DEFAULT_PRESET, Measured, PRESETS, Preset, preset};
 pub use settings::Settings;
 pub use table::KNOBS;
 
@@ -233,7 +235,7 @@ fn plain(value: f64) -> String {
 }
 
 /// The number among the words nearest to a number, else the word most like a word.
-fn nearest_word(text: &str, words: &'static [&'static str]) -> &'static str {
+fn nearest_word(text: &str, words: &[&'static str]) -> &'static str {
     let distance = |word: &str| match (number(text), number(word)) {
         (Some(a), Some(b)) => (a - b).abs(),
         _ => 1.0 - strsim::jaro_winkler(text, word),
@@ -257,7 +259,7 @@ impl fmt::Display for Domain {
                 };
                 write!(f, "{} to {}", shown(least), shown(most))
             }
-            Self::Whole { least, most } if *most == u64::from(u32::MAX) => {
+            Self::Whole { least, most } if *most >= u64::from(u32::MAX) => {
                 write!(f, "{least} or more")
             }
             Self::Whole { least, most } => write!(f, "{least} to {most}"),

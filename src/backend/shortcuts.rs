@@ -21,9 +21,7 @@ pub struct Shortcuts {
 pub enum Exp2 {
     /// Relative error 1.8e-3.
     Degree2,
-    /// Relative error 1.1e-4.
-    Degree3,
-    /// Relative error 4.1e-6.
+    /// Relative error 2.7e-6.
     Degree4,
     /// As exact as `f32` is.
     #[default]

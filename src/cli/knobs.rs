@@ -4,7 +4,7 @@ use clap::Args;
 
 use super::console::Console;
 use super::failure::Failure;
-use crate::knobs::{Class, How, KNOBS, Knob, On};
+use crate::knobs::{Class, How, KNOBS, Knob, Measured, On, PRESETS};
 
 /// Lists the knobs: every setting that trades speed or memory for accuracy.
 ///
@@ -26,6 +26,13 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
         for knob in KNOBS.iter().filter(|knob| knob.class == class) {
             console.result(format_args!("  {:<18}  {}", knob.name, knob.what));
             console.result(format_args!("  {:<18}  {}", "", facts(knob)));
+        }
+    }
+    console.result("presets: --preset NAME, knobs that go together");
+    for preset in PRESETS {
+        console.result(format_args!("  {preset}"));
+        if let Some(Measured { command, .. }) = preset.measured {
+            console.result(format_args!("  {:<18}  measured by: {command}", ""));
         }
     }
     Ok(())

@@ -28,6 +28,8 @@ mod run_files;
 mod scene;
 mod scenegen;
 mod selftest;
+mod study;
+mod trade;
 mod train;
 
 use std::ffi::OsString;
@@ -61,6 +63,7 @@ Examples:
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
   densify knobs                                            what trades speed or memory for accuracy
+  densify trade data/garden --knobs alpha_min,sh_every     what these cost and buy here
   densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
   densify selftest                                         whether this machine computes what it should
 
@@ -89,6 +92,7 @@ enum Command {
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
+    Trade(trade::TradeArgs),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -126,6 +130,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Knobs(knobs) => knobs::run(&knobs, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
+        Command::Trade(trade) => trade::run(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
     };
     match done.and_then(|()| console.finish()) {

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{How, KNOBS, Knob, KnobError, number, parse};
 use crate::backend::{Exp2, MomentStorage, ParameterStorage, Shortcuts, Stepped, Storage};
+use crate::trainer::Savings;
 
 /// All knobs that are set by `--knob` alone, by name, each with its value as the table spells it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -67,7 +68,6 @@ impl Settings {
             transmittance_min: number("transmittance_stop").unwrap_or(default.transmittance_min),
             exp2: match self.text("exp_degree") {
                 "2" => Exp2::Degree2,
-                "3" => Exp2::Degree3,
                 "4" => Exp2::Degree4,
                 _ => Exp2::Degree6,
             },
@@ -98,6 +98,15 @@ impl Settings {
     #[must_use]
     pub fn pairs_per_row(&self) -> Option<usize> {
         self.text("pairs_per_row").parse().ok()
+    }
+
+    /// What of it is the trainer's to know.
+    #[must_use]
+    pub fn savings(&self) -> Savings {
+        Savings {
+            ssim_every: self.text("ssim_every").parse().unwrap_or(1),
+            coarse_until: number(self.text("coarse_until")).unwrap_or(0.0),
+        }
     }
 
     /// The value of a knob; empty for one that is not set here.

@@ -233,6 +233,7 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
                 rates,
                 cadence: Cadence::default(),
                 seed: 1,
+                ssim_weight: 1.0,
             };
             backend.train_step(&input).expect("a small image is rendered");
             if observes {

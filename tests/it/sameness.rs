@@ -61,6 +61,7 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
                 rates: RATES,
                 cadence: Cadence::default(),
                 seed: 1,
+                ssim_weight: 1.0,
             };
             backend.train_step(&input).expect("a small image is rendered")
         })

@@ -45,8 +45,8 @@ use pulp::Arch;
 
 use super::candidates::{Candidates, error_weights};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
-    Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateError, StepInput,
+    StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -54,7 +54,7 @@ use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 use adam::BiasCorrection;
 use blocks::planes;
-use loss::LossBuffers;
+use loss::{ImageTerms, LossBuffers};
 use moments::Moments;
 use optimise::Differentiate;
 use parameters::Parameters;
@@ -87,6 +87,7 @@ pub struct CpuBackend {
     rows: usize,
     sh_degree: u8,
     near: f32,
+    shortcuts: Shortcuts,
     params: Parameters,
     moments: Moments,
     ages: Vec<u16>,
@@ -156,6 +157,7 @@ impl CpuBackend {
             rows: model.len(),
             sh_degree: model.sh_degree,
             near: options.near,
+            shortcuts: options.shortcuts,
             params,
             moments: Moments::zeros(budget, per_row, storage.moments),
             ages: vec![0; blocks * WIDTH],
@@ -255,7 +257,7 @@ impl CpuBackend {
                 }
             });
         }
-        let value = self.image_loss(&grid, target, background, None);
+        let value = self.image_loss(&grid, target, background, ImageTerms::default());
         let mut gradient = vec![0.0; rendering.rgb.len()];
         for (tile, from) in self.gradient.iter().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {
@@ -299,7 +301,8 @@ impl Backend for CpuBackend {
         let frame = self.forward(camera, background, input.sh_degree, false)?;
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let value = self.image_loss(&frame.grid, target, background, weights);
+        let terms = ImageTerms { ssim: input.ssim_weight, error: weights };
+        let value = self.image_loss(&frame.grid, target, background, terms);
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);
         }

@@ -11,11 +11,12 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, Pixe
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
-use super::project::{LOG2_255, Splat};
+use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane, TRANSMITTANCE,
-    TRANSMITTANCE_MIN, TilePlace, Within,
+    ALPHA_MAX, Blending, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane,
+    TRANSMITTANCE, TilePlace, Within,
 };
 use super::records::{TileRecords, parts};
 use super::simd::{V, WIDTH};
@@ -50,7 +51,9 @@ impl CpuBackend {
         let clock = std::mem::take(&mut self.clock);
         let frame = self.forward(camera, background, input.sh_degree, false);
         let measured = frame.map(|frame| {
-            let loss = scalars(self.image_loss(&frame.grid, target, background, None)).loss;
+            let loss =
+                scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))
+                    .loss;
             let points = self.draw_points(&frame, input);
             let columns = if request.columns.is_empty() {
                 Vec::new()
@@ -104,6 +107,7 @@ impl CpuBackend {
     /// The columns of the view at hand.
     fn columns(&mut self, frame: &Frame, wanted: &[AuxColumn]) -> Vec<(AuxColumn, Vec<f32>)> {
         let Frame { grid, bands, .. } = frame;
+        let blending = self.shortcuts.into();
         let Self { pool, arch, lists, splats, records, sums, visible, gradient, rows, .. } = self;
         let rows = *rows;
         let sums = &mut sums[..rows * STRIDE];
@@ -121,6 +125,7 @@ impl CpuBackend {
                             splats,
                             list: lists.of_tile(i),
                             place: TilePlace::new(grid, tile),
+                            blending,
                             map: &gradient[tile].planes[MAP],
                             records: part.records(lists, i, records, STRIDE),
                         });
@@ -160,6 +165,8 @@ struct Replay<'a> {
     /// Sorted.
     list: &'a [AtomicU64],
     place: TilePlace,
+    /// Those of the forward pass, but for its exponential, which is exact here.
+    blending: Blending,
     map: &'a Plane,
     /// This tile writes the records of its own entries, those that are held.
     records: TileRecords<'a>,
@@ -170,8 +177,9 @@ impl WithSimd for Replay<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { splats, list, place, map, records } = self;
+        let Self { splats, list, place, blending, map, records } = self;
         let c = |x: f32| V::splat(s, x);
+        let least_light = c(blending.transmittance_min);
         let zero = V::zero(s);
         // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
         let (mut light, mut alive) = place.inside();
@@ -191,11 +199,11 @@ impl WithSimd for Replay<'_> {
                 for at in (0..WIDTH).step_by(S::F32_LANES) {
                     let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
                     let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                    let seen = c(-LOG2_255).le(e);
+                    let seen = c(-blending.log2_reach).le(e);
                     let alpha = e.exp2().min(c(ALPHA_MAX));
                     let t = V::load(s, &light[p][at..]);
                     let next = alpha.neg_mul_add(t, t);
-                    let blends = c(TRANSMITTANCE_MIN).lt(next).and(seen);
+                    let blends = least_light.lt(next).and(seen);
                     let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
                     let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
                     let distance = (dx * dx + dy * dy).sqrt();
@@ -203,7 +211,7 @@ impl WithSimd for Replay<'_> {
                     sums[1] = sums[1] + blends.keep(c(1.0));
                     sums[2] = sums[2] + blends.keep(alpha * t);
                     sums[3] = sums[3] + blends.keep(distance);
-                    let stopped = next.le(c(TRANSMITTANCE_MIN)).and(seen);
+                    let stopped = next.le(least_light).and(seen);
                     let left = stopped.select(zero, blends.select(next, t));
                     left.store(&mut light[p][at..]);
                 }

@@ -8,11 +8,11 @@ use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
 use super::candidates;
-use super::loss::LossValue;
+use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
-    CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
+    Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
 use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
 use super::records::parts as parts_of_records;
@@ -45,11 +45,11 @@ impl CpuBackend {
         grid: &Grid,
         target: &Image8,
         background: [f32; 3],
-        error_weights: Option<[f32; 2]>,
+        terms: ImageTerms,
     ) -> LossValue {
         let Self { pool, loss, arch, canvas, gradient, clock, .. } = self;
-        let value = pool
-            .install(|| loss.run(*arch, grid, canvas, target, background, gradient, error_weights));
+        let value =
+            pool.install(|| loss.run(*arch, grid, canvas, target, background, gradient, terms));
         clock.lap("loss");
         value
     }
@@ -73,6 +73,7 @@ impl CpuBackend {
         let grid = Grid::new(camera.width, camera.height);
         self.resize_images(&grid);
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
+        let blending = Blending::from(self.shortcuts);
         let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, clock, .. } =
             self;
         clock.start();
@@ -87,7 +88,8 @@ impl CpuBackend {
                 .enumerate()
                 .for_each(|(task, (splats, seen))| {
                     let (params, rows) = (params.task(task), splats.len());
-                    arch.dispatch(Project { view: &view, params, rows, splats, seen });
+                    let (view, log2_reach) = (&view, blending.log2_reach);
+                    arch.dispatch(Project { view, log2_reach, params, rows, splats, seen });
                 });
             clock.lap("project");
             let visible = Visible { splats: &splats[..rows], seen };
@@ -104,6 +106,7 @@ impl CpuBackend {
                         place: TilePlace::new(&grid, band.start + i),
                         background,
                         with_depth,
+                        blending,
                         canvas,
                     });
                 });
@@ -118,6 +121,7 @@ impl CpuBackend {
     /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
     pub(super) fn backward(&mut self, frame: &Frame, detail: Detail) {
         let Frame { grid, background, bands, .. } = frame;
+        let blending = self.shortcuts.into();
         let Self {
             pool,
             arch,
@@ -148,6 +152,7 @@ impl CpuBackend {
                             list: lists.of_tile(i),
                             place: TilePlace::new(grid, tile),
                             background: *background,
+                            blending,
                             canvas: &canvas[tile],
                             upstream: [r, g, b],
                             upstream_more: (detail == Detail::All).then_some([alpha, depth]),
@@ -205,6 +210,7 @@ impl CpuBackend {
         mode: DepthMode,
     ) -> Vec<Candidate> {
         let Frame { grid, bands, background, view, .. } = frame;
+        let shortcuts = self.shortcuts;
         let Self { lists, splats, params, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
         let tile = |x: usize, y: usize| y / TILE * grid.columns + x / TILE;
@@ -219,7 +225,7 @@ impl CpuBackend {
             for (slot, &(x, y, error)) in of_band {
                 let at = [x as f32 + 0.5, y as f32 + 0.5];
                 let list = lists.of_tile(tile(x, y) - band.start);
-                let surface = candidates::surface_row(splats, list, at, mode)
+                let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
                     .and_then(|row| candidates::closest_approach(params, row, view, at));
                 *slot = surface.map(|(position, depth)| Candidate {
                     position: position.to_array(),
@@ -259,6 +265,7 @@ impl CpuBackend {
         let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
             self;
         let (rows, arch) = (*rows, *arch);
+        let stepped = self.shortcuts.stepped;
         let terms = Terms::new(self.terms, rows);
         let noise = self.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
@@ -303,6 +310,7 @@ impl CpuBackend {
                             due,
                             terms,
                             noise,
+                            stepped,
                             first_row: task * ROWS_PER_TASK,
                             rows: rows - task * ROWS_PER_TASK,
                         });

@@ -21,10 +21,6 @@ use crate::sh;
 
 /// Variance added to both diagonal entries of a projected covariance `[px²]`.
 pub(super) const BLUR: f32 = 0.3;
-/// Alpha below this is not blended.
-pub(super) const ALPHA_MIN: f32 = 1.0 / 255.0;
-/// log₂(255): a splat reaches as far as its exponent stays above minus this.
-pub(super) const LOG2_255: f32 = 7.994_353_4;
 /// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
@@ -92,7 +88,7 @@ pub(super) struct Splat {
     pub(super) colour: [f32; 3],
     /// Camera z `[scene units]`.
     pub(super) depth: f32,
-    /// Half the height of the region where alpha >= 1/255 `[px]`.
+    /// Half the height of the region where alpha is at least what is blended `[px]`.
     pub(super) half_height: f32,
     /// Half the width of that region `[px]`.
     pub(super) half_width: f32,
@@ -100,8 +96,10 @@ pub(super) struct Splat {
     pub(super) inv_l1: f32,
     /// How far below the mean that region's rightmost point is `[px]`.
     pub(super) peak: f32,
+    /// How far the exponent may fall from the centre to the region's edge.
+    pub(super) reach: f32,
     /// A splat fills one cache line.
-    pub(super) unused: [f32; 2],
+    pub(super) unused: f32,
 }
 
 /// Numbers of a [`Splat`].
@@ -283,6 +281,8 @@ fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
 /// Projects a run of whole blocks and lists the rows that are on screen.
 pub(super) struct Project<'a> {
     pub(super) view: &'a ViewParams,
+    /// [`Shortcuts::log2_reach`](crate::backend::Shortcuts::log2_reach).
+    pub(super) log2_reach: f32,
     /// Parameter blocks of these rows.
     pub(super) params: ParameterView<'a>,
     /// Number of rows (the last block may be partly empty).
@@ -314,8 +314,8 @@ impl WithSimd for Project<'_> {
                     each!(i in 3 => below(lanes(s, block, plane::LOG_SCALE + i, at), f32::MAX));
                 let sound = sound[0].and(sound[1]).and(sound[2]).and(below(logit, f32::MAX));
                 let log2_opacity = log2_sigmoid(s, logit);
-                // How far the exponent may fall; <= 0 where even the centre is below 1/255.
-                let reach = log2_opacity + LOG2_255;
+                // How far the exponent may fall; <= 0 where even the centre is too faint.
+                let reach = log2_opacity + self.log2_reach;
                 let opaque = V::zero(s).lt(reach);
                 // The determinant leaves f32 where a row is some 4·10⁹ px wide; its factors are none then.
                 let alive = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
@@ -360,6 +360,7 @@ impl WithSimd for Project<'_> {
                     half_width,
                     V::splat(s, 1.0 / FOLD) / l1,
                     g.cov[1] / g.cov[0] * half_width,
+                    reach,
                 ];
                 for (line, field) in out.iter_mut().zip(fields) {
                     field.store(&mut line[at..]);

@@ -27,7 +27,7 @@ use resume::Start;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
 /// a room or an object; large outdoor scenes want more.
-const DEFAULT_BUDGET: usize = 200_000;
+pub(super) const DEFAULT_BUDGET: usize = 200_000;
 /// Degree, where neither `--sh-degree` nor `--memory` says otherwise.
 const DEFAULT_SH_DEGREE: u8 = 3;
 
@@ -113,6 +113,10 @@ pub(super) struct TrainArgs {
     /// `[default: the policy's choice, mostly 1]`
     #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u32).range(1..=1000))]
     sh_every: Option<u32>,
+    /// Knobs that go together: exact, balanced, fast or tiny-memory; says what it was measured to cost
+    /// and buy `[default: balanced]`
+    #[arg(long, value_name = "NAME", help_heading = "Training")]
+    preset: Option<String>,
     /// Set a knob of the trade between speed, memory and accuracy, such as alpha_min=1/128;
     /// `densify knobs` lists them. May be repeated
     #[arg(long, value_name = "NAME=VALUE", help_heading = "Training")]
