@@ -58,6 +58,7 @@ fn train(
             rates: RATES,
             cadence: Cadence::default(),
             seed: 7,
+            ssim_weight: 1.0,
         };
         let output = backend.train_step(&input).expect("a small image is rendered");
         sum += if step + 20 > last { f64::from(output.loss) / 20.0 } else { 0.0 };

@@ -58,6 +58,12 @@ impl<T: Copy + Default> Blocks<T> {
         (capacity.div_ceil(WIDTH) * WIDTH * planes * size_of::<T>()) as u64
     }
 
+    /// Bytes that are there.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> u64 {
+        size_of_val(&self.data[..]) as u64
+    }
+
     /// Numbers per block.
     pub(super) fn stride(&self) -> usize {
         self.planes * WIDTH

@@ -93,7 +93,44 @@ pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
 mod tests {
     use super::*;
     use crate::backend::cpu::CpuBackend;
+    use crate::backend::{MomentStorage, ParameterStorage, Storage};
     use crate::gaussians::Gaussians;
+
+    #[test]
+    fn what_is_allocated_is_what_the_ledger_says() {
+        let formats = [
+            (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
+            (ParameterStorage::F16, MomentStorage::Bf16, 3 * 4 + 56 * 2, 2 * 59 * 2),
+            (ParameterStorage::F16, MomentStorage::Ratio8, 3 * 4 + 56 * 2, 3 * 59),
+        ];
+        for (parameters, moments, of_parameters, of_moments) in formats {
+            let options = CpuOptions {
+                storage: Storage { parameters, moments },
+                tile_cap: 300,
+                record_cap: 70,
+                threads: Some(1),
+                ..CpuOptions::new(110)
+            };
+            let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
+            let backend = CpuBackend::new(&model, &options).unwrap();
+            let line = |what: &str| {
+                let line = backend.ledger.lines.iter().find(|line| line.what == what);
+                line.map(|line| line.bytes)
+            };
+            // 110 rows are seven blocks of sixteen.
+            assert_eq!(line("parameters"), Some(112 * of_parameters), "{parameters:?}");
+            assert_eq!(line("optimiser moments"), Some(112 * of_moments), "{moments:?}");
+            assert_eq!(line("gradients per entry"), Some(70 * 9 * 4));
+            let CpuBackend { params, moments, records, sums, splats, visible, .. } = &backend;
+            assert_eq!(line("parameters"), Some(params.held()));
+            assert_eq!(line("optimiser moments"), Some(moments.held()));
+            let bytes = |of: usize| Some(of as u64);
+            assert_eq!(line("gradients per entry"), bytes(size_of_val(&records[..])));
+            assert_eq!(line("splat gradients"), bytes(size_of_val(&sums[..])));
+            let seen = size_of_val(&visible[..]);
+            assert_eq!(line("projected splats"), bytes(size_of_val(&splats[..]) + seen));
+        }
+    }
 
     /// Around 2³¹ and 2³² rows, and as many as a slot can name and more.
     #[test]

@@ -64,6 +64,14 @@ impl Moments {
         }
     }
 
+    /// Bytes that are there.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> u64 {
+        let mut sum = 0;
+        each_moment!(self, blocks => sum += blocks.held());
+        sum
+    }
+
     pub(super) fn clear_row(&mut self, row: usize) {
         each_moment!(self, blocks => blocks.clear_row(row));
     }

@@ -67,6 +67,12 @@ impl Parameters {
             + Blocks::<F16>::bytes(capacity, half)
     }
 
+    /// Bytes that are there.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> u64 {
+        self.wide.held() + self.fixed.held() + self.half.held()
+    }
+
     /// Numbers per block of the three.
     fn strides(&self) -> [usize; 3] {
         [self.wide.stride(), self.fixed.stride(), self.half.stride()]
