@@ -68,7 +68,8 @@ fn train(
 
 /// The bits of what a run goes on from: the model, and the optimiser's state.
 fn state(backend: &CpuBackend) -> (Gaussians, Vec<Tensor>) {
-    let tensors = backend.state().iter().map(|name| backend.save(name).expect("an array")).collect();
+    let tensors =
+        backend.state().iter().map(|name| backend.save(name).expect("an array")).collect();
     (backend.download().expect("a model"), tensors)
 }
 
@@ -98,7 +99,8 @@ fn training_is_as_good() {
     };
     let (first, reference) = (loss(Storage::default(), 20), loss(Storage::default(), 400));
     assert!(reference < 0.2 * first, "{first} -> {reference}");
-    let found: Vec<_> = storages().into_iter().map(|storage| (storage, loss(storage, 400))).collect();
+    let found: Vec<_> =
+        storages().into_iter().map(|storage| (storage, loss(storage, 400))).collect();
     println!("{first} {reference} {found:?}");
     let bad: Vec<_> = found.iter().filter(|(_, loss)| *loss > 1.1 * reference).collect();
     assert!(bad.is_empty(), "f32: {first} -> {reference}, but {bad:?}");
@@ -199,8 +201,7 @@ fn bytes_per_row(policy: &str, storage: Storage, [pairs, records]: [f64; 2]) -> 
 /// The promise of the preset `tiny-memory`.
 #[test]
 fn a_row_takes_less_than_480_bytes() {
-    let small =
-        Storage { parameters: ParameterStorage::F16, moments: MomentStorage::Ratio8 };
+    let small = Storage { parameters: ParameterStorage::F16, moments: MomentStorage::Ratio8 };
     for policy in ["vanilla", "diet", "mcmc"] {
         let (today, least) = (
             bytes_per_row(policy, Storage::default(), [16.0, 16.0]),

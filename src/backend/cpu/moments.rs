@@ -28,16 +28,34 @@ macro_rules! each_moment {
     ($moments:expr, $blocks:ident => $do:expr) => {
         match $moments {
             Moments::F32([first, second]) => {
-                { let $blocks = first; $do }
-                { let $blocks = second; $do }
+                {
+                    let $blocks = first;
+                    $do
+                }
+                {
+                    let $blocks = second;
+                    $do
+                }
             }
             Moments::Bf16([first, second]) => {
-                { let $blocks = first; $do }
-                { let $blocks = second; $do }
+                {
+                    let $blocks = first;
+                    $do
+                }
+                {
+                    let $blocks = second;
+                    $do
+                }
             }
             Moments::Ratio8(first, second) => {
-                { let $blocks = first; $do }
-                { let $blocks = second; $do }
+                {
+                    let $blocks = first;
+                    $do
+                }
+                {
+                    let $blocks = second;
+                    $do
+                }
             }
         }
     };

@@ -80,10 +80,7 @@ impl CpuBackend {
         let (rows, arch) = (*rows, *arch);
         let params = params.view(rows);
         pool.install(|| {
-            (
-                splats[..rows].par_chunks_mut(ROWS_PER_TASK),
-                seen.par_chunks_mut(BLOCKS_PER_TASK),
-            )
+            (splats[..rows].par_chunks_mut(ROWS_PER_TASK), seen.par_chunks_mut(BLOCKS_PER_TASK))
                 .into_par_iter()
                 .enumerate()
                 .for_each(|(task, (splats, seen))| {

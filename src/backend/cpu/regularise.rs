@@ -146,7 +146,11 @@ mod tests {
         let mut scratch = Scratch::ZERO;
         let mut gradient = vec![1.0; 14 * WIDTH];
         let per_row = Terms::new(terms, 16).unwrap();
-        Arch::new().dispatch(Add(per_row, parameters.view(16).open(0, 14, &mut scratch), &mut gradient));
+        Arch::new().dispatch(Add(
+            per_row,
+            parameters.view(16).open(0, 14, &mut scratch),
+            &mut gradient,
+        ));
         let h = 1e-2_f32;
         let central = |change: &dyn Fn(&mut Gaussians, f32)| {
             let [mut low, mut high] = [model.clone(), model.clone()];

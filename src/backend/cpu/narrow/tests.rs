@@ -222,7 +222,9 @@ fn draws_are_independent() {
         for block in 0..BLOCKS {
             let mut draws = Draws::of_block(&rng, block * WIDTH);
             for _ in 0..PLANES {
-                all.extend(draws[which].next().map(|x| f64::from(x >> 8) / f64::from(1 << 24) - 0.5));
+                all.extend(
+                    draws[which].next().map(|x| f64::from(x >> 8) / f64::from(1 << 24) - 0.5),
+                );
             }
         }
         all
