@@ -12,7 +12,6 @@
 // Where the surface is, and its depth; depth 0 where there is none.
 @group(0) @binding(8) var<storage, read_write> points: array<vec4<f32>>;
 
-const ALPHA_MIN: f32 = 1.0 / 255.0;
 
 // now.a: the band, now.b: how many pixels, now.c: the surface is at the largest blend weight (0) or
 // where half the light is gone (1), now.d: place of the first in `points`.
@@ -64,7 +63,7 @@ fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
             most = weight;
             best = row;
         }
-        if light <= 1e-4 {
+        if light <= TRANSMITTANCE_MIN {
             break;
         }
     }

@@ -43,7 +43,7 @@ fn project(
     }
     let log2_opacity = log2_sigmoid(row.logit);
     // How far the exponent may fall; <= 0 where even the centre is below 1/255.
-    let reach = log2_opacity + LOG2_255;
+    let reach = log2_opacity + LOG2_REACH;
     if reach <= 0.0 {
         return;
     }

@@ -80,7 +80,7 @@ fn rasterize(
                     let u = a.z * (d.x - a.w * d.y);
                     let z = b.x * d.y;
                     let e = b.y - u * u - z * z;
-                    if e >= -LOG2_255 && k < count && !done {
+                    if e >= -LOG2_REACH && k < count && !done {
                         let alpha = min(exp2(e), ALPHA_MAX);
                         let next = light - alpha * light;
                         if next <= TRANSMITTANCE_MIN {

@@ -160,7 +160,7 @@ fn rasterize_bwd(
                     let u = a.z * (d.x - a.w * d.y);
                     let z = b.x * d.y;
                     let e = b.y - u * u - z * z;
-                    if e >= -LOG2_255 {
+                    if e >= -LOG2_REACH {
                         let unclamped = exp2(e);
                         let alpha = min(unclamped, ALPHA_MAX);
                         light = light / (1.0 - alpha);

@@ -66,10 +66,12 @@ const NONE: u32 = 0xffffffffu;
 const TILE: u32 = 16u;
 const GROUP: u32 = 256u;
 
-// Blending: the largest alpha; the transmittance at which a pixel stops; −log2 of the smallest alpha.
+// Blending: the largest alpha; the transmittance at which a pixel stops; the smallest alpha, and −log2
+// of it. All but the first are knobs.
 const ALPHA_MAX: f32 = 0.99;
-const TRANSMITTANCE_MIN: f32 = 1e-4;
-const LOG2_255: f32 = 7.9943534;
+override TRANSMITTANCE_MIN: f32 = 1e-4;
+override ALPHA_MIN: f32 = 1.0 / 255.0;
+override LOG2_REACH: f32 = 7.9943534;
 
 // The pixel of an invocation within its tile: neighbours in number are neighbours in the image, so
 // that those that run together mostly agree.

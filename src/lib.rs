@@ -9,7 +9,7 @@
 //! use densify::dataset::{Dataset, LoadOptions};
 //! use densify::init::initialise;
 //! use densify::schedule::{Background, RateOptions};
-//! use densify::trainer::{OnNan, TrainOptions, Trainer};
+//! use densify::trainer::{OnNan, Savings, TrainOptions, Trainer};
 //! use densify::views::DatasetViews;
 //! use densify_policies::policy::SceneInfo;
 //! use densify_policies::registry::find;
@@ -40,6 +40,7 @@
 //!     sh_every: None,
 //!     prefetch: 4,
 //!     on_nan: OnNan::Prune,
+//!     savings: Savings::NONE,
 //! };
 //! let mut trainer = Trainer::new(views, Box::new(backend), ("diet", policy), scene, options)?;
 //! for _ in 0..iterations {
@@ -65,6 +66,7 @@ pub mod dataset;
 pub mod evaluate;
 pub mod gaussians;
 pub mod init;
+pub mod knobs;
 pub mod memory;
 pub mod metrics;
 pub mod output;

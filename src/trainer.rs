@@ -28,7 +28,7 @@ use crate::views::ViewSource;
 use check::check;
 pub use error::TrainError;
 use guard::asked;
-pub use options::{OnNan, TrainOptions};
+pub use options::{OnNan, Savings, TrainOptions};
 use quarantine::AUDIT_EVERY;
 pub use state::TrainerState;
 
@@ -159,12 +159,14 @@ impl<V: ViewSource> Trainer<V> {
     /// [`TrainError`]. After one, the run is over; the model can still be read.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let step = self.step + 1;
+        let TrainOptions { iterations, savings, .. } = self.options;
+        self.views.shrink(schedule::divisor(step, iterations, savings.coarse_until));
         let view = self.next_view();
         let start = Instant::now();
         let image = self.image(step, view)?;
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
-        let TrainOptions { iterations, seed, sh_degree, background, rates, .. } = self.options;
+        let TrainOptions { seed, sh_degree, background, rates, .. } = self.options;
         let input = StepInput {
             step,
             view,
@@ -175,6 +177,7 @@ impl<V: ViewSource> Trainer<V> {
             rates: rates.at(step, iterations, self.scene.extent),
             cadence,
             seed,
+            ssim_weight: savings.ssim_weight(step, iterations),
         };
         let output = self.backend.train_step(&input).map_err(|e| self.stopped(step, e))?;
         self.step = step;

@@ -4,7 +4,7 @@ use std::error::Error;
 
 use crate::camera::Camera;
 use crate::dataset::View;
-use crate::dataset::images::{ImageCache, SharedImage};
+use crate::dataset::images::{ImageCache, ImageSource, SharedImage};
 
 /// Why a view cannot be had: whatever the source of the views says.
 pub type ViewError = Box<dyn Error + Send + Sync>;
@@ -28,13 +28,27 @@ pub trait ViewSource: Send {
 
     /// Says which views will be asked for next, soonest first.
     fn prefetch(&self, upcoming: &[usize]);
+
+    /// From now on cameras and images shall be so many times smaller along both sides. A source that
+    /// cannot shrink them leaves them as they are.
+    fn shrink(&mut self, divisor: u32) {
+        let _ = divisor;
+    }
 }
+
+/// Images are not shrunk to fewer pixels than this along a side: there is nothing left to learn from.
+const LEAST_SIDE: u32 = 16;
 
 /// Views of a dataset with their images, of which some are held decoded.
 #[derive(Debug)]
 pub struct DatasetViews {
     views: Vec<View>,
+    divisor: u32,
+    /// Where images are shrunk: the cameras that go with them.
+    cameras: Vec<Camera>,
     cache: ImageCache,
+    cache_bytes: u64,
+    threads: usize,
 }
 
 impl DatasetViews {
@@ -43,8 +57,17 @@ impl DatasetViews {
     #[must_use]
     pub fn new(views: Vec<View>, cache_bytes: u64, threads: usize) -> Self {
         let sources = views.iter().map(|view| view.source.clone()).collect();
-        Self { cache: ImageCache::new(sources, cache_bytes, threads), views }
+        let cache = ImageCache::new(sources, cache_bytes, threads);
+        Self { views, divisor: 1, cameras: Vec::new(), cache, cache_bytes, threads }
     }
+}
+
+/// The camera of an image so many times smaller, or as near to that as leaves something to see.
+fn shrunk(camera: &Camera, divisor: u32) -> Camera {
+    let least = camera.width.min(camera.height);
+    let divisor = f64::from((least / LEAST_SIDE).clamp(1, divisor.max(1)));
+    let side = |side: u32| ((f64::from(side) / divisor).round() as u32).max(1);
+    camera.resized(side(camera.width), side(camera.height))
 }
 
 impl ViewSource for DatasetViews {
@@ -57,7 +80,7 @@ impl ViewSource for DatasetViews {
     }
 
     fn camera(&self, view: usize) -> &Camera {
-        &self.views[view].camera
+        self.cameras.get(view).unwrap_or(&self.views[view].camera)
     }
 
     fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
@@ -66,5 +89,52 @@ impl ViewSource for DatasetViews {
 
     fn prefetch(&self, upcoming: &[usize]) {
         self.cache.prefetch(upcoming);
+    }
+
+    fn shrink(&mut self, divisor: u32) {
+        if divisor == self.divisor {
+            return;
+        }
+        self.divisor = divisor;
+        self.cameras.clear();
+        if divisor > 1 {
+            self.cameras.extend(self.views.iter().map(|view| shrunk(&view.camera, divisor)));
+        }
+        let source = |view: usize| {
+            let Camera { width, height, .. } = *self.camera(view);
+            ImageSource { width, height, ..self.views[view].source.clone() }
+        };
+        let sources = (0..self.views.len()).map(source).collect();
+        // The threads end, and what is held is free, before the next cache holds anything.
+        self.cache = ImageCache::new(Vec::new(), 0, 0);
+        self.cache = ImageCache::new(sources, self.cache_bytes, self.threads);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::{Dataset, LoadOptions};
+
+    #[test]
+    fn shrunk_views_have_cameras_and_images_of_one_size() {
+        let dataset = Dataset::load("scene:spheres".as_ref(), &LoadOptions::default()).unwrap();
+        let full = dataset.train[0].camera;
+        let mut views = DatasetViews::new(dataset.train[..2].to_vec(), 1 << 20, 1);
+        for divisor in [4, 2, 1, 1000, 1] {
+            views.shrink(divisor);
+            let camera = *views.camera(0);
+            let image = views.image(0).unwrap();
+            assert_eq!((image.width, image.height), (camera.width, camera.height));
+            let least = camera.width.min(camera.height);
+            match divisor {
+                1 => assert_eq!(camera, full),
+                1000 => assert!((LEAST_SIDE..2 * LEAST_SIDE).contains(&least), "{least}"),
+                _ => assert_eq!(camera.width, full.width / divisor),
+            }
+            // The same rays at the same share of the image.
+            let share = |camera: &Camera| camera.cx / f64::from(camera.width);
+            assert!((share(&camera) - share(&full)).abs() < 1e-12);
+        }
     }
 }

@@ -16,6 +16,8 @@ pub enum Purpose {
     Noise = 3,
     /// Drawing with replacement: the row is the number of the draw.
     Draw = 4,
+    /// Rounding numbers that are stored in fewer bits.
+    Round = 5,
 }
 
 /// Draws of one policy event.
@@ -36,6 +38,7 @@ impl PolicyRng {
     /// Four independent 32-bit words for (row, purpose, counter). Draws are told apart for
     /// `counter` < 65,536.
     #[must_use]
+    #[inline]
     pub fn bits(&self, row: u32, purpose: Purpose, counter: u32) -> [u32; 4] {
         pcg4d([row, self.step, self.seed, (purpose as u32) << 16 ^ counter])
     }
@@ -76,6 +79,7 @@ fn unit_open(bits: u32) -> f32 {
     ((bits >> 9) as f32 + 0.5) * (1.0 / 8_388_608.0)
 }
 
+#[inline]
 fn pcg4d(v: [u32; 4]) -> [u32; 4] {
     let [mut x, mut y, mut z, mut w] =
         v.map(|k| k.wrapping_mul(1_664_525).wrapping_add(1_013_904_223));
@@ -95,7 +99,8 @@ fn pcg4d(v: [u32; 4]) -> [u32; 4] {
 mod tests {
     use super::*;
 
-    const PURPOSES: [Purpose; 4] = [Purpose::Select, Purpose::Place, Purpose::Noise, Purpose::Draw];
+    const PURPOSES: [Purpose; 5] =
+        [Purpose::Select, Purpose::Place, Purpose::Noise, Purpose::Draw, Purpose::Round];
     const DRAWS: u32 = 1 << 16;
 
     /// χ² of counts that should all be equal, in standard deviations from its mean.

@@ -8,8 +8,10 @@ mod candidates;
 pub mod cpu;
 pub mod gpu;
 mod pixel_map;
+mod shortcuts;
 mod signal_planes;
 mod state;
+mod storage;
 
 use std::time::Duration;
 
@@ -21,7 +23,9 @@ use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
+pub use shortcuts::{Exp2, Shortcuts, Stepped};
 pub use state::{StateError, Tensor, Values};
+pub use storage::{MomentStorage, ParameterStorage, Storage};
 
 /// Step sizes of one iteration, one per parameter class.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,6 +65,9 @@ pub struct StepInput<'a> {
     pub cadence: Cadence,
     /// Seed of the run, for noise on the means.
     pub seed: u64,
+    /// Factor of the SSIM term's gradient: 1 in the loss as published; 0 where it is left out, and
+    /// then nothing of it is computed.
+    pub ssim_weight: f32,
 }
 
 /// A training view to be measured for a policy's event.
@@ -98,11 +105,11 @@ pub struct AuxOutput {
 /// The scalars of one training step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepOutput {
-    /// 0.8·L1 + 0.2·(1 − SSIM), without the terms that a policy adds.
+    /// 0.8·L1 + 0.2·(1 − SSIM), without the terms that a policy adds; L1 where SSIM is left out.
     pub loss: f32,
     /// Mean over pixels and channels of |I − G|.
     pub l1: f32,
-    /// Mean structural similarity.
+    /// Mean structural similarity; NaN where it is left out.
     pub ssim: f32,
     /// Rows whose projection is on screen.
     pub visible: usize,

@@ -106,6 +106,7 @@ fn header() -> Header {
                 learning_rates: RateOptions { mean_start: 1.0 / 3.0, ..RateOptions::default() },
             },
             policy: PolicyConfig { name: "told".into(), parameters: toml::toml! { a = 0.1 } },
+            knobs: crate::knobs::Settings::default(),
         },
         dataset: Fingerprint {
             train: views.clone(),

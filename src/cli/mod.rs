@@ -19,6 +19,7 @@ mod device;
 mod devices;
 mod eval;
 mod failure;
+mod knobs;
 mod number;
 mod policies;
 mod progress;
@@ -27,6 +28,8 @@ mod run_files;
 mod scene;
 mod scenegen;
 mod selftest;
+mod study;
+mod trade;
 mod train;
 
 use std::ffi::OsString;
@@ -59,6 +62,8 @@ Examples:
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
+  densify knobs                                            what trades speed or memory for accuracy
+  densify trade data/garden --knobs alpha_min,sh_every     what these cost and buy here
   densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
   densify selftest                                         whether this machine computes what it should
 
@@ -83,9 +88,11 @@ enum Command {
     Render(Box<render::RenderArgs>),
     Compare(compare::CompareArgs),
     Devices(devices::DevicesArgs),
+    Knobs(knobs::KnobsArgs),
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
+    Trade(trade::TradeArgs),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -113,17 +120,17 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     };
     let console = Console::new(quiet);
     let done = match arguments.command {
-        Command::Train(train) => {
-            let after = words.iter().skip(1).skip_while(|word| *word != "train").skip(1);
-            train::run(&after.cloned().collect::<Vec<_>>(), *train, &console)
-        }
-        Command::Plan(train) => train::plan::run(&train, &console),
+        Command::Train(train) => train::run(&after(&words, "train"), &train, &console),
+        Command::Plan(_) => train::arguments(&after(&words, "plan"))
+            .and_then(|train| train::plan::run(&train, &console)),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),
         Command::Devices(devices) => devices::run(&devices, &console),
+        Command::Knobs(knobs) => knobs::run(&knobs, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
+        Command::Trade(trade) => trade::run(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
     };
     match done.and_then(|()| console.finish()) {
@@ -133,6 +140,11 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
             failure.code
         }
     }
+}
+
+/// The words after that of a subcommand.
+fn after(words: &[OsString], subcommand: &str) -> Vec<OsString> {
+    words.iter().skip(1).skip_while(|word| *word != subcommand).skip(1).cloned().collect()
 }
 
 #[cfg(test)]

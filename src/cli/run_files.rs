@@ -114,16 +114,7 @@ pub(super) fn open(
 ) -> Result<Opened, Failure> {
     use_threads(machine.threads);
     let dataset = scene::load(dataset, &config, console)?;
-    let file = read_splats(model)?;
-    for (number, what) in [
-        (file.dropped, "left out: a value is not finite"),
-        (file.repaired, "with a zero quaternion, read as unrotated"),
-    ] {
-        if number > 0 {
-            console.say(format_args!("note: {}: {number} rows {what}", model.display()));
-        }
-    }
-    let model: Gaussians = dataset.normalisation.model_from_world(&file.gaussians);
+    let model = read_model(model, &dataset, console)?;
     let budget = model.len().max(1);
     let near = (near * dataset.extent()) as f32;
     let largest_image = scene::largest_image(&dataset);
@@ -140,6 +131,24 @@ pub(super) fn open(
         }
     };
     Ok(Opened { sh_degree: model.sh_degree, backend, dataset, scene: config })
+}
+
+/// Reads a model, by whatever program, into the coordinates of a dataset.
+pub(super) fn read_model(
+    path: &Path,
+    dataset: &Dataset,
+    console: &Console,
+) -> Result<Gaussians, Failure> {
+    let file = read_splats(path)?;
+    for (number, what) in [
+        (file.dropped, "left out: a value is not finite"),
+        (file.repaired, "with a zero quaternion, read as unrotated"),
+    ] {
+        if number > 0 {
+            console.say(format_args!("note: {}: {number} rows {what}", path.display()));
+        }
+    }
+    Ok(dataset.normalisation.model_from_world(&file.gaussians))
 }
 
 impl Opened {

@@ -34,6 +34,9 @@ pub struct Wishes {
     pub sh_degree: RangeInclusive<u8>,
     /// Most (row, tile) pairs, where they are not to be chosen.
     pub tile_cap: Option<usize>,
+    /// (Row, tile) pairs per row where they are chosen: those for a start, and those where rows leave
+    /// room, in rising order.
+    pub pairs: [usize; 3],
     /// Most (row, tile) pairs possible.
     pub most_pairs: usize,
     /// Bytes of decoded images, where they are not to be chosen.
@@ -53,9 +56,10 @@ pub struct Fit {
     pub at_wanted_degree: usize,
 }
 
-/// (Row, tile) pairs per row: those for a start, then those where rows leave room. A view seldom
-/// has three per row; one that has more is rendered in bands, to the same bits.
-const PAIRS: [usize; 3] = [4, 8, 16];
+/// (Row, tile) pairs per row unless something else is wished: those for a start, then those where rows
+/// leave room. A view seldom has three per row; one that has more is rendered in bands, to the same
+/// bits.
+pub const PAIRS: [usize; 3] = [4, 8, 16];
 /// The share of the memory that decoded images may have: one part in so many.
 pub(crate) const IMAGES: u64 = 8;
 
@@ -90,7 +94,7 @@ pub fn fit<E>(
     let mut at_wanted_degree = None;
     let mut found = None;
     for degree in wishes.sh_degree.clone().rev() {
-        let of = |rows| wishes.setting(rows, degree, PAIRS[0]);
+        let of = |rows| wishes.setting(rows, degree, wishes.pairs[0]);
         let rows = most_within(least, most, |rows| Ok(bytes(&of(rows))? <= wishes.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
         found = rows.map(|rows| (rows, degree));
@@ -99,9 +103,9 @@ pub fn fit<E>(
         }
     }
     let Some((rows, degree)) = found else { return Ok(None) };
-    let mut setting = wishes.setting(rows, degree, PAIRS[0]);
+    let mut setting = wishes.setting(rows, degree, wishes.pairs[0]);
     if rows == most {
-        for pairs in PAIRS.into_iter().skip(1) {
+        for pairs in wishes.pairs.into_iter().skip(1) {
             let larger = wishes.setting(rows, degree, pairs);
             if bytes(&larger)? <= wishes.memory {
                 setting = larger;
@@ -137,7 +141,7 @@ pub fn least_memory<E>(
     // The least model with all of its images.
     let all = Wishes { memory: u64::MAX, ..wishes.clone() };
     let least = wishes.least_rows.clamp(1, wishes.most_rows.max(1));
-    let most = bytes(&all.setting(least, *wishes.sh_degree.start(), PAIRS[0]))?;
+    let most = bytes(&all.setting(least, *wishes.sh_degree.start(), wishes.pairs[0]))?;
     let Ok(most) = usize::try_from(most.div_ceil(step)) else { return Ok(None) };
     let too_little = most_within(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
     Ok(Some(too_little.map_or(0, |steps| steps as u64 + 1) * step))

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{OutputError, write_atomically};
+use crate::knobs::Settings;
 use crate::schedule::{Background, RateOptions};
 
 /// Name of the file in a run's folder.
@@ -22,6 +23,9 @@ pub struct RunConfig {
     pub train: TrainConfig,
     /// What decides where Gaussians are born and die.
     pub policy: PolicyConfig,
+    /// Knobs of the trade between speed, memory and accuracy that are no options of their own.
+    #[serde(default)]
+    pub knobs: Settings,
 }
 
 /// Where the images come from.
@@ -178,6 +182,7 @@ mod tests {
                 learning_rates: RateOptions::default(),
             },
             policy: PolicyConfig { name: "diet".into(), parameters: toml::toml! { rho = 0.2 } },
+            knobs: Settings::of(&["alpha_min=1/128".into()]).unwrap(),
         }
     }
 

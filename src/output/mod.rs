@@ -29,7 +29,8 @@ pub use cameras::cameras_json;
 pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
 pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
 pub use records::{
-    Mean, RecordLog, StepRecord, Summary, geometry_of, write_geometry, write_json, write_scores,
+    Mean, RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
+    write_scores,
 };
 pub use tensorboard::TensorBoard;
 

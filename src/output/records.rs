@@ -245,6 +245,17 @@ pub fn write_geometry(
     enter(&run.join(geometry_file(split)), iteration, entry)
 }
 
+/// The mean scores of an iteration on the test views, if there are any.
+///
+/// # Errors
+/// [`OutputError`] when the file says something else.
+pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError> {
+    let path = run.join("results.json");
+    let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
+    let entry = read_all(&path)?.remove(&entry_name(iteration));
+    entry.map(serde_json::from_value).transpose().map_err(|e| malformed(e.to_string()))
+}
+
 /// The geometric measurements of an iteration on the test views, if there are any.
 ///
 /// # Errors

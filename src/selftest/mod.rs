@@ -28,10 +28,44 @@ mod scenes;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use crate::backend::BackendError;
+use crate::camera::Camera;
+use crate::gaussians::Gaussians;
 pub use bench::Bench;
 pub use cases::cases;
 pub use report::{markdown, table};
 use trial::Trial;
+
+/// What a reference image blends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Blended {
+    /// What every renderer does by default: alpha from 1/255, transmittance down to 1e-4.
+    Standard,
+    /// Everything.
+    Everything,
+}
+
+/// Colours of some pixels (x, y) of a view by the float64 renderer, background included, not clamped.
+/// Rows at camera z below `near` are not drawn.
+pub(crate) fn reference_pixels(
+    model: &Gaussians,
+    camera: &Camera,
+    background: [f32; 3],
+    near: f32,
+    blended: Blended,
+    pixels: &[[u32; 2]],
+) -> Vec<[f64; 3]> {
+    use reference::{Model, Rules, View, blend, project};
+    let rules = match blended {
+        Blended::Standard => Rules::STANDARD,
+        Blended::Everything => Rules::SMOOTH,
+    };
+    let rules = Rules { near: f64::from(near), ..rules };
+    let view = View { camera, background: background.map(f64::from), sh_degree: model.sh_degree };
+    let splats = project::project(&Model::of(model), view, &rules);
+    let order = project::by_depth(&splats);
+    let colour = |&at: &[u32; 2]| blend::sample(&splats, &order, view, &rules, at).rgb;
+    pixels.iter().map(colour).collect()
+}
 
 /// Something that must hold on every backend.
 #[derive(Debug, Clone, Copy)]

@@ -2,7 +2,7 @@
 
 use densify_policies::policy::SceneInfo;
 
-use super::{TrainError, TrainOptions};
+use super::{Savings, TrainError, TrainOptions};
 use crate::backend::Backend;
 
 pub(super) fn check(
@@ -24,6 +24,12 @@ pub(super) fn check(
     }
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
+    }
+    let Savings { ssim_every, coarse_until } = options.savings;
+    if ssim_every == 0 || !(0.0..1.0).contains(&coarse_until) {
+        return bad(format!(
+            "ssim_every {ssim_every} must be >= 1, coarse_until {coarse_until} in [0, 1)"
+        ));
     }
     if let Some(rate) = options.rates.invalid() {
         return bad(format!("learning rate `{rate}` must be a positive number"));

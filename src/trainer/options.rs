@@ -22,6 +22,40 @@ pub struct TrainOptions {
     pub prefetch: usize,
     /// What becomes of rows that hold a number that is none.
     pub on_nan: OnNan,
+    /// Where less is computed than could be.
+    pub savings: Savings,
+}
+
+/// Where a run computes less than it could, beside its backend
+/// ([`Shortcuts`](crate::backend::Shortcuts)). The default is nowhere.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Savings {
+    /// The loss has its SSIM term in every so many-th step, with as many times its weight, so that
+    /// the gradient is the same in the mean; >= 1.
+    pub ssim_every: u32,
+    /// Share of the run that is trained on shrunk images ([`schedule::divisor`]), in `[0, 1)`.
+    ///
+    /// [`schedule::divisor`]: crate::schedule::divisor
+    pub coarse_until: f64,
+}
+
+impl Savings {
+    /// None.
+    pub const NONE: Self = Self { ssim_every: 1, coarse_until: 0.0 };
+
+    /// Factor of the SSIM term in a step of a run of so many iterations. The last step has it, so
+    /// that a run ends with a measurement.
+    #[must_use]
+    pub fn ssim_weight(self, step: u32, iterations: u32) -> f32 {
+        let every = self.ssim_every.max(1);
+        if step.is_multiple_of(every) || step == iterations { every as f32 } else { 0.0 }
+    }
+}
+
+impl Default for Savings {
+    fn default() -> Self {
+        Self::NONE
+    }
 }
 
 /// What becomes of rows with a parameter or a moment that is NaN or infinite.

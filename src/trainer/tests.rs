@@ -295,6 +295,7 @@ const OPTIONS: TrainOptions = TrainOptions {
     sh_every: None,
     prefetch: 2,
     on_nan: OnNan::Prune,
+    savings: Savings::NONE,
 };
 
 fn build(

@@ -54,10 +54,12 @@ fn request(map: PixelMap) -> AuxRequest {
     AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }
 }
 
-fn backend(scene: &Scene, request: &AuxRequest, tile_cap: usize, threads: usize) -> CpuBackend {
+/// `cap` bounds the tile lists, and half of it the records.
+fn backend(scene: &Scene, request: &AuxRequest, cap: usize, threads: usize) -> CpuBackend {
     let mut options = CpuOptions::new(scene.model.len() + 3);
     options.threads = Some(threads);
-    options.tile_cap = tile_cap;
+    options.tile_cap = cap;
+    options.record_cap = cap.div_ceil(2);
     options.needs = Needs {
         signals: SignalSet::of(&[Signal::ScreenGradient, Signal::WeightSum, Signal::WeightMax]),
         aux: Some(request.clone()),
@@ -203,6 +205,7 @@ fn neither_threads_nor_bands_change_a_bit() {
     let expected = run(10_000, 1);
     assert_eq!(run(10_000, 3), expected);
     assert_eq!(run(1, 2), expected);
+    assert_eq!(run(60, 2), expected);
 }
 
 #[test]
@@ -231,6 +234,7 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
                 rates,
                 cadence: Cadence::default(),
                 seed: 1,
+                ssim_weight: 1.0,
             };
             backend.train_step(&input).expect("a small image is rendered");
             if observes {

@@ -79,6 +79,7 @@ fn step(
         rates,
         cadence,
         seed: 5,
+        ssim_weight: 1.0,
     };
     backend.train_step(&input).expect("a small image is rendered");
 }

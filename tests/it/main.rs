@@ -4,7 +4,8 @@
 //! checks it by central differences, and `oracle` holds both against stored float64 renders;
 //! `extremes` runs the cases of the selftest and says where every extreme is tested; `signals` and
 //! `loss` hold the rest against the reference; `properties` are of any scene; `sameness` compares
-//! bits; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan
+//! bits; `shortcuts` holds the knobs of the backends
+//! to their errors; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan
 //! to the backend and to a plain vector; `cli` runs the program on photographs of a small scene;
 //! `fuzz` damages files; `gpu` holds the GPU backend against the native one; `geometry` holds policies
 //! to surfaces that are known; `invariants` keeps the walls of ARCHITECTURE.md standing.
@@ -28,6 +29,8 @@ mod quarantine;
 mod reference;
 mod sameness;
 mod scenes;
+mod shortcuts;
 mod signals;
 mod source_text;
+mod storage;
 mod subject;

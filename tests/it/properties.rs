@@ -52,7 +52,7 @@ fn render(
     background: [f32; 3],
     cap: Option<usize>,
 ) -> Rendering {
-    let resources = Resources { tile_cap: cap, threads: Some(1) };
+    let resources = Resources { tile_cap: cap, threads: Some(1), ..Resources::default() };
     let mut backend = subject::backend(model, resources);
     backend.render(camera, background, model.sh_degree).expect("a small image is rendered")
 }

@@ -47,6 +47,7 @@ fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) {
             rates: RATES,
             cadence: Cadence::default(),
             seed: 3,
+            ssim_weight: 1.0,
         };
         let output = backend.train_step(&input).expect("a small image is rendered");
         assert!(output.loss.is_finite(), "step {step}");

@@ -62,6 +62,7 @@ fn train(model: &Gaussians, camera: &Camera, resources: Resources) -> (Gaussians
                 rates: RATES,
                 cadence: Cadence::default(),
                 seed: 1,
+                ssim_weight: 1.0,
             };
             backend.train_step(&input).expect("a small image is rendered")
         })
@@ -97,6 +98,21 @@ fn bands_change_nothing() {
         for (banded, step) in banded_steps.iter().zip(&steps) {
             assert_eq!(StepOutput { bands: 1, ..*banded }, *step, "cap {cap}");
         }
+    }
+}
+
+/// Records that do not fit are made in parts: within a band, and within a tile.
+#[test]
+fn room_for_records_changes_nothing() {
+    let camera = scenes::camera(140, 120, 32);
+    let model = scenes::cloud(150, 1, &camera, 42);
+    let whole = Resources::default();
+    let (image, trained) = (run(&model, &camera, whole), train(&model, &camera, whole));
+    assert!(trained.1[0].entries > 1_500 && trained.1[0].bands == 1, "{:?}", trained.1[0]);
+    for (tile_cap, record_cap) in [(None, 1_500), (None, 100), (None, 7), (Some(500), 100)] {
+        let some = Resources { tile_cap, record_cap: Some(record_cap), ..whole };
+        assert!(bits(&run(&model, &camera, some)) == bits(&image), "{some:?}");
+        assert!(train(&model, &camera, some).0 == trained.0, "{some:?}, training");
     }
 }
 

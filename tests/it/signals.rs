@@ -116,6 +116,7 @@ fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBacken
             rates: STILL,
             cadence: Cadence::default(),
             seed: 1,
+            ssim_weight: 1.0,
         };
         backend.train_step(&input).expect("a small image is rendered");
     }

@@ -16,6 +16,8 @@ pub(crate) use densify::selftest::values::RATES;
 pub(crate) struct Resources {
     /// Most (row, tile) entries at a time; `None` is the default.
     pub(crate) tile_cap: Option<usize>,
+    /// Most gradient records at a time; `None` is the default.
+    pub(crate) record_cap: Option<usize>,
     /// Worker threads; `None` takes all cores.
     pub(crate) threads: Option<usize>,
 }
@@ -26,6 +28,9 @@ pub(crate) fn options(rows: usize, resources: Resources) -> CpuOptions {
     options.threads = resources.threads;
     if let Some(cap) = resources.tile_cap {
         options.tile_cap = cap;
+    }
+    if let Some(cap) = resources.record_cap {
+        options.record_cap = cap;
     }
     options
 }

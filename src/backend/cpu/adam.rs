@@ -65,7 +65,8 @@ fn rate(rates: &LearningRates, p: usize) -> f32 {
     }
 }
 
-/// One step for the sixteen rows of a block, and for the parameters in `planes`; the others rest.
+/// One step for those of the sixteen rows of a block that have a bit in `who`, and for the parameters
+/// in `planes`; the others rest.
 #[inline(always)]
 #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
 pub(super) fn step<S: Simd>(
@@ -77,15 +78,20 @@ pub(super) fn step<S: Simd>(
     planes: Range<usize>,
     rates: &LearningRates,
     bias: &BiasCorrection,
+    who: u16,
 ) {
     let c = |x: f32| V::splat(s, x);
     let mut correction = [[0.0_f32; WIDTH]; 2];
+    let mut steps = [0.0_f32; WIDTH];
     for (lane, age) in ages.iter_mut().enumerate() {
-        *age = age.saturating_add(1);
+        let is_one = who >> lane & 1;
+        steps[lane] = f32::from(is_one);
+        *age = age.saturating_add(is_one);
         let [first, second] = bias.of(*age);
         correction[0][lane] = first;
         correction[1][lane] = second;
     }
+    let all = who == u16::MAX;
     let [m, v] = moments;
     for p in planes {
         let rate = rate(rates, p);
@@ -94,19 +100,29 @@ pub(super) fn step<S: Simd>(
             let g = V::load(s, &gradient[at..]);
             let m_new = V::load(s, &m[at..]).mul_add(c(BETA1), g * (1.0 - BETA1));
             let v_new = V::load(s, &v[at..]).mul_add(c(BETA2), g * g * (1.0 - BETA2));
-            m_new.store(&mut m[at..]);
-            v_new.store(&mut v[at..]);
+            let x = V::load(s, &params[at..]);
             let m_hat = m_new * V::load(s, &correction[0][lane..]);
             let v_hat = v_new.sqrt() * V::load(s, &correction[1][lane..]);
             let step = m_hat * rate / (v_hat + EPSILON);
-            (V::load(s, &params[at..]) - step).store(&mut params[at..]);
+            let next = x - step;
+            if all {
+                m_new.store(&mut m[at..]);
+                v_new.store(&mut v[at..]);
+                next.store(&mut params[at..]);
+            } else {
+                let steps = V::zero(s).lt(V::load(s, &steps[lane..]));
+                steps.select(m_new, V::load(s, &m[at..])).store(&mut m[at..]);
+                steps.select(v_new, V::load(s, &v[at..])).store(&mut v[at..]);
+                steps.select(next, x).store(&mut params[at..]);
+            }
         }
     }
 }
 
-/// Brings the parameters of a block back to where they are safe.
+/// Brings the parameters of a block back to where they are safe. Quaternions whose squared length is
+/// no farther from 1 than `slack` stay.
 #[inline(always)]
-pub(super) fn confine<S: Simd>(s: S, params: &mut [f32]) {
+pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
     let c = |x: f32| V::splat(s, x);
     for lane in (0..WIDTH).step_by(S::F32_LANES) {
         let at = |p: usize| p * WIDTH + lane;
@@ -115,7 +131,7 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32]) {
         // A quaternion this short has no direction left; it starts again without rotation. Here and
         // below, NaN stays NaN: an audit shall find it.
         let lost = norm2.le(c(1e-12));
-        let inv = c(1.0) / norm2.sqrt();
+        let inv = (norm2 - c(1.0)).abs().le(c(slack)).select(c(1.0), c(1.0) / norm2.sqrt());
         for (i, x) in q.into_iter().enumerate() {
             let identity = if i == 0 { 1.0 } else { 0.0 };
             lost.select(c(identity), x * inv).store(&mut params[at(plane::QUAT + i)..]);
@@ -163,7 +179,7 @@ mod tests {
             let (mut params, mut ages) = ([0.0; WIDTH], [0; WIDTH]);
             for _ in 0..count {
                 let moments = [&mut m[..], &mut v[..]];
-                step(s, &mut params, moments, &mut ages, &gradients, 0..1, &RATES, bias);
+                step(s, &mut params, moments, &mut ages, &gradients, 0..1, &RATES, bias, u16::MAX);
                 path.push(params);
             }
         }

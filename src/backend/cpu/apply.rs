@@ -3,15 +3,17 @@
 use densify_policies::plan::{Family, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed};
 use densify_policies::rng::{PolicyRng, Purpose};
 
-use super::blocks::{Blocks, plane};
+use super::blocks::plane;
+use super::moments::Moments;
+use super::parameters::Parameters;
 use super::signals::Accumulators;
 use super::summed::Summed;
 use crate::gaussians::{logit, rgb_to_dc, sigmoid};
 
 /// The buffers that are re-indexed together.
 pub(super) struct Model<'a> {
-    pub(super) params: &'a mut Blocks,
-    pub(super) moments: [&'a mut Blocks; 2],
+    pub(super) params: &'a mut Parameters,
+    pub(super) moments: &'a mut Moments,
     pub(super) ages: &'a mut [u16],
     pub(super) signals: &'a mut Accumulators,
     pub(super) summed: &'a mut Summed,
@@ -43,9 +45,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
         for row in 0..ops.rows_after {
             let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
             model.params.set(row, plane::OPACITY, clamped);
-            for moment in &mut model.moments {
-                moment.set(row, plane::OPACITY, 0.0);
-            }
+            model.moments.forget(row, plane::OPACITY);
             model.summed.forget_opacity(row);
         }
     }
@@ -124,9 +124,7 @@ impl Model<'_> {
 
     /// Zero moments, age 0, no past.
     fn reborn(&mut self, row: usize) {
-        for moment in &mut self.moments {
-            moment.clear_row(row);
-        }
+        self.moments.clear_row(row);
         self.ages[row] = 0;
         self.signals.blocks.clear_row(row);
         self.summed.clear_row(row);
@@ -134,9 +132,7 @@ impl Model<'_> {
 
     fn relocate(&mut self, from: usize, to: usize) {
         self.params.copy_row(from, to);
-        for moment in &mut self.moments {
-            moment.copy_row(from, to);
-        }
+        self.moments.copy_row(from, to);
         self.ages[to] = self.ages[from];
         self.signals.blocks.copy_row(from, to);
         self.summed.copy_row(from, to);

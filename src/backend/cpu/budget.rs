@@ -2,9 +2,11 @@
 
 use super::CpuOptions;
 use super::adam::BiasCorrection;
-use super::blocks::{Blocks, planes};
+use super::blocks::planes;
 use super::loss::LossBuffers;
+use super::moments::Moments;
 use super::observe;
+use super::parameters::Parameters;
 use super::project::Splat;
 use super::rasterize::TileCanvas;
 use super::rasterize_bwd::TileGradient;
@@ -21,6 +23,11 @@ pub(super) fn tile_cap(options: &CpuOptions) -> usize {
     options.tile_cap.max(options.budget).max(1).min(u32::MAX as usize)
 }
 
+/// As many as there are entries, at most.
+pub(super) fn record_cap(options: &CpuOptions) -> usize {
+    options.record_cap.clamp(1, tile_cap(options))
+}
+
 /// Bytes per buffer for these options.
 pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
     let budget = options.budget.max(1);
@@ -33,8 +40,10 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let grid = Grid::new(width, height);
     let float = size_of::<f32>() as u64;
     let mut ledger = Ledger::default();
-    ledger.add_to(Section::Model, "parameters", Blocks::bytes(budget, per_row));
-    ledger.add_to(Section::Model, "optimiser moments", 2 * Blocks::bytes(budget, per_row));
+    let parameters = Parameters::bytes(budget, per_row, options.storage.parameters);
+    ledger.add_to(Section::Model, "parameters", parameters);
+    let moments = Moments::bytes(budget, per_row, options.storage.moments);
+    ledger.add_to(Section::Model, "optimiser moments", moments);
     ledger.add_to(
         Section::Model,
         "optimiser ages and bias tables",
@@ -61,7 +70,8 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     );
     ledger.add_to(Section::Gradients, "splat gradients", padded * stride as u64 * float);
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
-    ledger.add_to(Section::Tiles, "gradients per entry", cap * stride as u64 * float);
+    let records = record_cap(options) as u64 * stride as u64 * float;
+    ledger.add_to(Section::Tiles, "gradients per entry", records);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
     ledger.add_to(Section::Renderer, "loss", LossBuffers::bytes(grid.width, grid.height, threads));
@@ -83,7 +93,44 @@ pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
 mod tests {
     use super::*;
     use crate::backend::cpu::CpuBackend;
+    use crate::backend::{MomentStorage, ParameterStorage, Storage};
     use crate::gaussians::Gaussians;
+
+    #[test]
+    fn what_is_allocated_is_what_the_ledger_says() {
+        let formats = [
+            (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
+            (ParameterStorage::F16, MomentStorage::Bf16, 3 * 4 + 56 * 2, 2 * 59 * 2),
+            (ParameterStorage::F16, MomentStorage::Ratio8, 3 * 4 + 56 * 2, 3 * 59),
+        ];
+        for (parameters, moments, of_parameters, of_moments) in formats {
+            let options = CpuOptions {
+                storage: Storage { parameters, moments },
+                tile_cap: 300,
+                record_cap: 70,
+                threads: Some(1),
+                ..CpuOptions::new(110)
+            };
+            let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
+            let backend = CpuBackend::new(&model, &options).unwrap();
+            let line = |what: &str| {
+                let line = backend.ledger.lines.iter().find(|line| line.what == what);
+                line.map(|line| line.bytes)
+            };
+            // 110 rows are seven blocks of sixteen.
+            assert_eq!(line("parameters"), Some(112 * of_parameters), "{parameters:?}");
+            assert_eq!(line("optimiser moments"), Some(112 * of_moments), "{moments:?}");
+            assert_eq!(line("gradients per entry"), Some(70 * 9 * 4));
+            let CpuBackend { params, moments, records, sums, splats, visible, .. } = &backend;
+            assert_eq!(line("parameters"), Some(params.held()));
+            assert_eq!(line("optimiser moments"), Some(moments.held()));
+            let bytes = |of: usize| Some(of as u64);
+            assert_eq!(line("gradients per entry"), bytes(size_of_val(&records[..])));
+            assert_eq!(line("splat gradients"), bytes(size_of_val(&sums[..])));
+            let seen = size_of_val(&visible[..]);
+            assert_eq!(line("projected splats"), bytes(size_of_val(&splats[..]) + seen));
+        }
+    }
 
     /// Around 2³¹ and 2³² rows, and as many as a slot can name and more.
     #[test]

@@ -10,10 +10,12 @@ use std::sync::atomic::AtomicU64;
 use densify_policies::policy::DepthMode;
 use glam::{Quat, Vec3};
 
-use super::blocks::{Blocks, plane};
-use super::project::{ALPHA_MIN, Splat, ViewParams};
+use super::blocks::plane;
+use super::parameters::Parameters;
+use super::project::{Splat, ViewParams};
 use super::rasterize::ALPHA_MAX;
 use super::tiles::Entry;
+use crate::backend::Shortcuts;
 
 /// The row that stands for the surface at pixel centre `at`: the one with the largest blend weight
 /// or the one at which half the light is gone.
@@ -21,6 +23,7 @@ pub(super) fn surface_row(
     splats: &[Splat],
     list: &[AtomicU64],
     at: [f32; 2],
+    shortcuts: Shortcuts,
     mode: DepthMode,
 ) -> Option<usize> {
     let mut light = 1.0_f32;
@@ -33,7 +36,7 @@ pub(super) fn surface_row(
         let u = splat.l1 * (dx - splat.shear * dy);
         let z = splat.l3 * dy;
         let alpha = (splat.log2_opacity - u * u - z * z).exp2().min(ALPHA_MAX);
-        if alpha.is_nan() || alpha < ALPHA_MIN {
+        if alpha.is_nan() || alpha < shortcuts.alpha_min {
             continue;
         }
         let weight = alpha * light;
@@ -43,7 +46,7 @@ pub(super) fn surface_row(
             DepthMode::Median if light < 0.5 => return Some(row),
             _ => {}
         }
-        if light <= 1e-4 {
+        if light <= shortcuts.transmittance_min {
             break;
         }
     }
@@ -53,7 +56,7 @@ pub(super) fn surface_row(
 /// Where the ray through pixel centre `at` comes closest to the Gaussian of `row`, in its
 /// Mahalanobis metric, with the depth there. `None` where that is not in front of `near`.
 pub(super) fn closest_approach(
-    params: &Blocks,
+    params: &Parameters,
     row: usize,
     view: &ViewParams,
     at: [f32; 2],

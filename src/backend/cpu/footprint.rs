@@ -1,4 +1,4 @@
-//! Which tiles a splat's ellipse (where alpha >= 1/255) touches.
+//! Which tiles a splat's ellipse (where alpha is at least what is blended, 1/255 by default) touches.
 //!
 //! Per row of tiles, the ellipse's leftmost and rightmost points within that row bound the tiles: no
 //! tile is listed whose pixels it does not come near. The answer is kept as a few bits, since it is
@@ -6,11 +6,11 @@
 
 use std::ops::Range;
 
-use super::project::{LOG2_255, Splat};
+use super::project::Splat;
 use super::tiles::{Grid, TILE};
 
 /// Slack for the bounds of an ellipse [px]: their rounding errors, f32's at 16,384 px, are far less
-/// relative to the ellipse's size, and a pixel missed at the bound has an alpha of 1/255.
+/// relative to the ellipse's size, and a pixel missed at the bound has the least alpha that is blended.
 const SLACK: f32 = 0.02;
 
 /// The tiles of a band that a row touches, as a number of the first and a bit for each of those to
@@ -105,9 +105,8 @@ impl Reach {
         let Self { x0, x1, y0, y1, narrow } = *self;
         // In folded units the ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy. Its
         // rightmost point is at dy = peak, its leftmost at dy = −peak.
-        let Splat { mean: [mx, my], shear, l3, inv_l1, peak, .. } = *splat;
+        let Splat { mean: [mx, my], shear, l3, inv_l1, peak, reach, .. } = *splat;
         let [hw, hh] = half_sides(splat);
-        let reach = splat.log2_opacity + LOG2_255;
         for ty in y0..y1 {
             let (mut from, mut to) = (x0, x1);
             if !narrow {

@@ -124,6 +124,7 @@ mod tests {
             rates,
             cadence: Cadence::default(),
             seed: 1,
+            ssim_weight: 1.0,
         };
         backend.train_step(&input).unwrap();
     }

@@ -58,7 +58,22 @@ pub(super) struct LossBuffers {
     stride: usize,
 }
 
-/// The scalars of a loss.
+/// What of a loss is asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ImageTerms {
+    /// See [`StepInput::ssim_weight`](crate::backend::StepInput::ssim_weight).
+    pub(super) ssim: f32,
+    /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
+    pub(super) error: Option<[f32; 2]>,
+}
+
+impl Default for ImageTerms {
+    fn default() -> Self {
+        Self { ssim: 1.0, error: None }
+    }
+}
+
+/// The scalars of a loss; without SSIM that is NaN.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct LossValue {
     pub(super) l1: f64,
@@ -67,6 +82,9 @@ pub(super) struct LossValue {
 
 impl LossValue {
     pub(super) fn loss(self) -> f64 {
+        if self.ssim.is_nan() {
+            return self.l1;
+        }
         (1.0 - f64::from(SSIM_WEIGHT)) * self.l1 + f64::from(SSIM_WEIGHT) * (1.0 - self.ssim)
     }
 }
@@ -101,7 +119,7 @@ impl LossBuffers {
 
     /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
     /// also the error of each pixel, as the mean over channels of their combination of |e| and
-    /// 1 − SSIM.
+    /// 1 − SSIM. Nothing of SSIM is computed where neither asks for it.
     #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
@@ -111,9 +129,11 @@ impl LossBuffers {
         target: &Image8,
         background: [f32; 3],
         gradient: &mut [TileGradient],
-        error_weights: Option<[f32; 2]>,
+        terms: ImageTerms,
     ) -> LossValue {
+        let ImageTerms { ssim: ssim_weight, error: error_weights } = terms;
         let with_error = error_weights.is_some();
+        let l1_alone = ssim_weight == 0.0 && !with_error;
         self.resize(grid, with_error);
         let stride = self.stride;
         let samples = (3 * grid.width * grid.height) as f64;
@@ -133,6 +153,30 @@ impl LossBuffers {
                 .for_each(|(i, (e, y))| {
                     arch.dispatch(Lines { source, first: i * STRIP, stride, e, y });
                 });
+            if l1_alone {
+                let scale = (1.0 - SSIM_WEIGHT) / samples as f32;
+                let parts: Vec<f64> = gradient
+                    .par_chunks_mut(grid.columns * STRIP / TILE)
+                    .zip(e.par_chunks_mut(strip))
+                    .enumerate()
+                    .map(|(i, (tiles, e))| {
+                        let mask = target.mask.as_deref();
+                        let first = i * STRIP;
+                        arch.dispatch(Absolute {
+                            grid,
+                            channel,
+                            first,
+                            stride,
+                            e,
+                            scale,
+                            mask,
+                            tiles,
+                        })
+                    })
+                    .collect();
+                l1 += parts.into_iter().sum::<f64>();
+                continue;
+            }
             let parts: Vec<LossValue> = (
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),
@@ -173,13 +217,15 @@ impl LossBuffers {
                         y,
                         derivatives: [p1, p2, p3],
                         scale: 1.0 / samples as f32,
+                        ssim_weight,
                         mask: target.mask.as_deref(),
                         tiles,
                     });
                 },
             );
         }
-        LossValue { l1: l1 / samples, ssim: ssim / samples }
+        let ssim = if ssim_weight == 0.0 { f64::NAN } else { ssim / samples };
+        LossValue { l1: l1 / samples, ssim }
     }
 
     /// Error of a pixel after a run with error weights.
@@ -400,6 +446,57 @@ const LANES: [f32; WIDTH] = {
     lanes
 };
 
+/// One strip of one channel, of L1 alone: its sum, and dL/dpixel.
+struct Absolute<'a> {
+    grid: &'a Grid,
+    channel: usize,
+    first: usize,
+    stride: usize,
+    /// The strip's lines; they are used up.
+    e: &'a mut [f32],
+    /// L1's weight / number of samples.
+    scale: f32,
+    mask: Option<&'a [u8]>,
+    /// The strip's tiles.
+    tiles: &'a mut [TileGradient],
+}
+
+impl WithSimd for Absolute<'_> {
+    /// Σ|e| over the strip's pixels.
+    type Output = f64;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> f64 {
+        let Self { grid, channel, first, stride, e, scale, mask, tiles } = self;
+        let zero = V::zero(s);
+        let mut total = 0.0;
+        for tile in tiles.iter_mut() {
+            tile.planes[channel] = DARK;
+        }
+        for (row, line) in e.chunks_exact_mut(stride).enumerate() {
+            let mut sum = zero;
+            for at in (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES) {
+                let e = V::load(s, &line[at..]);
+                sum = sum + e.abs();
+                let positive = zero.lt(e).keep(V::splat(s, scale));
+                let negative = e.lt(zero).keep(V::splat(s, scale));
+                (positive - negative).store(&mut line[at..]);
+            }
+            total += f64::from(sum.sum());
+            // The loss sees e·mask, so the chain rule has the mask once more.
+            if let Some(mask) = mask {
+                let mask = &mask[(first + row) * grid.width..][..grid.width];
+                masked(&mut line[PAD..PAD + grid.width], mask);
+            }
+            let tiles = &mut tiles[row / TILE * grid.columns..][..grid.columns];
+            for (tile, g) in tiles.iter_mut().zip(line[PAD..].as_chunks::<TILE>().0) {
+                set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
+            }
+        }
+        total
+    }
+}
+
 /// Second pass over one strip of one channel: dL/dpixel.
 struct Gradient<'a> {
     grid: &'a Grid,
@@ -412,6 +509,7 @@ struct Gradient<'a> {
     derivatives: [&'a [f32]; 3],
     /// 1 / number of samples.
     scale: f32,
+    ssim_weight: f32,
     mask: Option<&'a [u8]>,
     /// The strip's tiles.
     tiles: &'a mut [TileGradient],
@@ -422,12 +520,13 @@ impl WithSimd for Gradient<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, mask, tiles } =
-            self;
+        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, .. } = self;
+        let Self { ssim_weight, mask, tiles, .. } = self;
         let rows = STRIP.min(grid.height - first);
         let lines: [&mut [f32]; 4] = lines_of(scratch, stride);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
-        let (l1_scale, ssim_scale) = ((1.0 - SSIM_WEIGHT) * scale, -SSIM_WEIGHT * scale);
+        let l1_scale = (1.0 - SSIM_WEIGHT) * scale;
+        let ssim_scale = -SSIM_WEIGHT * scale * ssim_weight;
         let zero = V::zero(s);
         for tile in tiles.iter_mut() {
             tile.planes[channel] = DARK;
@@ -468,3 +567,6 @@ impl WithSimd for Gradient<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -15,14 +15,18 @@ mod candidates;
 mod footprint;
 mod fresh;
 mod loss;
+mod moments;
+mod narrow;
 mod observe;
 mod optimise;
 mod options;
+mod parameters;
 mod passes;
 mod project;
 mod project_bwd;
 mod rasterize;
 mod rasterize_bwd;
+mod records;
 mod regularise;
 mod signals;
 mod simd;
@@ -41,17 +45,19 @@ use pulp::Arch;
 
 use super::candidates::{Candidates, error_weights};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
-    Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateError, StepInput,
+    StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 use adam::BiasCorrection;
-use blocks::{Blocks, planes};
-use loss::LossBuffers;
+use blocks::planes;
+use loss::{ImageTerms, LossBuffers};
+use moments::Moments;
 use optimise::Differentiate;
+use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
 use project::Splat;
 use rasterize::{DARK, TileCanvas};
@@ -81,8 +87,9 @@ pub struct CpuBackend {
     rows: usize,
     sh_degree: u8,
     near: f32,
-    params: Blocks,
-    moments: [Blocks; 2],
+    shortcuts: Shortcuts,
+    params: Parameters,
+    moments: Moments,
     ages: Vec<u16>,
     bias: BiasCorrection,
     summed: Summed,
@@ -100,8 +107,10 @@ pub struct CpuBackend {
     /// Shape: `[tiles]`.
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// Bits of one record per slot. Shape: `[tile cap, stride of the signals' detail]`.
+    /// Bits of one record per entry, as far as there is room. Shape: `[record cap, stride of the
+    /// signals' detail]`.
     records: Vec<AtomicU32>,
+    record_cap: usize,
     /// One record per row. Shape: `[budget, stride of the signals' detail]`.
     sums: Vec<f32>,
     clock: StageClock,
@@ -134,10 +143,11 @@ impl CpuBackend {
         budget::reserve(&ledger)?;
         let signals = Accumulators::new(budget, &options.needs);
         let stride = signals.detail().stride();
-        let cap = budget::tile_cap(options);
+        let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let blocks = budget.div_ceil(WIDTH);
         let per_row = planes(model.sh_degree);
-        let mut params = Blocks::zeros(budget, per_row);
+        let storage = options.storage;
+        let mut params = Parameters::zeros(budget, per_row, storage.parameters);
         params.pack(model);
         Ok(Self {
             arch: Arch::new(),
@@ -147,8 +157,9 @@ impl CpuBackend {
             rows: model.len(),
             sh_degree: model.sh_degree,
             near: options.near,
+            shortcuts: options.shortcuts,
             params,
-            moments: [Blocks::zeros(budget, per_row), Blocks::zeros(budget, per_row)],
+            moments: Moments::zeros(budget, per_row, storage.moments),
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
             summed: Summed::new(budget, per_row, options.needs.cadence),
@@ -162,7 +173,8 @@ impl CpuBackend {
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
-            records: atomic_zeros(cap * stride),
+            records: atomic_zeros(record_cap * stride),
+            record_cap,
             sums: vec![0.0; blocks * WIDTH * stride],
             clock: StageClock::default(),
         })
@@ -191,7 +203,7 @@ impl CpuBackend {
         assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
         assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
         let detail = Detail::All;
-        let records = self.lists.cap() * detail.stride();
+        let records = self.record_cap * detail.stride();
         if self.records.len() < records {
             self.records = atomic_zeros(records);
         }
@@ -211,8 +223,7 @@ impl CpuBackend {
         self.backward(&frame, detail);
         let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
         self.arch.dispatch(Differentiate {
-            params: self.params.of_rows(self.rows),
-            stride: self.params.stride(),
+            params: self.params.view(self.rows),
             sums: &self.sums,
             visible: &self.visible,
             view: &frame.view,
@@ -246,7 +257,7 @@ impl CpuBackend {
                 }
             });
         }
-        let value = self.image_loss(&grid, target, background, None);
+        let value = self.image_loss(&grid, target, background, ImageTerms::default());
         let mut gradient = vec![0.0; rendering.rgb.len()];
         for (tile, from) in self.gradient.iter().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {
@@ -290,7 +301,8 @@ impl Backend for CpuBackend {
         let frame = self.forward(camera, background, input.sh_degree, false)?;
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let value = self.image_loss(&frame.grid, target, background, weights);
+        let terms = ImageTerms { ssim: input.ssim_weight, error: weights };
+        let value = self.image_loss(&frame.grid, target, background, terms);
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);
         }
@@ -330,7 +342,7 @@ impl Backend for CpuBackend {
         }
         let mut model = apply::Model {
             params: &mut self.params,
-            moments: self.moments.each_mut(),
+            moments: &mut self.moments,
             ages: &mut self.ages,
             signals: &mut self.signals,
             summed: &mut self.summed,

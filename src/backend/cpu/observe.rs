@@ -5,18 +5,20 @@
 //! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
 //! map the plane of the image gradient that belongs to alpha.
 
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, PixelMap};
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
-use super::project::{LOG2_255, Splat};
+use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane, TRANSMITTANCE,
-    TRANSMITTANCE_MIN, TilePlace, Within,
+    ALPHA_MAX, Blending, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane,
+    TRANSMITTANCE, TilePlace, Within,
 };
+use super::records::{TileRecords, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
@@ -49,7 +51,9 @@ impl CpuBackend {
         let clock = std::mem::take(&mut self.clock);
         let frame = self.forward(camera, background, input.sh_degree, false);
         let measured = frame.map(|frame| {
-            let loss = scalars(self.image_loss(&frame.grid, target, background, None)).loss;
+            let loss =
+                scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))
+                    .loss;
             let points = self.draw_points(&frame, input);
             let columns = if request.columns.is_empty() {
                 Vec::new()
@@ -103,6 +107,7 @@ impl CpuBackend {
     /// The columns of the view at hand.
     fn columns(&mut self, frame: &Frame, wanted: &[AuxColumn]) -> Vec<(AuxColumn, Vec<f32>)> {
         let Frame { grid, bands, .. } = frame;
+        let blending = self.shortcuts.into();
         let Self { pool, arch, lists, splats, records, sums, visible, gradient, rows, .. } = self;
         let rows = *rows;
         let sums = &mut sums[..rows * STRIDE];
@@ -113,28 +118,26 @@ impl CpuBackend {
                 if bands.len() > 1 {
                     lists.refill(Visible { splats: &splats[..rows], seen: visible }, grid, band);
                 }
-                (0..band.len()).into_par_iter().for_each(|i| {
-                    let tile = band.start + i;
-                    arch.dispatch(Replay {
-                        splats,
-                        list: lists.of_tile(i),
-                        place: TilePlace::new(grid, tile),
-                        map: &gradient[tile].planes[MAP],
-                        records,
+                for part in parts(lists, band.len(), records.len() / STRIDE) {
+                    part.tiles.clone().into_par_iter().for_each(|i| {
+                        let tile = band.start + i;
+                        arch.dispatch(Replay {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(grid, tile),
+                            blending,
+                            map: &gradient[tile].planes[MAP],
+                            records: part.records(lists, i, records, STRIDE),
+                        });
                     });
-                });
-                let records = &records[..];
-                sums.par_chunks_mut(STRIDE).enumerate().for_each(|(row, sums)| {
-                    if is_seen(row) {
-                        let slots = lists.slots_of_row(row);
-                        let mine = &records[slots.start * STRIDE..slots.end * STRIDE];
-                        for record in mine.chunks_exact(STRIDE) {
+                    part.gather(lists, records, sums, visible, (STRIDE, false), |sums, records| {
+                        for record in records.chunks_exact(STRIDE) {
                             for (sum, x) in sums.iter_mut().zip(record) {
                                 *sum += f32::from_bits(x.load(Relaxed));
                             }
                         }
-                    }
-                });
+                    });
+                }
             }
         });
         let value = |column: AuxColumn, row: usize| match column {
@@ -162,9 +165,11 @@ struct Replay<'a> {
     /// Sorted.
     list: &'a [AtomicU64],
     place: TilePlace,
+    /// Those of the forward pass, but for its exponential, which is exact here.
+    blending: Blending,
     map: &'a Plane,
-    /// Bits of one record per slot; this tile writes those of its own entries.
-    records: &'a [AtomicU32],
+    /// This tile writes the records of its own entries, those that are held.
+    records: TileRecords<'a>,
 }
 
 impl WithSimd for Replay<'_> {
@@ -172,13 +177,14 @@ impl WithSimd for Replay<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { splats, list, place, map, records } = self;
+        let Self { splats, list, place, blending, map, records } = self;
         let c = |x: f32| V::splat(s, x);
+        let least_light = c(blending.transmittance_min);
         let zero = V::zero(s);
         // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
         let (mut light, mut alive) = place.inside();
         let mut patches = Patches::EMPTY;
-        for entry in list {
+        for (i, entry) in list.iter().enumerate() {
             let entry = Entry::load(entry);
             let splat = &splats[entry.row];
             let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
@@ -193,11 +199,11 @@ impl WithSimd for Replay<'_> {
                 for at in (0..WIDTH).step_by(S::F32_LANES) {
                     let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
                     let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                    let seen = c(-LOG2_255).le(e);
+                    let seen = c(-blending.log2_reach).le(e);
                     let alpha = e.exp2().min(c(ALPHA_MAX));
                     let t = V::load(s, &light[p][at..]);
                     let next = alpha.neg_mul_add(t, t);
-                    let blends = c(TRANSMITTANCE_MIN).lt(next).and(seen);
+                    let blends = least_light.lt(next).and(seen);
                     let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
                     let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
                     let distance = (dx * dx + dy * dy).sqrt();
@@ -205,7 +211,7 @@ impl WithSimd for Replay<'_> {
                     sums[1] = sums[1] + blends.keep(c(1.0));
                     sums[2] = sums[2] + blends.keep(alpha * t);
                     sums[3] = sums[3] + blends.keep(distance);
-                    let stopped = next.le(c(TRANSMITTANCE_MIN)).and(seen);
+                    let stopped = next.le(least_light).and(seen);
                     let left = stopped.select(zero, blends.select(next, t));
                     left.store(&mut light[p][at..]);
                 }
@@ -215,8 +221,7 @@ impl WithSimd for Replay<'_> {
                     alive &= !(1 << p);
                 }
             }
-            let record = &records[entry.slot * STRIDE..(entry.slot + 1) * STRIDE];
-            for (to, sum) in record.iter().zip(sums) {
+            for (to, sum) in records.of(entry, i).into_iter().flatten().zip(sums) {
                 to.store(sum.sum().to_bits(), Relaxed);
             }
         }

@@ -2,26 +2,34 @@
 //! live in the cache only; there is no gradient buffer of the model's size, unless a policy wants
 //! gradients summed between optimiser steps.
 
+use densify_policies::rng::PolicyRng;
 use pulp::{Simd, WithSimd};
 
 use super::adam::{self, BiasCorrection};
-use super::blocks::{plane, planes};
+use super::blocks::{Scratch, plane, planes};
+use super::moments::MomentTask;
+use super::narrow::Draws;
+use super::parameters::{ParameterTask, ParameterView};
 use super::project::ViewParams;
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::{Detail, field};
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::summed::{Due, TaskSums};
-use crate::backend::LearningRates;
 use crate::backend::signal_planes::SignalPlanes;
+use crate::backend::{LearningRates, Stepped};
 use crate::gaussians::sh_coefficients;
+
+/// How far from 1 the squared length of a quaternion may be where it is stored in fewer bits. Were it
+/// brought to 1 at each step, and then rounded, a row at rest would turn at random.
+const NARROW_SLACK: f32 = 1.0 / 16.0;
 
 /// One optimiser step for a run of whole blocks.
 pub(super) struct Optimise<'a> {
-    pub(super) params: &'a mut [f32],
-    pub(super) moments: [&'a mut [f32]; 2],
-    /// Numbers per block of the three above.
-    pub(super) stride: usize,
+    pub(super) params: &'a mut ParameterTask<'a>,
+    pub(super) moments: &'a mut MomentTask<'a>,
+    /// Draws for rounding what is stored in fewer bits.
+    pub(super) storing: &'a PolicyRng,
     pub(super) ages: &'a mut [u16],
     /// Accumulators of these blocks; empty if no sum is requested.
     pub(super) signals: &'a mut [f32],
@@ -42,6 +50,8 @@ pub(super) struct Optimise<'a> {
     pub(super) terms: Option<Terms>,
     /// Noise on the means, if there is any.
     pub(super) noise: Option<Noise>,
+    /// Which rows step.
+    pub(super) stepped: Stepped,
     /// Row of the first block's first lane, and number of rows from there on.
     pub(super) first_row: usize,
     pub(super) rows: usize,
@@ -52,18 +62,24 @@ impl WithSimd for Optimise<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { params, moments: [m, v], stride, ages, signals, layout, sums, .. } = self;
+        let Self { params: stored, moments, ages, signals, layout, sums, .. } = self;
         let Self { detail, visible, view, rates, bias, mut summed, due, terms, noise, .. } = self;
+        let stepped = self.stepped;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
         let signal_stride = signals.len() / visible.len().max(1);
+        let stride = stored.stride();
+        let slack = if stored.is_narrow() { NARROW_SLACK } else { 0.0 };
+        let is_narrow = stored.is_narrow() || moments.is_narrow();
+        let mut scratch = Scratch::ZERO;
+        let mut moment_scratch = [Scratch::ZERO; 2];
         for (b, &seen) in visible.iter().enumerate() {
-            let of = b * stride..(b + 1) * stride;
+            let params = stored.open(b, trained, &mut scratch);
             let per_block = WIDTH * detail.stride();
             let sums = &sums[b * per_block..(b + 1) * per_block];
             if seen != 0 || !was_zero {
-                gradient.compute(s, &params[of.clone()], sums, detail, seen, view);
+                gradient.compute(s, params, sums, detail, seen, view);
                 was_zero = seen == 0;
             }
             if seen != 0 && signal_stride > 0 {
@@ -71,40 +87,68 @@ impl WithSimd for Optimise<'_> {
                 layout.accumulate(s, block, &gradient, detail, view);
             }
             if let Some(terms) = &terms {
-                terms.add(s, &params[of.clone()], &mut gradient.params);
+                terms.add(s, params, &mut gradient.params);
                 was_zero = false;
             }
             if due.sums_matter() {
                 was_zero &= !summed.exchange(b, &mut gradient.params, trained, due);
             }
             let lanes = b * WIDTH..(b + 1) * WIDTH;
-            let params = &mut params[of.clone()];
-            let (m, v) = (&mut m[of.clone()], &mut v[of]);
+            let [m, v] = moments.open(b, stride, trained, &mut moment_scratch);
             let ages = &mut ages[lanes.clone()];
             let (main, rest) = (0..trained.min(plane::SH_REST), plane::SH_REST..trained);
             let g = &gradient.params;
+            let who = match stepped {
+                Stepped::All => u16::MAX,
+                // Sums bring gradients of views before this one.
+                Stepped::Visible if due.sums_matter() => seen | with_any(g, trained),
+                Stepped::Visible => seen,
+            };
             match summed.rest_ages(lanes) {
+                _ if who == 0 => {}
                 // Bands 1–3 step with the others.
-                None if due.main => adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias),
+                None if due.main => {
+                    adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias, who);
+                }
                 None => {}
                 Some(rest_ages) => {
                     if due.main {
-                        adam::step(s, params, [&mut *m, &mut *v], ages, g, main, rates, bias);
+                        adam::step(s, params, [&mut *m, &mut *v], ages, g, main, rates, bias, who);
                     }
                     if due.rest {
-                        adam::step(s, params, [m, v], rest_ages, g, rest, rates, bias);
+                        adam::step(s, params, [m, v], rest_ages, g, rest, rates, bias, who);
                     }
                 }
             }
             if due.main {
-                adam::confine(s, params);
+                if who != 0 {
+                    adam::confine(s, params, slack);
+                }
                 if let Some(noise) = &noise {
                     let first = self.first_row + b * WIDTH;
                     noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
                 }
             }
+            // Noise moves means of rows that rest, too.
+            if is_narrow && (due.main || due.rest) && (who != 0 || noise.is_some()) {
+                let first_row = self.first_row + b * WIDTH;
+                let [mut of_params, mut of_m, mut of_v] = Draws::of_block(self.storing, first_row);
+                stored.close(b, trained, &scratch, &mut of_params);
+                moments.close(b, stride, trained, &moment_scratch, [&mut of_m, &mut of_v]);
+            }
         }
     }
+}
+
+/// Bit per lane of a block: whether its gradient has any number but 0.
+fn with_any(gradient: &[f32], planes: usize) -> u16 {
+    let mut lanes = 0;
+    for plane in gradient[..planes * WIDTH].as_chunks::<WIDTH>().0 {
+        for (lane, g) in plane.iter().enumerate() {
+            lanes |= u16::from(*g != 0.0) << lane;
+        }
+    }
+    lanes
 }
 
 /// dL/dpixel for [`CpuBackend::differentiate`](super::CpuBackend::differentiate).
@@ -168,8 +212,7 @@ impl ModelGradient {
 
 /// The gradients of a whole model, without a step.
 pub(super) struct Differentiate<'a> {
-    pub(super) params: &'a [f32],
-    pub(super) stride: usize,
+    pub(super) params: ParameterView<'a>,
     /// Records of [`Detail::All`].
     pub(super) sums: &'a [f32],
     pub(super) visible: &'a [u16],
@@ -182,12 +225,14 @@ impl WithSimd for Differentiate<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { params, stride, sums, visible, view, out } = self;
+        let Self { params, sums, visible, view, out } = self;
         let per_block = WIDTH * Detail::All.stride();
-        let sh_planes = stride / WIDTH - plane::SH;
+        let sh_planes = params.planes() - plane::SH;
         let trained = planes(view.sh_degree) - plane::SH;
         let mut g = BlockGradient::ZERO;
-        for (b, block) in params.chunks_exact(stride).enumerate() {
+        let mut scratch = Scratch::ZERO;
+        for b in 0..params.blocks() {
+            let block = params.open(b, planes(view.sh_degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
             g.compute(s, block, sums, Detail::All, visible[b], view);
             for lane in 0..WIDTH.min(out.means.len() - b * WIDTH) {

@@ -2,6 +2,8 @@
 
 use densify_policies::policy::Needs;
 
+use crate::backend::{Shortcuts, Storage};
+
 /// How to set up a [`CpuBackend`](super::CpuBackend).
 #[derive(Debug, Clone)]
 pub struct CpuOptions {
@@ -12,13 +14,20 @@ pub struct CpuOptions {
     /// Most (row, tile) entries held at a time; beyond it the image is processed in bands.
     /// At least one tile's list must fit, so it is raised to the budget.
     pub tile_cap: usize,
+    /// Most gradient records, one per entry, held at a time, >= 1; where the lists hold more entries,
+    /// the backward pass takes them in parts.
+    pub record_cap: usize,
     /// Worker threads; `None` takes all cores.
     pub threads: Option<usize>,
     /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
     /// memory than the ledger says.
     pub largest_image: (u32, u32),
+    /// How parameters and moments are stored.
+    pub storage: Storage,
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Where to compute less than could be.
+    pub shortcuts: Shortcuts,
 }
 
 impl CpuOptions {
@@ -29,9 +38,12 @@ impl CpuOptions {
             budget,
             near: 0.01,
             tile_cap: budget.saturating_mul(16),
+            record_cap: usize::MAX,
             threads: None,
             largest_image: (0, 0),
+            storage: Storage::default(),
             needs: Needs::default(),
+            shortcuts: Shortcuts::default(),
         }
     }
 }

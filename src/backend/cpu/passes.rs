@@ -4,16 +4,18 @@
 use std::ops::Range;
 
 use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
+use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
 use super::candidates;
-use super::loss::LossValue;
+use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
-    CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
+    Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
 use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
+use super::records::parts as parts_of_records;
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
@@ -43,11 +45,11 @@ impl CpuBackend {
         grid: &Grid,
         target: &Image8,
         background: [f32; 3],
-        error_weights: Option<[f32; 2]>,
+        terms: ImageTerms,
     ) -> LossValue {
         let Self { pool, loss, arch, canvas, gradient, clock, .. } = self;
-        let value = pool
-            .install(|| loss.run(*arch, grid, canvas, target, background, gradient, error_weights));
+        let value =
+            pool.install(|| loss.run(*arch, grid, canvas, target, background, gradient, terms));
         clock.lap("loss");
         value
     }
@@ -71,21 +73,20 @@ impl CpuBackend {
         let grid = Grid::new(camera.width, camera.height);
         self.resize_images(&grid);
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
+        let blending = Blending::from(self.shortcuts);
         let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, clock, .. } =
             self;
         clock.start();
         let (rows, arch) = (*rows, *arch);
-        let stride = params.stride();
+        let params = params.view(rows);
         pool.install(|| {
-            (
-                params.of_rows(rows).par_chunks(stride * BLOCKS_PER_TASK),
-                splats[..rows].par_chunks_mut(ROWS_PER_TASK),
-                seen.par_chunks_mut(BLOCKS_PER_TASK),
-            )
+            (splats[..rows].par_chunks_mut(ROWS_PER_TASK), seen.par_chunks_mut(BLOCKS_PER_TASK))
                 .into_par_iter()
-                .for_each(|(params, splats, seen)| {
-                    let rows = splats.len();
-                    arch.dispatch(Project { view: &view, params, stride, rows, splats, seen });
+                .enumerate()
+                .for_each(|(task, (splats, seen))| {
+                    let (params, rows) = (params.task(task), splats.len());
+                    let (view, log2_reach) = (&view, blending.log2_reach);
+                    arch.dispatch(Project { view, log2_reach, params, rows, splats, seen });
                 });
             clock.lap("project");
             let visible = Visible { splats: &splats[..rows], seen };
@@ -102,6 +103,7 @@ impl CpuBackend {
                         place: TilePlace::new(&grid, band.start + i),
                         background,
                         with_depth,
+                        blending,
                         canvas,
                     });
                 });
@@ -116,6 +118,7 @@ impl CpuBackend {
     /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
     pub(super) fn backward(&mut self, frame: &Frame, detail: Detail) {
         let Frame { grid, background, bands, .. } = frame;
+        let blending = self.shortcuts.into();
         let Self {
             pool,
             arch,
@@ -136,39 +139,31 @@ impl CpuBackend {
                 if bands.len() > 1 {
                     lists.refill(Visible { splats: &splats[..*rows], seen: visible }, grid, band);
                 }
-                (0..band.len()).into_par_iter().for_each(|i| {
-                    let tile = band.start + i;
-                    let [r, g, b, alpha, depth] = &gradient[tile].planes;
-                    arch.dispatch(RasterizeBwd {
-                        splats,
-                        list: lists.of_tile(i),
-                        place: TilePlace::new(grid, tile),
-                        background: *background,
-                        canvas: &canvas[tile],
-                        upstream: [r, g, b],
-                        upstream_more: (detail == Detail::All).then_some([alpha, depth]),
-                        detail,
-                        records,
+                let mut fresh = band.start == 0;
+                for part in parts_of_records(lists, band.len(), records.len() / stride) {
+                    part.tiles.clone().into_par_iter().for_each(|i| {
+                        let tile = band.start + i;
+                        let [r, g, b, alpha, depth] = &gradient[tile].planes;
+                        arch.dispatch(RasterizeBwd {
+                            splats,
+                            list: lists.of_tile(i),
+                            place: TilePlace::new(grid, tile),
+                            background: *background,
+                            blending,
+                            canvas: &canvas[tile],
+                            upstream: [r, g, b],
+                            upstream_more: (detail == Detail::All).then_some([alpha, depth]),
+                            detail,
+                            records: part.records(lists, i, records, stride),
+                        });
                     });
-                });
-                clock.lap("rasterize_bwd");
-                let first = band.start == 0;
-                let records = &records[..];
-                sums.par_chunks_mut(stride * WIDTH).zip(&visible[..]).enumerate().for_each(
-                    |(block, (sums, &seen))| {
-                        for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
-                            if first {
-                                sum.fill(0.0);
-                            }
-                            if seen >> lane & 1 == 1 {
-                                let slots = lists.slots_of_row(block * WIDTH + lane);
-                                let mine = &records[slots.start * stride..slots.end * stride];
-                                gather(sum, detail, mine);
-                            }
-                        }
-                    },
-                );
-                clock.lap("gather");
+                    clock.lap("rasterize_bwd");
+                    part.gather(lists, records, sums, visible, (stride, fresh), |sum, records| {
+                        gather(sum, detail, records);
+                    });
+                    fresh = false;
+                    clock.lap("gather");
+                }
             }
         });
     }
@@ -212,6 +207,7 @@ impl CpuBackend {
         mode: DepthMode,
     ) -> Vec<Candidate> {
         let Frame { grid, bands, background, view, .. } = frame;
+        let shortcuts = self.shortcuts;
         let Self { lists, splats, params, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
         let tile = |x: usize, y: usize| y / TILE * grid.columns + x / TILE;
@@ -226,7 +222,7 @@ impl CpuBackend {
             for (slot, &(x, y, error)) in of_band {
                 let at = [x as f32 + 0.5, y as f32 + 0.5];
                 let list = lists.of_tile(tile(x, y) - band.start);
-                let surface = candidates::surface_row(splats, list, at, mode)
+                let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
                     .and_then(|row| candidates::closest_approach(params, row, view, at));
                 *slot = surface.map(|(position, depth)| Candidate {
                     position: position.to_array(),
@@ -266,22 +262,24 @@ impl CpuBackend {
         let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
             self;
         let (rows, arch) = (*rows, *arch);
+        let stepped = self.shortcuts.stepped;
         let terms = Terms::new(self.terms, rows);
         let noise = self.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
-        let [m, v] = moments;
         let layout = signals.layout();
-        let (stride, signal_stride) = (params.stride(), signals.blocks.stride());
+        let signal_stride = signals.blocks.stride();
+        let storing = PolicyRng::new(input.seed, input.step);
         let blocks = rows.div_ceil(WIDTH);
         let tasks = blocks.div_ceil(BLOCKS_PER_TASK);
         let per_task = signal_stride * BLOCKS_PER_TASK;
         let mut signal_blocks = parts(signals.blocks.of_rows_mut(rows), per_task, tasks);
         let mut summed = self.summed.tasks(rows, tasks);
+        let mut param_tasks = params.tasks(rows, tasks);
+        let mut moment_tasks = moments.tasks(rows, tasks);
         pool.install(|| {
             (
-                params.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
-                m.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
-                v.of_rows_mut(rows).par_chunks_mut(stride * BLOCKS_PER_TASK),
+                param_tasks.par_iter_mut(),
+                moment_tasks.par_iter_mut(),
                 ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
                 signal_blocks.par_iter_mut(),
                 sums[..blocks * WIDTH * detail.stride()]
@@ -291,11 +289,11 @@ impl CpuBackend {
             )
                 .into_par_iter()
                 .for_each(
-                    |(params, m, v, ages, signals, sums, visible, (task, summed))| {
+                    |(params, moments, ages, signals, sums, visible, (task, summed))| {
                         arch.dispatch(Optimise {
                             params,
-                            moments: [m, v],
-                            stride,
+                            moments,
+                            storing: &storing,
                             ages,
                             signals,
                             layout,
@@ -309,6 +307,7 @@ impl CpuBackend {
                             due,
                             terms,
                             noise,
+                            stepped,
                             first_row: task * ROWS_PER_TASK,
                             rows: rows - task * ROWS_PER_TASK,
                         });

@@ -12,7 +12,8 @@
 use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};
 
-use super::blocks::plane;
+use super::blocks::{Scratch, plane, planes};
+use super::parameters::ParameterView;
 use super::simd::{Mask, V, WIDTH, each};
 use crate::camera::Camera;
 use crate::gaussians::sh_coefficients;
@@ -20,10 +21,6 @@ use crate::sh;
 
 /// Variance added to both diagonal entries of a projected covariance `[px²]`.
 pub(super) const BLUR: f32 = 0.3;
-/// Alpha below this is not blended.
-pub(super) const ALPHA_MIN: f32 = 1.0 / 255.0;
-/// log₂(255): a splat reaches as far as its exponent stays above minus this.
-pub(super) const LOG2_255: f32 = 7.994_353_4;
 /// Margin of the image beyond which the direction used in J is clamped, as a fraction of its size:
 /// 0.15 = 0.3/2 (the original clamps at 1.3 tan(fov/2)).
 const FOV_MARGIN: f64 = 0.15;
@@ -91,7 +88,7 @@ pub(super) struct Splat {
     pub(super) colour: [f32; 3],
     /// Camera z `[scene units]`.
     pub(super) depth: f32,
-    /// Half the height of the region where alpha >= 1/255 `[px]`.
+    /// Half the height of the region where alpha is at least what is blended `[px]`.
     pub(super) half_height: f32,
     /// Half the width of that region `[px]`.
     pub(super) half_width: f32,
@@ -99,8 +96,10 @@ pub(super) struct Splat {
     pub(super) inv_l1: f32,
     /// How far below the mean that region's rightmost point is `[px]`.
     pub(super) peak: f32,
+    /// How far the exponent may fall from the centre to the region's edge.
+    pub(super) reach: f32,
     /// A splat fills one cache line.
-    pub(super) unused: [f32; 2],
+    pub(super) unused: f32,
 }
 
 /// Numbers of a [`Splat`].
@@ -282,9 +281,10 @@ fn reaches<S: Simd>(s: S, centre: V<S>, half: V<S>, size: u32) -> Mask<S> {
 /// Projects a run of whole blocks and lists the rows that are on screen.
 pub(super) struct Project<'a> {
     pub(super) view: &'a ViewParams,
+    /// [`Shortcuts::log2_reach`](crate::backend::Shortcuts::log2_reach).
+    pub(super) log2_reach: f32,
     /// Parameter blocks of these rows.
-    pub(super) params: &'a [f32],
-    pub(super) stride: usize,
+    pub(super) params: ParameterView<'a>,
     /// Number of rows (the last block may be partly empty).
     pub(super) rows: usize,
     /// Shape: `[rows]`.
@@ -299,7 +299,10 @@ impl WithSimd for Project<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let view = self.view;
-        for (b, block) in self.params.chunks_exact(self.stride).enumerate() {
+        let needed = planes(view.sh_degree);
+        let mut scratch = Scratch::ZERO;
+        for b in 0..self.params.blocks() {
+            let block = self.params.open(b, needed, &mut scratch);
             let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];
             for at in (0..WIDTH).step_by(S::F32_LANES) {
@@ -311,8 +314,8 @@ impl WithSimd for Project<'_> {
                     each!(i in 3 => below(lanes(s, block, plane::LOG_SCALE + i, at), f32::MAX));
                 let sound = sound[0].and(sound[1]).and(sound[2]).and(below(logit, f32::MAX));
                 let log2_opacity = log2_sigmoid(s, logit);
-                // How far the exponent may fall; <= 0 where even the centre is below 1/255.
-                let reach = log2_opacity + LOG2_255;
+                // How far the exponent may fall; <= 0 where even the centre is too faint.
+                let reach = log2_opacity + self.log2_reach;
                 let opaque = V::zero(s).lt(reach);
                 // The determinant leaves f32 where a row is some 4·10⁹ px wide; its factors are none then.
                 let alive = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
@@ -357,6 +360,7 @@ impl WithSimd for Project<'_> {
                     half_width,
                     V::splat(s, 1.0 / FOLD) / l1,
                     g.cov[1] / g.cov[0] * half_width,
+                    reach,
                 ];
                 for (line, field) in out.iter_mut().zip(fields) {
                     field.store(&mut line[at..]);

@@ -1,6 +1,7 @@
 //! Stage 3: tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255; a pixel stops, without that
-//! splat, where its transmittance would fall to 1e-4 or below.
+//! splat, where its transmittance would fall to 1e-4 or below. Both limits, and how exact the
+//! exponential is, are knobs ([`Blending`]).
 //!
 //! One tile at a time, and within it one patch of 4×4 pixels per splat at a time: a vector. Most
 //! splats are a few pixels wide, and patches cover them with a third fewer vectors than rows of
@@ -12,14 +13,30 @@ use std::sync::atomic::AtomicU64;
 
 use pulp::{Simd, WithSimd};
 
-use super::project::{LOG2_255, Splat};
+use super::project::Splat;
 use super::simd::{V, WIDTH, each};
 use super::tiles::{Entry, Grid, TILE};
+use crate::backend::{Exp2, Shortcuts};
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
 pub(super) const ALPHA_MAX: f32 = 0.99;
-/// A pixel stops before its transmittance reaches this.
-pub(super) const TRANSMITTANCE_MIN: f32 = 1e-4;
+/// What blending takes and where it ends; forward and backward pass must have the same.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Blending {
+    /// A splat is blended where its exponent is at least minus this.
+    pub(super) log2_reach: f32,
+    /// A pixel stops before its transmittance reaches this.
+    pub(super) transmittance_min: f32,
+    pub(super) exp2: Exp2,
+}
+
+impl From<Shortcuts> for Blending {
+    fn from(shortcuts: Shortcuts) -> Self {
+        let Shortcuts { transmittance_min, exp2, .. } = shortcuts;
+        Self { log2_reach: shortcuts.log2_reach(), transmittance_min, exp2 }
+    }
+}
+
 /// Splats copied side by side before use, so that their cache misses overlap.
 pub(super) const BATCH: usize = 32;
 
@@ -126,7 +143,7 @@ impl TilePlace {
 /// A splat in one tile: everything that is constant over a patch.
 #[repr(align(64))]
 pub(super) struct Patches {
-    /// Bit per patch: whether it may hold a pixel with alpha >= 1/255.
+    /// Bit per patch: whether it may hold a pixel that the splat is blended into.
     pub(super) mask: u32,
     /// What to add to [`Within::u`] and [`Within::z`], per patch.
     pub(super) u: [f32; PATCHES],
@@ -183,7 +200,7 @@ impl Patches {
             // The least |u| and |z| of the patch.
             let u = ((u + u_middle).abs() - u_half).max(V::zero(s));
             let z = ((z + z_middle).abs() - z_half).max(V::zero(s));
-            let reached = u.mul_add(u, z * z).le(c(splat.log2_opacity + LOG2_255 + 1e-3));
+            let reached = u.mul_add(u, z * z).le(c(splat.reach + 1e-3));
             self.mask |= reached.bits() << at;
         }
     }
@@ -215,6 +232,7 @@ pub(super) struct Rasterize<'a> {
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) with_depth: bool,
+    pub(super) blending: Blending,
     pub(super) canvas: &'a mut TileCanvas,
 }
 
@@ -223,15 +241,23 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        if self.with_depth { self.run::<S, true>(s) } else { self.run::<S, false>(s) }
+        match (self.blending.exp2, self.with_depth) {
+            (Exp2::Degree2, true) => self.run::<S, 2, true>(s),
+            (Exp2::Degree2, false) => self.run::<S, 2, false>(s),
+            (Exp2::Degree4, true) => self.run::<S, 4, true>(s),
+            (Exp2::Degree4, false) => self.run::<S, 4, false>(s),
+            (Exp2::Degree6, true) => self.run::<S, 6, true>(s),
+            (Exp2::Degree6, false) => self.run::<S, 6, false>(s),
+        }
     }
 }
 
 impl Rasterize<'_> {
     #[inline(always)]
-    fn run<S: Simd, const WITH_DEPTH: bool>(self, s: S) {
-        let Self { splats, list, place, background, canvas, .. } = self;
+    fn run<S: Simd, const EXP2: u8, const WITH_DEPTH: bool>(self, s: S) {
+        let Self { splats, list, place, background, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
+        let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
@@ -267,11 +293,11 @@ impl Rasterize<'_> {
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
                         let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
                         let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
-                        let seen = c(-LOG2_255).le(e);
-                        let alpha = e.exp2().min(c(ALPHA_MAX));
+                        let seen = faintest.le(e);
+                        let alpha = e.exp2_by::<EXP2>().min(c(ALPHA_MAX));
                         let t = V::load(s, &light[p][at..]);
                         let next = alpha.neg_mul_add(t, t);
-                        let goes_on = c(TRANSMITTANCE_MIN).lt(next).and(seen);
+                        let goes_on = least_light.lt(next).and(seen);
                         let w = goes_on.keep(alpha * t);
                         blend(s, w, colour[0], &mut red[p][at..]);
                         blend(s, w, colour[1], &mut green[p][at..]);
@@ -280,7 +306,7 @@ impl Rasterize<'_> {
                             blend(s, w, at_depth, &mut depth[p][at..]);
                         }
                         goes_on.select(next, t).store(&mut light[p][at..]);
-                        let stops = next.le(c(TRANSMITTANCE_MIN)).and(seen).and(V::zero(s).lt(t));
+                        let stops = next.le(least_light).and(seen).and(V::zero(s).lt(t));
                         if stops.any() {
                             let place_in_list = (n * BATCH + i) as u32;
                             stop_pixels(

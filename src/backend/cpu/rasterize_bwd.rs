@@ -18,12 +18,15 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use pulp::{Simd, WithSimd};
 
-use super::project::{LOG2_255, Splat};
+use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Aligned, BATCH, DARK, Patches, Plane, TRANSMITTANCE, TileCanvas, TilePlace, Within,
+    ALPHA_MAX, Aligned, BATCH, Blending, DARK, Patches, Plane, TRANSMITTANCE, TileCanvas,
+    TilePlace, Within,
 };
+use super::records::TileRecords;
 use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
+use crate::backend::Exp2;
 
 /// Fields of a record.
 pub(super) mod field {
@@ -94,14 +97,15 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
+    /// Those of the forward pass.
+    pub(super) blending: Blending,
     pub(super) canvas: &'a TileCanvas,
     pub(super) upstream: [&'a Plane; 3],
     /// Alpha and depth, for [`Detail::All`].
     pub(super) upstream_more: Option<[&'a Plane; 2]>,
     pub(super) detail: Detail,
-    /// Bits of one record per slot; this tile writes those of its own entries.
-    /// Shape: `[cap, detail.stride()]`.
-    pub(super) records: &'a [AtomicU32],
+    /// This tile writes the records of its own entries, those that are held.
+    pub(super) records: TileRecords<'a>,
 }
 
 impl WithSimd for RasterizeBwd<'_> {
@@ -109,10 +113,10 @@ impl WithSimd for RasterizeBwd<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        match self.detail {
-            Detail::Gradients => self.run::<S, 0>(s),
-            Detail::WeightMax => self.run::<S, 1>(s),
-            Detail::All => self.run::<S, 2>(s),
+        match self.blending.exp2 {
+            Exp2::Degree2 => self.by_detail::<S, 2>(s),
+            Exp2::Degree4 => self.by_detail::<S, 4>(s),
+            Exp2::Degree6 => self.by_detail::<S, 6>(s),
         }
     }
 }
@@ -129,9 +133,18 @@ struct Sums<S: Simd> {
 
 impl RasterizeBwd<'_> {
     #[inline(always)]
-    fn run<S: Simd, const DETAIL: u8>(self, s: S) {
-        let Self { splats, list, place, background, canvas, upstream, records, detail, .. } = self;
-        let stride = detail.stride();
+    fn by_detail<S: Simd, const EXP2: u8>(self, s: S) {
+        match self.detail {
+            Detail::Gradients => self.run::<S, EXP2, 0>(s),
+            Detail::WeightMax => self.run::<S, EXP2, 1>(s),
+            Detail::All => self.run::<S, EXP2, 2>(s),
+        }
+    }
+
+    #[inline(always)]
+    fn run<S: Simd, const EXP2: u8, const DETAIL: u8>(self, s: S) {
+        let Self { splats, list, place, background, canvas, upstream, records, .. } = self;
+        let faintest = V::splat(s, -self.blending.log2_reach);
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb] = upstream;
         let [ga, gd] = self.upstream_more.unwrap_or([&DARK, &DARK]);
@@ -152,8 +165,8 @@ impl RasterizeBwd<'_> {
             *end = canvas.stop[p].iter().copied().max().unwrap_or(0).min(list.len() as u32);
         }
         let list_end = patch_end.iter().copied().max().unwrap_or(0) as usize;
-        for entry in &list[list_end..] {
-            write(record_of(records, entry, stride), &[0.0; field::ALL]);
+        for (i, entry) in list[list_end..].iter().enumerate() {
+            write(records.of(Entry::load(entry), list_end + i), &[0.0; field::ALL]);
         }
 
         let mut batch = [Splat::default(); BATCH];
@@ -196,8 +209,8 @@ impl RasterizeBwd<'_> {
                         let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
                         let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
                         let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
-                        let seen = c(-LOG2_255).le(e).and(super::simd::before(s, here, stop));
-                        let unclamped = e.exp2();
+                        let seen = faintest.le(e).and(super::simd::before(s, here, stop));
+                        let unclamped = e.exp2_by::<EXP2>();
                         let alpha = seen.keep(unclamped.min(c(ALPHA_MAX)));
                         let t = V::load(s, &light[p][at..]) / (c(1.0) - alpha);
                         t.store(&mut light[p][at..]);
@@ -259,21 +272,15 @@ impl RasterizeBwd<'_> {
                     }
                     _ => {}
                 }
-                write(record_of(records, &chunk[i], stride), &record);
+                write(records.of(Entry::load(&chunk[i]), first + i), &record);
             }
         }
     }
 }
 
 #[inline(always)]
-fn record_of<'a>(records: &'a [AtomicU32], entry: &AtomicU64, stride: usize) -> &'a [AtomicU32] {
-    let slot = Entry::load(entry).slot;
-    &records[slot * stride..(slot + 1) * stride]
-}
-
-#[inline(always)]
-fn write(to: &[AtomicU32], record: &[f32; field::ALL]) {
-    for (to, x) in to.iter().zip(record) {
+fn write(to: Option<&[AtomicU32]>, record: &[f32; field::ALL]) {
+    for (to, x) in to.into_iter().flatten().zip(record) {
         to.store(x.to_bits(), Relaxed);
     }
 }

@@ -97,7 +97,9 @@ mod tests {
     use pulp::{Arch, WithSimd};
 
     use super::*;
-    use crate::backend::cpu::blocks::Blocks;
+    use crate::backend::ParameterStorage;
+    use crate::backend::cpu::blocks::Scratch;
+    use crate::backend::cpu::parameters::Parameters;
     use crate::gaussians::Gaussians;
 
     struct Add<'a>(Terms, &'a [f32], &'a mut [f32]);
@@ -139,11 +141,16 @@ mod tests {
     fn gradients_are_those_of_the_terms() {
         let terms = LossTerms { opacity: 0.7, scale: 1.3 };
         let model = model();
-        let mut blocks = Blocks::zeros(16, 14);
-        blocks.pack(&model);
+        let mut parameters = Parameters::zeros(16, 14, ParameterStorage::F32);
+        parameters.pack(&model);
+        let mut scratch = Scratch::ZERO;
         let mut gradient = vec![1.0; 14 * WIDTH];
         let per_row = Terms::new(terms, 16).unwrap();
-        Arch::new().dispatch(Add(per_row, blocks.of_rows(16), &mut gradient));
+        Arch::new().dispatch(Add(
+            per_row,
+            parameters.view(16).open(0, 14, &mut scratch),
+            &mut gradient,
+        ));
         let h = 1e-2_f32;
         let central = |change: &dyn Fn(&mut Gaussians, f32)| {
             let [mut low, mut high] = [model.clone(), model.clone()];

@@ -5,6 +5,7 @@ use pulp::Simd;
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, plane};
+use super::parameters::Parameters;
 use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::{Detail, field};
@@ -96,7 +97,7 @@ impl Accumulators {
     }
 
     pub(super) fn bytes(budget: usize, needs: &Needs) -> u64 {
-        Blocks::bytes(budget, SignalPlanes::new(needs).count)
+        Blocks::<f32>::bytes(budget, SignalPlanes::new(needs).count)
     }
 
     pub(super) fn layout(&self) -> SignalPlanes {
@@ -179,7 +180,7 @@ impl Accumulators {
         &self,
         rows: usize,
         wanted: SignalSet,
-        params: &Blocks,
+        params: &Parameters,
         ages: &[u16],
     ) -> Signals {
         let mut signals = Signals::zeros(rows, wanted);

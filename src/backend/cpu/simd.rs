@@ -127,23 +127,38 @@ impl<S: Simd> V<S> {
     }
 
     /// 2^self for self in `[−126, 126]`; relative error below 2e-7. Outside, any value.
-    ///
-    /// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest, in
-    /// `[−½, ½]`, goes through the degree-6 minimax polynomial of 2^f (error 2e-9).
     #[inline(always)]
     pub(super) fn exp2(self) -> Self {
+        self.exp2_by::<6>()
+    }
+
+    /// The same by a polynomial of degree 2 (relative error below 1.8e-3), 4 (below 2.8e-6), or else 6.
+    ///
+    /// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest f, in
+    /// `[−½, ½]`, goes through the minimax polynomial of 2^f (relative errors of 1.7e-3, 2.6e-6 and
+    /// 2e-9 before rounding).
+    #[inline(always)]
+    pub(super) fn exp2_by<const DEGREE: u8>(self) -> Self {
         let s = self.s;
         let magic = Self::splat(s, 12_582_912.0);
         let shifted = self + magic;
         let f = self - (shifted - magic);
         let c = |x: f32| Self::splat(s, x);
-        let p = c(1.534_581_2e-4)
-            .mul_add(f, c(1.339_993_1e-3))
-            .mul_add(f, c(9.618_489e-3))
-            .mul_add(f, c(5.550_328_8e-2))
-            .mul_add(f, c(2.402_264_7e-1))
-            .mul_add(f, c(6.931_472e-1))
-            .mul_add(f, c(1.0));
+        let p = match DEGREE {
+            2 => c(2.384_289_4e-1).mul_add(f, c(7.034_48e-1)).mul_add(f, c(1.000_443_1)),
+            4 => c(9.570_102e-3)
+                .mul_add(f, c(5.591_786e-2))
+                .mul_add(f, c(2.402_474_4e-1))
+                .mul_add(f, c(6.931_218e-1))
+                .mul_add(f, c(0.999_999_3)),
+            _ => c(1.534_581_2e-4)
+                .mul_add(f, c(1.339_993_1e-3))
+                .mul_add(f, c(9.618_489e-3))
+                .mul_add(f, c(5.550_328_8e-2))
+                .mul_add(f, c(2.402_264_7e-1))
+                .mul_add(f, c(6.931_472e-1))
+                .mul_add(f, c(1.0)),
+        };
         let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
         let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
         Self { s, v: s.transmute_f32s_u32s(bits) }
@@ -309,6 +324,8 @@ mod tests {
     #[derive(Clone, Copy)]
     enum Function {
         Exp2,
+        Exp2By2,
+        Exp2By4,
         Exp,
         Log2,
     }
@@ -325,6 +342,8 @@ mod tests {
                     let x = V::load(s, &chunk[at..]);
                     let y = match function {
                         Function::Exp2 => x.exp2(),
+                        Function::Exp2By2 => x.exp2_by::<2>(),
+                        Function::Exp2By4 => x.exp2_by::<4>(),
                         Function::Exp => x.exp(),
                         Function::Log2 => x.log2_of_1_to_2(),
                     };
@@ -373,6 +392,11 @@ mod tests {
         let arch = Arch::new();
         let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
         assert!(arch.dispatch(exp2) < 2e-7);
+        for (function, bound) in [(Function::Exp2By2, 1.8e-3), (Function::Exp2By4, 2.8e-6)] {
+            let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), function, 0.0);
+            let worst = arch.dispatch(exp2);
+            assert!(worst < bound && worst > 0.9 * bound, "{worst}");
+        }
         let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
         assert!(arch.dispatch(exp) < 2e-7);
         let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);

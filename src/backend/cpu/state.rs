@@ -32,7 +32,7 @@ impl CpuBackend {
         let rows = self.rows;
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
-            return Tensor::f32(name, &[rows, planes], self.moments[i].to_rows(rows, 0..planes));
+            return self.moments.tensor(i, name, rows, planes);
         }
         if name == AGES {
             return Tensor::u16(name, &[rows], self.ages[..rows].to_vec());
@@ -53,8 +53,7 @@ impl CpuBackend {
         let name = tensor.name.clone();
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
-            let values = tensor.into_f32(&[rows, planes])?;
-            self.moments[i].set_rows(rows, 0..planes, &values);
+            self.moments.restore(i, rows, planes, tensor)?;
         } else if name == AGES {
             let ages = tensor.into_u16(&[rows])?;
             self.ages[..rows].copy_from_slice(&ages);

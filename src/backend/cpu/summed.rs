@@ -82,7 +82,7 @@ impl Summed {
 
     pub(super) fn bytes(budget: usize, planes: usize, longest: Cadence) -> u64 {
         let rows = if longest.sh_rest > 1 { budget.next_multiple_of(WIDTH) } else { 0 };
-        let sums = Blocks::bytes(budget, planes - first_plane(planes, longest));
+        let sums = Blocks::<f32>::bytes(budget, planes - first_plane(planes, longest));
         sums + (rows * size_of::<u16>()) as u64
     }
 

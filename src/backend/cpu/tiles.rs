@@ -20,7 +20,7 @@
 //! floating-point expressions; so the two passes agree.
 
 use std::ops::Range;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
@@ -97,8 +97,9 @@ impl Visible<'_> {
 pub(super) struct TileLists {
     /// Tile after tile: (depth bits, slot) until the tile is sorted, then (row, slot). Shape: `[cap]`.
     entries: Vec<AtomicU64>,
-    /// The row of each slot. Shape: `[cap]`.
-    row_of_slot: Vec<u32>,
+    /// The row of each slot; once lists are sorted, its [position](Self::note_positions) where that
+    /// is asked for. Shape: `[cap]`.
+    row_of_slot: Vec<AtomicU32>,
     /// First slot and number of slots of each row; meaningless for rows not visible. Between
     /// counting and emitting, a [`Footprint`] instead. Shape: `[budget]`.
     slots: Vec<[u32; 2]>,
@@ -112,7 +113,7 @@ impl TileLists {
     pub(super) fn new(budget: usize, cap: usize) -> Self {
         Self {
             entries: (0..cap).map(|_| AtomicU64::new(0)).collect(),
-            row_of_slot: vec![0; cap],
+            row_of_slot: (0..cap).map(|_| AtomicU32::new(0)).collect(),
             slots: vec![[0; 2]; budget],
             starts: Vec::new(),
             counters: Vec::new(),
@@ -122,7 +123,7 @@ impl TileLists {
     /// Bytes for a budget of rows, a cap of entries and an image of so many tiles.
     pub(super) fn bytes(budget: usize, cap: usize, tiles: usize) -> u64 {
         let per_row = size_of::<[u32; 2]>();
-        let per_entry = size_of::<AtomicU64>() + size_of::<u32>();
+        let per_entry = size_of::<AtomicU64>() + size_of::<AtomicU32>();
         let counters = (tiles * MOST_CHUNKS).min(MOST_COUNTERS.max(tiles));
         let starts_and_counters = (tiles + 1 + counters) * size_of::<u32>();
         (budget * per_row + cap * per_entry + starts_and_counters) as u64
@@ -196,7 +197,7 @@ impl TileLists {
                         let key = depth | (first + filled) as u64;
                         entries[cursors[tile] as usize].store(key, Relaxed);
                         cursors[tile] += 1;
-                        row_of_slot[filled] = row as u32;
+                        *row_of_slot[filled].get_mut() = row as u32;
                         filled += 1;
                     });
                     slots[row - rows.start] = [(first + before) as u32, (filled - before) as u32];
@@ -238,7 +239,7 @@ impl TileLists {
         scratch.sort_unstable();
         for (entry, &key) in list.iter().zip(&scratch[..]) {
             let slot = key as u32;
-            let row = self.row_of_slot[slot as usize];
+            let row = self.row_of_slot[slot as usize].load(Relaxed);
             entry.store(u64::from(row) << 32 | u64::from(slot), Relaxed);
         }
     }
@@ -246,6 +247,27 @@ impl TileLists {
     /// The entries of tile `tile` of the band.
     pub(super) fn of_tile(&self, tile: usize) -> &[AtomicU64] {
         &self.entries[self.starts[tile] as usize..self.starts[tile + 1] as usize]
+    }
+
+    /// Entries of the band, tile after tile, before tile `tile`.
+    pub(super) fn first_of(&self, tile: usize) -> usize {
+        self.starts[tile] as usize
+    }
+
+    /// Notes of each slot which entry of the band it belongs to. After sorting, which needs the
+    /// place.
+    pub(super) fn note_positions(&self, tiles: usize) {
+        (0..tiles).into_par_iter().for_each(|tile| {
+            let first = self.first_of(tile);
+            for (i, entry) in self.of_tile(tile).iter().enumerate() {
+                self.row_of_slot[Entry::load(entry).slot].store((first + i) as u32, Relaxed);
+            }
+        });
+    }
+
+    /// What was noted of a slot.
+    pub(super) fn position_of(&self, slot: usize) -> usize {
+        self.row_of_slot[slot].load(Relaxed) as usize
     }
 
     /// The slots of `row` in the band, in order of tile number. Only for visible rows.

@@ -1,6 +1,5 @@
 //! An open device with its kernels, and how its errors become ours.
 
-use std::collections::HashMap;
 use std::future::Future;
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,7 +9,7 @@ use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
 use super::buffers::{Planned, Sizes};
-use super::pipelines::Pipelines;
+use super::pipelines::{Pipelines, Variant};
 use crate::backend::BackendError;
 use crate::memory::Bytes;
 
@@ -60,8 +59,8 @@ pub(super) struct Device {
     pub(super) queue: wgpu::Queue,
     pub(super) summary: AdapterSummary,
     told: Arc<Mutex<Told>>,
-    /// By detail of the records, and by whether alpha and depth have gradients.
-    pipelines: Mutex<HashMap<(u32, bool), Arc<Pipelines>>>,
+    /// By what they are compiled for; there are few.
+    pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
     /// Details of the records for which the canary has sung.
     proven: Mutex<Vec<u32>>,
 }
@@ -102,18 +101,14 @@ impl Device {
     }
 
     /// The kernels, which are compiled once.
-    pub(super) fn pipelines(
-        &self,
-        detail: u32,
-        more: bool,
-    ) -> Result<Arc<Pipelines>, BackendError> {
+    pub(super) fn pipelines(&self, variant: Variant) -> Result<Arc<Pipelines>, BackendError> {
         let mut all = self.pipelines.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(pipelines) = all.get(&(detail, more)) {
+        if let Some((_, pipelines)) = all.iter().find(|(known, _)| *known == variant) {
             return Ok(pipelines.clone());
         }
-        let made = self.guarded("the kernels", 0, |device| Pipelines::new(device, detail, more))?;
+        let made = self.guarded("the kernels", 0, |device| Pipelines::new(device, variant))?;
         let made = Arc::new(made);
-        all.insert((detail, more), made.clone());
+        all.push((variant, made.clone()));
         Ok(made)
     }
 

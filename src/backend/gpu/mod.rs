@@ -37,8 +37,8 @@ use densify_policies::policy::{Cadence, Candidate, LossTerms, Needs, NoiseTerm, 
 
 use super::candidates::Candidates;
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, StateError, StepInput, StepOutput,
-    Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateError, StepInput,
+    StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
@@ -58,7 +58,7 @@ pub use options::GpuOptions;
 use passes::{Passes, Recorder, Shape};
 use photographs::Kept;
 pub use photographs::KeptPhotographs;
-use pipelines::Pipelines;
+use pipelines::{Pipelines, Variant};
 use signals::Planes;
 
 /// Largest image side `[px]`; at this size every index of the stages still fits its type.
@@ -85,6 +85,7 @@ pub struct GpuBackend {
     budget: usize,
     rows: usize,
     near: f32,
+    shortcuts: Shortcuts,
     planes: Planes,
     terms: LossTerms,
     noise: Option<NoiseTerm>,
@@ -121,6 +122,13 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
+        let Shortcuts { exp2, stepped, .. } = Shortcuts::default();
+        let shortcuts = options.shortcuts;
+        if (Shortcuts { exp2, stepped, ..shortcuts }) != shortcuts {
+            return Err(BackendError::OverLimit(
+                "the GPU backend lacks a shortcut that is asked for; use --backend cpu".into(),
+            ));
+        }
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let device = device.0.clone();
@@ -134,7 +142,8 @@ impl GpuBackend {
         let planes = Planes::new(&options.needs);
         let sizes = promise::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
-        let pipelines = device.pipelines(sizes.detail, sizes.more)?;
+        let variant = Variant { detail: sizes.detail, more: sizes.more, shortcuts };
+        let pipelines = device.pipelines(variant)?;
         let launches = device
             .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
@@ -152,6 +161,7 @@ impl GpuBackend {
             budget,
             rows: model.len(),
             near: options.near,
+            shortcuts,
             planes,
             terms: options.needs.loss_terms,
             noise: options.needs.noise,
@@ -204,7 +214,8 @@ impl GpuBackend {
     fn rebuild(&mut self) -> Result<(), BackendError> {
         self.buffers.resize(&self.device, &self.sizes)?;
         let Self { device, sizes, pipelines, buffers, .. } = self;
-        *pipelines = device.pipelines(sizes.detail, sizes.more)?;
+        let Sizes { detail, more, .. } = *sizes;
+        *pipelines = device.pipelines(Variant { detail, more, shortcuts: self.shortcuts })?;
         self.launches =
             device.guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers))?;
         self.edits = EditLaunches::new(device, sizes, &self.planes, buffers, pipelines);

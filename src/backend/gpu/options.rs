@@ -3,6 +3,7 @@
 use densify_policies::policy::Needs;
 
 use super::photographs::KeptPhotographs;
+use crate::backend::Shortcuts;
 
 /// How to set up a [`GpuBackend`](super::GpuBackend).
 #[derive(Debug, Clone)]
@@ -21,6 +22,8 @@ pub struct GpuOptions {
     pub photographs: KeptPhotographs,
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Where to compute less than could be.
+    pub shortcuts: Shortcuts,
 }
 
 impl GpuOptions {
@@ -34,6 +37,7 @@ impl GpuOptions {
             largest_image: (0, 0),
             photographs: KeptPhotographs::default(),
             needs: Needs::default(),
+            shortcuts: Shortcuts::default(),
         }
     }
 }

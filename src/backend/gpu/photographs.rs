@@ -62,8 +62,10 @@ impl GpuBackend {
             return bits;
         }
         let bits = self.upload_target(image);
-        let place = self.kept.places.len() as u64;
         let room = self.sizes.photographs;
+        // A view whose image has another size now keeps its place.
+        let own = self.kept.places.get(&view).map(|&(place, ..)| place);
+        let place = own.unwrap_or(self.kept.places.len() as u64);
         if place < room.count as u64 && (bits & HAS_MASK == 0 || room.with_masks) {
             self.copy_photograph(place, size, bits, true);
             self.kept.places.insert(view, (place, size, bits));

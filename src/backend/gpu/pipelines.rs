@@ -6,6 +6,7 @@ use wgpu::{
 };
 
 use super::buffers::Buffers;
+use crate::backend::Shortcuts;
 
 macro_rules! shader {
     ($name:literal) => {
@@ -88,6 +89,16 @@ kernels! {
     Audit: "audit" "audit" [1, 2];
 }
 
+/// What kernels are compiled for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Variant {
+    /// Detail of the records.
+    pub(super) detail: u32,
+    /// Whether alpha and depth have gradients.
+    pub(super) more: bool,
+    pub(super) shortcuts: Shortcuts,
+}
+
 /// The kernels of a device, for records of one detail, in the order of [`Kernel`].
 #[derive(Debug)]
 pub(super) struct Pipelines {
@@ -114,8 +125,16 @@ pub(super) struct Launch {
 }
 
 impl Pipelines {
-    /// Builds every kernel. `more` says that alpha and depth have gradients.
-    pub(super) fn new(device: &Device, detail: u32, more: bool) -> Self {
+    /// Builds every kernel.
+    pub(super) fn new(device: &Device, variant: Variant) -> Self {
+        let Variant { detail, more, shortcuts } = variant;
+        let detail = ("DETAIL", f64::from(detail));
+        // Every text has these, as the shared one does.
+        let blending = [
+            ("ALPHA_MIN", f64::from(shortcuts.alpha_min)),
+            ("LOG2_REACH", f64::from(shortcuts.log2_reach())),
+            ("TRANSMITTANCE_MIN", f64::from(shortcuts.transmittance_min)),
+        ];
         let texts: Vec<_> = (0..STAGES.len()).map(text).collect();
         let modules: Vec<_> = STAGES
             .iter()
@@ -131,13 +150,12 @@ impl Pipelines {
             .iter()
             .map(|&(stage, entry, bindings)| {
                 let place = STAGES.iter().position(|(name, _)| *name == stage).unwrap_or(0);
-                let constants: &[(&str, f64)] = match stage {
-                    "rasterize_bwd" => {
-                        &[("DETAIL", f64::from(detail)), ("MORE", f64::from(u8::from(more)))]
-                    }
-                    "project_bwd" | "signals" => &[("DETAIL", f64::from(detail))],
+                let own: &[(&str, f64)] = match stage {
+                    "rasterize_bwd" => &[detail, ("MORE", f64::from(u8::from(more)))],
+                    "project_bwd" | "signals" => &[detail],
                     _ => &[],
                 };
+                let constants = [own, &blending].concat();
                 let layout = bind_group_layout(device, entry, &texts[place], bindings);
                 let pipeline_layout =
                     device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
@@ -151,7 +169,7 @@ impl Pipelines {
                     module: &modules[place],
                     entry_point: Some(entry),
                     compilation_options: wgpu::PipelineCompilationOptions {
-                        constants,
+                        constants: &constants,
                         // Every kernel writes what it reads.
                         zero_initialize_workgroup_memory: false,
                     },

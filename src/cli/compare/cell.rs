@@ -1,22 +1,19 @@
 //! One run of a comparison, and the record that it leaves.
 
-use std::collections::BTreeMap;
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
-use densify_scenegen::GroundTruth;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::contender::Contender;
 use super::{POINTS, run_folder};
-use crate::cli::failure::{Failure, INPUT, OTHER};
+use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
-use crate::dataset::builtin;
+use crate::cli::study::{Call, Entry, Summary, has_geometry};
 use crate::metrics::geometry::Geometry;
-use crate::output::{Mean, OutputError, geometry_of, write_atomically};
+use crate::output::{Mean, geometry_of};
 
 /// What is run.
 #[derive(Debug, Clone, PartialEq)]
@@ -85,6 +82,14 @@ impl Record {
     }
 }
 
+impl Entry for Record {
+    type Of = Cell;
+
+    fn is_of(&self, cell: &Cell) -> bool {
+        self.arguments == cell.arguments() && self.densify == env!("CARGO_PKG_VERSION")
+    }
+}
+
 impl Cell {
     /// The call of `densify` that runs this cell, but for the output folder.
     fn arguments(&self) -> Vec<String> {
@@ -110,70 +115,40 @@ impl Cell {
         format!("{label}-{}-{budget}-seed{seed}", Contender::new(policy).folder())
     }
 
-    /// Trains in a process of its own, whose memory is then the run's and nobody else's.
+    /// Runs it.
     ///
     /// # Errors
     /// With the trainer's message and exit code when it fails.
     pub(super) fn train(&self, output: &Path) -> Result<Record, Failure> {
-        let other = |message: String| Failure { code: OTHER, message };
-        let program = std::env::current_exe()
-            .map_err(|e| other(format!("cannot find the program that is running: {e}")))?;
         let run = self.run();
         let folder = output.join("runs").join(&run);
-        let mut call = Command::new(&program);
-        call.args(self.arguments()).arg("--overwrite").arg("--output").arg(&folder);
-        if !self.train.iter().any(|flag| flag.starts_with("--checkpoint-every")) {
-            // A run of a comparison that is interrupted runs again, so that its times are whole.
-            call.args(["--checkpoint-every", "0"]);
-        }
-        self.wait_for(&mut call)?;
-        if has_geometry(&self.scene) {
-            // In a process of its own too: the memory of the run stays the run's.
-            let mut call = Command::new(&program);
-            call.arg("eval").arg(&folder).arg("--scene").arg(&self.scene);
-            call.args(shared_with_eval(&self.train));
-            self.wait_for(&mut call)?;
-        }
+        let call = Call {
+            scene: &self.scene,
+            arguments: self.arguments(),
+            options: &self.train,
+            folder: &folder,
+        };
+        let done = call.train().and_then(|()| match has_geometry(&self.scene) {
+            true => call.measure(),
+            false => Ok(()),
+        });
+        done.map_err(|failure| {
+            failure.and(&format!("this was the run {self}; the same command goes on from here"))
+        })?;
         self.record(&folder, run)
     }
 
-    fn wait_for(&self, call: &mut Command) -> Result<(), Failure> {
-        let child = call
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .output()
-            .map_err(|e| Failure { code: OTHER, message: format!("cannot start a run: {e}") })?;
-        if child.status.success() {
-            return Ok(());
-        }
-        let said = String::from_utf8_lossy(&child.stderr);
-        let message = said.trim().trim_start_matches("error: ").to_owned();
-        let code = child.status.code().and_then(|code| u8::try_from(code).ok());
-        Err(Failure { code: code.unwrap_or(OTHER), message }
-            .and(&format!("this was the run {self}; the same command goes on from here")))
-    }
-
     fn record(&self, folder: &Path, run: String) -> Result<Record, Failure> {
-        let path = folder.join("stats/summary.json");
-        let bad = |problem: String| Failure {
-            code: OTHER,
-            message: format!("{}: {problem}", path.display()),
-        };
-        let text = fs::read(&path).map_err(|e| bad(e.to_string()))?;
-        let summary: Value = serde_json::from_slice(&text).map_err(|e| bad(e.to_string()))?;
-        let number = |field: &str| {
-            summary[field].as_f64().ok_or_else(|| bad(format!("`{field}` is missing")))
-        };
-        let tests: BTreeMap<u32, Mean> = serde_json::from_value(summary["test"].clone())
-            .map_err(|e| bad(format!("`test`: {e}")))?;
+        let summary = Summary::read(folder)?;
+        let Summary { ref tests, .. } = summary;
         let Some((_, &Mean { psnr, ssim, flip })) = tests.last_key_value() else {
-            return Err(Failure {
-                code: INPUT,
-                message: format!("{}: no view is held out to measure", self.scene.display()),
-            });
+            return Err(Failure::input(format!(
+                "{}: no view is held out to measure",
+                self.scene.display()
+            )));
         };
         Ok(Record {
-            densify: summary["densify"].as_str().unwrap_or_default().to_owned(),
+            densify: summary.text("densify"),
             scene: self.label.clone(),
             policy: self.policy.clone(),
             budget: self.budget,
@@ -184,90 +159,14 @@ impl Cell {
             psnr,
             ssim,
             flip,
-            rows: number("rows")? as usize,
-            peak_rows: number("peak_rows")? as usize,
-            peak_bytes: summary["peak_bytes"].as_u64(),
-            seconds: number("seconds")?,
-            cpu_seconds: summary["cpu_seconds"].as_f64(),
-            extra_forwards: number("extra_forwards")? as u64,
-            curve: tests.into_iter().map(|(step, mean)| (step, mean.psnr)).collect(),
+            rows: summary.number("rows")? as usize,
+            peak_rows: summary.number("peak_rows")? as usize,
+            peak_bytes: summary.get("peak_bytes").as_u64(),
+            seconds: summary.number("seconds")?,
+            cpu_seconds: summary.get("cpu_seconds").as_f64(),
+            extra_forwards: summary.number("extra_forwards")? as u64,
+            curve: tests.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
             geometry: geometry_of(folder, self.iterations)?,
-        })
-    }
-}
-
-/// Options of `densify train` that `densify eval` has too, and that say where and on what to compute.
-const SHARED: [&str; 3] = ["--threads", "--backend", "--gpu"];
-
-/// Those of the options of a run that its measurement takes as well.
-fn shared_with_eval(train: &[String]) -> Vec<&String> {
-    let mut shared = Vec::new();
-    let mut words = train.iter();
-    while let Some(word) = words.next() {
-        let (flag, with_value) = word.split_once('=').map_or((&**word, false), |(f, _)| (f, true));
-        if SHARED.contains(&flag) {
-            shared.push(word);
-            shared.extend((!with_value).then(|| words.next()).flatten());
-        }
-    }
-    shared
-}
-
-/// Whether the surface of a scene is known.
-fn has_geometry(scene: &Path) -> bool {
-    builtin::name(scene).is_some() || GroundTruth::is_in(scene)
-}
-
-/// The records in `compare.jsonl`.
-pub(super) struct Records {
-    path: PathBuf,
-    all: Vec<Record>,
-}
-
-impl Records {
-    /// Reads what is there. A last line that was cut off is not: its run runs again.
-    ///
-    /// # Errors
-    /// When a line is no record.
-    pub(super) fn open(path: &Path) -> Result<Self, Failure> {
-        let text = match fs::read_to_string(path) {
-            Ok(text) => text,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
-            Err(e) => return Err(Failure::input(format!("{}: {e}", path.display()))),
-        };
-        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-        let mut all = Vec::new();
-        for (i, line) in whole.lines().enumerate() {
-            all.push(serde_json::from_str(line).map_err(|e| {
-                Failure::input(format!(
-                    "{}, line {}: {e}; delete the line, and its run runs again",
-                    path.display(),
-                    i + 1
-                ))
-            })?);
-        }
-        Ok(Self { path: path.to_owned(), all })
-    }
-
-    /// The record of a cell whose run is finished.
-    pub(super) fn of(&self, cell: &Cell) -> Option<&Record> {
-        let arguments = cell.arguments();
-        let version = env!("CARGO_PKG_VERSION");
-        self.all.iter().rev().find(|r| r.arguments == arguments && r.densify == version)
-    }
-
-    /// Adds a record and writes them all.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
-    pub(super) fn add(&mut self, record: Record) -> Result<(), OutputError> {
-        self.all.push(record);
-        let text = self.all.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));
-        write_atomically(&self.path, |out| {
-            for line in text {
-                out.write_all(line.map_err(std::io::Error::other)?.as_bytes())?;
-            }
-            Ok(())
         })
     }
 }
@@ -282,23 +181,4 @@ pub(super) fn over_time(output: &Path, record: &Record, field: &str) -> Vec<(u32
         Some((iteration, step[field].as_f64()?))
     };
     steps.filter_map(point).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn runs_and_their_measurements_use_the_same_device() {
-        let words =
-            |text: &str| -> Vec<String> { text.split_whitespace().map(str::to_owned).collect() };
-        for (train, shared) in [
-            ("", ""),
-            ("--threads 1 -r 4 --backend gpu", "--threads 1 --backend gpu"),
-            ("--near=0.1 --gpu=lavapipe --threads=2", "--gpu=lavapipe --threads=2"),
-            ("--sh-degree 2 --backend", "--backend"),
-        ] {
-            assert_eq!(shared_with_eval(&words(train)), words(shared).iter().collect::<Vec<_>>());
-        }
-    }
 }

@@ -16,9 +16,9 @@ use clap::Args;
 use super::console::Console;
 use super::failure::Failure;
 use super::number;
-use crate::dataset::builtin;
+use super::study::{Records, labels};
 use crate::output::write_atomically;
-use cell::{Cell, Record, Records};
+use cell::{Cell, Record};
 use contender::Contender;
 
 /// Trains a scene with several policies, under the same conditions, and says which did best.
@@ -218,34 +218,6 @@ fn budgets(asked: &[Budget], labels: &[String]) -> Result<Vec<Vec<usize>>, Failu
     labels.iter().map(one).collect()
 }
 
-/// A short name for each scene: its folder's, or that of the built-in scene.
-fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
-    let mut labels = Vec::new();
-    for scene in scenes {
-        if let Some(name) = builtin::name(scene) {
-            labels.push(unlike(&labels, name.to_owned())?);
-            continue;
-        }
-        let whole = std::fs::canonicalize(scene).map_err(|e| {
-            Failure::input(format!("{}: {e}; name the scene's folder", scene.display()))
-        })?;
-        let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let name = name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '.', "-");
-        labels.push(unlike(&labels, name)?);
-    }
-    Ok(labels)
-}
-
-/// The name, if it is none of those that are taken.
-fn unlike(taken: &[String], name: String) -> Result<String, Failure> {
-    if taken.contains(&name) {
-        return Err(Failure::input(format!(
-            "two scenes are called {name}; compare them in two calls, or rename one folder"
-        )));
-    }
-    Ok(name)
-}
-
 /// Distinct values of a property of the records, in the order of their appearance.
 fn distinct<'a, T: PartialEq>(records: &[&'a Record], of: impl Fn(&'a Record) -> T) -> Vec<T> {
     let mut values = Vec::new();
@@ -288,13 +260,5 @@ mod tests {
         for text in ["room=", "=", "room=x"] {
             assert!(budget(text).is_err(), "{text}");
         }
-    }
-
-    #[test]
-    fn built_in_scenes_go_by_their_names() {
-        let paths = ["scene:table", "scene:thin"].map(PathBuf::from);
-        assert_eq!(labels(&paths).ok(), Some(vec!["table".to_owned(), "thin".to_owned()]));
-        let twice = ["scene:table", "scene:table"].map(PathBuf::from);
-        assert!(labels(&twice).is_err_and(|failure| failure.message.contains("table")));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::difference::Difference;
+use super::difference::between;
 use super::{Record, budgets_of, distinct};
 use crate::cli::number::grouped;
 use crate::metrics::geometry::Geometry;
@@ -38,9 +38,9 @@ pub(super) fn markdown(records: &[&Record], policies: &[String]) -> String {
         text += "| policy | PSNR | better in | SSIM | better in | FLIP | better in |\n\
                  |---|---|---|---|---|---|---|\n";
         for policy in others {
-            let psnr = Difference::between(records, policy, first, |r| r.psnr);
-            let ssim = Difference::between(records, policy, first, |r| r.ssim);
-            let flip = Difference::between(records, policy, first, |r| r.flip);
+            let psnr = between(records, policy, first, |r| r.psnr);
+            let ssim = between(records, policy, first, |r| r.ssim);
+            let flip = between(records, policy, first, |r| r.flip);
             let (Some(psnr), Some(ssim), Some(flip)) = (psnr, ssim, flip) else {
                 let _ =
                     writeln!(text, "| {policy} | not ranked: no run kept its budget | | | | | |");
@@ -125,8 +125,8 @@ fn line(policy: &str, first: &str, runs: &[&Record], records: &[&Record], budget
     let here: Vec<&Record> =
         records.iter().filter(|r| r.scene == run.scene && r.budget == budget).copied().collect();
     let difference = |score: fn(&Record) -> f64, digits| {
-        let between = Difference::between(&here, policy, first, score);
-        between
+        let difference = between(&here, policy, first, score);
+        difference
             .filter(|_| policy != first)
             .map_or_else(String::new, |d| format!(" ({})", d.show(digits)))
     };

@@ -19,6 +19,7 @@ use crate::dataset::images::ImageDemand;
 use crate::dataset::{Dataset, View};
 use crate::gaussians::sh_coefficients;
 use crate::init::usable_points;
+use crate::knobs::Settings;
 use crate::memory::{IMAGES, Ledger, Section, Setting, peak_resident, resident};
 use crate::metrics::scratch_bytes;
 use crate::output::{InitChoice, SceneConfig};
@@ -41,6 +42,7 @@ pub(super) struct Survey {
     pub(super) entry: &'static PolicyEntry,
     /// The policy's parameters as set.
     pub(super) parameters: Table,
+    pub(super) settings: Settings,
     pub(super) device: Option<GpuDevice>,
     pub(super) scene: SceneConfig,
     pub(super) dataset: Dataset,
@@ -58,7 +60,10 @@ impl Survey {
     pub(super) fn of(args: &TrainArgs, console: &Console) -> Result<Self, Failure> {
         let entry = find(&args.policy)?;
         let parameters = parameters(args, entry)?;
+        let knob = |error| Failure::input(format!("--knob: {error}"));
+        let settings = Settings::of(&args.knob).map_err(knob)?;
         let device = args.device.open(console)?;
+        settings.check_backend(device.is_some()).map_err(knob)?;
         use_threads(args.threads);
         let scene = args.data.config(&args.scene);
         let dataset = scene::load(&args.scene, &scene, console)?;
@@ -66,7 +71,18 @@ impl Survey {
         let usable = usable_points(&dataset.points);
         let images = images(&dataset);
         let (resident, peak) = (resident(), peak_resident());
-        Ok(Self { entry, parameters, device, scene, dataset, images, usable, resident, peak })
+        Ok(Self {
+            entry,
+            parameters,
+            settings,
+            device,
+            scene,
+            dataset,
+            images,
+            usable,
+            resident,
+            peak,
+        })
     }
 
     /// The same with images of another size; `None` where there are none of it.
@@ -74,9 +90,9 @@ impl Survey {
         let scene = SceneConfig { resolution: Some(resolution), ..self.scene.clone() };
         let dataset = scene::read(&args.scene, &scene).ok()?;
         let parameters = self.parameters.clone();
-        let device = self.device.clone();
+        let (settings, device) = (self.settings.clone(), self.device.clone());
         let images = images(&dataset);
-        Some(Self { dataset, images, scene, parameters, device, ..*self })
+        Some(Self { dataset, images, scene, parameters, settings, device, ..*self })
     }
 
     /// How the first rows are placed, unless a checkpoint says.
@@ -133,9 +149,12 @@ impl Survey {
             budget: setting.rows,
             near: self.near(args),
             tile_cap: setting.tile_cap,
+            record_cap: self.record_cap(setting),
             threads: args.threads.map(usize::from),
             largest_image: scene::largest_image(&self.dataset),
+            storage: self.settings.storage(),
             needs,
+            shortcuts: self.settings.shortcuts(),
         }
     }
 
@@ -148,6 +167,15 @@ impl Survey {
             largest_image: scene::largest_image(&self.dataset),
             photographs: self.kept_photographs(args, setting),
             needs,
+            shortcuts: self.settings.shortcuts(),
+        }
+    }
+
+    /// Gradient records for two pairs in five, where pairs are counted; else for all.
+    fn record_cap(&self, setting: &Setting) -> usize {
+        match self.settings.pairs_per_row() {
+            Some(_) => (setting.tile_cap / 5 * 2).max(1),
+            None => usize::MAX,
         }
     }
 

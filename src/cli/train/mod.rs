@@ -8,6 +8,7 @@ mod resume;
 mod session;
 mod setup;
 mod size;
+mod spelling;
 mod tally;
 
 use std::ffi::OsString;
@@ -26,7 +27,7 @@ use resume::Start;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
 /// a room or an object; large outdoor scenes want more.
-const DEFAULT_BUDGET: usize = 200_000;
+pub(super) const DEFAULT_BUDGET: usize = 200_000;
 /// Degree, where neither `--sh-degree` nor `--memory` says otherwise.
 const DEFAULT_SH_DEGREE: u8 = 3;
 
@@ -112,6 +113,14 @@ pub(super) struct TrainArgs {
     /// `[default: the policy's choice, mostly 1]`
     #[arg(long, value_name = "N", help_heading = "Training", value_parser = clap::value_parser!(u32).range(1..=1000))]
     sh_every: Option<u32>,
+    /// Knobs that go together: exact, balanced, fast or tiny-memory; says what it was measured to cost
+    /// and buy `[default: balanced]`
+    #[arg(long, value_name = "NAME", help_heading = "Training")]
+    preset: Option<String>,
+    /// Set a knob of the trade between speed, memory and accuracy, such as alpha_min=1/128;
+    /// `densify knobs` lists them. May be repeated
+    #[arg(long, value_name = "NAME=VALUE", help_heading = "Training")]
+    knob: Vec<String>,
     /// What becomes of Gaussians with a number that is not finite, found every 100 iterations at
     /// least
     #[arg(long, value_name = "WHAT", help_heading = "Training", default_value = "prune")]
@@ -196,19 +205,24 @@ impl From<Init> for InitChoice {
 }
 
 /// Trains. `words` are those after `train` on the command line, which `args` was parsed from.
-pub(super) fn run(words: &[OsString], args: TrainArgs, console: &Console) -> Result<(), Failure> {
+pub(super) fn run(words: &[OsString], args: &TrainArgs, console: &Console) -> Result<(), Failure> {
     let (args, resumed) = match args.resume {
-        true => match resume::start(words, &args, console)? {
-            Start::Anew => (args, None),
+        true => match resume::start(words, args, console)? {
+            Start::Anew => (arguments(words)?, None),
             Start::From(run) => {
                 let (args, resumed) = *run;
                 (args, Some(resumed))
             }
         },
-        false => (args, None),
+        false => (arguments(words)?, None),
     };
     let prepared = setup::prepare(&args, resumed, console)?;
     session::train(&args, prepared, console)
+}
+
+/// The arguments in the words of a call, its knobs spelled out.
+pub(super) fn arguments(words: &[OsString]) -> Result<TrainArgs, Failure> {
+    spelling::arguments(&spelling::spelled(words, None)?)
 }
 
 #[cfg(test)]

@@ -8,16 +8,17 @@ use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use clap::parser::ValueSource;
-use clap::{ArgMatches, Args, Command, FromArgMatches};
+use clap::{ArgMatches, FromArgMatches};
 use toml::{Table, Value};
 
 use super::TrainArgs;
 use super::choices::default_output;
+use super::spelling::{self, command, given_knobs, id, is_given};
 use super::tally::is_in_use;
 use crate::checkpoint::{Checkpoint, newest};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
+use crate::knobs::Settings;
 use crate::output::{InitChoice, RunConfig, RunFolder, saved_iterations};
 
 /// A run that goes on.
@@ -36,7 +37,7 @@ pub(super) enum Start {
 }
 
 /// Settings in `config.toml` that change no byte of the result.
-const FREE: [&str; 7] = [
+const FREE: [&str; 8] = [
     "densify",
     "scene.path",
     "scene.working_directory",
@@ -44,6 +45,7 @@ const FREE: [&str; 7] = [
     "scene.image_cache",
     "train.tile_cap",
     "train.extended_to",
+    "knobs.pairs_per_row",
 ];
 
 /// Looks for the checkpoint. `words` are those after `train` on the command line, which `args` was
@@ -77,10 +79,10 @@ pub(super) fn start(
     }
     let saved = &checkpoint.header().config;
     let step = checkpoint.header().trainer.step;
-    let command = TrainArgs::augment_args(Command::new("densify train").no_binary_name(true));
-    let given = command.clone().try_get_matches_from(words).map_err(usage)?;
-    let all = adopted(saved, &given).into_iter().chain(words.iter().cloned());
-    let matches = command.try_get_matches_from(all);
+    let words = spelling::spelled(words, Some(&saved.policy.name))?;
+    let given = spelling::matches(&words)?;
+    let all = adopted(saved, &given)?.into_iter().chain(words);
+    let matches = command().try_get_matches_from(all);
     let args = matches.and_then(|matches| TrainArgs::from_arg_matches(&matches));
     let mut args = args.map_err(|error| {
         let problem = error.to_string();
@@ -135,21 +137,12 @@ fn nothing(
     Ok(Start::Anew)
 }
 
-fn usage(error: clap::Error) -> Failure {
-    Failure::input(error.to_string().trim().trim_start_matches("error: "))
-}
-
-fn is_given(matches: &ArgMatches, id: &str) -> bool {
-    matches.value_source(id) == Some(ValueSource::CommandLine)
-}
-
 /// The options of a saved run that are not given, as words.
-fn adopted(saved: &RunConfig, given: &ArgMatches) -> Vec<OsString> {
-    let RunConfig { scene, train, policy, .. } = saved;
+fn adopted(saved: &RunConfig, given: &ArgMatches) -> Result<Vec<OsString>, Failure> {
+    let RunConfig { scene, train, policy, knobs, .. } = saved;
     let mut words: Vec<OsString> = Vec::new();
     let mut adopt = |flag: &str, value: Option<OsString>| {
-        let id = flag.trim_start_matches('-').replace('-', "_");
-        if let Some(value) = value.filter(|_| !is_given(given, &id)) {
+        if let Some(value) = value.filter(|_| !is_given(given, &id(flag))) {
             // One word, so that a value that begins with a dash is none of an option.
             let mut word = OsString::from(format!("{flag}="));
             word.push(value);
@@ -199,13 +192,21 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Vec<OsString> {
         let set = policy.parameters.iter();
         words.extend(set.map(|(key, value)| format!("--policy-set={name}.{key}={value}").into()));
     }
-    words
+    let given = given_knobs(given)?;
+    let kept = knobs.iter().filter(|(name, _)| given.iter().all(|(knob, _)| knob.name != *name));
+    words.extend(kept.map(|(name, value)| format!("--knob={name}={value}").into()));
+    Ok(words)
 }
 
 /// Fails where the configuration of this call would give another result than the saved one.
 pub(super) fn check(now: &RunConfig, checkpoint: &Checkpoint) -> Result<(), Failure> {
     let saved = &checkpoint.header().config;
     let (mut ours, mut theirs) = (leaves(now), leaves(saved));
+    // A run of a version that lacked a knob had it as it is by default.
+    for (name, value) in Settings::default().iter() {
+        let value = || Value::from(value).to_string();
+        theirs.entry(format!("knobs.{name}")).or_insert_with(value);
+    }
     for free in FREE {
         ours.remove(free);
         theirs.remove(free);
@@ -248,6 +249,7 @@ fn flag(key: &str, policy: &str) -> String {
             Some(parameter) => format!("--policy-set {policy}.{parameter}"),
             None => key.to_owned(),
         },
+        ("knobs", name) => format!("--knob {name}"),
         ("train", "adapter") => "--gpu".to_owned(),
         ("train", name) => match name.strip_prefix("learning_rates.") {
             Some(rate) => format!("--lr {rate}"),

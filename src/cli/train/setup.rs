@@ -22,6 +22,7 @@ use crate::cli::number::grouped;
 use crate::dataset::Dataset;
 use crate::gaussians::Gaussians;
 use crate::init::{initialise, random_points, restart};
+use crate::knobs::{self, DEFAULT_PRESET};
 use crate::memory::{Ledger, Setting};
 use crate::output::{InitChoice, PolicyConfig, RunConfig, RunFolder, SceneConfig, TrainConfig};
 use crate::trainer::{TrainOptions, Trainer, needs};
@@ -128,6 +129,7 @@ pub(super) fn prepare(
             parameters: entry.effective(parameters, &scene)?,
         },
         scene: SceneConfig { image_cache: setting.image_cache, ..survey.scene.clone() },
+        knobs: survey.settings.clone(),
     };
     let fingerprint = Fingerprint::of(&survey.dataset);
     if let Some(checkpoint) = &checkpoint {
@@ -138,6 +140,17 @@ pub(super) fn prepare(
         console.say(line);
     }
     announce(args, entry, &config, &output, console);
+    match &args.preset {
+        Some(name) => {
+            console.say(format_args!("preset   {}", knobs::preset(name).map_err(Failure::input)?))
+        }
+        // One that goes on has the knobs that it began with.
+        None if checkpoint.is_some() => {}
+        None => console.say(format_args!(
+            "preset   {}",
+            knobs::preset(DEFAULT_PRESET).map_err(Failure::input)?
+        )),
+    }
 
     let needs = needs(policy.as_ref(), &scene, args.sh_every);
     let ledger = survey.ledger(args, &setting, &needs, size::threads(args));
@@ -157,6 +170,7 @@ pub(super) fn prepare(
         sh_every: args.sh_every,
         prefetch: AHEAD,
         on_nan: args.on_nan.into(),
+        savings: config.knobs.savings(),
     };
     let mut trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
     let kept = checkpoint.map(|checkpoint| go_on(checkpoint, &mut trainer, last, console));

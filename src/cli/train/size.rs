@@ -8,7 +8,7 @@ use crate::cli::failure::{DEVICE, Failure};
 use crate::cli::number::grouped;
 use crate::cli::scene::DEFAULT_IMAGE_CACHE;
 use crate::memory::{
-    Bytes, Fit, Grant, Ledger, Setting, Wishes, fit, grant, least_memory, resident,
+    Bytes, Fit, Grant, Ledger, PAIRS, Setting, Wishes, fit, grant, least_memory, resident,
 };
 
 /// (Row, tile) pairs per row of the budget, where memory is not given.
@@ -34,7 +34,8 @@ impl Size {
     pub(super) fn as_given(args: &TrainArgs, survey: &Survey) -> Result<Self, Failure> {
         let rows = args.budget.unwrap_or(DEFAULT_BUDGET);
         let most = most_pairs(args, survey, rows)?;
-        let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(most);
+        let per_row = survey.settings.pairs_per_row().unwrap_or(PAIRS_PER_ROW);
+        let pairs = rows.saturating_mul(per_row).min(most);
         let setting = Setting {
             rows,
             sh_degree: args.sh_degree.unwrap_or(DEFAULT_SH_DEGREE),
@@ -49,6 +50,15 @@ impl Size {
     /// # Errors
     /// When nothing fits, with what would.
     pub(super) fn choose(args: &TrainArgs, survey: &Survey) -> Result<Self, Failure> {
+        // A run that goes on has the cap that was solved for.
+        if let (Some(cap), Some(pairs), false) =
+            (args.tile_cap, survey.settings.pairs_per_row(), args.resume)
+        {
+            return Err(Failure::input(format!(
+                "--tile-cap {cap} and --knob pairs_per_row={pairs} contradict each other; give one of \
+                 them, such as --tile-cap {cap} with pairs_per_row=auto"
+            )));
+        }
         let Some(memory) = args.memory else {
             return Self::as_given(args, survey);
         };
@@ -184,6 +194,7 @@ fn wishes(args: &TrainArgs, survey: &Survey, memory: u64) -> Result<Wishes, Fail
         most_rows: args.budget.map_or(possible, |budget| budget.min(possible)),
         sh_degree: degrees,
         tile_cap: args.tile_cap,
+        pairs: survey.settings.pairs_per_row().map_or(PAIRS, |pairs| [pairs; 3]),
         most_pairs: most_pairs(args, survey, LEAST_ROWS)?,
         // The host's memory, where the device's is bounded.
         image_cache: match &survey.device {

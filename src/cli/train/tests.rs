@@ -43,7 +43,7 @@ impl Case {
             .collect::<Vec<_>>();
         let command = TrainArgs::augment_args(Command::new("train").no_binary_name(true));
         let matches = command.try_get_matches_from(&words).unwrap();
-        run(&words, TrainArgs::from_arg_matches(&matches).unwrap(), &Console::new(true))
+        run(&words, &TrainArgs::from_arg_matches(&matches).unwrap(), &Console::new(true))
     }
 
     /// Trains with a fault; what came of it. Fails if the fault was never met.

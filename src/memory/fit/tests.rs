@@ -52,6 +52,7 @@ fn wishes(model: &Model, memory: u64) -> Wishes {
         most_rows: u32::MAX as usize,
         sh_degree: 0..=3,
         tile_cap: None,
+        pairs: PAIRS,
         most_pairs: u32::MAX as usize,
         image_cache: None,
         all_images: model.all_images,
@@ -67,16 +68,18 @@ proptest! {
         tile_cap in prop_oneof![Just(None), (1..500_000_usize).prop_map(Some)],
         image_cache in prop_oneof![Just(None), (0..200_000_000_u64).prop_map(Some)],
         lowest in 0..=3_u8,
+        pairs in prop_oneof![Just(PAIRS), Just([1; 3]), Just([4; 3])],
     ) {
         let wishes = Wishes {
             most_rows: most,
             tile_cap,
+            pairs,
             image_cache,
             sh_degree: lowest..=3,
             ..wishes(&model, memory)
         };
         let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(&wishes) else {
-            let least = wishes.setting(1_000.min(most), lowest, PAIRS[0]);
+            let least = wishes.setting(1_000.min(most), lowest, pairs[0]);
             prop_assert!(model.bytes(&least) > memory);
             return Ok(());
         };
@@ -88,7 +91,7 @@ proptest! {
         prop_assert!(tile_cap.is_none_or(|cap| setting.tile_cap == cap.max(setting.rows)));
         prop_assert!(image_cache.is_none_or(|cache| setting.image_cache == cache));
         if by_memory {
-            let more = wishes.setting(setting.rows + 1, setting.sh_degree, PAIRS[0]);
+            let more = wishes.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
             prop_assert!(model.bytes(&more) > memory);
         } else {
             let more = wishes.setting(setting.rows, setting.sh_degree, PAIRS[2]);
@@ -104,7 +107,7 @@ proptest! {
         let enough = 20_000.min(most);
         prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
         if setting.sh_degree < 3 {
-            let higher = wishes.setting(enough, setting.sh_degree + 1, PAIRS[0]);
+            let higher = wishes.setting(enough, setting.sh_degree + 1, pairs[0]);
             prop_assert!(model.bytes(&higher) > memory);
         }
     }

@@ -17,7 +17,7 @@ use crate::schedule::{Background, RateOptions};
 use crate::selftest::bench::{Bench, Room};
 use crate::selftest::scenes;
 use crate::selftest::trial::{Trial, count_broken};
-use crate::trainer::{OnNan, TrainOptions, Trainer, needs};
+use crate::trainer::{OnNan, Savings, TrainOptions, Trainer, needs};
 use crate::views::{ViewError, ViewSource};
 
 const SIDE: u32 = 64;
@@ -142,6 +142,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         sh_every: None,
         prefetch: 1,
         on_nan: OnNan::Stop,
+        savings: Savings::NONE,
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
     let needs = needs(policy.as_ref(), &scene, options.sh_every);

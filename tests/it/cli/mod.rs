@@ -4,10 +4,12 @@ mod comparing;
 mod faults;
 mod generated;
 mod killing;
+mod knobs;
 mod looking;
 mod memory;
 mod resuming;
 mod same;
+mod trading;
 mod training;
 
 use std::collections::BTreeMap;

@@ -62,6 +62,7 @@ fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
         rates: RATES,
         cadence: Cadence::default(),
         seed: 1,
+        ssim_weight: 1.0,
     };
     backend.train_step(&input).expect("a small image is rendered").visible
 }

@@ -98,6 +98,7 @@ fn candidates(model: &Gaussians, target: &Image8, request: CandidateRequest) -> 
         rates,
         cadence: Cadence::default(),
         seed: 0,
+        ssim_weight: 1.0,
     };
     backend.train_step(&input).expect("a step");
     let needs = Needs { candidates: Some(request), ..Needs::default() };

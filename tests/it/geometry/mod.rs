@@ -15,7 +15,7 @@ use densify::gaussians::Gaussians;
 use densify::init::{initialise, restart};
 use densify::metrics::geometry::{self, Geometry, Ground};
 use densify::schedule::{Background, RateOptions};
-use densify::trainer::{OnNan, TrainOptions, Trainer, needs};
+use densify::trainer::{OnNan, Savings, TrainOptions, Trainer, needs};
 use densify::views::DatasetViews;
 use densify_policies::policy::{Needs, SceneInfo};
 use densify_policies::registry::find;
@@ -109,6 +109,7 @@ impl Known {
             sh_every: None,
             prefetch: 0,
             on_nan: OnNan::Prune,
+            savings: Savings::NONE,
         };
         let near = (0.04 * dataset.extent()) as f32;
         let needs = needs(policy.as_ref(), &scene, options.sh_every);

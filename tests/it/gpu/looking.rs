@@ -214,6 +214,7 @@ fn where_all_pixels_are_equally_wrong_the_first_is_taken() {
                 background: [0.0; 3],
                 sh_degree: 0,
                 rates: RATES,
+                ssim_weight: 1.0,
                 cadence: Cadence::default(),
                 seed: 1,
             };

@@ -30,6 +30,7 @@ fn step(backend: &mut GpuBackend, step: u32, view: usize, (camera, target): &(Ca
         background: [0.3, 0.4, 0.6],
         sh_degree: 0,
         rates: RATES,
+        ssim_weight: 1.0,
         cadence: Cadence::default(),
         seed: 3,
     };
@@ -44,6 +45,7 @@ fn to_keep_photographs_changes_nothing_but_memory() {
     views[1].1.alpha = Some(plane(5, (30, 30)));
     views[2].1.mask = Some(plane(6, (41, 30)));
     views[3].1.mask = Some(plane(7, (17, 5)));
+    let coarse = [view((20, 13), 9), view((15, 15), 10), view((20, 15), 11), view((8, 2), 12)];
     let model = scenes::cloud(60, 0, &views[0].0, 8);
     for device in subjects() {
         let run = |count, with_masks| {
@@ -51,7 +53,9 @@ fn to_keep_photographs_changes_nothing_but_memory() {
             let mut backend = GpuBackend::new(&model, &options, device).expect("it fits");
             for number in 0..12 {
                 let view = number * 7 % 4;
-                step(&mut backend, number as u32 + 1, view, &views[view]);
+                // As in a run that goes from coarse to fine.
+                let images = if number < 6 { &coarse } else { &views };
+                step(&mut backend, number as u32 + 1, view, &images[view]);
             }
             assert_eq!(backend.allocated(), backend.promised());
             (backend.download().expect("a model"), backend.allocated())

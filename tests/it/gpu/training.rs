@@ -31,6 +31,7 @@ pub(super) fn step(
         rates: RATES,
         cadence,
         seed: 11,
+        ssim_weight: 1.0,
     };
     backend.train_step(&input).expect("a small image is rendered")
 }

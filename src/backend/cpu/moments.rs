@@ -1,0 +1,307 @@
+//! Adam's two moments, as f32 or in fewer bits; see [`MomentStorage`].
+//!
+//! The first moment is at most 7.3 roots of the second, whatever the gradients were: what a step
+//! uses is that ratio, and [`MomentStorage::Ratio8`] stores nothing else, in steps of 0.057. Noise
+//! alone gives ratios of about 0.23, to whose variance the rounding adds a twentieth; it has no
+//! scale that neighbours would share, and so none that a neighbour could spoil.
+
+use super::BLOCKS_PER_TASK;
+use super::blocks::{Blocks, Scratch};
+use super::narrow::{Bf16, Draws, Narrow, first_moment, first_moments, narrow, ratios, widen};
+use super::passes::parts;
+use super::simd::WIDTH;
+use crate::backend::{MomentStorage, StateError, Tensor};
+
+/// The moments of all rows, first and second.
+#[derive(Debug)]
+pub(super) enum Moments {
+    /// See [`MomentStorage::F32`].
+    F32([Blocks; 2]),
+    /// See [`MomentStorage::Bf16`].
+    Bf16([Blocks<Bf16>; 2]),
+    /// See [`MomentStorage::Ratio8`].
+    Ratio8(Blocks<i8>, Blocks<Bf16>),
+}
+
+/// Does the same to both moments, whatever they are.
+macro_rules! each_moment {
+    ($moments:expr, $blocks:ident => $do:expr) => {
+        match $moments {
+            Moments::F32([first, second]) => {
+                {
+                    let $blocks = first;
+                    $do
+                }
+                {
+                    let $blocks = second;
+                    $do
+                }
+            }
+            Moments::Bf16([first, second]) => {
+                {
+                    let $blocks = first;
+                    $do
+                }
+                {
+                    let $blocks = second;
+                    $do
+                }
+            }
+            Moments::Ratio8(first, second) => {
+                {
+                    let $blocks = first;
+                    $do
+                }
+                {
+                    let $blocks = second;
+                    $do
+                }
+            }
+        }
+    };
+}
+
+impl Moments {
+    pub(super) fn zeros(capacity: usize, planes: usize, storage: MomentStorage) -> Self {
+        match storage {
+            MomentStorage::F32 => Self::F32([0, 1].map(|_| Blocks::zeros(capacity, planes))),
+            MomentStorage::Bf16 => Self::Bf16([0, 1].map(|_| Blocks::zeros(capacity, planes))),
+            MomentStorage::Ratio8 => {
+                Self::Ratio8(Blocks::zeros(capacity, planes), Blocks::zeros(capacity, planes))
+            }
+        }
+    }
+
+    /// Bytes for `capacity` rows.
+    pub(super) fn bytes(capacity: usize, planes: usize, storage: MomentStorage) -> u64 {
+        let half = Blocks::<Bf16>::bytes(capacity, planes);
+        match storage {
+            MomentStorage::F32 => 2 * Blocks::<f32>::bytes(capacity, planes),
+            MomentStorage::Bf16 => 2 * half,
+            MomentStorage::Ratio8 => Blocks::<i8>::bytes(capacity, planes) + half,
+        }
+    }
+
+    /// Bytes that are there.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> u64 {
+        let mut sum = 0;
+        each_moment!(self, blocks => sum += blocks.held());
+        sum
+    }
+
+    pub(super) fn clear_row(&mut self, row: usize) {
+        each_moment!(self, blocks => blocks.clear_row(row));
+    }
+
+    /// Copies what is stored, to the bit.
+    pub(super) fn copy_row(&mut self, from: usize, to: usize) {
+        each_moment!(self, blocks => blocks.copy_row(from, to));
+    }
+
+    /// Zero moments of one parameter.
+    pub(super) fn forget(&mut self, row: usize, plane: usize) {
+        each_moment!(self, blocks => blocks.set(row, plane, Default::default()));
+    }
+
+    /// The first and the second moment of one parameter.
+    pub(super) fn get(&self, row: usize, plane: usize) -> [f32; 2] {
+        match self {
+            Self::F32(both) => both.each_ref().map(|blocks| blocks.get(row, plane)),
+            Self::Bf16(both) => both.each_ref().map(|blocks| blocks.get(row, plane).to_f32()),
+            Self::Ratio8(first, second) => {
+                let second = second.get(row, plane).to_f32();
+                [first_moment(first.get(row, plane), second), second]
+            }
+        }
+    }
+
+    /// The blocks of the first `rows` rows, to read.
+    pub(super) fn view(&self, rows: usize) -> MomentView<'_> {
+        MomentView { moments: self, rows }
+    }
+
+    /// The blocks of the first `rows` rows, cut for so many of the optimiser's tasks.
+    pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<MomentTask<'_>> {
+        fn cut<T: Copy + Default>(
+            blocks: &mut Blocks<T>,
+            rows: usize,
+            tasks: usize,
+        ) -> impl Iterator<Item = &mut [T]> {
+            let per_task = blocks.stride() * BLOCKS_PER_TASK;
+            parts(blocks.of_rows_mut(rows), per_task, tasks).into_iter()
+        }
+        match self {
+            Self::F32([m, v]) => {
+                let both = cut(m, rows, tasks).zip(cut(v, rows, tasks));
+                both.map(|(m, v)| MomentTask::F32([m, v])).collect()
+            }
+            Self::Bf16([m, v]) => {
+                let both = cut(m, rows, tasks).zip(cut(v, rows, tasks));
+                both.map(|(m, v)| MomentTask::Bf16([m, v])).collect()
+            }
+            Self::Ratio8(m, v) => {
+                let both = cut(m, rows, tasks).zip(cut(v, rows, tasks));
+                both.map(|(m, v)| MomentTask::Ratio8(m, v)).collect()
+            }
+        }
+    }
+
+    /// The first (0) or second (1) moments of the first `rows` rows, as they are stored: numbers,
+    /// the bits of bfloat16, or ratios in two's complement. Shape: `[rows, planes]`.
+    pub(super) fn tensor(&self, which: usize, name: &str, rows: usize, planes: usize) -> Tensor {
+        let shape = [rows, planes];
+        let halves = |blocks: &Blocks<Bf16>| {
+            let bits = blocks.to_rows(rows, 0..planes).into_iter().map(|x| x.0).collect();
+            Tensor::u16(name, &shape, bits)
+        };
+        match (self, which) {
+            (Self::F32(both), _) => Tensor::f32(name, &shape, both[which].to_rows(rows, 0..planes)),
+            (Self::Bf16(both), _) => halves(&both[which]),
+            (Self::Ratio8(first, _), 0) => {
+                let ratios = first.to_rows(rows, 0..planes);
+                Tensor::u8(name, &shape, ratios.into_iter().map(i8::cast_unsigned).collect())
+            }
+            (Self::Ratio8(_, second), _) => halves(second),
+        }
+    }
+
+    /// Takes back what [`tensor`](Self::tensor) returned.
+    pub(super) fn restore(
+        &mut self,
+        which: usize,
+        rows: usize,
+        planes: usize,
+        tensor: Tensor,
+    ) -> Result<(), StateError> {
+        let shape = [rows, planes];
+        let halves = |blocks: &mut Blocks<Bf16>, tensor: Tensor| {
+            let bits: Vec<Bf16> = tensor.into_u16(&shape)?.into_iter().map(Bf16).collect();
+            blocks.set_rows(rows, 0..planes, &bits);
+            Ok(())
+        };
+        match (self, which) {
+            (Self::F32(both), _) => {
+                both[which].set_rows(rows, 0..planes, &tensor.into_f32(&shape)?);
+                Ok(())
+            }
+            (Self::Bf16(both), _) => halves(&mut both[which], tensor),
+            (Self::Ratio8(first, _), 0) => {
+                let ratios = tensor.into_u8(&shape)?.into_iter().map(u8::cast_signed);
+                first.set_rows(rows, 0..planes, &ratios.collect::<Vec<i8>>());
+                Ok(())
+            }
+            (Self::Ratio8(_, second), _) => halves(second, tensor),
+        }
+    }
+}
+
+/// The moments of some blocks, to read.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct MomentView<'a> {
+    moments: &'a Moments,
+    rows: usize,
+}
+
+impl<'a> MomentView<'a> {
+    /// The first `planes` planes, or more, of a block, of both moments.
+    pub(super) fn open<'b>(
+        self,
+        block: usize,
+        planes: usize,
+        scratch: &'b mut [Scratch; 2],
+    ) -> [&'b [f32]; 2]
+    where
+        'a: 'b,
+    {
+        fn of<T: Copy + Default>(blocks: &Blocks<T>, rows: usize, block: usize) -> &[T] {
+            let stride = blocks.stride();
+            &blocks.of_rows(rows)[block * stride..(block + 1) * stride]
+        }
+        let (Self { moments, rows }, used) = (self, planes * WIDTH);
+        let [m, v] = scratch;
+        match moments {
+            Moments::F32([first, second]) => {
+                return [of(first, rows, block), of(second, rows, block)];
+            }
+            Moments::Bf16([first, second]) => {
+                widen(&of(first, rows, block)[..used], &mut m.0[..used]);
+                widen(&of(second, rows, block)[..used], &mut v.0[..used]);
+            }
+            Moments::Ratio8(first, second) => {
+                widen(&of(second, rows, block)[..used], &mut v.0[..used]);
+                first_moments(&of(first, rows, block)[..used], &v.0[..used], &mut m.0[..used]);
+            }
+        }
+        [&m.0, &v.0]
+    }
+}
+
+/// The moments of some blocks, to change.
+#[derive(Debug)]
+pub(super) enum MomentTask<'a> {
+    F32([&'a mut [f32]; 2]),
+    Bf16([&'a mut [Bf16]; 2]),
+    Ratio8(&'a mut [i8], &'a mut [Bf16]),
+}
+
+impl MomentTask<'_> {
+    /// The first `planes` planes, or more, of a block of `stride` numbers, of both moments.
+    #[inline(always)]
+    pub(super) fn open<'b>(
+        &'b mut self,
+        block: usize,
+        stride: usize,
+        planes: usize,
+        scratch: &'b mut [Scratch; 2],
+    ) -> [&'b mut [f32]; 2] {
+        let of = block * stride..(block + 1) * stride;
+        let used = planes * WIDTH;
+        let [m, v] = scratch;
+        match self {
+            Self::F32([first, second]) => return [&mut first[of.clone()], &mut second[of]],
+            Self::Bf16([first, second]) => {
+                widen(&first[of.clone()][..used], &mut m.0[..used]);
+                widen(&second[of][..used], &mut v.0[..used]);
+            }
+            Self::Ratio8(first, second) => {
+                widen(&second[of.clone()][..used], &mut v.0[..used]);
+                first_moments(&first[of][..used], &v.0[..used], &mut m.0[..used]);
+            }
+        }
+        [&mut m.0, &mut v.0]
+    }
+
+    /// Stores the planes that were opened, where they are not what is stored.
+    #[inline(always)]
+    pub(super) fn close(
+        &mut self,
+        block: usize,
+        stride: usize,
+        planes: usize,
+        scratch: &[Scratch; 2],
+        draws: [&mut Draws; 2],
+    ) {
+        let of = block * stride..(block + 1) * stride;
+        let used = planes * WIDTH;
+        let ([m, v], [of_m, of_v]) = (scratch, draws);
+        match self {
+            Self::F32(_) => {}
+            Self::Bf16([first, second]) => {
+                narrow(&m.0[..used], &mut first[of.clone()][..used], of_m);
+                narrow(&v.0[..used], &mut second[of][..used], of_v);
+            }
+            Self::Ratio8(first, second) => {
+                let second = &mut second[of.clone()][..used];
+                narrow(&v.0[..used], second, of_v);
+                ratios(&m.0[..used], second, &mut first[of][..used], of_m);
+            }
+        }
+    }
+
+    /// Whether what is stored is not what was computed.
+    #[inline(always)]
+    pub(super) fn is_narrow(&self) -> bool {
+        !matches!(self, Self::F32(_))
+    }
+}

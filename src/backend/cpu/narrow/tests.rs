@@ -1,0 +1,254 @@
+//! Every number that can be stored, the neighbours of those that cannot, and the draws.
+
+use super::*;
+
+/// All draws that f16 tells apart.
+fn draws() -> impl Iterator<Item = u32> {
+    (0..1 << F16_DROPPED).map(|k| k << (32 - F16_DROPPED))
+}
+
+/// Numbers of both signs and every exponent, with arbitrary digits.
+fn numbers() -> impl Iterator<Item = f32> {
+    (0..=254_u32 << 3).flat_map(|k| {
+        let digits = k.wrapping_mul(2_654_435_769) >> 9;
+        let size = f32::from_bits((k >> 3) << 23 | digits);
+        [size, -size]
+    })
+}
+
+/// All codes are numbers of their own, and come back whatever the draw.
+fn all_come_back<T: Narrow + PartialEq + std::fmt::Debug>(of_bits: fn(u16) -> T) {
+    for bits in 0..=u16::MAX {
+        let (stored, x) = (of_bits(bits), of_bits(bits).to_f32());
+        for random in [0, 1, 1 << 31, u32::MAX] {
+            let back = T::between(x, random);
+            if x.is_nan() {
+                assert!(back.to_f32().is_nan(), "{bits:#x}: {back:?}");
+            } else {
+                assert_eq!(back, stored, "{bits:#x}, {random:#x}: {x:e}");
+            }
+        }
+        if !x.is_nan() {
+            assert_eq!(T::nearest(x), stored, "{bits:#x}");
+        }
+    }
+}
+
+#[test]
+fn whatever_is_stored_comes_back() {
+    all_come_back(F16);
+    all_come_back(Bf16);
+}
+
+/// The definition of binary16, IEEE 754-2008, section 3.4.
+#[test]
+fn halves_are_what_the_standard_says() {
+    for bits in 0..=u16::MAX {
+        let [sign, exponent, digits] = [bits >> 15, bits >> 10 & 31, bits & 0x3ff].map(f64::from);
+        let size = match bits >> 10 & 31 {
+            0 => digits * 2_f64.powi(-24),
+            31 if digits == 0.0 => f64::INFINITY,
+            31 => f64::NAN,
+            _ => (1.0 + digits / 1024.0) * 2_f64.powf(exponent - 15.0),
+        };
+        let expected = if sign == 0.0 { size } else { -size };
+        let found = f64::from(F16(bits).to_f32());
+        assert!(found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan());
+    }
+}
+
+/// Over all draws a number becomes its upper neighbour as often as it is near to it, and nothing but
+/// its neighbours.
+fn is_fair<T: Narrow>(of_bits: fn(u16) -> T, largest: u16) {
+    let mut all: Vec<f32> = (0..=largest).map(|bits| of_bits(bits).to_f32()).collect();
+    all.extend(all.clone().into_iter().map(|x| -x));
+    all.sort_by(f32::total_cmp);
+    let most = all[all.len() - 1];
+    for x in numbers() {
+        let above = all.partition_point(|&y| y < x);
+        if x.abs() > most {
+            for random in draws() {
+                assert_eq!(T::between(x, random).to_f32().to_bits(), most.copysign(x).to_bits());
+            }
+            continue;
+        }
+        let (low, high) = (all[above.saturating_sub(1)], all[above]);
+        let step = f64::from(high) - f64::from(low);
+        let share = if step == 0.0 { 1.0 } else { (f64::from(x) - f64::from(low)) / step };
+        let mut ups = 0;
+        for random in draws() {
+            let y = T::between(x, random).to_f32();
+            assert!(y == low || y == high, "{x:e} became {y:e}, not {low:e} or {high:e}");
+            ups += u32::from(y == high);
+        }
+        let found = f64::from(ups) / f64::from(1_u32 << F16_DROPPED);
+        // One draw of each that are told apart, and the rounding of what is added to small ones.
+        assert!((found - share).abs() < 2.5e-4, "{x:e}: {found} instead of {share}");
+        let near = f64::from(T::nearest(x).to_f32()) - f64::from(x);
+        assert!(near.abs() <= 0.5001 * step, "{x:e}: the nearest is off by {near:e} of {step:e}");
+    }
+}
+
+#[test]
+fn rounding_is_fair_and_stays_between_the_neighbours() {
+    is_fair(F16, F16_MAX as u16);
+    is_fair(Bf16, BF16_MAX as u16);
+}
+
+/// Fixed point: all that is stored comes back, and what lies between is fair.
+#[test]
+fn fixed_point_is_fair_and_stays() {
+    for (digits, most) in [(11, 16.0_f32), (14, 2.0)] {
+        let step = most / 32768.0;
+        for stored in -i16::MAX..=i16::MAX {
+            let x = fixed::to_f32(stored, digits);
+            assert_eq!(f64::from(x), f64::from(stored) * f64::from(step));
+            for random in [0, 1, 1 << 31, u32::MAX] {
+                assert_eq!(fixed::between(x, digits, random), stored, "{x}");
+            }
+        }
+        for x in [0.1_f32, -0.1, 1e-6, -3e-5, 0.7311, -1.9, 0.99 * most] {
+            let low = (x / step).floor();
+            let mut ups = 0;
+            for random in (0..1 << 14).map(|k| k << 18) {
+                let stored = f32::from(fixed::between(x, digits, random));
+                assert!(stored == low || stored == low + 1.0, "{x}: {stored}");
+                ups += u32::from(stored > low);
+            }
+            let (found, share) = (f64::from(ups) / 16384.0, f64::from(x / step - low));
+            assert!((found - share).abs() < 2e-4, "{x}: {found} instead of {share}");
+            let near = fixed::to_f32(fixed::nearest(x, digits), digits) - x;
+            assert!(near.abs() <= 0.5 * step, "{x}: the nearest is off by {near}");
+        }
+        for random in [0, u32::MAX] {
+            for x in [most, 9e9, f32::MAX] {
+                assert_eq!(fixed::between(x, digits, random), i16::MAX);
+                assert_eq!(fixed::between(-x, digits, random), -i16::MAX);
+            }
+            for x in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                assert!(fixed::to_f32(fixed::between(x, digits, random), digits).is_nan());
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_no_number_stays_none() {
+    for random in [0, 1 << 31, u32::MAX] {
+        for x in [f32::INFINITY, f32::NEG_INFINITY] {
+            assert_eq!(F16::between(x, random).to_f32(), x);
+            assert_eq!(Bf16::between(x, random).to_f32(), x);
+        }
+        for bits in [0x7f80_0001, 0x7fff_ffff, 0xff80_0001, 0xffff_ffff, 0x7fc0_0000] {
+            let x = f32::from_bits(bits);
+            assert!(F16::between(x, random).to_f32().is_nan(), "{bits:#x}");
+            assert!(Bf16::between(x, random).to_f32().is_nan(), "{bits:#x}");
+        }
+    }
+}
+
+/// Ratios stay, of any second moment; what lies between them becomes a neighbour, fairly.
+#[test]
+fn ratios_are_fair_and_stay() {
+    let rng = PolicyRng::new(3, 1);
+    for second in [1e-37_f32, 3e-20, 1.7e-9, 0.4, 2e12] {
+        let second = Bf16::nearest(second);
+        for ratio in -127_i8..=127 {
+            let x = first_moment(ratio, second.to_f32());
+            let mut stored = [0; WIDTH];
+            for first_row in 0..40 {
+                let [mut draws, ..] = Draws::of_block(&rng, first_row * WIDTH);
+                ratios(&[x; WIDTH], &[second; WIDTH], &mut stored, &mut draws);
+                assert_eq!(stored, [ratio; WIDTH], "{x:e} of {second:?}");
+            }
+        }
+        for share in [0.1_f32, 0.37, 0.5, 0.99] {
+            let root = second.to_f32().sqrt() * RATIO_STEP;
+            let mut stored = [0; WIDTH];
+            let mut sum = 0;
+            for first_row in 0..4096 {
+                let [mut draws, ..] = Draws::of_block(&rng, first_row * WIDTH);
+                ratios(&[(share - 4.0) * root; WIDTH], &[second; WIDTH], &mut stored, &mut draws);
+                assert!(stored.iter().all(|&ratio| ratio == -4 || ratio == -3), "{stored:?}");
+                sum += stored.iter().map(|&ratio| u32::from(ratio == -3)).sum::<u32>();
+            }
+            let n = 4096.0 * WIDTH as f32;
+            let deviation = (sum as f32 - n * share) / (n * share * (1.0 - share)).sqrt();
+            assert!(deviation.abs() < 5.0, "{share}: off by {deviation} standard errors");
+        }
+    }
+}
+
+/// Without a second moment there is no first; and with one that is no number, the first is none, so
+/// that an audit finds it.
+#[test]
+fn ratios_of_nothing() {
+    let [mut draws, ..] = Draws::of_block(&PolicyRng::new(0, 0), 0);
+    for (first, second) in [(1e-30, 0.0), (0.0, 0.0), (f32::NAN, f32::NAN), (3.0, f32::INFINITY)] {
+        let mut stored = [1; WIDTH];
+        ratios(&[first; WIDTH], &[Bf16::nearest(second); WIDTH], &mut stored, &mut draws);
+        assert_eq!(stored, [0; WIDTH], "{first} of {second}");
+        assert_eq!(first_moment(0, second).is_nan(), !second.is_finite(), "{first} of {second}");
+    }
+}
+
+/// No history of gradients gives a ratio beyond the last that is stored.
+#[test]
+fn the_first_moment_is_bounded_by_the_second() {
+    let mut most = 0.0_f64;
+    for growth in [1.0, 1.01, 1.05, 1.1, 1.109_889, 1.2, 2.0] {
+        let (mut m, mut v, mut g) = (0.0, 0.0, 1e-9_f64);
+        for _ in 0..150 {
+            m = 0.9 * m + 0.1 * g;
+            v = 0.999 * v + 0.001 * g * g;
+            g *= growth;
+            most = most.max(m / v.sqrt());
+        }
+    }
+    // The worst of the roundings of the second, too.
+    let worst = most / (1.0 - 2_f64.powi(-8)).sqrt();
+    assert!(most > 7.2 && worst < f64::from(RATIO_MAX), "{most}, {worst}");
+}
+
+/// Draws of a row, of a plane after another, of a step after another, and for the three arrays, are
+/// independent: so are the decisions that they make.
+#[test]
+fn draws_are_independent() {
+    const BLOCKS: usize = 256;
+    const PLANES: usize = 56;
+    let table = |seed, step, which: usize| -> Vec<f64> {
+        let rng = PolicyRng::new(seed, step);
+        let mut all = Vec::new();
+        for block in 0..BLOCKS {
+            let mut draws = Draws::of_block(&rng, block * WIDTH);
+            for _ in 0..PLANES {
+                all.extend(
+                    draws[which].next().map(|x| f64::from(x >> 8) / f64::from(1 << 24) - 0.5),
+                );
+            }
+        }
+        all
+    };
+    let first = table(1, 500, 0);
+    let n = first.len() as f64;
+    let mean = first.iter().sum::<f64>() / n;
+    let variance = first.iter().map(|x| x * x).sum::<f64>() / n;
+    assert!(mean.abs() < 5.0 * (1.0 / 12.0 / n).sqrt(), "{mean}");
+    assert!((variance - 1.0 / 12.0).abs() < 5.0 * (1.0 / 180.0 / n).sqrt(), "{variance}");
+    let correlation = |a: &[f64], b: &[f64]| {
+        let n = a.len().min(b.len()) as f64;
+        12.0 * a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / n * n.sqrt()
+    };
+    let found = [
+        ("rows", correlation(&first, &first[1..])),
+        ("planes", correlation(&first, &first[WIDTH..])),
+        ("planes but one", correlation(&first, &first[2 * WIDTH..])),
+        ("blocks", correlation(&first, &first[WIDTH * PLANES..])),
+        ("steps", correlation(&first, &table(1, 501, 0))),
+        ("seeds", correlation(&first, &table(2, 500, 0))),
+        ("arrays", correlation(&first, &table(1, 500, 1))),
+        ("arrays", correlation(&table(1, 500, 1), &table(1, 500, 2))),
+    ];
+    let bad: Vec<_> = found.iter().filter(|(_, deviation)| deviation.abs() > 5.0).collect();
+    assert!(bad.is_empty(), "{bad:?}");
+}

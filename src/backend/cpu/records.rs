@@ -1,0 +1,168 @@
+//! Where the backward pass writes one record per (row, tile) entry, and what becomes of them.
+//!
+//! Where there is room for a record of every entry that the lists hold, an entry's record lies in its
+//! slot, and a row finds its records side by side. Records are three quarters of what an entry takes,
+//! though, and all that they are for is to be summed. With room for fewer, a band is taken in parts:
+//! runs of tiles, whose records lie in the order of the lists, and of which each row takes its own
+//! before the next part. A tile with more entries than there is room for is done again for each piece
+//! of its list. A row's records are added in order of tile number in any case, so that parts, as bands,
+//! cost time and change no bit.
+
+use std::ops::Range;
+use std::sync::atomic::AtomicU32;
+
+use rayon::prelude::*;
+
+use super::simd::WIDTH;
+use super::tiles::{Entry, TileLists};
+
+/// Entries of a band whose records are held together.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Part {
+    /// Tiles of the band that hold them.
+    pub(super) tiles: Range<usize>,
+    /// The entries, counted from the first of the band; `None`: all of them, each in its slot.
+    entries: Option<Range<usize>>,
+}
+
+/// Where the records of one tile go.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TileRecords<'a> {
+    /// Bits of the records. Shape: `[cap, stride]`.
+    bits: &'a [AtomicU32],
+    stride: usize,
+    /// The record of the list's first entry; it and others may lie outside. `None`: by slot.
+    first: Option<usize>,
+}
+
+impl<'a> TileRecords<'a> {
+    /// The record of the entry at place `at` of the tile's list, if it is held in this part.
+    #[inline(always)]
+    pub(super) fn of(&self, entry: Entry, at: usize) -> Option<&'a [AtomicU32]> {
+        let record = match self.first {
+            None => entry.slot,
+            Some(first) => first.wrapping_add(at),
+        };
+        let start = record.checked_mul(self.stride)?;
+        self.bits.get(start..start.checked_add(self.stride)?)
+    }
+}
+
+/// The parts of a band of so many tiles, for at most `cap` records at a time, in order.
+pub(super) fn parts(lists: &TileLists, tiles: usize, cap: usize) -> Vec<Part> {
+    let firsts = (0..=tiles).map(|tile| lists.first_of(tile));
+    let parts = cut(&firsts.collect::<Vec<_>>(), cap);
+    if parts.len() > 1 {
+        lists.note_positions(tiles);
+    }
+    parts
+}
+
+/// `firsts` has the number of entries before each tile, and of all.
+fn cut(firsts: &[usize], cap: usize) -> Vec<Part> {
+    let cap = cap.max(1);
+    let tiles = firsts.len() - 1;
+    if firsts[tiles] <= cap {
+        return vec![Part { tiles: 0..tiles, entries: None }];
+    }
+    let mut parts = Vec::new();
+    let mut start = 0;
+    while start < tiles {
+        let fit = firsts[start + 1..].partition_point(|&first| first - firsts[start] <= cap);
+        let end = start + fit.max(1);
+        let mut entries = firsts[start]..firsts[end];
+        // More than one only of a tile that is too much by itself.
+        while !entries.is_empty() {
+            let some = entries.start..entries.end.min(entries.start + cap);
+            entries.start = some.end;
+            parts.push(Part { tiles: start..end, entries: Some(some) });
+        }
+        start = end;
+    }
+    parts
+}
+
+impl Part {
+    /// Where the records of a tile of the band go.
+    pub(super) fn records<'a>(
+        &self,
+        lists: &TileLists,
+        tile: usize,
+        bits: &'a [AtomicU32],
+        stride: usize,
+    ) -> TileRecords<'a> {
+        let first = |held: &Range<usize>| lists.first_of(tile).wrapping_sub(held.start);
+        TileRecords { bits, stride, first: self.entries.as_ref().map(first) }
+    }
+
+    /// Shows each visible row its sum and its records, some at a time, in order of tile number.
+    /// `fresh` says that the sums start anew. Shape of `sums`: `[rows, stride]`.
+    pub(super) fn gather(
+        &self,
+        lists: &TileLists,
+        bits: &[AtomicU32],
+        sums: &mut [f32],
+        visible: &[u16],
+        (stride, fresh): (usize, bool),
+        add: impl Fn(&mut [f32], &[AtomicU32]) + Sync,
+    ) {
+        sums.par_chunks_mut(stride * WIDTH).zip(visible).enumerate().for_each(
+            |(block, (sums, &seen))| {
+                for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
+                    if fresh {
+                        sum.fill(0.0);
+                    }
+                    if seen >> lane & 1 == 0 {
+                        continue;
+                    }
+                    let slots = lists.slots_of_row(block * WIDTH + lane);
+                    let Some(held) = &self.entries else {
+                        add(sum, &bits[slots.start * stride..slots.end * stride]);
+                        continue;
+                    };
+                    for slot in slots {
+                        let position = lists.position_of(slot);
+                        if held.contains(&position) {
+                            let record = position - held.start;
+                            add(sum, &bits[record * stride..(record + 1) * stride]);
+                        }
+                    }
+                }
+            },
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_hold_every_entry_once_and_no_more_than_fit() {
+        for lengths in [vec![], vec![0], vec![5, 0, 3, 9, 1, 1, 0, 25, 2], vec![7; 40]] {
+            let mut firsts = vec![0];
+            firsts.extend(lengths.iter().scan(0, |sum, n| {
+                *sum += n;
+                Some(*sum)
+            }));
+            let total = firsts[lengths.len()];
+            for cap in [1, 2, 4, 9, 10, 24, 25, 26, 300] {
+                let parts = cut(&firsts, cap);
+                if total <= cap {
+                    assert_eq!(parts, [Part { tiles: 0..lengths.len(), entries: None }]);
+                    continue;
+                }
+                let mut next = 0;
+                for part in &parts {
+                    let held = part.entries.clone().expect("not all");
+                    assert!(held.start == next && held.len() <= cap && !held.is_empty());
+                    let of_tiles = firsts[part.tiles.start]..firsts[part.tiles.end];
+                    assert!(held.start >= of_tiles.start && held.end <= of_tiles.end);
+                    assert!(part.tiles.len() == 1 || held == of_tiles, "{part:?}");
+                    next = held.end;
+                }
+                assert_eq!(next, total, "{lengths:?}, {cap}");
+            }
+        }
+    }
+}

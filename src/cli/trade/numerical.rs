@@ -1,0 +1,138 @@
+//! Numerical error: one model, rendered with a knob at a level and by the float64 renderer, pixel by
+//! pixel.
+
+use std::path::Path;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+use super::cell::{Cell, Numerical};
+use crate::backend::Backend;
+use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::camera::Camera;
+use crate::cli::console::Console;
+use crate::cli::failure::{Failure, OTHER};
+use crate::cli::run_files::{iteration, read_model};
+use crate::cli::scene;
+use crate::gaussians::Gaussians;
+use crate::knobs::{How, Settings, find};
+use crate::output::{RunConfig, model_path};
+use crate::selftest::{Blended, reference_pixels};
+
+/// Views looked at, evenly spread over those held out.
+const VIEWS: usize = 4;
+/// Pixels looked at in each: the float64 renderer visits every row in each of them.
+const PIXELS: usize = 1024;
+
+/// A trained model, and the truth about some of its pixels.
+pub(super) struct Subject {
+    model: Gaussians,
+    near: f32,
+    background: [f32; 3],
+    views: Vec<Looked>,
+}
+
+/// A view with some pixels.
+struct Looked {
+    camera: Camera,
+    pixels: Vec<[u32; 2]>,
+    /// By the standard rules, and with everything blended.
+    truth: [Vec<[f64; 3]>; 2],
+}
+
+impl Subject {
+    /// The model of a run, in the views that it held out.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub(super) fn of(folder: &Path, console: &Console) -> Result<Self, Failure> {
+        let config = RunConfig::read(folder)?;
+        let dataset = scene::load(&config.scene_path(), &config.scene, console)?;
+        let path = model_path(folder, iteration(folder, None)?);
+        let model = read_model(&path, &dataset, console)?;
+        let near = (config.train.near * dataset.extent()) as f32;
+        let background = config.scene.background.fixed();
+        let count = dataset.test.len();
+        let chosen = (0..VIEWS.min(count)).map(|i| i * count / VIEWS.min(count));
+        let views = chosen.map(|i| Looked::at(&model, dataset.test[i].camera, near, background, i));
+        Ok(Self { views: views.collect(), model, near, background })
+    }
+
+    /// The error with a knob at a level.
+    ///
+    /// # Errors
+    /// When the backend cannot be made.
+    pub(super) fn measure(
+        &self,
+        cell: &Cell,
+        knob: &str,
+        level: &str,
+    ) -> Result<Numerical, Failure> {
+        let input = |error| Failure::input(format!("--knob: {error}"));
+        let setting = if knob.is_empty() { Vec::new() } else { vec![format!("{knob}={level}")] };
+        let settings = Settings::of(&setting).map_err(input)?;
+        let mut options = CpuOptions::new(self.model.len().max(1));
+        options.near = self.near;
+        options.shortcuts = settings.shortcuts();
+        options.storage = settings.storage();
+        if let (Ok(knob), Ok(value)) = (find(knob), level.parse())
+            && knob.how == How::Flag("--tile-cap")
+        {
+            options.tile_cap = value;
+        }
+        let mut backend = CpuBackend::new(&self.model, &options)?;
+        let (mut squares, mut worst, mut count) = ([0.0; 2], 0.0_f64, 0.0);
+        for view in &self.views {
+            let image = backend.render(&view.camera, self.background, self.model.sh_degree)?;
+            for (i, &[x, y]) in view.pixels.iter().enumerate() {
+                let at = 3 * (y * view.camera.width + x) as usize;
+                for channel in 0..3 {
+                    let shown = f64::from(image.rgb[at + channel]).clamp(0.0, 1.0);
+                    let off = [0, 1].map(|k| shown - view.truth[k][i][channel].clamp(0.0, 1.0));
+                    squares[0] += off[0] * off[0];
+                    squares[1] += off[1] * off[1];
+                    worst = worst.max(off[0].abs());
+                    count += 1.0;
+                }
+            }
+        }
+        if count == 0.0 {
+            return Err(Failure { code: OTHER, message: "no pixel to look at".into() });
+        }
+        // Beyond this is nothing that eight or sixteen bits could show.
+        let psnr = |squares: f64| (-10.0 * (squares / count).log10()).min(200.0);
+        Ok(Numerical {
+            densify: env!("CARGO_PKG_VERSION").to_owned(),
+            scene: cell.label.clone(),
+            knob: knob.to_owned(),
+            level: level.to_owned(),
+            arguments: cell.arguments(),
+            standard: psnr(squares[0]),
+            everything: psnr(squares[1]),
+            worst,
+        })
+    }
+}
+
+impl Looked {
+    fn at(
+        model: &Gaussians,
+        camera: Camera,
+        near: f32,
+        background: [f32; 3],
+        number: usize,
+    ) -> Self {
+        // The same pixels at every call.
+        let mut draws = ChaCha8Rng::seed_from_u64(number as u64);
+        let place = |_| [camera.width, camera.height].map(|side| draws.random_range(0..side));
+        let pixels: Vec<[u32; 2]> = (0..PIXELS).map(place).collect();
+        let truth = [Blended::Standard, Blended::Everything].map(|rules| {
+            let parts = pixels
+                .par_chunks(64)
+                .map(|pixels| reference_pixels(model, &camera, background, near, rules, pixels));
+            parts.collect::<Vec<_>>().concat()
+        });
+        Self { camera, pixels, truth }
+    }
+}

@@ -1,0 +1,243 @@
+//! A study as text: Markdown for the file, a few lines for the terminal. Markdown has no grey: rows
+//! that others dominate are set in italics, and say by what.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use super::report::{Effect, PSNR, Report, SECONDS};
+use crate::cli::number::grouped;
+use crate::cli::study::Difference;
+use crate::knobs::Class;
+
+/// The whole study.
+pub(super) fn markdown(report: &Report) -> String {
+    let mut text = String::from("# What each knob costs and buys\n\n");
+    let Report { iterations, budget, seeds, scenes, train, .. } = report;
+    let options = if train.is_empty() {
+        String::new()
+    } else {
+        format!(" Options of every run: `{}`.", train.join(" "))
+    };
+    let _ = writeln!(
+        text,
+        "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
+         Differences are from the default with the same scene and seed, with 95 % bootstrap \
+         intervals of their mean; ratios are geometric means. Scores are of views held out, rendered \
+         without any shortcut.",
+        env!("CARGO_PKG_VERSION"),
+        scenes.join(", "),
+        grouped(*iterations as usize),
+        grouped(*budget),
+        if *seeds == 1 { "seed" } else { "seeds" },
+    );
+    text += &defaults(report);
+    text += &numerical(report);
+    text += &outcomes(report);
+    text += &together(report);
+    text += &stages(report);
+    text
+}
+
+/// What the differences are from.
+fn defaults(report: &Report) -> String {
+    let mut text =
+        "\n## The default\n\n| scene | PSNR [dB] | time [s] | peak [MiB] |\n|---|---|---|---|\n"
+            .to_owned();
+    for scene in &report.scenes {
+        let psnr = shown(report.mean(scene, "", "", PSNR), 2);
+        let seconds = shown(report.mean(scene, "", "", SECONDS).map(f64::exp), 1);
+        let peak = shown(report.peak_mib(scene, "", ""), 0);
+        let _ = writeln!(text, "| {scene} | {psnr} | {seconds} | {peak} |");
+    }
+    text
+}
+
+fn numerical(report: &Report) -> String {
+    let mut text = String::from(
+        "\n## Numerical error\n\nThe same model, rendered with the knob at the level, against a \
+         renderer in float64: by the standard rules (alpha from 1/255, transmittance down to 1e-4), \
+         and one that blends everything.\n\n\
+         | knob | level | scene | standard rules [dB] | everything blended [dB] | largest error |\n\
+         |---|---|---|---|---|---|\n",
+    );
+    for image in &report.images {
+        let knob = if image.knob.is_empty() { "(default)" } else { &image.knob };
+        let _ = writeln!(
+            text,
+            "| {knob} | {} | {} | {:.1} | {:.1} | {:.1e} |",
+            image.level, image.scene, image.standard, image.everything, image.worst
+        );
+    }
+    text
+}
+
+fn outcomes(report: &Report) -> String {
+    let mut text = String::from(
+        "\n## Outcome of training\n\nItalics: dominated, another level is nowhere worse and somewhere \
+         better in PSNR, time and memory. Free: the interval of PSNR lies above −0.05 dB, that of SSIM \
+         above −0.001, that of depth error below 1.02, and numerical PSNR is at least 60 dB.\n\n\
+         | knob | level | class | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | peak × | images [dB] | same bits | verdict |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    for effect in &report.effects {
+        let cells = row(effect);
+        let grey = effect.dominated.is_some();
+        let cell = |cell: &String| {
+            if grey && !cell.is_empty() { format!("*{cell}*") } else { cell.clone() }
+        };
+        let cells: Vec<String> = cells.iter().map(cell).collect();
+        let _ = writeln!(text, "| {} |", cells.join(" | "));
+    }
+    text
+}
+
+fn row(effect: &Effect) -> Vec<String> {
+    let ratio = |d: &Difference| {
+        let mean = format!("{:.3}", d.mean.exp());
+        match d.interval {
+            Some([low, high]) => format!("{mean} [{:.3}, {:.3}]", low.exp(), high.exp()),
+            None => mean,
+        }
+    };
+    let maybe = |d: &Option<Difference>| d.as_ref().map_or_else(|| "–".to_owned(), ratio);
+    let mut verdict: Vec<String> = Vec::new();
+    if effect.free {
+        verdict.push("free".into());
+    }
+    if effect.knob.class == Class::Exact && effect.same < effect.psnr.pairs {
+        verdict.push("**not the same bits**".into());
+    }
+    if let Some(by) = &effect.dominated {
+        verdict.push(format!("dominated by {by}"));
+    }
+    vec![
+        effect.knob.name.to_owned(),
+        effect.level.clone(),
+        effect.knob.class.to_string(),
+        effect.psnr.show(2),
+        effect.ssim.show(4),
+        effect.flip.show(4),
+        maybe(&effect.depth),
+        maybe(&effect.chamfer),
+        ratio(&effect.seconds),
+        ratio(&effect.peak),
+        shown(effect.numerical, 1),
+        format!("{} of {}", effect.same, effect.psnr.pairs),
+        verdict.join(", "),
+    ]
+}
+
+fn together(report: &Report) -> String {
+    if report.together.is_empty() {
+        return String::new();
+    }
+    let mut text = String::from(
+        "\n## Knobs together\n\nThose whose effect on PSNR or time is more than two standard errors, \
+         each at the fastest such level, in twelve runs after Plackett and Burman (1946) with the \
+         first seed. Where an effect among others differs from the one alone by more than two \
+         standard errors, knobs interact.\n\n\
+         | knob | level | ΔPSNR alone [dB] | among others [dB] | time × alone | among others | interacts |\n\
+         |---|---|---|---|---|---|---|\n",
+    );
+    for one in &report.together {
+        let [psnr, seconds] = one.alone;
+        let differs =
+            |k: usize| one.errors.is_some_and(|e| (one.among[k] - one.alone[k]).abs() > 2.0 * e[k]);
+        let interacts = match (one.errors, differs(0), differs(1)) {
+            (None, ..) => "not known: no column was left idle",
+            (_, true, true) => "in PSNR and time",
+            (_, true, false) => "in PSNR",
+            (_, false, true) => "in time",
+            _ => "no",
+        };
+        let error = one.errors.map_or_else(String::new, |e| format!(" ± {:.2}", e[0]));
+        let _ = writeln!(
+            text,
+            "| {} | {} | {psnr:+.2} | {:+.2}{error} | {:.3} | {:.3} | {interacts} |",
+            one.knob,
+            one.level,
+            one.among[0],
+            seconds.exp(),
+            one.among[1].exp(),
+        );
+    }
+    text
+}
+
+/// Seconds by stage of the default and of every level, as a mean over all runs.
+fn stages(report: &Report) -> String {
+    let mean = |knob: &str, level: &str| -> BTreeMap<String, f64> {
+        let runs: Vec<_> = report.runs(knob, level).collect();
+        let mut sums: BTreeMap<String, f64> = BTreeMap::new();
+        for (stage, seconds) in runs.iter().flat_map(|run| &run.stage_seconds) {
+            *sums.entry(stage.clone()).or_default() += seconds / runs.len() as f64;
+        }
+        sums
+    };
+    let base = mean("", "");
+    let names: Vec<&String> = base.keys().collect();
+    let mut text =
+        String::from("\n## Time by stage\n\nSeconds, means over all scenes and seeds.\n\n");
+    let titles: Vec<String> = names.iter().map(|name| format!(" {name} |")).collect();
+    let _ = writeln!(text, "| knob | level |{}", titles.concat());
+    let _ = writeln!(text, "|---|---|{}", "---|".repeat(names.len()));
+    let levels = report.effects.iter().map(|e| (e.knob.name, &*e.level));
+    for (knob, level) in std::iter::once(("", "")).chain(levels) {
+        let seconds = mean(knob, level);
+        let cells: Vec<String> = names
+            .iter()
+            .map(|name| format!(" {} |", shown(seconds.get(*name).copied(), 2)))
+            .collect();
+        let knob = if knob.is_empty() { "(default)" } else { knob };
+        let _ = writeln!(text, "| {knob} | {level} |{}", cells.concat());
+    }
+    text
+}
+
+fn shown(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+/// A line per level.
+pub(super) fn summary(report: &Report) -> String {
+    let mut text = format!("{:<28}  dPSNR [dB]  time x  peak x", "knob");
+    for effect in &report.effects {
+        let name = format!("{}={}", effect.knob.name, effect.level);
+        let free = if effect.free { "  free" } else { "" };
+        let _ = write!(
+            text,
+            "\n{name:<28}  {:>+10.2}  {:>6.3}  {:>6.3}{free}",
+            effect.psnr.mean,
+            effect.seconds.mean.exp(),
+            effect.peak.mean.exp()
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::report::sample;
+    use super::*;
+
+    #[test]
+    fn every_level_has_its_row_and_the_dominated_are_grey() {
+        let report = sample();
+        let text = markdown(&report);
+        for words in [
+            "| room | 31.00 | 100.0 | 64 |",
+            "| alpha_min | 1/32 | room | 42.0 | 41.0 | 1.0e-2 |",
+            "| ssim_every | 5 | heuristic | +0.20 [+0.20, +0.20] |",
+            "| *alpha_min* | *1/32* | *bounded* | *-0.90 [",
+            "*dominated by alpha_min=1/64*",
+            "| 0 of 3 | free |",
+            "--policy=diet",
+            "| (default) |  | 50.00 |",
+        ] {
+            assert!(text.contains(words), "{words:?} is not in {text}");
+        }
+        assert!(!text.contains("Knobs together"));
+        let said = summary(&report);
+        assert!(said.contains("ssim_every=5") && said.contains("0.500   1.000  free"), "{said}");
+    }
+}

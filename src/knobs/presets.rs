@@ -1,0 +1,118 @@
+//! Presets: knobs that go together, named by what they promise. Levels are chosen from what
+//! `densify trade` measures, and each says what that was.
+
+use std::fmt;
+
+use super::KnobError;
+
+/// Knobs that go together.
+#[derive(Debug)]
+pub struct Preset {
+    /// Its name.
+    pub name: &'static str,
+    /// What it promises.
+    pub what: &'static str,
+    /// Knobs with their values, as the table of knobs spells them.
+    pub levels: &'static [(&'static str, &'static str)],
+    /// What that costs and buys; `None` for the one that the others are measured against.
+    pub measured: Option<Measured>,
+}
+
+/// What a preset was measured to cost and buy, against `exact`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measured {
+    /// Mean difference of PSNR on views held out `[dB]`.
+    pub psnr: f64,
+    /// Its 95 % interval.
+    pub interval: [f64; 2],
+    /// Time of training, as a ratio.
+    pub seconds: f64,
+    /// Peak memory of the process, as a ratio.
+    pub peak: f64,
+    /// Scenes and size of the runs.
+    pub on: &'static str,
+    /// What measured it.
+    pub command: &'static str,
+}
+
+/// The preset of a run that names none.
+pub const DEFAULT_PRESET: &str = "balanced";
+
+/// All presets.
+pub static PRESETS: &[Preset] = &[
+    Preset {
+        name: "exact",
+        what: "no shortcut that a knob can take",
+        levels: &[
+            ("alpha_min", "1/255"),
+            ("transmittance_stop", "1e-4"),
+            ("exp_degree", "6"),
+            ("ssim_every", "1"),
+            ("coarse_until", "0"),
+            ("sparse_adam", "off"),
+            ("param_storage", "f32"),
+            ("moment_storage", "f32"),
+        ],
+        measured: None,
+    },
+    // As `exact` is, until a study on four scenes has shown which levels are free: these go here.
+    Preset {
+        name: "balanced",
+        what: "what costs nothing that can be seen",
+        levels: &[],
+        measured: Some(Measured {
+            psnr: 0.0,
+            interval: [0.0, 0.0],
+            seconds: 1.0,
+            peak: 1.0,
+            on: "the same bytes as exact",
+            command: "densify train --preset exact",
+        }),
+    },
+    Preset { name: "fast", what: "time before accuracy", levels: &[], measured: None },
+    Preset {
+        name: "tiny-memory",
+        what: "memory before time",
+        // 479 bytes per row at degree 3 with `diet`; docs/memory.md has the table.
+        levels: &[
+            ("image_cache", "0"),
+            ("param_storage", "f16"),
+            ("moment_storage", "ratio8"),
+            ("pairs_per_row", "1"),
+        ],
+        measured: None,
+    },
+];
+
+/// The preset of this name.
+///
+/// # Errors
+/// When there is none, with those that there are.
+pub fn preset(name: &str) -> Result<&'static Preset, KnobError> {
+    PRESETS.iter().find(|preset| preset.name == name).ok_or_else(|| {
+        let names: Vec<&str> = PRESETS.iter().map(|preset| preset.name).collect();
+        let nearest = super::nearest_word(name, &names);
+        KnobError(format!(
+            "no preset is called `{name}`; the nearest is {nearest}, of {}",
+            names.join(", ")
+        ))
+    })
+}
+
+impl fmt::Display for Preset {
+    /// `fast: ssim_every=5; -0.12 dB [-0.20, -0.05], …`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let levels: Vec<String> =
+            self.levels.iter().map(|(knob, value)| format!("{knob}={value}")).collect();
+        let levels = if levels.is_empty() { "the defaults".to_owned() } else { levels.join(" ") };
+        write!(f, "{}: {}; {levels}; ", self.name, self.what)?;
+        match self.measured {
+            None => f.write_str("what the others are measured against"),
+            Some(Measured { psnr, interval: [low, high], seconds, peak, on, .. }) => write!(
+                f,
+                "{psnr:+.2} dB [{low:+.2}, {high:+.2}], {seconds:.2} of the time and {peak:.2} of the \
+                 memory of exact ({on})"
+            ),
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! The knobs that are set by `--knob` alone, as a run has them.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::{How, KNOBS, Knob, KnobError, number, parse};
+use crate::backend::{Exp2, MomentStorage, ParameterStorage, Shortcuts, Stepped, Storage};
+use crate::trainer::Savings;
+
+/// All knobs that are set by `--knob` alone, by name, each with its value as the table spells it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Settings(BTreeMap<String, String>);
+
+impl Default for Settings {
+    fn default() -> Self {
+        let knobs = KNOBS.iter().filter(|knob| knob.how == How::Knob);
+        Self(knobs.map(|knob| (knob.name.to_owned(), knob.default.to_owned())).collect())
+    }
+}
+
+impl Settings {
+    /// The defaults, with these `NAME=VALUE`. Knobs that are options or parameters by another name are
+    /// checked and left out: these take effect where options and parameters do.
+    ///
+    /// # Errors
+    /// When a knob or its value is none.
+    pub fn of(settings: &[String]) -> Result<Self, KnobError> {
+        let mut all = Self::default();
+        for setting in settings {
+            let (knob, value) = parse(setting)?;
+            if knob.how == How::Knob {
+                all.0.insert(knob.name.to_owned(), value);
+            }
+        }
+        Ok(all)
+    }
+
+    /// Each knob with its value.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.0.iter().map(|(name, value)| (&**name, &**value))
+    }
+
+    /// Each knob that is not as it is by default.
+    pub fn changed(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
+        KNOBS.iter().filter_map(|knob| {
+            let value = self.0.get(knob.name)?;
+            (!knob.is_default(value)).then_some((knob, &**value))
+        })
+    }
+
+    /// Fails where a backend lacks a knob that is set.
+    ///
+    /// # Errors
+    /// Names the knob.
+    pub fn check_backend(&self, gpu: bool) -> Result<(), KnobError> {
+        self.changed().try_for_each(|(knob, value)| knob.check_backend(value, gpu))
+    }
+
+    /// What of it is a backend's to know.
+    #[must_use]
+    pub fn shortcuts(&self) -> Shortcuts {
+        let default = Shortcuts::default();
+        let number = |name: &str| number(self.text(name)).map(|value| value as f32);
+        Shortcuts {
+            alpha_min: number("alpha_min").unwrap_or(default.alpha_min),
+            transmittance_min: number("transmittance_stop").unwrap_or(default.transmittance_min),
+            exp2: match self.text("exp_degree") {
+                "2" => Exp2::Degree2,
+                "4" => Exp2::Degree4,
+                _ => Exp2::Degree6,
+            },
+            stepped: match self.text("sparse_adam") {
+                "on" => Stepped::Visible,
+                _ => Stepped::All,
+            },
+        }
+    }
+
+    /// How parameters and moments are stored.
+    #[must_use]
+    pub fn storage(&self) -> Storage {
+        Storage {
+            parameters: match self.text("param_storage") {
+                "f16" => ParameterStorage::F16,
+                _ => ParameterStorage::F32,
+            },
+            moments: match self.text("moment_storage") {
+                "bf16" => MomentStorage::Bf16,
+                "ratio8" => MomentStorage::Ratio8,
+                _ => MomentStorage::F32,
+            },
+        }
+    }
+
+    /// (Row, tile) pairs held per row of the budget; `None` where that is not set.
+    #[must_use]
+    pub fn pairs_per_row(&self) -> Option<usize> {
+        self.text("pairs_per_row").parse().ok()
+    }
+
+    /// What of it is the trainer's to know.
+    #[must_use]
+    pub fn savings(&self) -> Savings {
+        Savings {
+            ssim_every: self.text("ssim_every").parse().unwrap_or(1),
+            coarse_until: number(self.text("coarse_until")).unwrap_or(0.0),
+        }
+    }
+
+    /// The value of a knob; empty for one that is not set here.
+    fn text(&self, name: &str) -> &str {
+        self.0.get(name).map_or("", String::as_str)
+    }
+}

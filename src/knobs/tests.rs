@@ -1,0 +1,98 @@
+//! Tests of the table and of what its values may be.
+
+use std::collections::BTreeSet;
+
+use super::*;
+
+#[test]
+fn the_table_agrees_with_itself() {
+    let mut names = BTreeSet::new();
+    for knob in KNOBS {
+        let name = knob.name;
+        assert!(names.insert(name), "{name} is there twice");
+        assert!(name.chars().all(|c| c.is_ascii_lowercase() || c == '_'), "{name}");
+        assert!(!knob.what.is_empty() && !knob.what.ends_with('.'), "{name}");
+        if knob.default.starts_with('[') {
+            assert!(knob.how != How::Knob, "{name} is set by nothing else, so it needs a default");
+        } else {
+            assert_eq!(knob.canonical(knob.default).as_deref(), Ok(knob.default), "{name}");
+        }
+        if let Levels::Values(values) = knob.levels {
+            for level in values {
+                assert_eq!(knob.canonical(level).as_deref(), Ok(*level), "{name}");
+            }
+            let measured = values.iter().filter(|level| **level != knob.default).count();
+            assert!(knob.how == How::BuiltIn || (1..=5).contains(&measured), "{name}");
+        }
+    }
+}
+
+#[test]
+fn equal_values_are_equal_texts() {
+    for (setting, name, value) in [
+        ("alpha_min=1/255", "alpha_min", "1/255"),
+        (" alpha_min = 0.0078125", "alpha_min", "1/128"),
+        ("alpha_min=0.005", "alpha_min", "5e-3"),
+        ("transmittance_stop=0.0001", "transmittance_stop", "1e-4"),
+        ("exp_degree=4", "exp_degree", "4"),
+        ("budget=2e5", "budget", "200000"),
+        ("tile_size=16", "tile_size", "16"),
+    ] {
+        let (knob, found) = parse(setting).unwrap();
+        assert_eq!((knob.name, &*found), (name, value), "{setting}");
+        assert_eq!(knob.canonical(&found).as_deref(), Ok(value), "{setting}");
+    }
+}
+
+#[test]
+fn what_is_outside_is_refused_with_the_nearest_that_works() {
+    for (setting, words) in [
+        ("alpha_min=0.5", ["alpha_min", "0.5", "works is 1/32"]),
+        ("alpha_min=0", ["alpha_min", "`0`", "works is 1/1024"]),
+        ("alpha_min=-1/0", ["alpha_min", "1/1024 to 1/32", "works is 1/255"]),
+        ("alpha_min=NaN", ["alpha_min", "NaN", "works is 1/255"]),
+        ("transmittance_stop=1", ["transmittance_stop", "1e-5 to 1e-2", "works is 1e-2"]),
+        ("exp_degree=5", ["exp_degree", "2|4|6", "works is 4"]),
+        ("exp_degree=nine", ["exp_degree", "nine", "works is"]),
+        ("sh_degree=4", ["sh_degree", "0 to 3", "works is 3"]),
+        ("sh_degree=1.5", ["sh_degree", "1.5", "works is 2"]),
+        ("sh_degree=", ["sh_degree", "``", "works is 0"]),
+        ("budget=0", ["budget", "1 or more", "works is 1"]),
+        ("tile_size=8", ["tile_size", "8", "built in as 16"]),
+        ("alpha_mim=1/64", ["alpha_mim", "alpha_min", "densify knobs"]),
+        ("alpha_min", ["alpha_min", "NAME=VALUE", "1/128"]),
+    ] {
+        let message = parse(setting).unwrap_err().to_string();
+        for word in words {
+            assert!(message.contains(word), "{setting}: {word:?} is not in: {message}");
+        }
+    }
+}
+
+#[test]
+fn settings_hold_every_knob_of_their_own_and_what_follows_from_it() {
+    let settings = Settings::default();
+    assert_eq!(settings.shortcuts(), crate::backend::Shortcuts::default());
+    assert_eq!(settings.savings(), crate::trainer::Savings::NONE);
+    let effect =
+        |settings: &Settings| format!("{:?}{:?}", settings.shortcuts(), settings.savings());
+    assert_eq!(settings.changed().count(), 0);
+    let own: Vec<_> = KNOBS.iter().filter(|knob| knob.how == How::Knob).collect();
+    assert_eq!(settings.iter().count(), own.len());
+    // Each level of each knob does something.
+    for knob in own {
+        let Levels::Values(values) = knob.levels else { panic!("{}: values", knob.name) };
+        let mut seen = vec![effect(&settings)];
+        for level in values.iter().filter(|level| !knob.is_default(level)) {
+            let changed = Settings::of(&[format!("{}={level}", knob.name)]).unwrap();
+            let found: Vec<_> = changed.changed().map(|(k, v)| (k.name, v)).collect();
+            assert_eq!(found, [(knob.name, *level)]);
+            assert!(!seen.contains(&effect(&changed)), "{}={level} does nothing", knob.name);
+            assert_eq!(changed.check_backend(true).is_err(), knob.on == On::Native);
+            assert!(changed.check_backend(false).is_ok());
+            seen.push(effect(&changed));
+        }
+    }
+    let elsewhere = Settings::of(&["sh_degree=1".into(), "budget=9".into()]).unwrap();
+    assert_eq!(elsewhere, settings);
+}

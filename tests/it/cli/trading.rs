@@ -1,0 +1,89 @@
+//! `densify trade`: what knobs cost and buy.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::{Outcome, densify, files, read, records, scratch, text};
+use crate::photographs::Photographs;
+
+fn trade(scene: &Path, output: &Path, more: &[&str]) -> Outcome {
+    let mut arguments = vec!["trade", text(scene), "-o", text(output), "-b", "250", "-i", "24"];
+    arguments.extend(more);
+    densify(&arguments)
+}
+
+#[test]
+fn every_level_is_measured_once_and_in_the_table() {
+    let scene = Photographs::colmap_text();
+    let (_root, output) = scratch();
+    let knobs = "alpha_min:1/32,ssim_every:2,tile_cap,exp_degree";
+    let call = ["--knobs", knobs, "--seeds", "2", "--", "--sh-degree", "0"];
+    let said = trade(scene.path(), &output, &call).ok().stdout;
+    assert!(said.contains("[16/16]") && said.contains("alpha_min=1/32"), "{said}");
+    let all = records(&output.join("trade.jsonl"));
+    let of = |kind: &str| -> Vec<&Value> { all.iter().filter(|r| r["kind"] == kind).collect() };
+    let is = |r: &Value, knob: &str, level: &str| r["knob"] == knob && r["level"] == level;
+    let runs = of("run");
+    let find = |knob: &str, level: &str, seed: u64| {
+        let is_it = |r: &&&Value| is(r, knob, level) && r["seed"] == seed;
+        *runs.iter().find(is_it).unwrap_or_else(|| panic!("{knob}={level}, {seed}: {runs:?}"))
+    };
+    for seed in 0..2 {
+        let base = find("", "", seed);
+        assert!(
+            base["psnr"].as_f64() > Some(5.0) && base["ssim"].is_f64() && base["flip"].is_f64()
+        );
+        assert!(base["stage_seconds"]["rasterize"].as_f64() > Some(0.0), "{base}");
+        assert!(base["seconds"].as_f64() > Some(0.0) && base["ledger_bytes"].is_u64(), "{base}");
+        // Exact knobs change nothing, others do.
+        assert_eq!(find("tile_cap", "250", seed)["model"], base["model"]);
+        assert_ne!(find("alpha_min", "1/32", seed)["model"], base["model"]);
+        assert_ne!(find("ssim_every", "2", seed)["model"], base["model"]);
+    }
+    assert_ne!(find("", "", 0)["model"], find("", "", 1)["model"], "the seeds do nothing");
+    let images = of("image");
+    let psnr = |knob: &str, level: &str| {
+        let image = images.iter().find(|r| is(r, knob, level));
+        image.unwrap_or_else(|| panic!("{knob}={level}"))["standard"].as_f64().expect("a number")
+    };
+    let default = psnr("", "");
+    assert!(default > 80.0, "{default}");
+    assert_eq!(psnr("tile_cap", "250").to_bits(), default.to_bits());
+    assert!(psnr("alpha_min", "1/32") < 60.0 && psnr("exp_degree", "2") < default);
+    assert!(images.iter().all(|r| r["knob"] != "ssim_every"), "it changes no image");
+
+    let table = String::from_utf8(read(&output.join("trade.md"))).expect("UTF-8");
+    for words in ["--sh-degree 0", "2 of 2", "bounded", "(default)", "pareto-", "rasterize"] {
+        assert!(table.contains(words), "{words} is not in {table}");
+    }
+    let picture = table.split("](").nth(1).and_then(|rest| rest.split(')').next());
+    let picture = read(&output.join(picture.expect("a plot")));
+    assert!(picture.starts_with(b"<svg"));
+
+    // Again: nothing runs, and nothing changes.
+    let before = files(&output);
+    let said = trade(scene.path(), &output, &call).ok().stdout;
+    assert!(said.matches("done before").count() >= 16 && !said.contains("float64"), "{said}");
+    assert!(before == files(&output), "a study that was complete has changed");
+}
+
+#[test]
+fn bad_studies_are_refused_before_anything_runs() {
+    let scene = Photographs::colmap_text();
+    let (_root, output) = scratch();
+    let cases: [(&[&str], &[&str]); 8] = [
+        (&["--knobs", "alpha_mim"], &["alpha_mim", "alpha_min"]),
+        (&["--knobs", "alpha_min:1/2"], &["alpha_min", "1/2", "1/32"]),
+        (&["--knobs", "alpha_min,alpha_min"], &["alpha_min", "twice"]),
+        (&["--knobs", "tile_size"], &["tile_size", "built in"]),
+        (&["--knobs", "score_views", "--", "--policy", "vanilla"], &["score_views", "vanilla"]),
+        (&["--knobs", "sh_degree", "--", "--sh-degree", "1"], &["sh_degree", "--sh-degree 1"]),
+        (&["--", "--knob", "alpha_min=1/64"], &["--knob", "study"]),
+        (&["--", "--seed", "3"], &["--seed", "study"]),
+    ];
+    for (more, words) in cases {
+        trade(scene.path(), &output, more).refused(&more.join(" "), words);
+        assert!(!output.exists(), "{more:?}: something was written");
+    }
+}
