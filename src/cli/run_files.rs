@@ -113,7 +113,7 @@ pub(super) fn open(
     console: &Console,
 ) -> Result<Opened, Failure> {
     use_threads(machine.threads);
-    let dataset = scene::load(dataset, &config, console)?;
+    let dataset = scene::load(dataset, &config, false, console)?;
     let file = read_splats(model)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{OutputError, write_atomically};
 use crate::schedule::{Background, RateOptions};
+use crate::spread::Spread;
 
 /// Name of the file in a run's folder.
 pub const CONFIG_FILE: &str = "config.toml";
@@ -66,6 +67,12 @@ pub struct TrainConfig {
     pub seed: u64,
     /// Highest spherical-harmonic degree.
     pub sh_degree: u8,
+    /// What decided it.
+    #[serde(default)]
+    pub sh_degree_from: DegreeChoice,
+    /// Whether nothing is to be left out that the options do not say (`--full`).
+    #[serde(default)]
+    pub full: bool,
     /// Near plane as a fraction of the scene's extent.
     pub near: f64,
     /// Most (row, tile) entries held at a time; `None` lets the backend choose.
@@ -80,6 +87,19 @@ pub struct TrainConfig {
     pub adapter: Option<String>,
     /// Step sizes.
     pub learning_rates: RateOptions,
+}
+
+/// What decided the degree of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DegreeChoice {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training.
+    Spread(Spread),
+    /// What raises of the degree have brought in training; the degree is the highest that may come.
+    Training,
 }
 
 /// How the first Gaussians are placed.
@@ -169,6 +189,15 @@ mod tests {
                 extended_to: None,
                 seed: i64::MAX as u64,
                 sh_degree: 3,
+                sh_degree_from: DegreeChoice::Spread(Spread {
+                    tracks: 4_000,
+                    on_surface: 0.75,
+                    median: 0.5,
+                    tenth: 1.5,
+                    twentieth: 2.5,
+                    rms: 6.0,
+                }),
+                full: false,
                 near: 0.01,
                 tile_cap: None,
                 init: InitChoice::Points,

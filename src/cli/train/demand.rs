@@ -7,6 +7,7 @@ use glam::DVec3;
 use toml::Table;
 
 use super::TrainArgs;
+use super::degree::{Degree, ShDegree, check_full};
 use super::choices::parameters;
 use super::setup::{DECODERS, random_count};
 use crate::backend::cpu::{CpuBackend, CpuOptions};
@@ -16,12 +17,12 @@ use crate::cli::failure::Failure;
 use crate::cli::run_files::use_threads;
 use crate::cli::scene;
 use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, View};
+use crate::dataset::{Dataset, Tracks, View};
 use crate::gaussians::sh_coefficients;
 use crate::init::usable_points;
 use crate::memory::{Ledger, Section, Setting, peak_resident, resident};
 use crate::metrics::scratch_bytes;
-use crate::output::{InitChoice, SceneConfig};
+use crate::output::{InitChoice, RunConfig, SceneConfig};
 use crate::schedule::Background;
 use crate::trainer::needs;
 
@@ -44,6 +45,7 @@ pub(super) struct Survey {
     pub(super) device: Option<GpuDevice>,
     pub(super) scene: SceneConfig,
     pub(super) dataset: Dataset,
+    pub(super) degree: Degree,
     /// What training and test images take.
     images: [ImageDemand; 2],
     /// Rows that a start on the dataset's points would have, were there no limit.
@@ -54,29 +56,37 @@ pub(super) struct Survey {
 }
 
 impl Survey {
-    /// Loads the dataset and opens the device.
-    pub(super) fn of(args: &TrainArgs, console: &Console) -> Result<Self, Failure> {
+    /// Loads the dataset and opens the device. `saved` is the configuration of a run that goes on.
+    pub(super) fn of(
+        args: &TrainArgs,
+        saved: Option<&RunConfig>,
+        console: &Console,
+    ) -> Result<Self, Failure> {
+        check_full(args)?;
         let entry = find(&args.policy)?;
         let parameters = parameters(args, entry)?;
         let device = args.device.open(console)?;
         use_threads(args.threads);
         let scene = args.data.config(&args.scene);
-        let dataset = scene::load(&args.scene, &scene, console)?;
+        let with_tracks = saved.is_none() && args.sh_degree == Some(ShDegree::Auto);
+        let mut dataset = scene::load(&args.scene, &scene, with_tracks, console)?;
         console.say(scene::describe(&args.scene, &dataset));
         let usable = usable_points(&dataset.points);
         let images = images(&dataset);
         let (resident, peak) = (resident(), peak_resident());
-        Ok(Self { entry, parameters, device, scene, dataset, images, usable, resident, peak })
+        let degree = Degree::decide(args, saved, &dataset)?;
+        dataset.tracks = Tracks::default();
+        Ok(Self { entry, parameters, device, scene, dataset, degree, images, usable, resident, peak })
     }
 
     /// The same with images of another size; `None` where there are none of it.
     pub(super) fn at_resolution(&self, args: &TrainArgs, resolution: u32) -> Option<Self> {
         let scene = SceneConfig { resolution: Some(resolution), ..self.scene.clone() };
-        let dataset = scene::read(&args.scene, &scene).ok()?;
+        let dataset = scene::read(&args.scene, &scene, false).ok()?;
         let parameters = self.parameters.clone();
-        let device = self.device.clone();
+        let (device, degree) = (self.device.clone(), self.degree.clone());
         let images = images(&dataset);
-        Some(Self { dataset, images, scene, parameters, device, ..*self })
+        Some(Self { dataset, images, scene, parameters, device, degree, ..*self })
     }
 
     /// How the first rows are placed, unless a checkpoint says.
@@ -181,6 +191,10 @@ impl Survey {
         let first = self.initial_rows(args, setting.rows) as u64;
         let points = args.init_points.unwrap_or(self.dataset.points.len()) as u64;
         pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
+        if self.degree.bytes > 0 {
+            let image = train.held(0) + train.decoding(1);
+            pass("colours of tracks", Tracks::most_bytes() + self.degree.bytes + image);
+        }
         pass("a policy's event", self.event_bytes(setting, needs));
         // The model as downloaded and as exported.
         pass("export of the model, checkpoint", 2 * budget * row);

@@ -1,6 +1,7 @@
 //! `densify train`.
 
 mod choices;
+mod degree;
 mod demand;
 mod interrupt;
 pub(super) mod plan;
@@ -22,13 +23,12 @@ use super::number;
 use super::scene::{NEAR, SceneArgs};
 use crate::output::InitChoice;
 use crate::trainer::OnNan;
+use degree::ShDegree;
 use resume::Start;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
 /// a room or an object; large outdoor scenes want more.
 const DEFAULT_BUDGET: usize = 200_000;
-/// Degree, where neither `--sh-degree` nor `--memory` says otherwise.
-const DEFAULT_SH_DEGREE: u8 = 3;
 
 /// Trains a scene.
 ///
@@ -88,10 +88,17 @@ pub(super) struct TrainArgs {
     /// Length of the run; every schedule scales with it
     #[arg(short, long, value_name = "N", help_heading = "Training", default_value_t = 30_000, value_parser = clap::value_parser!(u32).range(1..))]
     iterations: u32,
-    /// How colours may depend on the direction of view: 0 not at all, 3 most
-    /// `[default: 3, or lower where --memory requires it]`
-    #[arg(long, value_name = "DEGREE", help_heading = "Training", value_parser = clap::value_parser!(u8).range(0..=3))]
-    sh_degree: Option<u8>,
+    /// How colours may depend on the direction of view: 0 not at all, 3 most; auto: as much as the
+    /// scene requires `[default: 3, or lower where --memory requires it]`
+    ///
+    /// With auto it is decided before training, by how much the photographs disagree about the
+    /// colours of the reconstruction's points. Where it has no tracks, the degree is raised along
+    /// the run, for as long as a raise has paid
+    #[arg(long, value_name = "DEGREE", help_heading = "Training")]
+    sh_degree: Option<ShDegree>,
+    /// Leave nothing out on a finding of densify's own: degree 3, whatever the scene or --memory says
+    #[arg(long, help_heading = "Training")]
+    full: bool,
     /// Where the first Gaussians are placed [default: points where the dataset has any, else
     /// random]
     #[arg(long, value_enum, value_name = "HOW", help_heading = "Training")]

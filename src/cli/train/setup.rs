@@ -67,7 +67,8 @@ pub(super) fn prepare(
     let output = output(args);
     RunFolder::check(&output, args.overwrite || args.resume)?;
 
-    let survey = Survey::of(args, console)?;
+    let saved = checkpoint.as_ref().map(|checkpoint| checkpoint.header().config.clone());
+    let survey = Survey::of(args, saved.as_ref(), console)?;
     if !args.test_iterations.is_empty() && survey.dataset.test.is_empty() {
         return Err(Failure::input(
             "--test-iterations: no view is held out to measure; add --eval or --test-every K",
@@ -112,6 +113,8 @@ pub(super) fn prepare(
             extended_to: (last > args.iterations).then_some(last),
             seed: args.seed,
             sh_degree: setting.sh_degree,
+            sh_degree_from: survey.degree.choice,
+            full: args.full,
             near: args.near,
             tile_cap: match &size.solved {
                 Some(_) => Some(setting.tile_cap),
@@ -134,7 +137,7 @@ pub(super) fn prepare(
         resume::check(&config, checkpoint)?;
         check_dataset(checkpoint, &fingerprint)?;
     }
-    for line in size.lines(args, &survey) {
+    for line in survey.degree.line().into_iter().chain(size.lines(args, &survey)) {
         console.say(line);
     }
     announce(args, entry, &config, &output, console);

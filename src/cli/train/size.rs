@@ -2,7 +2,7 @@
 
 use super::demand::Survey;
 use super::setup::DECODERS;
-use super::{DEFAULT_BUDGET, DEFAULT_SH_DEGREE, TrainArgs};
+use super::{DEFAULT_BUDGET, TrainArgs};
 use crate::backend::gpu::GpuBackend;
 use crate::cli::failure::{DEVICE, Failure};
 use crate::cli::number::grouped;
@@ -37,7 +37,7 @@ impl Size {
         let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(most);
         let setting = Setting {
             rows,
-            sh_degree: args.sh_degree.unwrap_or(DEFAULT_SH_DEGREE),
+            sh_degree: survey.degree.highest(),
             tile_cap: args.tile_cap.unwrap_or(pairs).max(rows),
             image_cache: args.data.image_cache.unwrap_or(DEFAULT_IMAGE_CACHE),
         };
@@ -96,7 +96,7 @@ impl Size {
                 ),
             }
         ));
-        let wanted = args.sh_degree.unwrap_or(DEFAULT_SH_DEGREE);
+        let wanted = survey.degree.highest();
         if sh_degree < wanted {
             let start = survey.start(args).unwrap_or(LEAST_ROWS);
             lines.push(format!(
@@ -172,10 +172,7 @@ pub(super) fn threads(args: &TrainArgs) -> usize {
 }
 
 fn wishes(args: &TrainArgs, survey: &Survey, memory: u64) -> Result<Wishes, Failure> {
-    let degrees = match args.sh_degree {
-        Some(degree) => degree..=degree,
-        None => 0..=DEFAULT_SH_DEGREE,
-    };
+    let degrees = survey.degree.range.clone();
     let possible = most_rows(survey, *degrees.end());
     Ok(Wishes {
         memory,
