@@ -53,6 +53,9 @@ pub struct SceneConfig {
 pub struct TrainConfig {
     /// Most rows there may ever be.
     pub budget: usize,
+    /// Whether rows must pay, and the budget is what they may come to at most (`--budget auto`).
+    #[serde(default)]
+    pub budget_auto: bool,
     /// The memory that budget, degree, tile lists and image cache were chosen for, if they were
     /// `[bytes]`.
     #[serde(default)]
@@ -70,6 +73,9 @@ pub struct TrainConfig {
     /// What decided it.
     #[serde(default)]
     pub sh_degree_from: DegreeChoice,
+    /// Whether `--memory` has made it lower than was wanted.
+    #[serde(default)]
+    pub sh_degree_lowered: bool,
     /// Whether nothing is to be left out that the options do not say (`--full`).
     #[serde(default)]
     pub full: bool,
@@ -166,10 +172,10 @@ impl RunConfig {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn sample() -> RunConfig {
+    pub(in crate::output) fn sample() -> RunConfig {
         RunConfig {
             densify: "0.1.0".into(),
             scene: SceneConfig {
@@ -184,6 +190,7 @@ mod tests {
             },
             train: TrainConfig {
                 budget: 28_000,
+                budget_auto: true,
                 memory: Some(1 << 28),
                 iterations: 2_000,
                 extended_to: None,
@@ -197,6 +204,7 @@ mod tests {
                     twentieth: 2.5,
                     rms: 6.0,
                 }),
+                sh_degree_lowered: false,
                 full: false,
                 near: 0.01,
                 tile_cap: None,

@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use super::TrainArgs;
+use super::size::Budget;
 use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
 use crate::dataset::Dataset;
@@ -34,6 +35,12 @@ impl FromStr for ShDegree {
 
 /// Fails where `--full` and something that leaves out are both given.
 pub(super) fn check_full(args: &TrainArgs) -> Result<(), Failure> {
+    if args.full && args.budget == Some(Budget::Auto) {
+        return Err(Failure::input(
+            "--full leaves nothing out, --budget auto leaves out what does not pay; give one of the two, \
+             or --full with a number of rows",
+        ));
+    }
     if args.full && args.sh_degree == Some(ShDegree::Auto) {
         return Err(Failure::input(
             "--full leaves nothing out, --sh-degree auto leaves out what the scene does not require; \

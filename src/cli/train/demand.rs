@@ -1,7 +1,7 @@
 //! What a run takes, buffer by buffer, for any size of it, before anything of it is allocated. The
 //! ledger of a run and that of `densify plan` are made here, so that they cannot disagree.
 
-use densify_policies::policy::{Needs, SceneInfo};
+use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::{PolicyEntry, find};
 use glam::DVec3;
 use toml::Table;
@@ -10,6 +10,7 @@ use super::TrainArgs;
 use super::degree::{Degree, ShDegree, check_full};
 use super::choices::parameters;
 use super::setup::{DECODERS, random_count};
+use super::size::Budget;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
 use crate::cli::console::Console;
@@ -22,9 +23,9 @@ use crate::gaussians::sh_coefficients;
 use crate::init::usable_points;
 use crate::memory::{Ledger, Section, Setting, peak_resident, resident};
 use crate::metrics::scratch_bytes;
-use crate::output::{InitChoice, RunConfig, SceneConfig};
+use crate::output::{DegreeChoice, InitChoice, RunConfig, SceneConfig};
 use crate::schedule::Background;
-use crate::trainer::needs;
+use crate::trainer::{Required, growth_signals, needs};
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
 /// Measured at 10 to 13 MiB.
@@ -46,6 +47,10 @@ pub(super) struct Survey {
     pub(super) scene: SceneConfig,
     pub(super) dataset: Dataset,
     pub(super) degree: Degree,
+    /// What the run is to find out by itself.
+    pub(super) required: Required,
+    /// The budget of a run that goes on.
+    pub(super) most_rows: Option<usize>,
     /// What training and test images take.
     images: [ImageDemand; 2],
     /// Rows that a start on the dataset's points would have, were there no limit.
@@ -76,7 +81,26 @@ impl Survey {
         let (resident, peak) = (resident(), peak_resident());
         let degree = Degree::decide(args, saved, &dataset)?;
         dataset.tracks = Tracks::default();
-        Ok(Self { entry, parameters, device, scene, dataset, degree, images, usable, resident, peak })
+        let required = Required {
+            degree: degree.choice == DegreeChoice::Training,
+            rows: args.budget == Some(Budget::Auto)
+                || saved.is_some_and(|saved| saved.train.budget_auto),
+        };
+        let most_rows = saved.map(|saved| saved.train.budget);
+        Ok(Self {
+            entry,
+            parameters,
+            device,
+            scene,
+            dataset,
+            degree,
+            required,
+            most_rows,
+            images,
+            usable,
+            resident,
+            peak,
+        })
     }
 
     /// The same with images of another size; `None` where there are none of it.
@@ -134,7 +158,16 @@ impl Survey {
     pub(super) fn needs(&self, args: &TrainArgs, rows: usize) -> Result<Needs, Failure> {
         let scene = self.info(args, rows, self.initial_rows(args, rows))?;
         let policy = self.entry.build(&self.parameters, &scene)?;
-        Ok(needs(policy.as_ref(), &scene, args.sh_every))
+        Ok(self.backend_needs(needs(policy.as_ref(), &scene, args.sh_every)))
+    }
+
+    /// The needs of a policy, and what the trainer needs beside them.
+    pub(super) fn backend_needs(&self, needs: Needs) -> Needs {
+        let signals = match self.required.rows {
+            true => growth_signals().iter().fold(needs.signals, SignalSet::with),
+            false => needs.signals,
+        };
+        Needs { signals, ..needs }
     }
 
     /// How the native backend is made.
@@ -198,11 +231,12 @@ impl Survey {
         pass("a policy's event", self.event_bytes(setting, needs));
         // The model as downloaded and as exported.
         pass("export of the model, checkpoint", 2 * budget * row);
-        if !self.dataset.test.is_empty() {
+        let measures_test = !self.dataset.test.is_empty();
+        if measures_test || self.required != Required::default() {
             let (width, height) = scene::largest_image(&self.dataset);
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
-            let image = test.held(0) + test.decoding(1);
-            pass("measuring a test view", rendering + image + scratch_bytes(width, threads));
+            let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
+            pass("measuring a view", rendering + image + scratch_bytes(width, threads));
         }
         let process = self.process_bytes();
         if let Some(beyond) = self.peak.and_then(|peak| peak.checked_sub(process)) {
