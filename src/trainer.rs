@@ -399,12 +399,17 @@ impl<V: ViewSource> Trainer<V> {
         &self.views
     }
 
-    /// A copy of the model as it is now, in the coordinates of training.
+    /// A copy of the model as it is now, in the coordinates of training; where [degrees are
+    /// earned](Required::degree), without those that are not in use.
     ///
     /// # Errors
     /// See [`BackendError`].
     pub fn model(&self) -> Result<Gaussians, BackendError> {
-        self.backend.download()
+        let model = self.backend.download()?;
+        Ok(match &self.earned {
+            Some(earned) => model.up_to_degree(earned.degree),
+            None => model,
+        })
     }
 
     /// The backend, for rendering and its ledger.

@@ -91,6 +91,10 @@ fn header() -> Header {
                 background: Background::Black,
             },
             train: TrainConfig {
+                budget_auto: false,
+                sh_degree_from: crate::output::DegreeChoice::Given,
+                sh_degree_lowered: false,
+                full: false,
                 budget: ROWS + 3,
                 memory: None,
                 iterations: 2_000,

@@ -41,7 +41,8 @@ impl Tracks {
     /// Most bytes that tracks take, however many a reconstruction has.
     #[must_use]
     pub const fn most_bytes() -> u64 {
-        let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>() + MOST_VIEWS as usize * size_of::<u32>();
+        let track =
+            size_of::<DVec3>() + 3 + size_of::<Vec<u32>>() + MOST_VIEWS as usize * size_of::<u32>();
         (2 * MOST * track) as u64
     }
 
@@ -142,7 +143,8 @@ mod tests {
         }
         let tracks = gathered.finish();
         assert!((MOST..2 * MOST).contains(&tracks.len()), "{}", tracks.len());
-        let gaps: Vec<f64> = tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
+        let gaps: Vec<f64> =
+            tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
         assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);
         assert!(tracks.views.iter().all(|views| views.len() == 5));
     }

@@ -70,9 +70,6 @@ pub struct TrainConfig {
     pub seed: u64,
     /// Highest spherical-harmonic degree.
     pub sh_degree: u8,
-    /// What decided it.
-    #[serde(default)]
-    pub sh_degree_from: DegreeChoice,
     /// Whether `--memory` has made it lower than was wanted.
     #[serde(default)]
     pub sh_degree_lowered: bool,
@@ -91,6 +88,9 @@ pub struct TrainConfig {
     pub sh_every: Option<u32>,
     /// The GPU adapter that trained; `None`: the processor.
     pub adapter: Option<String>,
+    /// What decided the degree.
+    #[serde(default)]
+    pub sh_degree_from: DegreeChoice,
     /// Step sizes.
     pub learning_rates: RateOptions,
 }

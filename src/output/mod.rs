@@ -27,7 +27,9 @@ mod tensorboard;
 
 pub use atomic::write_atomically;
 pub use cameras::cameras_json;
-pub use config::{CONFIG_FILE, DegreeChoice, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
+pub use config::{
+    CONFIG_FILE, DegreeChoice, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig,
+};
 pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
 pub use records::{
     Mean, RecordLog, StepRecord, Summary, geometry_of, write_geometry, write_json, write_scores,

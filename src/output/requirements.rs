@@ -68,7 +68,8 @@ impl Requirements {
             let why = if self.full { " (--full)" } else { "" };
             return vec![format!("left out nothing{why}")];
         }
-        let line = |left: &LeftOut| format!("left out {}: {}; {}", left.what, left.evidence, left.loss);
+        let line =
+            |left: &LeftOut| format!("left out {}: {}; {}", left.what, left.evidence, left.loss);
         self.left_out.iter().map(line).collect()
     }
 }
@@ -78,7 +79,9 @@ fn degree_left_out(config: &RunConfig, degree: u8, earned: Option<&Earned>) -> O
     let what = match (MAX_SH_DEGREE.checked_sub(degree)?, train.sh_degree_from) {
         (0, _) => return None,
         // The options say so.
-        (_, DegreeChoice::Given) if train.memory.is_none() || !train.sh_degree_lowered => return None,
+        (_, DegreeChoice::Given) if train.memory.is_none() || !train.sh_degree_lowered => {
+            return None;
+        }
         (1, _) => format!("degree {MAX_SH_DEGREE} of colour"),
         _ => format!("degrees {} to {MAX_SH_DEGREE} of colour", degree + 1),
     };
@@ -132,7 +135,10 @@ fn shrunk(growth: &Growth) -> Option<LeftOut> {
     let change: f64 = kept.iter().map(|shrink| shrink.change).sum();
     Some(LeftOut {
         what: format!("{} rows", first.before.saturating_sub(last.after)),
-        evidence: format!("{} times, the tenth of least weight was hidden and hardly missed", kept.len()),
+        evidence: format!(
+            "{} times, the tenth of least weight was hidden and hardly missed",
+            kept.len()
+        ),
         loss: format!("{change:.3} dB on training views, at once, in all"),
     })
 }
@@ -163,10 +169,11 @@ mod tests {
     #[test]
     fn each_decision_has_its_evidence_and_its_loss() {
         let mut config = sample();
-        let line = |config: &RunConfig, degree, earned: Option<&Earned>, growth: Option<&Growth>| {
-            let lines = Requirements::of(config, degree, 900, earned, growth).lines();
-            lines.join("\n")
-        };
+        let line =
+            |config: &RunConfig, degree, earned: Option<&Earned>, growth: Option<&Growth>| {
+                let lines = Requirements::of(config, degree, 900, earned, growth).lines();
+                lines.join("\n")
+            };
         config.train.sh_degree_from = DegreeChoice::Spread(spread());
         let text = line(&config, 0, None, None);
         for words in ["degrees 1 to 3", "4000 points", "0.50/255", "0.12/255"] {
@@ -189,11 +196,19 @@ mod tests {
             limit: 900,
             stopped: Some(300),
             rungs: vec![rung(700, None), rung(1000, Some([0.04, -0.125]))],
-            shrinks: vec![Shrink { step: 400, before: 1000, after: 900, change: -0.015, kept: true }],
+            shrinks: vec![Shrink {
+                step: 400,
+                before: 1000,
+                after: 900,
+                change: -0.015,
+                kept: true,
+            }],
             ..Growth::default()
         };
         let text = line(&config, 3, None, Some(&growth));
-        for words in ["rows beyond 1000", "step 300", "0.04 dB", "-0.12 dB", "100 rows", "-0.015 dB"] {
+        for words in
+            ["rows beyond 1000", "step 300", "0.04 dB", "-0.12 dB", "100 rows", "-0.015 dB"]
+        {
             assert!(text.contains(words), "{words}: {text}");
         }
     }

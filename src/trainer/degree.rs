@@ -120,7 +120,8 @@ mod tests {
     fn probes_are_passed_over_during_a_trial_only() {
         let order = [3, 1, 4, 0, 2];
         let mut earned = Earned::default();
-        let views = |earned: &Earned| [0, 1, 2, 3, 4].map(|place| earned.view(&order, place, &[1, 2]));
+        let views =
+            |earned: &Earned| [0, 1, 2, 3, 4].map(|place| earned.view(&order, place, &[1, 2]));
         assert_eq!(views(&earned), order);
         earned.on_trial = true;
         assert_eq!(views(&earned), [3, 4, 4, 0, 3]);

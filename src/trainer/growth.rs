@@ -105,9 +105,11 @@ impl Growth {
     /// Takes the end of a rung into account: whether rows have paid, and what the limit is now.
     fn judge(&mut self, (step, length): (u32, u32), rows: usize, end: Vec<f64>, budget: usize) {
         let rows_before = self.rungs.last().map(|rung| rung.rows);
-        let doublings = rows_before.map_or(0.0, |before| (rows as f64 / before.max(1) as f64).log2());
+        let doublings =
+            rows_before.map_or(0.0, |before| (rows as f64 / before.max(1) as f64).log2());
         let [middle, last] = &self.before;
-        let judged = doublings >= LEAST_GROWTH && middle.len() == end.len() && last.len() == end.len();
+        let judged =
+            doublings >= LEAST_GROWTH && middle.len() == end.len() && last.len() == end.len();
         let gain = judged.then(|| {
             // Half a rung of training before this one, carried on over this one.
             let (now, length) = (f64::from(step), f64::from(length));
@@ -242,8 +244,11 @@ impl<V: ViewSource> Trainer<V> {
         let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
         for &row in rows {
             let value = opacity(row).clamp(HIDDEN, 1.0 - f32::EPSILON);
-            let update =
-                Update { opacity: OpacityRule::Set(value), scale: ScaleRule::Uniform(1.0), keep_moments: true };
+            let update = Update {
+                opacity: OpacityRule::Set(value),
+                scale: ScaleRule::Uniform(1.0),
+                keep_moments: true,
+            };
             let _ = plan.update(row, update);
         }
         let ops = plan.compile();

@@ -7,8 +7,8 @@ use glam::DVec3;
 use toml::Table;
 
 use super::TrainArgs;
-use super::degree::{Degree, ShDegree, check_full};
 use super::choices::parameters;
+use super::degree::{Degree, ShDegree, check_full};
 use super::setup::{DECODERS, random_count};
 use super::size::Budget;
 use crate::backend::cpu::{CpuBackend, CpuOptions};

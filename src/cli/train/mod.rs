@@ -24,8 +24,8 @@ use super::scene::{NEAR, SceneArgs};
 use crate::output::InitChoice;
 use crate::trainer::OnNan;
 use degree::ShDegree;
-use size::Budget;
 use resume::Start;
+use size::Budget;
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries
 /// a room or an object; large outdoor scenes want more.

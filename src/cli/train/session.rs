@@ -19,8 +19,8 @@ use crate::cli::progress::Progress;
 use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::memory::Bytes;
 use crate::output::{
-    CHECKPOINTS, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json, model_path, saved_iterations,
-    write_atomically, write_json, write_scores,
+    CHECKPOINTS, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json, model_path,
+    saved_iterations, write_atomically, write_json, write_scores,
 };
 use crate::ply::write_splats;
 use crate::trainer::{StepReport, TrainError};

@@ -193,7 +193,10 @@ pub(super) fn points(
             if tracks.wants(views) {
                 let mut ids = Vec::new();
                 while let (Some(id), Some(_)) = (words.next(), words.next()) {
-                    ids.push(id.parse().map_err(|_| lines.fault("track", format!("{id:?} is no image id")))?);
+                    ids.push(
+                        id.parse()
+                            .map_err(|_| lines.fault("track", format!("{id:?} is no image id")))?,
+                    );
                 }
                 tracks.take(position, colour, ids);
             } else {

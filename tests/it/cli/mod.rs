@@ -6,6 +6,7 @@ mod generated;
 mod killing;
 mod looking;
 mod memory;
+mod requiring;
 mod resuming;
 mod same;
 mod training;
