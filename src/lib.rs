@@ -74,5 +74,6 @@ pub mod ply;
 pub mod schedule;
 pub mod selftest;
 pub mod sh;
+pub mod spread;
 pub mod trainer;
 pub mod views;

@@ -6,10 +6,13 @@
 //! model as the optimiser left it.
 
 mod check;
+mod degree;
 mod error;
 mod fresh;
+mod growth;
 mod guard;
 mod options;
+mod probe;
 mod quarantine;
 mod state;
 
@@ -26,9 +29,11 @@ use crate::gaussians::Gaussians;
 use crate::schedule;
 use crate::views::ViewSource;
 use check::check;
+pub use degree::{Earned, Trial};
 pub use error::TrainError;
+pub use growth::{Growth, PAYS, Rung, Shrink, signals as growth_signals};
 use guard::asked;
-pub use options::{OnNan, Savings, TrainOptions};
+pub use options::{OnNan, Required, Savings, TrainOptions};
 use quarantine::AUDIT_EVERY;
 pub use state::TrainerState;
 
@@ -114,6 +119,10 @@ pub struct Trainer<V> {
     views_time: Duration,
     images_time: Duration,
     events: Vec<EditEvent>,
+    /// Training views that are measured along the run; none where nothing asks for it.
+    probes: Vec<usize>,
+    earned: Option<Earned>,
+    growth: Option<Growth>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -148,7 +157,35 @@ impl<V: ViewSource> Trainer<V> {
             options,
             step: 0,
             events: Vec::new(),
+            probes: Vec::new(),
+            earned: None,
+            growth: None,
         })
+    }
+
+    /// Lets the run find out what the scene requires, before its first step. For rows the backend must
+    /// have been made with [`growth_signals`], too.
+    #[must_use]
+    pub fn requiring(mut self, what: Required) -> Self {
+        if what.degree || what.rows {
+            self.probes = probe::probes(self.views.count(), self.options.seed);
+        }
+        self.earned = what.degree.then(Earned::default);
+        let (rows, budget) = (self.backend.rows(), self.backend.budget());
+        self.growth = what.rows.then(|| Growth::new(rows, budget));
+        self
+    }
+
+    /// What trials of degrees have brought, where [they are earned](Required::degree).
+    #[must_use]
+    pub fn earned(&self) -> Option<&Earned> {
+        self.earned.as_ref()
+    }
+
+    /// What more rows have brought, where [they must pay](Required::rows).
+    #[must_use]
+    pub fn growth(&self) -> Option<&Growth> {
+        self.growth.as_ref()
     }
 
     /// One iteration: a view, a gradient step, and the policy's edit where one is due.
@@ -166,14 +203,14 @@ impl<V: ViewSource> Trainer<V> {
         let image = self.image(step, view)?;
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
-        let TrainOptions { seed, sh_degree, background, rates, .. } = self.options;
+        let TrainOptions { seed, background, rates, .. } = self.options;
         let input = StepInput {
             step,
             view,
             camera: self.views.camera(view),
             target: &image,
             background: background.at(seed, step),
-            sh_degree: schedule::sh_degree(step, iterations, sh_degree),
+            sh_degree: self.sh_degree(step),
             rates: rates.at(step, iterations, self.scene.extent),
             cadence,
             seed,
@@ -190,11 +227,13 @@ impl<V: ViewSource> Trainer<V> {
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
             events.extend(self.quarantine(step)?);
         }
+        events.extend(self.watch_growth(step)?);
         let start = Instant::now();
         if is_due {
             events.extend(self.edit(step)?);
         }
         self.policy_time = self.policy_time.saturating_add(start.elapsed());
+        self.earn(step)?;
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
@@ -243,7 +282,10 @@ impl<V: ViewSource> Trainer<V> {
             .take(self.options.prefetch.min(last))
             .collect();
         self.views.prefetch(&upcoming);
-        self.order[place]
+        match &self.earned {
+            Some(earned) => earned.view(&self.order, place, &self.probes),
+            None => self.order[place],
+        }
     }
 
     /// Asks the policy for a plan and executes it; policies may be due at steps at which they find
@@ -255,8 +297,10 @@ impl<V: ViewSource> Trainer<V> {
         self.views_time = self.views_time.saturating_add(start.elapsed());
         let (signals, candidates) =
             self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
-        let now = Snapshot { step, scene: &self.scene, signals: &signals, candidates: &candidates };
-        let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
+        let limit = self.limit();
+        let scene = SceneInfo { budget: limit, ..self.scene.clone() };
+        let now = Snapshot { step, scene: &scene, signals: &signals, candidates: &candidates };
+        let mut plan = EditPlan::new(self.backend.rows(), limit);
         let rng = PolicyRng::new(self.options.seed, step);
         let planned = asked(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         planned.map_err(|source| self.refused(step, source))?;
@@ -265,8 +309,10 @@ impl<V: ViewSource> Trainer<V> {
 
     /// Executes a plan. One that changes no row and was refused nothing is no event.
     fn execute(&mut self, step: u32, plan: EditPlan) -> Result<Option<EditEvent>, TrainError> {
-        let ops = plan.compile();
+        let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
+        // A limit below the budget is the trainer's own; a backend knows of one budget only.
+        ops.budget = self.backend.budget();
         self.backend.apply(&ops, self.options.seed, step).map_err(|e| self.stopped(step, e))?;
         self.peak_rows = self.peak_rows.max(rows_within(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
@@ -283,7 +329,7 @@ impl<V: ViewSource> Trainer<V> {
     /// A plan compiles only from accepted calls; this is the second lock on the budget, and it
     /// turns a plan that slipped through the first into an error instead of a panic in the backend.
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
-        let (rows, budget) = (self.backend.rows(), self.backend.budget());
+        let (rows, budget) = (self.backend.rows(), self.limit());
         let reason = if ops.rows_before != rows || ops.budget != budget {
             let RowOps { rows_before, budget: planned, .. } = ops;
             Some(format!(
@@ -357,12 +403,17 @@ impl<V: ViewSource> Trainer<V> {
         &self.views
     }
 
-    /// A copy of the model as it is now, in the coordinates of training.
+    /// A copy of the model as it is now, in the coordinates of training; where [degrees are
+    /// earned](Required::degree), without those that are not in use.
     ///
     /// # Errors
     /// See [`BackendError`].
     pub fn model(&self) -> Result<Gaussians, BackendError> {
-        self.backend.download()
+        let model = self.backend.download()?;
+        Ok(match &self.earned {
+            Some(earned) => model.up_to_degree(earned.degree),
+            None => model,
+        })
     }
 
     /// The backend, for rendering and its ledger.

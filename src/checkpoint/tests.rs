@@ -91,6 +91,10 @@ fn header() -> Header {
                 background: Background::Black,
             },
             train: TrainConfig {
+                budget_auto: false,
+                sh_degree_from: crate::output::DegreeChoice::Given,
+                sh_degree_lowered: false,
+                full: false,
                 budget: ROWS + 3,
                 memory: None,
                 iterations: 2_000,
@@ -114,6 +118,8 @@ fn header() -> Header {
             normalisation: Normalisation { centre: DVec3::new(0.1, 2e-300, 7.0), scale: 1.0 / 3.0 },
         },
         trainer: crate::trainer::TrainerState {
+            earned: None,
+            growth: None,
             step: 17,
             initial_rows: 9,
             peak_rows: ROWS,

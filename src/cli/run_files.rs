@@ -113,7 +113,7 @@ pub(super) fn open(
     console: &Console,
 ) -> Result<Opened, Failure> {
     use_threads(machine.threads);
-    let dataset = scene::load(dataset, &config, console)?;
+    let dataset = scene::load(dataset, &config, false, console)?;
     let model = read_model(model, &dataset, console)?;
     let budget = model.len().max(1);
     let near = (near * dataset.extent()) as f32;

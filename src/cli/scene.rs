@@ -70,21 +70,22 @@ impl SceneArgs {
     }
 }
 
-/// Reads the dataset at `path` and says what there is to say about it.
+/// Reads the dataset at `path`, and its tracks if they are wanted; says what there is to say.
 pub(super) fn load(
     path: &Path,
     config: &SceneConfig,
+    tracks: bool,
     console: &Console,
 ) -> Result<Dataset, Failure> {
-    let dataset = read(path, config)?;
+    let dataset = read(path, config, tracks)?;
     for note in &dataset.notes {
         console.say(format_args!("note: {note}"));
     }
     Ok(dataset)
 }
 
-/// Reads the dataset at `path`.
-pub(super) fn read(path: &Path, config: &SceneConfig) -> Result<Dataset, Failure> {
+/// Reads the dataset at `path`, and its tracks if they are wanted.
+pub(super) fn read(path: &Path, config: &SceneConfig, tracks: bool) -> Result<Dataset, Failure> {
     let resolution = config.resolution.map(|number| number.to_string().parse::<Resolution>());
     let split = match config.test_every.map(NonZeroU32::new) {
         Some(Some(every)) => Split::Every(every),
@@ -96,6 +97,7 @@ pub(super) fn read(path: &Path, config: &SceneConfig) -> Result<Dataset, Failure
         images: config.images.clone(),
         resolution: resolution.transpose().map_err(Failure::input)?,
         split,
+        tracks,
     };
     Ok(Dataset::load(path, &options)?)
 }

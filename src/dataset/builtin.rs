@@ -2,6 +2,7 @@
 //!
 //! Their images are as `densify scenegen --preset NAME` writes them with its defaults.
 
+use std::collections::HashMap;
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,6 +14,7 @@ use densify_scenegen::{
 use super::images::{Image8, ImageHeader, ImageSource};
 use super::normalise::Normalisation;
 use super::prepare::target_size;
+use super::tracks::Gathered;
 use super::{Dataset, DatasetError, LoadOptions, PointCloud, Split, View};
 use crate::camera::Camera;
 
@@ -60,14 +62,13 @@ pub fn dataset(
     points: InitPoints,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let mut views: Vec<(View, bool)> = scene
-        .views
-        .iter()
+    let mut views: Vec<(View, bool, u32)> = (0..)
+        .zip(&scene.views)
         .zip(frames)
-        .map(|(view, frame)| {
+        .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
             let held_out = view.split == densify_scenegen::Split::Test;
-            (posed(&view.name, camera, frame, options), held_out)
+            (posed(&view.name, camera, frame, options), held_out, number)
         })
         .collect();
     views.sort_by(|a, b| a.0.name.as_bytes().cmp(b.0.name.as_bytes()));
@@ -77,9 +78,15 @@ pub fn dataset(
     };
     let count = views.len();
     let (mut train, mut test) = (Vec::new(), Vec::new());
-    for (index, (view, held_out)) in views.into_iter().enumerate() {
+    let mut number_of = HashMap::new();
+    for (index, (view, held_out, number)) in views.into_iter().enumerate() {
         let held_out = every.map_or(held_out, |every| index % every == 0);
-        if held_out { test.push(view) } else { train.push(view) }
+        if held_out {
+            test.push(view);
+        } else {
+            number_of.insert(number, train.len() as u32);
+            train.push(view);
+        }
     }
     if train.is_empty() {
         return Err(DatasetError::NoTrainingViews { views: count });
@@ -90,11 +97,24 @@ pub fn dataset(
         view.camera = normalisation.camera(&view.camera);
     }
     let positions = points.positions.iter().map(|&point| normalisation.point(point)).collect();
+    let mut gathered = Gathered::new();
+    let found = points.positions.iter().zip(&points.colours);
+    for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
+        let views = seen_by.len() as u64;
+        if options.tracks && gathered.wants(views) {
+            gathered.take(position, colour, seen_by.iter().copied());
+        } else {
+            gathered.pass(views);
+        }
+    }
+    let view_of = |number: u32| number_of.get(&number).copied();
+    let tracks = gathered.finish().of_training(&normalisation, view_of);
     Ok(Dataset {
         root: path.to_owned(),
         train,
         test,
         points: PointCloud { positions, colours: points.colours },
+        tracks,
         normalisation,
         notes: scene.model.notes.clone(),
     })

@@ -16,6 +16,7 @@ mod paths;
 mod pose;
 mod prepare;
 mod resample;
+mod tracks;
 mod transforms;
 pub mod undistort;
 
@@ -38,6 +39,7 @@ use folders::Folders;
 use normalise::Normalisation;
 pub use options::{LoadOptions, ParseResolutionError, Resolution, Split};
 use paths::Root;
+pub use tracks::{LEAST_VIEWS, Tracks};
 use undistort::Lens;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
@@ -51,6 +53,9 @@ pub struct Dataset {
     pub test: Vec<View>,
     /// Points of the reconstruction, if the dataset has any.
     pub points: PointCloud,
+    /// Which training views show a point, if that was [asked for](LoadOptions::tracks) and the dataset
+    /// says it.
+    pub tracks: Tracks,
     /// From the dataset's own coordinates to the normalised ones used here.
     pub normalisation: Normalisation,
     /// What was noticed while loading and may interest the user (dropped points, missing frames).
@@ -108,6 +113,8 @@ struct Scene {
     frames: Vec<Frame>,
     points: PointCloud,
     points_file: Option<PathBuf>,
+    /// Tracks, their views by [`Frame::id`].
+    tracks: Tracks,
     /// Whether the dataset says itself which frames are held out.
     own_split: bool,
     notes: Vec<String>,
@@ -117,6 +124,8 @@ struct Scene {
 #[derive(Debug)]
 struct Frame {
     name: String,
+    /// What tracks call it, if there are any.
+    id: Option<u32>,
     /// File and frame, for messages.
     origin: String,
     image: PathBuf,
@@ -172,10 +181,15 @@ impl Dataset {
 
 fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError> {
     let here = |name: &str| root.path().join(name).is_file();
+    let model = colmap::find(root.path());
     if transforms::PAIR.iter().all(|name| here(name)) {
-        transforms::read_pair(root, &Folders::new(root, options, false)?)
-    } else if let Some(folder) = colmap::find(root.path()) {
-        colmap::read(root, &folder, &Folders::new(root, options, true)?)
+        let mut scene = transforms::read_pair(root, &Folders::new(root, options, false)?)?;
+        if let Some(folder) = model.filter(|_| options.tracks) {
+            colmap::adopt_tracks(root, &folder, &mut scene);
+        }
+        Ok(scene)
+    } else if let Some(folder) = model {
+        colmap::read(root, &folder, &Folders::new(root, options, true)?, options.tracks)
     } else if here(transforms::SINGLE) {
         transforms::read_single(root, &Folders::new(root, options, false)?)
     } else {

@@ -14,6 +14,8 @@ pub struct LoadOptions {
     pub resolution: Option<Resolution>,
     /// Which views are held out.
     pub split: Split,
+    /// Whether to read which views show which points ([`Tracks`](super::Tracks)).
+    pub tracks: bool,
 }
 
 /// The size to train at. Images are never enlarged.

@@ -1,5 +1,6 @@
 //! From frames as files describe them to views to train on: sizes, lenses, split, coordinates.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use glam::DVec3;
@@ -20,7 +21,8 @@ pub(super) fn dataset(
     scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let Scene { listing, mut frames, mut points, points_file, own_split, mut notes } = scene;
+    let Scene { listing, mut frames, mut points, points_file, tracks, own_split, mut notes } =
+        scene;
     // Bytewise, as the field sorts names for its test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
     refuse_duplicates(&listing, &frames)?;
@@ -41,11 +43,13 @@ pub(super) fn dataset(
     };
     let count = views.len();
     let (mut train, mut test) = (Vec::new(), Vec::new());
+    let mut number_of = HashMap::new();
     for (index, (view, frame)) in views.into_iter().zip(&frames).enumerate() {
         let held_out = every.map_or(frame.held_out, |every| index % every == 0);
         if held_out {
             test.push(view);
         } else {
+            number_of.extend(frame.id.map(|id| (id, train.len() as u32)));
             train.push(view);
         }
     }
@@ -75,7 +79,8 @@ pub(super) fn dataset(
     drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
         p.as_vec3().is_finite()
     })?;
-    Ok(Dataset { root: path.to_owned(), train, test, points, normalisation, notes })
+    let tracks = tracks.of_training(&normalisation, |id| number_of.get(&id).copied());
+    Ok(Dataset { root: path.to_owned(), train, test, points, tracks, normalisation, notes })
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {

@@ -106,6 +106,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
         own_split |= held_out;
         frames.push(Frame {
             name: relative(file),
+            id: None,
             origin: format!("{}: frame {file}", path.display()),
             image: found.path,
             reduced: found.reduced,

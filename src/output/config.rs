@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::{OutputError, write_atomically};
 use crate::knobs::Settings;
 use crate::schedule::{Background, RateOptions};
+use crate::spread::Spread;
 
 /// Name of the file in a run's folder.
 pub const CONFIG_FILE: &str = "config.toml";
@@ -56,6 +57,9 @@ pub struct SceneConfig {
 pub struct TrainConfig {
     /// Most rows there may ever be.
     pub budget: usize,
+    /// Whether rows must pay, and the budget is what they may come to at most (`--budget auto`).
+    #[serde(default)]
+    pub budget_auto: bool,
     /// The memory that budget, degree, tile lists and image cache were chosen for, if they were
     /// `[bytes]`.
     #[serde(default)]
@@ -70,6 +74,12 @@ pub struct TrainConfig {
     pub seed: u64,
     /// Highest spherical-harmonic degree.
     pub sh_degree: u8,
+    /// Whether `--memory` has made it lower than was wanted.
+    #[serde(default)]
+    pub sh_degree_lowered: bool,
+    /// Whether nothing is to be left out that the options do not say (`--full`).
+    #[serde(default)]
+    pub full: bool,
     /// Near plane as a fraction of the scene's extent.
     pub near: f64,
     /// Most (row, tile) entries held at a time; `None` lets the backend choose.
@@ -82,8 +92,24 @@ pub struct TrainConfig {
     pub sh_every: Option<u32>,
     /// The GPU adapter that trained; `None`: the processor.
     pub adapter: Option<String>,
+    /// What decided the degree.
+    #[serde(default)]
+    pub sh_degree_from: DegreeChoice,
     /// Step sizes.
     pub learning_rates: RateOptions,
+}
+
+/// What decided the degree of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DegreeChoice {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training.
+    Spread(Spread),
+    /// What raises of the degree have brought in training; the degree is the highest that may come.
+    Training,
 }
 
 /// How the first Gaussians are placed.
@@ -150,10 +176,10 @@ impl RunConfig {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn sample() -> RunConfig {
+    pub(in crate::output) fn sample() -> RunConfig {
         RunConfig {
             densify: "0.1.0".into(),
             scene: SceneConfig {
@@ -168,11 +194,22 @@ mod tests {
             },
             train: TrainConfig {
                 budget: 28_000,
+                budget_auto: true,
                 memory: Some(1 << 28),
                 iterations: 2_000,
                 extended_to: None,
                 seed: i64::MAX as u64,
                 sh_degree: 3,
+                sh_degree_from: DegreeChoice::Spread(Spread {
+                    tracks: 4_000,
+                    on_surface: 0.75,
+                    median: 0.5,
+                    tenth: 1.5,
+                    twentieth: 2.5,
+                    rms: 6.0,
+                }),
+                sh_degree_lowered: false,
+                full: false,
                 near: 0.01,
                 tile_cap: None,
                 init: InitChoice::Points,

@@ -7,7 +7,7 @@
 //!   cameras.json                                 all cameras, world coordinates
 //!   point_cloud/iteration_N/point_cloud.ply      the model
 //!   checkpoints/iteration_N.safetensors          what a run goes on from
-//!   stats/train.jsonl  events.jsonl  summary.json
+//!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
 //!   results.json  per_view.json                  test scores, as the original trainer lays them out
 //!   geometry.json                                how the model sits on a known surface
 //!   events.out.tfevents.*                        the same curves for TensorBoard
@@ -22,16 +22,20 @@ mod config;
 pub(crate) mod disk;
 mod folder;
 mod records;
+mod requirements;
 mod tensorboard;
 
 pub use atomic::write_atomically;
 pub use cameras::cameras_json;
-pub use config::{CONFIG_FILE, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig};
+pub use config::{
+    CONFIG_FILE, DegreeChoice, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig,
+};
 pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
 pub use records::{
     Mean, RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,
 };
+pub use requirements::{LeftOut, Requirements};
 pub use tensorboard::TensorBoard;
 
 use std::path::{Path, PathBuf};

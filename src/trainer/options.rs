@@ -58,6 +58,15 @@ impl Default for Savings {
     }
 }
 
+/// What a run is to find out by itself about its scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Required {
+    /// The degree of colour, up to [`TrainOptions::sh_degree`].
+    pub degree: bool,
+    /// The number of rows, up to the budget.
+    pub rows: bool,
+}
+
 /// What becomes of rows with a parameter or a moment that is NaN or infinite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnNan {

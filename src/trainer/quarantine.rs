@@ -28,7 +28,7 @@ impl<V: ViewSource> Trainer<V> {
         if self.options.on_nan == OnNan::Stop || !few {
             return Err(TrainError::Unsound { step, count, rows, first: first.to_string() });
         }
-        let mut plan = EditPlan::new(rows, self.backend.budget());
+        let mut plan = EditPlan::new(rows, self.limit());
         plan.cause("not finite");
         for found in unsound {
             // Never refused: each row once, and not all of them.

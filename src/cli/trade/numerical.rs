@@ -48,7 +48,7 @@ impl Subject {
     /// When it cannot be read.
     pub(super) fn of(folder: &Path, console: &Console) -> Result<Self, Failure> {
         let config = RunConfig::read(folder)?;
-        let dataset = scene::load(&config.scene_path(), &config.scene, console)?;
+        let dataset = scene::load(&config.scene_path(), &config.scene, false, console)?;
         let path = model_path(folder, iteration(folder, None)?);
         let model = read_model(&path, &dataset, console)?;
         let near = (config.train.near * dataset.extent()) as f32;

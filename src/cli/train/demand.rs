@@ -1,14 +1,16 @@
 //! What a run takes, buffer by buffer, for any size of it, before anything of it is allocated. The
 //! ledger of a run and that of `densify plan` are made here, so that they cannot disagree.
 
-use densify_policies::policy::{Needs, SceneInfo};
+use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::{PolicyEntry, find};
 use glam::DVec3;
 use toml::Table;
 
 use super::TrainArgs;
 use super::choices::parameters;
+use super::degree::{Degree, ShDegree, check_full};
 use super::setup::{DECODERS, random_count};
+use super::size::Budget;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions, KeptPhotographs};
 use crate::cli::console::Console;
@@ -16,15 +18,15 @@ use crate::cli::failure::Failure;
 use crate::cli::run_files::use_threads;
 use crate::cli::scene;
 use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, View};
+use crate::dataset::{Dataset, Tracks, View};
 use crate::gaussians::sh_coefficients;
 use crate::init::usable_points;
 use crate::knobs::Settings;
 use crate::memory::{IMAGES, Ledger, Section, Setting, peak_resident, resident};
 use crate::metrics::scratch_bytes;
-use crate::output::{InitChoice, SceneConfig};
+use crate::output::{DegreeChoice, InitChoice, RunConfig, SceneConfig};
 use crate::schedule::Background;
-use crate::trainer::needs;
+use crate::trainer::{Required, growth_signals, needs};
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
 /// Measured at 10 to 13 MiB.
@@ -46,6 +48,11 @@ pub(super) struct Survey {
     pub(super) device: Option<GpuDevice>,
     pub(super) scene: SceneConfig,
     pub(super) dataset: Dataset,
+    pub(super) degree: Degree,
+    /// What the run is to find out by itself.
+    pub(super) required: Required,
+    /// The budget of a run that goes on.
+    pub(super) most_rows: Option<usize>,
     /// What training and test images take.
     images: [ImageDemand; 2],
     /// Rows that a start on the dataset's points would have, were there no limit.
@@ -56,8 +63,13 @@ pub(super) struct Survey {
 }
 
 impl Survey {
-    /// Loads the dataset and opens the device.
-    pub(super) fn of(args: &TrainArgs, console: &Console) -> Result<Self, Failure> {
+    /// Loads the dataset and opens the device. `saved` is the configuration of a run that goes on.
+    pub(super) fn of(
+        args: &TrainArgs,
+        saved: Option<&RunConfig>,
+        console: &Console,
+    ) -> Result<Self, Failure> {
+        check_full(args)?;
         let entry = find(&args.policy)?;
         let parameters = parameters(args, entry)?;
         let knob = |error| Failure::input(format!("--knob: {error}"));
@@ -66,11 +78,20 @@ impl Survey {
         settings.check_backend(device.is_some()).map_err(knob)?;
         use_threads(args.threads);
         let scene = args.data.config(&args.scene);
-        let dataset = scene::load(&args.scene, &scene, console)?;
+        let with_tracks = saved.is_none() && args.sh_degree == Some(ShDegree::Auto);
+        let mut dataset = scene::load(&args.scene, &scene, with_tracks, console)?;
         console.say(scene::describe(&args.scene, &dataset));
         let usable = usable_points(&dataset.points);
         let images = images(&dataset);
         let (resident, peak) = (resident(), peak_resident());
+        let degree = Degree::decide(args, saved, &dataset)?;
+        dataset.tracks = Tracks::default();
+        let required = Required {
+            degree: degree.choice == DegreeChoice::Training,
+            rows: args.budget == Some(Budget::Auto)
+                || saved.is_some_and(|saved| saved.train.budget_auto),
+        };
+        let most_rows = saved.map(|saved| saved.train.budget);
         Ok(Self {
             entry,
             parameters,
@@ -78,6 +99,9 @@ impl Survey {
             device,
             scene,
             dataset,
+            degree,
+            required,
+            most_rows,
             images,
             usable,
             resident,
@@ -88,11 +112,11 @@ impl Survey {
     /// The same with images of another size; `None` where there are none of it.
     pub(super) fn at_resolution(&self, args: &TrainArgs, resolution: u32) -> Option<Self> {
         let scene = SceneConfig { resolution: Some(resolution), ..self.scene.clone() };
-        let dataset = scene::read(&args.scene, &scene).ok()?;
+        let dataset = scene::read(&args.scene, &scene, false).ok()?;
         let parameters = self.parameters.clone();
         let (settings, device) = (self.settings.clone(), self.device.clone());
-        let images = images(&dataset);
-        Some(Self { dataset, images, scene, parameters, settings, device, ..*self })
+        let (degree, images) = (self.degree.clone(), images(&dataset));
+        Some(Self { dataset, images, scene, parameters, settings, device, degree, ..*self })
     }
 
     /// How the first rows are placed, unless a checkpoint says.
@@ -140,7 +164,16 @@ impl Survey {
     pub(super) fn needs(&self, args: &TrainArgs, rows: usize) -> Result<Needs, Failure> {
         let scene = self.info(args, rows, self.initial_rows(args, rows))?;
         let policy = self.entry.build(&self.parameters, &scene)?;
-        Ok(needs(policy.as_ref(), &scene, args.sh_every))
+        Ok(self.backend_needs(needs(policy.as_ref(), &scene, args.sh_every)))
+    }
+
+    /// The needs of a policy, and what the trainer needs beside them.
+    pub(super) fn backend_needs(&self, needs: Needs) -> Needs {
+        let signals = match self.required.rows {
+            true => growth_signals().iter().fold(needs.signals, SignalSet::with),
+            false => needs.signals,
+        };
+        Needs { signals, ..needs }
     }
 
     /// How the native backend is made.
@@ -221,14 +254,19 @@ impl Survey {
         let first = self.initial_rows(args, setting.rows) as u64;
         let points = args.init_points.unwrap_or(self.dataset.points.len()) as u64;
         pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
+        if self.degree.bytes > 0 {
+            let image = train.held(0) + train.decoding(1);
+            pass("colours of tracks", Tracks::most_bytes() + self.degree.bytes + image);
+        }
         pass("a policy's event", self.event_bytes(setting, needs));
         // The model as downloaded and as exported.
         pass("export of the model, checkpoint", 2 * budget * row);
-        if !self.dataset.test.is_empty() {
+        let measures_test = !self.dataset.test.is_empty();
+        if measures_test || self.required != Required::default() {
             let (width, height) = scene::largest_image(&self.dataset);
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
-            let image = test.held(0) + test.decoding(1);
-            pass("measuring a test view", rendering + image + scratch_bytes(width, threads));
+            let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
+            pass("measuring a view", rendering + image + scratch_bytes(width, threads));
         }
         let process = self.process_bytes();
         if let Some(beyond) = self.peak.and_then(|peak| peak.checked_sub(process)) {

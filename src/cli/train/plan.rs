@@ -17,7 +17,10 @@ pub(in crate::cli) fn run(args: &TrainArgs, console: &Console) -> Result<(), Fai
              to plan a new one",
         ));
     }
-    let survey = Survey::of(args, console)?;
+    let survey = Survey::of(args, None, console)?;
+    if let Some(line) = survey.degree.line() {
+        console.result(line);
+    }
     let size = Size::choose(args, &survey)?;
     for line in size.lines(args, &survey) {
         console.result(line);

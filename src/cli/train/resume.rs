@@ -182,6 +182,9 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Result<Vec<OsString>, Failu
             words.push("--eval".into());
         }
     }
+    if train.full && !is_given(given, "full") {
+        words.push("--full".into());
+    }
     // Settings that are given come after these and win.
     let rates = Table::try_from(train.learning_rates).unwrap_or_default();
     words.extend(rates.iter().map(|(name, rate)| format!("--lr={name}={rate}").into()));

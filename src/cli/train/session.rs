@@ -19,8 +19,8 @@ use crate::cli::progress::Progress;
 use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::memory::Bytes;
 use crate::output::{
-    CHECKPOINTS, Mean, OutputError, RunFolder, Summary, cameras_json, model_path, saved_iterations,
-    write_atomically, write_json, write_scores,
+    CHECKPOINTS, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json, model_path,
+    saved_iterations, write_atomically, write_json, write_scores,
 };
 use crate::ply::write_splats;
 use crate::trainer::{StepReport, TrainError};
@@ -281,11 +281,14 @@ impl<'a> Session<'a> {
     /// Measures the views held out, if there are any.
     fn test(&mut self, step: u32, is_last: bool) -> Result<(), Failure> {
         let Prepared { trainer, test, config, .. } = &mut self.run;
+        let degree = match trainer.earned() {
+            Some(_) => trainer.sh_degree(step),
+            None => config.train.sh_degree,
+        };
         if test.count() == 0 {
             return Ok(());
         }
         let background = config.scene.background.fixed();
-        let degree = config.train.sh_degree;
         let interrupts = self.interrupts;
         let scores = evaluate(trainer.backend(), test, background, degree, |_| {
             interrupts.received().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
@@ -338,7 +341,18 @@ impl<'a> Session<'a> {
             test_views: test.count(),
             test: self.tally.tested.clone(),
         };
+        write_json(&self.folder.join("stats/requirements.json"), &self.requirements())?;
         write_json(&self.folder.join("stats/summary.json"), &summary)
+    }
+
+    /// What was left out.
+    fn requirements(&self) -> Requirements {
+        let Prepared { config, trainer, .. } = &self.run;
+        let degree = match trainer.earned() {
+            Some(earned) => earned.degree,
+            None => config.train.sh_degree,
+        };
+        Requirements::of(config, degree, trainer.rows(), trainer.earned(), trainer.growth())
     }
 
     /// What came of it, in a few lines.
@@ -366,6 +380,9 @@ impl<'a> Session<'a> {
             format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
         });
         self.console.say(format_args!("time     {}{cpu}", duration(self.tally.wall)));
+        for line in self.requirements().lines() {
+            self.console.say(line);
+        }
         self.console.say(format_args!("model    {}", model_path(path, steps).display()));
         self.console.say(format_args!("numbers  {}", path.join("stats").display()));
     }

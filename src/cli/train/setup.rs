@@ -68,7 +68,8 @@ pub(super) fn prepare(
     let output = output(args);
     RunFolder::check(&output, args.overwrite || args.resume)?;
 
-    let survey = Survey::of(args, console)?;
+    let saved = checkpoint.as_ref().map(|checkpoint| checkpoint.header().config.clone());
+    let survey = Survey::of(args, saved.as_ref(), console)?;
     if !args.test_iterations.is_empty() && survey.dataset.test.is_empty() {
         return Err(Failure::input(
             "--test-iterations: no view is held out to measure; add --eval or --test-every K",
@@ -108,11 +109,18 @@ pub(super) fn prepare(
         densify: env!("CARGO_PKG_VERSION").to_owned(),
         train: TrainConfig {
             budget: setting.rows,
+            budget_auto: survey.required.rows,
             memory: args.memory,
             iterations: args.iterations,
             extended_to: (last > args.iterations).then_some(last),
             seed: args.seed,
             sh_degree: setting.sh_degree,
+            sh_degree_from: survey.degree.choice,
+            sh_degree_lowered: match &saved {
+                Some(saved) => saved.train.sh_degree_lowered,
+                None => size.is_lowered(&survey),
+            },
+            full: args.full,
             near: args.near,
             tile_cap: match &size.solved {
                 Some(_) => Some(setting.tile_cap),
@@ -136,7 +144,7 @@ pub(super) fn prepare(
         resume::check(&config, checkpoint)?;
         check_dataset(checkpoint, &fingerprint)?;
     }
-    for line in size.lines(args, &survey) {
+    for line in survey.degree.line().into_iter().chain(size.lines(args, &survey)) {
         console.say(line);
     }
     announce(args, entry, &config, &output, console);
@@ -152,12 +160,12 @@ pub(super) fn prepare(
         )),
     }
 
-    let needs = needs(policy.as_ref(), &scene, args.sh_every);
+    let needs = survey.backend_needs(needs(policy.as_ref(), &scene, args.sh_every));
     let ledger = survey.ledger(args, &setting, &needs, size::threads(args));
     size::check(args, &survey, &ledger)?;
     console.say(format_args!("memory promised\n{ledger}"));
     let backend = backend(args, &survey, &setting, needs, model)?;
-    let Survey { mut dataset, .. } = survey;
+    let Survey { mut dataset, required, .. } = survey;
     let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, 1);
     dataset.points = crate::dataset::PointCloud::default();
@@ -172,7 +180,8 @@ pub(super) fn prepare(
         on_nan: args.on_nan.into(),
         savings: config.knobs.savings(),
     };
-    let mut trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
+    let trainer = Trainer::new(views, backend, (entry.name, policy), scene, options)?;
+    let mut trainer = trainer.requiring(required);
     let kept = checkpoint.map(|checkpoint| go_on(checkpoint, &mut trainer, last, console));
     let kept = kept.transpose()?;
     Ok(Prepared { config, output, trainer, test, dataset, ledger, fingerprint, last, kept })

@@ -1,11 +1,13 @@
 //! How large a run is: as the options say, or solved for `--memory`.
 
+use std::str::FromStr;
+
 use super::demand::Survey;
 use super::setup::DECODERS;
-use super::{DEFAULT_BUDGET, DEFAULT_SH_DEGREE, TrainArgs};
+use super::{DEFAULT_BUDGET, TrainArgs};
 use crate::backend::gpu::GpuBackend;
 use crate::cli::failure::{DEVICE, Failure};
-use crate::cli::number::grouped;
+use crate::cli::number::{self, grouped};
 use crate::cli::scene::DEFAULT_IMAGE_CACHE;
 use crate::memory::{
     Bytes, Fit, Grant, Ledger, PAIRS, Setting, Wishes, fit, grant, least_memory, resident,
@@ -22,6 +24,36 @@ const MIB: u64 = 1 << 20;
 /// Divisors of the images' sides that are alternatives.
 pub(super) const RESOLUTIONS: [u32; 3] = [1, 2, 4];
 
+/// What is given with `--budget`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Budget {
+    /// At most so many rows.
+    Rows(usize),
+    /// As many as pay.
+    Auto,
+}
+
+impl FromStr for Budget {
+    type Err = String;
+
+    fn from_str(word: &str) -> Result<Self, String> {
+        match word {
+            "auto" => Ok(Self::Auto),
+            _ => number::rows(word).map(Self::Rows).map_err(|error| format!("{error}, or auto")),
+        }
+    }
+}
+
+impl TrainArgs {
+    /// Most rows, where a number is given.
+    fn rows(&self) -> Option<usize> {
+        match self.budget {
+            Some(Budget::Rows(rows)) => Some(rows),
+            Some(Budget::Auto) | None => None,
+        }
+    }
+}
+
 /// The size of a run.
 pub(super) struct Size {
     pub(super) setting: Setting,
@@ -32,13 +64,13 @@ pub(super) struct Size {
 impl Size {
     /// As the options say, which name rows.
     pub(super) fn as_given(args: &TrainArgs, survey: &Survey) -> Result<Self, Failure> {
-        let rows = args.budget.unwrap_or(DEFAULT_BUDGET);
+        let rows = args.rows().unwrap_or(survey.most_rows.unwrap_or(DEFAULT_BUDGET));
         let most = most_pairs(args, survey, rows)?;
         let per_row = survey.settings.pairs_per_row().unwrap_or(PAIRS_PER_ROW);
         let pairs = rows.saturating_mul(per_row).min(most);
         let setting = Setting {
             rows,
-            sh_degree: args.sh_degree.unwrap_or(DEFAULT_SH_DEGREE),
+            sh_degree: survey.degree.highest(),
             tile_cap: args.tile_cap.unwrap_or(pairs).max(rows),
             image_cache: args.data.image_cache.unwrap_or(DEFAULT_IMAGE_CACHE),
         };
@@ -69,6 +101,11 @@ impl Size {
         }
     }
 
+    /// Whether memory has made the degree lower than was wanted.
+    pub(super) fn is_lowered(&self, survey: &Survey) -> bool {
+        self.setting.sh_degree < survey.degree.highest()
+    }
+
     /// What there is to say about it, a line each.
     pub(super) fn lines(&self, args: &TrainArgs, survey: &Survey) -> Vec<String> {
         let Setting { rows, sh_degree, tile_cap, image_cache } = self.setting;
@@ -76,12 +113,13 @@ impl Size {
         let Some((memory, fit)) = &self.solved else {
             let default = match args.budget {
                 None => " (default; choose with --budget or --memory)",
-                Some(_) => "",
+                Some(Budget::Auto) => " at most (auto: as many as pay)",
+                Some(Budget::Rows(_)) => "",
             };
             return vec![format!("budget   {said} rows{default}")];
         };
         let memory = Bytes(*memory);
-        let mut lines = vec![match args.budget {
+        let mut lines = vec![match args.rows() {
             Some(budget) if fit.by_memory => format!(
                 "budget   {said} rows: --memory {memory} holds fewer than --budget {}",
                 grouped(budget)
@@ -106,8 +144,8 @@ impl Size {
                 ),
             }
         ));
-        let wanted = args.sh_degree.unwrap_or(DEFAULT_SH_DEGREE);
-        if sh_degree < wanted {
+        let wanted = survey.degree.highest();
+        if self.is_lowered(survey) {
             let start = survey.start(args).unwrap_or(LEAST_ROWS);
             lines.push(format!(
                 "note: degree {sh_degree} instead of {wanted}, at which only {} rows fit and the scene \
@@ -182,16 +220,13 @@ pub(super) fn threads(args: &TrainArgs) -> usize {
 }
 
 fn wishes(args: &TrainArgs, survey: &Survey, memory: u64) -> Result<Wishes, Failure> {
-    let degrees = match args.sh_degree {
-        Some(degree) => degree..=degree,
-        None => 0..=DEFAULT_SH_DEGREE,
-    };
+    let degrees = survey.degree.range.clone();
     let possible = most_rows(survey, *degrees.end());
     Ok(Wishes {
         memory,
         least_rows: LEAST_ROWS,
         enough_rows: survey.start(args).unwrap_or(LEAST_ROWS),
-        most_rows: args.budget.map_or(possible, |budget| budget.min(possible)),
+        most_rows: args.rows().map_or(possible, |budget| budget.min(possible)),
         sh_degree: degrees,
         tile_cap: args.tile_cap,
         pairs: survey.settings.pairs_per_row().map_or(PAIRS, |pairs| [pairs; 3]),

@@ -11,6 +11,7 @@ use glam::DVec3;
 
 use super::super::error::DatasetError;
 use super::super::paths::MAX_NAME;
+use super::super::tracks::{Gathered, MOST_VIEWS};
 use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
@@ -165,14 +166,17 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
         let name = reader.name(&field)?;
         let observations = reader.u64(&field)?;
         reader.skip(&field, observations, 24)?;
-        images.push(Image::checked(path, name, camera, q, t)?);
+        images.push(Image::checked(path, id, name, camera, q, t)?);
     }
     reader.end("images", count)?;
     Ok(images)
 }
 
-/// Reads points3D.bin; the tracks in it are skipped.
-pub(super) fn points(path: &Path) -> Result<PointCloud, DatasetError> {
+/// Reads points3D.bin, with the tracks in it where they are wanted.
+pub(super) fn points(
+    path: &Path,
+    mut tracks: Option<&mut Gathered>,
+) -> Result<PointCloud, DatasetError> {
     let mut reader = Reader::open(path)?;
     // id, position, colour, error, length of the track.
     let count = reader.count("number of points", 8 + 24 + 3 + 8 + 8, MAX_POINTS)?;
@@ -183,9 +187,28 @@ pub(super) fn points(path: &Path) -> Result<PointCloud, DatasetError> {
         let position = reader.f64s::<3>(field)?;
         let colour = reader.bytes::<3>(field)?;
         reader.skip(field, 1, 8)?;
-        let track = reader.u64(field)?;
-        reader.skip(field, track, 8)?;
-        points.positions.push(DVec3::from(position));
+        let position = DVec3::from(position);
+        let views = reader.u64(field)?;
+        match tracks.as_deref_mut() {
+            Some(tracks) if tracks.wants(views) => {
+                // Each with its place among the image's observations.
+                let (kept, rest) = (views.min(MOST_VIEWS), views.saturating_sub(MOST_VIEWS));
+                let mut ids = Vec::new();
+                for _ in 0..kept {
+                    ids.push(reader.u32(field)?);
+                    reader.skip(field, 1, 4)?;
+                }
+                reader.skip(field, rest, 8)?;
+                tracks.take(position, colour, ids);
+            }
+            tracks => {
+                reader.skip(field, views, 8)?;
+                if let Some(tracks) = tracks {
+                    tracks.pass(views);
+                }
+            }
+        }
+        points.positions.push(position);
         points.colours.push(colour);
     }
     reader.end("points", count)?;

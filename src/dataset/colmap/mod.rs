@@ -15,6 +15,7 @@ use super::error::DatasetError;
 use super::folders::Folders;
 use super::paths::{Named, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
+use super::tracks::{Gathered, Tracks};
 use super::undistort::Lens;
 use super::{Frame, PointCloud, Scene};
 
@@ -23,10 +24,13 @@ const REMEDY: &str = "export the model again with COLMAP";
 /// Most records accepted.
 const MAX_IMAGES: u64 = 1_000_000;
 const MAX_POINTS: u64 = 1 << 28;
+/// Difference up to which two poses are one, written by two programs.
+const SAME_POSE: f64 = 1e-5;
 
 /// One registered image.
 #[derive(Debug)]
 struct Image {
+    id: u32,
     name: String,
     camera: u32,
     rotation: DMat3,
@@ -36,6 +40,7 @@ struct Image {
 impl Image {
     fn checked(
         file: &Path,
+        id: u32,
         name: String,
         camera: u32,
         q: [f64; 4],
@@ -44,7 +49,7 @@ impl Image {
         let frame = format!("image {name}");
         let rotation = checked_quaternion(file, &frame, q)?;
         let (rotation, translation) = checked_pose(file, &frame, rotation, t.into())?;
-        Ok(Self { name, camera, rotation, translation })
+        Ok(Self { id, name, camera, rotation, translation })
     }
 }
 
@@ -54,6 +59,7 @@ struct Model {
     cameras: HashMap<u32, Lens>,
     images: Vec<Image>,
     points: PointCloud,
+    tracks: Tracks,
 }
 
 /// The folder of the model, if there is one: `sparse/0`, else `sparse`.
@@ -66,29 +72,16 @@ pub(super) fn find(root: &Path) -> Option<PathBuf> {
 }
 
 /// Reads the model in `folder`.
-pub(super) fn read(root: &Root, folder: &Path, folders: &Folders) -> Result<Scene, DatasetError> {
-    let binary = ["cameras.bin", "images.bin"].iter().any(|name| folder.join(name).is_file());
-    let ending = if binary { "bin" } else { "txt" };
-    let file = |name: &str| folder.join(format!("{name}.{ending}"));
-    let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
-    // Links out of the dataset are refused for the model's files too.
-    for path in [&cameras, &images, &points] {
-        let inside = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy();
-        root.existing(Named { file: path, field: "the file", value: &inside })?;
-    }
-    let model = if binary {
-        Model {
-            cameras: bin::cameras(&cameras)?,
-            images: bin::images(&images)?,
-            points: bin::points(&points)?,
-        }
-    } else {
-        Model {
-            cameras: txt::cameras(&cameras)?,
-            images: txt::images(&images)?,
-            points: txt::points(&points)?,
-        }
-    };
+///
+/// # Errors
+/// When a file is missing, damaged, or contradicts another.
+pub(super) fn read(
+    root: &Root,
+    folder: &Path,
+    folders: &Folders,
+    with_tracks: bool,
+) -> Result<Scene, DatasetError> {
+    let ([cameras, images, points], model) = model(root, folder, with_tracks)?;
     let mut frames = Vec::with_capacity(model.images.len());
     let mut reduced_missing = 0;
     for image in model.images {
@@ -103,6 +96,7 @@ pub(super) fn read(root: &Root, folder: &Path, folders: &Folders) -> Result<Scen
         let mask = folders.mask(named)?;
         frames.push(Frame {
             name: relative(&image.name),
+            id: Some(image.id),
             origin: format!("{}: {field}", images.display()),
             image: found.path,
             reduced: found.reduced,
@@ -122,9 +116,68 @@ pub(super) fn read(root: &Root, folder: &Path, folders: &Folders) -> Result<Scen
         frames,
         points: model.points,
         points_file: Some(points),
+        tracks: model.tracks,
         own_split: false,
         notes,
     })
+}
+
+/// The model's three files and what they hold.
+fn model(
+    root: &Root,
+    folder: &Path,
+    with_tracks: bool,
+) -> Result<([PathBuf; 3], Model), DatasetError> {
+    let binary = ["cameras.bin", "images.bin"].iter().any(|name| folder.join(name).is_file());
+    let ending = if binary { "bin" } else { "txt" };
+    let file = |name: &str| folder.join(format!("{name}.{ending}"));
+    let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
+    // Links out of the dataset are refused for the model's files too.
+    for path in [&cameras, &images, &points] {
+        let inside = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy();
+        root.existing(Named { file: path, field: "the file", value: &inside })?;
+    }
+    let mut gathered = with_tracks.then(Gathered::new);
+    let tracks = gathered.as_mut();
+    let (lenses, posed, cloud) = if binary {
+        (bin::cameras(&cameras)?, bin::images(&images)?, bin::points(&points, tracks)?)
+    } else {
+        (txt::cameras(&cameras)?, txt::images(&images)?, txt::points(&points, tracks)?)
+    };
+    let tracks = gathered.map(Gathered::finish).unwrap_or_default();
+    Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
+}
+
+/// Gives a scene of another format the tracks of the model in `folder`, where that is of the same
+/// images with the same poses, as `densify scenegen` writes both. Where not, there are no tracks,
+/// which is no error: nobody said that the two belong together.
+pub(super) fn adopt_tracks(root: &Root, folder: &Path, scene: &mut Scene) {
+    let Ok((_, model)) = model(root, folder, true) else { return };
+    let by_name: HashMap<String, &Image> =
+        model.images.iter().map(|image| (relative(&image.name), image)).collect();
+    let mut matched = false;
+    for frame in &mut scene.frames {
+        let path = frame.image.strip_prefix(root.path()).unwrap_or(&frame.image);
+        let path = relative(&path.to_string_lossy());
+        let inside = path.match_indices('/').map(|(at, _)| &path[at + 1..]);
+        let Some(image) = std::iter::once(&*path).chain(inside).find_map(|name| by_name.get(name))
+        else {
+            continue;
+        };
+        let centre = |rotation: DMat3, t: DVec3| -(rotation.transpose() * t);
+        let here = centre(frame.rotation, frame.translation);
+        let there = centre(image.rotation, image.translation);
+        let moved = here.distance(there) > SAME_POSE * (1.0 + there.length());
+        let turned = frame.rotation.abs_diff_eq(image.rotation, SAME_POSE);
+        if moved || !turned {
+            return;
+        }
+        frame.id = Some(image.id);
+        matched = true;
+    }
+    if matched {
+        scene.tracks = model.tracks;
+    }
 }
 
 /// A camera's size, if an image can have it.

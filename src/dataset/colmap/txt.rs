@@ -10,6 +10,7 @@ use glam::DVec3;
 
 use super::super::error::DatasetError;
 use super::super::paths::MAX_NAME;
+use super::super::tracks::Gathered;
 use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
@@ -141,7 +142,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
         if name.is_empty() || name.len() > MAX_NAME {
             return Err(lines.fault(&field, "the name is missing or longer than 4 KiB"));
         }
-        images.push(Image::checked(path, name.to_owned(), camera, q, t)?);
+        images.push(Image::checked(path, id, name.to_owned(), camera, q, t)?);
         if images.len() as u64 > MAX_IMAGES {
             return Err(lines.fault("images", "there are more than a million"));
         }
@@ -169,8 +170,11 @@ fn after_words(text: &str, count: usize) -> &str {
     rest
 }
 
-/// Reads points3D.txt.
-pub(super) fn points(path: &Path) -> Result<PointCloud, DatasetError> {
+/// Reads points3D.txt, with the tracks in it where they are wanted.
+pub(super) fn points(
+    path: &Path,
+    mut tracks: Option<&mut Gathered>,
+) -> Result<PointCloud, DatasetError> {
     let mut lines = Lines::open(path)?;
     let mut points = PointCloud::default();
     while lines.advance_to_record()? {
@@ -181,7 +185,25 @@ pub(super) fn points(path: &Path) -> Result<PointCloud, DatasetError> {
         for channel in &mut colour {
             *channel = lines.number(&mut words, "colour")?;
         }
-        points.positions.push(DVec3::from(position));
+        let position = DVec3::from(position);
+        if let Some(tracks) = tracks.as_deref_mut() {
+            // The error, then pairs of an image and a place among its observations.
+            let _ = words.next();
+            let views = words.clone().count() as u64 / 2;
+            if tracks.wants(views) {
+                let mut ids = Vec::new();
+                while let (Some(id), Some(_)) = (words.next(), words.next()) {
+                    ids.push(
+                        id.parse()
+                            .map_err(|_| lines.fault("track", format!("{id:?} is no image id")))?,
+                    );
+                }
+                tracks.take(position, colour, ids);
+            } else {
+                tracks.pass(views);
+            }
+        }
+        points.positions.push(position);
         points.colours.push(colour);
         if points.positions.len() as u64 > MAX_POINTS {
             return Err(lines.fault("points", "there are more than 2^28"));

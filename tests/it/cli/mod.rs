@@ -7,6 +7,7 @@ mod killing;
 mod knobs;
 mod looking;
 mod memory;
+mod requiring;
 mod resuming;
 mod same;
 mod trading;

@@ -1,0 +1,163 @@
+//! Tracks: which views a reconstruction has found a point in. They are read only where something
+//! asks for them, and thinned as they are read: a statistic over points needs some thousands, and a
+//! reconstruction may have millions.
+
+use glam::DVec3;
+
+use super::normalise::Normalisation;
+
+/// Most tracks kept; fewer than half of it only where there are fewer.
+const MOST: usize = 1 << 15;
+/// Most views kept of one track.
+pub(super) const MOST_VIEWS: u64 = 64;
+/// A track in fewer views says nothing about how a colour changes with the view.
+pub const LEAST_VIEWS: usize = 4;
+
+/// Points with the views that they were found in, in structure of arrays.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tracks {
+    /// Positions. Shape: `[tracks]`.
+    pub positions: Vec<DVec3>,
+    /// sRGB colours, as the reconstruction has them. Shape: `[tracks]`.
+    pub colours: Vec<[u8; 3]>,
+    /// Numbers of training views, ascending, each once, at least [`LEAST_VIEWS`]. Shape: `[tracks]`,
+    /// then views.
+    pub views: Vec<Vec<u32>>,
+}
+
+impl Tracks {
+    /// Number of tracks.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Whether there is no track.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    /// Most bytes that tracks take, however many a reconstruction has.
+    #[must_use]
+    pub const fn most_bytes() -> u64 {
+        let track =
+            size_of::<DVec3>() + 3 + size_of::<Vec<u32>>() + MOST_VIEWS as usize * size_of::<u32>();
+        (2 * MOST * track) as u64
+    }
+
+    /// The tracks as training sees them: `view_of` turns what a file calls a view into the number of
+    /// a training view, if it is one.
+    pub(super) fn of_training(
+        self,
+        normalisation: &Normalisation,
+        view_of: impl Fn(u32) -> Option<u32>,
+    ) -> Self {
+        let mut kept = Self::default();
+        let points = self.positions.into_iter().zip(self.colours);
+        for ((position, colour), views) in points.zip(self.views) {
+            let position = normalisation.point(position);
+            let mut views: Vec<u32> = views.into_iter().filter_map(&view_of).collect();
+            views.sort_unstable();
+            views.dedup();
+            if position.as_vec3().is_finite() && views.len() >= LEAST_VIEWS {
+                kept.positions.push(position);
+                kept.colours.push(colour);
+                kept.views.push(views);
+            }
+        }
+        kept
+    }
+}
+
+/// Gathers tracks as a file is read; of too many, every second, fourth, … in their order.
+#[derive(Debug)]
+pub(super) struct Gathered {
+    tracks: Tracks,
+    /// One of so many is kept.
+    stride: usize,
+    seen: usize,
+}
+
+impl Gathered {
+    pub(super) fn new() -> Self {
+        Self { tracks: Tracks::default(), stride: 1, seen: 0 }
+    }
+
+    /// Whether the next track of so many views would be kept; those that are too short do not count.
+    pub(super) fn wants(&self, views: u64) -> bool {
+        views >= LEAST_VIEWS as u64 && self.seen.is_multiple_of(self.stride)
+    }
+
+    /// Takes the next track. `views` are what the file calls them; of very many the first are kept.
+    pub(super) fn take(
+        &mut self,
+        position: DVec3,
+        colour: [u8; 3],
+        views: impl IntoIterator<Item = u32>,
+    ) {
+        self.tracks.positions.push(position);
+        self.tracks.colours.push(colour);
+        self.tracks.views.push(views.into_iter().take(MOST_VIEWS as usize).collect());
+        self.seen += 1;
+        if self.tracks.len() >= 2 * MOST {
+            self.stride *= 2;
+            keep_every_second(&mut self.tracks.positions);
+            keep_every_second(&mut self.tracks.colours);
+            keep_every_second(&mut self.tracks.views);
+        }
+    }
+
+    /// Passes a track over that [was not wanted](Self::wants).
+    pub(super) fn pass(&mut self, views: u64) {
+        self.seen += usize::from(views >= LEAST_VIEWS as u64);
+    }
+
+    pub(super) fn finish(self) -> Tracks {
+        self.tracks
+    }
+}
+
+fn keep_every_second<T>(values: &mut Vec<T>) {
+    let mut place = 0;
+    values.retain(|_| {
+        place += 1;
+        place % 2 == 1
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_tracks_are_thinned_evenly_and_short_ones_left_out() {
+        let mut gathered = Gathered::new();
+        for i in 0..5 * MOST {
+            let views = if i % 2 == 0 { 5 } else { 3 };
+            if gathered.wants(views) {
+                gathered.take(DVec3::splat(i as f64), [0; 3], 0..views as u32);
+            } else {
+                gathered.pass(views);
+            }
+        }
+        let tracks = gathered.finish();
+        assert!((MOST..2 * MOST).contains(&tracks.len()), "{}", tracks.len());
+        let gaps: Vec<f64> =
+            tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
+        assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);
+        assert!(tracks.views.iter().all(|views| views.len() == 5));
+    }
+
+    #[test]
+    fn only_training_views_count() {
+        let tracks = Tracks {
+            positions: vec![DVec3::ZERO, DVec3::ONE, DVec3::NAN],
+            colours: vec![[1; 3], [2; 3], [3; 3]],
+            views: vec![vec![9, 7, 5, 3, 3], vec![9, 7, 5, 4], vec![1, 3, 5, 7]],
+        };
+        let odd = |id: u32| (id % 2 == 1).then_some(id / 2);
+        let kept = tracks.of_training(&Normalisation::IDENTITY, odd);
+        assert_eq!(kept.views, [vec![1, 2, 3, 4]], "the second has three training views");
+    }
+}

@@ -1,0 +1,123 @@
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
+
+use super::*;
+use crate::camera::Camera;
+use crate::dataset::builtin::PREFIX;
+use crate::dataset::images::{ImageHeader, ImageSource};
+use crate::dataset::{Dataset, LoadOptions};
+
+const SIZE: u32 = 60;
+const VIEWS: usize = 8;
+
+/// Views of a wall of 20 x 20 coloured squares, 3 px wide each, from one place; `shade` is what a view
+/// makes of a square's colour.
+fn scene(shade: impl Fn(usize, usize, f32) -> f32) -> (Tracks, Vec<View>) {
+    let squares = (SIZE / 3) as usize;
+    let colour =
+        |square: usize| [square * 37, square * 59, square * 83].map(|v| (40 + v % 120) as f32);
+    let mut tracks = Tracks::default();
+    // Not those at the border, where a pixel's neighbours end.
+    for square in (0..squares * squares).filter(|s| s / squares > 0 && s / squares < squares - 1) {
+        let (x, y) = (3 * (square % squares) + 1, 3 * (square / squares) + 1);
+        tracks.positions.push(DVec3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0));
+        tracks.colours.push(colour(square).map(|v| v as u8));
+        tracks.views.push((0..VIEWS as u32).collect());
+    }
+    let views = (0..VIEWS).map(|view| {
+        let pixels = (0..SIZE * SIZE).map(|p| (p % SIZE / 3 + p / SIZE / 3 * (SIZE / 3)) as usize);
+        let rgb = pixels.flat_map(|s| colour(s).map(|v| shade(view, s, v).clamp(0.0, 255.0) as u8));
+        posed(Image8 { width: SIZE, height: SIZE, rgb: rgb.collect(), alpha: None, mask: None })
+    });
+    (tracks, views.collect())
+}
+
+fn posed(image: Image8) -> View {
+    let (width, height) = (image.width, image.height);
+    let camera = Camera {
+        width,
+        height,
+        fx: 1.0,
+        fy: 1.0,
+        cx: 0.0,
+        cy: 0.0,
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::ZERO,
+    };
+    let header = ImageHeader {
+        width,
+        height,
+        has_alpha: false,
+        decoded_bytes: image.bytes(),
+        file_bytes: 0,
+    };
+    let (path, rendered) = (PathBuf::from("made"), Some(Arc::new(image)));
+    let source =
+        ImageSource { path, mask: None, width, height, undistortion: None, header, rendered };
+    View { name: "made".into(), camera, source }
+}
+
+#[test]
+fn colours_that_stay_ask_for_degree_0_whatever_the_exposure() {
+    for exposures in [[1.0; VIEWS], [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05]] {
+        let (tracks, views) = scene(|view, _, value| value * exposures[view]);
+        let found = measure(&tracks, &views).unwrap();
+        assert_eq!(found.tracks, tracks.len());
+        assert!(found.twentieth < 0.75, "rounding to whole steps: {found:?}");
+    }
+}
+
+#[test]
+fn colours_that_change_with_the_view_ask_for_more() {
+    for (strength, degree) in [(0.0, 0), (2.0, 1), (5.0, 2), (30.0, 3)] {
+        // A tenth of the squares shine in half of the views.
+        let shade = |view: usize, square: usize, value: f32| match square % 10 {
+            0 if view % 2 == 0 => value + strength,
+            _ => value,
+        };
+        let (tracks, views) = scene(shade);
+        let found = Spread { tracks: LEAST_TRACKS, ..measure(&tracks, &views).unwrap() };
+        assert_eq!(found.degree(), Some(degree), "{strength}: {found:?}");
+    }
+}
+
+#[test]
+fn what_stands_before_a_point_in_a_quarter_of_its_views_is_left_out() {
+    let hidden = |share: usize| {
+        let (tracks, views) =
+            scene(|view, _, value| if view < share { 255.0 - value } else { value });
+        measure(&tracks, &views).unwrap().twentieth
+    };
+    assert!(hidden(2) < 0.75, "{}", hidden(2));
+    assert!(hidden(4) > 4.0, "{}", hidden(4));
+}
+
+#[test]
+fn points_that_are_not_on_a_surface_decide_nothing() {
+    let (mut tracks, views) = scene(|_, _, value| value);
+    let on = measure(&tracks, &views).unwrap();
+    assert!(on.on_surface > 0.99, "{on:?}");
+    for colour in tracks.colours.iter_mut().step_by(3) {
+        *colour = colour.map(|value| 255 - value);
+    }
+    let some = Spread { tracks: LEAST_TRACKS, ..measure(&tracks, &views).unwrap() };
+    assert!(some.degree().is_some(), "{some:?}");
+    let none = Spread { on_surface: 0.49, ..some };
+    assert_eq!(none.degree(), None);
+    assert_eq!(Spread { tracks: LEAST_TRACKS - 1, ..some }.degree(), None);
+    assert_eq!(measure(&Tracks::default(), &views).unwrap().degree(), None);
+}
+
+#[test]
+fn built_in_scenes_ask_for_what_their_materials_need() {
+    for (name, degrees) in [("spheres", 0..=0), ("room", 0..=0), ("glossy", 2..=3)] {
+        let options = LoadOptions { tracks: true, ..LoadOptions::default() };
+        let path = format!("{PREFIX}{name}");
+        let loaded = Dataset::load(Path::new(&path), &options).unwrap();
+        let found = measure(&loaded.tracks, &loaded.train).unwrap();
+        let degree = found.degree();
+        assert!(degree.is_some_and(|degree| degrees.contains(&degree)), "{name}: {found:?}");
+    }
+}

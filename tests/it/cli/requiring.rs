@@ -1,0 +1,131 @@
+//! What a run leaves out by itself: degrees of colour and rows, and the report of it.
+
+use std::path::Path;
+
+use densify_policies::registry::find;
+use serde_json::Value;
+
+use super::{densify, files, json, model, often, scratch, text};
+use crate::photographs::Photographs;
+
+const ITERATIONS: u32 = 400;
+
+/// Trains a scene that is to be found out about. `flags` are words separated by spaces.
+fn train(scene: &Path, run: &Path, flags: &str) -> super::Outcome {
+    let iterations = ITERATIONS.to_string();
+    let mut words = vec!["train", text(scene), "-o", text(run), "--iterations", &iterations];
+    words.extend(["--backend", "cpu"]);
+    words.extend(flags.split_whitespace());
+    densify(&words)
+}
+
+fn report(run: &Path) -> Value {
+    json(&run.join("stats/requirements.json"))
+}
+
+fn list<'a>(value: &'a Value, path: &str) -> &'a [Value] {
+    value.pointer(path).and_then(Value::as_array).map_or(&[], Vec::as_slice)
+}
+
+#[test]
+fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
+    let scene = Photographs::colmap_text();
+    let policy = find("mcmc").expect("it is registered");
+    let flags = format!(
+        "--sh-degree auto --budget auto --policy mcmc {} --init random --init-points 1k",
+        often(policy)
+    );
+    let (root, whole) = scratch();
+    let outcome =
+        train(scene.path(), &whole, &format!("{flags} --threads 1 --checkpoint-every 250")).ok();
+    assert!(outcome.stdout.contains("left out"), "{}", outcome.stdout);
+    let found = report(&whole);
+    // Too few tracks: degrees are on trial, and the last one tried is in use only if it was kept.
+    assert_eq!(found["sh_degree_from"], "training");
+    let trials = list(&found, "/degrees/trials");
+    let last = trials.last().expect("a trial");
+    let (tried, used) = (last["degree"].as_u64(), found["sh_degree"].as_u64());
+    assert_eq!(used == tried, last["kept"] == true, "{found}");
+    assert!(trials.iter().all(|trial| trial["gain"].is_f64()), "{found}");
+    let rungs = list(&found, "/rows/rungs");
+    assert!(rungs.len() >= 2 && !list(&found, "/rows/shrinks").is_empty(), "{found}");
+    let rows = |rung: &Value| rung["rows"].as_u64().expect("rows");
+    let mut limit = 1_000_f64;
+    for rung in rungs {
+        assert!(rows(rung) as f64 <= limit.round(), "{found}");
+        limit = limit.round() * std::f64::consts::SQRT_2;
+    }
+
+    let threads = root.path().join("threads");
+    train(scene.path(), &threads, &format!("{flags} --threads 2")).ok();
+    let part = root.path().join("part");
+    for (name, bytes) in files(&whole) {
+        // As a process leaves it that is killed before its end.
+        if !name.contains("iteration_400") {
+            let path = part.join(name);
+            std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+            std::fs::write(path, bytes).expect("a copy");
+        }
+    }
+    let again = densify(&["train", text(scene.path()), "-o", text(&part), "--resume"]).ok();
+    assert!(again.stdout.contains("from step 250"), "{}", again.stdout);
+    for run in [threads, part] {
+        assert!(model(&run, ITERATIONS) == model(&whole, ITERATIONS), "{}", run.display());
+        assert_eq!(report(&run), found, "{}", run.display());
+    }
+}
+
+#[test]
+fn the_degree_of_a_built_in_scene_is_that_of_its_files() {
+    let (root, folder) = scratch();
+    densify(&["scenegen", "--preset", "spheres", "-o", text(&folder)]).ok();
+    let line = |scene: &str| {
+        let words = ["plan", scene, "--backend", "cpu", "--sh-degree", "auto", "--budget", "2k"];
+        let outcome = densify(&words).ok();
+        let line = outcome.stdout.lines().find(|line| line.starts_with("colour "));
+        line.unwrap_or_else(|| panic!("{}", outcome.stdout)).to_owned()
+    };
+    let here = line("scene:spheres");
+    assert!(here.starts_with("colour   degree 0 (auto)"), "{here}");
+    assert_eq!(line(text(&folder)), here, "transforms beside a model with tracks");
+    // COLMAP's files alone say the same.
+    for file in ["transforms_train.json", "transforms_test.json"] {
+        std::fs::remove_file(folder.join(file)).expect("it is there");
+    }
+    assert!(line(text(&folder)).starts_with("colour   degree 0 (auto)"));
+    drop(root);
+}
+
+#[test]
+fn nothing_is_left_out_unasked() {
+    let scene = Photographs::colmap_text();
+    for (flags, said) in [("", "left out nothing\n"), ("--full", "left out nothing (--full)\n")] {
+        let (_root, run) = scratch();
+        let words = ["train", text(scene.path()), "-o", text(&run), "--iterations", "5"];
+        let words: Vec<&str> = words.into_iter().chain(flags.split_whitespace()).collect();
+        let outcome = densify(&words).ok();
+        assert!(outcome.stdout.contains(said), "{}", outcome.stdout);
+        assert_eq!(report(&run)["left_out"], serde_json::json!([]));
+        assert_eq!(report(&run)["sh_degree"], 3);
+    }
+}
+
+#[test]
+fn contradictions_name_both_sides() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    for (flags, words) in [
+        ("--full --sh-degree auto", ["--full", "--sh-degree auto"]),
+        ("--full --budget auto", ["--full", "--budget auto"]),
+        ("--sh-degree 4", ["--sh-degree", "auto"]),
+        ("--budget none", ["--budget", "auto"]),
+    ] {
+        train(scene.path(), &run, flags).refused(flags, &words);
+        assert!(!run.exists(), "{flags}");
+    }
+    train(scene.path(), &run, "--sh-degree 1 --budget 500").ok();
+    let again = train(scene.path(), &run, "--resume --sh-degree auto");
+    again.refused("--resume", &["--resume", "--sh-degree auto", "degree 1"]);
+    let again = train(scene.path(), &run, "--resume --full");
+    again.refused("--resume", &["--resume", "--full"]);
+}
