@@ -74,8 +74,12 @@ fn settings_hold_every_knob_of_their_own_and_what_follows_from_it() {
     let settings = Settings::default();
     assert_eq!(settings.shortcuts(), crate::backend::Shortcuts::default());
     assert_eq!(settings.savings(), crate::trainer::Savings::NONE);
-    let effect =
-        |settings: &Settings| format!("{:?}{:?}", settings.shortcuts(), settings.savings());
+    assert_eq!(settings.storage(), crate::backend::Storage::default());
+    assert_eq!(settings.pairs_per_row(), None);
+    let effect = |settings: &Settings| {
+        let (shortcuts, savings) = (settings.shortcuts(), settings.savings());
+        format!("{shortcuts:?}{savings:?}{:?}{:?}", settings.storage(), settings.pairs_per_row())
+    };
     assert_eq!(settings.changed().count(), 0);
     let own: Vec<_> = KNOBS.iter().filter(|knob| knob.how == How::Knob).collect();
     assert_eq!(settings.iter().count(), own.len());

@@ -106,11 +106,11 @@ fn bands_change_nothing() {
 fn room_for_records_changes_nothing() {
     let camera = scenes::camera(140, 120, 32);
     let model = scenes::cloud(150, 1, &camera, 42);
-    let whole = Resources::default();
+    let whole = Resources { tile_cap: Some(1 << 20), ..Resources::default() };
     let (image, trained) = (run(&model, &camera, whole), train(&model, &camera, whole));
     assert!(trained.1[0].entries > 1_500 && trained.1[0].bands == 1, "{:?}", trained.1[0]);
-    for (tile_cap, record_cap) in [(None, 1_500), (None, 100), (None, 7), (Some(500), 100)] {
-        let some = Resources { tile_cap, record_cap: Some(record_cap), ..whole };
+    for (tile_cap, record_cap) in [(1 << 20, 1_500), (1 << 20, 100), (1 << 20, 7), (500, 100)] {
+        let some = Resources { tile_cap: Some(tile_cap), record_cap: Some(record_cap), ..whole };
         assert!(bits(&run(&model, &camera, some)) == bits(&image), "{some:?}");
         assert!(train(&model, &camera, some).0 == trained.0, "{some:?}, training");
     }

@@ -11,7 +11,8 @@ const ITERATIONS: u32 = 24;
 
 /// Knobs that are none of `train`'s options, each not as it is by default.
 const CHANGED: &str = "--knob alpha_min=1/64 --knob transmittance_stop=1e-3 --knob exp_degree=4 \
-                       --knob ssim_every=5 --knob coarse_until=0.8 --knob sparse_adam=on";
+                       --knob ssim_every=5 --knob coarse_until=0.8 --knob sparse_adam=on \
+                       --knob param_storage=f16 --knob moment_storage=ratio8 --knob pairs_per_row=2";
 
 fn short(scene: &Path, output: &Path, flags: &str) -> Outcome {
     train(scene, output, ITERATIONS, &format!("--budget 250 --test-every 3 {flags}"))
@@ -33,7 +34,7 @@ fn every_knob_and_preset_is_listed() {
 fn what_cannot_be_is_refused_before_anything_is_written() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    let cases: [(&str, &[&str]); 14] = [
+    let cases: [(&str, &[&str]); 16] = [
         ("--knob alpha_min=0.5", &["alpha_min", "0.5", "1/32"]),
         ("--knob alpha_mim=1/64", &["alpha_mim", "alpha_min", "densify knobs"]),
         ("--knob alpha_min", &["--knob", "NAME=VALUE"]),
@@ -48,6 +49,11 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
             &["--knob refine_every=9", "--policy-set diet.grow_every=7"],
         ),
         ("--policy vanilla --knob score_views=5", &["score_views=5", "vanilla", "views"]),
+        ("--knob moment_storage=f16", &["moment_storage", "f32|bf16|ratio8", "bf16"]),
+        (
+            "--tile-cap 300 --knob pairs_per_row=1",
+            &["--tile-cap 300", "pairs_per_row=1", "contradict"],
+        ),
         ("--preset quick", &["quick", "nearest", "fast"]),
         (
             "--preset exact --knob alpha_min=1/64",
