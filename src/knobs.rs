@@ -235,7 +235,7 @@ fn plain(value: f64) -> String {
 }
 
 /// The number among the words nearest to a number, else the word most like a word.
-fn nearest_word(text: &str, words: &[&'static str]) -> &'static str {
+fn nearest_word(text: &str, words: &'static [&'static str]) -> &'static str {
     let distance = |word: &str| match (number(text), number(word)) {
         (Some(a), Some(b)) => (a - b).abs(),
         _ => 1.0 - strsim::jaro_winkler(text, word),

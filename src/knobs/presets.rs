@@ -91,11 +91,7 @@ pub static PRESETS: &[Preset] = &[
 pub fn preset(name: &str) -> Result<&'static Preset, KnobError> {
     PRESETS.iter().find(|preset| preset.name == name).ok_or_else(|| {
         let names: Vec<&str> = PRESETS.iter().map(|preset| preset.name).collect();
-        let nearest = super::nearest_word(name, &names);
-        KnobError(format!(
-            "no preset is called `{name}`; the nearest is {nearest}, of {}",
-            names.join(", ")
-        ))
+        KnobError(format!("no preset is called `{name}`; there are {}", names.join(", ")))
     })
 }
 

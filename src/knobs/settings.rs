@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::{How, KNOBS, Knob, KnobError, number, parse};
+use super::{How, KNOBS, Knob, KnobError, find, number, parse};
 use crate::backend::{Exp2, MomentStorage, ParameterStorage, Shortcuts, Stepped, Storage};
 use crate::trainer::Savings;
 
@@ -22,17 +22,19 @@ impl Default for Settings {
 
 impl Settings {
     /// The defaults, with these `NAME=VALUE`. Knobs that are options or parameters by another name are
-    /// checked and left out: these take effect where options and parameters do.
+    /// left out: these take effect, and are checked, where options and parameters are.
     ///
     /// # Errors
     /// When a knob or its value is none.
     pub fn of(settings: &[String]) -> Result<Self, KnobError> {
         let mut all = Self::default();
         for setting in settings {
-            let (knob, value) = parse(setting)?;
-            if knob.how == How::Knob {
-                all.0.insert(knob.name.to_owned(), value);
+            let name = setting.split('=').next().unwrap_or_default().trim();
+            if find(name).is_ok_and(|knob| knob.how != How::Knob) {
+                continue;
             }
+            let (knob, value) = parse(setting)?;
+            all.0.insert(knob.name.to_owned(), value);
         }
         Ok(all)
     }

@@ -173,7 +173,7 @@ pub static KNOBS: &[Knob] = &[
         class: Heuristic,
         on: On::Both,
         how: Flag("--sh-degree"),
-        what: "how colour depends on the direction of view; 12, 27, 48 or 59 numbers less per row",
+        what: "how colour depends on the direction of view; 14, 23, 38 or 59 numbers per row",
         levels: Values(&["0", "1", "2"]),
     },
     Knob {

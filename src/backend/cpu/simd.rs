@@ -2,7 +2,8 @@
 //!
 //! `pulp` dispatches at run time (AVX-512, AVX2, NEON, baseline). Its methods take the token first
 //! and read poorly in formulas; [`V`] carries the token along and overloads the operators. All is
-//! inlined into the dispatched kernel, so the wrapper costs nothing.
+//! inlined into the dispatched kernel, so the wrapper costs nothing. One piece: a vector and its
+//! functions.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 

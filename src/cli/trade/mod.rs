@@ -148,9 +148,14 @@ impl Study<'_> {
         Ok(())
     }
 
+    /// What came of the runs. Where the same call was another cell's too, it was made once: the seed
+    /// decides everything.
     fn outcomes(&self, cells: &[Cell]) -> Vec<Outcome> {
         let of = |cell: &Cell| match self.records.of(&What::Run(cell.clone())) {
-            Some(Record::Run(outcome)) => Some(Outcome::clone(outcome)),
+            Some(Record::Run(outcome)) => {
+                let Cell { knob, level, .. } = cell.clone();
+                Some(Outcome { knob, level, ..Outcome::clone(outcome) })
+            }
             _ => None,
         };
         cells.iter().filter_map(of).collect()

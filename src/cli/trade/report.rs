@@ -30,10 +30,12 @@ pub(super) struct Effect {
     pub(super) psnr: Difference,
     pub(super) ssim: Difference,
     pub(super) flip: Difference,
-    /// Logarithms of ratios, as the next three.
+    /// Logarithms of ratios, as the next four.
     pub(super) depth: Option<Difference>,
     pub(super) chamfer: Option<Difference>,
     pub(super) seconds: Difference,
+    /// Of processor time, which other programs disturb less.
+    pub(super) cpu: Option<Difference>,
     pub(super) peak: Difference,
     /// Runs whose model is that of the default to the bit.
     pub(super) same: usize,
@@ -66,6 +68,7 @@ const FLIP: Measure = |r| Some(r.flip);
 const DEPTH: Measure = |r| positive(r.geometry.as_ref()?.depth.abs_rel).map(f64::ln);
 const CHAMFER: Measure = |r| positive(r.geometry.as_ref()?.centres.chamfer).map(f64::ln);
 pub(super) const SECONDS: Measure = |r| positive(r.seconds).map(f64::ln);
+const CPU: Measure = |r| positive(r.cpu_seconds?).map(f64::ln);
 /// Where the system does not say, what was promised.
 const PEAK: Measure = |r| positive(r.peak_bytes.unwrap_or(r.ledger_bytes) as f64).map(f64::ln);
 
@@ -144,6 +147,7 @@ impl Report {
             depth,
             chamfer: of(CHAMFER),
             seconds: of(SECONDS)?,
+            cpu: of(CPU),
             peak: of(PEAK)?,
             same,
             numerical,

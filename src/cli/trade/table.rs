@@ -76,8 +76,8 @@ fn outcomes(report: &Report) -> String {
         "\n## Outcome of training\n\nItalics: dominated, another level is nowhere worse and somewhere \
          better in PSNR, time and memory. Free: the interval of PSNR lies above −0.05 dB, that of SSIM \
          above −0.001, that of depth error below 1.02, and numerical PSNR is at least 60 dB.\n\n\
-         | knob | level | class | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | peak × | images [dB] | same bits | verdict |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         | knob | level | class | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | processor time × | peak × | images [dB] | same bits | verdict |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for effect in &report.effects {
         let cells = row(effect);
@@ -120,6 +120,7 @@ fn row(effect: &Effect) -> Vec<String> {
         maybe(&effect.depth),
         maybe(&effect.chamfer),
         ratio(&effect.seconds),
+        maybe(&effect.cpu),
         ratio(&effect.peak),
         shown(effect.numerical, 1),
         format!("{} of {}", effect.same, effect.psnr.pairs),

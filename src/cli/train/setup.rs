@@ -148,16 +148,11 @@ pub(super) fn prepare(
         console.say(line);
     }
     announce(args, entry, &config, &output, console);
-    match &args.preset {
-        Some(name) => {
-            console.say(format_args!("preset   {}", knobs::preset(name).map_err(Failure::input)?))
-        }
-        // One that goes on has the knobs that it began with.
-        None if checkpoint.is_some() => {}
-        None => console.say(format_args!(
-            "preset   {}",
-            knobs::preset(DEFAULT_PRESET).map_err(Failure::input)?
-        )),
+    // A run that goes on has the knobs that it began with.
+    let default = checkpoint.is_none().then_some(DEFAULT_PRESET);
+    if let Some(name) = args.preset.as_deref().or(default) {
+        let preset = knobs::preset(name).map_err(Failure::input)?;
+        console.say(format_args!("preset   {preset}"));
     }
 
     let needs = survey.backend_needs(needs(policy.as_ref(), &scene, args.sh_every));

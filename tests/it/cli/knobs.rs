@@ -54,7 +54,7 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
             "--tile-cap 300 --knob pairs_per_row=1",
             &["--tile-cap 300", "pairs_per_row=1", "contradict"],
         ),
-        ("--preset quick", &["quick", "nearest", "fast"]),
+        ("--preset quick", &["quick", "exact, balanced, fast"]),
         (
             "--preset exact --knob alpha_min=1/64",
             &["--preset exact", "alpha_min=1/255", "alpha_min=1/64"],
@@ -83,7 +83,7 @@ fn a_setting_by_either_name_is_the_same_setting() {
     short(scene.path(), &by_flag, flags).ok();
     // The same twice, and in another spelling, is no contradiction.
     let knobs = "--knob sh_every=2 --sh-every 2 --knob tile_cap=3e2 --knob refine_every=5 \
-                 --knob sh_degree=1 --knob budget=250";
+                 --knob sh_degree=1 --knob budget=0.25k --knob image_cache=1GiB";
     short(scene.path(), &by_knob, knobs).ok();
     let config = |run: &Path| String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
     assert_eq!(config(&by_flag), config(&by_knob));
@@ -123,7 +123,7 @@ fn every_level_does_what_its_class_says() {
             assert_eq!(config.contains(&line), knob.how == How::Knob, "{what}: {config}");
         }
     }
-    assert!(changed >= 14, "only {changed} levels change anything");
+    assert!(changed >= 12, "only {changed} levels change anything");
 }
 
 #[test]

@@ -57,6 +57,7 @@ fn every_level_is_measured_once_and_in_the_table() {
     for words in ["--sh-degree 0", "2 of 2", "bounded", "(default)", "pareto-", "rasterize"] {
         assert!(table.contains(words), "{words} is not in {table}");
     }
+    assert_eq!(said.contains("stand out; together"), table.contains("## Knobs together"));
     let picture = table.split("](").nth(1).and_then(|rest| rest.split(')').next());
     let picture = read(&output.join(picture.expect("a plot")));
     assert!(picture.starts_with(b"<svg"));
