@@ -88,8 +88,8 @@ fn scene() -> (Gaussians, Camera, Image8) {
     (model, camera, target)
 }
 
-/// The loss falls as it does with f32. It would not if steps were rounded to the nearest: most are
-/// shorter than half the distance of two numbers that can be stored, and nothing would move.
+/// The loss falls as it does with f32. That small steps are not lost, as they would be by rounding to
+/// the nearest, is held number by number in `cpu/narrow/tests.rs`.
 #[test]
 fn training_is_as_good() {
     let (model, camera, target) = scene();

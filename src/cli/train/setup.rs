@@ -142,7 +142,7 @@ pub(super) fn prepare(
     announce(args, entry, &config, &output, console);
     match &args.preset {
         Some(name) => {
-            console.say(format_args!("preset   {}", knobs::preset(name).map_err(Failure::input)?))
+            console.say(format_args!("preset   {}", knobs::preset(name).map_err(Failure::input)?));
         }
         // One that goes on has the knobs that it began with.
         None if checkpoint.is_some() => {}
