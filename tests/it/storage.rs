@@ -101,7 +101,6 @@ fn training_is_as_good() {
     assert!(reference < 0.2 * first, "{first} -> {reference}");
     let found: Vec<_> =
         storages().into_iter().map(|storage| (storage, loss(storage, 400))).collect();
-    println!("{first} {reference} {found:?}");
     let bad: Vec<_> = found.iter().filter(|(_, loss)| *loss > 1.1 * reference).collect();
     assert!(bad.is_empty(), "f32: {first} -> {reference}, but {bad:?}");
 }
@@ -207,7 +206,6 @@ fn a_row_takes_less_than_480_bytes() {
             bytes_per_row(policy, Storage::default(), [16.0, 16.0]),
             bytes_per_row(policy, small, [1.0, 0.4]),
         );
-        println!("{policy}: {today:.1} bytes per row, and {least:.1}");
         assert!(least <= 480.0 && today > 1_500.0, "{policy}: {today}, {least}");
     }
 }
