@@ -94,7 +94,7 @@ proptest! {
             let more = wishes.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
             prop_assert!(model.bytes(&more) > memory);
         } else {
-            let more = wishes.setting(setting.rows, setting.sh_degree, PAIRS[2]);
+            let more = wishes.setting(setting.rows, setting.sh_degree, pairs[2]);
             prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
             let images = Setting { image_cache: model.all_images, ..setting };
             prop_assert!(

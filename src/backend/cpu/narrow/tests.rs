@@ -1,5 +1,7 @@
 //! Every number that can be stored, the neighbours of those that cannot, and the draws.
 
+#![expect(clippy::float_cmp, reason = "what can be stored comes back to the last bit")]
+
 use super::*;
 
 /// All draws that f16 tells apart.
@@ -208,6 +210,54 @@ fn the_first_moment_is_bounded_by_the_second() {
     // The worst of the roundings of the second, too.
     let worst = most / (1.0 - 2_f64.powi(-8)).sqrt();
     assert!(most > 7.2 && worst < f64::from(RATIO_MAX), "{most}, {worst}");
+}
+
+/// What is stored after each of many small steps, on average over rows.
+fn after_steps(
+    start: f32,
+    step: impl Fn(f32) -> f32,
+    store: impl Fn(&mut [f32], &mut Draws),
+) -> f32 {
+    const BLOCKS: usize = 16;
+    let mut sum = 0.0;
+    for block in 0..BLOCKS {
+        let mut plane = [start; WIDTH];
+        for at in 1..=2000 {
+            let [mut draws, ..] = Draws::of_block(&PolicyRng::new(5, at), block * WIDTH);
+            plane = plane.map(&step);
+            store(&mut plane, &mut draws);
+        }
+        sum += plane.iter().sum::<f32>();
+    }
+    sum / (BLOCKS * WIDTH) as f32
+}
+
+fn stored<T: Narrow>(plane: &mut [f32], draws: &mut Draws) {
+    let mut kept = [T::default(); WIDTH];
+    narrow(plane, &mut kept, draws);
+    widen(&kept, plane);
+}
+
+/// Steps far shorter than the distance of two neighbours go as far as in f32. Rounded to the nearest,
+/// none would change anything.
+#[test]
+fn small_steps_are_not_lost() {
+    // A twentieth of the distance of f16 below 1; of fixed point; and a second moment at rest.
+    let half = after_steps(1.0, |x| x - 2.5e-5, stored::<F16>);
+    assert!((half - 0.95).abs() < 2e-3, "{half}");
+    let fixed = after_steps(
+        -5.0,
+        |x| x - 2.5e-5,
+        |plane, draws| {
+            let (mut kept, (plane, _)) = ([0; WIDTH], plane.as_chunks_mut::<WIDTH>());
+            narrow_fixed(&plane[0], &mut kept, 11, draws);
+            widen_fixed(&kept, &mut plane[0], 11);
+        },
+    );
+    assert!((fixed + 5.05).abs() < 2e-3, "{fixed}");
+    let second = after_steps(1.0, |x| 0.999 * x, stored::<Bf16>);
+    let expected = 0.999_f32.powi(2000);
+    assert!((second / expected - 1.0).abs() < 0.05, "{second} instead of {expected}");
 }
 
 /// Draws of a row, of a plane after another, of a step after another, and for the three arrays, are
