@@ -100,3 +100,23 @@ fn settings_hold_every_knob_of_their_own_and_what_follows_from_it() {
     let elsewhere = Settings::of(&["sh_degree=1".into(), "budget=9".into()]).unwrap();
     assert_eq!(elsewhere, settings);
 }
+
+#[test]
+fn presets_are_made_of_knobs() {
+    let names: Vec<&str> = PRESETS.iter().map(|preset| preset.name).collect();
+    let knob = find("preset").unwrap();
+    assert!(knob.domain == Domain::Choice(&["exact", "balanced", "fast", "tiny-memory"]));
+    assert_eq!(names, ["exact", "balanced", "fast", "tiny-memory"]);
+    assert_eq!(knob.default, DEFAULT_PRESET);
+    for preset in PRESETS {
+        for (name, value) in preset.levels {
+            let knob = find(name).unwrap();
+            assert_eq!(knob.canonical(value).as_deref(), Ok(*value), "{}: {name}", preset.name);
+        }
+        // It says what it costs; the one that is the measure has nothing to say.
+        let said = preset.to_string();
+        assert_eq!(preset.measured.is_none(), preset.name == "exact", "{said}");
+        assert_eq!(said.contains(" dB ["), preset.measured.is_some(), "{said}");
+    }
+    assert!(preset("quick").unwrap_err().to_string().contains("exact, balanced, fast"));
+}

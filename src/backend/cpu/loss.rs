@@ -154,7 +154,7 @@ impl LossBuffers {
                     arch.dispatch(Lines { source, first: i * STRIP, stride, e, y });
                 });
             if l1_alone {
-                let scale = (1.0 - SSIM_WEIGHT) / samples as f32;
+                let scale = (1.0 - SSIM_WEIGHT) * (1.0 / samples as f32);
                 let parts: Vec<f64> = gradient
                     .par_chunks_mut(grid.columns * STRIP / TILE)
                     .zip(e.par_chunks_mut(strip))
