@@ -58,7 +58,7 @@ pub struct Growth {
     /// Attempts to do with fewer rows.
     pub shrinks: Vec<Shrink>,
     /// Rungs in a row that did not pay.
-    idle: u32,
+    pub idle: u32,
 }
 
 /// The end of a rung.
