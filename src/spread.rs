@@ -30,7 +30,7 @@ use crate::dataset::{DatasetError, LEAST_VIEWS, Tracks, View};
 pub const LEAST_TRACKS: usize = 500;
 /// The difference that a twentieth of the tracks exceeds, from which on degree 1, 2 and 3 are asked
 /// for `[1/255]`. `docs/requirements.md` has the scenes that they were chosen on.
-pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 4.0];
+pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
 /// Difference between a point's own colour and what its views show, up to which it lies on a surface
 /// `[1/255]`.
 const OWN: f64 = 4.0;

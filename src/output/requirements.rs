@@ -118,14 +118,17 @@ fn degree_left_out(config: &RunConfig, degree: u8, earned: Option<&Earned>) -> O
 }
 
 fn rows_left_out(growth: &Growth, rows: usize, budget: usize) -> Option<LeftOut> {
-    let [mean, low] = growth.rungs.iter().rev().find_map(|rung| rung.gain)?;
-    growth.stopped.filter(|_| rows < budget).map(|step| LeftOut {
+    let [mean, low] = growth.rungs.last()?.gain;
+    let idle = growth.rungs.iter().rev().take(2).all(|rung| rung.gain[1] < PAYS);
+    growth.stopped.filter(|_| rows < budget && idle).map(|step| LeftOut {
         what: format!("rows beyond {}", growth.rungs.last().map_or(rows, |rung| rung.rows)),
         evidence: format!(
-            "growth ended at step {step}, as a doubling of rows had to bring {PAYS:.2} dB and was not \
-             shown to, twice in a row"
+            "growth ended at step {step}, as the least tenth of the rows was not shown to bring \
+             {PAYS:.2} dB per doubling, twice in a row"
         ),
-        loss: format!("the last one brought {mean:.2} dB (95 %: {low:.2} dB or more) on training views"),
+        loss: format!(
+            "it brought {mean:.2} dB per doubling (95 %: {low:.2} dB or more) on training views"
+        ),
     })
 }
 
@@ -192,12 +195,19 @@ mod tests {
         assert!(text.contains("degree 3 of") && text.contains("not measured"), "{text}");
         config.train.sh_degree = 3;
         let rung = |rows, gain| Rung { step: 300, rows, psnr: 30.0, gain };
-        let mut growth = Growth::default();
-        growth.limit = 900;
-        growth.stopped = Some(300);
-        growth.rungs = vec![rung(700, None), rung(1000, Some([0.04, -0.125]))];
-        growth.shrinks =
-            vec![Shrink { step: 400, before: 1000, after: 900, change: -0.015, kept: true }];
+        let growth = Growth {
+            limit: 900,
+            stopped: Some(300),
+            rungs: vec![rung(700, [0.06, 0.03]), rung(1000, [0.04, -0.125])],
+            shrinks: vec![Shrink {
+                step: 400,
+                before: 1000,
+                after: 900,
+                change: -0.015,
+                kept: true,
+            }],
+            ..Growth::default()
+        };
         let text = line(&config, 3, None, Some(&growth));
         for words in
             ["rows beyond 1000", "step 300", "0.04 dB", "-0.12 dB", "100 rows", "-0.015 dB"]
