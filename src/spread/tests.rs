@@ -74,7 +74,7 @@ fn colours_that_change_with_the_view_ask_for_more() {
     for (strength, degree) in [(0.0, 0), (2.0, 1), (5.0, 2), (30.0, 3)] {
         // A tenth of the squares shine in half of the views.
         let shade = |view: usize, square: usize, value: f32| match square % 10 {
-            0 if view % 2 == 0 => value + strength,
+            0 if view.is_multiple_of(2) => value + strength,
             _ => value,
         };
         let (tracks, views) = scene(shade);
