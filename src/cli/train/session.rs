@@ -93,13 +93,15 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
             let (scene, kept) = (session.run.config.scene.path.clone(), session.checkpoint);
             drop(session);
             let path = folder.abandon();
-            let (scene, path) = (scene.display(), path.display());
             let kept = kept.map_or_else(String::new, |step| {
                 format!(
-                    ", with a checkpoint of step {step}; go on with: densify train {scene} \
-                     -o {path} --resume"
+                    ", with the checkpoint {}; go on with: densify train {} -o {} --resume",
+                    checkpoint_path(&path, step).display(),
+                    scene.display(),
+                    path.display(),
                 )
             });
+            let path = path.display();
             Err(failure.and(&format!("what was written until then is in {path}{kept}")))
         }
     }

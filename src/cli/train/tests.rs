@@ -222,7 +222,7 @@ fn a_device_that_is_lost_leaves_what_the_run_goes_on_from() {
                 None => before += 1,
                 Some(step) => {
                     after += 1;
-                    let words = format!("with a checkpoint of step {step}; go on with: ");
+                    let words = format!("iteration_{step}.safetensors; go on with: ");
                     assert!(message.contains(&words), "{what}");
                     case.train("--resume").unwrap_or_else(|e| panic!("{what}: {}", e.message));
                     assert!(case.model() == expected, "{what}");

@@ -34,6 +34,7 @@ fn check_tree(run: &Path) {
         &ply,
         "results.json",
         "stats/events.jsonl",
+        "stats/requirements.json",
         "stats/summary.json",
         "stats/train.jsonl",
     ];
