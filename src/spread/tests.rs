@@ -1,3 +1,5 @@
+//! Colours of tracks in made-up views: what makes them disagree, and what must not.
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

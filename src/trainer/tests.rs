@@ -19,6 +19,8 @@ use crate::dataset::images::{Image8, SharedImage};
 use crate::memory::Ledger;
 use crate::schedule::{Background, RateOptions};
 use crate::views::ViewError;
+use densify_policies::policy::Snapshot;
+use densify_policies::rng::PolicyRng;
 
 /// Everything that was asked of the fakes, in order.
 type Diary = Arc<Mutex<Vec<String>>>;

@@ -1,3 +1,5 @@
+//! Growth on made-up measurements: where it stops, and what a shrink test removes.
+
 use super::*;
 
 const LENGTH: u32 = 100;
