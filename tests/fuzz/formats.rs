@@ -218,7 +218,8 @@ fn dataset(files: &[(&str, &[u8])]) -> bool {
     let images = ["images/0.png", "images/1.png"].map(|name| (name, PHOTOGRAPH));
     let all: Vec<_> = images.into_iter().chain(files.iter().copied()).collect();
     within(&all, |folder| {
-        let Ok(dataset) = Dataset::load(folder, &LoadOptions::default()) else {
+        let options = LoadOptions { tracks: true, ..LoadOptions::default() };
+        let Ok(dataset) = Dataset::load(folder, &options) else {
             return false;
         };
         assert!(!dataset.train.is_empty());
