@@ -11,7 +11,7 @@ use super::contender::Contender;
 use super::{POINTS, run_folder};
 use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
-use crate::cli::study::{Call, Entry, Summary, has_geometry};
+use crate::cli::study::{Call, Entry, Summary, has_geometry, in_run, last_arguments};
 use crate::metrics::geometry::Geometry;
 use crate::output::{Mean, geometry_of};
 
@@ -102,11 +102,7 @@ impl Cell {
         set("--seed", self.seed.to_string());
         set("--iterations", self.iterations.to_string());
         set("--test-iterations", tests.join(","));
-        arguments.push("--quiet".to_owned());
-        if !self.train.iter().any(|flag| flag == "--eval" || flag.starts_with("--test-every")) {
-            arguments.push("--eval".to_owned());
-        }
-        arguments.extend(self.train.iter().cloned());
+        arguments.extend(last_arguments(&self.train));
         arguments
     }
 
@@ -132,9 +128,7 @@ impl Cell {
             true => call.measure(),
             false => Ok(()),
         });
-        done.map_err(|failure| {
-            failure.and(&format!("this was the run {self}; the same command goes on from here"))
-        })?;
+        done.map_err(|failure| in_run(self, failure))?;
         self.record(&folder, run)
     }
 

@@ -2,6 +2,7 @@
 //! and nobody else's.
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -48,6 +49,19 @@ impl Call<'_> {
         call.args(shared_with_eval(self.options));
         wait_for(&mut call)
     }
+}
+
+/// How the call of a study's run ends: views are held out, and then come the options that the user
+/// gave.
+pub(in crate::cli) fn last_arguments(options: &[String]) -> Vec<String> {
+    let holds_out = |flag: &String| flag == "--eval" || flag.starts_with("--test-every");
+    let own = if options.iter().any(holds_out) { &["--quiet"][..] } else { &["--quiet", "--eval"] };
+    own.iter().map(|&flag| flag.to_owned()).chain(options.iter().cloned()).collect()
+}
+
+/// A failure within a run of a study.
+pub(in crate::cli) fn in_run(run: &impl Display, failure: Failure) -> Failure {
+    failure.and(&format!("this was the run {run}; the same command goes on from here"))
 }
 
 fn program() -> Result<PathBuf, Failure> {

@@ -7,7 +7,7 @@ mod journal;
 
 use std::path::PathBuf;
 
-pub(super) use call::{Call, Summary, has_geometry};
+pub(super) use call::{Call, Summary, has_geometry, in_run, last_arguments};
 pub(super) use difference::Difference;
 pub(super) use journal::{Entry, Records};
 

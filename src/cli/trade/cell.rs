@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::cli::failure::{Failure, OTHER};
-use crate::cli::study::{Call, Entry, Summary};
+use crate::cli::study::{Call, Entry, Summary, in_run, last_arguments};
 use crate::metrics::geometry::Geometry;
 use crate::output::{Mean, geometry_of, model_path, scores_of};
 
@@ -152,11 +152,7 @@ impl Cell {
         for setting in &self.settings {
             set("--knob", setting.clone());
         }
-        arguments.push("--quiet".to_owned());
-        if !self.train.iter().any(|flag| flag == "--eval" || flag.starts_with("--test-every")) {
-            arguments.push("--eval".to_owned());
-        }
-        arguments.extend(self.train.iter().cloned());
+        arguments.extend(last_arguments(&self.train));
         arguments
     }
 
@@ -186,9 +182,7 @@ impl Cell {
             options: &self.train,
             folder: &folder,
         };
-        call.train().and_then(|()| call.measure()).map_err(|failure| {
-            failure.and(&format!("this was the run {self}; the same command goes on from here"))
-        })?;
+        call.train().and_then(|()| call.measure()).map_err(|failure| in_run(self, failure))?;
         let summary = Summary::read(&folder)?;
         let iterations = summary.number("iterations")? as u32;
         let path = model_path(&folder, iterations);
