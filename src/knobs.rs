@@ -11,7 +11,7 @@ mod table;
 
 use std::fmt;
 
-pub use presets::{DEFAULT_PRESET, Measured, PRESETS, Preset, preset};
+pub use presets::{DEFAULT_PRESET, EXACT, Measured, PRESETS, Preset, preset};
 pub use settings::Settings;
 pub use table::KNOBS;
 

@@ -10,9 +10,8 @@
 //! with g >= `tau`, where g = g_p + `colour_weight` · g_c; g_p and g_c are the means, over the
 //! views that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
 //! colour; a view from which the row is nearer than `full_depth` counts in them by the square of
-//! the ratio (as in *Pixel-GS*, Zhang et al. 2024). Dead rows (less opaque than `min_opacity`;
-//! after step `max_scale_from` also larger than `max_scale` · scene extent) are pruned; they are no
-//! candidates. If there are more candidates than room, some are paid for by as many victims, in all
+//! the ratio (as in *Pixel-GS*, Zhang et al. 2024). Dead rows (less opaque than `min_opacity`) are
+//! pruned; they are no candidates. If there are more candidates than room, some are paid for by as many victims, in all
 //! growths together up to `rho` · budget, in each an equal part of it. Then the candidates grow,
 //! the largest g first: small ones (up to `small` · scene extent) are cloned, the others split in
 //! two (`split`). What is left over is counted as denied. The statistics start anew.
@@ -35,7 +34,8 @@
 //! Some defaults are not those of paper and code, by measurement in runs of 2,000 to 7,000 steps:
 //! `split` is `long-axis`; `full_depth` keeps out fog that explains single photographs; `rho` and
 //! `rho_c` are for the whole run, as who exchanges the model many times over learns photographs by
-//! heart. The repository's docs/comparison.md has the figures.
+//! heart; `max_scale` is 0, as paper and code prune what may be all that there is of a wall or the
+//! sky, and nothing takes its place. The repository's docs/comparison.md has the figures.
 //!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;
@@ -64,6 +64,8 @@
 //! - `clone_opacity = "conserve"`: parent and clone both get 1 − √(1 − o), and scales multiplied by
 //!   o / (2o′ − o′²/√2), so that together they are as opaque as the parent was (*3D Gaussian Splatting
 //!   as Markov Chain Monte Carlo*, Kheradmand et al. 2024, equation 9). Both start with zero moments.
+//! - `max_scale`: with 0.1, as in paper and code, rows that are larger count as dead after step
+//!   `max_scale_from`.
 //! - `importance`: the views in which the importance of a row is measured.
 //!   - `epochs`: the training renders of the previous and the current epoch, free of cost.
 //!   - `fresh`: `fresh_views` training views, drawn at random and rendered anew for each event at
@@ -109,7 +111,7 @@
 //! | kappa | 0.1 | >= 0 | standard deviations | longest shift of `descent` |
 //! | clone_opacity | "unchanged" | unchanged, conserve | | opacity of clones and their parents |
 //! | min_opacity | 0.005 | 0 to 1 | | opacity below which a row is dead |
-//! | max_scale | 0.1 | > 0 | scene extent | size beyond which a row is dead |
+//! | max_scale | 0.0 | >= 0 | scene extent | size beyond which a row is dead; 0: none |
 //! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
 //! | importance | "epochs" | epochs, fresh | | views in which the importance of a row is measured |
 //! | fresh_views | 100 | >= 1 | views | random views per event, for `fresh`; all if there are fewer |
@@ -370,7 +372,7 @@ impl Diet {
     fn dead(&self, now: &Snapshot<'_>) -> Result<Vec<u32>, PolicyError> {
         let opacity = now.signal(Signal::Opacity)?;
         let scale = now.signal(Signal::ScaleMax)?;
-        let by_size = now.step > self.params.max_scale_from;
+        let by_size = self.params.max_scale > 0.0 && now.step > self.params.max_scale_from;
         let max_scale = self.scene_units(self.params.max_scale, now.scene);
         let mortality = Mortality {
             min_opacity: self.params.min_opacity as f32,

@@ -38,13 +38,16 @@ pub struct Measured {
 /// Small runs, in which the spread from run to run is large: they stand until larger ones are made.
 const SMALL: &str = "scene:spheres and scene:room, 1,500 iterations, 15,000 rows";
 
+/// The preset that others are measured against.
+pub const EXACT: &str = "exact";
+
 /// The preset of a run that names none.
 pub const DEFAULT_PRESET: &str = "balanced";
 
 /// All presets.
 pub static PRESETS: &[Preset] = &[
     Preset {
-        name: "exact",
+        name: EXACT,
         what: "no shortcut that a knob can take",
         levels: &[
             ("alpha_min", "1/255"),

@@ -108,7 +108,7 @@ pub static KNOBS: &[Knob] = &[
         on: On::Both,
         how: Flag("--preset"),
         what: "knobs that go together, by what they promise; `densify knobs` lists them below",
-        levels: Values(&["exact", "fast", "tiny-memory"]),
+        levels: Values(&["balanced", "fast", "tiny-memory"]),
     },
     Knob {
         name: "ssim_every",

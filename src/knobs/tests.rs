@@ -108,14 +108,18 @@ fn presets_are_made_of_knobs() {
     assert!(knob.domain == Domain::Choice(&["exact", "balanced", "fast", "tiny-memory"]));
     assert_eq!(names, ["exact", "balanced", "fast", "tiny-memory"]);
     assert_eq!(knob.default, DEFAULT_PRESET);
+    let exact = preset(EXACT).unwrap().levels;
     for preset in PRESETS {
         for (name, value) in preset.levels {
             let knob = find(name).unwrap();
+            // Those that trade nothing for accuracy, or are the policy's, are no matter of `exact`.
+            let trades = knob.how == How::Knob && knob.class != Class::Exact;
+            assert!(!trades || exact.iter().any(|(own, _)| own == name), "{name}: not in exact");
             assert_eq!(knob.canonical(value).as_deref(), Ok(*value), "{}: {name}", preset.name);
         }
         // It says what it costs; the one that is the measure has nothing to say.
         let said = preset.to_string();
-        assert_eq!(preset.measured.is_none(), preset.name == "exact", "{said}");
+        assert_eq!(preset.measured.is_none(), preset.name == EXACT, "{said}");
         assert_eq!(said.contains(" dB ["), preset.measured.is_some(), "{said}");
     }
     assert!(preset("quick").unwrap_err().to_string().contains("exact, balanced, fast"));

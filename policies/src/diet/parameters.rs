@@ -141,7 +141,7 @@ impl Default for DietParams {
             kappa: 0.1,
             clone_opacity: CloneOpacity::Unchanged,
             min_opacity: 0.005,
-            max_scale: 0.1,
+            max_scale: 0.0,
             max_scale_from: 3000,
             importance: Importance::Epochs,
             fresh_views: 100,
@@ -178,7 +178,7 @@ impl DietParams {
         in_range("child_opacity", self.child_opacity, (Excluded(0.0), Included(1.0)))?;
         in_range("kappa", self.kappa, 0.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
-        in_range("max_scale", self.max_scale, (Excluded(0.0), Unbounded))?;
+        in_range("max_scale", self.max_scale, 0.0..)?;
         in_range("fresh_views", f64::from(self.fresh_views), 1.0..)?;
         // `Signal::Age` goes no further.
         in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;

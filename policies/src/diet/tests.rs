@@ -113,15 +113,20 @@ fn the_dead_and_the_room_come_first() {
 }
 
 #[test]
-fn huge_rows_die_after_step_3000_at_growth_only() {
+fn huge_rows_live_unless_a_size_is_named() {
     let event = event(3000, 4, 100)
         .with(Signal::ScaleMax, &[0.05, 1.01, 1.0, 1.01])
         .with(Signal::ScreenGradient, &[0.0, 0.0, 9.0, 8.0]);
-    let early = run(&event, "");
+    let late = Event { step: 3100, ..event.clone() };
+    let lives = run(&late, "");
+    assert_eq!((lives.pruned, lives.split), (vec![], vec![2, 3]));
+    // With one they die after step 3000, at growth only.
+    let named = "max_scale = 0.1";
+    let early = run(&event, named);
     assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
-    let late = run(&Event { step: 3100, ..event.clone() }, "");
+    let late = run(&late, named);
     assert_eq!((late.pruned, late.split), (vec![1, 3], vec![2]));
-    assert!(run(&Event { step: 3150, ..event }, "").ops.is_empty());
+    assert!(run(&Event { step: 3150, ..event }, named).ops.is_empty());
 }
 
 #[test]
@@ -430,7 +435,7 @@ fn ranges_are_checked_and_what_is_missing_is_said() {
         "split_factor = 0",
         "kappa = -0.1",
         "min_opacity = -1",
-        "max_scale = 0",
+        "max_scale = -0.1",
         "protect = 65536",
         "fresh_views = 0",
         "importance = \"views\"",

@@ -9,10 +9,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::cli::failure::{Failure, OTHER};
 use crate::cli::study::{Call, Entry, Summary, in_run, last_arguments};
+use crate::knobs::{EXACT, preset};
 use crate::metrics::geometry::Geometry;
 use crate::output::{Mean, geometry_of, model_path, scores_of};
 
-/// The knob of a run in which none is changed, and that of a run of the factorial.
+/// The knob of a run in which none is changed, which is one with the preset `exact`, and that of a run of the factorial.
 pub(super) const BASE: &str = "";
 pub(super) const FACTORIAL: &str = "factorial";
 
@@ -38,7 +39,7 @@ impl fmt::Display for Cell {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { label, knob, level, seed, .. } = self;
         let what = match &**knob {
-            BASE => "as it is by default".to_owned(),
+            BASE => "exact".to_owned(),
             FACTORIAL => format!("run {level} of the factorial"),
             knob => format!("{knob}={level}"),
         };
@@ -149,18 +150,26 @@ impl Cell {
             set("--iterations", self.iterations.to_string());
         }
         set("--seed", self.seed.to_string());
-        for setting in &self.settings {
+        for setting in self.exact().iter().chain(&self.settings) {
             set("--knob", setting.clone());
         }
         arguments.extend(last_arguments(&self.train));
         arguments
     }
 
+    /// The levels of `exact`, but for knobs that are changed. The preset itself would not let them be.
+    fn exact(&self) -> Vec<String> {
+        let is_set = |knob: &str| self.settings.iter().any(|s| s.split('=').next() == Some(knob));
+        let levels = preset(EXACT).map_or(&[][..], |exact| exact.levels);
+        let kept = levels.iter().filter(|(knob, _)| !is_set("preset") && !is_set(knob));
+        kept.map(|(knob, level)| format!("{knob}={level}")).collect()
+    }
+
     /// Name of the run's folder.
     pub(super) fn run(&self) -> String {
         let Self { label, knob, level, seed, .. } = self;
         let plain = |c: char| if c.is_ascii_alphanumeric() || "._".contains(c) { c } else { '-' };
-        let what = if knob.is_empty() { "default".to_owned() } else { format!("{knob}-{level}") };
+        let what = if knob.is_empty() { "exact".to_owned() } else { format!("{knob}-{level}") };
         let what: String = what.chars().map(plain).collect();
         format!("{label}-{what}-seed{seed}")
     }

@@ -12,7 +12,7 @@ use crate::knobs::{How, KNOBS, Knob, Levels, find};
 #[derive(Debug, Clone)]
 pub(super) struct Chosen {
     pub(super) knob: &'static Knob,
-    /// Its levels beside the default, as the table spells them.
+    /// Its levels beside that of `exact`, as the table spells them.
     pub(super) levels: Vec<String>,
 }
 
@@ -79,9 +79,7 @@ fn levels(knob: &Knob, args: &TradeArgs) -> Vec<String> {
         factors.iter().map(level).collect()
     };
     match knob.levels {
-        Levels::Values(values) => {
-            values.iter().filter(|v| !knob.is_default(v)).map(|v| (*v).to_owned()).collect()
-        }
+        Levels::Values(values) => values.iter().map(|v| (*v).to_owned()).collect(),
         Levels::TimesBudget(factors) => times(factors, args.budget as f64),
         Levels::TimesIterations(factors) => times(factors, f64::from(args.iterations)),
     }

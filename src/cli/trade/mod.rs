@@ -28,7 +28,7 @@ use report::Report;
 ///
 /// For every knob (`densify knobs`) and each of its levels: how far off the same model's images are,
 /// against a renderer in float64; and what training with it arrives at, on views held out, with time
-/// by stage and memory at its peak. One knob at a time around the default, with the same seeds; then
+/// by stage and memory at its peak. One knob at a time from the preset `exact`, with the same seeds; then
 /// those that stand out together, in a design of twelve runs.
 ///
 /// A run that is finished is not run again: call the same command to go on after an interruption. The

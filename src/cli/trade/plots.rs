@@ -18,7 +18,7 @@ const SCALE: [RGBColor; 3] = [RGBColor(68, 1, 84), RGBColor(33, 145, 140), RGBCo
 struct Point {
     name: String,
     seconds: f64,
-    /// Against the default `[dB]`.
+    /// Against `exact` `[dB]`.
     psnr: f64,
     /// Peak memory `[MiB]`.
     peak: f64,
@@ -51,7 +51,7 @@ fn points(report: &Report, scene: &str) -> Vec<Point> {
     let Some(base) = report.mean(scene, "", "", PSNR) else { return Vec::new() };
     let levels = report.effects.iter().map(|e| (e.knob.name, &*e.level));
     let point = |(knob, level): (&str, &str)| {
-        let name = if knob.is_empty() { "default".to_owned() } else { format!("{knob}={level}") };
+        let name = if knob.is_empty() { "exact".to_owned() } else { format!("{knob}={level}") };
         Some(Point {
             name,
             seconds: report.mean(scene, knob, level, SECONDS)?.exp(),
@@ -109,7 +109,7 @@ fn svg(title: &str, points: &[Point]) -> Result<String, Box<dyn std::error::Erro
             .configure_mesh()
             .light_line_style(WHITE)
             .x_desc("time of training [s], logarithmic")
-            .y_desc("PSNR against the default [dB]")
+            .y_desc("PSNR against exact [dB]")
             .x_label_formatter(&|x| if *x < 10.0 { format!("{x:.2}") } else { format!("{x:.0}") })
             .y_label_formatter(&|y| format!("{y:+.2}"))
             .draw()?;
@@ -162,7 +162,7 @@ mod tests {
         let points = points(&report, "room");
         let front: Vec<(&str, bool)> = points.iter().map(|p| (&*p.name, p.front)).collect();
         let expected = [
-            ("default", false),
+            ("exact", false),
             ("alpha_min=1/64", false),
             ("alpha_min=1/32", false),
             ("ssim_every=5", true),

@@ -23,7 +23,7 @@ pub(super) struct Report {
     pub(super) together: Vec<Together>,
 }
 
-/// What a knob does at a level, against the default.
+/// What a knob does at a level, against `exact`.
 pub(super) struct Effect {
     pub(super) knob: &'static Knob,
     pub(super) level: String,
@@ -37,7 +37,7 @@ pub(super) struct Effect {
     /// Of processor time, which other programs disturb less.
     pub(super) cpu: Option<Difference>,
     pub(super) peak: Difference,
-    /// Runs whose model is that of the default to the bit.
+    /// Runs whose model is that of `exact` to the bit.
     pub(super) same: usize,
     /// Least over scenes, of images against the float64 renderer `[dB]`.
     pub(super) numerical: Option<f64>,
@@ -115,7 +115,7 @@ impl Report {
         self.outcomes.iter().filter(is_it)
     }
 
-    /// Each run with a knob at a level, and the default one of the same scene and seed.
+    /// Each run with a knob at a level, and the exact one of the same scene and seed.
     fn pairs(&self, knob: &str, level: &str) -> Vec<(&Outcome, &Outcome)> {
         let base = |run: &Outcome| {
             self.runs(BASE, "").find(|base| (&base.scene, base.seed) == (&run.scene, run.seed))
@@ -162,17 +162,17 @@ impl Report {
         here.map(|image| image.standard).reduce(f64::min)
     }
 
-    /// Says which levels are dominated, by others or by the default.
+    /// Says which levels are dominated, by others or by `exact`.
     fn rank(&mut self) {
         let price = |effect: &Effect| Price {
             psnr: effect.psnr.mean,
             seconds: effect.seconds.mean.exp(),
             peak: effect.peak.mean.exp(),
         };
-        let default = Price { psnr: 0.0, seconds: 1.0, peak: 1.0 };
+        let exact = Price { psnr: 0.0, seconds: 1.0, peak: 1.0 };
         let prices: Vec<Price> =
-            std::iter::once(default).chain(self.effects.iter().map(price)).collect();
-        let names: Vec<String> = std::iter::once("the default".to_owned())
+            std::iter::once(exact).chain(self.effects.iter().map(price)).collect();
+        let names: Vec<String> = std::iter::once("exact".to_owned())
             .chain(self.effects.iter().map(|e| format!("{}={}", e.knob.name, e.level)))
             .collect();
         for (i, effect) in self.effects.iter_mut().enumerate() {
@@ -327,7 +327,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn effects_are_paired_with_the_default_of_the_same_seed() {
+    fn effects_are_paired_with_the_exact_one_of_the_same_seed() {
         let report = sample();
         let of = |level: &str| report.effects.iter().find(|e| e.level == level).expect("there");
         let free = of("1/64");

@@ -21,7 +21,7 @@ pub(super) fn markdown(report: &Report) -> String {
     let _ = writeln!(
         text,
         "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
-         Differences are from the default with the same scene and seed, with 95 % bootstrap \
+         Differences are from `exact` with the same scene and seed, with 95 % bootstrap \
          intervals of their mean; ratios are geometric means. Scores are of views held out, rendered \
          without any shortcut.",
         env!("CARGO_PKG_VERSION"),
@@ -30,7 +30,7 @@ pub(super) fn markdown(report: &Report) -> String {
         grouped(*budget),
         if *seeds == 1 { "seed" } else { "seeds" },
     );
-    text += &defaults(report);
+    text += &exact(report);
     text += &numerical(report);
     text += &outcomes(report);
     text += &together(report);
@@ -39,9 +39,9 @@ pub(super) fn markdown(report: &Report) -> String {
 }
 
 /// What the differences are from.
-fn defaults(report: &Report) -> String {
+fn exact(report: &Report) -> String {
     let mut text =
-        "\n## The default\n\n| scene | PSNR [dB] | time [s] | peak [MiB] |\n|---|---|---|---|\n"
+        "\n## exact\n\n| scene | PSNR [dB] | time [s] | peak [MiB] |\n|---|---|---|---|\n"
             .to_owned();
     for scene in &report.scenes {
         let psnr = shown(report.mean(scene, "", "", PSNR), 2);
@@ -61,7 +61,7 @@ fn numerical(report: &Report) -> String {
          |---|---|---|---|---|---|\n",
     );
     for image in &report.images {
-        let knob = if image.knob.is_empty() { "(default)" } else { &image.knob };
+        let knob = if image.knob.is_empty() { "(exact)" } else { &image.knob };
         let _ = writeln!(
             text,
             "| {knob} | {} | {} | {:.1} | {:.1} | {:.1e} |",
@@ -165,7 +165,7 @@ fn together(report: &Report) -> String {
     text
 }
 
-/// Seconds by stage of the default and of every level, as a mean over all runs.
+/// Seconds by stage of `exact` and of every level, as a mean over all runs.
 fn stages(report: &Report) -> String {
     let mean = |knob: &str, level: &str| -> BTreeMap<String, f64> {
         let runs: Vec<_> = report.runs(knob, level).collect();
@@ -189,7 +189,7 @@ fn stages(report: &Report) -> String {
             .iter()
             .map(|name| format!(" {} |", shown(seconds.get(*name).copied(), 2)))
             .collect();
-        let knob = if knob.is_empty() { "(default)" } else { knob };
+        let knob = if knob.is_empty() { "(exact)" } else { knob };
         let _ = writeln!(text, "| {knob} | {level} |{}", cells.concat());
     }
     text
@@ -233,7 +233,7 @@ mod tests {
             "*dominated by alpha_min=1/64*",
             "| 0 of 3 | free |",
             "--policy=diet",
-            "| (default) |  | 50.00 |",
+            "| (exact) |  | 50.00 |",
         ] {
             assert!(text.contains(words), "{words:?} is not in {text}");
         }

@@ -42,19 +42,27 @@ fn every_level_is_measured_once_and_in_the_table() {
         assert_ne!(find("ssim_every", "2", seed)["model"], base["model"]);
     }
     assert_ne!(find("", "", 0)["model"], find("", "", 1)["model"], "the seeds do nothing");
+    // All but the knob are as with the preset `exact`.
+    let is_spelled = |knob: &str, level: &str, setting: &str| {
+        let run = find(knob, level, 0);
+        run["arguments"].as_array().is_some_and(|words| words.iter().any(|word| word == setting))
+    };
+    assert!(is_spelled("", "", "alpha_min=1/255") && is_spelled("", "", "ssim_every=1"));
+    assert!(is_spelled("alpha_min", "1/32", "ssim_every=1"));
+    assert!(!is_spelled("alpha_min", "1/32", "alpha_min=1/255"));
     let images = of("image");
     let psnr = |knob: &str, level: &str| {
         let image = images.iter().find(|r| is(r, knob, level));
         image.unwrap_or_else(|| panic!("{knob}={level}"))["standard"].as_f64().expect("a number")
     };
-    let default = psnr("", "");
-    assert!(default > 80.0, "{default}");
-    assert_eq!(psnr("tile_cap", "250").to_bits(), default.to_bits());
-    assert!(psnr("alpha_min", "1/32") < 60.0 && psnr("exp_degree", "2") < default);
+    let exact = psnr("", "");
+    assert!(exact > 80.0, "{exact}");
+    assert_eq!(psnr("tile_cap", "250").to_bits(), exact.to_bits());
+    assert!(psnr("alpha_min", "1/32") < 60.0 && psnr("exp_degree", "2") < exact);
     assert!(images.iter().all(|r| r["knob"] != "ssim_every"), "it changes no image");
 
     let table = String::from_utf8(read(&output.join("trade.md"))).expect("UTF-8");
-    for words in ["--sh-degree 0", "2 of 2", "bounded", "(default)", "pareto-", "rasterize"] {
+    for words in ["--sh-degree 0", "2 of 2", "bounded", "(exact)", "pareto-", "rasterize"] {
         assert!(table.contains(words), "{words} is not in {table}");
     }
     assert_eq!(said.contains("stand out; together"), table.contains("## Knobs together"));
