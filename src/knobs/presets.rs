@@ -55,6 +55,7 @@ pub static PRESETS: &[Preset] = &[
             ("exp_degree", "6"),
             ("ssim_every", "1"),
             ("coarse_until", "0"),
+            ("budget_share", "1"),
             ("sparse_adam", "off"),
             ("param_storage", "f32"),
             ("moment_storage", "f32"),
@@ -78,12 +79,7 @@ pub static PRESETS: &[Preset] = &[
     Preset {
         name: "fast",
         what: "time before accuracy",
-        levels: &[
-            ("transmittance_stop", "1e-3"),
-            ("exp_degree", "2"),
-            ("ssim_every", "2"),
-            ("sh_every", "4"),
-        ],
+        levels: &[("budget_share", "0.5"), ("transmittance_stop", "1e-3")],
         measured: Some(Measured {
             psnr: -0.57,
             interval: [-1.22, -0.08],

@@ -108,6 +108,7 @@ impl Settings {
         Savings {
             ssim_every: self.text("ssim_every").parse().unwrap_or(1),
             coarse_until: number(self.text("coarse_until")).unwrap_or(0.0),
+            budget_share: number(self.text("budget_share")).unwrap_or(1.0),
         }
     }
 

@@ -133,6 +133,17 @@ pub static KNOBS: &[Knob] = &[
         levels: Values(&["0.2", "0.4", "0.6"]),
     },
     Knob {
+        name: "budget_share",
+        default: "1",
+        domain: Domain::Number { least: 0.05, most: 1.0 },
+        unit: "of the budget",
+        class: Heuristic,
+        on: On::Both,
+        how: How::Knob,
+        what: "rows may grow up to this share of the budget; what is left is neither touched nor computed",
+        levels: Values(&["0.25", "0.5", "0.75"]),
+    },
+    Knob {
         name: "sparse_adam",
         default: "off",
         domain: Domain::Choice(&["off", "on"]),

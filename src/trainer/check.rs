@@ -25,10 +25,12 @@ pub(super) fn check(
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
     }
-    let Savings { ssim_every, coarse_until } = options.savings;
-    if ssim_every == 0 || !(0.0..1.0).contains(&coarse_until) {
+    let Savings { ssim_every, coarse_until, budget_share } = options.savings;
+    let is_share = budget_share > 0.0 && budget_share <= 1.0;
+    if ssim_every == 0 || !(0.0..1.0).contains(&coarse_until) || !is_share {
         return bad(format!(
-            "ssim_every {ssim_every} must be >= 1, coarse_until {coarse_until} in [0, 1)"
+            "ssim_every {ssim_every} must be >= 1, coarse_until {coarse_until} in [0, 1), \
+             budget_share {budget_share} in (0, 1]"
         ));
     }
     if let Some(rate) = options.rates.invalid() {

@@ -1,17 +1,17 @@
-//! A limit of rows that rises while rows pay: `--budget auto`.
+//! A limit of rows that rises while rows pay, and falls while rows are not missed: `--budget auto`.
 //!
-//! The run is cut into rungs. At the end of each, before the policy's edit, the tenth of the rows that
-//! weighs least in any view is hidden, and the probes are rendered with and without it. That is what
-//! the last rows bring, on one model at one step: the difference does not hold what training brings
-//! meanwhile, which is larger and cannot be told from what growth brings where both are read off the
-//! same curve. Per doubling of rows it is 1 / log2(10 / 9) = 6.6 times as much. Rows are not trained
-//! anew without the tenth, so that it is rather too large than too small.
+//! The run is cut into rungs, and some training views, the probes, are measured at the end of each,
+//! before the policy's edit. In the first half of the run the limit then rises by half a doubling,
+//! within the budget; policies are told the limit as their budget, and plans keep it as they keep a
+//! budget, so that no policy need know. What a doubling has brought is the slope of the probes' PSNR
+//! over log2(rows), fitted to the last three rungs. Training brings something meanwhile, too, which
+//! cannot be told from it: the slope is rather too large, so that growth stops too late rather than too
+//! early. It stops when the slope has been below [`PAYS`] twice in a row.
 //!
-//! While growth goes on, the limit then rises by half a doubling, within the budget; policies are told
-//! the limit as their budget, and plans keep it as they keep a budget, so that no policy need know.
-//! Growth stops when the lower end of the 95 % interval has been below [`PAYS`] twice in a row: more
-//! rows have to be shown to pay. After it the tenth is removed where the probes lose less than
-//! [`LOSES`] by that, and the next one is tried at the end of the next rung; else all stay.
+//! What that has let in is sent out again. At the end of each later rung the rows are ordered by the
+//! largest weight that they have in any view; as many tenths of them as the probes miss, at once, by
+//! less than [`PAYS`] per doubling are removed. On one model at one step the difference is free of
+//! noise, and as the rows that stay learn to fill in, it is rather too large.
 
 use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
 use densify_policies::policy::{Needs, Signal, SignalSet};
@@ -24,8 +24,6 @@ use crate::views::ViewSource;
 
 /// What a doubling of rows must bring `[dB]`.
 pub const PAYS: f64 = 0.10;
-/// What removing the least tenth may cost `[dB]`.
-const LOSES: f64 = 0.02;
 /// Steps of a rung in a run of 30,000: ten rungs, or five doublings, until most policies stop to grow.
 const RUNG: u32 = 1_500;
 /// Rungs are whole multiples of this: policies are due every 100 steps at most.
@@ -34,8 +32,12 @@ const LEAST_RUNG: u32 = 100;
 const FACTOR: f64 = std::f64::consts::SQRT_2;
 /// Fewer rows are no limit.
 const LEAST_ROWS: usize = 1_000;
+/// Rungs over which the slope is fitted.
+const FITTED: usize = 3;
 /// The share of the run after which rows are not removed any more: those that stay must settle.
 const LAST_SHRINK: f64 = 0.8;
+/// Most tenths of the rows that are removed at once.
+const MOST_TENTHS: usize = 5;
 /// An opacity that no pixel shows.
 const HIDDEN: f32 = 1e-6;
 
@@ -71,9 +73,9 @@ pub struct Rung {
     pub rows: usize,
     /// Mean PSNR of the probes `[dB]`.
     pub psnr: f64,
-    /// What the least tenth of the rows brings, with the lower end of the 95 % interval
-    /// `[dB per doubling]`.
-    pub gain: [f64; 2],
+    /// What rows have brought in this rung and the two before, training included `[dB per doubling]`;
+    /// `None` where there are not so many, or rows did not become more.
+    pub gain: Option<f64>,
 }
 
 /// An attempt to do with fewer rows.
@@ -84,12 +86,10 @@ pub struct Shrink {
     pub step: u32,
     /// Rows before.
     pub before: usize,
-    /// Rows without the least tenth.
+    /// Rows without those that are missed least; as before if a tenth would be missed too much.
     pub after: usize,
-    /// What that changes in the probes, at once `[dB]`.
+    /// What that changes in the probes, at once `[dB]`; what losing a tenth would, if none was lost.
     pub change: f64,
-    /// Whether they were removed.
-    pub kept: bool,
 }
 
 impl Growth {
@@ -97,17 +97,17 @@ impl Growth {
         Self { limit: rows.max(LEAST_ROWS).min(budget), ..Self::default() }
     }
 
-    /// Takes the end of a rung into account: what the probes show with all rows, and without the least
-    /// tenth.
-    fn judge(&mut self, step: u32, rows: usize, [all, fewer]: [&[f64]; 2], budget: usize) {
-        let doublings = (rows as f64 / (rows - tenth(rows)) as f64).log2();
-        let brought: Vec<f64> = all.iter().zip(fewer).map(|(a, b)| (a - b) / doublings).collect();
-        let (mean, half) = mean_of(&brought);
-        let gain = [mean, mean - half];
+    /// Takes the end of a rung into account, and what the probes show.
+    fn judge(&mut self, step: u32, rows: usize, psnr: f64, budget: usize) {
+        self.rungs.push(Rung { step, rows, psnr, gain: None });
+        let gain = slope(&self.rungs[self.rungs.len().saturating_sub(FITTED)..]);
+        if let Some(rung) = self.rungs.last_mut() {
+            rung.gain = gain;
+        }
         // A limit that rows do not come near says nothing about more of them.
         let is_full = rows as f64 * FACTOR.sqrt() >= self.limit as f64;
-        self.idle = if gain[1] < PAYS && is_full { self.idle + 1 } else { 0 };
-        self.rungs.push(Rung { step, rows, psnr: mean_of(all).0, gain });
+        let is_idle = is_full && gain.is_some_and(|gain| gain < PAYS);
+        self.idle = if is_idle { self.idle + 1 } else { 0 };
         if self.idle >= 2 {
             self.stopped = Some(step);
             self.limit = rows.max(1);
@@ -116,17 +116,29 @@ impl Growth {
         }
     }
 
-    /// Whether the least rows may be removed at the end of a rung.
+    /// Whether rows may be removed at the end of a rung.
     fn may_shrink(&self, step: u32, iterations: u32) -> bool {
         let grown = self.stopped.is_some() || step > iterations / 2;
-        let late = f64::from(step) > LAST_SHRINK * f64::from(iterations);
-        grown && !late && self.shrinks.last().is_none_or(|shrink| shrink.kept)
+        grown && f64::from(step) <= LAST_SHRINK * f64::from(iterations)
     }
 }
 
-/// The rows that are hidden.
-fn tenth(rows: usize) -> usize {
-    rows / 10
+/// The slope of PSNR over log2(rows) `[dB per doubling]`, by least squares.
+fn slope(rungs: &[Rung]) -> Option<f64> {
+    let count = rungs.len() as f64;
+    let doublings = |rung: &Rung| (rung.rows.max(1) as f64).log2();
+    let x = rungs.iter().map(doublings).sum::<f64>() / count;
+    let y = rungs.iter().map(|rung| rung.psnr).sum::<f64>() / count;
+    let spread: f64 = rungs.iter().map(|rung| (doublings(rung) - x).powi(2)).sum();
+    let common: f64 = rungs.iter().map(|rung| (doublings(rung) - x) * (rung.psnr - y)).sum();
+    // That of a quarter of a doubling from end to end is the least that says something.
+    let enough = rungs.len() == FITTED && spread > 2.0 * 0.125_f64.powi(2);
+    enough.then(|| common / spread)
+}
+
+/// What losing so many tenths of the rows may cost `[dB]`.
+fn allowed(tenths: usize) -> f64 {
+    PAYS * (10.0 / (10.0 - tenths as f64)).log2()
 }
 
 /// Steps of a rung.
@@ -135,10 +147,12 @@ fn rung(iterations: u32) -> u32 {
 }
 
 impl<V: ViewSource> Trainer<V> {
-    /// The most rows that a plan may lead to now.
+    /// The most rows that a plan may lead to now; never fewer than there are, so that a model that
+    /// began with more need not be cut.
     pub(super) fn limit(&self) -> usize {
-        let budget = self.backend.budget();
-        self.growth.as_ref().map_or(budget, |growth| growth.limit.min(budget))
+        let usable = self.options.savings.rows(self.backend.budget());
+        let limit = self.growth.as_ref().map_or(usable, |growth| growth.limit.min(usable));
+        limit.max(self.backend.rows())
     }
 
     /// Measures, raises the limit, or removes rows, where `step` is due for it.
@@ -150,57 +164,64 @@ impl<V: ViewSource> Trainer<V> {
             return Ok(None);
         };
         let grows = growth.stopped.is_none() && step <= iterations / 2;
-        let shrinks = growth.may_shrink(step, iterations);
-        let (rows, budget) = (self.backend.rows(), self.backend.budget());
-        if !(grows || shrinks) || tenth(rows) == 0 {
-            return Ok(None);
-        }
-        let (least, [all, fewer]) = self.without_least(step)?;
+        let rows = self.backend.rows();
+        let usable = self.options.savings.rows(self.backend.budget());
         let mut event = None;
         if grows {
-            growth.judge(step, rows, [&all, &fewer], budget);
-            if let Some(Rung { psnr, gain: [gain, low], .. }) = growth.rungs.last() {
-                let limit = growth.limit;
-                tracing::info!(step, rows, psnr, gain, low, limit, "end of a rung");
-            }
-        } else {
-            let changes: Vec<f64> = fewer.iter().zip(&all).map(|(a, b)| a - b).collect();
-            let (change, _) = mean_of(&changes);
-            let (after, kept) = (rows - least.len(), change > -LOSES);
-            tracing::info!(step, before = rows, after, change, kept, "fewer rows");
-            growth.shrinks.push(Shrink { step, before: rows, after, change, kept });
+            let (psnr, _) = mean_of(&self.probe(step, self.sh_degree(step))?);
+            growth.judge(step, rows, psnr, usable);
+            let (gain, limit) = (growth.rungs.last().and_then(|rung| rung.gain), growth.limit);
+            tracing::info!(step, rows, psnr, gain, limit, "end of a rung");
+        } else if growth.may_shrink(step, iterations) && rows >= 10 {
+            let (least, change) = self.least_missed(step)?;
+            let after = rows - least.len();
+            tracing::info!(step, before = rows, after, change, "fewer rows");
+            growth.shrinks.push(Shrink { step, before: rows, after, change });
             growth.stopped.get_or_insert(step);
-            growth.limit = rows.max(1);
-            if kept {
+            // The policy may not fill up again what is removed.
+            growth.limit = after;
+            if !least.is_empty() {
                 let mut plan = EditPlan::new(rows, self.limit());
-                plan.cause("the least tenth is not missed");
+                plan.cause("they are not missed");
                 for row in least {
                     // Never refused: each row once.
                     let _ = plan.prune(row);
                 }
                 event = self.execute(step, plan)?;
-                growth.limit = self.backend.rows();
             }
         }
         self.growth = Some(growth);
         Ok(event)
     }
 
-    /// The tenth of the rows that weighs least, and the PSNR of the probes with and without it.
-    fn without_least(&mut self, step: u32) -> Result<(Vec<u32>, [Vec<f64>; 2]), TrainError> {
+    /// The rows that are missed least, as many as may be, and what the probes lose without them `[dB]`;
+    /// what they lose without a tenth, if that is too much.
+    fn least_missed(&mut self, step: u32) -> Result<(Vec<u32>, f64), TrainError> {
         let needs = Needs { signals: signals(), ..Needs::default() };
         let taken = self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
         let of = |signal| taken.0.get(signal).unwrap_or_default();
         let (weights, opacities) = (of(Signal::WeightMax), of(Signal::Opacity));
         let mut least: Vec<u32> = (0..weights.len() as u32).collect();
         least.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
-        least.truncate(tenth(weights.len()));
+        let tenth = least.len() / 10;
         let degree = self.sh_degree(step);
-        let all = self.probe(step, degree)?;
-        self.set_opacities(step, &least, |_| HIDDEN)?;
-        let fewer = self.probe(step, degree)?;
-        self.set_opacities(step, &least, |row| opacities[row as usize])?;
-        Ok((least, [all, fewer]))
+        let (all, _) = mean_of(&self.probe(step, degree)?);
+        let (mut hidden, mut gone, mut change) = (0, 0, None);
+        for tenths in 1..=MOST_TENTHS {
+            self.set_opacities(step, &least[hidden..tenths * tenth], |_| HIDDEN)?;
+            hidden = tenths * tenth;
+            let without = mean_of(&self.probe(step, degree)?).0 - all;
+            let is_missed = -without >= allowed(tenths);
+            if !is_missed {
+                (gone, change) = (hidden, Some(without));
+            } else {
+                change.get_or_insert(without);
+                break;
+            }
+        }
+        self.set_opacities(step, &least[..hidden], |row| opacities[row as usize])?;
+        least.truncate(gone);
+        Ok((least, change.unwrap_or_default()))
     }
 
     /// Gives rows other opacities and nothing else; no event.

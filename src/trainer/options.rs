@@ -37,11 +37,19 @@ pub struct Savings {
     ///
     /// [`schedule::divisor`]: crate::schedule::divisor
     pub coarse_until: f64,
+    /// Share of the budget up to which policies may let rows grow, in `(0, 1]`.
+    pub budget_share: f64,
 }
 
 impl Savings {
     /// None.
-    pub const NONE: Self = Self { ssim_every: 1, coarse_until: 0.0 };
+    pub const NONE: Self = Self { ssim_every: 1, coarse_until: 0.0, budget_share: 1.0 };
+
+    /// What of a budget may be used, at least 1.
+    #[must_use]
+    pub fn rows(self, budget: usize) -> usize {
+        ((budget as f64 * self.budget_share) as usize).clamp(1, budget)
+    }
 
     /// Factor of the SSIM term in a step of a run of so many iterations. The last step has it, so
     /// that a run ends with a measurement.

@@ -6,6 +6,7 @@ use densify::backend::{Backend, MomentStorage, ParameterStorage, StepInput, Stor
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
+use densify_policies::plan::EditPlan;
 use densify_policies::policy::{Cadence, Needs, SceneInfo};
 use densify_policies::registry::find;
 
@@ -209,4 +210,26 @@ fn a_row_takes_less_than_480_bytes() {
         );
         assert!(least <= 480.0 && today > 1_500.0, "{policy}: {today}, {least}");
     }
+}
+
+/// With room for few records at a time, rows that were removed leave nothing behind in which the rest
+/// would find its own.
+#[test]
+fn rows_that_are_gone_have_no_records() {
+    let (model, camera, target) = scene();
+    let run = |record_cap| {
+        let options =
+            CpuOptions { record_cap, threads: Some(1), ..CpuOptions::new(model.len() + 5) };
+        let mut backend = CpuBackend::new(&model, &options).expect("a small model fits");
+        train(&mut backend, &camera, &target, 1..=2);
+        let mut plan = EditPlan::new(model.len(), model.len() + 5);
+        for row in 10..model.len() as u32 {
+            plan.prune(row).expect("each row once");
+        }
+        backend.apply(&plan.compile(), 7, 2).expect("an edit");
+        train(&mut backend, &camera, &target, 3..=4);
+        state(&backend)
+    };
+    // Enough for all records of the ten rows that stay, not for the slots of those that went.
+    assert!(run(200) == run(1 << 20));
 }

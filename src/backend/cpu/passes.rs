@@ -158,6 +158,8 @@ impl CpuBackend {
                         });
                     });
                     clock.lap("rasterize_bwd");
+                    // Slots of rows that are gone are those of an older frame.
+                    let visible = &visible[..rows.div_ceil(WIDTH)];
                     part.gather(lists, records, sums, visible, (stride, fresh), |sum, records| {
                         gather(sum, detail, records);
                     });
