@@ -15,6 +15,7 @@ mod guard;
 mod options;
 mod probe;
 mod quarantine;
+mod scored;
 mod state;
 
 use std::time::{Duration, Instant};
@@ -35,6 +36,7 @@ pub use growth::{Growth, PAYS, Rung, Shrink, signals as growth_signals};
 use guard::asked;
 pub use options::{OnNan, Required, Savings, TrainOptions};
 use quarantine::AUDIT_EVERY;
+use scored::Scored;
 pub use state::TrainerState;
 
 /// What a run with this policy needs of its backend: the policy's needs, and room for the cadence of
@@ -119,6 +121,8 @@ pub struct Trainer<V> {
     views_time: Duration,
     images_time: Duration,
     events: Vec<EditEvent>,
+    /// Training views that are rendered for scores.
+    scored: Scored,
     /// Training views that are measured along the run; none where nothing asks for it.
     probes: Vec<usize>,
     earned: Option<Earned>,
@@ -157,6 +161,7 @@ impl<V: ViewSource> Trainer<V> {
             options,
             step: 0,
             events: Vec::new(),
+            scored: Scored::all(count),
             probes: Vec::new(),
             earned: None,
             growth: None,
@@ -169,6 +174,9 @@ impl<V: ViewSource> Trainer<V> {
     pub fn requiring(mut self, what: Required) -> Self {
         if what.degree || what.rows {
             self.probes = probe::probes(self.views.count(), self.options.seed);
+        }
+        if what.scored_views {
+            self.scored = Scored::distinct(&self.views, self.scene.extent);
         }
         self.earned = what.degree.then(Earned::default);
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
@@ -186,6 +194,14 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn growth(&self) -> Option<&Growth> {
         self.growth.as_ref()
+    }
+
+    /// Training views that are left out where the policy scores rows or looks at auxiliary views, as
+    /// others are nearly the same; none where it does neither.
+    #[must_use]
+    pub fn unscored_views(&self) -> usize {
+        let scores = self.needs.fresh_views > 0 || self.needs.aux.is_some();
+        if scores { self.scored.left_out() } else { 0 }
     }
 
     /// One iteration: a view, a gradient step, and the policy's edit where one is due.
@@ -365,14 +381,6 @@ impl<V: ViewSource> Trainer<V> {
     pub fn backend(&mut self) -> &mut dyn Backend {
         self.backend.as_mut()
     }
-}
-
-/// Most rows in use at any instant of an edit: children and seeds stand in their slots before the
-/// moves shorten the model.
-fn rows_within(ops: &RowOps) -> usize {
-    let born = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
-    let highest = born.max().map_or(0, |slot| slot as usize + 1);
-    highest.max(ops.rows_before).max(ops.rows_after)
 }
 
 /// The needs of a run, if a backend can work with them.

@@ -20,6 +20,8 @@ pub struct Requirements {
     pub degrees: Option<Earned>,
     /// Ends of rungs and attempts to do with fewer rows, where rows had to pay.
     pub rows: Option<Growth>,
+    /// Training views that were not rendered for scores, as others are nearly the same.
+    pub unscored_views: usize,
     /// What was left out; nothing that the options themselves leave out.
     pub left_out: Vec<LeftOut>,
 }
@@ -36,20 +38,21 @@ pub struct LeftOut {
 }
 
 impl Requirements {
-    /// The report of a run of this configuration that has come to `rows` rows at a degree.
+    /// The report of a run of this configuration that has come to `rows` rows at a degree, with what it
+    /// has found: trials of degrees, the limit of rows, and views that were not scored.
     #[must_use]
     pub fn of(
         config: &RunConfig,
         sh_degree: u8,
         rows: usize,
-        degrees: Option<&Earned>,
-        growth: Option<&Growth>,
+        (degrees, growth, unscored_views): (Option<&Earned>, Option<&Growth>, usize),
     ) -> Self {
         let train = &config.train;
         let left_out = [
             degree_left_out(config, sh_degree, degrees),
             growth.and_then(|growth| rows_left_out(growth, rows, train.budget)),
             growth.and_then(shrunk),
+            (unscored_views > 0).then(|| unscored(unscored_views)),
         ];
         Self {
             full: train.full,
@@ -57,6 +60,7 @@ impl Requirements {
             sh_degree_from: train.sh_degree_from,
             degrees: degrees.cloned(),
             rows: growth.cloned(),
+            unscored_views,
             left_out: left_out.into_iter().flatten().collect(),
         }
     }
@@ -148,6 +152,15 @@ fn shrunk(growth: &Growth) -> Option<LeftOut> {
     })
 }
 
+fn unscored(views: usize) -> LeftOut {
+    LeftOut {
+        what: format!("{views} training views where rows are scored"),
+        evidence: "for each there is another within 1 % of the scene's extent and one degree"
+            .into(),
+        loss: "its loss was not measured".into(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -164,11 +177,14 @@ mod tests {
     fn what_the_options_say_is_not_left_out() {
         let mut config = sample();
         config.train.sh_degree_from = DegreeChoice::Given;
-        let report = Requirements::of(&config, 0, 500, None, None);
+        let report = Requirements::of(&config, 0, 500, (None, None, 0));
         assert_eq!(report.lines(), ["left out nothing"]);
         config.train.full = true;
-        let report = Requirements::of(&config, 3, 500, None, None);
+        let report = Requirements::of(&config, 3, 500, (None, None, 0));
         assert_eq!(report.lines(), ["left out nothing (--full)"]);
+        config.train.full = false;
+        let report = Requirements::of(&config, 3, 500, (None, None, 4));
+        assert!(report.lines()[0].starts_with("left out 4 training views"), "{report:?}");
     }
 
     #[test]
@@ -176,7 +192,7 @@ mod tests {
         let mut config = sample();
         let line =
             |config: &RunConfig, degree, earned: Option<&Earned>, growth: Option<&Growth>| {
-                let lines = Requirements::of(config, degree, 900, earned, growth).lines();
+                let lines = Requirements::of(config, degree, 900, (earned, growth, 0)).lines();
                 lines.join("\n")
             };
         config.train.sh_degree_from = DegreeChoice::Spread(spread());

@@ -7,7 +7,7 @@ use densify_policies::policy::{SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 
 use super::guard::asked;
-use super::{EditEvent, TrainError, Trainer, rows_within};
+use super::{EditEvent, TrainError, Trainer};
 use crate::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
@@ -69,4 +69,12 @@ impl<V: ViewSource> Trainer<V> {
             Err(TrainError::BrokenPlan { step, policy: self.policy_name.clone(), reason })
         })
     }
+}
+
+/// Most rows in use at any instant of an edit: children and seeds stand in their slots before the
+/// moves shorten the model.
+pub(super) fn rows_within(ops: &RowOps) -> usize {
+    let born = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
+    let highest = born.max().map_or(0, |slot| slot as usize + 1);
+    highest.max(ops.rows_before).max(ops.rows_after)
 }

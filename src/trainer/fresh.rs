@@ -6,7 +6,6 @@ use densify_policies::policy::{AuxView, Needs, Signal};
 use super::guard::asked;
 use super::{TrainError, Trainer};
 use crate::backend::AuxInput;
-use crate::schedule;
 use crate::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
@@ -23,7 +22,7 @@ impl<V: ViewSource> Trainer<V> {
         }
         let degree = self.sh_degree(step);
         let wanted = needs.fresh_views as usize;
-        for view in schedule::fresh_views(self.views.count(), wanted, self.options.seed, step) {
+        for view in self.scored.draw(wanted, self.options.seed, step) {
             let measured = self.backend.measure_weights(self.views.camera(view), degree);
             measured.map_err(|e| self.stopped(step, e))?;
             self.extra_forwards += 1;
@@ -40,7 +39,7 @@ impl<V: ViewSource> Trainer<V> {
             return Ok(());
         };
         let (options, degree) = (self.options, self.sh_degree(step));
-        for view in schedule::fresh_views(self.views.count(), wanted, options.seed, step) {
+        for view in self.scored.draw(wanted, options.seed, step) {
             let image = self.image(step, view)?;
             let measured = self.backend.observe(&AuxInput {
                 step,

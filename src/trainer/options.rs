@@ -73,6 +73,8 @@ pub struct Required {
     pub degree: bool,
     /// The number of rows, up to the budget.
     pub rows: bool,
+    /// Which training views say something that others do not, where rows are scored.
+    pub scored_views: bool,
 }
 
 /// What becomes of rows with a parameter or a moment that is NaN or infinite.

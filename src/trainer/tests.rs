@@ -416,6 +416,29 @@ fn fresh_views_are_measured_where_they_are_wanted() {
 }
 
 #[test]
+fn views_that_are_nearly_the_same_are_scored_once() {
+    // Cameras one apart: with an extent of 150, the second is the first, and the third is not.
+    let case = Case { fresh_views: 100, ..CASE };
+    let info = SceneInfo { extent: 150.0, ..scene(&case, 3) };
+    let (trainer, diary, _) = build(&case, 3, info, OPTIONS).unwrap();
+    let mut trainer = trainer.requiring(Required { scored_views: true, ..Required::default() });
+    for _ in 0..9 {
+        trainer.step().unwrap();
+    }
+    let diary = diary.lock().unwrap().clone();
+    let measured: Vec<&str> =
+        diary.iter().filter(|d| d.starts_with("measure")).map(|d| &d[..9]).collect();
+    assert!(measured.contains(&"measure 0") && measured.contains(&"measure 2"), "{diary:?}");
+    assert!(!measured.contains(&"measure 1"), "{diary:?}");
+    assert_eq!(trainer.unscored_views(), 1);
+    // All are trained on.
+    assert!(
+        (0..3).all(|view| diary.iter().any(|d| d.contains(&format!("view {view}")))),
+        "{diary:?}"
+    );
+}
+
+#[test]
 fn fresh_signals_are_there_only_where_they_are_wanted() {
     let case = Case { what: Told::ReadFresh, fresh_views: 2, ..CASE };
     let (message, ..) = failure(&case);
@@ -447,7 +470,7 @@ fn the_peak_outlives_a_prune() {
 fn slots_written_before_the_moves_count_for_the_peak() {
     let ops =
         RowOps { rows_before: 4, rows_after: 3, child_slots: vec![1, 5], ..RowOps::default() };
-    assert_eq!(rows_within(&ops), 6);
+    assert_eq!(edit::rows_within(&ops), 6);
 }
 
 #[test]

@@ -90,6 +90,7 @@ impl Survey {
             degree: degree.choice == DegreeChoice::Training,
             rows: args.budget == Some(Budget::Auto)
                 || saved.is_some_and(|saved| saved.train.budget_auto),
+            scored_views: !args.full,
         };
         let most_rows = saved.map(|saved| saved.train.budget);
         Ok(Self {

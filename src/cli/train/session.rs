@@ -354,7 +354,8 @@ impl<'a> Session<'a> {
             Some(earned) => earned.degree,
             None => config.train.sh_degree,
         };
-        Requirements::of(config, degree, trainer.rows(), trainer.earned(), trainer.growth())
+        let found = (trainer.earned(), trainer.growth(), trainer.unscored_views());
+        Requirements::of(config, degree, trainer.rows(), found)
     }
 
     /// What came of it, in a few lines.
