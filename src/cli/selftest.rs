@@ -26,7 +26,7 @@ pub(super) struct SelftestArgs {
     #[arg(value_name = "CASE")]
     only: Vec<u8>,
     /// Run cases in full that take minutes: half a million rows as large as the image, which takes
-    /// some 2 GiB, and runs of 30,000 steps
+    /// some 800 MiB, and runs of 30,000 steps
     #[arg(long)]
     long: bool,
     /// Write the table as Markdown

@@ -55,6 +55,7 @@ impl<'a> Trial<'a> {
     }
 
     /// Compares image, gradients and statistics of one view with the reference's, then trains on it.
+    /// Returns the gradients, and those of the reference.
     pub(super) fn check(
         &mut self,
         what: &str,
@@ -62,7 +63,7 @@ impl<'a> Trial<'a> {
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
-    ) -> Result<(), BackendError> {
+    ) -> Result<(ModelGradient, Model), BackendError> {
         let view = View { camera, background: background.map(f64::from), sh_degree };
         let (exact, rules) = (Model::of(model), Rules::STANDARD);
         let splats = project::project(&exact, view, &rules);
@@ -81,7 +82,8 @@ impl<'a> Trial<'a> {
             self.figure(what, name, error, self.gradient);
         }
         self.statistics(what, &measured, &screen, &image.boundary);
-        self.train(what, &mut *backend, camera, background, sh_degree)
+        self.train(what, &mut *backend, camera, background, sh_degree)?;
+        Ok((measured, expected))
     }
 
     /// Compares the image of one view with the reference's.

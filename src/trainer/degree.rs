@@ -9,7 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::probe::mean_of;
+use super::probe::mean;
 use super::{TrainError, Trainer};
 use crate::schedule::{self, scaled};
 use crate::views::ViewSource;
@@ -108,7 +108,7 @@ impl<V: ViewSource> Trainer<V> {
         let with = self.probe(step, degree)?;
         let without = self.probe(step, degree - 1)?;
         let gains: Vec<f64> = with.iter().zip(&without).map(|(a, b)| a - b).collect();
-        Ok(Some(mean_of(&gains).0))
+        Ok(Some(mean(&gains)))
     }
 }
 

@@ -17,7 +17,7 @@ use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
 use densify_policies::policy::{Needs, Signal, SignalSet};
 use serde::{Deserialize, Serialize};
 
-use super::probe::mean_of;
+use super::probe::mean;
 use super::{EditEvent, TrainError, Trainer};
 use crate::schedule::scaled;
 use crate::views::ViewSource;
@@ -168,7 +168,7 @@ impl<V: ViewSource> Trainer<V> {
         let usable = self.options.savings.rows(self.backend.budget());
         let mut event = None;
         if grows {
-            let (psnr, _) = mean_of(&self.probe(step, self.sh_degree(step))?);
+            let psnr = mean(&self.probe(step, self.sh_degree(step))?);
             growth.judge(step, rows, psnr, usable);
             let (gain, limit) = (growth.rungs.last().and_then(|rung| rung.gain), growth.limit);
             tracing::info!(step, rows, psnr, gain, limit, "end of a rung");
@@ -205,12 +205,12 @@ impl<V: ViewSource> Trainer<V> {
         least.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
         let tenth = least.len() / 10;
         let degree = self.sh_degree(step);
-        let (all, _) = mean_of(&self.probe(step, degree)?);
+        let all = mean(&self.probe(step, degree)?);
         let (mut hidden, mut gone, mut change) = (0, 0, None);
         for tenths in 1..=MOST_TENTHS {
             self.set_opacities(step, &least[hidden..tenths * tenth], |_| HIDDEN)?;
             hidden = tenths * tenth;
-            let without = mean_of(&self.probe(step, degree)?).0 - all;
+            let without = mean(&self.probe(step, degree)?) - all;
             let is_missed = -without >= allowed(tenths);
             if !is_missed {
                 (gone, change) = (hidden, Some(without));

@@ -55,7 +55,7 @@ pub(super) struct TrainArgs {
     /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
     /// `[default: 200k, or as many as --memory holds]`
     ///
-    /// auto: growth stops where a doubling of Gaussians is not shown to bring 0.10 dB on training
+    /// auto: growth stops where a doubling of Gaussians brings less than 0.10 dB on training
     /// views; what is missed least is removed then. The default stays the limit
     #[arg(short, long, value_name = "ROWS", help_heading = "Memory")]
     budget: Option<Budget>,

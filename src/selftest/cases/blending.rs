@@ -30,7 +30,8 @@ pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     }
     let mut model = scenes::cloud(12, 0, &camera, 8);
     model.opacity_logits.iter_mut().step_by(2).for_each(|logit| *logit = f32::MAX);
-    trial.check("alpha 1", &model, &camera, GREY, 0)
+    trial.check("alpha 1", &model, &camera, GREY, 0)?;
+    Ok(())
 }
 
 pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
@@ -78,7 +79,8 @@ fn scattered(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let scale = 0.4 * z / camera.fx as f32;
         scenes::push(&mut model, [place[0], place[1], z], [scale; 3], UPRIGHT, -5.0, shade);
     }
-    trial.check("100000 rows beside each other", &model, &camera, GREY, 0)
+    trial.check("100000 rows beside each other", &model, &camera, GREY, 0)?;
+    Ok(())
 }
 
 pub(super) fn behind(trial: &mut Trial<'_>) -> Result<(), BackendError> {

@@ -4,7 +4,7 @@ use super::{GREY, flat_colour, straight};
 use crate::backend::BackendError;
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
-use crate::selftest::compare::class;
+use crate::selftest::compare::{class, relative_error};
 use crate::selftest::reference::CLASSES;
 use crate::selftest::scenes;
 use crate::selftest::trial::{Trial, count_broken};
@@ -108,7 +108,16 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         trial.gradient = tolerance;
         for turn in 0..16 {
             let what = format!("{sigma_px} px, turn {turn}");
-            trial.check(&what, &needle(sigma_px, turn), &camera, GREY, 0)?;
+            let model = needle(sigma_px, turn);
+            let (measured, expected) = trial.check(&what, &model, &camera, GREY, 0)?;
+            let found = by_covariance(
+                &model,
+                measured.log_scales[0].map(f64::from),
+                measured.quats[0].map(f64::from),
+            );
+            let [scales, quats] = [expected.class("log_scales"), expected.class("quats")];
+            let exact = by_covariance(&model, array(scales), array(quats));
+            trial.figure(&what, "by covariance", relative_error(&found, &exact), 1e-3);
         }
     }
     // The exponent may be off by 1e-2 here, and alpha with it.
@@ -118,6 +127,29 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         trial.check_image(&what, &needle(1e4, turn), &camera, GREY, 0)?;
     }
     Ok(())
+}
+
+/// dL/dΣ of a row of unit quaternion, in the frame of its axes: xx, yy, zz, xy, xz. What turning about
+/// the long axis would tell, yz, is lost where the others are equally wide.
+///
+/// Log-scales move the diagonal D of Σ = R D Rᵀ by 2D; a turn δ about an axis of the row, which moves q
+/// by half of q ⊗ (0, δ), moves the element ij beside it by (Dᵢ − Dⱼ) δ, and its mirror image, too.
+fn by_covariance(model: &Gaussians, log_scales: [f64; 3], quats: [f64; 4]) -> [f64; 5] {
+    let variance = model.log_scales[0].map(|log| (2.0 * f64::from(log)).exp());
+    let [w, x, y, z] = model.quats[0].map(f64::from);
+    let [gw, gx, gy, gz] = quats;
+    // The imaginary part of conj(q) ⊗ g, halved.
+    let turn_y = 0.5 * (w * gy - y * gw - z * gx + x * gz);
+    let turn_z = 0.5 * (w * gz - z * gw - x * gy + y * gx);
+    let [a, b, c] = variance;
+    let diagonal = [0, 1, 2].map(|i| log_scales[i] / (2.0 * variance[i]));
+    let [xx, yy, zz] = diagonal;
+    [xx, yy, zz, turn_z / (2.0 * (a - b)), turn_y / (2.0 * (c - a))]
+}
+
+/// The first numbers of an array of one row.
+fn array<const N: usize>(values: &[f64]) -> [f64; N] {
+    std::array::from_fn(|i| values[i])
 }
 
 /// A row of 0.01 px by `sigma_px` before the blur: at z = 1 a pixel is 1/64 wide.
