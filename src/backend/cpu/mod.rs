@@ -173,7 +173,7 @@ impl CpuBackend {
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
-            records: atomic_zeros(record_cap * stride),
+            records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
             sums: vec![0.0; blocks * WIDTH * stride],
             clock: StageClock::default(),
@@ -205,7 +205,7 @@ impl CpuBackend {
         let detail = Detail::All;
         let records = self.record_cap * detail.stride();
         if self.records.len() < records {
-            self.records = atomic_zeros(records);
+            self.records = bytemuck::zeroed_vec(records);
         }
         self.sums.resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
         let frame = self.forward(camera, background, sh_degree, true)?;
@@ -268,10 +268,6 @@ impl CpuBackend {
         }
         (scalars(value), gradient)
     }
-}
-
-fn atomic_zeros(n: usize) -> Vec<AtomicU32> {
-    (0..n).map(|_| AtomicU32::new(0)).collect()
 }
 
 impl Backend for CpuBackend {

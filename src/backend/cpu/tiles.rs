@@ -112,8 +112,9 @@ pub(super) struct TileLists {
 impl TileLists {
     pub(super) fn new(budget: usize, cap: usize) -> Self {
         Self {
-            entries: (0..cap).map(|_| AtomicU64::new(0)).collect(),
-            row_of_slot: (0..cap).map(|_| AtomicU32::new(0)).collect(),
+            // Zeroed by the system, as needed: what no view fills is never resident.
+            entries: bytemuck::zeroed_vec(cap),
+            row_of_slot: bytemuck::zeroed_vec(cap),
             slots: vec![[0; 2]; budget],
             starts: Vec::new(),
             counters: Vec::new(),
