@@ -218,6 +218,18 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
     assert!(files(&run)["config.toml"] == before["config.toml"]);
 }
 
+/// What is set aside for rows and pairs that never come is not resident.
+#[test]
+#[cfg(target_os = "linux")]
+fn memory_is_taken_as_it_is_needed() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    train(scene.path(), &run, "--budget 400k --init random --init-points 500 --iterations 2").ok();
+    let summary = json(&run.join("stats/summary.json"));
+    let (peak, promised) = (count(&summary, "peak_bytes"), count(&summary, "ledger_bytes"));
+    assert!(promised > 400 * MIB && peak < promised / 4, "{peak} of {promised}");
+}
+
 /// From far too little to plenty, each limit of the address space `[KiB]` ends in a message or in a
 /// model.
 #[test]
