@@ -11,10 +11,10 @@
 //! views that saw the row, of the norms of the loss gradient by its mean on screen (NDC) and by its
 //! colour; a view from which the row is nearer than `full_depth` counts in them by the square of
 //! the ratio (as in *Pixel-GS*, Zhang et al. 2024). Dead rows (less opaque than `min_opacity`) are
-//! pruned; they are no candidates. If there are more candidates than room, some are paid for by as many victims, in all
-//! growths together up to `rho` · budget, in each an equal part of it. Then the candidates grow,
-//! the largest g first: small ones (up to `small` · scene extent) are cloned, the others split in
-//! two (`split`). What is left over is counted as denied. The statistics start anew.
+//! pruned; they are no candidates. If there are more candidates than room, some are paid for by as
+//! many victims, in all growths together up to `rho` · budget, in each an equal part of it. Then
+//! the candidates grow, the largest g first: small ones (up to `small` · scene extent) are cloned,
+//! the others split in two (`split`). What is left over counts as denied; statistics start anew.
 //!
 //! **Victims** are the least important rows, candidates excepted: those whose largest blend weight
 //! α·T, over all pixels of the views of `importance`, is smallest. Newborns are protected until
@@ -34,8 +34,8 @@
 //! Some defaults are not those of paper and code, by measurement in runs of 2,000 to 7,000 steps:
 //! `split` is `long-axis`; `full_depth` keeps out fog that explains single photographs; `rho` and
 //! `rho_c` are for the whole run, as who exchanges the model many times over learns photographs by
-//! heart; `max_scale` is 0, as paper and code prune what may be all that there is of a wall or the
-//! sky, and nothing takes its place. The repository's docs/comparison.md has the figures.
+//! heart; `max_scale` is 0, as paper and code (0.1, after step `max_scale_from`) prune what may be all
+//! that there is of a wall, and nothing takes its place. docs/comparison.md has the figures.
 //!
 //! Each event is one plan: pruned rows free their slots before others are born, so that the budget
 //! holds at every instant. The published code overshoots it between insertion and the next pruning;
@@ -64,8 +64,6 @@
 //! - `clone_opacity = "conserve"`: parent and clone both get 1 − √(1 − o), and scales multiplied by
 //!   o / (2o′ − o′²/√2), so that together they are as opaque as the parent was (*3D Gaussian Splatting
 //!   as Markov Chain Monte Carlo*, Kheradmand et al. 2024, equation 9). Both start with zero moments.
-//! - `max_scale`: with 0.1, as in paper and code, rows that are larger count as dead after step
-//!   `max_scale_from`.
 //! - `importance`: the views in which the importance of a row is measured.
 //!   - `epochs`: the training renders of the previous and the current epoch, free of cost.
 //!   - `fresh`: `fresh_views` training views, drawn at random and rendered anew for each event at
