@@ -201,7 +201,7 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn unscored_views(&self) -> usize {
         let scores = self.needs.fresh_views > 0 || self.needs.aux.is_some();
-        if scores { self.scored.left_out() } else { 0 }
+        if scores { self.views.count() - self.scored.count() } else { 0 }
     }
 
     /// One iteration: a view, a gradient step, and the policy's edit where one is due.

@@ -45,10 +45,10 @@ impl Savings {
     /// None.
     pub const NONE: Self = Self { ssim_every: 1, coarse_until: 0.0, budget_share: 1.0 };
 
-    /// What of a budget may be used, at least 1.
+    /// What of a budget may be used, at least 1 of any.
     #[must_use]
     pub fn rows(self, budget: usize) -> usize {
-        ((budget as f64 * self.budget_share) as usize).clamp(1, budget)
+        ((budget as f64 * self.budget_share) as usize).max(1).min(budget)
     }
 
     /// Factor of the SSIM term in a step of a run of so many iterations. The last step has it, so

@@ -17,40 +17,36 @@ const SAME_LENS: f64 = 0.01;
 
 /// The views that are rendered for scores.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Scored {
-    views: Vec<usize>,
-    count: usize,
-}
+pub(super) struct Scored(Vec<usize>);
 
 impl Scored {
     /// All of so many views.
     pub(super) fn all(count: usize) -> Self {
-        Self { views: (0..count).collect(), count }
+        Self((0..count).collect())
     }
 
     /// Of views that are nearly the same the first one each.
     pub(super) fn distinct<V: ViewSource>(views: &V, extent: f32) -> Self {
-        let count = views.count();
         let near = NEAR * f64::from(extent);
         let mut chosen: Vec<usize> = Vec::new();
-        for view in 0..count {
+        for view in 0..views.count() {
             let camera = views.camera(view);
             if !chosen.iter().any(|&other| are_alike(camera, views.camera(other), near)) {
                 chosen.push(view);
             }
         }
-        Self { views: chosen, count }
+        Self(chosen)
     }
 
-    /// Views that are left out.
-    pub(super) fn left_out(&self) -> usize {
-        self.count - self.views.len()
+    /// Number of the views.
+    pub(super) fn count(&self) -> usize {
+        self.0.len()
     }
 
     /// So many of the views, or all of them if there are fewer, drawn from (seed, step).
     pub(super) fn draw(&self, count: usize, seed: u64, step: u32) -> Vec<usize> {
-        let drawn = schedule::fresh_views(self.views.len(), count, seed, step);
-        drawn.into_iter().map(|place| self.views[place]).collect()
+        let drawn = schedule::fresh_views(self.0.len(), count, seed, step);
+        drawn.into_iter().map(|place| self.0[place]).collect()
     }
 }
 
@@ -110,7 +106,7 @@ mod tests {
             camera(0.16, 0.1, 50.0),
         ]);
         let scored = Scored::distinct(&views, 10.0);
-        assert_eq!((&scored.views[..], scored.left_out()), (&[0, 2, 3, 4][..], 2));
+        assert_eq!((&scored.0[..], views.count() - scored.count()), (&[0, 2, 3, 4][..], 2));
         let mut drawn = scored.draw(100, 7, 3);
         drawn.sort_unstable();
         assert_eq!(drawn, [0, 2, 3, 4]);

@@ -13,7 +13,8 @@ use crate::knobs::{EXACT, preset};
 use crate::metrics::geometry::Geometry;
 use crate::output::{Mean, geometry_of, model_path, scores_of};
 
-/// The knob of a run in which none is changed, which is one with the preset `exact`, and that of a run of the factorial.
+/// The knob of a run in which none is changed, which is one with the preset `exact`, and that of a run
+/// of the factorial.
 pub(super) const BASE: &str = "";
 pub(super) const FACTORIAL: &str = "factorial";
 
@@ -142,11 +143,10 @@ impl Cell {
     pub(super) fn arguments(&self) -> Vec<String> {
         let mut arguments = vec!["train".to_owned(), self.scene.to_string_lossy().into_owned()];
         let mut set = |name: &str, value: String| arguments.extend([name.to_owned(), value]);
-        let is_set = |knob: &str| self.settings.iter().any(|s| s.split('=').next() == Some(knob));
-        if !is_set("budget") {
+        if !self.is_set("budget") {
             set("--budget", self.budget.to_string());
         }
-        if !is_set("iterations") {
+        if !self.is_set("iterations") {
             set("--iterations", self.iterations.to_string());
         }
         set("--seed", self.seed.to_string());
@@ -157,11 +157,14 @@ impl Cell {
         arguments
     }
 
+    fn is_set(&self, knob: &str) -> bool {
+        self.settings.iter().any(|setting| setting.split('=').next() == Some(knob))
+    }
+
     /// The levels of `exact`, but for knobs that are changed. The preset itself would not let them be.
     fn exact(&self) -> Vec<String> {
-        let is_set = |knob: &str| self.settings.iter().any(|s| s.split('=').next() == Some(knob));
         let levels = preset(EXACT).map_or(&[][..], |exact| exact.levels);
-        let kept = levels.iter().filter(|(knob, _)| !is_set("preset") && !is_set(knob));
+        let kept = levels.iter().filter(|(knob, _)| !self.is_set("preset") && !self.is_set(knob));
         kept.map(|(knob, level)| format!("{knob}={level}")).collect()
     }
 
