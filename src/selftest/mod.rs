@@ -23,7 +23,7 @@ mod compare;
 mod reference;
 #[path = "../../tests/it/scenes.rs"]
 #[expect(dead_code, reason = "the tests use the rest")]
-mod scenes;
+pub(crate) mod scenes;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 

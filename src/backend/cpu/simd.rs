@@ -257,7 +257,8 @@ impl<S: Simd> Mask<S> {
         self.select(yes, V::zero(self.s))
     }
 
-    /// Bit i: lane i. AVX-512 masks are bits already; others have all bits of a lane set or none.
+    /// Bit i: lane i. AVX-512 masks are bits already; others have all bits of a lane set or none, and
+    /// where there are no vectors a lane is one byte.
     #[inline(always)]
     pub(super) fn bits(self) -> u32 {
         let bytes = pulp::bytemuck::bytes_of(&self.m);
@@ -265,7 +266,7 @@ impl<S: Simd> Mask<S> {
             return u32::from(u16::from_le_bytes([low, high]));
         }
         let mut bits = 0;
-        for (lane, bytes) in bytes.chunks_exact(size_of::<f32>()).enumerate() {
+        for (lane, bytes) in bytes.chunks_exact(bytes.len() / S::F32_LANES).enumerate() {
             bits |= u32::from(bytes[0] & 1) << lane;
         }
         bits
@@ -316,91 +317,4 @@ impl<S: Simd> Neg for V<S> {
 
 #[cfg(test)]
 #[allow(clippy::float_cmp, reason = "small whole numbers are exact")]
-mod tests {
-    use pulp::{Arch, WithSimd};
-
-    use super::*;
-
-    struct Each<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
-    #[derive(Clone, Copy)]
-    enum Function {
-        Exp2,
-        Exp2By2,
-        Exp2By4,
-        Exp,
-        Log2,
-    }
-
-    impl WithSimd for Each<'_> {
-        type Output = f64;
-        #[inline(always)]
-        fn with_simd<S: Simd>(self, s: S) -> f64 {
-            let Each(inputs, truth, function, floor) = self;
-            let mut worst = 0.0_f64;
-            for chunk in inputs.chunks_exact(WIDTH) {
-                let mut out = [0.0_f32; WIDTH];
-                for at in (0..WIDTH).step_by(S::F32_LANES) {
-                    let x = V::load(s, &chunk[at..]);
-                    let y = match function {
-                        Function::Exp2 => x.exp2(),
-                        Function::Exp2By2 => x.exp2_by::<2>(),
-                        Function::Exp2By4 => x.exp2_by::<4>(),
-                        Function::Exp => x.exp(),
-                        Function::Log2 => x.log2_of_1_to_2(),
-                    };
-                    y.store(&mut out[at..]);
-                }
-                for (&x, &y) in chunk.iter().zip(&out) {
-                    let t = truth(x);
-                    worst = worst.max((f64::from(y) - t).abs() / t.abs().max(floor));
-                }
-            }
-            worst
-        }
-    }
-
-    fn grid(from: f32, to: f32) -> Vec<f32> {
-        let n = 16 * 20_000;
-        (0..n).map(|i| from + (to - from) * i as f32 / (n - 1) as f32).collect()
-    }
-
-    struct Sums;
-
-    impl WithSimd for Sums {
-        type Output = [f32; 4];
-        #[inline(always)]
-        fn with_simd<S: Simd>(self, s: S) -> [f32; 4] {
-            let lanes: Vec<f32> = (0..4 * WIDTH).map(|i| (i * i) as f32).collect();
-            sums_of_four(each!(k in 4 => V::load(s, &lanes[WIDTH * k..])))
-        }
-    }
-
-    #[test]
-    fn four_vectors_are_summed_together() {
-        let arch = Arch::new();
-        let lanes = match arch.dispatch(Sums)[0] {
-            // Σ i² for i < 16, 8 or 4, by the lanes this machine has.
-            1240.0 => 16,
-            140.0 => 8,
-            _ => 4,
-        };
-        let sum = |k: usize| (WIDTH * k..WIDTH * k + lanes).map(|i| (i * i) as f32).sum::<f32>();
-        assert_eq!(arch.dispatch(Sums), [0, 1, 2, 3].map(sum));
-    }
-
-    #[test]
-    fn elementary_functions_are_accurate() {
-        let arch = Arch::new();
-        let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
-        assert!(arch.dispatch(exp2) < 2e-7);
-        for (function, bound) in [(Function::Exp2By2, 1.8e-3), (Function::Exp2By4, 2.8e-6)] {
-            let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), function, 0.0);
-            let worst = arch.dispatch(exp2);
-            assert!(worst < bound && worst > 0.9 * bound, "{worst}");
-        }
-        let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
-        assert!(arch.dispatch(exp) < 2e-7);
-        let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
-        assert!(arch.dispatch(log2) < 3e-7);
-    }
-}
+mod tests;
