@@ -1,4 +1,5 @@
-//! Time per training step and stage on random scenes, on one thread, on two, and on every adapter.
+//! Time per training step and stage on random scenes, on one thread, on two, and on every adapter,
+//! in every way that it can add up gradients.
 //!
 //! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are
 //! medians of processor time, so that a loaded machine distorts them little; the stage columns are
@@ -180,10 +181,16 @@ fn main() {
     println!("one thread: at most {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
     let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
     let usable = adapters().into_iter().filter(|a| a.missing.is_empty());
-    let open = |name| GpuDevice::open(&AdapterChoice { name: Some(name) });
-    let devices: Vec<GpuDevice> = usable.filter_map(|a| open(a.name).ok()).collect();
+    let mut devices: Vec<GpuDevice> = Vec::new();
+    for adapter in usable {
+        for way in adapter.accumulations {
+            let name = Some(adapter.name.clone());
+            devices.extend(GpuDevice::open(&AdapterChoice { name, accumulation: Some(way) }).ok());
+        }
+    }
     for (i, device) in devices.iter().enumerate() {
-        println!("adapter {i}: {}, {}", device.adapter().name, device.adapter().driver);
+        let (adapter, way) = (device.adapter(), device.accumulation());
+        println!("adapter {i}: {}, {}, accumulation={way}", adapter.name, adapter.driver);
     }
     println!("   rows  image   entries         on  CPU ms  wall ms  stages [ms]");
     for (rows, size) in [

@@ -77,6 +77,8 @@ pub enum On {
     Both,
     /// The native backend.
     Native,
+    /// The GPU backend.
+    Gpu,
 }
 
 /// How a knob is set.
@@ -204,15 +206,20 @@ impl Knob {
     /// Fails where a backend would have to be what it cannot be.
     ///
     /// # Errors
-    /// When the value is not the default and a GPU, which lacks the knob, is to train.
+    /// When the value is not the default and the backend that is to train lacks the knob.
     pub fn check_backend(&self, value: &str, gpu: bool) -> Result<(), KnobError> {
-        if !gpu || self.on == On::Both || self.is_default(value) {
+        let (here, other) = match (self.on, gpu) {
+            (On::Native, true) => ("GPU", "cpu"),
+            (On::Gpu, false) => ("native", "gpu"),
+            (On::Both, _) | (On::Native, false) | (On::Gpu, true) => return Ok(()),
+        };
+        if self.is_default(value) {
             return Ok(());
         }
         let Self { name, default, .. } = self;
         Err(KnobError(format!(
-            "knob {name}={value}: the GPU backend does not have it; the nearest that works there is \
-             {name}={default}, or use --backend cpu"
+            "knob {name}={value}: the {here} backend does not have it; the nearest that works there \
+             is {name}={default}, or use --backend {other}"
         )))
     }
 }

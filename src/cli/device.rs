@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use super::console::Console;
 use super::failure::Failure;
 use crate::backend::gpu::{
-    AdapterChoice, AdapterKind, AdapterSummary, GpuDevice, adapters, may_be_present,
+    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, GpuDevice, adapters, may_be_present,
 };
 
 /// Where to compute.
@@ -32,8 +32,13 @@ pub(super) enum Where {
 }
 
 impl DeviceArgs {
-    /// Opens the device to compute on; `None` is the processor. Says which it is.
-    pub(super) fn open(&self, console: &Console) -> Result<Option<GpuDevice>, Failure> {
+    /// Opens the device to compute on; `None` is the processor. Says which it is. Without an
+    /// `accumulation`, how it adds up gradients is its own choice.
+    pub(super) fn open(
+        &self,
+        accumulation: Option<Accumulation>,
+        console: &Console,
+    ) -> Result<Option<GpuDevice>, Failure> {
         if self.backend == Where::Cpu {
             if self.gpu.is_some() {
                 return Err(Failure::input(
@@ -50,7 +55,7 @@ impl DeviceArgs {
             );
             return Ok(None);
         }
-        let device = GpuDevice::open(&AdapterChoice { name: self.gpu.clone() })?;
+        let device = GpuDevice::open(&AdapterChoice { name: self.gpu.clone(), accumulation })?;
         let adapter = device.adapter();
         let note = match adapter.kind {
             AdapterKind::Software => ", a software driver: --backend cpu is faster",
@@ -58,5 +63,10 @@ impl DeviceArgs {
         };
         console.say(format_args!("device   {} ({}){note}", adapter.name, adapter.interface));
         Ok(Some(device))
+    }
+
+    /// The same for what needs no gradients, and so nothing of a device but what all have.
+    pub(super) fn open_to_render(&self, console: &Console) -> Result<Option<GpuDevice>, Failure> {
+        self.open(Some(Accumulation::Slots), console)
     }
 }

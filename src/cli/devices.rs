@@ -13,7 +13,8 @@ use crate::memory::Bytes;
 ///
 /// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; how
 /// much memory there is in all, drivers do not say. `WGPU_BACKEND` (vulkan, metal, dx12) and, for
-/// Vulkan, `VK_DRIVER_FILES` decide which drivers are asked.
+/// Vulkan, `VK_DRIVER_FILES` decide which drivers are asked. Accumulation is how gradients are added up:
+/// slots repeat, cas and atomics are faster (`train --knob accumulation=NAME`, `train --deterministic`).
 #[derive(Debug, Args)]
 pub(super) struct DevicesArgs {}
 
@@ -36,6 +37,14 @@ pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
         });
         let budgets: Vec<_> = budgets.collect();
         console.result(format_args!("  largest budget  {}", budgets.join(", ")));
+        let own = adapter.accumulation();
+        let others = adapter.accumulations.iter().filter(|way| **way != own);
+        let others: Vec<_> = others.map(ToString::to_string).collect();
+        let note = match others.is_empty() {
+            true => String::new(),
+            false => format!("; if asked for, {}", others.join(", ")),
+        };
+        console.result(format_args!("  accumulation    {own}{note}"));
         for missing in &adapter.missing {
             console.result(format_args!("  cannot be used: {missing}"));
         }

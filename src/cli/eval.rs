@@ -54,7 +54,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     crate::output::RunConfig::read(run)?;
     let iteration = iteration(run, args.iteration)?;
     let moved_to = args.scene.clone();
-    let machine = Machine { threads: args.threads, device: args.device.open(console)? };
+    let machine = Machine { threads: args.threads, device: args.device.open_to_render(console)? };
     let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
     let views = opened.views(args.split)?;
     let background = opened.scene.background.fixed();

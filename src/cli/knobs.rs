@@ -52,6 +52,7 @@ fn facts(knob: &Knob) -> String {
     let on = match knob.on {
         On::Both => "",
         On::Native => "; native backend only",
+        On::Gpu => "; GPU backend only",
     };
     format!("{}{unit}, of {}{how}{on}", knob.default, knob.domain)
 }

@@ -110,7 +110,7 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
 }
 
 fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
-    let machine = Machine { threads: args.threads, device: args.device.open(console)? };
+    let machine = Machine { threads: args.threads, device: args.device.open_to_render(console)? };
     if !args.model.is_file() {
         crate::output::RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;

@@ -99,11 +99,12 @@ fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
 fn benches(args: &SelftestArgs, console: &Console) -> Result<Vec<Bench>, Failure> {
     let native = Bench::Native { threads: args.threads.map(usize::from) };
     if !args.all {
-        return Ok(vec![args.device.open(console)?.map_or(native, Bench::Gpu)]);
+        return Ok(vec![args.device.open(None, console)?.map_or(native, Bench::Gpu)]);
     }
     let mut benches = vec![native];
     for adapter in adapters().into_iter().filter(|adapter| adapter.missing.is_empty()) {
-        let device = GpuDevice::open(&AdapterChoice { name: Some(adapter.name) })?;
+        let device =
+            GpuDevice::open(&AdapterChoice { name: Some(adapter.name), accumulation: None })?;
         benches.push(Bench::Gpu(device));
     }
     Ok(benches)

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::{How, KNOBS, Knob, KnobError, find, number, parse};
+use crate::backend::gpu::Accumulation;
 use crate::backend::{Exp2, MomentStorage, ParameterStorage, Shortcuts, Stepped, Storage};
 use crate::trainer::Savings;
 
@@ -37,6 +38,29 @@ impl Settings {
             all.0.insert(knob.name.to_owned(), value);
         }
         Ok(all)
+    }
+
+    /// The settings of a run as it had them, where it was of a version that lacked some: by default,
+    /// but for sums in slots on a GPU, which had no other.
+    #[must_use]
+    pub fn completed(&self, gpu: bool) -> Self {
+        let mut all = Self::default();
+        if gpu {
+            all.take_accumulation(Accumulation::Slots);
+        }
+        all.0.extend(self.0.clone());
+        all
+    }
+
+    /// Notes how the device that was opened adds up, so that `auto` is no longer open.
+    pub fn take_accumulation(&mut self, taken: Accumulation) {
+        self.0.insert("accumulation".to_owned(), taken.name().to_owned());
+    }
+
+    /// How a GPU is to add up gradients; `None` where that is its own choice.
+    #[must_use]
+    pub fn accumulation(&self) -> Option<Accumulation> {
+        Accumulation::of_name(self.text("accumulation"))
     }
 
     /// Each knob with its value.

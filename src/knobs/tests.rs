@@ -78,7 +78,8 @@ fn settings_hold_every_knob_of_their_own_and_what_follows_from_it() {
     assert_eq!(settings.pairs_per_row(), None);
     let effect = |settings: &Settings| {
         let (shortcuts, savings) = (settings.shortcuts(), settings.savings());
-        format!("{shortcuts:?}{savings:?}{:?}{:?}", settings.storage(), settings.pairs_per_row())
+        let (storage, pairs) = (settings.storage(), settings.pairs_per_row());
+        format!("{shortcuts:?}{savings:?}{storage:?}{pairs:?}{:?}", settings.accumulation())
     };
     assert_eq!(settings.changed().count(), 0);
     let own: Vec<_> = KNOBS.iter().filter(|knob| knob.how == How::Knob).collect();
@@ -93,12 +94,24 @@ fn settings_hold_every_knob_of_their_own_and_what_follows_from_it() {
             assert_eq!(found, [(knob.name, *level)]);
             assert!(!seen.contains(&effect(&changed)), "{}={level} does nothing", knob.name);
             assert_eq!(changed.check_backend(true).is_err(), knob.on == On::Native);
-            assert!(changed.check_backend(false).is_ok());
+            assert_eq!(changed.check_backend(false).is_err(), knob.on == On::Gpu);
             seen.push(effect(&changed));
         }
     }
     let elsewhere = Settings::of(&["sh_degree=1".into(), "budget=9".into()]).unwrap();
     assert_eq!(elsewhere, settings);
+}
+
+#[test]
+fn a_run_of_an_older_version_has_the_knobs_that_it_had() {
+    use crate::backend::gpu::Accumulation;
+    let older: Settings = toml::from_str("alpha_min = \"1/64\"").unwrap();
+    let native = Settings::of(&["alpha_min=1/64".into()]).unwrap();
+    assert_eq!(older.completed(false), native);
+    assert_eq!(older.completed(true).accumulation(), Some(Accumulation::Slots));
+    let mut newer = native.clone();
+    newer.take_accumulation(Accumulation::SubgroupCas);
+    assert_eq!(newer.completed(true), newer);
 }
 
 #[test]

@@ -4,6 +4,7 @@ use wgpu::{
     Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
 };
 
+use super::accumulation::Accumulation;
 use super::device::wait;
 use crate::backend::BackendError;
 
@@ -39,12 +40,15 @@ pub struct AdapterSummary {
     pub largest_buffer: u64,
     /// What it lacks to be used, if anything.
     pub missing: Vec<String>,
+    /// The ways of adding up gradients that it has, the fastest last; always [`Accumulation::Slots`].
+    pub accumulations: Vec<Accumulation>,
 }
 
 impl AdapterSummary {
     fn new(adapter: &Adapter) -> Self {
         let info = adapter.get_info();
-        let limits = adapter.limits();
+        let (limits, features) = (adapter.limits(), adapter.features());
+        let has = |way: &Accumulation| way.missing(features).is_empty();
         Self {
             kind: match info.device_type {
                 DeviceType::DiscreteGpu => AdapterKind::Discrete,
@@ -58,7 +62,8 @@ impl AdapterSummary {
             name: info.name,
             largest_binding: limits.max_storage_buffer_binding_size,
             largest_buffer: limits.max_buffer_size,
-            missing: missing(&limits, adapter.features()),
+            missing: missing(&limits, features),
+            accumulations: Accumulation::ALL.into_iter().filter(has).collect(),
         }
     }
 
@@ -68,6 +73,16 @@ impl AdapterSummary {
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         let per_row = if sh_degree >= 3 { 84 } else { 80 };
         (self.largest_binding.min(self.largest_buffer) / per_row).min(MOST_ROWS)
+    }
+
+    /// How it adds up gradients where nobody says: as fast as it can, but for software drivers, which
+    /// are there to check the kernels and do what repeats.
+    #[must_use]
+    pub fn accumulation(&self) -> Accumulation {
+        match self.kind {
+            AdapterKind::Software => Accumulation::Slots,
+            _ => self.accumulations.last().copied().unwrap_or(Accumulation::Slots),
+        }
     }
 
     /// Whether `auto` may take it: a GPU that lacks nothing.
@@ -143,14 +158,40 @@ pub fn adapters() -> Vec<AdapterSummary> {
     enumerate().into_iter().map(|(_, summary)| summary).collect()
 }
 
-/// Which adapter to take.
+/// Which adapter to take, and how it is to work.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct AdapterChoice {
     /// Part of its name or its driver's, in any case of letters; the best there is without one.
     pub name: Option<String>,
+    /// How it adds up gradients; [its own choice](AdapterSummary::accumulation) without one.
+    pub accumulation: Option<Accumulation>,
 }
 
 impl AdapterChoice {
+    /// How the adapter that was taken adds up gradients.
+    ///
+    /// # Errors
+    /// [`BackendError::NoAdapter`] where it cannot do what is asked for: what it lacks, and what it can.
+    pub(super) fn accumulation(
+        &self,
+        adapter: &AdapterSummary,
+        features: Features,
+    ) -> Result<Accumulation, BackendError> {
+        let Some(wanted) = self.accumulation else { return Ok(adapter.accumulation()) };
+        let missing = wanted.missing(features);
+        if missing.is_empty() {
+            return Ok(wanted);
+        }
+        let can: Vec<String> =
+            adapter.accumulations.iter().map(|way| format!("accumulation={way}")).collect();
+        Err(BackendError::NoAdapter(format!(
+            "accumulation={wanted}: {} lacks {}; what works there is {}",
+            adapter.name,
+            missing.join(" and "),
+            can.join(" or ")
+        )))
+    }
+
     fn matches(&self, summary: &AdapterSummary) -> bool {
         let Some(name) = &self.name else { return true };
         let name = name.to_lowercase();
@@ -209,7 +250,54 @@ mod tests {
             largest_binding: 128 << 20,
             largest_buffer: 256 << 20,
             missing: missing.iter().map(|&m| m.to_owned()).collect(),
+            accumulations: vec![Accumulation::Slots],
         }
+    }
+
+    #[test]
+    fn gradients_are_added_up_as_the_adapter_can() {
+        use Accumulation::{Slots, SubgroupAtomics, SubgroupCas};
+        let subgroups = Features::SUBGROUP;
+        let both = subgroups | Features::SHADER_FLOAT32_ATOMIC;
+        let of = |kind, features| AdapterSummary {
+            accumulations: Accumulation::ALL
+                .into_iter()
+                .filter(|way| way.missing(features).is_empty())
+                .collect(),
+            ..adapter("Card", kind, &[])
+        };
+        let chosen = |kind, features, accumulation| {
+            let choice = AdapterChoice { name: None, accumulation };
+            choice.accumulation(&of(kind, features), features)
+        };
+        // As fast as it can, where nobody says.
+        let card = AdapterKind::Discrete;
+        for (features, expected) in [
+            (Features::empty(), Slots),
+            (subgroups, SubgroupCas),
+            (both, SubgroupAtomics),
+            // Sums over tiles want subgroups, too.
+            (Features::SHADER_FLOAT32_ATOMIC, Slots),
+        ] {
+            assert_eq!(chosen(card, features, None).unwrap(), expected, "{features:?}");
+            assert_eq!(chosen(AdapterKind::Software, features, None).unwrap(), Slots);
+        }
+        // What is asked for, or a refusal.
+        for wanted in Accumulation::ALL {
+            assert_eq!(chosen(AdapterKind::Software, both, Some(wanted)).unwrap(), wanted);
+            assert_eq!(Accumulation::of_name(wanted.name()), Some(wanted));
+        }
+        let told = |features, wanted| {
+            chosen(card, features, Some(wanted)).expect_err("it lacks something").to_string()
+        };
+        let without = told(subgroups, SubgroupAtomics);
+        assert!(without.contains("Card lacks atomic addition of f32"), "{without}");
+        assert!(without.contains("accumulation=slots or accumulation=cas"), "{without}");
+        let neither = told(Features::empty(), SubgroupAtomics);
+        for word in ["SUBGROUP", "SHADER_FLOAT32_ATOMIC", "is accumulation=slots"] {
+            assert!(neither.contains(word), "{word} is not in {neither}");
+        }
+        assert!(!told(Features::empty(), SubgroupCas).contains("FLOAT32"));
     }
 
     #[test]
@@ -220,7 +308,7 @@ mod tests {
             adapter("Shared", AdapterKind::Integrated, &[]),
             adapter("Card", AdapterKind::Discrete, &[]),
         ];
-        let named = |name: &str| AdapterChoice { name: Some(name.into()) };
+        let named = |name: &str| AdapterChoice { name: Some(name.into()), accumulation: None };
         assert_eq!(choose(&all, &AdapterChoice::default()).unwrap(), 3);
         assert_eq!(choose(&all[..3], &AdapterChoice::default()).unwrap(), 2);
         assert_eq!(choose(&all[..2], &AdapterChoice::default()).unwrap(), 0);

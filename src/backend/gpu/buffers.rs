@@ -6,6 +6,7 @@ use std::collections::HashMap;
 use densify_policies::policy::{Cadence, ErrorMode, Needs};
 use wgpu::{Buffer, BufferDescriptor, BufferUsages};
 
+use super::accumulation::Accumulation;
 use super::device::Device;
 use super::frame::{Frame, State, grid};
 use super::photographs::KeptPhotographs;
@@ -48,6 +49,8 @@ pub(super) struct Sizes {
     pub(super) planes: u64,
     /// Records and their sums.
     pub(super) detail: u32,
+    /// How sums come about: whether there are records at all.
+    pub(super) accumulation: Accumulation,
     /// Whether the gradients of alpha and depth are given, too.
     pub(super) more: bool,
     pub(super) cadence: Cadence,
@@ -71,6 +74,7 @@ impl Sizes {
         sh_degree: u8,
         image: (u32, u32),
         needs: &Needs,
+        accumulation: Accumulation,
     ) -> Self {
         let planes = Planes::new(needs);
         Self {
@@ -81,6 +85,7 @@ impl Sizes {
             photographs: KeptPhotographs::default(),
             planes: u64::from(planes.count),
             detail: planes.detail,
+            accumulation,
             more: false,
             cadence: needs.cadence,
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
@@ -133,7 +138,9 @@ impl Sizes {
         for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
             add(Section::Tiles, "entries", name, 4 * cap);
         }
-        add(Section::Tiles, "gradients per entry", "records", stride * cap);
+        if self.accumulation == Accumulation::Slots {
+            add(Section::Tiles, "gradients per entry", "records", stride * cap);
+        }
         let sums = b.max(16 * cap.div_ceil(BLOCK));
         add(Section::Tiles, "sums", "sums", 4 * sums);
         add(Section::Tiles, "sums", "block sums", 4 * sums.div_ceil(BLOCK));

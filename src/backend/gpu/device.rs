@@ -7,6 +7,7 @@ use std::task::{Context, Poll, Waker};
 
 use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
+use super::accumulation::Accumulation;
 use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
 use super::buffers::{Planned, Sizes};
 use super::pipelines::{Pipelines, Variant};
@@ -40,7 +41,8 @@ impl GpuDevice {
     /// Opens an adapter.
     ///
     /// # Errors
-    /// [`BackendError::NoAdapter`] with what there is and what it lacks.
+    /// [`BackendError::NoAdapter`] with what there is and what it lacks, to work at all or to add up
+    /// gradients as is asked for.
     pub fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
         Ok(Self(Arc::new(Device::open(choice)?)))
     }
@@ -50,6 +52,12 @@ impl GpuDevice {
     pub fn adapter(&self) -> &AdapterSummary {
         &self.0.summary
     }
+
+    /// How it adds up gradients.
+    #[must_use]
+    pub fn accumulation(&self) -> Accumulation {
+        self.0.accumulation
+    }
 }
 
 /// An open device.
@@ -58,6 +66,7 @@ pub(super) struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     pub(super) summary: AdapterSummary,
+    pub(super) accumulation: Accumulation,
     told: Arc<Mutex<Told>>,
     /// By what they are compiled for; there are few.
     pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
@@ -71,9 +80,11 @@ impl Device {
         let mut all = enumerate();
         let summaries: Vec<_> = all.iter().map(|(_, summary)| summary.clone()).collect();
         let (adapter, summary) = all.swap_remove(choose(&summaries, choice)?);
+        let accumulation = choice.accumulation(&summary, adapter.features())?;
         let descriptor = DeviceDescriptor {
             label: Some("densify"),
-            required_features: Features::IMMEDIATES,
+            // No more than is used: what is asked for can change how a driver compiles.
+            required_features: Features::IMMEDIATES | accumulation.features(),
             required_limits: adapter.limits(),
             // Buffers are few and made once: no pools beyond what the ledger says.
             memory_hints: MemoryHints::MemoryUsage,
@@ -94,6 +105,7 @@ impl Device {
             device,
             queue,
             summary,
+            accumulation,
             told,
             pipelines: Mutex::default(),
             proven: Mutex::default(),

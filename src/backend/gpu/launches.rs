@@ -2,8 +2,10 @@
 
 use wgpu::Device;
 
-use super::buffers::{Buffers, FIRST_SH, SECOND_SH, SH, WAITING_SH};
+use super::accumulation::Accumulation;
+use super::buffers::{Buffers, FIRST_SH, SECOND_SH, SH, Sizes, WAITING_SH};
 use super::pipelines::{Kernel, Launch, Pipelines};
+use super::signals::record_stride;
 
 /// What errors are read from: the loss's error per pixel, or its gradient.
 const MAPS: [&str; 2] = ["error", "pixel gradient"];
@@ -28,7 +30,6 @@ pub(super) struct Launches {
     pub(super) pixel_gradient: Launch,
     pub(super) loss_total: Launch,
     pub(super) rasterize_bwd: [Launch; 2],
-    pub(super) gather: Launch,
     pub(super) project_bwd: Launch,
     pub(super) adam_bands: [Launch; 4],
     pub(super) adam_geometry: Launch,
@@ -40,17 +41,36 @@ pub(super) struct Launches {
     pub(super) narrow: Launch,
     pub(super) write_worst: [Launch; 2],
     pub(super) replay: [Launch; 2],
-    pub(super) gather_columns: Launch,
+    pub(super) sums: Sums,
+}
+
+/// What comes before or after a tile kernel, so that its sums are those of rows.
+#[derive(Debug)]
+pub(super) enum Sums {
+    /// After each band: of the backward pass, and of an auxiliary view.
+    Slots { gather: Launch, gather_columns: Launch },
+    /// Before the first one, the sums being of so many numbers per row.
+    Atomics { clear: Launch, numbers: u32 },
 }
 
 impl Launches {
-    pub(super) fn new(device: &Device, pipelines: &Pipelines, buffers: &Buffers) -> Self {
+    pub(super) fn new(
+        device: &Device,
+        pipelines: &Pipelines,
+        buffers: &Buffers,
+        sizes: &Sizes,
+    ) -> Self {
         let bind =
             |kernel, names: &[&'static str]| pipelines.launch(device, buffers, kernel, names);
         let keys = ["keys 0", "keys 1"];
         let values = ["values 0", "values 1"];
         let both = |f: &dyn Fn(usize) -> Launch| [f(0), f(1)];
         let [sh0, sh1, sh2, sh3] = SH;
+        let in_slots = sizes.accumulation == Accumulation::Slots;
+        let (backward, replay, sums_to) = match in_slots {
+            true => (Kernel::RasterizeBwd, Kernel::Replay, "records"),
+            false => (Kernel::RasterizeBwdAtomic, Kernel::ReplayAtomic, "row sums"),
+        };
         Self {
             project: bind(
                 Kernel::Project,
@@ -117,13 +137,9 @@ impl Launches {
             loss_total: bind(Kernel::LossTotal, &["frame", "state", "tile sums"]),
             rasterize_bwd: both(&|i| {
                 let lists = [values[i], "row of slot", "tile starts"];
-                let pixels = ["splats", "finish", "pixel gradient", "records"];
-                bind(Kernel::RasterizeBwd, &[&["frame", "state"], &lists[..], &pixels[..]].concat())
+                let pixels = ["splats", "finish", "pixel gradient", sums_to];
+                bind(backward, &[&["frame", "state"], &lists[..], &pixels[..]].concat())
             }),
-            gather: bind(
-                Kernel::Gather,
-                &["frame", "depths", "slots of row", "records", "row sums"],
-            ),
             project_bwd: bind(
                 Kernel::ProjectBwd,
                 &["frame", "rows", sh0, sh1, sh2, sh3, "row sums", "depths", "gradient"],
@@ -172,13 +188,21 @@ impl Launches {
             }),
             replay: both(&|i| {
                 let lists = [values[i], "row of slot", "tile starts"];
-                let names = ["splats", "pixel gradient", "records"];
-                bind(Kernel::Replay, &[&["frame", "state"], &lists[..], &names[..]].concat())
+                let names = ["splats", "pixel gradient", sums_to];
+                bind(replay, &[&["frame", "state"], &lists[..], &names[..]].concat())
             }),
-            gather_columns: bind(
-                Kernel::GatherColumns,
-                &["frame", "depths", "slots of row", "records", "row sums"],
-            ),
+            sums: if in_slots {
+                let names = ["frame", "depths", "slots of row", "records", "row sums"];
+                Sums::Slots {
+                    gather: bind(Kernel::Gather, &names),
+                    gather_columns: bind(Kernel::GatherColumns, &names),
+                }
+            } else {
+                Sums::Atomics {
+                    clear: bind(Kernel::ClearSums, &["frame", "row sums"]),
+                    numbers: record_stride(sizes.detail) as u32,
+                }
+            },
         }
     }
 }

@@ -6,8 +6,10 @@
 //! processed in bands: as many are encoded as the step before needed, and a step for which these do
 //! not do changes nothing, says so, and is taken again with enough.
 //!
-//! Every sum has one order, so that the same device gives the same bytes twice.
+//! With [`Accumulation::Slots`] every sum has one order, so that the same device gives the same bytes
+//! twice. Elsewhere the sums of rows over tiles have any order, and all other sums still have one.
 
+mod accumulation;
 mod adapter;
 mod audit;
 mod buffers;
@@ -44,6 +46,7 @@ use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 
+pub use accumulation::Accumulation;
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
 use audit::Audited;
 use buffers::{Buffers, Sizes, bias_table};
@@ -142,10 +145,12 @@ impl GpuBackend {
         let planes = Planes::new(&options.needs);
         let sizes = promise::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
-        let variant = Variant { detail: sizes.detail, more: sizes.more, shortcuts };
+        let Sizes { detail, more, accumulation, .. } = sizes;
+        let variant = Variant { detail, more, shortcuts, accumulation };
         let pipelines = device.pipelines(variant)?;
-        let launches = device
-            .guarded("the kernels", 0, |device| Launches::new(device, &pipelines, &buffers))?;
+        let launches = device.guarded("the kernels", 0, |device| {
+            Launches::new(device, &pipelines, &buffers, &sizes)
+        })?;
         let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
         let audited = audit::launches(&device, &sizes, &buffers, &pipelines);
         let ledger = promise::ledger(&sizes, &options.needs);
@@ -214,10 +219,11 @@ impl GpuBackend {
     fn rebuild(&mut self) -> Result<(), BackendError> {
         self.buffers.resize(&self.device, &self.sizes)?;
         let Self { device, sizes, pipelines, buffers, .. } = self;
-        let Sizes { detail, more, .. } = *sizes;
-        *pipelines = device.pipelines(Variant { detail, more, shortcuts: self.shortcuts })?;
-        self.launches =
-            device.guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers))?;
+        let Sizes { detail, more, accumulation, .. } = *sizes;
+        let shortcuts = self.shortcuts;
+        *pipelines = device.pipelines(Variant { detail, more, shortcuts, accumulation })?;
+        self.launches = device
+            .guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers, sizes))?;
         self.edits = EditLaunches::new(device, sizes, &self.planes, buffers, pipelines);
         self.audited = audit::launches(device, sizes, buffers, pipelines);
         Ok(())

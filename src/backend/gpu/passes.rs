@@ -4,7 +4,7 @@
 use wgpu::ComputePass;
 
 use super::buffers::{BLOCK, band_coefficients};
-use super::launches::Launches;
+use super::launches::{Launches, Sums};
 use super::pipelines::{Launch, Pipelines};
 
 /// Workgroups in the first of two dimensions; see `shaders/view.wgsl`.
@@ -26,6 +26,9 @@ const DIGITS_OF_ROWS: u32 = 4;
 const DIGITS_OF_ENTRIES: u32 = 5;
 /// In place of a band: the whole image.
 const WHOLE: u32 = u32::MAX;
+
+/// Numbers per row of an auxiliary view.
+const COLUMNS: u32 = 4;
 
 /// What decides which commands are encoded.
 #[derive(Debug, Clone, Copy)]
@@ -171,16 +174,22 @@ impl Passes<'_> {
         to.run(&l.loss_total, [0; 4], 1);
     }
 
-    /// Stage 5: from the pixels' gradients to one record per row.
+    /// Stage 5: from the pixels' gradients to one sum per row.
     pub(super) fn backward(&self, to: &mut Recorder<'_, '_>) {
         let l = self.launches;
         let Shape { rows, tiles, bands } = self.shape;
+        let groups = rows.div_ceil(256);
+        if let Sums::Atomics { clear, numbers } = &l.sums {
+            to.run(clear, [*numbers, 0, 0, 0], groups);
+        }
         for band in 0..bands {
             if bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
             }
             to.run(&l.rasterize_bwd[self.sorted()], [band, 0, 0, 0], tiles);
-            to.run(&l.gather, [band, 0, 0, 0], rows.div_ceil(256));
+            if let Sums::Slots { gather, .. } = &l.sums {
+                to.run(gather, [band, 0, 0, 0], groups);
+            }
         }
     }
 
@@ -235,12 +244,18 @@ impl Passes<'_> {
     /// Each row's sums over the pixels of a view that it is blended into.
     pub(super) fn columns(&self, to: &mut Recorder<'_, '_>) {
         let l = self.launches;
+        let groups = self.shape.rows.div_ceil(256);
+        if let Sums::Atomics { clear, .. } = &l.sums {
+            to.run(clear, [COLUMNS, 0, 0, 0], groups);
+        }
         for band in 0..self.shape.bands {
             if self.shape.bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
             }
             to.run(&l.replay[self.sorted()], [band, 0, 0, 0], self.shape.tiles);
-            to.run(&l.gather_columns, [band, 0, 0, 0], self.shape.rows.div_ceil(256));
+            if let Sums::Slots { gather_columns, .. } = &l.sums {
+                to.run(gather_columns, [band, 0, 0, 0], groups);
+            }
         }
     }
 

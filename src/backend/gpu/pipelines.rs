@@ -5,6 +5,7 @@ use wgpu::{
     BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, ComputePipeline, Device,
 };
 
+use super::accumulation::Accumulation;
 use super::buffers::Buffers;
 use crate::backend::Shortcuts;
 
@@ -17,26 +18,56 @@ macro_rules! shader {
 const VIEW: &str = shader!("view");
 const GAUSSIAN: &str = shader!("gaussian");
 const RANDOM: &str = shader!("random");
+const BACKWARD: &str = shader!("backward");
+const SUBGROUPS: &str = shader!("subgroups");
+
+/// Which devices have a stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Of {
+    /// Those that add up in slots.
+    Slots,
+    /// Those that add up by atomics.
+    Atomics,
+    /// All.
+    All,
+}
 
 /// The texts of each stage.
-pub(super) const STAGES: [(&str, &[&str]); 12] = [
-    ("project", &[VIEW, GAUSSIAN, shader!("project")]),
-    ("tiles", &[VIEW, shader!("tiles")]),
-    ("rasterize", &[VIEW, shader!("rasterize")]),
-    ("loss", &[VIEW, shader!("loss")]),
-    ("rasterize_bwd", &[VIEW, shader!("rasterize_bwd")]),
-    ("project_bwd", &[VIEW, GAUSSIAN, shader!("project_bwd")]),
-    ("adam", &[VIEW, RANDOM, shader!("adam")]),
-    ("signals", &[VIEW, shader!("signals")]),
-    ("apply", &[VIEW, RANDOM, shader!("apply")]),
-    ("candidates", &[VIEW, RANDOM, shader!("candidates")]),
-    ("observe", &[VIEW, shader!("observe")]),
-    ("audit", &[VIEW, shader!("audit")]),
+pub(super) const STAGES: [(&str, Of, &[&str]); 14] = [
+    ("project", Of::All, &[VIEW, GAUSSIAN, shader!("project")]),
+    ("tiles", Of::All, &[VIEW, shader!("tiles")]),
+    ("rasterize", Of::All, &[VIEW, shader!("rasterize")]),
+    ("loss", Of::All, &[VIEW, shader!("loss")]),
+    ("rasterize_bwd", Of::Slots, &[VIEW, BACKWARD, shader!("rasterize_bwd")]),
+    (
+        "rasterize_bwd_atomic",
+        Of::Atomics,
+        &[VIEW, BACKWARD, SUBGROUPS, shader!("rasterize_bwd_atomic")],
+    ),
+    ("project_bwd", Of::All, &[VIEW, GAUSSIAN, shader!("project_bwd")]),
+    ("adam", Of::All, &[VIEW, RANDOM, shader!("adam")]),
+    ("signals", Of::All, &[VIEW, shader!("signals")]),
+    ("apply", Of::All, &[VIEW, RANDOM, shader!("apply")]),
+    ("candidates", Of::All, &[VIEW, RANDOM, shader!("candidates")]),
+    ("observe", Of::Slots, &[VIEW, shader!("observe")]),
+    ("observe_atomic", Of::Atomics, &[VIEW, SUBGROUPS, shader!("observe_atomic")]),
+    ("audit", Of::All, &[VIEW, shader!("audit")]),
 ];
 
-/// The text of a stage's module.
-pub(super) fn text(stage: usize) -> String {
-    STAGES[stage].1.concat()
+/// The text of a stage's module, for a device that adds up gradients in this way; none of a stage that
+/// it does not have.
+pub(super) fn text(stage: usize, accumulation: Accumulation) -> Option<String> {
+    let (_, of, texts) = STAGES[stage];
+    let sums = match accumulation {
+        Accumulation::Slots => None,
+        Accumulation::SubgroupCas => Some(shader!("sums_cas")),
+        Accumulation::SubgroupAtomics => Some(shader!("sums_f32")),
+    };
+    match (of, sums) {
+        (Of::All, _) | (Of::Slots, None) => Some(texts.concat()),
+        (Of::Atomics, Some(sums)) => Some([&texts.concat(), sums].concat()),
+        (Of::Slots, Some(_)) | (Of::Atomics, None) => None,
+    }
 }
 
 macro_rules! kernels {
@@ -69,6 +100,8 @@ kernels! {
     LossTotal: "loss" "total" [0, 1, 7];
     RasterizeBwd: "rasterize_bwd" "rasterize_bwd" [0, 1, 2, 3, 4, 5, 6, 7, 8];
     Gather: "rasterize_bwd" "gather" [0, 9, 10, 11, 12];
+    RasterizeBwdAtomic: "rasterize_bwd_atomic" "rasterize_bwd_atomic" [0, 1, 2, 3, 4, 5, 6, 7, 8];
+    ClearSums: "rasterize_bwd_atomic" "clear_sums" [0, 8];
     ProjectBwd: "project_bwd" "project_bwd" [0, 1, 2, 3, 4, 5, 6, 7, 8];
     AdamBand: "adam" "adam_band" [0, 1, 2, 3, 4, 5, 6, 7, 8];
     AdamGeometry: "adam" "adam_geometry" [0, 1, 2, 3, 4, 5, 6, 7, 8];
@@ -86,6 +119,7 @@ kernels! {
     WriteWorst: "candidates" "write_worst" [0, 9, 10, 11, 12];
     Replay: "observe" "replay" [0, 1, 2, 3, 4, 5, 6, 7];
     GatherColumns: "observe" "gather_columns" [0, 8, 9, 10, 11];
+    ReplayAtomic: "observe_atomic" "replay_atomic" [0, 1, 2, 3, 4, 5, 6, 8];
     Audit: "audit" "audit" [1, 2];
 }
 
@@ -97,12 +131,14 @@ pub(super) struct Variant {
     /// Whether alpha and depth have gradients.
     pub(super) more: bool,
     pub(super) shortcuts: Shortcuts,
+    pub(super) accumulation: Accumulation,
 }
 
-/// The kernels of a device, for records of one detail, in the order of [`Kernel`].
+/// The kernels of a device, for records of one detail, in the order of [`Kernel`]; none of stages that
+/// it does not have.
 #[derive(Debug)]
 pub(super) struct Pipelines {
-    pipelines: Vec<(ComputePipeline, BindGroupLayout)>,
+    pipelines: Vec<Option<(ComputePipeline, BindGroupLayout)>>,
 }
 
 /// How a stage's text declares the buffer at a binding.
@@ -125,9 +161,9 @@ pub(super) struct Launch {
 }
 
 impl Pipelines {
-    /// Builds every kernel.
+    /// Builds every kernel that there is for the variant.
     pub(super) fn new(device: &Device, variant: Variant) -> Self {
-        let Variant { detail, more, shortcuts } = variant;
+        let Variant { detail, more, shortcuts, accumulation } = variant;
         let detail = ("DETAIL", f64::from(detail));
         // Every text has these, as the shared one does.
         let blending = [
@@ -135,28 +171,32 @@ impl Pipelines {
             ("LOG2_REACH", f64::from(shortcuts.log2_reach())),
             ("TRANSMITTANCE_MIN", f64::from(shortcuts.transmittance_min)),
         ];
-        let texts: Vec<_> = (0..STAGES.len()).map(text).collect();
         let modules: Vec<_> = STAGES
             .iter()
-            .zip(&texts)
-            .map(|((stage, _), text)| {
-                device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            .enumerate()
+            .map(|(place, (stage, ..))| {
+                let text = text(place, accumulation)?;
+                let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
                     label: Some(stage),
-                    source: wgpu::ShaderSource::Wgsl(text.into()),
-                })
+                    source: wgpu::ShaderSource::Wgsl((&text).into()),
+                });
+                Some((module, text))
             })
             .collect();
         let pipelines = KERNELS
             .iter()
             .map(|&(stage, entry, bindings)| {
-                let place = STAGES.iter().position(|(name, _)| *name == stage).unwrap_or(0);
+                let place = STAGES.iter().position(|(name, ..)| *name == stage).unwrap_or(0);
+                let (module, text) = modules[place].as_ref()?;
                 let own: &[(&str, f64)] = match stage {
-                    "rasterize_bwd" => &[detail, ("MORE", f64::from(u8::from(more)))],
+                    "rasterize_bwd" | "rasterize_bwd_atomic" => {
+                        &[detail, ("MORE", f64::from(u8::from(more)))]
+                    }
                     "project_bwd" | "signals" => &[detail],
                     _ => &[],
                 };
                 let constants = [own, &blending].concat();
-                let layout = bind_group_layout(device, entry, &texts[place], bindings);
+                let layout = bind_group_layout(device, entry, text, bindings);
                 let pipeline_layout =
                     device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                         label: Some(entry),
@@ -166,7 +206,7 @@ impl Pipelines {
                 let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                     label: Some(entry),
                     layout: Some(&pipeline_layout),
-                    module: &modules[place],
+                    module,
                     entry_point: Some(entry),
                     compilation_options: wgpu::PipelineCompilationOptions {
                         constants: &constants,
@@ -175,14 +215,21 @@ impl Pipelines {
                     },
                     cache: None,
                 });
-                (pipeline, layout)
+                Some((pipeline, layout))
             })
             .collect();
         Self { pipelines }
     }
 
+    /// # Panics
+    /// When the device does not have the kernel's stage: a bug in the caller.
+    fn built(&self, kernel: Kernel) -> &(ComputePipeline, BindGroupLayout) {
+        let built = self.pipelines[kernel as usize].as_ref();
+        built.unwrap_or_else(|| panic!("this device adds up in another way than {kernel:?}"))
+    }
+
     pub(super) fn pipeline(&self, kernel: Kernel) -> &ComputePipeline {
-        &self.pipelines[kernel as usize].0
+        &self.built(kernel).0
     }
 
     /// Binds buffers by name, in the order of the kernel's bindings.
@@ -205,7 +252,7 @@ impl Pipelines {
             .collect();
         let bindings = device.create_bind_group(&BindGroupDescriptor {
             label: Some(entry),
-            layout: &self.pipelines[kernel as usize].1,
+            layout: &self.built(kernel).1,
             entries: &entries,
         });
         Launch { kernel, bindings }

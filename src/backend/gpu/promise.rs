@@ -2,6 +2,7 @@
 
 use densify_policies::policy::Needs;
 
+use super::accumulation::Accumulation;
 use super::buffers::{MOST_ENTRIES, Sizes};
 use super::device::{Device, GpuDevice};
 use super::signals::{Planes, record_stride};
@@ -10,8 +11,12 @@ use crate::backend::candidates::Candidates;
 use crate::memory::{Ledger, Section};
 
 fn most_pairs(device: &Device, needs: &Needs) -> u64 {
-    let stride = record_stride(Planes::new(needs).detail);
-    (device.largest_binding() / (4 * stride)).min(MOST_ENTRIES)
+    // Of the largest buffer that grows with them: records, or lists.
+    let numbers = match device.accumulation {
+        Accumulation::Slots => record_stride(Planes::new(needs).detail),
+        Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
+    };
+    (device.largest_binding() / (4 * numbers)).min(MOST_ENTRIES)
 }
 
 pub(super) fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Sizes {
@@ -24,7 +29,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Siz
     let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
     // The adapter takes fewer rows than the sums do entries.
     let cap = cap.min(MOST_ENTRIES).max(budget as u64);
-    let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs);
+    let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
     sizes.photographs = options.photographs;
     // They lie in one buffer, which nothing binds.
     let one = sizes.photograph_bytes().iter().sum::<u64>();

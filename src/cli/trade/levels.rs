@@ -6,7 +6,7 @@ use super::TradeArgs;
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::train;
-use crate::knobs::{How, KNOBS, Knob, Levels, find};
+use crate::knobs::{How, KNOBS, Knob, Levels, On, find};
 
 /// A knob that is measured.
 #[derive(Debug, Clone)]
@@ -36,7 +36,9 @@ pub(super) fn chosen(args: &TradeArgs, console: &Console) -> Result<Vec<Chosen>,
     }
     if args.knobs.is_empty() {
         let mut all = Vec::new();
-        for knob in KNOBS.iter().filter(|knob| knob.how != How::BuiltIn) {
+        let is_there = |knob: &&Knob| knob.on != On::Gpu || is_on_gpu(&args.train);
+        let settable = KNOBS.iter().filter(|knob| knob.how != How::BuiltIn);
+        for knob in settable.filter(is_there) {
             let one = Chosen { knob, levels: levels(knob, args) };
             match check(args, &one) {
                 Ok(()) => all.push(one),
@@ -70,6 +72,13 @@ pub(super) fn chosen(args: &TradeArgs, console: &Console) -> Result<Vec<Chosen>,
         all.push(one);
     }
     Ok(all)
+}
+
+/// Whether these options of `train` ask for a GPU.
+fn is_on_gpu(train: &[String]) -> bool {
+    let names_one = |word: &String| word == "--gpu" || word.starts_with("--gpu=");
+    let backend = train.windows(2).any(|words| words[0] == "--backend" && words[1] == "gpu");
+    backend || train.iter().any(|word| names_one(word) || word == "--backend=gpu")
 }
 
 /// The levels of a knob in runs of this size.

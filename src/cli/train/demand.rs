@@ -12,7 +12,7 @@ use super::degree::{Degree, ShDegree, check_full};
 use super::setup::{DECODERS, random_count};
 use super::size::Budget;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
-use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions, KeptPhotographs};
+use crate::backend::gpu::{Accumulation, GpuBackend, GpuDevice, GpuOptions, KeptPhotographs};
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::run_files::use_threads;
@@ -73,9 +73,18 @@ impl Survey {
         let entry = find(&args.policy)?;
         let parameters = parameters(args, entry)?;
         let knob = |error| Failure::input(format!("--knob: {error}"));
-        let settings = Settings::of(&args.knob).map_err(knob)?;
-        let device = args.device.open(console)?;
+        let mut settings = Settings::of(&args.knob).map_err(knob)?;
+        let device = args.device.open(accumulation(args, &settings)?, console)?;
         settings.check_backend(device.is_some()).map_err(knob)?;
+        if let Some(device) = &device {
+            let taken = device.accumulation();
+            settings.take_accumulation(taken);
+            let note = match taken.is_deterministic() {
+                true => "the same bytes every time",
+                false => "the last bits are chance; --deterministic for the same bytes every time",
+            };
+            console.say(format_args!("sums     accumulation={taken}: {note}"));
+        }
         use_threads(args.threads);
         let scene = args.data.config(&args.scene);
         let with_tracks = saved.is_none() && args.sh_degree == Some(ShDegree::Auto);
@@ -318,6 +327,21 @@ impl Survey {
     /// Bytes of all training images decoded.
     pub(super) fn all_images(&self) -> u64 {
         self.images[0].all
+    }
+}
+
+/// How a GPU is to add up gradients; `None` leaves that to it.
+fn accumulation(args: &TrainArgs, settings: &Settings) -> Result<Option<Accumulation>, Failure> {
+    match settings.accumulation() {
+        Some(given) if args.deterministic && !given.is_deterministic() => {
+            Err(Failure::input(format!(
+                "--deterministic, which takes accumulation={}, and --knob accumulation={given} \
+                 contradict each other; give one of them",
+                Accumulation::Slots
+            )))
+        }
+        _ if args.deterministic => Ok(Some(Accumulation::Slots)),
+        given => Ok(given),
     }
 }
 

@@ -51,6 +51,10 @@ pub(super) struct TrainArgs {
     data: SceneArgs,
     #[command(flatten)]
     device: DeviceArgs,
+    /// Give the same bytes every time. The processor always does; a GPU adds up gradients in slots for it,
+    /// in one order, where it would do it by atomics otherwise (`densify devices`)
+    #[arg(long, help_heading = "Device")]
+    deterministic: bool,
 
     /// Most Gaussians the model may ever have, at any instant: 200000, 28k, 1.5M
     /// `[default: 200k, or as many as --memory holds]`

@@ -17,8 +17,8 @@ use super::spelling::{self, command, given_knobs, id, is_given};
 use super::tally::is_in_use;
 use crate::checkpoint::{Checkpoint, newest};
 use crate::cli::console::Console;
+use crate::cli::device::Where;
 use crate::cli::failure::Failure;
-use crate::knobs::Settings;
 use crate::output::{InitChoice, RunConfig, RunFolder, saved_iterations};
 
 /// A run that goes on.
@@ -195,8 +195,14 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Result<Vec<OsString>, Failu
         let set = policy.parameters.iter();
         words.extend(set.map(|(key, value)| format!("--policy-set={name}.{key}={value}").into()));
     }
+    // Where this call says how sums are made, or that there is no GPU, `check` compares with the run.
+    let on_processor = given.get_one("backend") == Some(&Where::Cpu) && is_given(given, "backend");
+    let says_sums = on_processor || is_given(given, "deterministic");
     let given = given_knobs(given)?;
-    let kept = knobs.iter().filter(|(name, _)| given.iter().all(|(knob, _)| knob.name != *name));
+    let knobs = knobs.completed(train.adapter.is_some());
+    let kept = knobs.iter().filter(|(name, _)| {
+        given.iter().all(|(knob, _)| knob.name != *name) && !(says_sums && *name == "accumulation")
+    });
     words.extend(kept.map(|(name, value)| format!("--knob={name}={value}").into()));
     Ok(words)
 }
@@ -204,12 +210,8 @@ fn adopted(saved: &RunConfig, given: &ArgMatches) -> Result<Vec<OsString>, Failu
 /// Fails where the configuration of this call would give another result than the saved one.
 pub(super) fn check(now: &RunConfig, checkpoint: &Checkpoint) -> Result<(), Failure> {
     let saved = &checkpoint.header().config;
-    let (mut ours, mut theirs) = (leaves(now), leaves(saved));
-    // A run of a version that lacked a knob had it as it is by default.
-    for (name, value) in Settings::default().iter() {
-        let value = || Value::from(value).to_string();
-        theirs.entry(format!("knobs.{name}")).or_insert_with(value);
-    }
+    let knobs = saved.knobs.completed(saved.train.adapter.is_some());
+    let (mut ours, mut theirs) = (leaves(now), leaves(&RunConfig { knobs, ..saved.clone() }));
     for free in FREE {
         ours.remove(free);
         theirs.remove(free);

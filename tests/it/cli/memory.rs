@@ -112,10 +112,13 @@ fn a_run_takes_no_more_than_it_is_given() {
 #[test]
 fn on_a_gpu_it_bounds_what_is_on_the_device() {
     let scene = Photographs::colmap_text();
-    for device in crate::gpu::subjects() {
+    let mut rows: Vec<(&str, u64)> = Vec::new();
+    for device in crate::gpu::ways() {
         let (root, run) = scratch();
         let name = &device.adapter().name;
-        let flags = ["--gpu", name, "--memory", "48MiB", "--iterations", "2", "--eval"];
+        let knob = format!("accumulation={}", device.accumulation());
+        let flags =
+            ["--gpu", name, "--memory", "48MiB", "--iterations", "2", "--eval", "--knob", &knob];
         let call = |command: &str| {
             let arguments = [command, text(scene.path()), "-o", text(&run)];
             densify(&[&arguments[..], &flags].concat())
@@ -131,6 +134,14 @@ fn on_a_gpu_it_bounds_what_is_on_the_device() {
         // What the backend allocates is the ledger: `what_is_allocated_is_what_the_ledger_says`.
         assert!(bytes <= 48 * MIB && bytes > 47 * MIB, "{name}: {bytes}");
         assert!(planned.stdout.contains("on the device"), "{name}: {}", planned.stdout);
+        // Without records more rows fit.
+        let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
+        let most = config.lines().find_map(|line| line.strip_prefix("budget = "));
+        let most = most.and_then(|rows| rows.parse().ok()).expect("a number of rows");
+        let in_slots = rows.iter().find(|(other, _)| other == name).map(|(_, rows)| *rows);
+        let is_in_slots = device.accumulation().is_deterministic();
+        assert!(is_in_slots || in_slots.is_some_and(|rows| most > rows + rows / 10), "{name}");
+        rows.push((name, most));
     }
 }
 

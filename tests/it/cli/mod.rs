@@ -1,5 +1,6 @@
 //! The program as its users meet it: arguments in, exit code, messages and files out.
 
+mod accumulation;
 mod comparing;
 mod faults;
 mod generated;

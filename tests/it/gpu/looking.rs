@@ -12,7 +12,7 @@ use densify_policies::policy::{
 };
 
 use super::training::step;
-use super::{backend_for, subjects};
+use super::{backend_for, name, subjects, ways};
 use crate::compare::{Table, relative_error};
 use crate::scenes;
 use crate::subject::RATES;
@@ -82,8 +82,8 @@ fn auxiliary_views_show_what_they_show_natively() {
     let options = CpuOptions { needs: needs.clone(), ..CpuOptions::new(model.len()) };
     let mut cpu = CpuBackend::new(&model, &options).expect("a small model fits");
     let expected = look(&mut cpu);
-    for device in subjects() {
-        let mut table = Table::new("auxiliary views, GPU against CPU");
+    for device in ways() {
+        let mut table = Table::new(&format!("auxiliary views, {} against CPU", name(device)));
         for cap in [None, Some(1)] {
             let options =
                 GpuOptions { needs: needs.clone(), tile_cap: cap, ..GpuOptions::new(model.len()) };

@@ -3,7 +3,7 @@
 
 use densify::backend::cpu::ImageGradient;
 
-use super::{backend, subjects};
+use super::{backend, name, ways};
 use crate::compare::{Limits, Table, compare_images, relative_error};
 use crate::oracle::case::{Part, cases};
 use crate::reference::CLASSES;
@@ -14,8 +14,8 @@ const GPU: Limits = Limits { interior: 1e-4, ..Limits::CPU };
 #[test]
 fn the_gpu_reproduces_stored_images_and_gradients() {
     let Some(cases) = cases() else { return };
-    for device in subjects() {
-        let mut table = Table::new("GPU against stored arrays");
+    for device in ways() {
+        let mut table = Table::new(&format!("{} against stored arrays", name(device)));
         for case in &cases {
             let mut gpu = backend(&case.model, device);
             for part in Part::ALL {

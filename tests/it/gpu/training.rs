@@ -8,7 +8,7 @@ use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 
-use super::{backend_for, options, subjects};
+use super::{backend_for, name, options, subjects, ways};
 use crate::compare::{Table, relative_error};
 use crate::scenes;
 use crate::subject::RATES;
@@ -111,8 +111,8 @@ fn steps_are_those_of_the_native_backend() {
             Cadence { all: 2, sh_rest: 4 },
         ),
     ];
-    for device in subjects() {
-        let mut table = Table::new("training, GPU against CPU");
+    for device in ways() {
+        let mut table = Table::new(&format!("training, {} against CPU", name(device)));
         for (what, needs, cadence) in &runs {
             let cpu_options = CpuOptions { needs: needs.clone(), ..CpuOptions::new(model.len()) };
             let mut cpu = CpuBackend::new(&model, &cpu_options).expect("a small model fits");
@@ -146,7 +146,7 @@ fn steps_are_those_of_the_native_backend() {
 }
 
 #[test]
-fn the_same_device_gives_the_same_bytes_with_any_cap() {
+fn in_slots_a_device_gives_the_same_bytes_with_any_cap() {
     let camera = scenes::camera(60, 50, 61);
     let model = scenes::cloud(150, 2, &camera, 62);
     for device in subjects() {

@@ -10,7 +10,7 @@ use densify::gaussians::Gaussians;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{backend, options, subjects};
+use super::{atomics, backend, name, options, subjects, ways};
 use crate::compare::{Limits, Table, compare_images, relative_error};
 use crate::reference::{CLASSES, Model, Rules, View, render};
 use crate::scenes;
@@ -116,8 +116,8 @@ fn wide(values: &[f32]) -> Vec<f64> {
 
 #[test]
 fn gradients_are_those_of_the_native_backend() {
-    for device in subjects() {
-        let mut table = Table::new("gradients, GPU against CPU");
+    for device in ways() {
+        let mut table = Table::new(&format!("gradients, {} against CPU", name(device)));
         for (name, model, camera) in scenes() {
             let boundary = boundaries(&model, &camera);
             let upstream = scenes::upstream(&camera, 9).ignoring(&boundary);
@@ -235,12 +235,56 @@ fn bands_and_sizes_leave_nothing_behind() {
     }
 }
 
+/// Sums start at 0 with every pass, go on over bands, and start again where a pass is taken again because
+/// its bands did not do.
+#[test]
+fn atomic_sums_are_those_of_one_pass_with_any_cap() {
+    let camera = scenes::camera(70, 90, 32);
+    let model = scenes::cloud(150, 1, &camera, 42);
+    let upstream = scenes::upstream(&camera, 9);
+    let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
+    let upstream = ImageGradient {
+        rgb: narrow(&upstream.rgb),
+        alpha: narrow(&upstream.alpha),
+        depth: narrow(&upstream.depth),
+    };
+    let slots = subjects().first().map(|device| {
+        let whole = backend(&model, device).differentiate(&camera, GREY, 1, &upstream);
+        whole.expect("a small image is rendered").1
+    });
+    let Some(expected) = slots else { return };
+    for device in atomics() {
+        let mut table = Table::new(&format!("passes, {}", name(device)));
+        for cap in [None, Some(500), Some(1)] {
+            let options = GpuOptions { tile_cap: cap, ..options(&model) };
+            let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
+            for pass in 1..=3 {
+                let found = gpu.differentiate(&camera, GREY, 1, &upstream);
+                let (_, found) = found.expect("a small image is rendered");
+                let what = format!("cap {cap:?}, pass {pass}");
+                for class in CLASSES {
+                    let expected = wide(subject::class(&expected, class));
+                    let error = relative_error(subject::class(&found, class), &expected);
+                    table.check(&what, class, error, 2e-5);
+                }
+                for ((of, found), (_, expected)) in
+                    statistics(&found).into_iter().zip(statistics(&expected))
+                {
+                    table.check(&what, of, relative_error(&found, &wide(&expected)), 2e-5);
+                }
+            }
+        }
+        table.finish();
+    }
+}
+
 #[test]
 fn what_is_allocated_is_what_the_ledger_says() {
-    for device in subjects() {
+    for device in ways() {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);
-        let options = GpuOptions { largest_image: (40, 30), ..options(&model) };
+        let options =
+            GpuOptions { largest_image: (40, 30), tile_cap: Some(700), ..options(&model) };
         let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
         let promised = gpu.promised();
         let lines: u64 = gpu.ledger().lines.iter().map(|line| line.bytes).sum();
@@ -249,5 +293,10 @@ fn what_is_allocated_is_what_the_ledger_says() {
         assert_eq!(&GpuBackend::promise(model.sh_degree, &options, device), gpu.ledger());
         gpu.render(&camera, GREY, 1).expect("a rendering");
         assert_eq!(gpu.allocated(), promised);
+        // Only slots take records: nine numbers per pair.
+        let of_pairs = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));
+        let records: u64 = of_pairs.map(|line| line.bytes).sum();
+        let is_in_slots = device.accumulation().is_deterministic();
+        assert_eq!(records, if is_in_slots { 4 * 9 * 700 } else { 0 }, "{}", name(device));
     }
 }

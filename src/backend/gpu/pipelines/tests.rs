@@ -14,59 +14,102 @@ use super::super::frame::{Frame, State, folded_seed};
 use super::super::readback;
 use super::*;
 
-fn module(stage: usize) -> Module {
-    let text = text(stage);
-    naga::front::wgsl::parse_str(&text)
-        .unwrap_or_else(|e| panic!("{}: {}", STAGES[stage].0, e.emit_to_string(&text)))
+fn module(stage: usize, text: &str) -> Module {
+    naga::front::wgsl::parse_str(text)
+        .unwrap_or_else(|e| panic!("{}: {}", STAGES[stage].0, e.emit_to_string(text)))
+}
+
+/// What naga must allow, beside what WebGPU has everywhere.
+fn capabilities(accumulation: Accumulation) -> Capabilities {
+    let needed = accumulation.features();
+    [
+        (wgpu::Features::SUBGROUP, Capabilities::SUBGROUP),
+        (wgpu::Features::SHADER_FLOAT32_ATOMIC, Capabilities::SHADER_FLOAT32_ATOMIC),
+    ]
+    .into_iter()
+    .filter(|(feature, _)| needed.contains(*feature))
+    .fold(Capabilities::IMMEDIATES, |all, (_, capability)| all | capability)
 }
 
 #[test]
 fn every_shader_is_valid_and_binds_what_the_table_says() {
-    for (stage, (name, _)) in STAGES.iter().enumerate() {
-        let module = module(stage);
-        let info = Validator::new(ValidationFlags::all(), Capabilities::IMMEDIATES)
-            .validate(&module)
-            .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text(stage))));
-        let of_stage: Vec<_> = KERNELS.iter().filter(|(of, ..)| of == name).collect();
-        assert_eq!(of_stage.len(), module.entry_points.len(), "{name}: kernels");
-        for (i, entry) in module.entry_points.iter().enumerate() {
-            let (_, _, bindings) = of_stage
-                .iter()
-                .find(|(_, kernel, _)| *kernel == entry.name)
-                .unwrap_or_else(|| panic!("{name}: {} is in no table", entry.name));
-            let uses = info.get_entry_point(i);
-            let mut used: Vec<u32> = Vec::new();
-            let (mut storage, mut shared) = (0, 0);
-            for (handle, variable) in module.global_variables.iter() {
-                if uses[handle].is_empty() {
-                    continue;
-                }
-                if let Some(binding) = &variable.binding {
-                    used.push(binding.binding);
-                    let writes = match variable.space {
-                        AddressSpace::Storage { access } => {
-                            Some(access.contains(naga::StorageAccess::STORE))
-                        }
-                        _ => None,
-                    };
-                    let bound = match binding_type(&text(stage), binding.binding) {
-                        wgpu::BufferBindingType::Uniform => None,
-                        wgpu::BufferBindingType::Storage { read_only } => Some(!read_only),
-                    };
-                    assert_eq!(bound, writes, "{name}: binding {}", binding.binding);
-                }
-                storage += u32::from(matches!(variable.space, AddressSpace::Storage { .. }));
-                if variable.space == AddressSpace::WorkGroup {
-                    shared += module.types[variable.ty].inner.size(module.to_ctx());
-                }
+    let mut seen = std::collections::BTreeSet::new();
+    for accumulation in Accumulation::ALL {
+        for (stage, (name, ..)) in STAGES.iter().enumerate() {
+            if let Some(text) = text(stage, accumulation) {
+                check_stage(stage, &text, capabilities(accumulation));
+                seen.insert(*name);
             }
-            used.sort_unstable();
-            assert_eq!(&used[..], *bindings, "{name}: {}", entry.name);
-            // What every device has: the portable limits of WebGPU.
-            assert!(storage <= 8, "{}: {storage} storage buffers", entry.name);
-            assert!(shared <= 16_384, "{}: {shared} bytes of shared memory", entry.name);
-            assert!(entry.workgroup_size.iter().product::<u32>() <= 256, "{}", entry.name);
         }
+    }
+    assert_eq!(seen.len(), STAGES.len(), "stages that no device has");
+}
+
+/// A device is asked for no more than its way to add up needs, and for all of that.
+#[test]
+fn a_shader_needs_what_its_way_to_add_up_asks_for() {
+    let is_valid = |stage: usize, accumulation, allowed| {
+        let text = text(stage, accumulation).expect("it has the stage");
+        Validator::new(ValidationFlags::all(), allowed).validate(&module(stage, &text)).is_ok()
+    };
+    let stage = |wanted: &str| STAGES.iter().position(|(name, ..)| *name == wanted);
+    let of_atomics = ["rasterize_bwd_atomic", "observe_atomic"];
+    for stage in of_atomics.map(|name| stage(name).expect("it is in the table")) {
+        for accumulation in [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics] {
+            let all = capabilities(accumulation);
+            assert!(is_valid(stage, accumulation, all), "{accumulation}");
+            for one in all.difference(Capabilities::IMMEDIATES).iter() {
+                assert!(!is_valid(stage, accumulation, all.difference(one)), "{one:?}");
+            }
+        }
+    }
+}
+
+fn check_stage(stage: usize, text: &str, capabilities: Capabilities) {
+    let name = STAGES[stage].0;
+    let module = module(stage, text);
+    let info = Validator::new(ValidationFlags::all(), capabilities)
+        .validate(&module)
+        .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(text)));
+    let of_stage: Vec<_> = KERNELS.iter().filter(|(of, ..)| *of == name).collect();
+    assert_eq!(of_stage.len(), module.entry_points.len(), "{name}: kernels");
+    for (i, entry) in module.entry_points.iter().enumerate() {
+        let (_, _, bindings) = of_stage
+            .iter()
+            .find(|(_, kernel, _)| *kernel == entry.name)
+            .unwrap_or_else(|| panic!("{name}: {} is in no table", entry.name));
+        let uses = info.get_entry_point(i);
+        let mut used: Vec<u32> = Vec::new();
+        let (mut storage, mut shared) = (0, 0);
+        for (handle, variable) in module.global_variables.iter() {
+            if uses[handle].is_empty() {
+                continue;
+            }
+            if let Some(binding) = &variable.binding {
+                used.push(binding.binding);
+                let writes = match variable.space {
+                    AddressSpace::Storage { access } => {
+                        Some(access.contains(naga::StorageAccess::STORE))
+                    }
+                    _ => None,
+                };
+                let bound = match binding_type(text, binding.binding) {
+                    wgpu::BufferBindingType::Uniform => None,
+                    wgpu::BufferBindingType::Storage { read_only } => Some(!read_only),
+                };
+                assert_eq!(bound, writes, "{name}: binding {}", binding.binding);
+            }
+            storage += u32::from(matches!(variable.space, AddressSpace::Storage { .. }));
+            if variable.space == AddressSpace::WorkGroup {
+                shared += module.types[variable.ty].inner.size(module.to_ctx());
+            }
+        }
+        used.sort_unstable();
+        assert_eq!(&used[..], *bindings, "{name}: {}", entry.name);
+        // What every device has: the portable limits of WebGPU.
+        assert!(storage <= 8, "{}: {storage} storage buffers", entry.name);
+        assert!(shared <= 16_384, "{}: {shared} bytes of shared memory", entry.name);
+        assert!(entry.workgroup_size.iter().product::<u32>() <= 256, "{}", entry.name);
     }
 }
 
@@ -87,7 +130,8 @@ fn structs_lie_as_the_shaders_read_them() {
             [$(stringify!($field)),*].len()
         }};
     }
-    let module = module(1);
+    let text = text(1, Accumulation::Slots).expect("all devices have it");
+    let module = module(1, &text);
     let (frame, span) = offsets(&module, "Frame");
     let fields = check!(frame, Frame, rotation centre lens ratio background image model rates
         more_rates noise draw planes);

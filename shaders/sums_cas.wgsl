@@ -1,0 +1,25 @@
+// The sums of rows where a device adds whole numbers only: bits of f32, exchanged if nobody else was
+// faster. What an addition comes after is chance, and so are its last bits.
+
+@group(0) @binding(8) var<storage, read_write> row_sums: array<atomic<u32>>;
+
+fn clear(at: u32) {
+    atomicStore(&row_sums[at], 0u);
+}
+
+fn add(at: u32, x: f32) {
+    var known = atomicLoad(&row_sums[at]);
+    loop {
+        let sum = bitcast<u32>(bitcast<f32>(known) + x);
+        let tried = atomicCompareExchangeWeak(&row_sums[at], known, sum);
+        if tried.exchanged {
+            break;
+        }
+        known = tried.old_value;
+    }
+}
+
+// Makes a sum the larger of itself and x, which is >= 0: such numbers are in the order of their bits.
+fn raise(at: u32, x: f32) {
+    atomicMax(&row_sums[at], bitcast<u32>(x));
+}

@@ -1,0 +1,72 @@
+//! How the gradients that a row gets from its tiles are added up: in slots, in one order, or at once by
+//! atomics, in any order. Which of them a device does is chosen when it is opened.
+
+use std::fmt;
+
+use wgpu::Features;
+
+/// How the gradients that a row gets from its tiles are added up.
+///
+/// On a device that adds by atomics the last bits of a sum depend on chance, and so does what training
+/// arrives at, from run to run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Accumulation {
+    /// One record per (row, tile) pair, and a row's records summed in order: the same bytes every time.
+    Slots,
+    /// Within subgroups, then to the rows by comparing and exchanging whole numbers.
+    SubgroupCas,
+    /// Within subgroups, then to the rows by atomic addition of `f32`.
+    SubgroupAtomics,
+}
+
+impl Accumulation {
+    /// All of them, the fastest last.
+    pub const ALL: [Self; 3] = [Self::Slots, Self::SubgroupCas, Self::SubgroupAtomics];
+
+    /// Its name, as the knob `accumulation` has it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Slots => "slots",
+            Self::SubgroupCas => "cas",
+            Self::SubgroupAtomics => "atomics",
+        }
+    }
+
+    /// The one of this name.
+    #[must_use]
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|way| way.name() == name)
+    }
+
+    /// Whether a device gives the same bytes every time.
+    #[must_use]
+    pub const fn is_deterministic(self) -> bool {
+        matches!(self, Self::Slots)
+    }
+
+    /// What a device must have for it, beside what all kernels need.
+    pub(super) fn features(self) -> Features {
+        match self {
+            Self::Slots => Features::empty(),
+            Self::SubgroupCas => Features::SUBGROUP,
+            Self::SubgroupAtomics => Features::SUBGROUP | Features::SHADER_FLOAT32_ATOMIC,
+        }
+    }
+
+    /// What an adapter with these features lacks of it, in words.
+    pub(super) fn missing(self, there: Features) -> Vec<&'static str> {
+        let lacking = self.features().difference(there);
+        let names = [
+            (Features::SUBGROUP, "subgroup operations (SUBGROUP)"),
+            (Features::SHADER_FLOAT32_ATOMIC, "atomic addition of f32 (SHADER_FLOAT32_ATOMIC)"),
+        ];
+        names.into_iter().filter(|(one, _)| lacking.contains(*one)).map(|(_, name)| name).collect()
+    }
+}
+
+impl fmt::Display for Accumulation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
