@@ -109,8 +109,12 @@ impl Bench {
             #[cfg(test)]
             Self::Sabotaged(how) => format!("native, with errors in {how:?}"),
             Self::Gpu(device) => {
-                let adapter = device.adapter();
-                format!("{} ({}, {})", adapter.name, adapter.interface, adapter.driver)
+                let (adapter, way) = (device.adapter(), device.accumulation());
+                let note = match way.is_deterministic() {
+                    true => String::new(),
+                    false => format!(", accumulation={way}"),
+                };
+                format!("{} ({}, {}{note})", adapter.name, adapter.interface, adapter.driver)
             }
         }
     }
