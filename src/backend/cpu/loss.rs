@@ -413,7 +413,8 @@ impl WithSimd for Similarity<'_> {
                 let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
                 let two_ve_bb = var_e * inv_b * inv_b * 2.0;
                 let by_contrast = mu_e * contrast * inv_b * 2.0 - mu_y * two_ve_bb;
-                let inside = V::load(s, &LANES[..]).lt(c((PAD + width - at) as f32));
+                // Vectors of fewer than sixteen lanes may lie beyond the image as a whole.
+                let inside = V::load(s, &LANES[..]).lt(c((PAD + width).saturating_sub(at) as f32));
                 let to = row * stride + at;
                 inside.keep(contrast * by_luminance + luminance * by_contrast).store(&mut p1[to..]);
                 inside.keep(-(luminance * contrast * inv_b)).store(&mut p2[to..]);
