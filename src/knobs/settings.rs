@@ -77,6 +77,8 @@ impl Settings {
                 "on" => Stepped::Visible,
                 _ => Stepped::All,
             },
+            // "off" is no number.
+            row_degrees: number("row_degrees"),
         }
     }
 
