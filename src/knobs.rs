@@ -15,6 +15,9 @@ pub use presets::{DEFAULT_PRESET, EXACT, Measured, PRESETS, Preset, preset};
 pub use settings::Settings;
 pub use table::KNOBS;
 
+/// A knob that is not used, in [`Domain::OffOr`].
+const OFF: &str = "off";
+
 /// A setting that trades speed or memory for accuracy.
 #[derive(Debug)]
 pub struct Knob {
@@ -45,6 +48,13 @@ pub enum Domain {
     Choice(&'static [&'static str]),
     /// A number, written as a decimal or a fraction such as 1/255.
     Number {
+        /// The least.
+        least: f64,
+        /// The most.
+        most: f64,
+    },
+    /// `off`, or a number.
+    OffOr {
         /// The least.
         least: f64,
         /// The most.
@@ -169,7 +179,8 @@ impl Knob {
                 }
                 Err(bad(nearest_word(text, words).to_owned()))
             }
-            Domain::Number { least, most } => match number(text) {
+            Domain::OffOr { .. } if text == OFF => Ok(text.to_owned()),
+            Domain::Number { least, most } | Domain::OffOr { least, most } => match number(text) {
                 Some(value) if (least..=most).contains(&value) => Ok(self.spelled(value)),
                 Some(value) if value < least => Err(bad(self.spelled(least))),
                 Some(value) if value > most => Err(bad(self.spelled(most))),
@@ -265,6 +276,9 @@ impl fmt::Display for Domain {
                     _ => plain(*x),
                 };
                 write!(f, "{} to {}", shown(least), shown(most))
+            }
+            Self::OffOr { least, most } => {
+                write!(f, "{OFF} or {}", Self::Number { least: *least, most: *most })
             }
             Self::Whole { least, most } if *most >= u64::from(u32::MAX) => {
                 write!(f, "{least} or more")

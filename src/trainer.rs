@@ -15,6 +15,7 @@ mod guard;
 mod options;
 mod probe;
 mod quarantine;
+mod row_degrees;
 mod scored;
 mod state;
 
@@ -29,13 +30,14 @@ use crate::dataset::images::SharedImage;
 use crate::gaussians::Gaussians;
 use crate::schedule;
 use crate::views::ViewSource;
-use check::check;
+use check::{check, checked_needs};
 pub use degree::{Earned, Trial};
 pub use error::TrainError;
 pub use growth::{Growth, PAYS, Rung, Shrink, signals as growth_signals};
 use guard::asked;
 pub use options::{OnNan, Required, Savings, TrainOptions};
 use quarantine::AUDIT_EVERY;
+pub use row_degrees::Dropped;
 use scored::Scored;
 pub use state::TrainerState;
 
@@ -127,6 +129,7 @@ pub struct Trainer<V> {
     probes: Vec<usize>,
     earned: Option<Earned>,
     growth: Option<Growth>,
+    dropped: Option<Dropped>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -165,6 +168,7 @@ impl<V: ViewSource> Trainer<V> {
             probes: Vec::new(),
             earned: None,
             growth: None,
+            dropped: None,
         })
     }
 
@@ -250,6 +254,7 @@ impl<V: ViewSource> Trainer<V> {
         }
         self.policy_time = self.policy_time.saturating_add(start.elapsed());
         self.earn(step)?;
+        self.drop_bands(step)?;
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
@@ -381,19 +386,6 @@ impl<V: ViewSource> Trainer<V> {
     pub fn backend(&mut self) -> &mut dyn Backend {
         self.backend.as_mut()
     }
-}
-
-/// The needs of a run, if a backend can work with them.
-fn checked_needs(
-    name: &str,
-    policy: &dyn DensityPolicy,
-    scene: &SceneInfo,
-    options: &TrainOptions,
-) -> Result<Needs, TrainError> {
-    let needs = needs(policy, scene, options.sh_every);
-    let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
-    needs.check().map_err(bad)?;
-    Ok(needs)
 }
 
 #[cfg(test)]

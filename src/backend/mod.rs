@@ -18,6 +18,8 @@ use std::time::Duration;
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, Needs, Signals};
 
+use serde::{Deserialize, Serialize};
+
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
@@ -134,6 +136,19 @@ pub struct Rendering {
     pub depth: Vec<f32>,
 }
 
+/// What [`Backend::drop_bands`] has left.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RowDegrees {
+    /// By how much colours could change `[1/255]`; see [`Shortcuts::row_degrees`].
+    pub tolerance: f32,
+    /// Rows that have degree 0, 1, 2 and 3.
+    pub rows: [usize; 4],
+    /// Bytes of parameters and moments that were held before and are held now, with what is held for
+    /// rows up to the budget.
+    pub bytes: [u64; 2],
+}
+
 /// Why a backend cannot go on.
 #[derive(Debug, thiserror::Error)]
 pub enum BackendError {
@@ -245,6 +260,21 @@ pub trait Backend: Send {
     /// # Errors
     /// See [`BackendError`].
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError>;
+
+    /// Gives each row the lowest degree of colour at which it looks as at the degree `in_use` but for
+    /// [`Shortcuts::row_degrees`], puts rows in order of falling degree with all that is theirs, and
+    /// gives back the memory of what they have lost. Bands beyond `in_use` are lost in any case. Every
+    /// array of [`state`](Self::state) keeps its shape; what was dropped is 0.
+    ///
+    /// Once: `None`, and nothing is done, where it has been done before, or was not asked for. The default
+    /// is for backends that cannot be asked.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn drop_bands(&mut self, in_use: u8) -> Result<Option<RowDegrees>, BackendError> {
+        let _ = in_use;
+        Ok(None)
+    }
 
     /// Renders a view.
     ///

@@ -13,6 +13,10 @@ pub struct Shortcuts {
     pub exp2: Exp2,
     /// Which rows the optimiser steps.
     pub stepped: Stepped,
+    /// By how much the colour of a row may change `[1/255]`, as the root mean square over all directions
+    /// of view, where its higher bands are [dropped](crate::backend::Backend::drop_bands): a distance
+    /// of √3 times as much in RGB, > 0. `None`: none are dropped.
+    pub row_degrees: Option<f32>,
 }
 
 /// Degree of the polynomial of 2^x in alpha: what is left of x beside a whole number goes through
@@ -45,6 +49,7 @@ impl Default for Shortcuts {
             transmittance_min: 1e-4,
             exp2: Exp2::default(),
             stepped: Stepped::default(),
+            row_degrees: None,
         }
     }
 }

@@ -120,6 +120,7 @@ fn header() -> Header {
         trainer: crate::trainer::TrainerState {
             earned: None,
             growth: None,
+            dropped: None,
             step: 17,
             initial_rows: 9,
             peak_rows: ROWS,

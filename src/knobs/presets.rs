@@ -62,6 +62,7 @@ pub static PRESETS: &[Preset] = &[
             ("coarse_until", "0"),
             ("budget_share", "1"),
             ("sparse_adam", "off"),
+            ("row_degrees", "off"),
             ("param_storage", "f32"),
             ("moment_storage", "f32"),
         ],

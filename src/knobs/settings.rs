@@ -101,6 +101,8 @@ impl Settings {
                 "on" => Stepped::Visible,
                 _ => Stepped::All,
             },
+            // "off" is no number.
+            row_degrees: number("row_degrees"),
         }
     }
 

@@ -188,6 +188,17 @@ pub static KNOBS: &[Knob] = &[
         levels: Values(&["0", "1", "2"]),
     },
     Knob {
+        name: "row_degrees",
+        default: "off",
+        domain: Domain::OffOr { least: 0.25, most: 32.0 },
+        unit: "of 255",
+        class: Heuristic,
+        on: On::Native,
+        how: How::Knob,
+        what: "half-way rows lose bands of colour that change it by no more, and memory falls; rms over directions",
+        levels: Values(&["1", "3", "6"]),
+    },
+    Knob {
         name: "sh_every",
         default: "[the policy's]",
         domain: Domain::Whole { least: 1, most: 1000 },

@@ -37,6 +37,8 @@ fn equal_values_are_equal_texts() {
         ("exp_degree=4", "exp_degree", "4"),
         ("budget=2e5", "budget", "200000"),
         ("tile_size=16", "tile_size", "16"),
+        ("row_degrees=3.0", "row_degrees", "3"),
+        ("row_degrees=off", "row_degrees", "off"),
     ] {
         let (knob, found) = parse(setting).unwrap();
         assert_eq!((knob.name, &*found), (name, value), "{setting}");
@@ -58,6 +60,8 @@ fn what_is_outside_is_refused_with_the_nearest_that_works() {
         ("sh_degree=1.5", ["sh_degree", "1.5", "works is 2"]),
         ("sh_degree=", ["sh_degree", "``", "works is 0"]),
         ("budget=0", ["budget", "1 or more", "works is 1"]),
+        ("row_degrees=0.1", ["row_degrees", "off or 1/4 to 32", "works is 0.25"]),
+        ("row_degrees=none", ["row_degrees", "none", "works is off"]),
         ("tile_size=8", ["tile_size", "8", "built in as 16"]),
         ("alpha_mim=1/64", ["alpha_mim", "alpha_min", "densify knobs"]),
         ("alpha_min", ["alpha_min", "NAME=VALUE", "1/128"]),

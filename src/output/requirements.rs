@@ -4,8 +4,10 @@
 use serde::Serialize;
 
 use super::{DegreeChoice, RunConfig};
+use crate::backend::RowDegrees;
 use crate::gaussians::MAX_SH_DEGREE;
-use crate::trainer::{Earned, Growth, PAYS};
+use crate::memory::Bytes;
+use crate::trainer::{Dropped, Earned, Growth, PAYS};
 
 /// The report of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -20,11 +22,17 @@ pub struct Requirements {
     pub degrees: Option<Earned>,
     /// Ends of rungs and attempts to do with fewer rows, where rows had to pay.
     pub rows: Option<Growth>,
+    /// Bands of colour that rows have lost along the run, where they may.
+    pub row_degrees: Option<Dropped>,
     /// Training views that were not rendered for scores, as others are nearly the same.
     pub unscored_views: usize,
     /// What was left out; nothing that the options themselves leave out.
     pub left_out: Vec<LeftOut>,
 }
+
+/// What a run has found: trials of degrees, the limit of rows, bands that rows have lost, views that
+/// were not scored.
+pub type Found<'a> = (Option<&'a Earned>, Option<&'a Growth>, Option<&'a Dropped>, usize);
 
 /// Something that was left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -39,19 +47,21 @@ pub struct LeftOut {
 
 impl Requirements {
     /// The report of a run of this configuration that has come to `rows` rows at a degree, with what it
-    /// has found: trials of degrees, the limit of rows, and views that were not scored.
+    /// has found: trials of degrees, the limit of rows, bands that rows have lost, and views that were
+    /// not scored.
     #[must_use]
     pub fn of(
         config: &RunConfig,
         sh_degree: u8,
         rows: usize,
-        (degrees, growth, unscored_views): (Option<&Earned>, Option<&Growth>, usize),
+        (degrees, growth, dropped, unscored_views): Found<'_>,
     ) -> Self {
         let train = &config.train;
         let left_out = [
             degree_left_out(config, sh_degree, degrees),
             growth.and_then(|growth| rows_left_out(growth, rows, train.budget)),
             growth.and_then(shrunk),
+            dropped.and_then(|dropped| bands_left_out(dropped, sh_degree)),
             (unscored_views > 0).then(|| unscored(unscored_views)),
         ];
         Self {
@@ -60,6 +70,7 @@ impl Requirements {
             sh_degree_from: train.sh_degree_from,
             degrees: degrees.cloned(),
             rows: growth.cloned(),
+            row_degrees: dropped.copied(),
             unscored_views,
             left_out: left_out.into_iter().flatten().collect(),
         }
@@ -156,6 +167,25 @@ fn shrunk(growth: &Growth) -> Option<LeftOut> {
     })
 }
 
+fn bands_left_out(dropped: &Dropped, sh_degree: u8) -> Option<LeftOut> {
+    let RowDegrees { tolerance, rows, bytes: [before, after] } = dropped.left;
+    let lower: Vec<String> = (0..usize::from(sh_degree))
+        .filter(|&degree| rows[degree] > 0)
+        .map(|degree| format!("{} rows at degree {degree}", rows[degree]))
+        .collect();
+    (!lower.is_empty()).then(|| LeftOut {
+        what: format!("higher bands of colour of {}", lower.join(", ")),
+        evidence: format!(
+            "after step {}, colours changed by no more than {tolerance}/255 without them (rms over \
+             directions of view); parameters and moments fell from {} to {}",
+            dropped.step,
+            Bytes(before),
+            Bytes(after)
+        ),
+        loss: "what that changes in images was not measured".into(),
+    })
+}
+
 fn unscored(views: usize) -> LeftOut {
     LeftOut {
         what: format!("{views} training views where rows are scored"),
@@ -181,13 +211,13 @@ mod tests {
     fn what_the_options_say_is_not_left_out() {
         let mut config = sample();
         config.train.sh_degree_from = DegreeChoice::Given;
-        let report = Requirements::of(&config, 0, 500, (None, None, 0));
+        let report = Requirements::of(&config, 0, 500, (None, None, None, 0));
         assert_eq!(report.lines(), ["left out nothing"]);
         config.train.full = true;
-        let report = Requirements::of(&config, 3, 500, (None, None, 0));
+        let report = Requirements::of(&config, 3, 500, (None, None, None, 0));
         assert_eq!(report.lines(), ["left out nothing (--full)"]);
         config.train.full = false;
-        let report = Requirements::of(&config, 3, 500, (None, None, 4));
+        let report = Requirements::of(&config, 3, 500, (None, None, None, 4));
         assert!(report.lines()[0].starts_with("left out 4 training views"), "{report:?}");
     }
 
@@ -196,7 +226,8 @@ mod tests {
         let mut config = sample();
         let line =
             |config: &RunConfig, degree, earned: Option<&Earned>, growth: Option<&Growth>| {
-                let lines = Requirements::of(config, degree, 900, (earned, growth, 0)).lines();
+                let lines =
+                    Requirements::of(config, degree, 900, (earned, growth, None, 0)).lines();
                 lines.join("\n")
             };
         config.train.sh_degree_from = DegreeChoice::Spread(spread());

@@ -1,8 +1,8 @@
 //! Whether scene, options, views and backend agree, before the first step.
 
-use densify_policies::policy::SceneInfo;
+use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
 
-use super::{Savings, TrainError, TrainOptions};
+use super::{Savings, TrainError, TrainOptions, needs};
 use crate::backend::Backend;
 
 pub(super) fn check(
@@ -41,4 +41,17 @@ pub(super) fn check(
         return bad(format!("{rows} rows, budget {budget} (scene: {})", scene.budget));
     }
     Ok(())
+}
+
+/// The needs of a run, if a backend can work with them.
+pub(super) fn checked_needs(
+    name: &str,
+    policy: &dyn DensityPolicy,
+    scene: &SceneInfo,
+    options: &TrainOptions,
+) -> Result<Needs, TrainError> {
+    let needs = needs(policy, scene, options.sh_every);
+    let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
+    needs.check().map_err(bad)?;
+    Ok(needs)
 }

@@ -9,7 +9,7 @@ use densify_policies::policy::{PolicyError, PolicyState};
 use serde::{Deserialize, Serialize};
 
 use super::guard::asked;
-use super::{Earned, EditEvent, Growth, Trainer};
+use super::{Dropped, Earned, EditEvent, Growth, Trainer};
 use crate::schedule;
 use crate::views::ViewSource;
 
@@ -39,6 +39,9 @@ pub struct TrainerState {
     /// Ends of rungs, where rows must pay.
     #[serde(default)]
     pub growth: Option<Growth>,
+    /// Bands of colour that rows have lost, if they have.
+    #[serde(default)]
+    pub dropped: Option<Dropped>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -58,6 +61,7 @@ impl<V: ViewSource> Trainer<V> {
             policy: asked(|| self.policy.save())?,
             earned: self.earned.clone(),
             growth: self.growth.clone(),
+            dropped: self.dropped,
         })
     }
 
@@ -78,6 +82,7 @@ impl<V: ViewSource> Trainer<V> {
         self.events = state.events;
         self.earned = state.earned;
         self.growth = state.growth;
+        self.dropped = state.dropped;
         // Within an epoch its order is at hand, and the next one is drawn; at the end of an epoch
         // only the next one.
         let count = self.views.count();

@@ -27,6 +27,7 @@ mod photographs;
 mod properties;
 mod quarantine;
 mod reference;
+mod row_degrees;
 mod sameness;
 mod scenes;
 mod shortcuts;

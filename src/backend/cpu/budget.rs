@@ -75,6 +75,10 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
     ledger.add_to(Section::Renderer, "loss", LossBuffers::bytes(grid.width, grid.height, threads));
+    if options.shortcuts.row_degrees.is_some() {
+        // A number and a degree each, while they are put in order.
+        ledger.add_to(Section::Passing, "rows by degree", padded * 5);
+    }
     ledger
 }
 

@@ -5,10 +5,8 @@
 //! alone gives ratios of about 0.23, to whose variance the rounding adds a twentieth; it has no
 //! scale that neighbours would share, and so none that a neighbour could spoil.
 
-use super::BLOCKS_PER_TASK;
-use super::blocks::{Blocks, Scratch};
+use super::blocks::{BlockTask, BlockView, Blocks, Degrees, Scratch};
 use super::narrow::{Bf16, Draws, Narrow, first_moment, first_moments, narrow, ratios, widen};
-use super::passes::parts;
 use super::simd::WIDTH;
 use crate::backend::{MomentStorage, StateError, Tensor};
 
@@ -83,7 +81,6 @@ impl Moments {
     }
 
     /// Bytes that are there.
-    #[cfg(test)]
     pub(super) fn held(&self) -> u64 {
         let mut sum = 0;
         each_moment!(self, blocks => sum += blocks.held());
@@ -97,6 +94,15 @@ impl Moments {
     /// Copies what is stored, to the bit.
     pub(super) fn copy_row(&mut self, from: usize, to: usize) {
         each_moment!(self, blocks => blocks.copy_row(from, to));
+    }
+
+    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
+        each_moment!(self, blocks => blocks.swap_rows(a, b));
+    }
+
+    /// See [`Blocks::drop_bands`].
+    pub(super) fn drop_bands(&mut self, rows: usize, of_model: u8, degrees: Degrees) {
+        each_moment!(self, blocks => blocks.drop_bands(rows, of_model, degrees));
     }
 
     /// Zero moments of one parameter.
@@ -118,30 +124,26 @@ impl Moments {
 
     /// The blocks of the first `rows` rows, to read.
     pub(super) fn view(&self, rows: usize) -> MomentView<'_> {
-        MomentView { moments: self, rows }
+        match self {
+            Self::F32(both) => MomentView::F32(both.each_ref().map(|blocks| blocks.view(rows))),
+            Self::Bf16(both) => MomentView::Bf16(both.each_ref().map(|blocks| blocks.view(rows))),
+            Self::Ratio8(first, second) => MomentView::Ratio8(first.view(rows), second.view(rows)),
+        }
     }
 
-    /// The blocks of the first `rows` rows, cut for so many of the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<MomentTask<'_>> {
-        fn cut<T: Copy + Default>(
-            blocks: &mut Blocks<T>,
-            rows: usize,
-            tasks: usize,
-        ) -> impl Iterator<Item = &mut [T]> {
-            let per_task = blocks.stride() * BLOCKS_PER_TASK;
-            parts(blocks.of_rows_mut(rows), per_task, tasks).into_iter()
-        }
+    /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
+    pub(super) fn tasks(&mut self, rows: usize) -> Vec<MomentTask<'_>> {
         match self {
             Self::F32([m, v]) => {
-                let both = cut(m, rows, tasks).zip(cut(v, rows, tasks));
+                let both = m.tasks(rows).into_iter().zip(v.tasks(rows));
                 both.map(|(m, v)| MomentTask::F32([m, v])).collect()
             }
             Self::Bf16([m, v]) => {
-                let both = cut(m, rows, tasks).zip(cut(v, rows, tasks));
+                let both = m.tasks(rows).into_iter().zip(v.tasks(rows));
                 both.map(|(m, v)| MomentTask::Bf16([m, v])).collect()
             }
             Self::Ratio8(m, v) => {
-                let both = cut(m, rows, tasks).zip(cut(v, rows, tasks));
+                let both = m.tasks(rows).into_iter().zip(v.tasks(rows));
                 both.map(|(m, v)| MomentTask::Ratio8(m, v)).collect()
             }
         }
@@ -198,13 +200,14 @@ impl Moments {
 
 /// The moments of some blocks, to read.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct MomentView<'a> {
-    moments: &'a Moments,
-    rows: usize,
+pub(super) enum MomentView<'a> {
+    F32([BlockView<'a, f32>; 2]),
+    Bf16([BlockView<'a, Bf16>; 2]),
+    Ratio8(BlockView<'a, i8>, BlockView<'a, Bf16>),
 }
 
 impl<'a> MomentView<'a> {
-    /// The first `planes` planes, or more, of a block, of both moments.
+    /// The first `planes` planes, or more, of a block that holds as many, of both moments.
     pub(super) fn open<'b>(
         self,
         block: usize,
@@ -214,23 +217,17 @@ impl<'a> MomentView<'a> {
     where
         'a: 'b,
     {
-        fn of<T: Copy + Default>(blocks: &Blocks<T>, rows: usize, block: usize) -> &[T] {
-            let stride = blocks.stride();
-            &blocks.of_rows(rows)[block * stride..(block + 1) * stride]
-        }
-        let (Self { moments, rows }, used) = (self, planes * WIDTH);
+        let used = planes * WIDTH;
         let [m, v] = scratch;
-        match moments {
-            Moments::F32([first, second]) => {
-                return [of(first, rows, block), of(second, rows, block)];
+        match self {
+            Self::F32(both) => return both.map(|blocks| blocks.block(block)),
+            Self::Bf16([first, second]) => {
+                widen(&first.block(block)[..used], &mut m.0[..used]);
+                widen(&second.block(block)[..used], &mut v.0[..used]);
             }
-            Moments::Bf16([first, second]) => {
-                widen(&of(first, rows, block)[..used], &mut m.0[..used]);
-                widen(&of(second, rows, block)[..used], &mut v.0[..used]);
-            }
-            Moments::Ratio8(first, second) => {
-                widen(&of(second, rows, block)[..used], &mut v.0[..used]);
-                first_moments(&of(first, rows, block)[..used], &v.0[..used], &mut m.0[..used]);
+            Self::Ratio8(first, second) => {
+                widen(&second.block(block)[..used], &mut v.0[..used]);
+                first_moments(&first.block(block)[..used], &v.0[..used], &mut m.0[..used]);
             }
         }
         [&m.0, &v.0]
@@ -240,33 +237,31 @@ impl<'a> MomentView<'a> {
 /// The moments of some blocks, to change.
 #[derive(Debug)]
 pub(super) enum MomentTask<'a> {
-    F32([&'a mut [f32]; 2]),
-    Bf16([&'a mut [Bf16]; 2]),
-    Ratio8(&'a mut [i8], &'a mut [Bf16]),
+    F32([BlockTask<'a, f32>; 2]),
+    Bf16([BlockTask<'a, Bf16>; 2]),
+    Ratio8(BlockTask<'a, i8>, BlockTask<'a, Bf16>),
 }
 
 impl MomentTask<'_> {
-    /// The first `planes` planes, or more, of a block of `stride` numbers, of both moments.
+    /// The first `planes` planes, or more, of a block that holds as many, of both moments.
     #[inline(always)]
     pub(super) fn open<'b>(
         &'b mut self,
         block: usize,
-        stride: usize,
         planes: usize,
         scratch: &'b mut [Scratch; 2],
     ) -> [&'b mut [f32]; 2] {
-        let of = block * stride..(block + 1) * stride;
         let used = planes * WIDTH;
         let [m, v] = scratch;
         match self {
-            Self::F32([first, second]) => return [&mut first[of.clone()], &mut second[of]],
+            Self::F32([first, second]) => return [first.block(block), second.block(block)],
             Self::Bf16([first, second]) => {
-                widen(&first[of.clone()][..used], &mut m.0[..used]);
-                widen(&second[of][..used], &mut v.0[..used]);
+                widen(&first.block(block)[..used], &mut m.0[..used]);
+                widen(&second.block(block)[..used], &mut v.0[..used]);
             }
             Self::Ratio8(first, second) => {
-                widen(&second[of.clone()][..used], &mut v.0[..used]);
-                first_moments(&first[of][..used], &v.0[..used], &mut m.0[..used]);
+                widen(&second.block(block)[..used], &mut v.0[..used]);
+                first_moments(&first.block(block)[..used], &v.0[..used], &mut m.0[..used]);
             }
         }
         [&mut m.0, &mut v.0]
@@ -277,24 +272,22 @@ impl MomentTask<'_> {
     pub(super) fn close(
         &mut self,
         block: usize,
-        stride: usize,
         planes: usize,
         scratch: &[Scratch; 2],
         draws: [&mut Draws; 2],
     ) {
-        let of = block * stride..(block + 1) * stride;
         let used = planes * WIDTH;
         let ([m, v], [of_m, of_v]) = (scratch, draws);
         match self {
             Self::F32(_) => {}
             Self::Bf16([first, second]) => {
-                narrow(&m.0[..used], &mut first[of.clone()][..used], of_m);
-                narrow(&v.0[..used], &mut second[of][..used], of_v);
+                narrow(&m.0[..used], &mut first.block(block)[..used], of_m);
+                narrow(&v.0[..used], &mut second.block(block)[..used], of_v);
             }
             Self::Ratio8(first, second) => {
-                let second = &mut second[of.clone()][..used];
+                let second = &mut second.block(block)[..used];
                 narrow(&v.0[..used], second, of_v);
-                ratios(&m.0[..used], second, &mut first[of][..used], of_m);
+                ratios(&m.0[..used], second, &mut first.block(block)[..used], of_m);
             }
         }
     }

@@ -43,7 +43,7 @@ pub(super) struct Optimise<'a> {
     pub(super) rates: &'a LearningRates,
     pub(super) bias: &'a BiasCorrection,
     /// Gradients kept for a later step.
-    pub(super) summed: TaskSums<'a>,
+    pub(super) summed: &'a mut TaskSums<'a>,
     /// Who steps now.
     pub(super) due: Due,
     /// Terms of the loss that concern every row, if there are any.
@@ -63,23 +63,23 @@ impl WithSimd for Optimise<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params: stored, moments, ages, signals, layout, sums, .. } = self;
-        let Self { detail, visible, view, rates, bias, mut summed, due, terms, noise, .. } = self;
+        let Self { detail, visible, view, rates, bias, summed, due, terms, noise, .. } = self;
         let stepped = self.stepped;
-        let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
         let signal_stride = signals.len() / visible.len().max(1);
-        let stride = stored.stride();
         let slack = if stored.is_narrow() { NARROW_SLACK } else { 0.0 };
         let is_narrow = stored.is_narrow() || moments.is_narrow();
         let mut scratch = Scratch::ZERO;
         let mut moment_scratch = [Scratch::ZERO; 2];
         for (b, &seen) in visible.iter().enumerate() {
+            let degree = view.sh_degree.min(stored.degree(b));
+            let trained = planes(degree);
             let params = stored.open(b, trained, &mut scratch);
             let per_block = WIDTH * detail.stride();
             let sums = &sums[b * per_block..(b + 1) * per_block];
             if seen != 0 || !was_zero {
-                gradient.compute(s, params, sums, detail, seen, view);
+                gradient.compute(s, params, sums, detail, seen, view, degree);
                 was_zero = seen == 0;
             }
             if seen != 0 && signal_stride > 0 {
@@ -94,7 +94,7 @@ impl WithSimd for Optimise<'_> {
                 was_zero &= !summed.exchange(b, &mut gradient.params, trained, due);
             }
             let lanes = b * WIDTH..(b + 1) * WIDTH;
-            let [m, v] = moments.open(b, stride, trained, &mut moment_scratch);
+            let [m, v] = moments.open(b, trained, &mut moment_scratch);
             let ages = &mut ages[lanes.clone()];
             let (main, rest) = (0..trained.min(plane::SH_REST), plane::SH_REST..trained);
             let g = &gradient.params;
@@ -134,7 +134,7 @@ impl WithSimd for Optimise<'_> {
                 let first_row = self.first_row + b * WIDTH;
                 let [mut of_params, mut of_m, mut of_v] = Draws::of_block(self.storing, first_row);
                 stored.close(b, trained, &scratch, &mut of_params);
-                moments.close(b, stride, trained, &moment_scratch, [&mut of_m, &mut of_v]);
+                moments.close(b, trained, &moment_scratch, [&mut of_m, &mut of_v]);
             }
         }
     }
@@ -227,14 +227,15 @@ impl WithSimd for Differentiate<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params, sums, visible, view, out } = self;
         let per_block = WIDTH * Detail::All.stride();
-        let sh_planes = params.planes() - plane::SH;
-        let trained = planes(view.sh_degree) - plane::SH;
+        let sh_planes = out.sh.len() / out.means.len().max(1);
         let mut g = BlockGradient::ZERO;
         let mut scratch = Scratch::ZERO;
         for b in 0..params.blocks() {
-            let block = params.open(b, planes(view.sh_degree), &mut scratch);
+            let degree = view.sh_degree.min(params.degree(b));
+            let trained = planes(degree) - plane::SH;
+            let block = params.open(b, planes(degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
-            g.compute(s, block, sums, Detail::All, visible[b], view);
+            g.compute(s, block, sums, Detail::All, visible[b], view, degree);
             for lane in 0..WIDTH.min(out.means.len() - b * WIDTH) {
                 let row = b * WIDTH + lane;
                 let at = |p: usize| g.params[p * WIDTH + lane];

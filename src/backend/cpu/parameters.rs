@@ -9,9 +9,8 @@
 
 use std::ops::Range;
 
-use super::blocks::{Blocks, Scratch, plane};
+use super::blocks::{BlockTask, BlockView, Blocks, Degrees, Scratch, plane};
 use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
-use super::passes::parts;
 use super::simd::WIDTH;
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 use crate::backend::ParameterStorage;
@@ -33,6 +32,8 @@ const fn digits(bounded: usize) -> u32 {
 /// The parameters of all rows.
 #[derive(Debug)]
 pub(super) struct Parameters {
+    /// Of colour, of each block.
+    degrees: Degrees,
     /// All planes, or the means.
     wide: Blocks,
     /// None, or the bounded planes.
@@ -53,6 +54,7 @@ impl Parameters {
     pub(super) fn zeros(capacity: usize, planes: usize, storage: ParameterStorage) -> Self {
         let [wide, fixed, half] = split(planes, storage);
         Self {
+            degrees: Degrees::ALL,
             wide: Blocks::zeros(capacity, wide),
             fixed: Blocks::zeros(capacity, fixed),
             half: Blocks::zeros(capacity, half),
@@ -68,18 +70,21 @@ impl Parameters {
     }
 
     /// Bytes that are there.
-    #[cfg(test)]
     pub(super) fn held(&self) -> u64 {
         self.wide.held() + self.fixed.held() + self.half.held()
     }
 
-    /// Numbers per block of the three.
-    fn strides(&self) -> [usize; 3] {
-        [self.wide.stride(), self.fixed.stride(), self.half.stride()]
+    /// The degree of colour of each block.
+    pub(super) fn degrees(&self) -> Degrees {
+        self.degrees
+    }
+
+    fn is_narrow(&self) -> bool {
+        self.fixed.planes() > 0
     }
 
     fn is_wide(&self, plane: usize) -> bool {
-        plane < MEANS || self.fixed.stride() == 0
+        plane < MEANS || !self.is_narrow()
     }
 
     pub(super) fn get(&self, row: usize, plane: usize) -> f32 {
@@ -122,6 +127,22 @@ impl Parameters {
         self.half.copy_row(from, to);
     }
 
+    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
+        self.wide.swap_rows(a, b);
+        self.fixed.swap_rows(a, b);
+        self.half.swap_rows(a, b);
+    }
+
+    /// See [`Blocks::drop_bands`].
+    pub(super) fn drop_bands(&mut self, rows: usize, of_model: u8, degrees: Degrees) {
+        self.degrees = degrees;
+        if self.is_narrow() {
+            self.half.drop_bands(rows, of_model, degrees);
+        } else {
+            self.wide.drop_bands(rows, of_model, degrees);
+        }
+    }
+
     pub(super) fn clear_row(&mut self, row: usize) {
         self.wide.clear_row(row);
         self.fixed.clear_row(row);
@@ -159,65 +180,67 @@ impl Parameters {
     /// The blocks of the first `rows` rows, to read.
     pub(super) fn view(&self, rows: usize) -> ParameterView<'_> {
         ParameterView {
-            strides: self.strides(),
-            wide: self.wide.of_rows(rows),
-            fixed: self.fixed.of_rows(rows),
-            half: self.half.of_rows(rows),
+            degrees: self.degrees,
+            blocks: 0..rows.div_ceil(WIDTH),
+            is_narrow: self.is_narrow(),
+            wide: self.wide.view(rows),
+            fixed: self.fixed.view(rows),
+            half: self.half.view(rows),
         }
     }
 
-    /// The blocks of the first `rows` rows, cut for so many of the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<ParameterTask<'_>> {
-        let strides = self.strides();
-        let per_task = strides.map(|stride| stride * BLOCKS_PER_TASK);
-        let wide = parts(self.wide.of_rows_mut(rows), per_task[0], tasks);
-        let fixed = parts(self.fixed.of_rows_mut(rows), per_task[1], tasks);
-        let half = parts(self.half.of_rows_mut(rows), per_task[2], tasks);
-        let all = wide.into_iter().zip(fixed).zip(half);
-        all.map(|((wide, fixed), half)| ParameterTask { strides, wide, fixed, half }).collect()
+    /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
+    pub(super) fn tasks(&mut self, rows: usize) -> Vec<ParameterTask<'_>> {
+        let (degrees, is_narrow) = (self.degrees, self.is_narrow());
+        let (wide, fixed, half) = (&mut self.wide, &mut self.fixed, &mut self.half);
+        let all = wide.tasks(rows).into_iter().zip(fixed.tasks(rows)).zip(half.tasks(rows));
+        let task = |(task, ((wide, fixed), half))| {
+            let first = task * BLOCKS_PER_TASK;
+            ParameterTask { degrees, first, is_narrow, wide, fixed, half }
+        };
+        all.enumerate().map(task).collect()
     }
 }
 
 /// Some blocks, to read.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct ParameterView<'a> {
-    /// Numbers per block of the three below.
-    strides: [usize; 3],
-    wide: &'a [f32],
-    fixed: &'a [i16],
-    half: &'a [F16],
-}
-
-/// Numbers of a block.
-fn of(block: usize, stride: usize) -> Range<usize> {
-    block * stride..(block + 1) * stride
+    degrees: Degrees,
+    /// Which of all blocks these are.
+    blocks: Range<usize>,
+    is_narrow: bool,
+    wide: BlockView<'a, f32>,
+    fixed: BlockView<'a, i16>,
+    half: BlockView<'a, F16>,
 }
 
 impl<'a> ParameterView<'a> {
     /// The blocks of task `i`, each of `ROWS_PER_TASK` rows but the last.
-    pub(super) fn task(self, i: usize) -> Self {
-        fn cut<T>(all: &[T], i: usize, stride: usize) -> &[T] {
-            let Range { start, end } = of(i, stride * BLOCKS_PER_TASK);
-            &all[start.min(all.len())..end.min(all.len())]
-        }
+    pub(super) fn task(&self, i: usize) -> Self {
+        let first = (i * BLOCKS_PER_TASK).min(self.blocks());
+        let part = first..self.blocks().min(first + BLOCKS_PER_TASK);
         Self {
-            strides: self.strides,
-            wide: cut(self.wide, i, self.strides[0]),
-            fixed: cut(self.fixed, i, self.strides[1]),
-            half: cut(self.half, i, self.strides[2]),
+            degrees: self.degrees,
+            blocks: self.blocks.start + part.start..self.blocks.start + part.end,
+            is_narrow: self.is_narrow,
+            wide: self.wide.part(part.clone()),
+            fixed: self.fixed.part(part.clone()),
+            half: self.half.part(part),
         }
-    }
-
-    /// Planes of a row.
-    pub(super) fn planes(&self) -> usize {
-        self.strides.iter().sum::<usize>() / WIDTH
     }
 
     pub(super) fn blocks(&self) -> usize {
-        self.wide.len() / self.strides[0]
+        self.blocks.len()
     }
 
-    /// The first `planes` planes, or more, of a block. Whole planes, one after the other.
+    /// The degree of colour of a block; 3, and so at least the model's, where nothing was dropped.
+    #[inline(always)]
+    pub(super) fn degree(&self, block: usize) -> u8 {
+        self.degrees.of(self.blocks.start + block)
+    }
+
+    /// The first `planes` planes, or more, of a block that holds as many. Whole planes, one after the
+    /// other.
     #[inline(always)]
     pub(super) fn open<'b>(
         &self,
@@ -228,12 +251,11 @@ impl<'a> ParameterView<'a> {
     where
         'a: 'b,
     {
-        let [wide, fixed, half] = self.strides;
-        if fixed == 0 {
-            return &self.wide[of(block, wide)];
+        if !self.is_narrow {
+            return self.wide.block(block);
         }
-        let narrow = (&self.fixed[of(block, fixed)], &self.half[of(block, half)]);
-        to_scratch(&self.wide[of(block, wide)], narrow, planes, scratch);
+        let narrow = (self.fixed.block(block), self.half.block(block));
+        to_scratch(self.wide.block(block), narrow, planes, scratch);
         &scratch.0
     }
 }
@@ -241,25 +263,28 @@ impl<'a> ParameterView<'a> {
 /// Some blocks, to change.
 #[derive(Debug)]
 pub(super) struct ParameterTask<'a> {
-    strides: [usize; 3],
-    wide: &'a mut [f32],
-    fixed: &'a mut [i16],
-    half: &'a mut [F16],
+    degrees: Degrees,
+    first: usize,
+    is_narrow: bool,
+    wide: BlockTask<'a, f32>,
+    fixed: BlockTask<'a, i16>,
+    half: BlockTask<'a, F16>,
 }
 
 impl ParameterTask<'_> {
-    /// Numbers per block.
-    pub(super) fn stride(&self) -> usize {
-        self.strides.iter().sum()
+    /// The degree of colour of a block; 3, and so at least the model's, where nothing was dropped.
+    #[inline(always)]
+    pub(super) fn degree(&self, block: usize) -> u8 {
+        self.degrees.of(self.first + block)
     }
 
     /// Whether what is stored is not what was computed.
     #[inline(always)]
     pub(super) fn is_narrow(&self) -> bool {
-        self.strides[1] > 0
+        self.is_narrow
     }
 
-    /// The first `planes` planes, or more, of a block.
+    /// The first `planes` planes, or more, of a block that holds as many.
     #[inline(always)]
     pub(super) fn open<'b>(
         &'b mut self,
@@ -267,12 +292,11 @@ impl ParameterTask<'_> {
         planes: usize,
         scratch: &'b mut Scratch,
     ) -> &'b mut [f32] {
-        let [wide, fixed, half] = self.strides;
-        if fixed == 0 {
-            return &mut self.wide[of(block, wide)];
+        if !self.is_narrow {
+            return self.wide.block(block);
         }
-        let narrow = (&self.fixed[of(block, fixed)], &self.half[of(block, half)]);
-        to_scratch(&self.wide[of(block, wide)], narrow, planes, scratch);
+        let narrow = (&*self.fixed.block(block), &*self.half.block(block));
+        to_scratch(self.wide.block(block), narrow, planes, scratch);
         &mut scratch.0
     }
 
@@ -285,19 +309,18 @@ impl ParameterTask<'_> {
         scratch: &Scratch,
         draws: &mut Draws,
     ) {
-        let [wide, fixed, half] = self.strides;
-        if fixed == 0 {
+        if !self.is_narrow {
             return;
         }
         let all = &scratch.0[..planes * WIDTH];
         let (means, rest) = all.split_at(MEANS * WIDTH);
         let (bounded, colour) = rest.split_at(BOUNDED * WIDTH);
-        self.wide[of(block, wide)].copy_from_slice(means);
-        let to = self.fixed[of(block, fixed)].as_chunks_mut().0;
+        self.wide.block(block).copy_from_slice(means);
+        let to = self.fixed.block(block).as_chunks_mut().0;
         for (i, (from, to)) in bounded.as_chunks().0.iter().zip(to).enumerate() {
             narrow_fixed(from, to, digits(i), draws);
         }
-        narrow(colour, &mut self.half[of(block, half)][..colour.len()], draws);
+        narrow(colour, &mut self.half.block(block)[..colour.len()], draws);
     }
 }
 

@@ -78,7 +78,7 @@ impl CpuBackend {
             self;
         clock.start();
         let (rows, arch) = (*rows, *arch);
-        let params = params.view(rows);
+        let params = &params.view(rows);
         pool.install(|| {
             (splats[..rows].par_chunks_mut(ROWS_PER_TASK), seen.par_chunks_mut(BLOCKS_PER_TASK))
                 .into_par_iter()
@@ -276,8 +276,8 @@ impl CpuBackend {
         let per_task = signal_stride * BLOCKS_PER_TASK;
         let mut signal_blocks = parts(signals.blocks.of_rows_mut(rows), per_task, tasks);
         let mut summed = self.summed.tasks(rows, tasks);
-        let mut param_tasks = params.tasks(rows, tasks);
-        let mut moment_tasks = moments.tasks(rows, tasks);
+        let mut param_tasks = params.tasks(rows);
+        let mut moment_tasks = moments.tasks(rows);
         pool.install(|| {
             (
                 param_tasks.par_iter_mut(),
@@ -305,7 +305,7 @@ impl CpuBackend {
                             view: &frame.view,
                             rates: &input.rates,
                             bias,
-                            summed: summed.reborrow(),
+                            summed,
                             due,
                             terms,
                             noise,

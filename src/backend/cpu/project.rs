@@ -230,7 +230,7 @@ pub(super) fn direction<S: Simd>(
     (each!(i in 3 => v[i] * inv), inv)
 }
 
-/// Basis functions for the view's degree at `d`.
+/// Basis functions up to a degree at `d`.
 #[inline(always)]
 pub(super) fn sh_basis<S: Simd>(s: S, degree: u8, d: [V<S>; 3]) -> [V<S>; 16] {
     let mut y = [V::zero(s); 16];
@@ -299,10 +299,10 @@ impl WithSimd for Project<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let view = self.view;
-        let needed = planes(view.sh_degree);
         let mut scratch = Scratch::ZERO;
         for b in 0..self.params.blocks() {
-            let block = self.params.open(b, needed, &mut scratch);
+            let degree = view.sh_degree.min(self.params.degree(b));
+            let block = self.params.open(b, planes(degree), &mut scratch);
             let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];
             for at in (0..WIDTH).step_by(S::F32_LANES) {
@@ -340,8 +340,8 @@ impl WithSimd for Project<'_> {
                     continue;
                 }
                 let (dir, _) = direction(s, block, at, view);
-                let y = sh_basis(s, view.sh_degree, dir);
-                let raw = raw_colour(s, block, at, view.sh_degree, &y);
+                let y = sh_basis(s, degree, dir);
+                let raw = raw_colour(s, block, at, degree, &y);
                 let colour = each!(i in 3 => raw[i].max(V::zero(s)));
                 let sound = each!(i in 3 => below(raw[i], COLOUR_MAX));
                 let alive = alive.and(sound[0]).and(sound[1]).and(sound[2]);

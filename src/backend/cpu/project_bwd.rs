@@ -50,10 +50,15 @@ impl BlockGradient {
         visible: [0.0; WIDTH],
     };
 
-    /// Differentiates the rows of `block` that are set in `visible`; the others get 0.
+    /// Differentiates the rows of `block` that are set in `visible`; the others get 0. `sh_degree` is
+    /// that of their colour in this view.
     ///
     /// `sums` has one record per row. Shape: `[WIDTH, detail.stride()]`.
     #[inline(always)]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "a kernel: each is a buffer or a setting of its own"
+    )]
     pub(super) fn compute<S: Simd>(
         &mut self,
         s: S,
@@ -62,6 +67,7 @@ impl BlockGradient {
         detail: Detail,
         visible: u16,
         view: &ViewParams,
+        sh_degree: u8,
     ) {
         if visible == 0 {
             *self = Self::ZERO;
@@ -75,7 +81,7 @@ impl BlockGradient {
             }
         }
         for at in (0..WIDTH).step_by(S::F32_LANES) {
-            self.lanes(s, block, at, detail, view);
+            self.lanes(s, block, at, detail, view, sh_degree);
         }
     }
 
@@ -87,6 +93,7 @@ impl BlockGradient {
         at: usize,
         detail: Detail,
         view: &ViewParams,
+        degree: u8,
     ) {
         let c = |x: f32| V::splat(s, x);
         let zero = V::zero(s);
@@ -173,7 +180,6 @@ impl BlockGradient {
         ];
 
         // Colour: through the clamp at 0 to the coefficients, and through the direction to the mean.
-        let degree = view.sh_degree;
         let (dir, inv_distance) = direction(s, block, at, view);
         let basis = sh_basis(s, degree, dir);
         let raw = raw_colour(s, block, at, degree, &basis);

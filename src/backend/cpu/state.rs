@@ -6,6 +6,7 @@ use super::blocks::planes;
 use super::signals::Accumulators;
 use crate::backend::{StateError, Tensor};
 
+const DEGREES: &str = "degrees";
 const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
 const AGES: &str = "ages";
 const CANDIDATES: &str = "candidates";
@@ -16,7 +17,10 @@ const SUMMED: &str = "summed.";
 
 impl CpuBackend {
     pub(super) fn state_names(&self) -> Vec<String> {
-        let mut names: Vec<String> = MOMENTS.map(str::to_owned).to_vec();
+        // First: it says where the others have room.
+        let degrees = self.shortcuts.row_degrees.map(|_| DEGREES);
+        let mut names: Vec<String> =
+            degrees.into_iter().chain(MOMENTS).map(str::to_owned).collect();
         names.push(AGES.to_owned());
         names.extend(self.signals.layout().kept().map(|(name, _)| format!("{SIGNAL}{name}")));
         if self.candidates.is_wanted() {
@@ -33,6 +37,9 @@ impl CpuBackend {
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
             return self.moments.tensor(i, name, rows, planes);
+        }
+        if name == DEGREES {
+            return self.degrees_tensor(name);
         }
         if name == AGES {
             return Tensor::u16(name, &[rows], self.ages[..rows].to_vec());
@@ -54,6 +61,8 @@ impl CpuBackend {
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
             self.moments.restore(i, rows, planes, tensor)?;
+        } else if name == DEGREES && self.shortcuts.row_degrees.is_some() {
+            self.restore_degrees(tensor)?;
         } else if name == AGES {
             let ages = tensor.into_u16(&[rows])?;
             self.ages[..rows].copy_from_slice(&ages);

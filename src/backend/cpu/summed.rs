@@ -10,10 +10,10 @@ use std::ops::Range;
 
 use densify_policies::policy::Cadence;
 
-use super::blocks::{Blocks, plane};
+use super::ROWS_PER_TASK;
+use super::blocks::{BlockTask, Blocks, Degrees, plane};
 use super::passes::parts;
 use super::simd::WIDTH;
-use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 use crate::backend::{StateError, StepInput, Tensor};
 
 /// The sums of all rows.
@@ -43,9 +43,7 @@ pub(super) struct Due {
 /// The sums of one task's rows.
 pub(super) struct TaskSums<'a> {
     first: usize,
-    /// Numbers per block.
-    stride: usize,
-    sums: &'a mut [f32],
+    sums: BlockTask<'a, f32>,
     rest_ages: &'a mut [u16],
 }
 
@@ -102,14 +100,13 @@ impl Summed {
 
     /// The sums, cut for the optimiser's tasks.
     pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<TaskSums<'_>> {
-        let stride = self.sums.stride();
-        let sums = parts(self.sums.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
+        let sums = self.sums.tasks(rows);
         let aged = self.rest_ages.len().min(rows.next_multiple_of(WIDTH));
         let ages = parts(&mut self.rest_ages[..aged], ROWS_PER_TASK, tasks);
         let first = self.first;
         sums.into_iter()
             .zip(ages)
-            .map(|(sums, rest_ages)| TaskSums { first, stride, sums, rest_ages })
+            .map(|(sums, rest_ages)| TaskSums { first, sums, rest_ages })
             .collect()
     }
 
@@ -167,7 +164,7 @@ impl Summed {
 
     /// Planes that are summed.
     fn planes(&self) -> usize {
-        self.sums.stride() / WIDTH
+        self.sums.planes()
     }
 
     pub(super) fn clear_row(&mut self, row: usize) {
@@ -184,9 +181,21 @@ impl Summed {
         }
     }
 
+    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
+        self.sums.swap_rows(a, b);
+        if !self.rest_ages.is_empty() {
+            self.rest_ages.swap(a, b);
+        }
+    }
+
+    /// See [`Blocks::drop_bands`].
+    pub(super) fn drop_bands(&mut self, rows: usize, of_model: u8, degrees: Degrees) {
+        self.sums.drop_bands(rows, of_model, degrees);
+    }
+
     /// As the opacity's moments are forgotten.
     pub(super) fn forget_opacity(&mut self, row: usize) {
-        if self.first == 0 && self.sums.stride() > 0 {
+        if self.first == 0 && self.planes() > 0 {
             self.sums.set(row, plane::OPACITY, 0.0);
         }
     }
@@ -200,11 +209,6 @@ impl Due {
 }
 
 impl TaskSums<'_> {
-    pub(super) fn reborrow(&mut self) -> TaskSums<'_> {
-        let Self { first, stride, sums, rest_ages } = self;
-        TaskSums { first: *first, stride: *stride, sums, rest_ages }
-    }
-
     /// Ages of bands 1–3 in these lanes, if they have their own.
     pub(super) fn rest_ages(&mut self, lanes: Range<usize>) -> Option<&mut [u16]> {
         self.rest_ages.get_mut(lanes)
@@ -219,7 +223,7 @@ impl TaskSums<'_> {
         trained: usize,
         due: Due,
     ) -> bool {
-        let sums = &mut self.sums[block * self.stride..(block + 1) * self.stride];
+        let sums = self.sums.block(block);
         let classes = [
             (0..trained.min(plane::SH_REST), due.main, due.waited[0]),
             (plane::SH_REST..trained, due.rest, due.waited[1]),

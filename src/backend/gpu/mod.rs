@@ -125,9 +125,9 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        let Shortcuts { exp2, stepped, .. } = Shortcuts::default();
+        let Shortcuts { exp2, stepped, row_degrees, .. } = Shortcuts::default();
         let shortcuts = options.shortcuts;
-        if (Shortcuts { exp2, stepped, ..shortcuts }) != shortcuts {
+        if (Shortcuts { exp2, stepped, row_degrees, ..shortcuts }) != shortcuts {
             return Err(BackendError::OverLimit(
                 "the GPU backend lacks a shortcut that is asked for; use --backend cpu".into(),
             ));

@@ -9,6 +9,7 @@ use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
 use crate::dataset::Dataset;
 use crate::gaussians::MAX_SH_DEGREE;
+use crate::knobs::Settings;
 use crate::output::{DegreeChoice, RunConfig};
 use crate::spread::{self, LEAST_TRACKS};
 
@@ -33,8 +34,11 @@ impl FromStr for ShDegree {
     }
 }
 
+/// The knob by which rows lose bands of colour.
+const ROW_DEGREES: &str = "row_degrees";
+
 /// Fails where `--full` and something that leaves out are both given.
-pub(super) fn check_full(args: &TrainArgs) -> Result<(), Failure> {
+pub(super) fn check_full(args: &TrainArgs, settings: &Settings) -> Result<(), Failure> {
     if args.full && args.budget == Some(Budget::Auto) {
         return Err(Failure::input(
             "--full leaves nothing out, --budget auto leaves out what does not pay; give one of the two, \
@@ -46,6 +50,15 @@ pub(super) fn check_full(args: &TrainArgs) -> Result<(), Failure> {
             "--full leaves nothing out, --sh-degree auto leaves out what the scene does not require; \
              give one of the two, or --full with --sh-degree 3",
         ));
+    }
+    let lost = settings.changed().find(|(knob, _)| knob.name == ROW_DEGREES);
+    if let Some((knob, value)) = lost.filter(|_| args.full) {
+        let name = knob.name;
+        return Err(Failure::input(format!(
+            "--full leaves nothing out, --knob {name}={value} leaves out bands of colour that rows do \
+             not need; give one of the two, or --full with {name}={}",
+            knob.default
+        )));
     }
     Ok(())
 }

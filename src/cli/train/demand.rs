@@ -69,11 +69,11 @@ impl Survey {
         saved: Option<&RunConfig>,
         console: &Console,
     ) -> Result<Self, Failure> {
-        check_full(args)?;
         let entry = find(&args.policy)?;
         let parameters = parameters(args, entry)?;
         let knob = |error| Failure::input(format!("--knob: {error}"));
         let mut settings = Settings::of(&args.knob).map_err(knob)?;
+        check_full(args, &settings)?;
         let device = args.device.open(accumulation(args, &settings)?, console)?;
         settings.check_backend(device.is_some()).map_err(knob)?;
         if let Some(device) = &device {

@@ -354,7 +354,8 @@ impl<'a> Session<'a> {
             Some(earned) => earned.degree,
             None => config.train.sh_degree,
         };
-        let found = (trainer.earned(), trainer.growth(), trainer.unscored_views());
+        let unscored = trainer.unscored_views();
+        let found = (trainer.earned(), trainer.growth(), trainer.dropped(), unscored);
         Requirements::of(config, degree, trainer.rows(), found)
     }
 

@@ -112,8 +112,14 @@ impl Row {
     }
 }
 
-/// Executes accepted calls on the plain vector.
-pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &PolicyRng) -> Vec<Row> {
+/// Executes accepted calls on the plain vector. `colours` are the numbers of colour that a slot holds.
+pub(super) fn execute(
+    model: Vec<Row>,
+    calls: &[Call],
+    budget: usize,
+    rng: &PolicyRng,
+    colours: &dyn Fn(usize) -> usize,
+) -> Vec<Row> {
     let before = model;
     let mut slots: Vec<Option<Row>> = before.iter().cloned().map(Some).collect();
     let (mut children, mut seeds) = (Vec::new(), Vec::new());
@@ -141,11 +147,13 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
             Call::Reset => reset = true,
         }
     }
-    for newborn in children.into_iter().chain(seeds) {
-        match slots.iter_mut().find(|slot| slot.is_none()) {
-            Some(hole) => *hole = Some(newborn),
-            None => slots.push(Some(newborn)),
+    for mut newborn in children.into_iter().chain(seeds) {
+        let slot = slots.iter().position(Option::is_none).unwrap_or(slots.len());
+        newborn.sh[colours(slot)..].fill(0.0);
+        if slot == slots.len() {
+            slots.push(None);
         }
+        slots[slot] = Some(newborn);
         assert!(slots.len() <= budget.max(before.len()), "a slot beyond the budget");
     }
     let live = slots.iter().flatten().count();
