@@ -7,7 +7,7 @@ use clap::Args;
 use super::console::Console;
 use super::device::DeviceArgs;
 use super::failure::{Failure, OTHER};
-use crate::backend::gpu::{AdapterChoice, GpuDevice, adapters};
+use crate::backend::gpu::{Accumulation, AdapterChoice, GpuDevice, adapters};
 use crate::output::write_atomically;
 use crate::selftest::{Bench, Case, Finding, Tested, cases, markdown, table};
 
@@ -49,6 +49,9 @@ Examples:
   densify selftest --gpu radeon                 on this adapter
   densify selftest --all --long --markdown selftest.md
                                                 on all of them, in full, into a file";
+
+/// Some cases want the same bits twice, which no other sums of a GPU give.
+const SUMS: Option<Accumulation> = Some(Accumulation::Slots);
 
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
     let chosen = chosen(&args.only)?;
@@ -99,12 +102,12 @@ fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
 fn benches(args: &SelftestArgs, console: &Console) -> Result<Vec<Bench>, Failure> {
     let native = Bench::Native { threads: args.threads.map(usize::from) };
     if !args.all {
-        return Ok(vec![args.device.open(None, console)?.map_or(native, Bench::Gpu)]);
+        return Ok(vec![args.device.open(SUMS, console)?.map_or(native, Bench::Gpu)]);
     }
     let mut benches = vec![native];
     for adapter in adapters().into_iter().filter(|adapter| adapter.missing.is_empty()) {
         let device =
-            GpuDevice::open(&AdapterChoice { name: Some(adapter.name), accumulation: None })?;
+            GpuDevice::open(&AdapterChoice { name: Some(adapter.name), accumulation: SUMS })?;
         benches.push(Bench::Gpu(device));
     }
     Ok(benches)
