@@ -25,8 +25,7 @@ fn scene() -> (Gaussians, Camera) {
     let camera = scenes::camera(52, 41, 5);
     let mut model = scenes::cloud(ROWS, 3, &camera, 8);
     for (row, sh) in model.sh.chunks_exact_mut(48).enumerate() {
-        let strength =
-            if row % 5 == 0 { 1e-6 } else { 0.98_f32.powi((row * 29 % ROWS) as i32) };
+        let strength = if row % 5 == 0 { 1e-6 } else { 0.98_f32.powi((row * 29 % ROWS) as i32) };
         for (band, scale) in [(1, 1.0), (2, 0.7), (3, 0.6)] {
             let factor = scale * strength;
             let coefficients = 3 * sh_coefficients(band - 1)..3 * sh_coefficients(band);
