@@ -1,5 +1,7 @@
 //! Blocks of one degree and of several, against plain rows.
 
+#![expect(clippy::float_cmp, reason = "numbers are moved, not computed")]
+
 use super::*;
 
 const CAPACITY: usize = 16 * 9;

@@ -1,5 +1,7 @@
 //! Degrees against directions that are looked at one by one, and what a backend then holds.
 
+#![expect(clippy::float_cmp, reason = "numbers are moved, not computed")]
+
 use densify_policies::policy::{Needs, Signal, SignalSet};
 
 use super::*;
