@@ -129,7 +129,7 @@ pub static KNOBS: &[Knob] = &[
         class: Heuristic,
         on: On::Both,
         how: How::Knob,
-        what: "share of the run on shrunk images: a third of it at 1/4 of their sides, the rest at 1/2",
+        what: "share of the run, from its start, that is trained on images of half their sides",
         levels: Values(&["0.2", "0.4", "0.6"]),
     },
     Knob {
