@@ -1,12 +1,7 @@
 // What both ways of differentiating a tile share (rasterize_bwd.wgsl, rasterize_bwd_atomic.wgsl): what
-// they read, what happens at a pixel, and what the parameters need of it. src/backend/cpu/rasterize_bwd.rs
-// tells why the sums are what they are.
+// they read beside quads.wgsl, what happens at the pixels, and what the parameters need of it.
+// src/backend/cpu/rasterize_bwd.rs tells why the sums are what they are.
 
-@group(0) @binding(1) var<storage, read> state: State;
-@group(0) @binding(2) var<storage, read> list: array<u32>;
-@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
-@group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
-@group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
 // dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set.
 @group(0) @binding(7) var<storage, read> gradient: array<f32>;
@@ -16,41 +11,62 @@ override DETAIL: u32 = 0u;
 // Whether alpha and depth have gradients.
 override MORE: bool = false;
 
-// Splats at a time, and loaded at a time, at most.
-const SPLATS: u32 = 4u;
-const BATCH: u32 = 16u;
 // Fields of the longest sum.
 const FIELDS: u32 = 15u;
 
-// Splats: mean within the tile, l1, shear | l3, log2 of the opacity, depth | colour.
-var<workgroup> batch: array<vec4<f32>, 48>;
 var<workgroup> last_stop: atomic<u32>;
 var<workgroup> list_end: u32;
 
+// dL/dpixel of an invocation's pixels; 0 outside of the image.
 struct Upstream {
-    rgb: vec3<f32>,
-    alpha: f32,
-    depth: f32,
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+    alpha: vec4<f32>,
+    depth: vec4<f32>,
 }
 
-// A pixel as it is behind the splat at hand: the light that is left there, and dL/d(what is seen).
-struct Pixel {
-    light: f32,
-    behind: f32,
+// Pixels as they are behind the splat at hand: the light that is left there, and dL/d(what is seen);
+// and the place in the list at which they stopped.
+struct Behind {
+    light: vec4<f32>,
+    seen: vec4<f32>,
+    stop: vec4<u32>,
 }
 
-fn upstream(pixel: vec2<u32>) -> Upstream {
-    var g = Upstream(vec3(0.0), 0.0, 0.0);
-    if pixel.x < frame.image.x && pixel.y < frame.image.y {
-        let size = frame.image.x * frame.image.y;
-        let at = pixel.y * frame.image.x + pixel.x;
-        g.rgb = vec3(gradient[at], gradient[size + at], gradient[2u * size + at]);
-        if MORE {
-            g.alpha = gradient[3u * size + at];
-            g.depth = gradient[4u * size + at];
+fn plane(n: u32, quad: Quad) -> vec4<f32> {
+    let first = n * frame.image.x * frame.image.y;
+    var g = vec4(0.0);
+    for (var p = 0u; p < 4u; p++) {
+        if quad.inside[p] {
+            g[p] = gradient[first + quad.place[p]];
         }
     }
     return g;
+}
+
+fn upstream(quad: Quad) -> Upstream {
+    var g = Upstream(plane(0u, quad), plane(1u, quad), plane(2u, quad), vec4(0.0), vec4(0.0));
+    if MORE {
+        g.alpha = plane(3u, quad);
+        g.depth = plane(4u, quad);
+    }
+    return g;
+}
+
+// Pixels behind all splats of a list.
+fn behind_all(quad: Quad, own: Upstream, length: u32) -> Behind {
+    let b = frame.background;
+    let seen = own.red * b.x + own.green * b.y + own.blue * b.z;
+    var pixels = Behind(vec4(1.0), seen, vec4(0u));
+    for (var p = 0u; p < 4u; p++) {
+        if quad.inside[p] {
+            let finished = finish[quad.place[p]];
+            pixels.light[p] = bitcast<f32>(finished.x);
+            pixels.stop[p] = min(finished.y, length);
+        }
+    }
+    return pixels;
 }
 
 fn fields() -> u32 {
@@ -62,13 +78,14 @@ fn maximum() -> u32 {
     return select(select(NONE, 9u, DETAIL == 1u), 14u, DETAIL == 2u);
 }
 
-// Of how many splats, from the front, any pixel of the tile takes one; `stop`: of this invocation's.
-fn taken_by_any(lane: u32, stop: u32) -> u32 {
+// How many splats, from the front, the tile goes through before all its pixels have stopped; `stops`: of
+// this invocation's.
+fn reached_by_any(lane: u32, stops: vec4<u32>) -> u32 {
     if lane == 0u {
         atomicStore(&last_stop, 0u);
     }
     workgroupBarrier();
-    atomicMax(&last_stop, stop);
+    atomicMax(&last_stop, max(max(stops.x, stops.y), max(stops.z, stops.w)));
     workgroupBarrier();
     if lane == 0u {
         list_end = atomicLoad(&last_stop);
@@ -76,82 +93,59 @@ fn taken_by_any(lane: u32, stop: u32) -> u32 {
     return workgroupUniformLoad(&list_end);
 }
 
-// Loads the splat of a row; `corner`: of the tile.
-fn load(place: u32, row: u32, corner: vec2<u32>) {
-    let a = splats[3u * row];
-    batch[3u * place] = vec4(a.xy - vec2<f32>(corner), a.zw);
-    batch[3u * place + 1u] = splats[3u * row + 1u];
-    batch[3u * place + 2u] = splats[3u * row + 2u];
-}
-
-// q = α·dL/dα and w = α·T of a splat of the batch in a pixel, which is left as it is behind the next
-// splat in front.
+// What the parameters need of splat i at hand, the nth of the list, summed over the pixels, which are
+// left as they are behind the next splat in front; with q = α·dL/dα and w = α·T. False, and nothing, where
+// none of the pixels takes it.
 fn differentiated(
     i: u32,
-    at: vec2<f32>,
+    n: u32,
+    quad: Quad,
     own: Upstream,
-    pixel: ptr<function, Pixel>,
-) -> vec2<f32> {
-    var q = 0.0;
-    var w = 0.0;
-    let a = batch[3u * i];
-    let b = batch[3u * i + 1u];
-    let d = at - a.xy;
-    let u = a.z * (d.x - a.w * d.y);
-    let z = b.x * d.y;
-    let e = b.y - u * u - z * z;
-    if e >= -LOG2_REACH {
-        let unclamped = exp2(e);
-        let alpha = min(unclamped, ALPHA_MAX);
-        (*pixel).light = (*pixel).light / (1.0 - alpha);
-        w = alpha * (*pixel).light;
-        var here = dot(batch[3u * i + 2u].xyz, own.rgb);
-        if MORE {
-            here += own.alpha + b.z * own.depth;
-        }
-        let ahead = here - (*pixel).behind;
-        (*pixel).behind = (*pixel).behind + alpha * ahead;
-        // No gradient where alpha is at its clamp.
-        q = select(0.0, w * ahead, unclamped <= ALPHA_MAX);
+    pixels: ptr<function, Behind>,
+    sums: ptr<function, array<f32, FIELDS>>,
+) -> bool {
+    let at = falloff(i, quad);
+    let takes = (vec4(n) < (*pixels).stop) & (at.exponent >= vec4(-LOG2_REACH));
+    if !any(takes) {
+        return false;
     }
-    return vec2(q, w);
-}
+    let unclamped = exp2(at.exponent);
+    let alpha = select(vec4(0.0), min(unclamped, vec4(ALPHA_MAX)), takes);
+    (*pixels).light = (*pixels).light / (1.0 - alpha);
+    let w = alpha * (*pixels).light;
+    let colour = batch[3u * i + 2u];
+    var here = colour.x * own.red + colour.y * own.green + colour.z * own.blue;
+    if MORE {
+        here += own.alpha + batch[3u * i + 1u].z * own.depth;
+    }
+    let ahead = here - (*pixels).seen;
+    (*pixels).seen = select((*pixels).seen, (*pixels).seen + alpha * ahead, takes);
+    // No gradient where alpha is at its clamp.
+    let q = select(vec4(0.0), w * ahead, takes & (unclamped <= vec4(ALPHA_MAX)));
 
-// Adds to the sums of a splat of the batch what the parameters need of q and w of a pixel.
-fn add_pixel(
-    sums: ptr<function, array<f32, 15>>,
-    i: u32,
-    at: vec2<f32>,
-    q: f32,
-    w: f32,
-    rgb: vec3<f32>,
-    depth: f32,
-) {
-    let a = batch[3u * i];
-    let l3 = batch[3u * i + 1u].x;
-    let d = at - a.xy;
-    let u = a.z * (d.x - a.w * d.y);
-    let z = l3 * d.y;
-    let qu = q * u;
-    let qz = q * z;
-    (*sums)[0] += q;
-    (*sums)[1] += qu;
-    (*sums)[2] += qz;
-    (*sums)[3] += qu * u;
-    (*sums)[4] += qu * z;
-    (*sums)[5] += qz * z;
-    (*sums)[6] += w * rgb.x;
-    (*sums)[7] += w * rgb.y;
-    (*sums)[8] += w * rgb.z;
+    let qu = q * at.u;
+    let qz = q * at.z;
+    (*sums)[0] = total(q);
+    (*sums)[1] = total(qu);
+    (*sums)[2] = total(qz);
+    (*sums)[3] = total(qu * at.u);
+    (*sums)[4] = total(qu * at.z);
+    (*sums)[5] = total(qz * at.z);
+    (*sums)[6] = total(w * own.red);
+    (*sums)[7] = total(w * own.green);
+    (*sums)[8] = total(w * own.blue);
     if DETAIL == 1u {
-        (*sums)[9] = max((*sums)[9], w);
+        (*sums)[9] = largest(w);
     }
     if DETAIL == 2u {
-        (*sums)[9] += abs(qu);
-        (*sums)[10] += abs(l3 * qz - a.z * a.w * qu);
-        (*sums)[11] += w;
-        (*sums)[12] += select(0.0, 1.0, w > 0.0);
-        (*sums)[13] += w * depth;
-        (*sums)[14] = max((*sums)[14], w);
+        let a = batch[3u * i];
+        let l3 = batch[3u * i + 1u].x;
+        (*sums)[9] = total(abs(qu));
+        (*sums)[10] = total(abs(l3 * qz - a.z * a.w * qu));
+        (*sums)[11] = total(w);
+        (*sums)[12] = total(select(vec4(0.0), vec4(1.0), w > vec4(0.0)));
+        (*sums)[13] = total(w * own.depth);
+        (*sums)[14] = largest(w);
     }
+    return true;
 }

@@ -1,59 +1,43 @@
 // Sums over the pixels that a row is blended into, front to back, for auxiliary views;
-// src/backend/cpu/observe.rs. One tile per group, four splats at a time, as in rasterize_bwd.wgsl.
+// src/backend/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
 
-@group(0) @binding(1) var<storage, read> state: State;
-@group(0) @binding(2) var<storage, read> list: array<u32>;
-@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
-@group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
-@group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 // Per slot: sums of the map, of pixels, of weights, of distances.
-@group(0) @binding(7) var<storage, read_write> records: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> records: array<f32>;
 
-const SPLATS: u32 = 4u;
-const BATCH: u32 = 16u;
-const SHARE: u32 = 64u;
-const ROUND: u32 = 32u;
-
-var<workgroup> parts: array<vec4<f32>, 256>;
-var<workgroup> weights: array<f32, 1024>;
-var<workgroup> map_of: array<f32, 256>;
-var<workgroup> batch: array<vec4<f32>, 32>;
-var<workgroup> slots: array<u32, 16>;
-
-// ROUND parts in order, added to what is given.
-fn added(given: vec4<f32>, first: u32) -> vec4<f32> {
-    var total = given;
-    for (var i = 0u; i < ROUND; i++) {
-        total += parts[first + i];
+// What an invocation finds of splat i at hand; k: of those at a time.
+fn put(
+    k: u32,
+    i: u32,
+    count: u32,
+    lane: u32,
+    quad: Quad,
+    map_here: vec4<f32>,
+    pixels: ptr<function, Open>,
+) {
+    var sums = vec4(0.0);
+    if i < count {
+        sums = blended(i, quad, map_here, pixels);
     }
-    return total;
+    for (var f = 0u; f < COLUMNS; f++) {
+        parts[(k * COLUMNS + f) * PITCH + lane] = sums[f];
+    }
 }
 
 // now.a: the band.
-@compute @workgroup_size(256)
+@compute @workgroup_size(64)
 fn replay(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let tile = group_of(id);
-    if tile >= frame.image.w || tile < state.cuts[now.a] || tile >= state.cuts[now.a + 1u] {
+    if !is_in_band(tile) {
         return;
     }
-    let corner = vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
-    let place = pixel_of(lane);
-    let pixel = corner + place;
-    let at = vec2<f32>(place) + 0.5;
-    let inside = pixel.x < frame.image.x && pixel.y < frame.image.y;
-    // 0 once the pixel has stopped, and outside the image.
-    var light = select(0.0, 1.0, inside);
-    map_of[lane] = 0.0;
-    if inside {
-        map_of[lane] = map[pixel.y * frame.image.x + pixel.x];
-    }
-    let share = lane % SHARE;
-    let mine = lane / SHARE;
+    let quad = quad_of(tile, lane);
+    let map_here = map_at(quad);
+    var pixels = Open(vec4(1.0), quad.inside);
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
     for (var first = begin; first < end; first += BATCH) {
@@ -61,54 +45,21 @@ fn replay(
         workgroupBarrier();
         if lane < count {
             let slot = list[first + lane];
-            let row = row_of_slot[slot];
-            let a = splats[3u * row];
             slots[lane] = slot;
-            batch[2u * lane] = vec4(a.xy - vec2<f32>(corner), a.zw);
-            batch[2u * lane + 1u] = splats[3u * row + 1u];
+            load(lane, row_of_slot[slot], quad.corner);
         }
         workgroupBarrier();
+        // Written out, as compilers do not unroll as much as this is.
         for (var base = 0u; base < count; base += SPLATS) {
-            for (var k = 0u; k < SPLATS; k++) {
-                var w = 0.0;
-                if base + k < count && light > 0.0 {
-                    let a = batch[2u * (base + k)];
-                    let b = batch[2u * (base + k) + 1u];
-                    let d = at - a.xy;
-                    let u = a.z * (d.x - a.w * d.y);
-                    let z = b.x * d.y;
-                    let e = b.y - u * u - z * z;
-                    if e >= -LOG2_REACH {
-                        let alpha = min(exp2(e), ALPHA_MAX);
-                        let next = light - alpha * light;
-                        if next <= TRANSMITTANCE_MIN {
-                            light = 0.0;
-                        } else {
-                            w = alpha * light;
-                            light = next;
-                        }
-                    }
-                }
-                weights[k * GROUP + lane] = w;
-            }
+            put(0u, base, count, lane, quad, map_here, &pixels);
+            put(1u, base + 1u, count, lane, quad, map_here, &pixels);
+            put(2u, base + 2u, count, lane, quad, map_here, &pixels);
+            put(3u, base + 3u, count, lane, quad, map_here, &pixels);
             workgroupBarrier();
-            var sums = vec4(0.0);
-            if base + mine < count {
-                let mean = batch[2u * (base + mine)].xy;
-                for (var k = 0u; k < 4u; k++) {
-                    let p = share * 4u + k;
-                    let w = weights[mine * GROUP + p];
-                    if w > 0.0 {
-                        let d = vec2<f32>(pixel_of(p)) + 0.5 - mean;
-                        sums += vec4(map_of[p], 1.0, w, sqrt(dot(d, d)));
-                    }
-                }
-            }
-            parts[lane] = sums;
-            workgroupBarrier();
-            if lane < SPLATS && base + lane < count {
-                let half = added(vec4(0.0), lane * SHARE);
-                records[slots[base + lane]] = added(half, lane * SHARE + ROUND);
+            // One invocation per column of each splat.
+            let which = base + lane / COLUMNS;
+            if lane < SPLATS * COLUMNS && which < count {
+                records[slots[which] * COLUMNS + lane % COLUMNS] = summed(lane, false);
             }
             workgroupBarrier();
         }

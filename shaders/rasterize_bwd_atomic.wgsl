@@ -1,29 +1,26 @@
 // Stage 5 with atomics: pixel gradients straight to the sums of rows, without records. The sums are those
 // of rasterize_bwd.wgsl, in an order that is chance.
 //
-// One tile per group. Each invocation finds q and w of its pixel, back to front, and what the parameters
-// need of them; a subgroup adds that up by itself, unless none of its pixels takes the splat. Over the
-// subgroups, and to the rows: subgroups.wgsl.
+// What an invocation finds in its pixels, a subgroup adds up by itself, unless none of its pixels takes
+// the splat. Over the subgroups, and to the rows: subgroups.wgsl.
 
-// One pixel's share in splat i of the batch.
-fn take(
+// What the tile's invocations find of splat i at hand.
+fn find(
     i: i32,
-    is_taken: bool,
+    first: u32,
     m: Member,
-    at: vec2<f32>,
+    quad: Quad,
     own: Upstream,
-    pixel: ptr<function, Pixel>,
+    pixels: ptr<function, Behind>,
 ) {
-    var found = vec2(0.0);
-    if i >= 0 && is_taken {
-        found = differentiated(u32(i), at, own, pixel);
+    // Said aloud: naga does not start a variable anew in each round of a loop.
+    var sums = array<f32, FIELDS>();
+    var is_taken = false;
+    if i >= 0 {
+        is_taken = differentiated(u32(i), first + u32(i), quad, own, pixels, &sums);
     }
-    var sums = array<f32, 15>();
     let stride = fields();
-    if subgroupAny(found.y > 0.0) {
-        if found.y > 0.0 {
-            add_pixel(&sums, u32(i), at, found.x, found.y, own.rgb, own.depth);
-        }
+    if subgroupAny(is_taken) {
         for (var f = 0u; f < stride; f++) {
             if f == maximum() {
                 sums[f] = subgroupMax(sums[f]);
@@ -33,61 +30,50 @@ fn take(
         }
     }
     if m.is_first && i >= 0 {
-        let first = (u32(i) * m.subgroups + m.subgroup) * stride;
+        let to = (u32(i) * m.subgroups + m.subgroup) * stride;
         for (var f = 0u; f < stride; f++) {
-            parts[first + f] = sums[f];
+            parts[to + f] = sums[f];
         }
     }
 }
 
 // now.a: the band.
-@compute @workgroup_size(256)
+@compute @workgroup_size(64)
 fn rasterize_bwd_atomic(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let tile = group_of(id);
-    if tile >= frame.image.w || tile < state.cuts[now.a] || tile >= state.cuts[now.a + 1u] {
+    if !is_in_band(tile) {
         return;
     }
-    let corner = vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
-    let place = pixel_of(lane);
-    let pixel = corner + place;
-    let at = vec2<f32>(place) + 0.5;
+    let quad = quad_of(tile, lane);
     let begin = tile_starts[tile];
-    let length = tile_starts[tile + 1u] - begin;
+    let own = upstream(quad);
+    var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
 
-    let own = upstream(pixel);
-    var ours = Pixel(1.0, dot(own.rgb, frame.background.xyz));
-    var stop = 0u;
-    if pixel.x < frame.image.x && pixel.y < frame.image.y {
-        let finished = finish[pixel.y * frame.image.x + pixel.x];
-        ours.light = bitcast<f32>(finished.x);
-        stop = min(finished.y, length);
-    }
-    let taken = taken_by_any(lane, stop);
+    let reached = reached_by_any(lane, pixels.stop);
     let m = member(lane);
     let stride = fields();
     let most = room(m, stride);
-    let batches = (taken + most - 1u) / most;
+    let batches = (reached + most - 1u) / most;
     for (var n = 0u; n < batches; n++) {
         let first = (batches - 1u - n) * most;
-        let count = min(most, taken - first);
+        let count = min(most, reached - first);
         workgroupBarrier();
         if lane < count {
             let row = row_of_slot[list[begin + first + lane]];
             rows[lane] = row;
-            load(lane, row, corner);
+            load(lane, row, quad.corner);
         }
         workgroupBarrier();
         // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
-        // counted (rasterize_bwd.wgsl says where).
-        for (var top = i32(count); top > 0; top -= i32(SPLATS)) {
-            let last = i32(stop) - i32(first);
-            take(top - 1, top - 1 < last, m, at, own, &ours);
-            take(top - 2, top - 2 < last, m, at, own, &ours);
-            take(top - 3, top - 3 < last, m, at, own, &ours);
-            take(top - 4, top - 4 < last, m, at, own, &ours);
+        // counted (slots.wgsl says where).
+        for (var top = i32(count); top > 0; top -= 4) {
+            find(top - 1, first, m, quad, own, &pixels);
+            find(top - 2, first, m, quad, own, &pixels);
+            find(top - 3, first, m, quad, own, &pixels);
+            find(top - 4, first, m, quad, own, &pixels);
         }
         workgroupBarrier();
         deliver(m, lane, count, stride, maximum());

@@ -5,15 +5,19 @@
 // Barriers: three for up to sixteen splats, fewer where subgroups are small and their parts many.
 
 // What each subgroup has found: of splat k, subgroup s, field f at (k·subgroups + s)·stride + f.
-var<workgroup> parts: array<f32, 3840>;
+var<workgroup> parts: array<f32, PARTS>;
 // Of the splats at hand.
-var<workgroup> rows: array<u32, 16>;
+var<workgroup> rows: array<u32, BATCH>;
 var<workgroup> numbered: atomic<u32>;
 var<workgroup> subgroups: u32;
 
-const PARTS: u32 = 3840u;
-// Parts that are added in one round of a loop, which compilers unroll; rasterize_bwd.wgsl says why.
-const ROUND: u32 = 32u;
+// Splats at a time, at most.
+const BATCH: u32 = 16u;
+// Room for the longest sum, of fifteen fields, from as many subgroups as there are invocations; where
+// subgroups are of 32, for that of 32 splats.
+const PARTS: u32 = 960u;
+// Parts that are added in one round of a loop, which compilers unroll; slots.wgsl says why.
+const ROUND: u32 = 8u;
 
 // An invocation among the others of its tile.
 struct Member {
@@ -44,34 +48,34 @@ fn member(lane: u32) -> Member {
 
 // Splats at a time for which there is room, of so many fields each.
 fn room(m: Member, stride: u32) -> u32 {
-    return clamp(PARTS / (m.subgroups * stride), 1u, 16u);
+    return clamp(PARTS / (m.subgroups * stride), 1u, BATCH);
 }
 
 // Adds the parts of `count` splats to the sums of their rows: one invocation per field of each. The
 // field `maximum` is the largest of its values; they are >= 0.
 fn deliver(m: Member, lane: u32, count: u32, stride: u32, maximum: u32) {
-    if lane >= count * stride {
-        return;
-    }
-    let k = lane / stride;
-    let f = lane % stride;
-    let is_maximum = f == maximum;
-    var total = 0.0;
-    for (var base = 0u; base < m.subgroups; base += ROUND) {
-        for (var i = 0u; i < ROUND; i++) {
-            let s = base + i;
-            let there = parts[(k * m.subgroups + s) * stride + f];
-            let x = select(0.0, there, s < m.subgroups);
-            total = select(total + x, max(total, x), is_maximum);
+    for (var n = lane; n < count * stride; n += MEMBERS) {
+        let k = n / stride;
+        let f = n % stride;
+        let is_maximum = f == maximum;
+        var sum = 0.0;
+        for (var base = 0u; base < m.subgroups; base += ROUND) {
+            for (var i = 0u; i < ROUND; i++) {
+                let s = base + i;
+                if s < m.subgroups {
+                    let x = parts[(k * m.subgroups + s) * stride + f];
+                    sum = select(sum + x, max(sum, x), is_maximum);
+                }
+            }
         }
-    }
-    // NaN is none of 0.
-    if total != 0.0 {
-        let at = rows[k] * stride + f;
-        if is_maximum {
-            raise(at, total);
-        } else {
-            add(at, total);
+        // NaN is none of 0.
+        if sum != 0.0 {
+            let at = rows[k] * stride + f;
+            if is_maximum {
+                raise(at, sum);
+            } else {
+                add(at, sum);
+            }
         }
     }
 }

@@ -73,14 +73,6 @@ override TRANSMITTANCE_MIN: f32 = 1e-4;
 override ALPHA_MIN: f32 = 1.0 / 255.0;
 override LOG2_REACH: f32 = 7.9943534;
 
-// The pixel of an invocation within its tile: neighbours in number are neighbours in the image, so
-// that those that run together mostly agree.
-fn pixel_of(lane: u32) -> vec2<u32> {
-    let x = (lane & 1u) | ((lane >> 1u) & 2u) | ((lane >> 2u) & 4u) | ((lane >> 3u) & 8u);
-    let y = ((lane >> 1u) & 1u) | ((lane >> 2u) & 2u) | ((lane >> 3u) & 4u) | ((lane >> 4u) & 8u);
-    return vec2(x, y);
-}
-
 // Workgroups in the first of two dimensions, each of which has at most 65,535 of them. It is a
 // constant because DX12 does not tell an indirect dispatch how many there are.
 const ACROSS: u32 = 32768u;

@@ -18,8 +18,11 @@ macro_rules! shader {
 const VIEW: &str = shader!("view");
 const GAUSSIAN: &str = shader!("gaussian");
 const RANDOM: &str = shader!("random");
-const BACKWARD: &str = shader!("backward");
+const QUADS: &str = shader!("quads");
+const SLOTS: &str = shader!("slots");
 const SUBGROUPS: &str = shader!("subgroups");
+const BACKWARD: &str = shader!("backward");
+const BLENDED: &str = shader!("blended");
 
 /// Which devices have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,21 +39,21 @@ pub(super) enum Of {
 pub(super) const STAGES: [(&str, Of, &[&str]); 14] = [
     ("project", Of::All, &[VIEW, GAUSSIAN, shader!("project")]),
     ("tiles", Of::All, &[VIEW, shader!("tiles")]),
-    ("rasterize", Of::All, &[VIEW, shader!("rasterize")]),
+    ("rasterize", Of::All, &[VIEW, QUADS, shader!("rasterize")]),
     ("loss", Of::All, &[VIEW, shader!("loss")]),
-    ("rasterize_bwd", Of::Slots, &[VIEW, BACKWARD, shader!("rasterize_bwd")]),
+    ("rasterize_bwd", Of::Slots, &[VIEW, QUADS, SLOTS, BACKWARD, shader!("rasterize_bwd")]),
     (
         "rasterize_bwd_atomic",
         Of::Atomics,
-        &[VIEW, BACKWARD, SUBGROUPS, shader!("rasterize_bwd_atomic")],
+        &[VIEW, QUADS, SUBGROUPS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
     ("project_bwd", Of::All, &[VIEW, GAUSSIAN, shader!("project_bwd")]),
     ("adam", Of::All, &[VIEW, RANDOM, shader!("adam")]),
     ("signals", Of::All, &[VIEW, shader!("signals")]),
     ("apply", Of::All, &[VIEW, RANDOM, shader!("apply")]),
     ("candidates", Of::All, &[VIEW, RANDOM, shader!("candidates")]),
-    ("observe", Of::Slots, &[VIEW, shader!("observe")]),
-    ("observe_atomic", Of::Atomics, &[VIEW, SUBGROUPS, shader!("observe_atomic")]),
+    ("observe", Of::Slots, &[VIEW, QUADS, SLOTS, BLENDED, shader!("observe")]),
+    ("observe_atomic", Of::Atomics, &[VIEW, QUADS, SUBGROUPS, BLENDED, shader!("observe_atomic")]),
     ("audit", Of::All, &[VIEW, shader!("audit")]),
 ];
 

@@ -1,0 +1,24 @@
+// What a splat is blended into, for both ways to add it up (observe.wgsl, observe_atomic.wgsl).
+
+// Sums of the map, of pixels, of weights, of distances.
+const COLUMNS: u32 = 4u;
+
+// The pixel map at an invocation's pixels; 0 outside of the image.
+fn map_at(quad: Quad) -> vec4<f32> {
+    var here = vec4(0.0);
+    for (var p = 0u; p < 4u; p++) {
+        if quad.inside[p] {
+            here[p] = map[quad.place[p]];
+        }
+    }
+    return here;
+}
+
+// The columns of splat i at hand, summed over the pixels.
+fn blended(i: u32, quad: Quad, map_here: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
+    let w = taken(falloff(i, quad).exponent, pixels);
+    let x = quad.x - batch[3u * i].x;
+    let y = quad.y - batch[3u * i].y;
+    let one = select(vec4(0.0), vec4(1.0), w > vec4(0.0));
+    return vec4(total(one * map_here), total(one), total(w), total(one * sqrt(x * x + y * y)));
+}

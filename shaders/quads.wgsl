@@ -1,0 +1,109 @@
+// What the kernels share that work tile by tile (rasterize, rasterize_bwd, observe and the atomic ones):
+// what they read, an invocation and its pixels, and what a splat is in them.
+//
+// One tile per group of 64 invocations. Each has four pixels that make a square, the four numbers of a
+// vec4: a splat is read once for all of them, and what they add to its sums meets in registers.
+
+@group(0) @binding(1) var<storage, read> state: State;
+// Slots, tile after tile, front to back.
+@group(0) @binding(2) var<storage, read> list: array<u32>;
+@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
+@group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
+@group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
+
+// Invocations of a tile.
+const MEMBERS: u32 = 64u;
+
+// Splats at hand: mean within the tile, l1, shear | l3, log2 of the opacity, depth | colour.
+var<workgroup> batch: array<vec4<f32>, 3u * BATCH>;
+
+// The pixels of an invocation.
+struct Quad {
+    // Of the tile, in the image [px].
+    corner: vec2<u32>,
+    // Centres, from that corner [px].
+    x: vec4<f32>,
+    y: vec4<f32>,
+    // Places in the image, row after row, where they are inside of it.
+    place: vec4<u32>,
+    inside: vec4<bool>,
+}
+
+// Whether a tile is there, and in the band at hand, `now.a`.
+fn is_in_band(tile: u32) -> bool {
+    return tile < frame.image.w && tile >= state.cuts[now.a] && tile < state.cuts[now.a + 1u];
+}
+
+// Neighbours in number are neighbours in the image, so that those that run together mostly agree.
+fn quad_of(tile: u32, lane: u32) -> Quad {
+    let corner = vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
+    let x = ((lane & 1u) << 1u) | (lane & 4u) | ((lane >> 1u) & 8u);
+    let y = (lane & 2u) | ((lane >> 1u) & 4u) | ((lane >> 2u) & 8u);
+    let across = vec4(x) + vec4(0u, 1u, 0u, 1u);
+    let down = vec4(y) + vec4(0u, 0u, 1u, 1u);
+    let column = across + corner.x;
+    let line = down + corner.y;
+    return Quad(
+        corner,
+        vec4<f32>(across) + 0.5,
+        vec4<f32>(down) + 0.5,
+        line * frame.image.x + column,
+        (column < vec4(frame.image.x)) & (line < vec4(frame.image.y)),
+    );
+}
+
+// Puts the splat of a row among those at hand; `corner`: of the tile.
+fn load(i: u32, row: u32, corner: vec2<u32>) {
+    let a = splats[3u * row];
+    batch[3u * i] = vec4(a.xy - vec2<f32>(corner), a.zw);
+    batch[3u * i + 1u] = splats[3u * row + 1u];
+    batch[3u * i + 2u] = splats[3u * row + 2u];
+}
+
+// A splat in the pixels: distances from its mean along its own axes, and log2 of its opacity there.
+struct Falloff {
+    u: vec4<f32>,
+    z: vec4<f32>,
+    exponent: vec4<f32>,
+}
+
+// Of splat i at hand.
+fn falloff(i: u32, quad: Quad) -> Falloff {
+    let a = batch[3u * i];
+    let b = batch[3u * i + 1u];
+    let down = quad.y - a.y;
+    let u = a.z * ((quad.x - a.x) - a.w * down);
+    let z = b.x * down;
+    return Falloff(u, z, b.y - u * u - z * z);
+}
+
+// Pixels on their way from front to back: the light that is left, and whether they go on.
+struct Open {
+    light: vec4<f32>,
+    goes_on: vec4<bool>,
+}
+
+// The weights of a splat in pixels, of which it takes the light, or which stop before it.
+fn taken(exponent: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
+    let reached = (*pixels).goes_on & (exponent >= vec4(-LOG2_REACH));
+    if !any(reached) {
+        return vec4(0.0);
+    }
+    let light = (*pixels).light;
+    let weight = min(exp2(exponent), vec4(ALPHA_MAX)) * light;
+    let next = light - weight;
+    let stops = reached & (next <= vec4(TRANSMITTANCE_MIN));
+    let takes = reached & !stops;
+    (*pixels).light = select(light, next, takes);
+    (*pixels).goes_on = (*pixels).goes_on & !stops;
+    return select(vec4(0.0), weight, takes);
+}
+
+// A function of the four pixels, added up; always in the same order.
+fn total(x: vec4<f32>) -> f32 {
+    return (x.x + x.y) + (x.z + x.w);
+}
+
+fn largest(x: vec4<f32>) -> f32 {
+    return max(max(x.x, x.y), max(x.z, x.w));
+}

@@ -1,0 +1,35 @@
+// Sums over a tile's pixels that go to one record per entry, in its slot: what each invocation has found
+// in its four pixels is put side by side, and added in order. So the sum over a tile has one order,
+// whatever the device, and four splats share two barriers. subgroups.wgsl is the other way.
+
+// Splats at a time, and loaded at a time, at most.
+const SPLATS: u32 = 4u;
+const BATCH: u32 = 8u;
+
+// Half of the invocations. So many rounds of a loop compilers unroll, and it matters: llvmpipe ends all
+// loops of an invocation after 65,535 rounds together, which a tile of 3,000 splats would reach otherwise.
+const ROUND: u32 = 32u;
+// Numbers from one sum's parts to the next one's: one more than there are, so that those that add up
+// different sums read different banks.
+const PITCH: u32 = 65u;
+
+// Part n·PITCH + lane: of sum n, found by an invocation.
+var<workgroup> parts: array<f32, 3900>;
+// Of the splats at hand.
+var<workgroup> slots: array<u32, BATCH>;
+
+// ROUND parts in order, added to what is given, or the largest of all.
+fn reduced(given: f32, first: u32, is_maximum: bool) -> f32 {
+    var sum = given;
+    for (var i = 0u; i < ROUND; i++) {
+        let x = parts[first + i];
+        sum = select(sum + x, max(sum, x), is_maximum);
+    }
+    return sum;
+}
+
+// Sum n of all parts, or their maximum.
+fn summed(n: u32, is_maximum: bool) -> f32 {
+    let half = reduced(0.0, n * PITCH, is_maximum);
+    return reduced(half, n * PITCH + ROUND, is_maximum);
+}
