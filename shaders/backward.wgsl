@@ -11,12 +11,6 @@ override DETAIL: u32 = 0u;
 // Whether alpha and depth have gradients.
 override MORE: bool = false;
 
-// Fields of the longest sum.
-const FIELDS: u32 = 15u;
-
-var<workgroup> last_stop: atomic<u32>;
-var<workgroup> list_end: u32;
-
 // dL/dpixel of an invocation's pixels; 0 outside of the image.
 struct Upstream {
     red: vec4<f32>,
@@ -78,33 +72,23 @@ fn maximum() -> u32 {
     return select(select(NONE, 9u, DETAIL == 1u), 14u, DETAIL == 2u);
 }
 
-// How many splats, from the front, the tile goes through before all its pixels have stopped; `stops`: of
-// this invocation's.
-fn reached_by_any(lane: u32, stops: vec4<u32>) -> u32 {
-    if lane == 0u {
-        atomicStore(&last_stop, 0u);
-    }
-    workgroupBarrier();
-    atomicMax(&last_stop, max(max(stops.x, stops.y), max(stops.z, stops.w)));
-    workgroupBarrier();
-    if lane == 0u {
-        list_end = atomicLoad(&last_stop);
-    }
-    return workgroupUniformLoad(&list_end);
+// How many splats, from the front, pixels go through before all have stopped.
+fn last_of(pixels: Behind) -> u32 {
+    return max(max(pixels.stop.x, pixels.stop.y), max(pixels.stop.z, pixels.stop.w));
 }
 
-// What the parameters need of splat i at hand, the nth of the list, summed over the pixels, which are
-// left as they are behind the next splat in front; with q = α·dL/dα and w = α·T. False, and nothing, where
-// none of the pixels takes it.
+// What the parameters need of a splat, the nth of the list, summed over the pixels, which are left as
+// they are behind the next splat in front; with q = α·dL/dα and w = α·T. False, and nothing, where none of
+// the pixels takes it.
 fn differentiated(
-    i: u32,
+    splat: Splat,
     n: u32,
     quad: Quad,
     own: Upstream,
     pixels: ptr<function, Behind>,
     sums: ptr<function, array<f32, FIELDS>>,
 ) -> bool {
-    let at = falloff(i, quad);
+    let at = falloff(splat, quad);
     let takes = (vec4(n) < (*pixels).stop) & (at.exponent >= vec4(-LOG2_REACH));
     if !any(takes) {
         return false;
@@ -113,10 +97,10 @@ fn differentiated(
     let alpha = select(vec4(0.0), min(unclamped, vec4(ALPHA_MAX)), takes);
     (*pixels).light = (*pixels).light / (1.0 - alpha);
     let w = alpha * (*pixels).light;
-    let colour = batch[3u * i + 2u];
-    var here = colour.x * own.red + colour.y * own.green + colour.z * own.blue;
+    let rgb = splat.colour;
+    var here = rgb.x * own.red + rgb.y * own.green + rgb.z * own.blue;
     if MORE {
-        here += own.alpha + batch[3u * i + 1u].z * own.depth;
+        here += own.alpha + splat.b.z * own.depth;
     }
     let ahead = here - (*pixels).seen;
     (*pixels).seen = select((*pixels).seen, (*pixels).seen + alpha * ahead, takes);
@@ -138,8 +122,8 @@ fn differentiated(
         (*sums)[9] = largest(w);
     }
     if DETAIL == 2u {
-        let a = batch[3u * i];
-        let l3 = batch[3u * i + 1u].x;
+        let a = splat.a;
+        let l3 = splat.b.x;
         (*sums)[9] = total(abs(qu));
         (*sums)[10] = total(abs(l3 * qz - a.z * a.w * qu));
         (*sums)[11] = total(w);

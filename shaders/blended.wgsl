@@ -14,11 +14,16 @@ fn map_at(quad: Quad) -> vec4<f32> {
     return here;
 }
 
-// The columns of splat i at hand, summed over the pixels.
-fn blended(i: u32, quad: Quad, map_here: vec4<f32>, pixels: ptr<function, Open>) -> vec4<f32> {
-    let w = taken(falloff(i, quad).exponent, pixels);
-    let x = quad.x - batch[3u * i].x;
-    let y = quad.y - batch[3u * i].y;
+// The columns of a splat, summed over the pixels.
+fn blended(
+    splat: Splat,
+    quad: Quad,
+    map_here: vec4<f32>,
+    pixels: ptr<function, Open>,
+) -> vec4<f32> {
+    let w = taken(falloff(splat, quad).exponent, pixels);
+    let x = quad.x - splat.a.x;
+    let y = quad.y - splat.a.y;
     let one = select(vec4(0.0), vec4(1.0), w > vec4(0.0));
     return vec4(total(one * map_here), total(one), total(w), total(one * sqrt(x * x + y * y)));
 }

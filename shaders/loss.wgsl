@@ -1,6 +1,7 @@
 // Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/backend/cpu/loss.rs.
 // SSIM is written in e = rendering − target, by an exact identity. The 11×11 window is taken apart
-// into columns and rows; beyond the image there are zeros.
+// into columns and rows; beyond the image there are zeros. An invocation sums for four pixels in a row,
+// whose windows have eight of fourteen values in common.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(2) var<storage, read> canvas: array<vec4<f32>>;
@@ -28,12 +29,15 @@ const HAS_ALPHA: u32 = 1u;
 const HAS_MASK: u32 = 2u;
 const WITH_ERROR: u32 = 4u;
 
-fn window(k: u32) -> f32 {
-    var weights = array<f32, 11>(
+// Weights of the kth of fourteen values in a row, in the windows around the sixth to the ninth.
+fn windows(k: u32) -> vec4<f32> {
+    var weights = array<f32, 17>(
+        0.0, 0.0, 0.0,
         0.0010283802, 0.007598758, 0.036000773, 0.10936069, 0.21300553, 0.26601174,
         0.21300553, 0.10936069, 0.036000773, 0.007598758, 0.0010283802,
+        0.0, 0.0, 0.0,
     );
-    return weights[k];
+    return vec4(weights[k + 3u], weights[k + 2u], weights[k + 1u], weights[k]);
 }
 
 fn weight_of(at: u32) -> f32 {
@@ -43,12 +47,16 @@ fn weight_of(at: u32) -> f32 {
     return f32((mask[at / 4u] >> (8u * (at % 4u))) & 0xffu) * (1.0 / 255.0);
 }
 
+fn is_inside(pixel: vec2<i32>) -> bool {
+    return all(pixel >= vec2(0)) && all(pixel < vec2<i32>(frame.image.xy));
+}
+
 // e and y of one channel of a pixel; 0 beyond the image.
-fn difference(x: i32, y: i32, channel: u32) -> vec2<f32> {
-    if x < 0 || y < 0 || x >= i32(frame.image.x) || y >= i32(frame.image.y) {
+fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
+    if !is_inside(pixel) {
         return vec2(0.0);
     }
-    let at = u32(y) * frame.image.x + u32(x);
+    let at = u32(pixel.y) * frame.image.x + u32(pixel.x);
     let word = truth[at];
     var target_value = f32((word >> (8u * channel)) & 0xffu) * (1.0 / 255.0);
     if (frame.draw.w & HAS_ALPHA) != 0u {
@@ -58,14 +66,45 @@ fn difference(x: i32, y: i32, channel: u32) -> vec2<f32> {
     return vec2((canvas[at][channel] - target_value) * weight_of(at), target_value);
 }
 
-// A tile with its surroundings: two values per pixel, then up to five per pixel of its columns.
+// Values in reach of four in a row.
+const SPAN: u32 = 14u;
+// Fours in a column of the tile, for all columns of its surroundings; fours in the tile's lines.
+const COLUMNS: u32 = SIDE * TILE / 4u;
+const LINES: u32 = TILE * TILE / 4u;
+
+// A tile with its surroundings: up to three values per pixel, then up to five per pixel of its columns.
 var<workgroup> around: array<vec2<f32>, 676>;
+var<workgroup> thirds: array<f32, 676>;
 var<workgroup> rows_a: array<vec4<f32>, 416>;
 var<workgroup> rows_b: array<f32, 416>;
-var<workgroup> reduced: array<vec2<f32>, 256>;
+var<workgroup> reduced: array<vec2<f32>, GROUP>;
 
-fn corner_of(tile: u32) -> vec2<i32> {
-    return vec2<i32>(vec2(tile % frame.image.z, tile / frame.image.z) * TILE);
+// Four pixels of a line of a tile.
+struct Four {
+    // The first one's column, and their line, from the tile's corner [px].
+    column: u32,
+    line: u32,
+    // Place of the first in the image, row after row, and how many are within it.
+    place: u32,
+    inside: u32,
+}
+
+fn corner_of(tile: u32) -> vec2<u32> {
+    return vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
+}
+
+fn four_of(corner: vec2<u32>, i: u32) -> Four {
+    let column = 4u * (i % 4u);
+    let line = i / 4u;
+    let x = corner.x + column;
+    let y = corner.y + line;
+    let there = select(0u, min(frame.image.x - x, 4u), x < frame.image.x && y < frame.image.y);
+    return Four(column, line, y * frame.image.x + x, there);
+}
+
+// The pixel of `around` at a place; its coordinates may be outside of the image.
+fn pixel_around(corner: vec2<u32>, i: u32) -> vec2<i32> {
+    return vec2<i32>(corner) + vec2(i32(i % SIDE), i32(i / SIDE)) - REACH;
 }
 
 // SSIM, its derivatives, and the sums of the tile. now.a, now.b: bits of the weights of |e| and of
@@ -80,52 +119,64 @@ fn similarity(
         return;
     }
     let corner = corner_of(tile);
-    let place = vec2(lane % TILE, lane / TILE);
-    let pixel = vec2<u32>(corner) + place;
-    let inside = pixel.x < frame.image.x && pixel.y < frame.image.y;
     let size = frame.image.x * frame.image.y;
-    let at = pixel.y * frame.image.x + pixel.x;
     var sums = vec2(0.0);
-    var wrong = 0.0;
+    var wrong = vec4(0.0);
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
         for (var i = lane; i < SIDE * SIDE; i += GROUP) {
-            let x = corner.x + i32(i % SIDE) - REACH;
-            let y = corner.y + i32(i / SIDE) - REACH;
-            around[i] = difference(x, y, channel);
+            around[i] = difference(pixel_around(corner, i), channel);
         }
         workgroupBarrier();
-        // Columns: the tile's lines, all of its surroundings' columns.
-        for (var i = lane; i < SIDE * TILE; i += GROUP) {
-            var a = vec4(0.0);
-            var b = 0.0;
-            for (var k = 0u; k < 11u; k++) {
-                let ey = around[i + k * SIDE];
-                let w = window(k);
-                let we = w * ey.x;
-                let wy = w * ey.y;
-                a += vec4(we, wy, we * ey.x, wy * ey.y);
-                b += we * ey.y;
+        for (var i = lane; i < COLUMNS; i += GROUP) {
+            let first = i / SIDE * 4u * SIDE + i % SIDE;
+            var e = vec4(0.0);
+            var y = vec4(0.0);
+            var ee = vec4(0.0);
+            var yy = vec4(0.0);
+            var ey = vec4(0.0);
+            for (var k = 0u; k < SPAN; k++) {
+                let here = around[first + k * SIDE];
+                let we = windows(k) * here.x;
+                let wy = windows(k) * here.y;
+                e += we;
+                y += wy;
+                ee += we * here.x;
+                yy += wy * here.y;
+                ey += we * here.y;
             }
-            rows_a[i] = a;
-            rows_b[i] = b;
+            rows_a[first] = vec4(e.x, y.x, ee.x, yy.x);
+            rows_a[first + SIDE] = vec4(e.y, y.y, ee.y, yy.y);
+            rows_a[first + 2u * SIDE] = vec4(e.z, y.z, ee.z, yy.z);
+            rows_a[first + 3u * SIDE] = vec4(e.w, y.w, ee.w, yy.w);
+            rows_b[first] = ey.x;
+            rows_b[first + SIDE] = ey.y;
+            rows_b[first + 2u * SIDE] = ey.z;
+            rows_b[first + 3u * SIDE] = ey.w;
         }
         workgroupBarrier();
-        if inside {
-            var a = vec4(0.0);
-            var mean_ey = 0.0;
-            for (var k = 0u; k < 11u; k++) {
-                let i = place.y * SIDE + place.x + k;
-                a += window(k) * rows_a[i];
-                mean_ey += window(k) * rows_b[i];
+        for (var i = lane; i < LINES; i += GROUP) {
+            let four = four_of(corner, i);
+            let first = four.line * SIDE + four.column;
+            var mu_e = vec4(0.0);
+            var mu_y = vec4(0.0);
+            var mean_ee = vec4(0.0);
+            var mean_yy = vec4(0.0);
+            var mean_ey = vec4(0.0);
+            for (var k = 0u; k < SPAN; k++) {
+                let here = rows_a[first + k];
+                let w = windows(k);
+                mu_e += w * here.x;
+                mu_y += w * here.y;
+                mean_ee += w * here.z;
+                mean_yy += w * here.w;
+                mean_ey += w * rows_b[first + k];
             }
-            let mu_e = a.x;
-            let mu_y = a.y;
             let mu_x = mu_e + mu_y;
-            let var_e = max(a.z - mu_e * mu_e, 0.0);
-            let var_y = max(a.w - mu_y * mu_y, 0.0);
+            let var_e = max(mean_ee - mu_e * mu_e, vec4(0.0));
+            let var_y = max(mean_yy - mu_y * mu_y, vec4(0.0));
             let cov = mean_ey - mu_e * mu_y;
-            let var_x = max(var_y + 2.0 * cov + var_e, 0.0);
+            let var_x = max(var_y + 2.0 * cov + var_e, vec4(0.0));
             let inv_a = 1.0 / (mu_x * mu_x + mu_y * mu_y + C1);
             let inv_b = 1.0 / (var_x + var_y + C2);
             let luminance = 1.0 - mu_e * mu_e * inv_a;
@@ -133,19 +184,38 @@ fn similarity(
             let by_luminance = -2.0 * mu_e * inv_a * (1.0 - mu_e * mu_x * inv_a);
             let two_ve_bb = 2.0 * var_e * inv_b * inv_b;
             let by_contrast = 2.0 * mu_e * contrast * inv_b - mu_y * two_ve_bb;
-            derivatives[3u * channel * size + at] = contrast * by_luminance + luminance * by_contrast;
-            derivatives[(3u * channel + 1u) * size + at] = -(luminance * contrast * inv_b);
-            derivatives[(3u * channel + 2u) * size + at] = luminance * two_ve_bb;
-            let e = around[(place.y + 5u) * SIDE + place.x + 5u].x;
+            let by_e = contrast * by_luminance + luminance * by_contrast;
+            let by_ee = -(luminance * contrast * inv_b);
+            let by_ey = luminance * two_ve_bb;
             let ssim = luminance * contrast;
-            sums += vec2(abs(e), ssim);
-            wrong += abs(e) * bitcast<f32>(now.a) + (1.0 - ssim) * bitcast<f32>(now.b);
+            for (var p = 0u; p < 4u; p++) {
+                if p < four.inside {
+                    let to = 3u * channel * size + four.place + p;
+                    derivatives[to] = by_e[p];
+                    derivatives[to + size] = by_ee[p];
+                    derivatives[to + 2u * size] = by_ey[p];
+                    let e = abs(around[first + 5u * SIDE + 5u + p].x);
+                    sums += vec2(e, ssim[p]);
+                    wrong[p] += e * bitcast<f32>(now.a) + (1.0 - ssim[p]) * bitcast<f32>(now.b);
+                }
+            }
         }
     }
-    if inside && (frame.draw.w & WITH_ERROR) != 0u {
-        error[at] = wrong * (1.0 / 3.0);
+    if lane < LINES && (frame.draw.w & WITH_ERROR) != 0u {
+        let four = four_of(corner, lane);
+        for (var p = 0u; p < four.inside; p++) {
+            error[four.place + p] = wrong[p] * (1.0 / 3.0);
+        }
     }
     reduced[lane] = sums;
+    let of_tile = reduced_sum(lane);
+    if lane == 0u {
+        tile_sums[tile] = of_tile;
+    }
+}
+
+// The sum of `reduced`, for the first invocation.
+fn reduced_sum(lane: u32) -> vec2<f32> {
     workgroupBarrier();
     for (var half = GROUP / 2u; half > 0u; half /= 2u) {
         if lane < half {
@@ -153,9 +223,7 @@ fn similarity(
         }
         workgroupBarrier();
     }
-    if lane == 0u {
-        tile_sums[tile] = reduced[0];
-    }
+    return reduced[0];
 }
 
 // dL/dpixel.
@@ -169,51 +237,67 @@ fn pixel_gradient(
         return;
     }
     let corner = corner_of(tile);
-    let place = vec2(lane % TILE, lane / TILE);
-    let pixel = vec2<u32>(corner) + place;
-    let inside = pixel.x < frame.image.x && pixel.y < frame.image.y;
     let size = frame.image.x * frame.image.y;
-    let at = pixel.y * frame.image.x + pixel.x;
     let scale = 1.0 / (3.0 * f32(size));
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
-        // `around` holds the first two derivatives, `rows_b` the third's columns; so the third is
-        // taken straight from memory.
         for (var i = lane; i < SIDE * SIDE; i += GROUP) {
-            let x = corner.x + i32(i % SIDE) - REACH;
-            let y = corner.y + i32(i / SIDE) - REACH;
-            var value = vec2(0.0);
-            if x >= 0 && y >= 0 && x < i32(frame.image.x) && y < i32(frame.image.y) {
-                let source = 3u * channel * size + u32(y) * frame.image.x + u32(x);
-                value = vec2(derivatives[source], derivatives[source + size]);
+            let at = pixel_around(corner, i);
+            var value = vec3(0.0);
+            if is_inside(at) {
+                let source = 3u * channel * size + u32(at.y) * frame.image.x + u32(at.x);
+                value = vec3(
+                    derivatives[source],
+                    derivatives[source + size],
+                    derivatives[source + 2u * size],
+                );
             }
-            around[i] = value;
+            around[i] = value.xy;
+            thirds[i] = value.z;
         }
         workgroupBarrier();
-        for (var i = lane; i < SIDE * TILE; i += GROUP) {
-            let x = corner.x + i32(i % SIDE) - REACH;
-            var sum = vec3(0.0);
-            for (var k = 0u; k < 11u; k++) {
-                let y = corner.y + i32(i / SIDE + k) - REACH;
-                var third = 0.0;
-                if x >= 0 && y >= 0 && x < i32(frame.image.x) && y < i32(frame.image.y) {
-                    third = derivatives[(3u * channel + 2u) * size + u32(y) * frame.image.x + u32(x)];
+        for (var i = lane; i < COLUMNS; i += GROUP) {
+            let first = i / SIDE * 4u * SIDE + i % SIDE;
+            var x = vec4(0.0);
+            var y = vec4(0.0);
+            var z = vec4(0.0);
+            for (var k = 0u; k < SPAN; k++) {
+                let here = around[first + k * SIDE];
+                let w = windows(k);
+                x += w * here.x;
+                y += w * here.y;
+                z += w * thirds[first + k * SIDE];
+            }
+            rows_a[first] = vec4(x.x, y.x, z.x, 0.0);
+            rows_a[first + SIDE] = vec4(x.y, y.y, z.y, 0.0);
+            rows_a[first + 2u * SIDE] = vec4(x.z, y.z, z.z, 0.0);
+            rows_a[first + 3u * SIDE] = vec4(x.w, y.w, z.w, 0.0);
+        }
+        workgroupBarrier();
+        for (var i = lane; i < LINES; i += GROUP) {
+            let four = four_of(corner, i);
+            let first = four.line * SIDE + four.column;
+            var x = vec4(0.0);
+            var y = vec4(0.0);
+            var z = vec4(0.0);
+            for (var k = 0u; k < SPAN; k++) {
+                let here = rows_a[first + k];
+                let w = windows(k);
+                x += w * here.x;
+                y += w * here.y;
+                z += w * here.z;
+            }
+            let pixel = vec2<i32>(corner + vec2(four.column, four.line));
+            for (var p = 0u; p < 4u; p++) {
+                if p < four.inside {
+                    let ey = difference(pixel + vec2(i32(p), 0), channel);
+                    let by_ssim = x[p] + 2.0 * ey.x * y[p] + ey.y * z[p];
+                    let g = (1.0 - SSIM_WEIGHT) * scale * sign(ey.x) - SSIM_WEIGHT * scale * by_ssim;
+                    // The loss sees e·mask, so the chain rule has the mask once more.
+                    let to = four.place + p;
+                    gradient[channel * size + to] = g * weight_of(to);
                 }
-                sum += window(k) * vec3(around[i + k * SIDE], third);
             }
-            rows_a[i] = vec4(sum, 0.0);
-        }
-        workgroupBarrier();
-        if inside {
-            var by = vec3(0.0);
-            for (var k = 0u; k < 11u; k++) {
-                by += window(k) * rows_a[place.y * SIDE + place.x + k].xyz;
-            }
-            let ey = difference(i32(pixel.x), i32(pixel.y), channel);
-            let by_ssim = by.x + 2.0 * ey.x * by.y + ey.y * by.z;
-            let g = (1.0 - SSIM_WEIGHT) * scale * sign(ey.x) - SSIM_WEIGHT * scale * by_ssim;
-            // The loss sees e·mask, so the chain rule has the mask once more.
-            gradient[channel * size + at] = g * weight_of(at);
         }
     }
 }
@@ -226,16 +310,10 @@ fn total(@builtin(local_invocation_index) lane: u32) {
         sums += tile_sums[tile];
     }
     reduced[lane] = sums;
-    workgroupBarrier();
-    for (var half = GROUP / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            reduced[lane] += reduced[lane + half];
-        }
-        workgroupBarrier();
-    }
+    let all = reduced_sum(lane);
     if lane == 0u {
         let samples = 3.0 * f32(frame.image.x * frame.image.y);
-        state.l1 = reduced[0].x / samples;
-        state.ssim = reduced[0].y / samples;
+        state.l1 = all.x / samples;
+        state.ssim = all.y / samples;
     }
 }

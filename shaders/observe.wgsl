@@ -18,7 +18,7 @@ fn put(
 ) {
     var sums = vec4(0.0);
     if i < count {
-        sums = blended(i, quad, map_here, pixels);
+        sums = blended(held(i), quad, map_here, pixels);
     }
     for (var f = 0u; f < COLUMNS; f++) {
         parts[(k * COLUMNS + f) * PITCH + lane] = sums[f];
@@ -46,7 +46,7 @@ fn replay(
         if lane < count {
             let slot = list[first + lane];
             slots[lane] = slot;
-            load(lane, row_of_slot[slot], quad.corner);
+            hold(lane, splat_of(row_of_slot[slot], quad.corner));
         }
         workgroupBarrier();
         // Written out, as compilers do not unroll as much as this is.

@@ -4,7 +4,7 @@
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 
-// What the tile's invocations find of splat i at hand.
+// What the subgroup finds of splat i of `count` at hand.
 fn find(
     i: u32,
     count: u32,
@@ -13,19 +13,17 @@ fn find(
     map_here: vec4<f32>,
     pixels: ptr<function, Open>,
 ) {
-    var sums = vec4(0.0);
-    if i < count {
-        sums = blended(i, quad, map_here, pixels);
+    if i >= count {
+        return;
     }
+    let columns = blended(held(i), quad, map_here, pixels);
     // The second counts pixels.
-    if subgroupAny(sums.y > 0.0) {
-        sums = subgroupAdd(sums);
-    }
-    if m.is_first && i < count {
-        let to = (i * m.subgroups + m.subgroup) * COLUMNS;
+    if subgroupAny(columns.y > 0.0) {
+        var sums = array<f32, FIELDS>();
         for (var f = 0u; f < COLUMNS; f++) {
-            parts[to + f] = sums[f];
+            sums[f] = columns[f];
         }
+        deliver(m, i, sums, COLUMNS, NONE);
     }
 }
 
@@ -39,22 +37,19 @@ fn replay_atomic(
     if !is_in_band(tile) {
         return;
     }
+    let m = member();
     let quad = quad_of(tile, lane);
     let map_here = map_at(quad);
     var pixels = Open(vec4(1.0), quad.inside);
-    let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
-    let m = member(lane);
-    let most = room(m, COLUMNS);
-    for (var first = begin; first < end; first += most) {
-        let count = min(most, end - first);
-        workgroupBarrier();
-        if lane < count {
-            let row = row_of_slot[list[first + lane]];
-            rows[lane] = row;
-            load(lane, row, quad.corner);
+    for (var first = tile_starts[tile]; first < end; first += m.members) {
+        if !subgroupAny(any(pixels.goes_on)) {
+            break;
         }
-        workgroupBarrier();
+        let count = min(m.members, end - first);
+        if m.place < count {
+            hold(row_of_slot[list[first + m.place]], quad.corner);
+        }
         // Four in a round, written out, as in rasterize_bwd_atomic.wgsl.
         for (var i = 0u; i < count; i += 4u) {
             find(i, count, m, quad, map_here, &pixels);
@@ -62,7 +57,5 @@ fn replay_atomic(
             find(i + 2u, count, m, quad, map_here, &pixels);
             find(i + 3u, count, m, quad, map_here, &pixels);
         }
-        workgroupBarrier();
-        deliver(m, lane, count, COLUMNS, NONE);
     }
 }

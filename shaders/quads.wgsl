@@ -14,8 +14,16 @@
 // Invocations of a tile.
 const MEMBERS: u32 = 64u;
 
-// Splats at hand: mean within the tile, l1, shear | l3, log2 of the opacity, depth | colour.
-var<workgroup> batch: array<vec4<f32>, 3u * BATCH>;
+// Fields of the longest sum over a tile's pixels.
+const FIELDS: u32 = 15u;
+
+struct Splat {
+    // Mean within the tile [px], l1, shear.
+    a: vec4<f32>,
+    // l3, log2 of the opacity, depth.
+    b: vec4<f32>,
+    colour: vec4<f32>,
+}
 
 // The pixels of an invocation.
 struct Quad {
@@ -52,12 +60,11 @@ fn quad_of(tile: u32, lane: u32) -> Quad {
     );
 }
 
-// Puts the splat of a row among those at hand; `corner`: of the tile.
-fn load(i: u32, row: u32, corner: vec2<u32>) {
+// The splat of a row; `corner`: of the tile.
+fn splat_of(row: u32, corner: vec2<u32>) -> Splat {
     let a = splats[3u * row];
-    batch[3u * i] = vec4(a.xy - vec2<f32>(corner), a.zw);
-    batch[3u * i + 1u] = splats[3u * row + 1u];
-    batch[3u * i + 2u] = splats[3u * row + 2u];
+    let within = vec4(a.xy - vec2<f32>(corner), a.zw);
+    return Splat(within, splats[3u * row + 1u], splats[3u * row + 2u]);
 }
 
 // A splat in the pixels: distances from its mean along its own axes, and log2 of its opacity there.
@@ -67,14 +74,11 @@ struct Falloff {
     exponent: vec4<f32>,
 }
 
-// Of splat i at hand.
-fn falloff(i: u32, quad: Quad) -> Falloff {
-    let a = batch[3u * i];
-    let b = batch[3u * i + 1u];
-    let down = quad.y - a.y;
-    let u = a.z * ((quad.x - a.x) - a.w * down);
-    let z = b.x * down;
-    return Falloff(u, z, b.y - u * u - z * z);
+fn falloff(splat: Splat, quad: Quad) -> Falloff {
+    let down = quad.y - splat.a.y;
+    let u = splat.a.z * ((quad.x - splat.a.x) - splat.a.w * down);
+    let z = splat.b.x * down;
+    return Falloff(u, z, splat.b.y - u * u - z * z);
 }
 
 // Pixels on their way from front to back: the light that is left, and whether they go on.

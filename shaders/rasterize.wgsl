@@ -34,12 +34,12 @@ fn draw(
         return;
     }
     let went_on = (*pixels).goes_on;
-    let w = taken(falloff(k, quad).exponent, pixels);
-    let colour = batch[3u * k + 2u];
-    (*shown).red += w * colour.x;
-    (*shown).green += w * colour.y;
-    (*shown).blue += w * colour.z;
-    (*shown).depth += w * batch[3u * k + 1u].z;
+    let splat = held(k);
+    let w = taken(falloff(splat, quad).exponent, pixels);
+    (*shown).red += w * splat.colour.x;
+    (*shown).green += w * splat.colour.y;
+    (*shown).blue += w * splat.colour.z;
+    (*shown).depth += w * splat.b.z;
     let stops = went_on & !(*pixels).goes_on;
     (*shown).stop = select((*shown).stop, vec4(n + k), stops);
 }
@@ -74,7 +74,7 @@ fn rasterize(
             all_stopped = atomicLoad(&stopped);
         }
         if first + lane < end {
-            load(lane, row_of_slot[list[first + lane]], quad.corner);
+            hold(lane, splat_of(row_of_slot[list[first + lane]], quad.corner));
         }
         if workgroupUniformLoad(&all_stopped) == MEMBERS {
             break;

@@ -1,39 +1,24 @@
 // Stage 5 with atomics: pixel gradients straight to the sums of rows, without records. The sums are those
 // of rasterize_bwd.wgsl, in an order that is chance.
-//
-// What an invocation finds in its pixels, a subgroup adds up by itself, unless none of its pixels takes
-// the splat. Over the subgroups, and to the rows: subgroups.wgsl.
 
-// What the tile's invocations find of splat i at hand.
+// What the subgroup finds of splat i at hand, the first of which is the nth of the list.
 fn find(
     i: i32,
-    first: u32,
+    n: u32,
     m: Member,
     quad: Quad,
     own: Upstream,
     pixels: ptr<function, Behind>,
 ) {
+    if i < 0 {
+        return;
+    }
     // Said aloud: naga does not start a variable anew in each round of a loop.
     var sums = array<f32, FIELDS>();
-    var is_taken = false;
-    if i >= 0 {
-        is_taken = differentiated(u32(i), first + u32(i), quad, own, pixels, &sums);
-    }
-    let stride = fields();
+    let at = u32(i);
+    let is_taken = differentiated(held(at), n + at, quad, own, pixels, &sums);
     if subgroupAny(is_taken) {
-        for (var f = 0u; f < stride; f++) {
-            if f == maximum() {
-                sums[f] = subgroupMax(sums[f]);
-            } else {
-                sums[f] = subgroupAdd(sums[f]);
-            }
-        }
-    }
-    if m.is_first && i >= 0 {
-        let to = (u32(i) * m.subgroups + m.subgroup) * stride;
-        for (var f = 0u; f < stride; f++) {
-            parts[to + f] = sums[f];
-        }
+        deliver(m, at, sums, fields(), maximum());
     }
 }
 
@@ -47,26 +32,19 @@ fn rasterize_bwd_atomic(
     if !is_in_band(tile) {
         return;
     }
+    let m = member();
     let quad = quad_of(tile, lane);
     let begin = tile_starts[tile];
     let own = upstream(quad);
     var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
-
-    let reached = reached_by_any(lane, pixels.stop);
-    let m = member(lane);
-    let stride = fields();
-    let most = room(m, stride);
-    let batches = (reached + most - 1u) / most;
+    let reached = subgroupMax(last_of(pixels));
+    let batches = (reached + m.members - 1u) / m.members;
     for (var n = 0u; n < batches; n++) {
-        let first = (batches - 1u - n) * most;
-        let count = min(most, reached - first);
-        workgroupBarrier();
-        if lane < count {
-            let row = row_of_slot[list[begin + first + lane]];
-            rows[lane] = row;
-            load(lane, row, quad.corner);
+        let first = (batches - 1u - n) * m.members;
+        let count = min(m.members, reached - first);
+        if m.place < count {
+            hold(row_of_slot[list[begin + first + m.place]], quad.corner);
         }
-        workgroupBarrier();
         // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
         // counted (slots.wgsl says where).
         for (var top = i32(count); top > 0; top -= 4) {
@@ -75,8 +53,6 @@ fn rasterize_bwd_atomic(
             find(top - 3, first, m, quad, own, &pixels);
             find(top - 4, first, m, quad, own, &pixels);
         }
-        workgroupBarrier();
-        deliver(m, lane, count, stride, maximum());
     }
 }
 

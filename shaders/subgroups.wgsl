@@ -1,80 +1,64 @@
-// Sums over a tile's pixels that are added to those of rows at once, by atomics: first within a
-// subgroup, then over the subgroups of the tile, then one atomic for each field of each splat. Subgroups
-// may be of any size, and are numbered here: how drivers number them is not relied upon.
+// Sums over a tile's pixels that are added to those of rows at once, by atomics. slots.wgsl is the other
+// way.
 //
-// Barriers: three for up to sixteen splats, fewer where subgroups are small and their parts many.
+// Each subgroup of a tile works by itself, without shared memory or a barrier: it holds as many splats as
+// it has invocations, one each, which they hand to one another; adds up what they find in their pixels;
+// and adds that to the sums of the splat's row, one invocation per field. Subgroups may be of any size.
 
-// What each subgroup has found: of splat k, subgroup s, field f at (k·subgroups + s)·stride + f.
-var<workgroup> parts: array<f32, PARTS>;
-// Of the splats at hand.
-var<workgroup> rows: array<u32, BATCH>;
-var<workgroup> numbered: atomic<u32>;
-var<workgroup> subgroups: u32;
-
-// Splats at a time, at most.
-const BATCH: u32 = 16u;
-// Room for the longest sum, of fifteen fields, from as many subgroups as there are invocations; where
-// subgroups are of 32, for that of 32 splats.
-const PARTS: u32 = 960u;
-// Parts that are added in one round of a loop, which compilers unroll; slots.wgsl says why.
-const ROUND: u32 = 8u;
-
-// An invocation among the others of its tile.
+// An invocation among those of its subgroup, which are counted: sizes that drivers tell may be more than
+// there are.
 struct Member {
-    // Whether it is the one that speaks for its subgroup.
-    is_first: bool,
-    // The number of its subgroup, and how many there are.
-    subgroup: u32,
-    subgroups: u32,
+    place: u32,
+    members: u32,
 }
 
-fn member(lane: u32) -> Member {
-    if lane == 0u {
-        atomicStore(&numbered, 0u);
-    }
-    workgroupBarrier();
-    let is_first = subgroupExclusiveAdd(1u) == 0u;
-    var number = 0u;
-    if is_first {
-        number = atomicAdd(&numbered, 1u);
-    }
-    number = subgroupBroadcastFirst(number);
-    workgroupBarrier();
-    if lane == 0u {
-        subgroups = atomicLoad(&numbered);
-    }
-    return Member(is_first, number, workgroupUniformLoad(&subgroups));
+// To be called where none has left.
+fn member() -> Member {
+    return Member(subgroupExclusiveAdd(1u), subgroupAdd(1u));
 }
 
-// Splats at a time for which there is room, of so many fields each.
-fn room(m: Member, stride: u32) -> u32 {
-    return clamp(PARTS / (m.subgroups * stride), 1u, BATCH);
+// The splat of this invocation, and its row.
+var<private> own_splat: Splat;
+var<private> own_row: u32;
+
+fn hold(row: u32, corner: vec2<u32>) {
+    own_row = row;
+    own_splat = splat_of(row, corner);
 }
 
-// Adds the parts of `count` splats to the sums of their rows: one invocation per field of each. The
-// field `maximum` is the largest of its values; they are >= 0.
-fn deliver(m: Member, lane: u32, count: u32, stride: u32, maximum: u32) {
-    for (var n = lane; n < count * stride; n += MEMBERS) {
-        let k = n / stride;
-        let f = n % stride;
-        let is_maximum = f == maximum;
+// The splat that the subgroup's ith holds.
+fn held(i: u32) -> Splat {
+    return Splat(
+        subgroupShuffle(own_splat.a, i),
+        subgroupShuffle(own_splat.b, i),
+        subgroupShuffle(own_splat.colour, i),
+    );
+}
+
+// Adds to the sums of the row of the ith's splat what the subgroup has found; `maximum`: the field that is
+// the largest of its values, which are >= 0; none: NONE.
+fn deliver(m: Member, i: u32, found: array<f32, FIELDS>, stride: u32, maximum: u32) {
+    var sums = found;
+    for (var f = 0u; f < stride; f++) {
+        if f == maximum {
+            sums[f] = subgroupMax(sums[f]);
+        } else {
+            sums[f] = subgroupAdd(sums[f]);
+        }
+    }
+    let first = subgroupShuffle(own_row, i) * stride;
+    for (var base = 0u; base < stride; base += m.members) {
+        let mine = base + m.place;
         var sum = 0.0;
-        for (var base = 0u; base < m.subgroups; base += ROUND) {
-            for (var i = 0u; i < ROUND; i++) {
-                let s = base + i;
-                if s < m.subgroups {
-                    let x = parts[(k * m.subgroups + s) * stride + f];
-                    sum = select(sum + x, max(sum, x), is_maximum);
-                }
-            }
+        for (var f = 0u; f < stride; f++) {
+            sum = select(sum, sums[f], f == mine);
         }
         // NaN is none of 0.
-        if sum != 0.0 {
-            let at = rows[k] * stride + f;
-            if is_maximum {
-                raise(at, sum);
+        if mine < stride && sum != 0.0 {
+            if mine == maximum {
+                raise(first + mine, sum);
             } else {
-                add(at, sum);
+                add(first + mine, sum);
             }
         }
     }

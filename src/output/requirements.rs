@@ -30,9 +30,18 @@ pub struct Requirements {
     pub left_out: Vec<LeftOut>,
 }
 
-/// What a run has found: trials of degrees, the limit of rows, bands that rows have lost, views that
-/// were not scored.
-pub type Found<'a> = (Option<&'a Earned>, Option<&'a Growth>, Option<&'a Dropped>, usize);
+/// What a run has found.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Found<'a> {
+    /// Trials of degrees, where these decided.
+    pub degrees: Option<&'a Earned>,
+    /// The limit of rows, where they had to pay.
+    pub growth: Option<&'a Growth>,
+    /// Bands that rows have lost, where they may.
+    pub dropped: Option<&'a Dropped>,
+    /// Views that were not scored.
+    pub unscored_views: usize,
+}
 
 /// Something that was left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -46,17 +55,11 @@ pub struct LeftOut {
 }
 
 impl Requirements {
-    /// The report of a run of this configuration that has come to `rows` rows at a degree, with what it
-    /// has found: trials of degrees, the limit of rows, bands that rows have lost, and views that were
-    /// not scored.
+    /// The report of a run of this configuration that has come to `rows` rows at a degree.
     #[must_use]
-    pub fn of(
-        config: &RunConfig,
-        sh_degree: u8,
-        rows: usize,
-        (degrees, growth, dropped, unscored_views): Found<'_>,
-    ) -> Self {
+    pub fn of(config: &RunConfig, sh_degree: u8, rows: usize, found: Found<'_>) -> Self {
         let train = &config.train;
+        let Found { degrees, growth, dropped, unscored_views } = found;
         let left_out = [
             degree_left_out(config, sh_degree, degrees),
             growth.and_then(|growth| rows_left_out(growth, rows, train.budget)),
@@ -211,13 +214,14 @@ mod tests {
     fn what_the_options_say_is_not_left_out() {
         let mut config = sample();
         config.train.sh_degree_from = DegreeChoice::Given;
-        let report = Requirements::of(&config, 0, 500, (None, None, None, 0));
+        let report = Requirements::of(&config, 0, 500, Found::default());
         assert_eq!(report.lines(), ["left out nothing"]);
         config.train.full = true;
-        let report = Requirements::of(&config, 3, 500, (None, None, None, 0));
+        let report = Requirements::of(&config, 3, 500, Found::default());
         assert_eq!(report.lines(), ["left out nothing (--full)"]);
         config.train.full = false;
-        let report = Requirements::of(&config, 3, 500, (None, None, None, 4));
+        let report =
+            Requirements::of(&config, 3, 500, Found { unscored_views: 4, ..Found::default() });
         assert!(report.lines()[0].starts_with("left out 4 training views"), "{report:?}");
     }
 
@@ -226,9 +230,8 @@ mod tests {
         let mut config = sample();
         let line =
             |config: &RunConfig, degree, earned: Option<&Earned>, growth: Option<&Growth>| {
-                let lines =
-                    Requirements::of(config, degree, 900, (earned, growth, None, 0)).lines();
-                lines.join("\n")
+                let found = Found { degrees: earned, growth, ..Found::default() };
+                Requirements::of(config, degree, 900, found).lines().join("\n")
             };
         config.train.sh_degree_from = DegreeChoice::Spread(spread());
         let text = line(&config, 0, None, None);

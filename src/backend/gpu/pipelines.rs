@@ -19,6 +19,7 @@ const VIEW: &str = shader!("view");
 const GAUSSIAN: &str = shader!("gaussian");
 const RANDOM: &str = shader!("random");
 const QUADS: &str = shader!("quads");
+const BATCH: &str = shader!("batch");
 const SLOTS: &str = shader!("slots");
 const SUBGROUPS: &str = shader!("subgroups");
 const BACKWARD: &str = shader!("backward");
@@ -39,9 +40,9 @@ pub(super) enum Of {
 pub(super) const STAGES: [(&str, Of, &[&str]); 14] = [
     ("project", Of::All, &[VIEW, GAUSSIAN, shader!("project")]),
     ("tiles", Of::All, &[VIEW, shader!("tiles")]),
-    ("rasterize", Of::All, &[VIEW, QUADS, shader!("rasterize")]),
+    ("rasterize", Of::All, &[VIEW, QUADS, BATCH, shader!("rasterize")]),
     ("loss", Of::All, &[VIEW, shader!("loss")]),
-    ("rasterize_bwd", Of::Slots, &[VIEW, QUADS, SLOTS, BACKWARD, shader!("rasterize_bwd")]),
+    ("rasterize_bwd", Of::Slots, &[VIEW, QUADS, BATCH, SLOTS, BACKWARD, shader!("rasterize_bwd")]),
     (
         "rasterize_bwd_atomic",
         Of::Atomics,
@@ -52,7 +53,7 @@ pub(super) const STAGES: [(&str, Of, &[&str]); 14] = [
     ("signals", Of::All, &[VIEW, shader!("signals")]),
     ("apply", Of::All, &[VIEW, RANDOM, shader!("apply")]),
     ("candidates", Of::All, &[VIEW, RANDOM, shader!("candidates")]),
-    ("observe", Of::Slots, &[VIEW, QUADS, SLOTS, BLENDED, shader!("observe")]),
+    ("observe", Of::Slots, &[VIEW, QUADS, BATCH, SLOTS, BLENDED, shader!("observe")]),
     ("observe_atomic", Of::Atomics, &[VIEW, QUADS, SUBGROUPS, BLENDED, shader!("observe_atomic")]),
     ("audit", Of::All, &[VIEW, shader!("audit")]),
 ];

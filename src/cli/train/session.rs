@@ -19,8 +19,8 @@ use crate::cli::progress::Progress;
 use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::memory::Bytes;
 use crate::output::{
-    CHECKPOINTS, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json, model_path,
-    saved_iterations, write_atomically, write_json, write_scores,
+    CHECKPOINTS, Found, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json,
+    model_path, saved_iterations, write_atomically, write_json, write_scores,
 };
 use crate::ply::write_splats;
 use crate::trainer::{StepReport, TrainError};
@@ -354,8 +354,12 @@ impl<'a> Session<'a> {
             Some(earned) => earned.degree,
             None => config.train.sh_degree,
         };
-        let unscored = trainer.unscored_views();
-        let found = (trainer.earned(), trainer.growth(), trainer.dropped(), unscored);
+        let found = Found {
+            degrees: trainer.earned(),
+            growth: trainer.growth(),
+            dropped: trainer.dropped(),
+            unscored_views: trainer.unscored_views(),
+        };
         Requirements::of(config, degree, trainer.rows(), found)
     }
 
