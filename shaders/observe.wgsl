@@ -46,7 +46,7 @@ fn replay(
         if lane < count {
             let slot = list[first + lane];
             slots[lane] = slot;
-            hold(lane, splat_of(row_of_slot[slot], quad.corner));
+            hold(lane, row_of_slot[slot], quad.corner);
         }
         workgroupBarrier();
         // Written out, as compilers do not unroll as much as this is.

@@ -37,18 +37,18 @@ fn replay_atomic(
     if !is_in_band(tile) {
         return;
     }
-    let m = member();
+    let m = member(lane);
     let quad = quad_of(tile, lane);
     let map_here = map_at(quad);
     var pixels = Open(vec4(1.0), quad.inside);
     let end = tile_starts[tile + 1u];
     for (var first = tile_starts[tile]; first < end; first += m.members) {
-        if !subgroupAny(any(pixels.goes_on)) {
+        if largest_of_all(m, u32(any(pixels.goes_on))) == 0u {
             break;
         }
         let count = min(m.members, end - first);
         if m.place < count {
-            hold(row_of_slot[list[first + m.place]], quad.corner);
+            hold(m.place, row_of_slot[list[first + m.place]], quad.corner);
         }
         // Four in a round, written out, as in rasterize_bwd_atomic.wgsl.
         for (var i = 0u; i < count; i += 4u) {

@@ -6,11 +6,8 @@
 // did not.
 @group(0) @binding(7) var<storage, read_write> finish: array<vec2<u32>>;
 
+// Splats at hand at a time, where all invocations work together.
 const BATCH: u32 = 64u;
-
-// Invocations none of whose pixels goes on.
-var<workgroup> stopped: atomic<u32>;
-var<workgroup> all_stopped: u32;
 
 // What the pixels show.
 struct Shown {
@@ -54,45 +51,28 @@ fn rasterize(
     if !is_in_band(tile) {
         return;
     }
+    let m = member(lane);
     let quad = quad_of(tile, lane);
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
-
     var pixels = Open(vec4(1.0), quad.inside);
     var shown = Shown(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(NONE));
-    if lane == 0u {
-        atomicStore(&stopped, 0u);
-    }
-    workgroupBarrier();
-    if !any(quad.inside) {
-        atomicAdd(&stopped, 1u);
-    }
-    for (var first = begin; first < end; first += BATCH) {
-        // Nobody reads the batch any more, and all have counted themselves.
-        workgroupBarrier();
-        if lane == 0u {
-            all_stopped = atomicLoad(&stopped);
-        }
-        if first + lane < end {
-            hold(lane, splat_of(row_of_slot[list[first + lane]], quad.corner));
-        }
-        if workgroupUniformLoad(&all_stopped) == MEMBERS {
+    for (var first = begin; first < end; first += m.members) {
+        if largest_of_all(m, u32(any(pixels.goes_on))) == 0u {
             break;
         }
-        let count = min(BATCH, end - first);
-        if any(pixels.goes_on) {
-            // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
-            // counted (slots.wgsl says where).
-            let n = first - begin;
-            for (var k = 0u; k < count && any(pixels.goes_on); k += 4u) {
-                draw(k, count, n, quad, &pixels, &shown);
-                draw(k + 1u, count, n, quad, &pixels, &shown);
-                draw(k + 2u, count, n, quad, &pixels, &shown);
-                draw(k + 3u, count, n, quad, &pixels, &shown);
-            }
-            if !any(pixels.goes_on) {
-                atomicAdd(&stopped, 1u);
-            }
+        let count = min(m.members, end - first);
+        if m.place < count {
+            hold(m.place, row_of_slot[list[first + m.place]], quad.corner);
+        }
+        meet();
+        // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
+        // counted (slots.wgsl says where).
+        for (var k = 0u; k < count && is_needed(any(pixels.goes_on)); k += 4u) {
+            draw(k, count, first - begin, quad, &pixels, &shown);
+            draw(k + 1u, count, first - begin, quad, &pixels, &shown);
+            draw(k + 2u, count, first - begin, quad, &pixels, &shown);
+            draw(k + 3u, count, first - begin, quad, &pixels, &shown);
         }
     }
     let red = shown.red + pixels.light * frame.background.x;

@@ -4,24 +4,6 @@
 // One record per slot.
 @group(0) @binding(8) var<storage, read_write> records: array<f32>;
 
-var<workgroup> last_stop: atomic<u32>;
-var<workgroup> list_end: u32;
-
-// How many splats, from the front, the tile goes through before all its pixels have stopped; `last`: of
-// this invocation's.
-fn reached_by_any(lane: u32, last: u32) -> u32 {
-    if lane == 0u {
-        atomicStore(&last_stop, 0u);
-    }
-    workgroupBarrier();
-    atomicMax(&last_stop, last);
-    workgroupBarrier();
-    if lane == 0u {
-        list_end = atomicLoad(&last_stop);
-    }
-    return workgroupUniformLoad(&list_end);
-}
-
 // What an invocation finds of splat i at hand; k: of those at a time.
 fn put(
     k: u32,
@@ -59,7 +41,8 @@ fn rasterize_bwd(
     let own = upstream(quad);
     var pixels = behind_all(quad, own, length);
 
-    let reached = reached_by_any(lane, last_of(pixels));
+    let m = member(lane);
+    let reached = largest_of_all(m, last_of(pixels));
     let stride = fields();
     // Nobody takes these.
     for (var i = reached + lane; i < length; i += MEMBERS) {
@@ -77,7 +60,7 @@ fn rasterize_bwd(
         if lane < count {
             let slot = list[begin + first + lane];
             slots[lane] = slot;
-            hold(lane, splat_of(row_of_slot[slot], quad.corner));
+            hold(lane, row_of_slot[slot], quad.corner);
         }
         workgroupBarrier();
         // Groups of four splats, back to front; in each the last comes first. Written out, as compilers

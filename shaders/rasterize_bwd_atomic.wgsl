@@ -32,18 +32,18 @@ fn rasterize_bwd_atomic(
     if !is_in_band(tile) {
         return;
     }
-    let m = member();
+    let m = member(lane);
     let quad = quad_of(tile, lane);
     let begin = tile_starts[tile];
     let own = upstream(quad);
     var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
-    let reached = subgroupMax(last_of(pixels));
+    let reached = largest_of_all(m, last_of(pixels));
     let batches = (reached + m.members - 1u) / m.members;
     for (var n = 0u; n < batches; n++) {
         let first = (batches - 1u - n) * m.members;
         let count = min(m.members, reached - first);
         if m.place < count {
-            hold(row_of_slot[list[begin + first + m.place]], quad.corner);
+            hold(m.place, row_of_slot[list[begin + first + m.place]], quad.corner);
         }
         // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
         // counted (slots.wgsl says where).

@@ -22,6 +22,7 @@ const QUADS: &str = shader!("quads");
 const BATCH: &str = shader!("batch");
 const SLOTS: &str = shader!("slots");
 const SUBGROUPS: &str = shader!("subgroups");
+const ATOMICS: &str = shader!("atomics");
 const BACKWARD: &str = shader!("backward");
 const BLENDED: &str = shader!("blended");
 
@@ -32,29 +33,31 @@ pub(super) enum Of {
     Slots,
     /// Those that add up by atomics.
     Atomics,
+    /// All, but how the invocations of a tile work together is another thing where there are subgroups.
+    Tiles,
     /// All.
     All,
 }
 
-/// The texts of each stage.
+/// The texts of each stage; [`text`] adds those that its device asks for.
 pub(super) const STAGES: [(&str, Of, &[&str]); 14] = [
     ("project", Of::All, &[VIEW, GAUSSIAN, shader!("project")]),
     ("tiles", Of::All, &[VIEW, shader!("tiles")]),
-    ("rasterize", Of::All, &[VIEW, QUADS, BATCH, shader!("rasterize")]),
+    ("rasterize", Of::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
     ("loss", Of::All, &[VIEW, shader!("loss")]),
-    ("rasterize_bwd", Of::Slots, &[VIEW, QUADS, BATCH, SLOTS, BACKWARD, shader!("rasterize_bwd")]),
+    ("rasterize_bwd", Of::Slots, &[VIEW, QUADS, BACKWARD, shader!("rasterize_bwd")]),
     (
         "rasterize_bwd_atomic",
         Of::Atomics,
-        &[VIEW, QUADS, SUBGROUPS, BACKWARD, shader!("rasterize_bwd_atomic")],
+        &[VIEW, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
     ("project_bwd", Of::All, &[VIEW, GAUSSIAN, shader!("project_bwd")]),
     ("adam", Of::All, &[VIEW, RANDOM, shader!("adam")]),
     ("signals", Of::All, &[VIEW, shader!("signals")]),
     ("apply", Of::All, &[VIEW, RANDOM, shader!("apply")]),
     ("candidates", Of::All, &[VIEW, RANDOM, shader!("candidates")]),
-    ("observe", Of::Slots, &[VIEW, QUADS, BATCH, SLOTS, BLENDED, shader!("observe")]),
-    ("observe_atomic", Of::Atomics, &[VIEW, QUADS, SUBGROUPS, BLENDED, shader!("observe_atomic")]),
+    ("observe", Of::Slots, &[VIEW, QUADS, BLENDED, shader!("observe")]),
+    ("observe_atomic", Of::Atomics, &[VIEW, QUADS, BLENDED, shader!("observe_atomic")]),
     ("audit", Of::All, &[VIEW, shader!("audit")]),
 ];
 
@@ -62,16 +65,16 @@ pub(super) const STAGES: [(&str, Of, &[&str]); 14] = [
 /// it does not have.
 pub(super) fn text(stage: usize, accumulation: Accumulation) -> Option<String> {
     let (_, of, texts) = STAGES[stage];
-    let sums = match accumulation {
-        Accumulation::Slots => None,
-        Accumulation::SubgroupCas => Some(shader!("sums_cas")),
-        Accumulation::SubgroupAtomics => Some(shader!("sums_f32")),
+    let more: &[&str] = match (of, accumulation) {
+        (Of::All, _) => &[],
+        (Of::Tiles, Accumulation::Slots) => &[BATCH],
+        (Of::Tiles, _) => &[SUBGROUPS],
+        (Of::Slots, Accumulation::Slots) => &[BATCH, SLOTS],
+        (Of::Atomics, Accumulation::SubgroupCas) => &[SUBGROUPS, ATOMICS, shader!("sums_cas")],
+        (Of::Atomics, Accumulation::SubgroupAtomics) => &[SUBGROUPS, ATOMICS, shader!("sums_f32")],
+        (Of::Slots, _) | (Of::Atomics, Accumulation::Slots) => return None,
     };
-    match (of, sums) {
-        (Of::All, _) | (Of::Slots, None) => Some(texts.concat()),
-        (Of::Atomics, Some(sums)) => Some([&texts.concat(), sums].concat()),
-        (Of::Slots, Some(_)) | (Of::Atomics, None) => None,
-    }
+    Some([texts, more].concat().concat())
 }
 
 macro_rules! kernels {
