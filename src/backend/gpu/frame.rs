@@ -1,5 +1,5 @@
 //! The uniform buffer that all stages read, and the scalars that they leave: the Rust side of
-//! `shaders/view.wgsl`. That both sides agree is checked offline, field by field.
+//! `shaders/shared/view.wgsl`. That both sides agree is checked offline, field by field.
 
 use bytemuck::{Pod, Zeroable};
 use densify_policies::policy::{LossTerms, NoiseTerm};
@@ -15,7 +15,7 @@ const FOV_MARGIN: f64 = 0.15;
 /// Weight of 1 − SSIM in the loss; L1 has the rest.
 const SSIM_WEIGHT: f32 = 0.2;
 
-/// See `Frame` in `shaders/view.wgsl`.
+/// See `Frame` in `shaders/shared/view.wgsl`.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Frame {
@@ -33,7 +33,7 @@ pub(super) struct Frame {
     pub(super) planes: [[u32; 4]; 4],
 }
 
-/// See `State` in `shaders/view.wgsl`; the cuts of the bands follow it.
+/// See `State` in `shaders/shared/view.wgsl`; the cuts of the bands follow it.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct State {

@@ -7,7 +7,7 @@ use super::buffers::{BLOCK, band_coefficients};
 use super::launches::{Launches, Sums};
 use super::pipelines::{Launch, Pipelines};
 
-/// Workgroups in the first of two dimensions; see `shaders/view.wgsl`.
+/// Workgroups in the first of two dimensions; see `shaders/shared/view.wgsl`.
 const ACROSS: u32 = 32_768;
 /// Places of indirect dispatches `[bytes]`; see `shaders/tiles.wgsl`.
 mod args {

@@ -15,16 +15,16 @@ macro_rules! shader {
     };
 }
 
-const VIEW: &str = shader!("view");
-const GAUSSIAN: &str = shader!("gaussian");
-const RANDOM: &str = shader!("random");
-const QUADS: &str = shader!("quads");
-const BATCH: &str = shader!("batch");
-const SLOTS: &str = shader!("slots");
-const SUBGROUPS: &str = shader!("subgroups");
-const ATOMICS: &str = shader!("atomics");
-const BACKWARD: &str = shader!("backward");
-const BLENDED: &str = shader!("blended");
+const VIEW: &str = shader!("shared/view");
+const GAUSSIAN: &str = shader!("shared/gaussian");
+const RANDOM: &str = shader!("shared/random");
+const QUADS: &str = shader!("shared/quads");
+const BATCH: &str = shader!("shared/batch");
+const SLOTS: &str = shader!("shared/slots");
+const SUBGROUPS: &str = shader!("shared/subgroups");
+const ATOMICS: &str = shader!("shared/atomics");
+const BACKWARD: &str = shader!("shared/backward");
+const BLENDED: &str = shader!("shared/blended");
 
 /// Which devices have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,8 +70,12 @@ pub(super) fn text(stage: usize, accumulation: Accumulation) -> Option<String> {
         (Of::Tiles, Accumulation::Slots) => &[BATCH],
         (Of::Tiles, _) => &[SUBGROUPS],
         (Of::Slots, Accumulation::Slots) => &[BATCH, SLOTS],
-        (Of::Atomics, Accumulation::SubgroupCas) => &[SUBGROUPS, ATOMICS, shader!("sums_cas")],
-        (Of::Atomics, Accumulation::SubgroupAtomics) => &[SUBGROUPS, ATOMICS, shader!("sums_f32")],
+        (Of::Atomics, Accumulation::SubgroupCas) => {
+            &[SUBGROUPS, ATOMICS, shader!("shared/sums_cas")]
+        }
+        (Of::Atomics, Accumulation::SubgroupAtomics) => {
+            &[SUBGROUPS, ATOMICS, shader!("shared/sums_f32")]
+        }
         (Of::Slots, _) | (Of::Atomics, Accumulation::Slots) => return None,
     };
     Some([texts, more].concat().concat())

@@ -241,36 +241,62 @@ fn memory_is_taken_as_it_is_needed() {
     assert!(promised > 400 * MIB && peak < promised / 4, "{peak} of {promised}");
 }
 
-/// From far too little to plenty, each limit of the address space `[KiB]` ends in a message or in a
-/// model.
+/// What becomes of a run that may have so much address space `[KiB]`: its exit code, what it has said,
+/// and whether it has left anything.
+#[cfg(target_os = "linux")]
+fn limited(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    let program = env!("CARGO_BIN_EXE_densify");
+    let call = format!(
+        "ulimit -v {limit} && exec {program} train {} -o {} --iterations 1 --quiet {flags}",
+        text(scene.path()),
+        text(&run)
+    );
+    let outcome = std::process::Command::new("sh").args(["-c", &call]).output();
+    let outcome = outcome.expect("a shell");
+    let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
+    (outcome.status.code(), said, !files(root.path()).is_empty())
+}
+
+/// From far too little to plenty, each limit of the address space ends in a message or in a model.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_system_that_grants_too_little_is_named_and_nothing_is_written() {
-    let scene = Photographs::colmap_text();
     let mut refused = 0;
     let mut trained = 0;
     for limit in (150_000..=1_350_000).step_by(100_000) {
-        let (root, run) = scratch();
-        let program = env!("CARGO_BIN_EXE_densify");
-        let call = format!(
-            "ulimit -v {limit} && exec {program} train {} -o {} --budget 150k --init random \
-             --iterations 1 --threads 2 --backend cpu --quiet",
-            text(scene.path()),
-            text(&run)
-        );
-        let outcome = std::process::Command::new("sh").args(["-c", &call]).output();
-        let outcome = outcome.expect("a shell");
-        let said = String::from_utf8_lossy(&outcome.stderr);
-        match outcome.status.code() {
-            Some(0) => trained += 1,
-            Some(3) => {
+        let flags = "--budget 150k --init random --threads 2 --backend cpu";
+        match limited(limit, flags) {
+            (Some(0), _, true) => trained += 1,
+            (Some(3), said, false) => {
                 assert!(said.starts_with("error: "), "{limit}: {said}");
-                assert!(files(root.path()).is_empty(), "{limit}: {:?}", files(root.path()));
                 let by_limit = said.contains("ulimit -v") && said.contains("give --memory");
                 refused += usize::from(by_limit);
             }
-            other => panic!("{limit} KiB end in {other:?}: {said}"),
+            other => panic!("{limit} KiB end in {other:?}"),
         }
     }
     assert!(refused >= 3 && trained >= 2, "{refused} refused, {trained} trained");
+}
+
+/// llvmpipe's device memory is the process's own, so that it can be made to run out where the device's
+/// buffers are created. (SwiftShader's code generator ends the process where it gets no memory.)
+#[test]
+#[cfg(target_os = "linux")]
+fn a_device_that_runs_out_of_memory_is_named_and_nothing_is_written() {
+    let is_llvmpipe = |name: &&str| name.contains("llvmpipe");
+    let mut names = crate::gpu::subjects().iter().map(|device| &device.adapter().name[..]);
+    let Some(name) = names.find(is_llvmpipe) else { return };
+    let flags = format!("--budget 1500k --tile-cap 100k --gpu '{name}'");
+    let mut refused = 0;
+    for limit in (1_400_000..=2_400_000).step_by(200_000) {
+        let (code, said, is_anything_left) = limited(limit, &flags);
+        assert_eq!((code, is_anything_left), (Some(3), false), "{limit} KiB: {said}");
+        assert!(said.starts_with("error: "), "{limit} KiB: {said}");
+        refused += usize::from(said.contains("for the training buffers; lower --budget"));
+    }
+    assert!(refused >= 2, "{refused} refused by the device");
+    let (code, said, _) = limited(6_000_000, &flags);
+    assert_eq!(code, Some(0), "{said}");
 }
