@@ -290,9 +290,9 @@ fn a_device_that_runs_out_of_memory_is_named_and_nothing_is_written() {
     let Some(name) = names.find(is_llvmpipe) else { return };
     let flags = format!("--budget 1500k --tile-cap 100k --gpu '{name}'");
     let mut refused = 0;
-    for limit in (1_400_000..=2_400_000).step_by(200_000) {
+    for limit in (1_400_000..=4_400_000).step_by(200_000) {
         match limited(limit, &flags) {
-            // How much a driver takes for itself is its own affair.
+            // How much a driver takes for itself is its own affair, and more with more threads.
             (Some(0), _, true) => {}
             (Some(3), said, false) => {
                 assert!(said.starts_with("error: "), "{limit} KiB: {said}");
@@ -302,6 +302,6 @@ fn a_device_that_runs_out_of_memory_is_named_and_nothing_is_written() {
         }
     }
     assert!(refused > 0, "the device refused nothing");
-    let (code, said, _) = limited(6_000_000, &flags);
+    let (code, said, _) = limited(16_000_000, &flags);
     assert_eq!(code, Some(0), "{said}");
 }
