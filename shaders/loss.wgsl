@@ -89,10 +89,6 @@ struct Four {
     inside: u32,
 }
 
-fn corner_of(tile: u32) -> vec2<u32> {
-    return vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
-}
-
 fn four_of(corner: vec2<u32>, i: u32) -> Four {
     let column = 4u * (i % 4u);
     let line = i / 4u;
@@ -105,6 +101,15 @@ fn four_of(corner: vec2<u32>, i: u32) -> Four {
 // The pixel of `around` at a place; its coordinates may be outside of the image.
 fn pixel_around(corner: vec2<u32>, i: u32) -> vec2<i32> {
     return vec2<i32>(corner) + vec2(i32(i % SIDE), i32(i / SIDE)) - REACH;
+}
+
+// Sums of four windows below one another, up to four of each, go to their places in `rows_a`.
+fn keep_columns(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>) {
+    let of_window = transpose(mat4x4(a, b, c, d));
+    rows_a[first] = of_window[0];
+    rows_a[first + SIDE] = of_window[1];
+    rows_a[first + 2u * SIDE] = of_window[2];
+    rows_a[first + 3u * SIDE] = of_window[3];
 }
 
 // SSIM, its derivatives, and the sums of the tile. now.a, now.b: bits of the weights of |e| and of
@@ -145,10 +150,7 @@ fn similarity(
                 yy += wy * here.y;
                 ey += we * here.y;
             }
-            rows_a[first] = vec4(e.x, y.x, ee.x, yy.x);
-            rows_a[first + SIDE] = vec4(e.y, y.y, ee.y, yy.y);
-            rows_a[first + 2u * SIDE] = vec4(e.z, y.z, ee.z, yy.z);
-            rows_a[first + 3u * SIDE] = vec4(e.w, y.w, ee.w, yy.w);
+            keep_columns(first, e, y, ee, yy);
             rows_b[first] = ey.x;
             rows_b[first + SIDE] = ey.y;
             rows_b[first + 2u * SIDE] = ey.z;
@@ -268,10 +270,7 @@ fn pixel_gradient(
                 y += w * here.y;
                 z += w * thirds[first + k * SIDE];
             }
-            rows_a[first] = vec4(x.x, y.x, z.x, 0.0);
-            rows_a[first + SIDE] = vec4(x.y, y.y, z.y, 0.0);
-            rows_a[first + 2u * SIDE] = vec4(x.z, y.z, z.z, 0.0);
-            rows_a[first + 3u * SIDE] = vec4(x.w, y.w, z.w, 0.0);
+            keep_columns(first, x, y, z, vec4(0.0));
         }
         workgroupBarrier();
         for (var i = lane; i < LINES; i += GROUP) {

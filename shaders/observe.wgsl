@@ -21,7 +21,7 @@ fn put(
         sums = blended(held(i), quad, map_here, pixels);
     }
     for (var f = 0u; f < COLUMNS; f++) {
-        parts[(k * COLUMNS + f) * PITCH + lane] = sums[f];
+        put_part(k * COLUMNS + f, lane, sums[f]);
     }
 }
 
@@ -42,26 +42,20 @@ fn replay(
     let end = tile_starts[tile + 1u];
     for (var first = begin; first < end; first += BATCH) {
         let count = min(BATCH, end - first);
-        workgroupBarrier();
-        if lane < count {
-            let slot = list[first + lane];
-            slots[lane] = slot;
-            hold(lane, row_of_slot[slot], quad.corner);
-        }
-        workgroupBarrier();
+        take_batch(first, count, lane, quad.corner);
         // Written out, as compilers do not unroll as much as this is.
         for (var base = 0u; base < count; base += SPLATS) {
             put(0u, base, count, lane, quad, map_here, &pixels);
             put(1u, base + 1u, count, lane, quad, map_here, &pixels);
             put(2u, base + 2u, count, lane, quad, map_here, &pixels);
             put(3u, base + 3u, count, lane, quad, map_here, &pixels);
-            workgroupBarrier();
+            meet();
             // One invocation per column of each splat.
             let which = base + lane / COLUMNS;
             if lane < SPLATS * COLUMNS && which < count {
                 records[slots[which] * COLUMNS + lane % COLUMNS] = summed(lane, false);
             }
-            workgroupBarrier();
+            meet();
         }
     }
 }

@@ -21,7 +21,7 @@ fn put(
     }
     let stride = fields();
     for (var f = 0u; f < stride; f++) {
-        parts[(k * stride + f) * PITCH + lane] = sums[f];
+        put_part(k * stride + f, lane, sums[f]);
     }
 }
 
@@ -56,13 +56,7 @@ fn rasterize_bwd(
     for (var n = 0u; n < batches; n++) {
         let first = (batches - 1u - n) * BATCH;
         let count = min(BATCH, reached - first);
-        workgroupBarrier();
-        if lane < count {
-            let slot = list[begin + first + lane];
-            slots[lane] = slot;
-            hold(lane, row_of_slot[slot], quad.corner);
-        }
-        workgroupBarrier();
+        take_batch(begin + first, count, lane, quad.corner);
         // Groups of four splats, back to front; in each the last comes first. Written out, as compilers
         // do not unroll as much as this is.
         for (var top = i32(count); top > 0; top -= i32(SPLATS)) {
@@ -70,14 +64,14 @@ fn rasterize_bwd(
             put(1u, top - 2, first, lane, quad, own, &pixels);
             put(2u, top - 3, first, lane, quad, own, &pixels);
             put(3u, top - 4, first, lane, quad, own, &pixels);
-            workgroupBarrier();
+            meet();
             // One invocation per field of each splat.
             let which = top - 1 - i32(lane / stride);
             if lane < SPLATS * stride && which >= 0 {
                 let f = lane % stride;
                 records[slots[which] * stride + f] = summed(lane, f == maximum());
             }
-            workgroupBarrier();
+            meet();
         }
     }
 }

@@ -44,7 +44,7 @@ fn is_in_band(tile: u32) -> bool {
 
 // Neighbours in number are neighbours in the image, so that those that run together mostly agree.
 fn quad_of(tile: u32, lane: u32) -> Quad {
-    let corner = vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
+    let corner = corner_of(tile);
     let x = ((lane & 1u) << 1u) | (lane & 4u) | ((lane >> 1u) & 8u);
     let y = (lane & 2u) | ((lane >> 1u) & 4u) | ((lane >> 2u) & 8u);
     let across = vec4(x) + vec4(0u, 1u, 0u, 1u);

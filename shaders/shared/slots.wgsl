@@ -1,6 +1,6 @@
 // Sums over a tile's pixels that go to one record per entry, in its slot: what each invocation has found
 // in its four pixels is put side by side, and added in order. So the sum over a tile has one order,
-// whatever the device, and four splats share two barriers. subgroups.wgsl is the other way.
+// whatever the device, and four splats share two barriers. atomics.wgsl is the other way.
 
 // Splats at a time, and loaded at a time, at most.
 const SPLATS: u32 = 4u;
@@ -17,6 +17,22 @@ const PITCH: u32 = 65u;
 var<workgroup> parts: array<f32, 3900>;
 // Of the splats at hand.
 var<workgroup> slots: array<u32, BATCH>;
+
+// Makes the next `count` splats, from one in the list on, those at hand; to be called by all.
+fn take_batch(from_entry: u32, count: u32, lane: u32, corner: vec2<u32>) {
+    meet();
+    if lane < count {
+        let slot = list[from_entry + lane];
+        slots[lane] = slot;
+        hold(lane, row_of_slot[slot], corner);
+    }
+    meet();
+}
+
+// What an invocation has found for sum n.
+fn put_part(n: u32, lane: u32, x: f32) {
+    parts[n * PITCH + lane] = x;
+}
 
 // ROUND parts in order, added to what is given, or the largest of all.
 fn reduced(given: f32, first: u32, is_maximum: bool) -> f32 {

@@ -81,6 +81,11 @@ fn group_of(id: vec3<u32>) -> u32 {
     return id.x + id.y * ACROSS;
 }
 
+// Where a tile begins in the image [px].
+fn corner_of(tile: u32) -> vec2<u32> {
+    return vec2(tile % frame.image.z, tile / frame.image.z) * TILE;
+}
+
 // |x| <= most; false for NaN and infinity. By bits: WGSL may assume that there is no NaN.
 fn below(x: f32, most: f32) -> bool {
     return (bitcast<u32>(x) & 0x7fffffffu) <= bitcast<u32>(most);
