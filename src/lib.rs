@@ -49,7 +49,7 @@
 //!         println!("step {}: {} rows, {} denied", event.step, event.after, event.denied);
 //!     }
 //! }
-//! let model = dataset.normalisation.model_to_world(&trainer.model()?);
+//! let model = dataset.normalisation.model_to_world(trainer.model()?);
 //! densify::ply::write_splats(&model, &mut std::fs::File::create("garden.ply")?)?;
 //! # Ok(())
 //! # }

@@ -110,11 +110,9 @@ fn for_each_tensor(
     backend: &dyn Backend,
     mut f: impl FnMut(&Tensor) -> io::Result<()>,
 ) -> Result<(), Stop> {
-    let gaussians = backend.download().map_err(Stop::Backend)?;
-    for which in 0..model::NAMES.len() {
-        f(&model::tensor(&gaussians, which)).map_err(Stop::Io)?;
+    for tensor in model::tensors(backend.download().map_err(Stop::Backend)?) {
+        f(&tensor).map_err(Stop::Io)?;
     }
-    drop(gaussians);
     for name in backend.state() {
         let tensor = backend.save(&name).map_err(Stop::Backend)?;
         f(&tensor).map_err(Stop::Io)?;

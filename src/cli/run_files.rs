@@ -148,7 +148,7 @@ pub(super) fn read_model(
             console.say(format_args!("note: {}: {number} rows {what}", path.display()));
         }
     }
-    Ok(dataset.normalisation.model_from_world(&file.gaussians))
+    Ok(dataset.normalisation.model_from_world(file.gaussians))
 }
 
 impl Opened {

@@ -94,33 +94,32 @@ impl Normalisation {
 
     /// A model in scene coordinates as one in world coordinates. Computed in f64.
     #[must_use]
-    pub fn model_to_world(&self, scene: &Gaussians) -> Gaussians {
+    pub fn model_to_world(&self, scene: Gaussians) -> Gaussians {
         self.mapped(scene, -self.scale.ln(), |mean| self.denormalise_point(mean))
     }
 
     /// A model in world coordinates as one in scene coordinates. Computed in f64.
     #[must_use]
-    pub fn model_from_world(&self, world: &Gaussians) -> Gaussians {
+    pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
         self.mapped(world, self.scale.ln(), |mean| self.point(mean))
     }
 
+    /// In place: a model may be most of what there is memory for.
     fn mapped(
         &self,
-        model: &Gaussians,
+        mut model: Gaussians,
         ln_scale: f64,
         point: impl Fn(DVec3) -> DVec3,
     ) -> Gaussians {
-        if *self == Self::IDENTITY {
-            return model.clone();
+        if *self != Self::IDENTITY {
+            for mean in &mut model.means {
+                *mean = point(DVec3::from(mean.map(f64::from))).as_vec3().to_array();
+            }
+            for value in model.log_scales.as_flattened_mut() {
+                *value = (f64::from(*value) + ln_scale) as f32;
+            }
         }
-        let mean = |m: &[f32; 3]| point(DVec3::from(m.map(f64::from))).as_vec3().to_array();
-        Gaussians {
-            means: model.means.iter().map(mean).collect(),
-            log_scales: (model.log_scales.iter())
-                .map(|log| log.map(|value| (f64::from(value) + ln_scale) as f32))
-                .collect(),
-            ..model.clone()
-        }
+        model
     }
 
     /// What to say before world coordinates are written as f32, if they will suffer.
@@ -218,13 +217,13 @@ mod tests {
             sh_degree: 0,
         };
         let n = Normalisation { centre: DVec3::new(100.0, 200.0, 300.0), scale: 0.125 };
-        let world = n.model_to_world(&model);
+        let world = n.model_to_world(model.clone());
         assert_eq!(world.means, [[104.0, 198.0, 308.0]]);
         assert!((world.log_scales[0][0] - (-3.0 + 8f32.ln())).abs() < 1e-6);
-        let back = n.model_from_world(&world);
+        let back = n.model_from_world(world);
         assert_eq!(back.means, model.means);
         assert!((back.log_scales[0][2] - 0.5).abs() < 1e-6);
         assert_eq!((back.quats, back.sh), (model.quats.clone(), model.sh.clone()));
-        assert_eq!(Normalisation::IDENTITY.model_to_world(&model), model);
+        assert_eq!(Normalisation::IDENTITY.model_to_world(model.clone()), model);
     }
 }

@@ -269,7 +269,7 @@ impl Survey {
             pass("colours of tracks", Tracks::most_bytes() + self.degree.bytes + image);
         }
         pass("a policy's event", self.event_bytes(setting, needs));
-        // The model as downloaded and as exported.
+        // The model, and as much again: of arrays that are freed, allocators keep some for a while.
         pass("export of the model, checkpoint", 2 * budget * row);
         let measures_test = !self.dataset.test.is_empty();
         if measures_test || self.required != Required::default() {

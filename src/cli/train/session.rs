@@ -274,7 +274,7 @@ impl<'a> Session<'a> {
     /// Writes the model in the dataset's own coordinates; returns where.
     fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
         let model = self.run.trainer.model()?;
-        let model = self.run.dataset.normalisation.model_to_world(&model);
+        let model = self.run.dataset.normalisation.model_to_world(model);
         let path = model_path(&self.folder, step);
         write_atomically(&path, |mut out| write_splats(&model, &mut out))?;
         Ok(path)

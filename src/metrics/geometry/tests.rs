@@ -137,7 +137,7 @@ fn carpet(z: f64) -> Gaussians {
 }
 
 fn measured(truth: &GroundTruth, world: &Gaussians) -> Geometry {
-    let model = WORLD.model_from_world(world);
+    let model = WORLD.model_from_world(world.clone());
     let options = CpuOptions { needs: needs(), ..CpuOptions::new(model.len().max(1)) };
     let mut backend = CpuBackend::new(&model, &options).unwrap();
     let ground = Ground { truth, normalisation: &WORLD, background: [0.0; 3], sh_degree: 0 };
