@@ -1,7 +1,8 @@
 // Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/backend/cpu/loss.rs.
 // SSIM is written in e = rendering − target, by an exact identity. The 11×11 window is taken apart
-// into columns and rows; beyond the image there are zeros. An invocation sums for four pixels in a row,
-// whose windows have eight of fourteen values in common.
+// into columns and rows; beyond the image there are zeros. An invocation sums for eight pixels in a row,
+// whose windows have four of eighteen values in common, and the rest by twos to sevens: what it reads
+// costs more than what it adds.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(2) var<storage, read> canvas: array<vec4<f32>>;
@@ -29,15 +30,15 @@ const HAS_ALPHA: u32 = 1u;
 const HAS_MASK: u32 = 2u;
 const WITH_ERROR: u32 = 4u;
 
-// Weights of the kth of fourteen values in a row, in the windows around the sixth to the ninth.
-fn windows(k: u32) -> vec4<f32> {
-    var weights = array<f32, 17>(
-        0.0, 0.0, 0.0,
+// Weights of the kth of eighteen values in a row, in the windows around the sixth to the thirteenth, from
+// those of the value before it: what a table of them would be asked for eight times, it is asked once.
+fn moved_on(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
+    var weights = array<f32, 11>(
         0.0010283802, 0.007598758, 0.036000773, 0.10936069, 0.21300553, 0.26601174,
         0.21300553, 0.10936069, 0.036000773, 0.007598758, 0.0010283802,
-        0.0, 0.0, 0.0,
     );
-    return vec4(weights[k + 3u], weights[k + 2u], weights[k + 1u], weights[k]);
+    let of_first = select(0.0, weights[min(k, 10u)], k <= 10u);
+    return mat2x4(vec4(of_first, before[0].xyz), vec4(before[0].w, before[1].xyz));
 }
 
 fn weight_of(at: u32) -> f32 {
@@ -66,21 +67,20 @@ fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
     return vec2((canvas[at][channel] - target_value) * weight_of(at), target_value);
 }
 
-// Values in reach of four in a row.
-const SPAN: u32 = 14u;
-// Fours in a column of the tile, for all columns of its surroundings; fours in the tile's lines.
-const COLUMNS: u32 = SIDE * TILE / 4u;
-const LINES: u32 = TILE * TILE / 4u;
+// Values in reach of eight in a row.
+const SPAN: u32 = 18u;
+// Eights in a column of the tile, for all columns of its surroundings; eights in the tile's lines.
+const COLUMNS: u32 = SIDE * TILE / 8u;
+const LINES: u32 = TILE * TILE / 8u;
 
-// A tile with its surroundings: up to three values per pixel, then up to five per pixel of its columns.
+// A tile with its surroundings: two values per pixel, then up to five per pixel of its columns.
 var<workgroup> around: array<vec2<f32>, 676>;
-var<workgroup> thirds: array<f32, 676>;
 var<workgroup> rows_a: array<vec4<f32>, 416>;
 var<workgroup> rows_b: array<f32, 416>;
 var<workgroup> reduced: array<vec2<f32>, GROUP>;
 
-// Four pixels of a line of a tile.
-struct Four {
+// Eight pixels of a line of a tile.
+struct Eight {
     // The first one's column, and their line, from the tile's corner [px].
     column: u32,
     line: u32,
@@ -89,27 +89,79 @@ struct Four {
     inside: u32,
 }
 
-fn four_of(corner: vec2<u32>, i: u32) -> Four {
-    let column = 4u * (i % 4u);
-    let line = i / 4u;
+fn eight_of(corner: vec2<u32>, i: u32) -> Eight {
+    let column = 8u * (i % 2u);
+    let line = i / 2u;
     let x = corner.x + column;
     let y = corner.y + line;
-    let there = select(0u, min(frame.image.x - x, 4u), x < frame.image.x && y < frame.image.y);
-    return Four(column, line, y * frame.image.x + x, there);
+    let there = select(0u, min(frame.image.x - x, 8u), x < frame.image.x && y < frame.image.y);
+    return Eight(column, line, y * frame.image.x + x, there);
 }
 
-// The pixel of `around` at a place; its coordinates may be outside of the image.
+// The pixel at a place of a tile with its surroundings; its coordinates may be outside of the image.
 fn pixel_around(corner: vec2<u32>, i: u32) -> vec2<i32> {
     return vec2<i32>(corner) + vec2(i32(i % SIDE), i32(i / SIDE)) - REACH;
 }
 
+// The first of the ith eight windows below one another, in a tile with its surroundings.
+fn eighth_of(i: u32) -> u32 {
+    return i / SIDE * 8u * SIDE + i % SIDE;
+}
+
 // Sums of four windows below one another, up to four of each, go to their places in `rows_a`.
-fn keep_columns(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>) {
+fn keep_four(first: u32, a: vec4<f32>, b: vec4<f32>, c: vec4<f32>, d: vec4<f32>) {
     let of_window = transpose(mat4x4(a, b, c, d));
     rows_a[first] = of_window[0];
     rows_a[first + SIDE] = of_window[1];
     rows_a[first + 2u * SIDE] = of_window[2];
     rows_a[first + 3u * SIDE] = of_window[3];
+}
+
+// The same of eight windows.
+fn keep_columns(
+    first: u32,
+    a: mat2x4<f32>,
+    b: mat2x4<f32>,
+    c: mat2x4<f32>,
+    d: mat2x4<f32>,
+) {
+    keep_four(first, a[0], b[0], c[0], d[0]);
+    keep_four(first + 4u * SIDE, a[1], b[1], c[1], d[1]);
+}
+
+// SSIM in four pixels, and its derivatives by the window's means.
+struct Similar {
+    ssim: vec4<f32>,
+    by_e: vec4<f32>,
+    by_ee: vec4<f32>,
+    by_ey: vec4<f32>,
+}
+
+fn similar(
+    mu_e: vec4<f32>,
+    mu_y: vec4<f32>,
+    mean_ee: vec4<f32>,
+    mean_yy: vec4<f32>,
+    mean_ey: vec4<f32>,
+) -> Similar {
+    let mu_x = mu_e + mu_y;
+    let var_e = max(mean_ee - mu_e * mu_e, vec4(0.0));
+    let var_y = max(mean_yy - mu_y * mu_y, vec4(0.0));
+    let cov = mean_ey - mu_e * mu_y;
+    let var_x = max(var_y + 2.0 * cov + var_e, vec4(0.0));
+    let inv_a = 1.0 / (mu_x * mu_x + mu_y * mu_y + C1);
+    let inv_b = 1.0 / (var_x + var_y + C2);
+    let luminance = 1.0 - mu_e * mu_e * inv_a;
+    let contrast = 1.0 - var_e * inv_b;
+    let by_luminance = -2.0 * mu_e * inv_a * (1.0 - mu_e * mu_x * inv_a);
+    let two_ve_bb = 2.0 * var_e * inv_b * inv_b;
+    let by_contrast = 2.0 * mu_e * contrast * inv_b - mu_y * two_ve_bb;
+    return Similar(
+        luminance * contrast,
+        contrast * by_luminance + luminance * by_contrast,
+        -(luminance * contrast * inv_b),
+        luminance * two_ve_bb,
+    );
 }
 
 // SSIM, its derivatives, and the sums of the tile. now.a, now.b: bits of the weights of |e| and of
@@ -126,7 +178,7 @@ fn similarity(
     let corner = corner_of(tile);
     let size = frame.image.x * frame.image.y;
     var sums = vec2(0.0);
-    var wrong = vec4(0.0);
+    var wrong = mat2x4<f32>();
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
         for (var i = lane; i < SIDE * SIDE; i += GROUP) {
@@ -134,16 +186,18 @@ fn similarity(
         }
         workgroupBarrier();
         for (var i = lane; i < COLUMNS; i += GROUP) {
-            let first = i / SIDE * 4u * SIDE + i % SIDE;
-            var e = vec4(0.0);
-            var y = vec4(0.0);
-            var ee = vec4(0.0);
-            var yy = vec4(0.0);
-            var ey = vec4(0.0);
+            let first = eighth_of(i);
+            var e = mat2x4<f32>();
+            var y = mat2x4<f32>();
+            var ee = mat2x4<f32>();
+            var yy = mat2x4<f32>();
+            var ey = mat2x4<f32>();
+            var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
+                w = moved_on(w, k);
                 let here = around[first + k * SIDE];
-                let we = windows(k) * here.x;
-                let wy = windows(k) * here.y;
+                let we = w * here.x;
+                let wy = w * here.y;
                 e += we;
                 y += wy;
                 ee += we * here.x;
@@ -151,62 +205,59 @@ fn similarity(
                 ey += we * here.y;
             }
             keep_columns(first, e, y, ee, yy);
-            rows_b[first] = ey.x;
-            rows_b[first + SIDE] = ey.y;
-            rows_b[first + 2u * SIDE] = ey.z;
-            rows_b[first + 3u * SIDE] = ey.w;
+            for (var p = 0u; p < 8u; p++) {
+                rows_b[first + p * SIDE] = ey[p / 4u][p % 4u];
+            }
         }
         workgroupBarrier();
         for (var i = lane; i < LINES; i += GROUP) {
-            let four = four_of(corner, i);
-            let first = four.line * SIDE + four.column;
-            var mu_e = vec4(0.0);
-            var mu_y = vec4(0.0);
-            var mean_ee = vec4(0.0);
-            var mean_yy = vec4(0.0);
-            var mean_ey = vec4(0.0);
+            let eight = eight_of(corner, i);
+            let first = eight.line * SIDE + eight.column;
+            var e = mat2x4<f32>();
+            var y = mat2x4<f32>();
+            var ee = mat2x4<f32>();
+            var yy = mat2x4<f32>();
+            var ey = mat2x4<f32>();
+            var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
+                w = moved_on(w, k);
                 let here = rows_a[first + k];
-                let w = windows(k);
-                mu_e += w * here.x;
-                mu_y += w * here.y;
-                mean_ee += w * here.z;
-                mean_yy += w * here.w;
-                mean_ey += w * rows_b[first + k];
+                e += w * here.x;
+                y += w * here.y;
+                ee += w * here.z;
+                yy += w * here.w;
+                ey += w * rows_b[first + k];
             }
-            let mu_x = mu_e + mu_y;
-            let var_e = max(mean_ee - mu_e * mu_e, vec4(0.0));
-            let var_y = max(mean_yy - mu_y * mu_y, vec4(0.0));
-            let cov = mean_ey - mu_e * mu_y;
-            let var_x = max(var_y + 2.0 * cov + var_e, vec4(0.0));
-            let inv_a = 1.0 / (mu_x * mu_x + mu_y * mu_y + C1);
-            let inv_b = 1.0 / (var_x + var_y + C2);
-            let luminance = 1.0 - mu_e * mu_e * inv_a;
-            let contrast = 1.0 - var_e * inv_b;
-            let by_luminance = -2.0 * mu_e * inv_a * (1.0 - mu_e * mu_x * inv_a);
-            let two_ve_bb = 2.0 * var_e * inv_b * inv_b;
-            let by_contrast = 2.0 * mu_e * contrast * inv_b - mu_y * two_ve_bb;
-            let by_e = contrast * by_luminance + luminance * by_contrast;
-            let by_ee = -(luminance * contrast * inv_b);
-            let by_ey = luminance * two_ve_bb;
-            let ssim = luminance * contrast;
-            for (var p = 0u; p < 4u; p++) {
-                if p < four.inside {
-                    let to = 3u * channel * size + four.place + p;
-                    derivatives[to] = by_e[p];
-                    derivatives[to + size] = by_ee[p];
-                    derivatives[to + 2u * size] = by_ey[p];
-                    let e = abs(around[first + 5u * SIDE + 5u + p].x);
-                    sums += vec2(e, ssim[p]);
-                    wrong[p] += e * bitcast<f32>(now.a) + (1.0 - ssim[p]) * bitcast<f32>(now.b);
+            for (var half = 0u; half < 2u; half++) {
+                let found = similar(e[half], y[half], ee[half], yy[half], ey[half]);
+                let n = 4u * half;
+                let centre = first + 5u * SIDE + 5u + n;
+                let off = abs(vec4(
+                    around[centre].x,
+                    around[centre + 1u].x,
+                    around[centre + 2u].x,
+                    around[centre + 3u].x,
+                ));
+                let there = vec4(n, n + 1u, n + 2u, n + 3u) < vec4(eight.inside);
+                let counts = select(vec4(0.0), vec4(1.0), there);
+                sums += vec2(dot(counts, off), dot(counts, found.ssim));
+                wrong[half] +=
+                    off * bitcast<f32>(now.a) + (1.0 - found.ssim) * bitcast<f32>(now.b);
+                for (var p = 0u; p < 4u; p++) {
+                    if n + p < eight.inside {
+                        let to = 3u * channel * size + eight.place + n + p;
+                        derivatives[to] = found.by_e[p];
+                        derivatives[to + size] = found.by_ee[p];
+                        derivatives[to + 2u * size] = found.by_ey[p];
+                    }
                 }
             }
         }
     }
     if lane < LINES && (frame.draw.w & WITH_ERROR) != 0u {
-        let four = four_of(corner, lane);
-        for (var p = 0u; p < four.inside; p++) {
-            error[four.place + p] = wrong[p] * (1.0 / 3.0);
+        let eight = eight_of(corner, lane);
+        for (var p = 0u; p < eight.inside; p++) {
+            error[eight.place + p] = wrong[p / 4u][p % 4u] * (1.0 / 3.0);
         }
     }
     reduced[lane] = sums;
@@ -243,57 +294,50 @@ fn pixel_gradient(
     let scale = 1.0 / (3.0 * f32(size));
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
-        for (var i = lane; i < SIDE * SIDE; i += GROUP) {
-            let at = pixel_around(corner, i);
-            var value = vec3(0.0);
-            if is_inside(at) {
-                let source = 3u * channel * size + u32(at.y) * frame.image.x + u32(at.x);
-                value = vec3(
-                    derivatives[source],
-                    derivatives[source + size],
-                    derivatives[source + 2u * size],
-                );
-            }
-            around[i] = value.xy;
-            thirds[i] = value.z;
-        }
-        workgroupBarrier();
         for (var i = lane; i < COLUMNS; i += GROUP) {
-            let first = i / SIDE * 4u * SIDE + i % SIDE;
-            var x = vec4(0.0);
-            var y = vec4(0.0);
-            var z = vec4(0.0);
+            let first = eighth_of(i);
+            let top = pixel_around(corner, first);
+            var x = mat2x4<f32>();
+            var y = mat2x4<f32>();
+            var z = mat2x4<f32>();
+            var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
-                let here = around[first + k * SIDE];
-                let w = windows(k);
-                x += w * here.x;
-                y += w * here.y;
-                z += w * thirds[first + k * SIDE];
+                w = moved_on(w, k);
+                let at = top + vec2(0, i32(k));
+                if is_inside(at) {
+                    let source = 3u * channel * size + u32(at.y) * frame.image.x + u32(at.x);
+                    x += w * derivatives[source];
+                    y += w * derivatives[source + size];
+                    z += w * derivatives[source + 2u * size];
+                }
             }
-            keep_columns(first, x, y, z, vec4(0.0));
+            keep_columns(first, x, y, z, mat2x4<f32>());
         }
         workgroupBarrier();
         for (var i = lane; i < LINES; i += GROUP) {
-            let four = four_of(corner, i);
-            let first = four.line * SIDE + four.column;
-            var x = vec4(0.0);
-            var y = vec4(0.0);
-            var z = vec4(0.0);
+            let eight = eight_of(corner, i);
+            let first = eight.line * SIDE + eight.column;
+            var x = mat2x4<f32>();
+            var y = mat2x4<f32>();
+            var z = mat2x4<f32>();
+            var w = mat2x4<f32>();
             for (var k = 0u; k < SPAN; k++) {
+                w = moved_on(w, k);
                 let here = rows_a[first + k];
-                let w = windows(k);
                 x += w * here.x;
                 y += w * here.y;
                 z += w * here.z;
             }
-            let pixel = vec2<i32>(corner + vec2(four.column, four.line));
-            for (var p = 0u; p < 4u; p++) {
-                if p < four.inside {
-                    let ey = difference(pixel + vec2(i32(p), 0), channel);
-                    let by_ssim = x[p] + 2.0 * ey.x * y[p] + ey.y * z[p];
+            let pixel = vec2<i32>(corner + vec2(eight.column, eight.line));
+            for (var n = 0u; n < 8u; n++) {
+                if n < eight.inside {
+                    let ey = difference(pixel + vec2(i32(n), 0), channel);
+                    let half = n / 4u;
+                    let p = n % 4u;
+                    let by_ssim = x[half][p] + 2.0 * ey.x * y[half][p] + ey.y * z[half][p];
                     let g = (1.0 - SSIM_WEIGHT) * scale * sign(ey.x) - SSIM_WEIGHT * scale * by_ssim;
                     // The loss sees e·mask, so the chain rule has the mask once more.
-                    let to = four.place + p;
+                    let to = eight.place + n;
                     gradient[channel * size + to] = g * weight_of(to);
                 }
             }

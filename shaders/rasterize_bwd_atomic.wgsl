@@ -3,22 +3,18 @@
 
 // What the subgroup finds of splat i at hand, the first of which is the nth of the list.
 fn find(
-    i: i32,
+    i: u32,
     n: u32,
     m: Member,
     quad: Quad,
     own: Upstream,
     pixels: ptr<function, Behind>,
 ) {
-    if i < 0 {
-        return;
-    }
     // Said aloud: naga does not start a variable anew in each round of a loop.
     var sums = array<f32, FIELDS>();
-    let at = u32(i);
-    let is_taken = differentiated(held(at), n + at, quad, own, pixels, &sums);
+    let is_taken = differentiated(held(i), n + i, quad, own, pixels, &sums);
     if subgroupAny(is_taken) {
-        deliver(m, at, sums, fields(), maximum());
+        deliver(m, i, sums, fields(), maximum());
     }
 }
 
@@ -36,6 +32,7 @@ fn rasterize_bwd_atomic(
     let quad = quad_of(tile, lane);
     let begin = tile_starts[tile];
     let own = upstream(quad);
+    let block = block_of(quad);
     var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
     let reached = largest_of_all(m, last_of(pixels));
     let batches = (reached + m.members - 1u) / m.members;
@@ -45,13 +42,15 @@ fn rasterize_bwd_atomic(
         if m.place < count {
             hold(m.place, row_of_slot[list[begin + first + m.place]], quad.corner);
         }
-        // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
-        // counted (slots.wgsl says where).
-        for (var top = i32(count); top > 0; top -= 4) {
-            find(top - 1, first, m, quad, own, &pixels);
-            find(top - 2, first, m, quad, own, &pixels);
-            find(top - 3, first, m, quad, own, &pixels);
-            find(top - 4, first, m, quad, own, &pixels);
+        // A subgroup's pixels are part of the tile's, and many a splat of the tile is not seen in them.
+        let seen = subgroupBallot(m.place < count && may_reach(own_splat, block));
+        for (var word = (count + 31u) / 32u; word > 0u; word--) {
+            var left = seen[word - 1u];
+            while left != 0u {
+                let bit = firstLeadingBit(left);
+                left ^= 1u << bit;
+                find(32u * (word - 1u) + bit, first, m, quad, own, &pixels);
+            }
         }
     }
 }

@@ -58,6 +58,8 @@ pub enum Section {
     Images,
     /// What is held for a moment only: evaluation, export. Its lines are not needed at once.
     Passing,
+    /// What is held for a moment only, and given back before anything of the above is allocated.
+    Before,
     /// The program itself before any of the above.
     Process,
 }
@@ -72,6 +74,7 @@ impl Section {
             Self::Policy => "policy",
             Self::Images => "images",
             Self::Passing => "in passing",
+            Self::Before => "before",
             Self::Process => "process",
         }
     }
@@ -106,20 +109,31 @@ impl Ledger {
         self.lines.extend_from_slice(&other.lines);
     }
 
-    /// Sum of all lines `[bytes]`; of the lines held in passing only the largest counts, as they
-    /// are never held together.
+    /// The most that is held at a time `[bytes]`: the sum of all lines, but that of those held in
+    /// passing, and of those held before, only the largest counts, as they are never held together,
+    /// and that what is held before is not there any more when all but the process is.
     #[must_use]
     pub fn total(&self) -> u64 {
-        let (passing, lasting): (Vec<_>, Vec<_>) =
-            self.lines.iter().partition(|line| line.section == Section::Passing);
-        let lasting = lasting.iter().fold(0_u64, |sum, line| sum.saturating_add(line.bytes));
-        lasting.saturating_add(passing.iter().map(|line| line.bytes).max().unwrap_or(0))
+        self.most_at_a_time(|_| true)
     }
 
-    /// What of the [total](Self::total) does not lie in the memory of a GPU `[bytes]`.
+    /// The same of what does not lie in the memory of a GPU `[bytes]`.
     #[must_use]
     pub fn on_host(&self) -> u64 {
-        self.total().saturating_sub(self.on_device())
+        self.most_at_a_time(|line| !line.on_device)
+    }
+
+    fn most_at_a_time(&self, counts: impl Fn(&LedgerLine) -> bool) -> u64 {
+        let (mut process, mut before, mut passing, mut lasting) = (0_u64, 0_u64, 0_u64, 0_u64);
+        for line in self.lines.iter().filter(|line| counts(line)) {
+            match line.section {
+                Section::Process => process = process.saturating_add(line.bytes),
+                Section::Before => before = before.max(line.bytes),
+                Section::Passing => passing = passing.max(line.bytes),
+                _ => lasting = lasting.saturating_add(line.bytes),
+            }
+        }
+        process.saturating_add(before.max(lasting.saturating_add(passing)))
     }
 
     /// Sum of what lies in the memory of a GPU `[bytes]`, where all of it lasts.
@@ -223,6 +237,28 @@ mod tests {
         full.add("a", u64::MAX);
         full.add("b", 1);
         assert_eq!(full.total(), u64::MAX);
+    }
+
+    #[test]
+    fn what_is_given_back_before_counts_only_where_it_is_the_most() {
+        let mut ledger = sample();
+        let total = ledger.total();
+        ledger.add_to(Section::Before, "loading", 30 << 20);
+        ledger.add_to(Section::Before, "measuring", 37 << 20);
+        assert_eq!(ledger.total(), total);
+        ledger.add_to(Section::Before, "measuring more", 38 << 20);
+        assert_eq!(ledger.total(), 41 << 20);
+    }
+
+    #[test]
+    fn the_host_holds_what_the_device_does_not() {
+        let mut ledger = sample();
+        let total = ledger.total();
+        ledger.add_on_device(Section::Model, "more moments", 50 << 20);
+        ledger.add_to(Section::Before, "loading", 39 << 20);
+        assert_eq!(ledger.on_device(), 50 << 20);
+        assert_eq!(ledger.total(), total + (50 << 20));
+        assert_eq!(ledger.on_host(), 42 << 20);
     }
 
     #[test]

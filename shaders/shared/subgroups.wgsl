@@ -9,6 +9,30 @@ struct Member {
     members: u32,
 }
 
+// A rectangle of pixels: its first and last centres, from the corner of the tile [px].
+struct Block {
+    low: vec2<f32>,
+    high: vec2<f32>,
+}
+
+// The pixels of the subgroup. To be called while all of them are there.
+fn block_of(quad: Quad) -> Block {
+    return Block(
+        vec2(subgroupMin(quad.x.x), subgroupMin(quad.y.x)),
+        vec2(subgroupMax(quad.x.w), subgroupMax(quad.y.w)),
+    );
+}
+
+// Whether a splat may reach into a block, by the box around its ellipse, which is widened so that none is
+// lost to rounding. Nor is one whose box has no numbers: nothing compares with them.
+fn may_reach(splat: Splat, block: Block) -> bool {
+    let radius = sqrt(max(splat.b.y + LOG2_REACH, 0.0));
+    let down = radius / splat.b.x;
+    let across = radius * length(vec2(1.0 / splat.a.z, splat.a.w / splat.b.x));
+    let half = 1.001 * vec2(across, down) + 0.01;
+    return !(any(splat.a.xy + half < block.low) || any(splat.a.xy - half > block.high));
+}
+
 // The splat of this invocation, and its row.
 var<private> own_splat: Splat;
 var<private> own_row: u32;

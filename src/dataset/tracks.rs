@@ -38,12 +38,12 @@ impl Tracks {
         self.positions.is_empty()
     }
 
-    /// Most bytes that tracks take, however many a reconstruction has.
+    /// What they take `[bytes]`.
     #[must_use]
-    pub const fn most_bytes() -> u64 {
-        let track =
-            size_of::<DVec3>() + 3 + size_of::<Vec<u32>>() + MOST_VIEWS as usize * size_of::<u32>();
-        (2 * MOST * track) as u64
+    pub fn bytes(&self) -> u64 {
+        let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
+        let views: usize = self.views.iter().map(Vec::len).sum();
+        (self.len() * track + views * size_of::<u32>()) as u64
     }
 
     /// The tracks as training sees them: `view_of` turns what a file calls a view into the number of

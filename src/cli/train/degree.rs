@@ -106,7 +106,7 @@ impl Degree {
             None if args.full => Ok(given(MAX_SH_DEGREE..=MAX_SH_DEGREE)),
             None => Ok(given(0..=MAX_SH_DEGREE)),
             Some(ShDegree::Auto) => {
-                let bytes = spread::bytes(&dataset.tracks);
+                let bytes = dataset.tracks.bytes() + spread::bytes(&dataset.tracks);
                 let found = match dataset.tracks.len() {
                     ..LEAST_TRACKS => None,
                     _ => Some(spread::measure(&dataset.tracks, &dataset.train)?),

@@ -259,15 +259,15 @@ impl Survey {
         let budget = setting.rows as u64;
         let float = size_of::<f32>() as u64;
         let row = float * (11 + 3 * sh_coefficients(degree) as u64);
+        if self.degree.bytes > 0 {
+            let bytes = self.degree.bytes + train.held(0) + train.decoding(1);
+            ledger.add_to(Section::Before, "colours of tracks", bytes);
+        }
         let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
         // Points, their order, neighbours in f64, and the rows before the backend has them.
         let first = self.initial_rows(args, setting.rows) as u64;
         let points = args.init_points.unwrap_or(self.dataset.points.len()) as u64;
         pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
-        if self.degree.bytes > 0 {
-            let image = train.held(0) + train.decoding(1);
-            pass("colours of tracks", Tracks::most_bytes() + self.degree.bytes + image);
-        }
         pass("a policy's event", self.event_bytes(setting, needs));
         // The model, and as much again: of arrays that are freed, allocators keep some for a while.
         pass("export of the model, checkpoint", 2 * budget * row);
@@ -280,7 +280,7 @@ impl Survey {
         }
         let process = self.process_bytes();
         if let Some(beyond) = self.peak.and_then(|peak| peak.checked_sub(process)) {
-            ledger.add_to(Section::Passing, "loading the scene", beyond);
+            ledger.add_to(Section::Before, "loading the scene", beyond);
         }
         ledger.add_to(Section::Process, "program and dataset", process);
         ledger
