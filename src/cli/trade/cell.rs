@@ -12,6 +12,7 @@ use crate::cli::study::{Call, Entry, Summary, in_run, last_arguments};
 use crate::knobs::{EXACT, preset};
 use crate::metrics::geometry::Geometry;
 use crate::output::{Mean, geometry_of, model_path, scores_of};
+use crate::schedule::REFERENCE_ITERATIONS;
 
 /// The knob of a run in which none is changed, which is one with the preset `exact`, and that of a run
 /// of the factorial.
@@ -138,6 +139,22 @@ impl Entry for Record {
     }
 }
 
+/// A knob at a level as `NAME=VALUE`, in runs of so many iterations: a preset by its own levels, where
+/// iterations are as much fewer than these as they are fewer than those of a run by default.
+pub(super) fn settings(knob: &str, level: &str, iterations: u32) -> Vec<String> {
+    let setting = |&(name, value): &(&str, &str)| match (name, value.parse::<u64>()) {
+        ("iterations", Ok(own)) => {
+            let scaled = own * u64::from(iterations) / u64::from(REFERENCE_ITERATIONS);
+            format!("{name}={}", scaled.max(1))
+        }
+        _ => format!("{name}={value}"),
+    };
+    match (knob, preset(level)) {
+        ("preset", Ok(preset)) => preset.levels.iter().map(setting).collect(),
+        _ => vec![format!("{knob}={level}")],
+    }
+}
+
 impl Cell {
     /// The call of `densify` that runs this cell, but for the output folder.
     pub(super) fn arguments(&self) -> Vec<String> {
@@ -164,7 +181,7 @@ impl Cell {
     /// The levels of `exact`, but for knobs that are changed. The preset itself would not let them be.
     fn exact(&self) -> Vec<String> {
         let levels = preset(EXACT).map_or(&[][..], |exact| exact.levels);
-        let kept = levels.iter().filter(|(knob, _)| !self.is_set("preset") && !self.is_set(knob));
+        let kept = levels.iter().filter(|(knob, _)| !self.is_set(knob));
         kept.map(|(knob, level)| format!("{knob}={level}")).collect()
     }
 
@@ -227,5 +244,18 @@ impl Cell {
             stage_seconds: serde_json::from_value(stages).unwrap_or_default(),
             geometry: geometry_of(&folder, iterations)?,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_preset_is_set_by_its_levels_and_shortens_runs_in_proportion() {
+        assert_eq!(settings("alpha_min", "1/64", 600), ["alpha_min=1/64"]);
+        assert_eq!(settings("preset", "fast", 600), ["iterations=300"]);
+        assert_eq!(settings("preset", "fast", 1), ["iterations=1"]);
+        assert_eq!(settings("preset", "tiny-memory", 600)[0], "image_cache=0");
     }
 }

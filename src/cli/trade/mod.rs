@@ -19,7 +19,7 @@ use super::study::{Records, labels};
 use super::train::DEFAULT_BUDGET;
 use crate::knobs::{Class, How};
 use crate::output::write_atomically;
-use cell::{BASE, Cell, FACTORIAL, Outcome, Record, What};
+use cell::{BASE, Cell, FACTORIAL, Outcome, Record, What, settings};
 use levels::{Chosen, chosen};
 use numerical::Subject;
 use report::Report;
@@ -211,7 +211,7 @@ fn cells(args: &TradeArgs, chosen: &[Chosen]) -> Result<Vec<Cell>, Failure> {
                 cells.extend(one.levels.iter().map(|level| Cell {
                     knob: one.knob.name.to_owned(),
                     level: level.clone(),
-                    settings: vec![format!("{}={level}", one.knob.name)],
+                    settings: settings(one.knob.name, level, args.iterations),
                     ..base.clone()
                 }));
             }

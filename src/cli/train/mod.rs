@@ -23,6 +23,7 @@ use super::failure::Failure;
 use super::number;
 use super::scene::{NEAR, SceneArgs};
 use crate::output::InitChoice;
+use crate::schedule::REFERENCE_ITERATIONS;
 use crate::trainer::OnNan;
 use degree::ShDegree;
 use resume::Start;
@@ -95,7 +96,8 @@ pub(super) struct TrainArgs {
     policy_config: Option<PathBuf>,
 
     /// Length of the run; every schedule scales with it
-    #[arg(short, long, value_name = "N", help_heading = "Training", default_value_t = 30_000, value_parser = clap::value_parser!(u32).range(1..))]
+    /// `[default: 30000, but 24000 with --preset balanced and 15000 with fast]`
+    #[arg(short, long, value_name = "N", help_heading = "Training", default_value_t = REFERENCE_ITERATIONS, hide_default_value = true, value_parser = clap::value_parser!(u32).range(1..))]
     iterations: u32,
     /// How colours may depend on the direction of view: 0 not at all, 3 most; auto: as much as the
     /// scene requires `[default: 3, or lower where --memory requires it]`

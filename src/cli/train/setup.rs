@@ -152,7 +152,14 @@ pub(super) fn prepare(
     let default = checkpoint.is_none().then_some(DEFAULT_PRESET);
     if let Some(name) = args.preset.as_deref().or(default) {
         let preset = knobs::preset(name).map_err(Failure::input)?;
-        console.say(format_args!("preset   {preset}"));
+        let iterations = args.iterations.to_string();
+        match preset.levels.iter().find(|(knob, _)| *knob == "iterations") {
+            // What it was measured to cost and buy is another run's.
+            Some((_, own)) if *own != iterations => console.say(format_args!(
+                "preset   none: --iterations {iterations} is given, and {name} is {own} iterations"
+            )),
+            _ => console.say(format_args!("preset   {preset}")),
+        }
     }
 
     let needs = survey.backend_needs(needs(policy.as_ref(), &scene, args.sh_every));

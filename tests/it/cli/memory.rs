@@ -80,9 +80,9 @@ fn grouped(number: u64) -> String {
 fn a_run_takes_no_more_than_it_is_given() {
     let scene = Photographs::transforms();
     for (memory, policy, preset, points) in [
-        (48, "diet", "balanced", "17k"),
-        (64, "taming", "balanced", "30k"),
-        (64, "mcmc", "balanced", "100k"),
+        (48, "diet", "exact", "17k"),
+        (64, "taming", "exact", "30k"),
+        (64, "mcmc", "exact", "100k"),
         // Here the model as it is exported is half of what is promised.
         (256, "diet", "tiny-memory", "245k"),
     ] {
