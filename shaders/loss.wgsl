@@ -1,8 +1,7 @@
 // Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group; src/backend/cpu/loss.rs.
 // SSIM is written in e = rendering − target, by an exact identity. The 11×11 window is taken apart
 // into columns and rows; beyond the image there are zeros. An invocation sums for eight pixels in a row,
-// whose windows have four of eighteen values in common, and the rest by twos to sevens: what it reads
-// costs more than what it adds.
+// whose windows read eighteen values instead of eight times eleven: reading costs more than adding.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(2) var<storage, read> canvas: array<vec4<f32>>;

@@ -109,9 +109,9 @@ impl Ledger {
         self.lines.extend_from_slice(&other.lines);
     }
 
-    /// The most that is held at a time `[bytes]`: the sum of all lines, but that of those held in
-    /// passing, and of those held before, only the largest counts, as they are never held together,
-    /// and that what is held before is not there any more when all but the process is.
+    /// The most that is held at a time `[bytes]`. Of the lines held in passing only the largest counts,
+    /// as they are never held together, and so with those held before, beside which there is nothing
+    /// but the process.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.most_at_a_time(|_| true)
