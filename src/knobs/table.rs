@@ -233,7 +233,7 @@ pub static KNOBS: &[Knob] = &[
     },
     Knob {
         name: "iterations",
-        default: "[24000, or 30000 with another preset]",
+        default: "[the preset's]",
         domain: Domain::Whole { least: 1, most: MANY },
         unit: "iterations",
         class: Heuristic,
