@@ -40,11 +40,14 @@ fn replay(
     var pixels = Open(vec4(1.0), quad.inside);
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
-    for (var first = begin; first < end; first += BATCH) {
+    var has_ended = true;
+    var first = begin;
+    for (; first < end; first += BATCH) {
         let count = min(BATCH, end - first);
         take_batch(first, count, lane, quad.corner);
         // Written out, as compilers do not unroll as much as this is.
-        for (var base = 0u; base < count; base += SPLATS) {
+        var base = 0u;
+        for (; base < count; base += SPLATS) {
             put(0u, base, count, lane, quad, map_here, &pixels);
             put(1u, base + 1u, count, lane, quad, map_here, &pixels);
             put(2u, base + 2u, count, lane, quad, map_here, &pixels);
@@ -57,7 +60,9 @@ fn replay(
             }
             meet();
         }
+        has_ended &= base >= count;
     }
+    expect_end(has_ended && first >= end);
 }
 
 @group(0) @binding(8) var<storage, read> depths: array<u32>;

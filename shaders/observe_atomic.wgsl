@@ -42,7 +42,9 @@ fn replay_atomic(
     let map_here = map_at(quad);
     var pixels = Open(vec4(1.0), quad.inside);
     let end = tile_starts[tile + 1u];
-    for (var first = tile_starts[tile]; first < end; first += m.members) {
+    var has_ended = true;
+    var first = tile_starts[tile];
+    for (; first < end; first += m.members) {
         if largest_of_all(m, u32(any(pixels.goes_on))) == 0u {
             break;
         }
@@ -51,11 +53,14 @@ fn replay_atomic(
             hold(m.place, row_of_slot[list[first + m.place]], quad.corner);
         }
         // Four in a round, written out, as in rasterize_bwd_atomic.wgsl.
-        for (var i = 0u; i < count; i += 4u) {
+        var i = 0u;
+        for (; i < count; i += 4u) {
             find(i, count, m, quad, map_here, &pixels);
             find(i + 1u, count, m, quad, map_here, &pixels);
             find(i + 2u, count, m, quad, map_here, &pixels);
             find(i + 3u, count, m, quad, map_here, &pixels);
         }
+        has_ended &= i >= count;
     }
+    expect_end(has_ended && (first >= end || !any(pixels.goes_on)));
 }

@@ -57,7 +57,9 @@ fn rasterize(
     let end = tile_starts[tile + 1u];
     var pixels = Open(vec4(1.0), quad.inside);
     var shown = Shown(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(NONE));
-    for (var first = begin; first < end; first += m.members) {
+    var has_ended = true;
+    var first = begin;
+    for (; first < end; first += m.members) {
         if largest_of_all(m, u32(any(pixels.goes_on))) == 0u {
             break;
         }
@@ -67,14 +69,17 @@ fn rasterize(
         }
         meet();
         // Four in a round, written out: compilers do not unroll as much as this is, and rounds are
-        // counted (slots.wgsl says where).
-        for (var k = 0u; k < count && is_needed(any(pixels.goes_on)); k += 4u) {
+        // counted (expect_end).
+        var k = 0u;
+        for (; k < count && is_needed(any(pixels.goes_on)); k += 4u) {
             draw(k, count, first - begin, quad, &pixels, &shown);
             draw(k + 1u, count, first - begin, quad, &pixels, &shown);
             draw(k + 2u, count, first - begin, quad, &pixels, &shown);
             draw(k + 3u, count, first - begin, quad, &pixels, &shown);
         }
+        has_ended &= k >= count || !any(pixels.goes_on);
     }
+    expect_end(has_ended && (first >= end || !any(pixels.goes_on)));
     let red = shown.red + pixels.light * frame.background.x;
     let green = shown.green + pixels.light * frame.background.y;
     let blue = shown.blue + pixels.light * frame.background.z;

@@ -45,21 +45,25 @@ fn rasterize_bwd(
     let reached = largest_of_all(m, last_of(pixels));
     let stride = fields();
     // Nobody takes these.
-    for (var i = reached + lane; i < length; i += MEMBERS) {
+    var i = reached + lane;
+    for (; i < length; i += MEMBERS) {
         let slot = list[begin + i];
         for (var f = 0u; f < stride; f++) {
             records[slot * stride + f] = 0.0;
         }
     }
+    var has_ended = i >= length;
 
     let batches = (reached + BATCH - 1u) / BATCH;
-    for (var n = 0u; n < batches; n++) {
+    var n = 0u;
+    for (; n < batches; n++) {
         let first = (batches - 1u - n) * BATCH;
         let count = min(BATCH, reached - first);
         take_batch(begin + first, count, lane, quad.corner);
         // Groups of four splats, back to front; in each the last comes first. Written out, as compilers
         // do not unroll as much as this is.
-        for (var top = i32(count); top > 0; top -= i32(SPLATS)) {
+        var top = i32(count);
+        for (; top > 0; top -= i32(SPLATS)) {
             put(0u, top - 1, first, lane, quad, own, &pixels);
             put(1u, top - 2, first, lane, quad, own, &pixels);
             put(2u, top - 3, first, lane, quad, own, &pixels);
@@ -73,7 +77,9 @@ fn rasterize_bwd(
             }
             meet();
         }
+        has_ended &= top <= 0;
     }
+    expect_end(has_ended && n >= batches);
 }
 
 // --- Records to one sum per row -------------------------------------------------------------------

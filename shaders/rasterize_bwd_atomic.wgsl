@@ -36,7 +36,9 @@ fn rasterize_bwd_atomic(
     var pixels = behind_all(quad, own, tile_starts[tile + 1u] - begin);
     let reached = largest_of_all(m, last_of(pixels));
     let batches = (reached + m.members - 1u) / m.members;
-    for (var n = 0u; n < batches; n++) {
+    var has_ended = true;
+    var n = 0u;
+    for (; n < batches; n++) {
         let first = (batches - 1u - n) * m.members;
         let count = min(m.members, reached - first);
         if m.place < count {
@@ -44,15 +46,19 @@ fn rasterize_bwd_atomic(
         }
         // A subgroup's pixels are part of the tile's, and many a splat of the tile is not seen in them.
         let seen = subgroupBallot(m.place < count && may_reach(own_splat, block));
-        for (var word = (count + 31u) / 32u; word > 0u; word--) {
+        var word = (count + 31u) / 32u;
+        for (; word > 0u; word--) {
             var left = seen[word - 1u];
             while left != 0u {
                 let bit = firstLeadingBit(left);
                 left ^= 1u << bit;
                 find(32u * (word - 1u) + bit, first, m, quad, own, &pixels);
             }
+            has_ended &= left == 0u;
         }
+        has_ended &= word == 0u;
     }
+    expect_end(has_ended && n >= batches);
 }
 
 // Sets the sums of all rows to 0, before the first band; now.a: numbers per row.

@@ -4,7 +4,7 @@
 // One tile per group of 64 invocations. Each has four pixels that make a square, the four numbers of a
 // vec4: a splat is read once for all of them, and what they add to its sums meets in registers.
 
-@group(0) @binding(1) var<storage, read> state: State;
+@group(0) @binding(1) var<storage, read_write> state: State;
 // Slots, tile after tile, front to back.
 @group(0) @binding(2) var<storage, read> list: array<u32>;
 @group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
@@ -40,6 +40,14 @@ struct Quad {
 // Whether a tile is there, and in the band at hand, `now.a`.
 fn is_in_band(tile: u32) -> bool {
     return tile < frame.image.w && tile >= state.cuts[now.a] && tile < state.cuts[now.a + 1u];
+}
+
+// Says whether loops have come to their end: llvmpipe ends all of an invocation after 65,535 rounds
+// together, without a word. What is computed then is worth nothing, and the host must know.
+fn expect_end(has_ended: bool) {
+    if !has_ended {
+        state.broken_off = 1u;
+    }
 }
 
 // Neighbours in number are neighbours in the image, so that those that run together mostly agree.

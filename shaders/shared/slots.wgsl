@@ -6,8 +6,8 @@
 const SPLATS: u32 = 4u;
 const BATCH: u32 = 8u;
 
-// Half of the invocations. So many rounds of a loop compilers unroll, and it matters: llvmpipe ends all
-// loops of an invocation after 65,535 rounds together, which a tile of 3,000 splats would reach otherwise.
+// Half of the invocations. So many rounds of a loop compilers unroll, and it matters: rounds are counted
+// (expect_end), and a tile of 3,000 splats would have too many otherwise.
 const ROUND: u32 = 32u;
 // Numbers from one sum's parts to the next one's: one more than there are, so that those that add up
 // different sums read different banks.

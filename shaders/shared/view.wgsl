@@ -42,7 +42,8 @@ struct State {
     entries_high: u32,
     // Entries of the band at hand.
     held: u32,
-    spare: u32,
+    // 1: a loop over a tile's splats has ended before its time, now or ever.
+    broken_off: u32,
     // Means over pixels and channels.
     l1: f32,
     ssim: f32,

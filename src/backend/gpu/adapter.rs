@@ -75,14 +75,10 @@ impl AdapterSummary {
         (self.largest_binding.min(self.largest_buffer) / per_row).min(MOST_ROWS)
     }
 
-    /// How it adds up gradients where nobody says: as fast as it can, but for software drivers, which
-    /// are there to check the kernels and do what repeats.
+    /// How it adds up gradients where nobody says: as fast as it can.
     #[must_use]
     pub fn accumulation(&self) -> Accumulation {
-        match self.kind {
-            AdapterKind::Software => Accumulation::Slots,
-            _ => self.accumulations.last().copied().unwrap_or(Accumulation::Slots),
-        }
+        self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
     }
 
     /// Whether `auto` may take it: a GPU that lacks nothing.
@@ -259,19 +255,18 @@ mod tests {
         use Accumulation::{Slots, SubgroupAtomics, SubgroupCas};
         let subgroups = Features::SUBGROUP;
         let both = subgroups | Features::SHADER_FLOAT32_ATOMIC;
-        let of = |kind, features| AdapterSummary {
+        let of = |features| AdapterSummary {
             accumulations: Accumulation::ALL
                 .into_iter()
                 .filter(|way| way.missing(features).is_empty())
                 .collect(),
-            ..adapter("Card", kind, &[])
+            ..adapter("Card", AdapterKind::Discrete, &[])
         };
-        let chosen = |kind, features, accumulation| {
+        let chosen = |features, accumulation| {
             let choice = AdapterChoice { name: None, accumulation };
-            choice.accumulation(&of(kind, features), features)
+            choice.accumulation(&of(features), features)
         };
         // As fast as it can, where nobody says.
-        let card = AdapterKind::Discrete;
         for (features, expected) in [
             (Features::empty(), Slots),
             (subgroups, SubgroupCas),
@@ -279,16 +274,15 @@ mod tests {
             // Sums over tiles want subgroups, too.
             (Features::SHADER_FLOAT32_ATOMIC, Slots),
         ] {
-            assert_eq!(chosen(card, features, None).unwrap(), expected, "{features:?}");
-            assert_eq!(chosen(AdapterKind::Software, features, None).unwrap(), Slots);
+            assert_eq!(chosen(features, None).unwrap(), expected, "{features:?}");
         }
         // What is asked for, or a refusal.
         for wanted in Accumulation::ALL {
-            assert_eq!(chosen(AdapterKind::Software, both, Some(wanted)).unwrap(), wanted);
+            assert_eq!(chosen(both, Some(wanted)).unwrap(), wanted);
             assert_eq!(Accumulation::of_name(wanted.name()), Some(wanted));
         }
         let told = |features, wanted| {
-            chosen(card, features, Some(wanted)).expect_err("it lacks something").to_string()
+            chosen(features, Some(wanted)).expect_err("it lacks something").to_string()
         };
         let without = told(subgroups, SubgroupAtomics);
         assert!(without.contains("Card lacks atomic addition of f32"), "{without}");

@@ -44,7 +44,7 @@ pub(super) struct State {
     pub(super) entries_low: u32,
     pub(super) entries_high: u32,
     pub(super) held: u32,
-    pub(super) spare: u32,
+    pub(super) broken_off: u32,
     pub(super) l1: f32,
     pub(super) ssim: f32,
     pub(super) spare_f: [f32; 2],

@@ -29,6 +29,7 @@ mod readback;
 mod signals;
 mod state;
 mod step;
+mod submit;
 mod transfer;
 
 use std::sync::Arc;
@@ -55,10 +56,9 @@ pub use device::GpuDevice;
 #[cfg(test)]
 pub(crate) use device::faults::with_device_lost_after;
 use edits::EditLaunches;
-use frame::{Frame, State};
+use frame::Frame;
 use launches::Launches;
 pub use options::GpuOptions;
-use passes::{Passes, Recorder, Shape};
 use photographs::Kept;
 pub use photographs::KeptPhotographs;
 use pipelines::{Pipelines, Variant};
@@ -233,42 +233,6 @@ impl GpuBackend {
         let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
         let of_model = [self.rows as u32, degree, self.sizes.cap as u32, self.budget as u32];
         Frame::of_view(camera, background, self.near, of_model)
-    }
-
-    /// Encodes and submits a view's passes until the bands that were encoded do, and returns the
-    /// state that they left, and how they were encoded. `encode` records everything.
-    fn run(
-        &mut self,
-        frame: &Frame,
-        encode: impl Fn(&Passes<'_>, &mut Recorder<'_, '_>),
-    ) -> Result<(State, Shape), BackendError> {
-        self.write("frame", bytemuck::bytes_of(frame));
-        let [rows, ..] = frame.model;
-        let tiles = frame.image[3];
-        loop {
-            let shape = Shape { rows, tiles, bands: self.bands };
-            let groups = self.buffers.get("groups");
-            let passes = Passes { launches: &self.launches, groups, shape };
-            let mut encoder = self.device.device.create_command_encoder(&Default::default());
-            if shape.bands > 1 {
-                encoder.clear_buffer(self.buffers.get("tile counts"), 0, None);
-            }
-            let pass = encoder.begin_compute_pass(&Default::default());
-            encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
-            let staging = self.buffers.get("read");
-            let bytes = size_of::<State>() as u64;
-            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, bytes);
-            let bytes = readback::finish(&self.device, staging, encoder, bytes)?;
-            let state: State = bytemuck::pod_read_unaligned(&bytes);
-            if state.short == 0 {
-                self.bands = state.bands.max(1);
-                return Ok((state, shape));
-            }
-            // One band was tried: a guess. Several: now the device has counted how many.
-            let guess = (2 * u64::from(state.total)).div_ceil(self.sizes.cap).max(2);
-            let needed = if shape.bands == 1 { guess } else { u64::from(state.bands) };
-            self.bands = needed.min(u64::from(tiles)) as u32;
-        }
     }
 }
 

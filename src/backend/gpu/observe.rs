@@ -9,7 +9,7 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateReques
 use super::GpuBackend;
 use super::buffers::OPS_BYTES;
 use super::frame::Frame;
-use super::passes::{Passes, Recorder, Search, Shape};
+use super::passes::{Search, Shape};
 use crate::backend::candidates::ranked;
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::backend::{AuxInput, AuxOutput, BackendError};
@@ -26,20 +26,6 @@ pub(super) struct Seen<'a> {
 }
 
 impl GpuBackend {
-    /// Encodes more passes over the view at hand and submits them.
-    pub(super) fn go_on(
-        &self,
-        shape: Shape,
-        encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_, '_>),
-    ) {
-        let groups = self.buffers.get("groups");
-        let passes = Passes { launches: &self.launches, groups, shape };
-        let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
-        self.device.queue.submit([encoder.finish()]);
-    }
-
     /// What to look for in a view of this size, if the device has room for what is found.
     pub(super) fn search(
         &self,

@@ -4,6 +4,7 @@
 //! Where there is no adapter, each test says so and passes, unless `DENSIFY_REQUIRE_GPU` is set.
 //! `VK_DRIVER_FILES` chooses drivers, several if need be.
 
+mod depth;
 mod edits;
 mod extremes;
 mod looking;

@@ -138,7 +138,7 @@ fn structs_lie_as_the_shaders_read_them() {
     assert_eq!((fields, span as usize), (frame.len(), size_of::<Frame>()));
     let (state, _) = offsets(&module, "State");
     let fields = check!(state, State, visible total bands short entries_low entries_high held
-        spare l1 ssim spare_f);
+        broken_off l1 ssim spare_f);
     assert_eq!(state["cuts"] as usize, size_of::<State>());
     assert_eq!(fields + 1, state.len());
 }

@@ -1,0 +1,76 @@
+//! A view's passes on their way to the device: encoded, submitted, and taken again where bands did not do.
+
+use super::accumulation::Accumulation;
+use super::frame::{Frame, State};
+use super::passes::{Passes, Recorder, Shape};
+use super::{GpuBackend, readback};
+use crate::backend::BackendError;
+
+impl GpuBackend {
+    /// Encodes and submits a view's passes until the bands that were encoded do, and returns the
+    /// state that they left, and how they were encoded. `encode` records everything.
+    pub(super) fn run(
+        &mut self,
+        frame: &Frame,
+        encode: impl Fn(&Passes<'_>, &mut Recorder<'_, '_>),
+    ) -> Result<(State, Shape), BackendError> {
+        self.write("frame", bytemuck::bytes_of(frame));
+        let [rows, ..] = frame.model;
+        let tiles = frame.image[3];
+        loop {
+            let shape = Shape { rows, tiles, bands: self.bands };
+            let groups = self.buffers.get("groups");
+            let passes = Passes { launches: &self.launches, groups, shape };
+            let mut encoder = self.device.device.create_command_encoder(&Default::default());
+            if shape.bands > 1 {
+                encoder.clear_buffer(self.buffers.get("tile counts"), 0, None);
+            }
+            let pass = encoder.begin_compute_pass(&Default::default());
+            encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
+            let staging = self.buffers.get("read");
+            let bytes = size_of::<State>() as u64;
+            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, bytes);
+            let bytes = readback::finish(&self.device, staging, encoder, bytes)?;
+            let state: State = bytemuck::pod_read_unaligned(&bytes);
+            if state.broken_off != 0 {
+                return Err(self.broken_off());
+            }
+            if state.short == 0 {
+                self.bands = state.bands.max(1);
+                return Ok((state, shape));
+            }
+            // One band was tried: a guess. Several: now the device has counted how many.
+            let guess = (2 * u64::from(state.total)).div_ceil(self.sizes.cap).max(2);
+            let needed = if shape.bands == 1 { guess } else { u64::from(state.bands) };
+            self.bands = needed.min(u64::from(tiles)) as u32;
+        }
+    }
+
+    /// Encodes more passes over the view at hand and submits them.
+    pub(super) fn go_on(
+        &self,
+        shape: Shape,
+        encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_, '_>),
+    ) {
+        let groups = self.buffers.get("groups");
+        let passes = Passes { launches: &self.launches, groups, shape };
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        let pass = encoder.begin_compute_pass(&Default::default());
+        encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
+        self.device.queue.submit([encoder.finish()]);
+    }
+
+    /// That the driver has not gone through all splats of a tile.
+    fn broken_off(&self) -> BackendError {
+        let remedy = match self.device.accumulation {
+            Accumulation::Slots => "",
+            _ => "; --knob accumulation=slots goes through more",
+        };
+        BackendError::Device {
+            device: self.device.summary.name.clone(),
+            why: format!(
+                "its driver ends loops before they have gone through the Gaussians of a tile{remedy}"
+            ),
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! Tiles of so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
+//! invocation after 65,535 rounds together, without a word. What comes then must be an error, not a model.
+
+use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient};
+use densify::backend::gpu::{Accumulation, GpuBackend, GpuDevice, GpuOptions};
+use densify::backend::{Backend, BackendError, Shortcuts};
+use densify::camera::Camera;
+use densify::gaussians::Gaussians;
+
+use super::{name, options, ways};
+use crate::compare::{Table, relative_error};
+use crate::{scenes, subject};
+
+const GREY: [f32; 3] = [0.3, 0.4, 0.6];
+/// Rows one behind the other, each of which all pixels of one tile take; what is behind all is still seen.
+fn pile(rows: usize, camera: &Camera) -> Gaussians {
+    let mut model = Gaussians::default();
+    let opacity = 5.0 / rows as f32;
+    for i in 0..rows {
+        let z = 2.0 + i as f64 / rows as f64;
+        let mean = scenes::world(camera, [0.01, -0.02, z]);
+        let logit = (opacity / (1.0 - opacity)).ln();
+        scenes::push(&mut model, mean, [20.0; 3], [1.0, 0.0, 0.0, 0.0], logit, |k| 0.1 * k as f32);
+    }
+    model
+}
+
+fn faint() -> Shortcuts {
+    Shortcuts { alpha_min: 1e-6, ..Shortcuts::default() }
+}
+
+fn backend(model: &Gaussians, device: &GpuDevice) -> GpuBackend {
+    let options = GpuOptions { shortcuts: faint(), ..options(model) };
+    GpuBackend::new(model, &options, device).expect("a small model fits")
+}
+
+fn native(model: &Gaussians) -> CpuBackend {
+    let options = CpuOptions { shortcuts: faint(), ..CpuOptions::new(model.len()) };
+    CpuBackend::new(model, &options).expect("a small model fits")
+}
+
+/// Holds that a driver that breaks off is found out, and that llvmpipe, which does, is.
+fn is_broken_off<T>(result: &Result<T, BackendError>, device: &GpuDevice, more: bool) -> bool {
+    let Err(error) = result else {
+        let breaks_off = device.adapter().name.contains("llvmpipe");
+        assert!(!breaks_off, "{} has gone through all of them", name(device));
+        return false;
+    };
+    let told = error.to_string();
+    for word in [&*device.adapter().name, "ends loops before they", "--backend cpu"] {
+        assert!(told.contains(word), "{word} is not in {told}");
+    }
+    assert_eq!(told.contains("--knob accumulation=slots"), more, "{told}");
+    true
+}
+
+#[test]
+fn a_list_too_long_to_be_drawn_is_an_error() {
+    let camera = scenes::camera(16, 16, 71);
+    let model = pile(300_000, &camera);
+    let expected = native(&model).render(&camera, GREY, 0).expect("a small image");
+    let mut table = Table::new("300,000 rows in a tile");
+    for device in ways() {
+        let found = backend(&model, device).render(&camera, GREY, 0);
+        let more = device.accumulation() != Accumulation::Slots;
+        if !is_broken_off(&found, device, more) {
+            let found = found.expect("it has gone through all").rgb;
+            let error = found.iter().zip(&expected.rgb).map(|(a, b)| (a - b).abs());
+            table.check(&name(device), "rgb", error.fold(0.0, f32::max).into(), 1e-3);
+        }
+    }
+    table.finish();
+}
+
+#[test]
+fn a_list_too_long_to_be_differentiated_is_an_error() {
+    let camera = scenes::camera(16, 16, 72);
+    let model = pile(30_000, &camera);
+    let upstream = ImageGradient {
+        rgb: (0..3 * 256).map(|i| (i % 7) as f32 - 2.5).collect(),
+        alpha: vec![0.5; 256],
+        depth: vec![-0.25; 256],
+    };
+    let (_, expected) =
+        native(&model).differentiate(&camera, GREY, 0, &upstream).expect("a small image");
+    let mut table = Table::new("30,000 rows in a tile");
+    for device in ways() {
+        let found = backend(&model, device).differentiate(&camera, GREY, 0, &upstream);
+        if device.accumulation() != Accumulation::Slots && is_broken_off(&found, device, true) {
+            continue;
+        }
+        let (_, found) = found.expect("slots go through so many");
+        for class in ["means", "opacity_logits", "sh"] {
+            let expected = subject::class(&expected, class).iter().copied().map(f64::from);
+            let expected: Vec<f64> = expected.collect();
+            let error = relative_error(subject::class(&found, class), &expected);
+            table.check(&name(device), class, error, 1e-3);
+        }
+    }
+    table.finish();
+}
