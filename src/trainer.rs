@@ -375,7 +375,15 @@ impl<V: ViewSource> Trainer<V> {
     /// # Errors
     /// See [`BackendError`].
     pub fn model(&self) -> Result<Gaussians, BackendError> {
-        let model = self.backend.download()?;
+        self.model_rows(0..self.backend.rows())
+    }
+
+    /// Some rows of the [`model`](Self::model), which must be there.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    pub fn model_rows(&self, rows: std::ops::Range<usize>) -> Result<Gaussians, BackendError> {
+        let model = self.backend.download_rows(rows)?;
         Ok(match &self.earned {
             Some(earned) => model.up_to_degree(earned.degree),
             None => model,

@@ -13,6 +13,7 @@ mod signal_planes;
 mod state;
 mod storage;
 
+use std::ops::Range;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
@@ -26,6 +27,7 @@ use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
 pub use shortcuts::{Exp2, Shortcuts, Stepped};
+pub(crate) use state::{ROWS_AT_A_TIME, pieces};
 pub use state::{StateError, Tensor, Values};
 pub use storage::{MomentStorage, ParameterStorage, Storage};
 
@@ -291,11 +293,26 @@ pub trait Backend: Send {
     ///
     /// # Errors
     /// See [`BackendError`].
-    fn download(&self) -> Result<Gaussians, BackendError>;
+    fn download(&self) -> Result<Gaussians, BackendError> {
+        self.download_rows(0..self.rows())
+    }
+
+    /// Copies some rows of the model to the host.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When there are no such rows: a bug in the caller.
+    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError>;
 
     /// Names of the arrays that hold, beside the model, all that the future depends on: moments,
     /// ages, accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.
     fn state(&self) -> Vec<String>;
+
+    /// Whether the first side of an array of [`state`](Self::state) is that of the rows, so that it can
+    /// be taken in pieces. All others are small.
+    fn is_by_rows(&self, name: &str) -> bool;
 
     /// Copies one array of [`state`](Self::state) to the host.
     ///
@@ -304,7 +321,19 @@ pub trait Backend: Send {
     ///
     /// # Panics
     /// When there is no such array: a bug in the caller.
-    fn save(&self, name: &str) -> Result<Tensor, BackendError>;
+    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
+        self.save_rows(name, 0..self.rows())
+    }
+
+    /// Copies some rows of an array to the host; one that is not [by rows](Self::is_by_rows) is whole,
+    /// whatever the rows.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When there is no such array, or there are no such rows: a bug in the caller.
+    fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError>;
 
     /// Takes back what [`save`](Self::save) returned, into a backend made with the same options for
     /// the [model](Self::download) of that moment. When all arrays are back, the future is the same
@@ -313,7 +342,18 @@ pub trait Backend: Send {
     /// # Errors
     /// [`StateError`] when this backend has no such array, or one of another type or shape. The
     /// array may come from a file that cannot be trusted.
-    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError>;
+    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
+        self.restore_rows(tensor, 0..self.rows())
+    }
+
+    /// Takes back what [`save_rows`](Self::save_rows) returned for the same rows.
+    ///
+    /// # Errors
+    /// As [`restore`](Self::restore).
+    ///
+    /// # Panics
+    /// When there are no such rows: a bug in the caller.
+    fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError>;
 
     /// Wall time of each stage of the last step, in order; a stage that ran more than once stands
     /// there as often.

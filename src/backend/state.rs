@@ -6,6 +6,16 @@
 //! opacity logit 1, then three per spherical-harmonic coefficient (red, green, blue).
 
 use std::io;
+use std::ops::Range;
+
+/// Rows of an array, or of the model, that go to a file at a time: a few megabytes.
+pub(crate) const ROWS_AT_A_TIME: usize = if cfg!(test) { 48 } else { 1 << 14 };
+
+/// So many rows, cut into pieces of [`ROWS_AT_A_TIME`]; one empty piece of none.
+pub(crate) fn pieces(rows: usize) -> impl Iterator<Item = Range<usize>> {
+    let starts = (0..rows.max(1)).step_by(ROWS_AT_A_TIME);
+    starts.map(move |start| start..rows.min(start + ROWS_AT_A_TIME))
+}
 
 /// Values that are converted to bytes at a time.
 const ENCODED: usize = 1 << 14;

@@ -21,10 +21,14 @@ mod fingerprint;
 mod folder;
 mod format;
 mod model;
+mod read;
+mod write;
 
 pub use fingerprint::{Fingerprint, ViewsPrint};
 pub use folder::{checkpoint_path, newest, tidy};
-pub use format::{Checkpoint, VERSION, write};
+pub use format::VERSION;
+pub use read::Checkpoint;
+pub use write::write;
 
 use std::path::{Path, PathBuf};
 
@@ -89,9 +93,9 @@ impl CheckpointError {
         Self::Invalid { path: path.to_owned(), problem: problem.to_string() }
     }
 
-    fn state(path: &Path) -> impl FnOnce(StateError) -> Self {
+    fn state(path: &Path) -> impl Fn(StateError) -> Self + use<> {
         let path = path.to_owned();
-        move |error| Self::Invalid { path, problem: error.to_string() }
+        move |error| Self::Invalid { path: path.clone(), problem: error.to_string() }
     }
 }
 

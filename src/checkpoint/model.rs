@@ -8,18 +8,17 @@ use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 pub(super) const NAMES: [&str; 5] =
     ["model.means", "model.log_scales", "model.quats", "model.opacity_logits", "model.sh"];
 
-/// The arrays of [`NAMES`]. None is copied: a model may be most of what there is memory for.
-pub(super) fn tensors(model: Gaussians) -> [Tensor; NAMES.len()] {
+/// One of the arrays of [`NAMES`], of some rows.
+pub(super) fn tensor(which: usize, model: Gaussians) -> Tensor {
     let rows = model.len();
-    let [means, log_scales, quats, opacity_logits, sh] = NAMES;
-    let coefficients = sh_coefficients(model.sh_degree);
-    [
-        Tensor::f32(means, &[rows, 3], model.means.into_flattened()),
-        Tensor::f32(log_scales, &[rows, 3], model.log_scales.into_flattened()),
-        Tensor::f32(quats, &[rows, 4], model.quats.into_flattened()),
-        Tensor::f32(opacity_logits, &[rows], model.opacity_logits),
-        Tensor::f32(sh, &[rows, coefficients, 3], model.sh),
-    ]
+    let name = NAMES[which];
+    match which {
+        0 => Tensor::f32(name, &[rows, 3], model.means.into_flattened()),
+        1 => Tensor::f32(name, &[rows, 3], model.log_scales.into_flattened()),
+        2 => Tensor::f32(name, &[rows, 4], model.quats.into_flattened()),
+        3 => Tensor::f32(name, &[rows], model.opacity_logits),
+        _ => Tensor::f32(name, &[rows, sh_coefficients(model.sh_degree), 3], model.sh),
+    }
 }
 
 /// The model of so many rows, from a source of arrays by name.

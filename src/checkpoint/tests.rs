@@ -11,13 +11,14 @@ use safetensors::SafeTensors;
 
 use super::*;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
-use crate::backend::{Backend, Tensor, Values};
+use crate::backend::{Backend, ROWS_AT_A_TIME, Tensor, Values};
 use crate::dataset::normalise::Normalisation;
 use crate::gaussians::Gaussians;
 use crate::output::{InitChoice, PolicyConfig, SceneConfig, TrainConfig};
 use crate::schedule::{Background, RateOptions};
 
-const ROWS: usize = 21;
+/// More than go to the file at a time.
+const ROWS: usize = ROWS_AT_A_TIME + 13;
 
 fn numbers(count: usize, seed: f32) -> Vec<f32> {
     (0..count).map(|i| ((i as f32 + seed) * 0.7131).sin()).collect()
@@ -242,13 +243,14 @@ fn a_state_of_another_run_is_refused_by_name() {
     refused(more, "there is no tensor `signals.PixelCount`");
     let mut less = options();
     less.needs.cadence = Cadence { all: 1, sh_rest: 4 };
-    refused(less, "`summed.gradients`: its shape is [21, 23]; this run needs [21, 9]");
+    // Of the rows that are read first.
+    refused(less, "`summed.gradients`: its shape is [48, 23]; this run needs [48, 9]");
     let mut fewer = options();
     fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
     refused(fewer, "`candidates`: 4 of them; this run holds 3");
     // A model larger than its own budget, or of a degree that there is not.
     for (budget, sh_degree, words) in
-        [(20, 1, "21 rows, but its budget is 20"), (24, 9, "at most 3")]
+        [(60, 1, "61 rows, but its budget is 60"), (64, 9, "at most 3")]
     {
         let mut header = header();
         (header.config.train.budget, header.config.train.sh_degree) = (budget, sh_degree);

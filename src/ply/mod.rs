@@ -11,7 +11,7 @@ mod splats;
 use std::path::{Path, PathBuf};
 
 pub use points::read_points;
-pub use splats::{SplatFile, read_splats, write_splats};
+pub use splats::{SplatFile, read_splats, write_splat_header, write_splat_rows, write_splats};
 
 /// Why a PLY file cannot be used.
 #[derive(Debug, thiserror::Error)]

@@ -127,9 +127,17 @@ fn degree(path: &Path, vertices: &Element) -> Result<u8, PlyError> {
 /// # Errors
 /// What `out` says.
 pub fn write_splats(model: &Gaussians, out: &mut impl Write) -> io::Result<()> {
-    let coefficients = sh_coefficients(model.sh_degree);
-    let mut header =
-        format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", model.len());
+    write_splat_header(model.len(), model.sh_degree, out)?;
+    write_splat_rows(model, out)
+}
+
+/// Writes what comes before the rows in a splat PLY of so many rows of a degree.
+///
+/// # Errors
+/// What `out` says.
+pub fn write_splat_header(rows: usize, sh_degree: u8, out: &mut impl Write) -> io::Result<()> {
+    let coefficients = sh_coefficients(sh_degree);
+    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
     for (index, name) in layout(3 * (coefficients - 1)).enumerate() {
         if index == 3 {
             for normal in ["nx", "ny", "nz"] {
@@ -139,8 +147,15 @@ pub fn write_splats(model: &Gaussians, out: &mut impl Write) -> io::Result<()> {
         header += &format!("property float {name}\n");
     }
     header += "end_header\n";
-    out.write_all(header.as_bytes())?;
+    out.write_all(header.as_bytes())
+}
 
+/// Writes some rows of the model whose [header](write_splat_header) has been written.
+///
+/// # Errors
+/// What `out` says.
+pub fn write_splat_rows(model: &Gaussians, out: &mut impl Write) -> io::Result<()> {
+    let coefficients = sh_coefficients(model.sh_degree);
     let mut chunk = Vec::with_capacity(CHUNK * 4 * (14 + 3 * coefficients));
     for row in 0..model.len() {
         let mut put = |value: f32| chunk.extend_from_slice(&value.to_le_bytes());

@@ -56,6 +56,25 @@ fn splats_make_the_round_trip_bit_for_bit() {
 }
 
 #[test]
+fn rows_in_pieces_make_the_same_file() {
+    let whole = model(300, 2);
+    let part = |rows: std::ops::Range<usize>| Gaussians {
+        sh_degree: 2,
+        means: whole.means[rows.clone()].to_vec(),
+        log_scales: whole.log_scales[rows.clone()].to_vec(),
+        quats: whole.quats[rows.clone()].to_vec(),
+        opacity_logits: whole.opacity_logits[rows.clone()].to_vec(),
+        sh: whole.sh[27 * rows.start..27 * rows.end].to_vec(),
+    };
+    let mut bytes = Vec::new();
+    write_splat_header(300, 2, &mut bytes).unwrap();
+    for rows in [0..0, 0..7, 7..270, 270..300] {
+        write_splat_rows(&part(rows), &mut bytes).unwrap();
+    }
+    assert!(bytes == written(&whole));
+}
+
+#[test]
 fn the_layout_is_the_original_one() {
     let mut one = model(1, 1);
     one.sh = (0..12u8).map(f32::from).collect();

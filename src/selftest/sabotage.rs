@@ -2,6 +2,7 @@
 //! case must be one that some error moves beyond its tolerance.
 
 use std::collections::BTreeSet;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use std::time::Duration;
 
@@ -174,8 +175,8 @@ impl Backend for Saboteur {
         self.spoil_image(&mut image);
         Ok(image)
     }
-    fn download(&self) -> Result<Gaussians, BackendError> {
-        let mut model = self.inner.download()?;
+    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+        let mut model = self.inner.download_rows(rows)?;
         if self.how == Sabotage::Model {
             model.means.as_flattened_mut().iter_mut().for_each(|x| *x += 1.0);
             model.log_scales.as_flattened_mut().fill(50.0);
@@ -188,11 +189,14 @@ impl Backend for Saboteur {
     fn state(&self) -> Vec<String> {
         self.inner.state()
     }
-    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
-        self.inner.save(name)
+    fn is_by_rows(&self, name: &str) -> bool {
+        self.inner.is_by_rows(name)
     }
-    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
-        self.inner.restore(tensor)
+    fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {
+        self.inner.save_rows(name, rows)
+    }
+    fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError> {
+        self.inner.restore_rows(tensor, rows)
     }
     fn stage_times(&self) -> &[(&'static str, Duration)] {
         self.inner.stage_times()

@@ -101,16 +101,23 @@ impl Backend for CountingBackend {
     ) -> Result<Rendering, BackendError> {
         Err(BackendError::ImageTooLarge { width: camera.width, height: camera.height, max: 0 })
     }
-    fn download(&self) -> Result<Gaussians, BackendError> {
-        Ok(Gaussians { means: vec![[0.0; 3]; self.rows], ..Gaussians::default() })
+    fn download_rows(&self, rows: std::ops::Range<usize>) -> Result<Gaussians, BackendError> {
+        Ok(Gaussians { means: vec![[0.0; 3]; rows.len()], ..Gaussians::default() })
     }
     fn state(&self) -> Vec<String> {
         Vec::new()
     }
-    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
+    fn is_by_rows(&self, _: &str) -> bool {
+        false
+    }
+    fn save_rows(&self, name: &str, _: std::ops::Range<usize>) -> Result<Tensor, BackendError> {
         panic!("{name} is not kept")
     }
-    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
+    fn restore_rows(
+        &mut self,
+        tensor: Tensor,
+        _: std::ops::Range<usize>,
+    ) -> Result<(), StateError> {
         Err(tensor.error("nothing is kept"))
     }
 

@@ -243,15 +243,19 @@ impl<T: Copy + Default> Blocks<T> {
         self.shape = shape;
     }
 
-    /// Some planes of the first `rows` rows, row by row. Shape: `[rows, planes.len()]`.
-    pub(super) fn to_rows(&self, rows: usize, planes: Range<usize>) -> Vec<T> {
-        (0..rows).flat_map(|row| planes.clone().map(move |p| self.get(row, p))).collect()
+    /// Some planes of some rows, row by row. Shape: `[rows.len(), planes.len()]`.
+    pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<T> {
+        let mut values = Vec::with_capacity(rows.len() * planes.len());
+        for row in rows {
+            values.extend(planes.clone().map(|plane| self.get(row, plane)));
+        }
+        values
     }
 
     /// The opposite of [`to_rows`](Self::to_rows).
-    pub(super) fn set_rows(&mut self, rows: usize, planes: Range<usize>, values: &[T]) {
+    pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[T]) {
         let mut values = values.iter();
-        for row in 0..rows {
+        for row in rows {
             for (plane, &value) in planes.clone().zip(&mut values) {
                 self.set(row, plane, value);
             }

@@ -36,6 +36,7 @@ mod state;
 mod summed;
 mod tiles;
 
+use std::ops::Range;
 use std::sync::atomic::AtomicU32;
 use std::time::Duration;
 
@@ -370,20 +371,27 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
-    fn download(&self) -> Result<Gaussians, BackendError> {
-        Ok(self.params.unpack(self.rows, self.sh_degree))
+    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        Ok(self.params.unpack(rows, self.sh_degree))
     }
 
     fn state(&self) -> Vec<String> {
         self.state_names()
     }
 
-    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
-        Ok(self.state_tensor(name))
+    fn is_by_rows(&self, name: &str) -> bool {
+        Self::state_is_by_rows(name)
     }
 
-    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
-        self.restore_tensor(tensor)
+    fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        Ok(self.state_tensor(name, rows))
+    }
+
+    fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.restore_tensor(tensor, rows)
     }
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {

@@ -5,6 +5,8 @@
 //! alone gives ratios of about 0.23, to whose variance the rounding adds a twentieth; it has no
 //! scale that neighbours would share, and so none that a neighbour could spoil.
 
+use std::ops::Range;
+
 use super::blocks::{BlockTask, BlockView, Blocks, Degrees, Scratch};
 use super::narrow::{Bf16, Draws, Narrow, first_moment, first_moments, narrow, ratios, widen};
 use super::simd::WIDTH;
@@ -149,12 +151,18 @@ impl Moments {
         }
     }
 
-    /// The first (0) or second (1) moments of the first `rows` rows, as they are stored: numbers,
-    /// the bits of bfloat16, or ratios in two's complement. Shape: `[rows, planes]`.
-    pub(super) fn tensor(&self, which: usize, name: &str, rows: usize, planes: usize) -> Tensor {
-        let shape = [rows, planes];
+    /// The first (0) or second (1) moments of some rows, as they are stored: numbers, the bits of
+    /// bfloat16, or ratios in two's complement. Shape: `[rows.len(), planes]`.
+    pub(super) fn tensor(
+        &self,
+        which: usize,
+        name: &str,
+        rows: Range<usize>,
+        planes: usize,
+    ) -> Tensor {
+        let shape = [rows.len(), planes];
         let halves = |blocks: &Blocks<Bf16>| {
-            let bits = blocks.to_rows(rows, 0..planes).into_iter().map(|x| x.0).collect();
+            let bits = blocks.to_rows(rows.clone(), 0..planes).into_iter().map(|x| x.0).collect();
             Tensor::u16(name, &shape, bits)
         };
         match (self, which) {
@@ -172,14 +180,14 @@ impl Moments {
     pub(super) fn restore(
         &mut self,
         which: usize,
-        rows: usize,
+        rows: Range<usize>,
         planes: usize,
         tensor: Tensor,
     ) -> Result<(), StateError> {
-        let shape = [rows, planes];
+        let shape = [rows.len(), planes];
         let halves = |blocks: &mut Blocks<Bf16>, tensor: Tensor| {
             let bits: Vec<Bf16> = tensor.into_u16(&shape)?.into_iter().map(Bf16).collect();
-            blocks.set_rows(rows, 0..planes, &bits);
+            blocks.set_rows(rows.clone(), 0..planes, &bits);
             Ok(())
         };
         match (self, which) {

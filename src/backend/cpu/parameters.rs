@@ -162,18 +162,20 @@ impl Parameters {
         }
     }
 
-    /// The first `rows` rows as a host model.
-    pub(super) fn unpack(&self, rows: usize, sh_degree: u8) -> Gaussians {
+    /// Some rows as a host model.
+    pub(super) fn unpack(&self, rows: Range<usize>, sh_degree: u8) -> Gaussians {
         let sh_planes = 3 * sh_coefficients(sh_degree);
+        let mut sh = Vec::with_capacity(rows.len() * sh_planes);
+        for row in rows.clone() {
+            sh.extend((0..sh_planes).map(|i| self.get(row, plane::SH + i)));
+        }
         Gaussians {
             sh_degree,
-            means: (0..rows).map(|r| self.get_n(r, plane::MEAN)).collect(),
-            log_scales: (0..rows).map(|r| self.get_n(r, plane::LOG_SCALE)).collect(),
-            quats: (0..rows).map(|r| self.get_n(r, plane::QUAT)).collect(),
-            opacity_logits: (0..rows).map(|r| self.get(r, plane::OPACITY)).collect(),
-            sh: (0..rows)
-                .flat_map(|r| (0..sh_planes).map(move |i| self.get(r, plane::SH + i)))
-                .collect(),
+            means: rows.clone().map(|r| self.get_n(r, plane::MEAN)).collect(),
+            log_scales: rows.clone().map(|r| self.get_n(r, plane::LOG_SCALE)).collect(),
+            quats: rows.clone().map(|r| self.get_n(r, plane::QUAT)).collect(),
+            opacity_logits: rows.map(|r| self.get(r, plane::OPACITY)).collect(),
+            sh,
         }
     }
 

@@ -1,9 +1,12 @@
 //! The native backend's state as named arrays. Each stage that keeps something between steps says
 //! what it is; lanes beyond the last row are nobody's and are left out.
 
+use std::ops::Range;
+
 use super::CpuBackend;
 use super::blocks::planes;
 use super::signals::Accumulators;
+use super::summed::Summed;
 use crate::backend::{StateError, Tensor};
 
 const DEGREES: &str = "degrees";
@@ -30,10 +33,16 @@ impl CpuBackend {
         names
     }
 
+    pub(super) fn state_is_by_rows(name: &str) -> bool {
+        match name.strip_prefix(SUMMED) {
+            Some(part) => Summed::is_by_rows(part),
+            None => ![DEGREES, CANDIDATES].contains(&name),
+        }
+    }
+
     /// # Panics
     /// When there is no such array: a bug in the caller.
-    pub(super) fn state_tensor(&self, name: &str) -> Tensor {
-        let rows = self.rows;
+    pub(super) fn state_tensor(&self, name: &str, rows: Range<usize>) -> Tensor {
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
             return self.moments.tensor(i, name, rows, planes);
@@ -42,21 +51,25 @@ impl CpuBackend {
             return self.degrees_tensor(name);
         }
         if name == AGES {
-            return Tensor::u16(name, &[rows], self.ages[..rows].to_vec());
+            return Tensor::u16(name, &[rows.len()], self.ages[rows].to_vec());
         }
         if name == CANDIDATES {
             return self.candidates.tensor(name);
         }
         if let Some(plane) = signal_plane(&self.signals, name) {
+            let shape = [rows.len()];
             let values = self.signals.blocks.to_rows(rows, plane..plane + 1);
-            return Tensor::f32(name, &[rows], values);
+            return Tensor::f32(name, &shape, values);
         }
         let summed = name.strip_prefix(SUMMED).and_then(|part| self.summed.tensor(part, rows));
         summed.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"))
     }
 
-    pub(super) fn restore_tensor(&mut self, tensor: Tensor) -> Result<(), StateError> {
-        let rows = self.rows;
+    pub(super) fn restore_tensor(
+        &mut self,
+        tensor: Tensor,
+        rows: Range<usize>,
+    ) -> Result<(), StateError> {
         let name = tensor.name.clone();
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
@@ -64,12 +77,12 @@ impl CpuBackend {
         } else if name == DEGREES && self.shortcuts.row_degrees.is_some() {
             self.restore_degrees(tensor)?;
         } else if name == AGES {
-            let ages = tensor.into_u16(&[rows])?;
-            self.ages[..rows].copy_from_slice(&ages);
+            let ages = tensor.into_u16(&[rows.len()])?;
+            self.ages[rows].copy_from_slice(&ages);
         } else if name == CANDIDATES && self.candidates.is_wanted() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = signal_plane(&self.signals, &name) {
-            let values = tensor.into_f32(&[rows])?;
+            let values = tensor.into_f32(&[rows.len()])?;
             self.signals.blocks.set_rows(rows, plane..plane + 1, &values);
         } else if let Some(part) = name.strip_prefix(SUMMED) {
             self.summed.restore(part, rows, tensor)?;

@@ -119,19 +119,27 @@ impl Summed {
         }
     }
 
+    /// Whether an array of the state is by rows.
+    pub(super) fn is_by_rows(part: &str) -> bool {
+        part != WAITING
+    }
+
     /// An array of the state: sums `[rows, summed planes]`, who waits `[2]`, ages of bands 1–3
     /// `[rows]`.
-    pub(super) fn tensor(&self, part: &str, rows: usize) -> Option<Tensor> {
+    pub(super) fn tensor(&self, part: &str, rows: Range<usize>) -> Option<Tensor> {
         let planes = self.planes();
         let name = format!("summed.{part}");
         let part = self.state().iter().find(|known| **known == part)?;
         Some(match *part {
-            GRADIENTS => Tensor::f32(name, &[rows, planes], self.sums.to_rows(rows, 0..planes)),
+            GRADIENTS => {
+                let shape = [rows.len(), planes];
+                Tensor::f32(name, &shape, self.sums.to_rows(rows, 0..planes))
+            }
             WAITING => {
                 let Due { main, rest, .. } = self.pending;
                 Tensor::u8(name, &[2], vec![u8::from(main), u8::from(rest)])
             }
-            _ => Tensor::u16(name, &[rows], self.rest_ages[..rows].to_vec()),
+            _ => Tensor::u16(name, &[rows.len()], self.rest_ages[rows].to_vec()),
         })
     }
 
@@ -139,14 +147,14 @@ impl Summed {
     pub(super) fn restore(
         &mut self,
         part: &str,
-        rows: usize,
+        rows: Range<usize>,
         tensor: Tensor,
     ) -> Result<(), StateError> {
         let planes = self.planes();
         match self.state().iter().find(|known| **known == part) {
             None => return Err(tensor.error("this run keeps nothing of that name")),
             Some(&GRADIENTS) => {
-                let values = tensor.into_f32(&[rows, planes])?;
+                let values = tensor.into_f32(&[rows.len(), planes])?;
                 self.sums.set_rows(rows, 0..planes, &values);
             }
             Some(&WAITING) => {
@@ -155,8 +163,8 @@ impl Summed {
                 self.pending = Due { main, rest, waited: [false; 2] };
             }
             Some(_) => {
-                let ages = tensor.into_u16(&[rows])?;
-                self.rest_ages[..rows].copy_from_slice(&ages);
+                let ages = tensor.into_u16(&[rows.len()])?;
+                self.rest_ages[rows].copy_from_slice(&ages);
             }
         }
         Ok(())

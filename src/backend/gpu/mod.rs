@@ -32,6 +32,7 @@ mod step;
 mod submit;
 mod transfer;
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -291,7 +292,8 @@ impl Backend for GpuBackend {
                 Signal::Age => self.present(3)?,
                 sum => {
                     let planes = self.planes.of(sum).into_iter();
-                    let columns: Result<Vec<_>, _> = planes.map(|p| self.column(p)).collect();
+                    let columns: Result<Vec<_>, _> =
+                        planes.map(|p| self.column(p, 0..self.rows)).collect();
                     let most = |a: Vec<f32>, b: Vec<f32>| {
                         a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect()
                     };
@@ -341,20 +343,27 @@ impl Backend for GpuBackend {
         self.rendering(camera.width, camera.height)
     }
 
-    fn download(&self) -> Result<Gaussians, BackendError> {
-        self.model()
+    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.model(rows)
     }
 
     fn state(&self) -> Vec<String> {
         self.state_names()
     }
 
-    fn save(&self, name: &str) -> Result<Tensor, BackendError> {
-        self.state_tensor(name)
+    fn is_by_rows(&self, name: &str) -> bool {
+        Self::state_is_by_rows(name)
     }
 
-    fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
-        self.restore_tensor(tensor)
+    fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.state_tensor(name, rows)
+    }
+
+    fn restore_rows(&mut self, tensor: Tensor, rows: Range<usize>) -> Result<(), StateError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.restore_tensor(tensor, rows)
     }
 
     fn stage_times(&self) -> &[(&'static str, Duration)] {

@@ -3,6 +3,8 @@
 //! They are named after the device, so that the native backend, whose sums have another order, does
 //! not go on from them unasked.
 
+use std::ops::Range;
+
 use super::GpuBackend;
 use super::buffers::{FIRST_SH, SECOND_SH, WAITING_SH, band_coefficients};
 use crate::backend::{BackendError, StateError, Tensor};
@@ -58,9 +60,17 @@ impl GpuBackend {
         names
     }
 
+    pub(super) fn state_is_by_rows(name: &str) -> bool {
+        ![WAITS, CANDIDATES].contains(&name)
+    }
+
     /// # Panics
     /// When there is no such array: a bug in the caller.
-    pub(super) fn state_tensor(&self, name: &str) -> Result<Tensor, BackendError> {
+    pub(super) fn state_tensor(
+        &self,
+        name: &str,
+        rows: Range<usize>,
+    ) -> Result<Tensor, BackendError> {
         if name == WAITS {
             let waits = [self.waiting.main, self.waiting.rest].map(u8::from);
             return Ok(Tensor::u8(name, &[2], waits.to_vec()));
@@ -69,22 +79,27 @@ impl GpuBackend {
             return Ok(self.candidates.tensor(name));
         }
         if let Some(plane) = self.signal(name) {
-            return Ok(Tensor::f32(name, &[self.rows], self.column(plane)?));
+            return Ok(Tensor::f32(name, &[rows.len()], self.column(plane, rows)?));
         }
         let found = self.buffer(name);
         let (buffer, numbers) =
             found.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
         // Ages are whole numbers in the same four bytes.
-        let values = self.read(buffer, 0, 4 * (numbers * self.rows) as u64)?;
+        let of_row = 4 * numbers as u64;
+        let values = self.read(buffer, of_row * rows.start as u64, of_row * rows.len() as u64)?;
         if buffer == AGES {
             let bytes = bytemuck::cast_slice(&values).to_vec();
-            return Ok(Tensor::u8(name, &[self.rows, 4], bytes));
+            return Ok(Tensor::u8(name, &[rows.len(), 4], bytes));
         }
-        Ok(Tensor::f32(name, &[self.rows, numbers], values))
+        Ok(Tensor::f32(name, &[rows.len(), numbers], values))
     }
 
-    pub(super) fn restore_tensor(&mut self, tensor: Tensor) -> Result<(), StateError> {
-        let rows = self.rows;
+    pub(super) fn restore_tensor(
+        &mut self,
+        tensor: Tensor,
+        rows: Range<usize>,
+    ) -> Result<(), StateError> {
+        let first = rows.start as u64;
         let name = tensor.name.clone();
         if name == WAITS {
             let waits = tensor.into_u8(&[2])?;
@@ -93,15 +108,16 @@ impl GpuBackend {
         } else if name == CANDIDATES && self.candidates.is_wanted() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal(&name) {
-            let values = tensor.into_f32(&[rows])?;
-            self.write_at("signals", u64::from(plane) * 4 * self.sizes.budget, &values);
+            let values = tensor.into_f32(&[rows.len()])?;
+            let start = u64::from(plane) * self.sizes.budget + first;
+            self.write_at("signals", 4 * start, &values);
         } else if let Some((buffer, numbers)) = self.buffer(&name) {
             if buffer == AGES {
-                let ages = tensor.into_u8(&[rows, 4])?;
-                self.write(buffer, &ages);
+                let ages = tensor.into_u8(&[rows.len(), 4])?;
+                self.write_at(buffer, 4 * first, &ages);
             } else {
-                let values = tensor.into_f32(&[rows, numbers])?;
-                self.write_at(buffer, 0, &values);
+                let values = tensor.into_f32(&[rows.len(), numbers])?;
+                self.write_at(buffer, 4 * numbers as u64 * first, &values);
             }
         } else {
             return Err(tensor.error("this run keeps nothing of that name"));

@@ -1,5 +1,7 @@
 //! Between host and device: the model, photographs, rendered images, and columns of numbers.
 
+use std::ops::Range;
+
 use super::buffers::{SH, band_coefficients};
 use super::frame::target;
 use super::passes::Recorder;
@@ -10,13 +12,11 @@ use crate::gaussians::Gaussians;
 
 impl GpuBackend {
     pub(super) fn write(&self, name: &str, bytes: &[u8]) {
-        if !bytes.is_empty() {
-            self.device.queue.write_buffer(self.buffers.get(name), 0, bytes);
-        }
+        self.write_at(name, 0, bytes);
     }
 
     /// Writes numbers from byte `at` on.
-    pub(super) fn write_at(&self, name: &str, at: u64, values: &[f32]) {
+    pub(super) fn write_at(&self, name: &str, at: u64, values: &[impl bytemuck::NoUninit]) {
         if !values.is_empty() {
             let bytes = bytemuck::cast_slice(values);
             self.device.queue.write_buffer(self.buffers.get(name), at, bytes);
@@ -85,18 +85,19 @@ impl GpuBackend {
         })
     }
 
-    /// The model.
-    pub(super) fn model(&self) -> Result<Gaussians, BackendError> {
-        let n = self.rows as u64;
-        let rows = self.read("rows", 0, 48 * n)?;
-        let rows = rows.as_chunks::<12>().0;
+    /// Some rows of the model.
+    pub(super) fn model(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+        let (first_row, n) = (rows.start as u64, rows.len() as u64);
         let sh_degree = self.sizes.sh_degree;
         let planes = self.sizes.sh_numbers();
-        let mut sh = vec![0.0; planes * self.rows];
+        let mut sh = vec![0.0; planes * rows.len()];
+        let rows = self.read("rows", 48 * first_row, 48 * n)?;
+        let rows = rows.as_chunks::<12>().0;
         let mut first = 0;
         for (band, name) in SH.into_iter().enumerate().take(usize::from(sh_degree) + 1) {
             let numbers = 3 * band_coefficients(band);
-            let values = self.read(name, 0, 4 * n * numbers as u64)?;
+            let bytes = 4 * numbers as u64;
+            let values = self.read(name, bytes * first_row, bytes * n)?;
             for (row, values) in values.chunks_exact(numbers).enumerate() {
                 sh[row * planes + first..][..numbers].copy_from_slice(values);
             }
@@ -112,10 +113,10 @@ impl GpuBackend {
         })
     }
 
-    /// A column of one plane of numbers.
-    pub(super) fn column(&self, plane: u32) -> Result<Vec<f32>, BackendError> {
-        let pitch = 4 * self.sizes.budget;
-        self.read("signals", u64::from(plane) * pitch, 4 * self.rows as u64)
+    /// Some rows of the column of one plane of numbers.
+    pub(super) fn column(&self, plane: u32, rows: Range<usize>) -> Result<Vec<f32>, BackendError> {
+        let start = u64::from(plane) * self.sizes.budget + rows.start as u64;
+        self.read("signals", 4 * start, 4 * rows.len() as u64)
     }
 
     /// A column of present values; see `present` in `shaders/signals.wgsl`.

@@ -11,6 +11,7 @@ use super::choices::parameters;
 use super::degree::{Degree, ShDegree, check_full};
 use super::setup::{DECODERS, random_count};
 use super::size::Budget;
+use crate::backend::ROWS_AT_A_TIME;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::backend::gpu::{Accumulation, GpuBackend, GpuDevice, GpuOptions, KeptPhotographs};
 use crate::cli::console::Console;
@@ -269,8 +270,9 @@ impl Survey {
         let points = args.init_points.unwrap_or(self.dataset.points.len()) as u64;
         pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
         pass("a policy's event", self.event_bytes(setting, needs));
-        // The model, and as much again: of arrays that are freed, allocators keep some for a while.
-        pass("export of the model, checkpoint", 2 * budget * row);
+        // So many rows, and as much again: of arrays that are freed, allocators keep some for a while.
+        let piece = budget.min(ROWS_AT_A_TIME as u64);
+        pass("export of the model, checkpoint", 2 * piece * row);
         let measures_test = !self.dataset.test.is_empty();
         if measures_test || self.required != Required::default() {
             let (width, height) = scene::largest_image(&self.dataset);

@@ -3,6 +3,7 @@
 mod choices;
 mod degree;
 mod demand;
+mod export;
 mod interrupt;
 pub(super) mod plan;
 mod resume;

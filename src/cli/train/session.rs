@@ -8,6 +8,7 @@ use std::time::Instant;
 use cpu_time::ProcessTime;
 
 use super::TrainArgs;
+use super::export::export;
 use super::interrupt::{Interrupt, Interrupts};
 use super::setup::Prepared;
 use super::tally::{Logs, Tally};
@@ -22,7 +23,6 @@ use crate::output::{
     CHECKPOINTS, Found, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json,
     model_path, saved_iterations, write_atomically, write_json, write_scores,
 };
-use crate::ply::write_splats;
 use crate::trainer::{StepReport, TrainError};
 use crate::views::ViewSource;
 
@@ -271,12 +271,10 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Writes the model in the dataset's own coordinates; returns where.
+    /// Writes the model; returns where.
     fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
-        let model = self.run.trainer.model()?;
-        let model = self.run.dataset.normalisation.model_to_world(model);
         let path = model_path(&self.folder, step);
-        write_atomically(&path, |mut out| write_splats(&model, &mut out))?;
+        export(&mut self.run.trainer, &self.run.dataset.normalisation, &path)?;
         Ok(path)
     }
 

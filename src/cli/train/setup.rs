@@ -32,6 +32,8 @@ use crate::views::DatasetViews;
 const RANDOM_POINTS: usize = 100_000;
 /// Threads that decode images ahead of the trainer.
 pub(super) const DECODERS: usize = 2;
+/// And threads that decode views held out.
+pub(super) const TEST_DECODERS: usize = 1;
 /// Views announced ahead: enough that each decoder has one at work and one waiting.
 const AHEAD: usize = 2 * DECODERS;
 
@@ -169,7 +171,7 @@ pub(super) fn prepare(
     let backend = backend(args, &survey, &setting, needs, model)?;
     let Survey { mut dataset, required, .. } = survey;
     let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
-    let test = DatasetViews::new(dataset.test.clone(), 0, 1);
+    let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
     dataset.points = crate::dataset::PointCloud::default();
     let options = TrainOptions {
         iterations: args.iterations,

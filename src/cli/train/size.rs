@@ -3,7 +3,7 @@
 use std::str::FromStr;
 
 use super::demand::Survey;
-use super::setup::DECODERS;
+use super::setup::{DECODERS, TEST_DECODERS};
 use super::{DEFAULT_BUDGET, TrainArgs};
 use crate::backend::gpu::GpuBackend;
 use crate::cli::failure::{DEVICE, Failure};
@@ -173,7 +173,7 @@ pub(super) fn check(args: &TrainArgs, survey: &Survey, ledger: &Ledger) -> Resul
 
 /// Fails where the system does not grant this process what a run takes.
 pub(super) fn check_grant(args: &TrainArgs, ledger: &Ledger) -> Result<(), Failure> {
-    let granted = grant(threads(args) + DECODERS);
+    let granted = grant(threads(args) + DECODERS + TEST_DECODERS);
     let (Some(Grant { left, by }), Some(now)) = (granted, resident()) else { return Ok(()) };
     let more = ledger.on_host().saturating_sub(now);
     if more <= left {

@@ -120,9 +120,7 @@ fn a_row_has_what_its_block_holds() {
     let (mut blocks, rows) = filled(planes(3));
     blocks.drop_bands(rows, 3, Degrees::falling(&[3, 2, 2, 2, 1, 1], 3));
     let whole = filled(planes(3)).0;
-    let row = |blocks: &Blocks, row: usize| {
-        blocks.to_rows(row + 1, 0..planes(3))[row * planes(3)..].to_vec()
-    };
+    let row = |blocks: &Blocks, row: usize| blocks.to_rows(row..row + 1, 0..planes(3));
     let cut = |mut numbers: Vec<f32>, degree: u8| {
         numbers[planes(degree)..].fill(0.0);
         numbers

@@ -1,0 +1,302 @@
+//! Reading: every part is checked before it is used, and arrays come some rows at a time.
+
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use safetensors::tensor::{Dtype, Metadata};
+
+use super::format::{CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY};
+use super::{CheckpointError, Header, model};
+use crate::backend::{Backend, BackendError, Tensor, Values, pieces};
+use crate::gaussians::{Gaussians, MAX_SH_DEGREE};
+
+/// Longest header accepted `[bytes]`.
+const MAX_HEADER: u64 = 64 << 20;
+/// Bytes read at a time; a multiple of every type's size.
+const CHUNK: usize = 1 << 16;
+
+/// A checkpoint that is sound: every part of the file has been checked.
+#[derive(Debug)]
+pub struct Checkpoint {
+    path: PathBuf,
+    file: File,
+    header: Header,
+    /// Where each array begins in the file, with what is known of it.
+    places: Vec<(u64, Record)>,
+}
+
+impl Checkpoint {
+    /// Opens a checkpoint and checks all of it.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Read`], [`CheckpointError::Invalid`].
+    pub fn open(path: &Path) -> Result<Self, CheckpointError> {
+        let invalid = |problem: String| CheckpointError::invalid(path, problem);
+        let failed = |source| CheckpointError::Read { path: path.to_owned(), source };
+        let mut file = File::open(path).map_err(failed)?;
+        let size = file.metadata().map_err(failed)?.len();
+        let mut length = [0; LENGTH as usize];
+        let short = || invalid(format!("it is cut short: {size} bytes"));
+        if size < LENGTH {
+            return Err(short());
+        }
+        file.read_exact(&mut length).map_err(failed)?;
+        let length = u64::from_le_bytes(length);
+        if length > MAX_HEADER {
+            return Err(invalid(
+                "it is no safetensors file: its header would be larger than 64 MiB".into(),
+            ));
+        }
+        if length > size - LENGTH {
+            return Err(short());
+        }
+        let mut bytes = vec![0; length as usize];
+        file.read_exact(&mut bytes).map_err(failed)?;
+        let (header, places) = parse(&bytes, LENGTH + length, size).map_err(invalid)?;
+        let mut checkpoint = Self { path: path.to_owned(), file, header, places };
+        for i in 0..checkpoint.places.len() {
+            Scan::new(&mut checkpoint, i)?.finish()?;
+        }
+        Ok(checkpoint)
+    }
+
+    /// Where it was read from.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// All but the arrays.
+    #[must_use]
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// The model, in the coordinates of training.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Invalid`] where it does not fit its own configuration;
+    /// [`CheckpointError::Read`].
+    pub fn model(&mut self) -> Result<Gaussians, CheckpointError> {
+        let train = &self.header.config.train;
+        let (budget, sh_degree) = (train.budget, train.sh_degree);
+        if sh_degree > MAX_SH_DEGREE {
+            return Err(self.invalid(format!("sh_degree is {sh_degree}; at most {MAX_SH_DEGREE}")));
+        }
+        let means = self.places.iter().find(|(_, record)| record.name == model::NAMES[0]);
+        let rows = means.and_then(|(_, record)| record.shape.first().copied()).unwrap_or(0);
+        if rows > budget {
+            return Err(self.invalid(format!("{rows} rows, but its budget is {budget}")));
+        }
+        let path = self.path.clone();
+        let fail = |error| CheckpointError::invalid(&path, error);
+        model::model(rows, sh_degree, |name| self.place(name).and_then(|i| self.tensor(i)), fail)
+    }
+
+    /// Gives `backend`, which holds the [model](Self::model), the state of that moment.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Invalid`] where the arrays are not those that this backend keeps;
+    /// [`CheckpointError::Read`].
+    pub fn restore(&mut self, backend: &mut dyn Backend) -> Result<(), CheckpointError> {
+        let wanted = backend.state();
+        let known = |name: &str| model::NAMES.contains(&name) || wanted.iter().any(|w| w == name);
+        if let Some((_, record)) = self.places.iter().find(|(_, record)| !known(&record.name)) {
+            let name = &record.name;
+            return Err(self.invalid(format!("this run keeps nothing like its tensor `{name}`")));
+        }
+        let rows = backend.rows();
+        for name in wanted {
+            let place = self.place(&name)?;
+            let refused = CheckpointError::state(&self.path);
+            let has_rows = self.places[place].1.shape.first() == Some(&rows);
+            if has_rows && backend.is_by_rows(&name) {
+                self.read(place, pieces(rows), |tensor, rows| {
+                    backend.restore_rows(tensor, rows).map_err(&refused)
+                })?;
+            } else {
+                // What should have rows, and has not so many, is refused.
+                backend.restore(self.tensor(place)?).map_err(refused)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn invalid(&self, problem: impl ToString) -> CheckpointError {
+        CheckpointError::invalid(&self.path, problem)
+    }
+
+    fn place(&self, name: &str) -> Result<usize, CheckpointError> {
+        let found = self.places.iter().position(|(_, record)| record.name == name);
+        found.ok_or_else(|| self.invalid(format!("there is no tensor `{name}`")))
+    }
+
+    /// A whole array.
+    fn tensor(&mut self, place: usize) -> Result<Tensor, CheckpointError> {
+        let mut whole = None;
+        let first = self.places[place].1.shape.first().copied().unwrap_or(0);
+        self.read(place, std::iter::once(0..first), |tensor, _| {
+            whole = Some(tensor);
+            Ok(())
+        })?;
+        whole.ok_or_else(|| self.invalid("an array of no side"))
+    }
+
+    /// Reads an array from front to back, in pieces of its first side, and checks its sum. `each` gets the
+    /// pieces before that.
+    fn read(
+        &mut self,
+        place: usize,
+        pieces: impl Iterator<Item = Range<usize>>,
+        mut each: impl FnMut(Tensor, Range<usize>) -> Result<(), CheckpointError>,
+    ) -> Result<(), CheckpointError> {
+        let record = self.places[place].1.clone();
+        let of_row = record.shape.iter().skip(1).try_fold(1, |all: usize, &n| all.checked_mul(n));
+        let mut scan = Scan::new(self, place)?;
+        for rows in pieces {
+            // The file is known to hold so many.
+            let count = rows.len().saturating_mul(of_row.unwrap_or(usize::MAX));
+            let values = match record.kind {
+                Dtype::F32 => Values::F32(scan.values(count, f32::from_le_bytes)?),
+                Dtype::U16 => Values::U16(scan.values(count, u16::from_le_bytes)?),
+                Dtype::U8 => Values::U8(scan.values(count, |[byte]: [u8; 1]| byte)?),
+                other => {
+                    let problem = format!("tensor `{}` is of type {other:?}", record.name);
+                    return Err(CheckpointError::invalid(scan.path, problem));
+                }
+            };
+            let mut shape = record.shape.clone();
+            if let Some(first) = shape.first_mut() {
+                *first = rows.len();
+            }
+            each(Tensor { name: record.name.clone(), shape, values }, rows)?;
+        }
+        scan.finish()
+    }
+}
+
+/// An array on its way from the file.
+struct Scan<'a> {
+    path: &'a Path,
+    file: &'a mut File,
+    record: &'a Record,
+    /// Bytes that have not been read.
+    left: usize,
+    /// Of those that have.
+    crc: u32,
+}
+
+impl<'a> Scan<'a> {
+    fn new(checkpoint: &'a mut Checkpoint, place: usize) -> Result<Self, CheckpointError> {
+        let Checkpoint { path, file, places, .. } = checkpoint;
+        let (start, record) = &places[place];
+        let left = record.bytes().unwrap_or(usize::MAX);
+        let scan = Self { path, file, record, left, crc: 0 };
+        scan.file.seek(SeekFrom::Start(*start)).map_err(|e| scan.failed(e))?;
+        Ok(scan)
+    }
+
+    fn failed(&self, source: io::Error) -> CheckpointError {
+        CheckpointError::Read { path: self.path.to_owned(), source }
+    }
+
+    /// So many bytes, in pieces of whole values.
+    fn bytes(&mut self, count: usize, mut seen: impl FnMut(&[u8])) -> Result<(), CheckpointError> {
+        let mut left = count;
+        let mut buffer = vec![0; left.min(CHUNK)];
+        while left > 0 {
+            let bytes = &mut buffer[..left.min(CHUNK)];
+            self.file.read_exact(bytes).map_err(|e| self.failed(e))?;
+            self.crc = crc32c::crc32c_append(self.crc, bytes);
+            seen(bytes);
+            left -= bytes.len();
+        }
+        self.left -= count;
+        Ok(())
+    }
+
+    fn values<T, const N: usize>(
+        &mut self,
+        count: usize,
+        decode: impl Fn([u8; N]) -> T,
+    ) -> Result<Vec<T>, CheckpointError> {
+        let mut values = Vec::new();
+        if values.try_reserve_exact(count).is_err() {
+            let what = "a tensor of the checkpoint";
+            return Err(BackendError::OutOfMemory { what, bytes: (count * N) as u64 }.into());
+        }
+        self.bytes(count * N, |bytes| {
+            values.extend(bytes.as_chunks::<N>().0.iter().map(|&b| decode(b)));
+        })?;
+        Ok(values)
+    }
+
+    /// Reads what is left and checks the sum of all.
+    fn finish(mut self) -> Result<(), CheckpointError> {
+        self.bytes(self.left, |_| ())?;
+        let (Record { name, crc32c, .. }, crc) = (self.record, self.crc);
+        if crc == *crc32c {
+            return Ok(());
+        }
+        let problem =
+            format!("tensor `{name}` is damaged: its checksum is {crc:08x}, not {crc32c:08x}");
+        Err(CheckpointError::invalid(self.path, problem))
+    }
+}
+
+/// Reads the header of a file of `size` bytes whose arrays begin at `start`.
+fn parse(bytes: &[u8], start: u64, size: u64) -> Result<(Header, Vec<(u64, Record)>), String> {
+    let table: Metadata =
+        serde_json::from_slice(bytes).map_err(|e| format!("its header is no safetensors: {e}"))?;
+    let metadata = table.metadata().as_ref();
+    let entry = |key: &str| {
+        let entry = metadata.and_then(|metadata| metadata.get(key));
+        entry.ok_or_else(|| format!("it is no checkpoint of densify: its header has no `{key}`"))
+    };
+    let version = entry(VERSION_KEY)?;
+    if *version != VERSION.to_string() {
+        return Err(format!(
+            "it is of version {version} of the format, but this densify reads version {VERSION}; \
+             go on with the densify that wrote it"
+        ));
+    }
+    let json = entry(HEADER_KEY)?;
+    let crc = format!("{:08x}", crc32c::crc32c(json.as_bytes()));
+    if *entry(CHECKSUM_KEY)? != crc {
+        return Err("its header is damaged: the checksum does not hold".to_owned());
+    }
+    let contents: Contents<Header> =
+        serde_json::from_str(json).map_err(|e| format!("its header: {e}"))?;
+    let Contents { header, tensors } = contents;
+    if tensors.len() != table.offset_keys().len() {
+        return Err("its header is damaged: it lists other tensors than the file".to_owned());
+    }
+    let mut places = Vec::new();
+    let mut end = start;
+    for record in tensors {
+        let info = table.info(&record.name);
+        let here = (end - start) as usize;
+        let same = info.is_some_and(|info| {
+            (info.dtype, &info.shape) == (record.kind, &record.shape)
+                && info.data_offsets.0 == here
+                && record.bytes() == Some(info.data_offsets.1 - here)
+        });
+        let next = record.bytes().and_then(|bytes| end.checked_add(bytes as u64));
+        let (true, Some(next)) = (same, next) else {
+            let name = &record.name;
+            return Err(format!(
+                "its header is damaged: tensor `{name}` is not where it should be"
+            ));
+        };
+        places.push((end, record));
+        end = next;
+    }
+    if end != size {
+        let how =
+            if size < end { "it is cut short" } else { "there is more in it than there should" };
+        return Err(format!("{how}: {size} bytes, its header tells of {end}"));
+    }
+    Ok((header, places))
+}
