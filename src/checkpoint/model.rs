@@ -33,10 +33,15 @@ pub(super) fn model(
         |which: usize, shape: &[usize]| read(NAMES[which])?.into_f32(shape).map_err(&fail);
     Ok(Gaussians {
         sh_degree,
-        means: next(0, &[rows, 3])?.as_chunks::<3>().0.to_vec(),
-        log_scales: next(1, &[rows, 3])?.as_chunks::<3>().0.to_vec(),
-        quats: next(2, &[rows, 4])?.as_chunks::<4>().0.to_vec(),
+        means: in_rows(next(0, &[rows, 3])?),
+        log_scales: in_rows(next(1, &[rows, 3])?),
+        quats: in_rows(next(2, &[rows, 4])?),
         opacity_logits: next(3, &[rows])?,
         sh: next(4, &[rows, coefficients, 3])?,
     })
+}
+
+/// The same numbers, N to a row; where they are, if that can be.
+fn in_rows<const N: usize>(values: Vec<f32>) -> Vec<[f32; N]> {
+    bytemuck::try_cast_vec(values).unwrap_or_else(|(_, values)| values.as_chunks().0.to_vec())
 }

@@ -83,7 +83,7 @@ fn a_run_takes_no_more_than_it_is_given() {
         (48, "diet", "exact", "17k"),
         (64, "taming", "exact", "30k"),
         (64, "mcmc", "exact", "100k"),
-        // Here the model as it is exported is half of what is promised.
+        // Here the model as f32 would be half of what is promised.
         (256, "diet", "tiny-memory", "245k"),
     ] {
         let (_root, run) = scratch();
