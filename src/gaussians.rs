@@ -13,6 +13,39 @@ pub const fn sh_coefficients(degree: u8) -> usize {
 /// Highest spherical-harmonic degree.
 pub const MAX_SH_DEGREE: u8 = 3;
 
+/// One of the arrays of a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ModelArray {
+    /// See [`Gaussians::means`].
+    Means,
+    /// See [`Gaussians::log_scales`].
+    LogScales,
+    /// See [`Gaussians::quats`].
+    Quats,
+    /// See [`Gaussians::opacity_logits`].
+    OpacityLogits,
+    /// See [`Gaussians::sh`].
+    Sh,
+}
+
+impl ModelArray {
+    /// All of them, in the order in which a row has its parameters.
+    pub const ALL: [Self; 5] =
+        [Self::Means, Self::LogScales, Self::Quats, Self::OpacityLogits, Self::Sh];
+
+    /// Where a row of a model of this degree has the array's numbers, of all its parameters.
+    #[must_use]
+    pub const fn parameters(self, sh_degree: u8) -> std::ops::Range<usize> {
+        match self {
+            Self::Means => 0..3,
+            Self::LogScales => 3..6,
+            Self::Quats => 6..10,
+            Self::OpacityLogits => 10..11,
+            Self::Sh => 11..11 + 3 * sh_coefficients(sh_degree),
+        }
+    }
+}
+
 /// A model: structure of arrays, one entry per row in each.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Gaussians {
@@ -31,6 +64,24 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
+    /// A model of this degree from its arrays, each row after row.
+    ///
+    /// # Errors
+    /// What `array` returns.
+    pub fn from_arrays<E>(
+        sh_degree: u8,
+        mut array: impl FnMut(ModelArray) -> Result<Vec<f32>, E>,
+    ) -> Result<Self, E> {
+        Ok(Self {
+            sh_degree,
+            means: in_rows(array(ModelArray::Means)?),
+            log_scales: in_rows(array(ModelArray::LogScales)?),
+            quats: in_rows(array(ModelArray::Quats)?),
+            opacity_logits: array(ModelArray::OpacityLogits)?,
+            sh: array(ModelArray::Sh)?,
+        })
+    }
+
     /// Number of rows.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -61,6 +112,11 @@ impl Gaussians {
         let n = 3 * sh_coefficients(self.sh_degree);
         &self.sh[row * n..(row + 1) * n]
     }
+}
+
+/// The same numbers, N to a row; where they are, if that can be.
+fn in_rows<const N: usize>(values: Vec<f32>) -> Vec<[f32; N]> {
+    bytemuck::try_cast_vec(values).unwrap_or_else(|(_, values)| values.as_chunks().0.to_vec())
 }
 
 /// Opacity of a logit: 1 / (1 + exp(−x)), without overflow at either end.

@@ -23,12 +23,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
 pub use shortcuts::{Exp2, Shortcuts, Stepped};
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};
-pub use state::{StateError, Tensor, Values};
+pub use state::{StateArray, StateError, Tensor, Values};
 pub use storage::{MomentStorage, ParameterStorage, Storage};
 
 /// Step sizes of one iteration, one per parameter class.
@@ -208,6 +208,9 @@ pub trait Backend: Send {
     /// Rows now.
     fn rows(&self) -> usize;
 
+    /// Spherical-harmonic degree of the model.
+    fn sh_degree(&self) -> u8;
+
     /// Most rows there may ever be; all buffers have this size from the start.
     fn budget(&self) -> usize;
 
@@ -304,15 +307,27 @@ pub trait Backend: Send {
     ///
     /// # Panics
     /// When there are no such rows: a bug in the caller.
-    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError>;
+    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+        let array = |array| self.download_array(array, rows.clone());
+        Gaussians::from_arrays(self.sh_degree(), array)
+    }
 
-    /// Names of the arrays that hold, beside the model, all that the future depends on: moments,
-    /// ages, accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.
-    fn state(&self) -> Vec<String>;
+    /// Copies some rows of one of the model's arrays to the host, row after row.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When there are no such rows: a bug in the caller.
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError>;
 
-    /// Whether the first side of an array of [`state`](Self::state) is that of the rows, so that it can
-    /// be taken in pieces. All others are small.
-    fn is_by_rows(&self, name: &str) -> bool;
+    /// The arrays that hold, beside the model, all that the future depends on: moments, ages,
+    /// accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.
+    fn state(&self) -> Vec<StateArray>;
 
     /// Copies one array of [`state`](Self::state) to the host.
     ///
@@ -325,7 +340,7 @@ pub trait Backend: Send {
         self.save_rows(name, 0..self.rows())
     }
 
-    /// Copies some rows of an array to the host; one that is not [by rows](Self::is_by_rows) is whole,
+    /// Copies some rows of an array to the host; one that is not [by rows](StateArray::by_rows) is whole,
     /// whatever the rows.
     ///
     /// # Errors

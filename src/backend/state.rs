@@ -20,6 +20,28 @@ pub(crate) fn pieces(rows: usize) -> impl Iterator<Item = Range<usize>> {
 /// Values that are converted to bytes at a time.
 const ENCODED: usize = 1 << 14;
 
+/// An array that a backend keeps beside the model.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StateArray {
+    /// Its name, unique among a backend's.
+    pub name: String,
+    /// Whether its first side is that of the rows, so that it can be taken in pieces. All others are
+    /// small.
+    pub by_rows: bool,
+}
+
+impl StateArray {
+    /// An array with one entry per row.
+    pub(super) fn by_rows(name: impl Into<String>) -> Self {
+        Self { name: name.into(), by_rows: true }
+    }
+
+    /// An array of another shape.
+    pub(super) fn small(name: impl Into<String>) -> Self {
+        Self { name: name.into(), by_rows: false }
+    }
+}
+
 /// A named array.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {

@@ -2,15 +2,14 @@
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, Metadata};
 
 use super::format::{CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY};
 use super::{CheckpointError, Header, model};
-use crate::backend::{Backend, BackendError, Tensor, Values, pieces};
-use crate::gaussians::{Gaussians, MAX_SH_DEGREE};
+use crate::backend::{Backend, BackendError, StateArray, Tensor, Values, pieces};
+use crate::gaussians::{Gaussians, MAX_SH_DEGREE, ModelArray};
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 64 << 20;
@@ -85,14 +84,17 @@ impl Checkpoint {
         if sh_degree > MAX_SH_DEGREE {
             return Err(self.invalid(format!("sh_degree is {sh_degree}; at most {MAX_SH_DEGREE}")));
         }
-        let means = self.places.iter().find(|(_, record)| record.name == model::NAMES[0]);
-        let rows = means.and_then(|(_, record)| record.shape.first().copied()).unwrap_or(0);
+        let means = self.place(model::name(ModelArray::Means))?;
+        let rows = self.places[means].1.shape.first().copied().unwrap_or(0);
         if rows > budget {
             return Err(self.invalid(format!("{rows} rows, but its budget is {budget}")));
         }
-        let path = self.path.clone();
-        let fail = |error| CheckpointError::invalid(&path, error);
-        model::model(rows, sh_degree, |name| self.place(name).and_then(|i| self.tensor(i)), fail)
+        Gaussians::from_arrays(sh_degree, |array| {
+            let place = self.place(model::name(array))?;
+            let tensor = self.tensor(place)?;
+            let values = tensor.into_f32(&model::shape(array, rows, sh_degree));
+            values.map_err(CheckpointError::state(&self.path))
+        })
     }
 
     /// Gives `backend`, which holds the [model](Self::model), the state of that moment.
@@ -102,20 +104,25 @@ impl Checkpoint {
     /// [`CheckpointError::Read`].
     pub fn restore(&mut self, backend: &mut dyn Backend) -> Result<(), CheckpointError> {
         let wanted = backend.state();
-        let known = |name: &str| model::NAMES.contains(&name) || wanted.iter().any(|w| w == name);
+        let known = |name: &str| {
+            ModelArray::ALL.into_iter().any(|array| model::name(array) == name)
+                || wanted.iter().any(|array| array.name == name)
+        };
         if let Some((_, record)) = self.places.iter().find(|(_, record)| !known(&record.name)) {
             let name = &record.name;
             return Err(self.invalid(format!("this run keeps nothing like its tensor `{name}`")));
         }
         let rows = backend.rows();
-        for name in wanted {
+        for StateArray { name, by_rows } in wanted {
             let place = self.place(&name)?;
             let refused = CheckpointError::state(&self.path);
             let has_rows = self.places[place].1.shape.first() == Some(&rows);
-            if has_rows && backend.is_by_rows(&name) {
-                self.read(place, pieces(rows), |tensor, rows| {
-                    backend.restore_rows(tensor, rows).map_err(&refused)
-                })?;
+            if has_rows && by_rows {
+                let mut scan = Scan::new(self, place)?;
+                for rows in pieces(rows) {
+                    backend.restore_rows(scan.tensor(rows.len())?, rows).map_err(&refused)?;
+                }
+                scan.finish()?;
             } else {
                 // What should have rows, and has not so many, is refused.
                 backend.restore(self.tensor(place)?).map_err(refused)?;
@@ -135,45 +142,10 @@ impl Checkpoint {
 
     /// A whole array.
     fn tensor(&mut self, place: usize) -> Result<Tensor, CheckpointError> {
-        let mut whole = None;
-        let first = self.places[place].1.shape.first().copied().unwrap_or(0);
-        self.read(place, std::iter::once(0..first), |tensor, _| {
-            whole = Some(tensor);
-            Ok(())
-        })?;
-        whole.ok_or_else(|| self.invalid("an array of no side"))
-    }
-
-    /// Reads an array from front to back, in pieces of its first side, and checks its sum. `each` gets the
-    /// pieces before that.
-    fn read(
-        &mut self,
-        place: usize,
-        pieces: impl Iterator<Item = Range<usize>>,
-        mut each: impl FnMut(Tensor, Range<usize>) -> Result<(), CheckpointError>,
-    ) -> Result<(), CheckpointError> {
-        let record = self.places[place].1.clone();
-        let of_row = record.shape.iter().skip(1).try_fold(1, |all: usize, &n| all.checked_mul(n));
         let mut scan = Scan::new(self, place)?;
-        for rows in pieces {
-            // The file is known to hold so many.
-            let count = rows.len().saturating_mul(of_row.unwrap_or(usize::MAX));
-            let values = match record.kind {
-                Dtype::F32 => Values::F32(scan.values(count, f32::from_le_bytes)?),
-                Dtype::U16 => Values::U16(scan.values(count, u16::from_le_bytes)?),
-                Dtype::U8 => Values::U8(scan.values(count, |[byte]: [u8; 1]| byte)?),
-                other => {
-                    let problem = format!("tensor `{}` is of type {other:?}", record.name);
-                    return Err(CheckpointError::invalid(scan.path, problem));
-                }
-            };
-            let mut shape = record.shape.clone();
-            if let Some(first) = shape.first_mut() {
-                *first = rows.len();
-            }
-            each(Tensor { name: record.name.clone(), shape, values }, rows)?;
-        }
-        scan.finish()
+        let whole = scan.tensor(scan.record.shape.first().copied().unwrap_or(0))?;
+        scan.finish()?;
+        Ok(whole)
     }
 }
 
@@ -200,6 +172,27 @@ impl<'a> Scan<'a> {
 
     fn failed(&self, source: io::Error) -> CheckpointError {
         CheckpointError::Read { path: self.path.to_owned(), source }
+    }
+
+    /// The next entries of the first side, so many, which the file is known to hold.
+    fn tensor(&mut self, entries: usize) -> Result<Tensor, CheckpointError> {
+        let Record { name, kind, shape, .. } = self.record;
+        let mut shape = shape.clone();
+        if let Some(first) = shape.first_mut() {
+            *first = entries;
+        }
+        let count = shape.iter().try_fold(1, |all: usize, &side| all.checked_mul(side));
+        let count = count.unwrap_or(usize::MAX);
+        let values = match kind {
+            Dtype::F32 => Values::F32(self.values(count, f32::from_le_bytes)?),
+            Dtype::U16 => Values::U16(self.values(count, u16::from_le_bytes)?),
+            Dtype::U8 => Values::U8(self.values(count, |[byte]: [u8; 1]| byte)?),
+            other => {
+                let problem = format!("tensor `{name}` is of type {other:?}");
+                return Err(CheckpointError::invalid(self.path, problem));
+            }
+        };
+        Ok(Tensor { name: name.clone(), shape, values })
     }
 
     /// So many bytes, in pieces of whole values.

@@ -11,7 +11,7 @@ use safetensors::SafeTensors;
 
 use super::*;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
-use crate::backend::{Backend, ROWS_AT_A_TIME, Tensor, Values};
+use crate::backend::{Backend, ROWS_AT_A_TIME, StateArray, Tensor, Values};
 use crate::dataset::normalise::Normalisation;
 use crate::gaussians::Gaussians;
 use crate::output::{InitChoice, PolicyConfig, SceneConfig, TrainConfig};
@@ -59,7 +59,7 @@ fn options() -> CpuOptions {
 /// A backend in the midst of a run: arbitrary values in every array of its state.
 fn backend() -> CpuBackend {
     let mut backend = CpuBackend::new(&gaussians(), &options()).unwrap();
-    for (i, name) in backend.state().into_iter().enumerate() {
+    for (i, StateArray { name, .. }) in backend.state().into_iter().enumerate() {
         let Tensor { mut shape, values, .. } = backend.save(&name).unwrap();
         if name == "candidates" {
             shape[0] = 4;
@@ -158,7 +158,7 @@ fn what_is_written_is_read_back_to_the_bit() {
     checkpoint.restore(&mut restored).unwrap();
     let expected = backend();
     assert_eq!(restored.state().len(), 10);
-    for name in expected.state() {
+    for StateArray { name, .. } in expected.state() {
         assert_eq!(restored.save(&name).unwrap(), expected.save(&name).unwrap(), "{name}");
     }
 }

@@ -2,14 +2,16 @@
 
 use std::collections::HashMap;
 use std::io;
+use std::ops::Range;
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
 use super::format::{CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY};
 use super::{CheckpointError, Header, model};
-use crate::backend::{Backend, BackendError, Tensor, Values, pieces};
-use crate::output::write_atomically;
+use crate::backend::{Backend, BackendError, StateArray, Tensor, Values, pieces};
+use crate::gaussians::ModelArray;
+use crate::output::{Stop, write_atomically_from};
 
 /// Writes the state of a run: `header`, and the model and all else that `backend` holds. The file
 /// appears under its name when it is complete and on disk; whatever was there stays until then.
@@ -17,47 +19,20 @@ use crate::output::write_atomically;
 /// # Errors
 /// [`CheckpointError::Write`], [`CheckpointError::Backend`].
 pub fn write(path: &Path, header: &Header, backend: &dyn Backend) -> Result<(), CheckpointError> {
-    // Twice over the arrays: the header, which comes first, has their checksums.
-    let noted = records_of(backend, |_| Ok(()));
-    let records = noted.map_err(|stop| stop.into_error(path))?;
-    let mut lost = None;
-    let written = write_atomically(path, |out| {
+    write_atomically_from(path, |out| {
+        // Twice over the arrays: the header, which comes first, has their checksums.
+        let records = records_of(backend, |_| Ok(()))?;
         let bytes = header_bytes(header, &records)?;
         out.write_all(&(bytes.len() as u64).to_le_bytes())?;
         out.write_all(&bytes)?;
-        match records_of(backend, |bytes| out.write_all(bytes)) {
-            Ok(written) => match records.iter().zip(&written).find(|(was, is)| was != is) {
-                Some((was, _)) => {
-                    Err(io::Error::other(format!("`{}` changed while it was written", was.name)))
-                }
-                None => Ok(()),
-            },
-            Err(Stop::Io(error)) => Err(error),
-            Err(Stop::Backend(error)) => {
-                lost = Some(error);
-                Err(io::Error::other("the backend is lost"))
+        let written = records_of(backend, |bytes| out.write_all(bytes))?;
+        match records.iter().zip(&written).find(|(was, is)| was != is) {
+            Some((Record { name, .. }, _)) => {
+                Err(io::Error::other(format!("`{name}` changed while it was written")).into())
             }
+            None => Ok(()),
         }
-    });
-    match lost {
-        Some(error) => Err(error.into()),
-        None => Ok(written?),
-    }
-}
-
-/// Why arrays stop coming.
-enum Stop {
-    Io(io::Error),
-    Backend(BackendError),
-}
-
-impl Stop {
-    fn into_error(self, path: &Path) -> CheckpointError {
-        match self {
-            Self::Io(source) => CheckpointError::Read { path: path.to_owned(), source },
-            Self::Backend(error) => error.into(),
-        }
-    }
+    })
 }
 
 /// The arrays of the model and of the backend's state, in the order of the file, whose bytes `sink` gets
@@ -65,16 +40,20 @@ impl Stop {
 fn records_of(
     backend: &dyn Backend,
     mut sink: impl FnMut(&[u8]) -> io::Result<()>,
-) -> Result<Vec<Record>, Stop> {
-    let rows = backend.rows();
+) -> Result<Vec<Record>, Stop<CheckpointError>> {
+    let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
     let mut records = Vec::new();
-    for which in 0..model::NAMES.len() {
-        let piece = |rows| Ok(model::tensor(which, backend.download_rows(rows)?));
+    for array in ModelArray::ALL {
+        let piece = |rows: Range<usize>| {
+            let shape = model::shape(array, rows.len(), sh_degree);
+            let values = backend.download_array(array, rows)?;
+            Ok(Tensor::f32(model::name(array), &shape, values))
+        };
         records.push(Record::of(pieces(rows).map(piece), &mut sink)?);
     }
-    for name in backend.state() {
+    for StateArray { name, by_rows } in backend.state() {
         let piece = |rows| backend.save_rows(&name, rows);
-        records.push(match backend.is_by_rows(&name) {
+        records.push(match by_rows {
             true => Record::of(pieces(rows).map(piece), &mut sink)?,
             false => Record::of([piece(0..rows)], &mut sink)?,
         });
@@ -88,17 +67,18 @@ impl Record {
     fn of(
         pieces: impl IntoIterator<Item = Result<Tensor, BackendError>>,
         mut sink: impl FnMut(&[u8]) -> io::Result<()>,
-    ) -> Result<Self, Stop> {
+    ) -> Result<Self, Stop<CheckpointError>> {
         let mut record = Self { name: String::new(), kind: Dtype::U8, shape: vec![], crc32c: 0 };
         let mut rows = 0;
         for piece in pieces {
-            let Tensor { name, shape, values } = piece.map_err(Stop::Backend)?;
+            let Tensor { name, shape, values } =
+                piece.map_err(|error| Stop::Source(error.into()))?;
             rows += shape.first().copied().unwrap_or(0);
             let encoded = values.encode(|bytes| {
                 record.crc32c = crc32c::crc32c_append(record.crc32c, bytes);
                 sink(bytes)
             });
-            encoded.map_err(Stop::Io)?;
+            encoded?;
             record.kind = match values {
                 Values::F32(_) => Dtype::F32,
                 Values::U16(_) => Dtype::U16,

@@ -25,19 +25,49 @@ pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
 ) -> Result<(), OutputError> {
+    write_atomically_from(path, |out| Ok::<_, Stop<OutputError>>(write(out)?))
+}
+
+/// Why a file is not written to its end.
+#[derive(Debug)]
+pub enum Stop<E> {
+    /// It cannot be written.
+    Io(io::Error),
+    /// What should stand in it cannot be had.
+    Source(E),
+}
+
+impl<E> From<io::Error> for Stop<E> {
+    fn from(error: io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
+/// As [`write_atomically`], of contents that may fail to come.
+///
+/// # Errors
+/// [`OutputError::Io`], and what `write` has in a [`Stop::Source`]; a file that was there is then
+/// unchanged and nothing is left behind.
+pub fn write_atomically_from<E: From<OutputError>>(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> Result<(), Stop<E>>,
+) -> Result<(), E> {
     let folder = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
     std::fs::create_dir_all(folder).map_err(OutputError::io("create the folder", folder))?;
-    replace(folder, path, write).map_err(OutputError::io("write", path))
+    replace(folder, path, write).map_err(|stop| match stop {
+        Stop::Io(error) => OutputError::io("write", path)(error).into(),
+        Stop::Source(error) => error,
+    })
 }
 
-fn replace(
+fn replace<E>(
     folder: &Path,
     path: &Path,
-    write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-) -> io::Result<()> {
+    write: impl FnOnce(&mut dyn Write) -> Result<(), Stop<E>>,
+) -> Result<(), Stop<E>> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
     // Temporary files are private by default; a result is as readable as any other new file.
@@ -52,7 +82,7 @@ fn replace(
     attempt(Operation::Sync, path)?;
     file.as_file().sync_all()?;
     attempt(Operation::Rename, path)?;
-    file.persist(path)?;
+    file.persist(path).map_err(io::Error::from)?;
     // The rename lasts once the folder is synced; not every file system can do that.
     #[cfg(unix)]
     let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
@@ -100,6 +130,21 @@ mod tests {
         assert!(message.contains("file.json") && message.contains("disk full"), "{message}");
         assert_eq!(std::fs::read(&path).unwrap(), b"first");
         assert_eq!(names(path.parent().unwrap()), ["file.json"]);
+    }
+
+    #[test]
+    fn what_the_contents_fail_with_comes_back_as_it_is() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("a");
+        write_atomically(&path, |out| out.write_all(b"old")).unwrap();
+        let lost = || OutputError::io("fetch", Path::new("b"))(io::Error::other("lost"));
+        let error = write_atomically_from(&path, |out| {
+            out.write_all(b"new")?;
+            Err(Stop::Source(lost()))
+        });
+        assert_eq!(error.unwrap_err().to_string(), lost().to_string());
+        assert_eq!(std::fs::read(&path).unwrap(), b"old");
+        assert_eq!(names(root.path()), ["a"]);
     }
 
     #[test]

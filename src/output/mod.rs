@@ -25,7 +25,7 @@ mod records;
 mod requirements;
 mod tensorboard;
 
-pub use atomic::write_atomically;
+pub use atomic::{Stop, write_atomically, write_atomically_from};
 pub use cameras::cameras_json;
 pub use config::{
     CONFIG_FILE, DegreeChoice, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig,

@@ -13,12 +13,12 @@ use super::bench::{Bench, Subject};
 use super::cases;
 use crate::backend::cpu::{CpuBackend, ImageGradient, ModelGradient};
 use crate::backend::{
-    Attribute, AuxInput, AuxOutput, Backend, BackendError, Kept, Rendering, StateError, StepInput,
-    StepOutput, Tensor, Unsound,
+    Attribute, AuxInput, AuxOutput, Backend, BackendError, Kept, Rendering, StateArray, StateError,
+    StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
-use crate::gaussians::Gaussians;
+use crate::gaussians::ModelArray;
 use crate::memory::Ledger;
 
 /// In what it errs.
@@ -122,6 +122,9 @@ impl Backend for Saboteur {
     fn rows(&self) -> usize {
         self.inner.rows()
     }
+    fn sh_degree(&self) -> u8 {
+        self.inner.sh_degree()
+    }
     fn budget(&self) -> usize {
         self.inner.budget()
     }
@@ -175,22 +178,25 @@ impl Backend for Saboteur {
         self.spoil_image(&mut image);
         Ok(image)
     }
-    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
-        let mut model = self.inner.download_rows(rows)?;
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let mut values = self.inner.download_array(array, rows)?;
         if self.how == Sabotage::Model {
-            model.means.as_flattened_mut().iter_mut().for_each(|x| *x += 1.0);
-            model.log_scales.as_flattened_mut().fill(50.0);
-            model.quats.fill([0.0; 4]);
-            model.opacity_logits.fill(10.0);
-            model.sh.fill(9.0);
+            match array {
+                ModelArray::Means => values.iter_mut().for_each(|x| *x += 1.0),
+                ModelArray::LogScales => values.fill(50.0),
+                ModelArray::Quats => values.fill(0.0),
+                ModelArray::OpacityLogits => values.fill(10.0),
+                ModelArray::Sh => values.fill(9.0),
+            }
         }
-        Ok(model)
+        Ok(values)
     }
-    fn state(&self) -> Vec<String> {
+    fn state(&self) -> Vec<StateArray> {
         self.inner.state()
-    }
-    fn is_by_rows(&self, name: &str) -> bool {
-        self.inner.is_by_rows(name)
     }
     fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {
         self.inner.save_rows(name, rows)

@@ -12,10 +12,12 @@ use glam::{DMat3, DVec3};
 
 use super::*;
 use crate::backend::{
-    Attribute, AuxInput, AuxOutput, Kept, Rendering, RowDegrees, StateError, Tensor, Unsound,
+    Attribute, AuxInput, AuxOutput, Kept, Rendering, RowDegrees, StateArray, StateError, Tensor,
+    Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
+use crate::gaussians::ModelArray;
 use crate::memory::Ledger;
 use crate::schedule::{Background, RateOptions};
 use crate::views::ViewError;
@@ -42,6 +44,9 @@ struct CountingBackend {
 impl Backend for CountingBackend {
     fn rows(&self) -> usize {
         self.rows
+    }
+    fn sh_degree(&self) -> u8 {
+        0
     }
     fn budget(&self) -> usize {
         self.budget
@@ -101,14 +106,15 @@ impl Backend for CountingBackend {
     ) -> Result<Rendering, BackendError> {
         Err(BackendError::ImageTooLarge { width: camera.width, height: camera.height, max: 0 })
     }
-    fn download_rows(&self, rows: std::ops::Range<usize>) -> Result<Gaussians, BackendError> {
-        Ok(Gaussians { means: vec![[0.0; 3]; rows.len()], ..Gaussians::default() })
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: std::ops::Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        Ok(vec![0.0; array.parameters(0).len() * rows.len()])
     }
-    fn state(&self) -> Vec<String> {
+    fn state(&self) -> Vec<StateArray> {
         Vec::new()
-    }
-    fn is_by_rows(&self, _: &str) -> bool {
-        false
     }
     fn save_rows(&self, name: &str, _: std::ops::Range<usize>) -> Result<Tensor, BackendError> {
         panic!("{name} is not kept")

@@ -80,7 +80,8 @@ pub(crate) fn every_number_that_is_none_is_found(make: Make<'_>) {
         assert_eq!(audit(&mut *make(&poisoned)), expected, "{value}");
     }
     let names = clean.state();
-    let moments = names.iter().filter(|name| name.contains("first") || name.contains("second"));
+    let names = names.iter().map(|array| &array.name);
+    let moments = names.filter(|name| name.contains("first") || name.contains("second"));
     let mut seen = 0;
     for name in moments {
         let sound = clean.save(name).expect("moments");
@@ -138,7 +139,8 @@ pub(crate) fn a_poisoned_moment_poisons_its_parameter(make: Make<'_>) {
         let names = backend.state();
         // Classes may share an array or not; the numbers of a row have the same order everywhere.
         let mut place = slot;
-        let of_first = names.iter().filter(|name| name.contains("first"));
+        let names = names.iter().map(|array| &array.name);
+        let of_first = names.filter(|name| name.contains("first"));
         for name in of_first {
             let mut moments = backend.save(name).expect("moments");
             let numbers = moments.shape[1];

@@ -4,7 +4,7 @@
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::backend::{
-    Backend, MomentStorage, ParameterStorage, Shortcuts, StepInput, Storage, Tensor,
+    Backend, MomentStorage, ParameterStorage, Shortcuts, StateArray, StepInput, Storage, Tensor,
 };
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
@@ -74,8 +74,8 @@ fn train(backend: &mut CpuBackend, camera: &Camera, steps: std::ops::RangeInclus
 }
 
 fn state(backend: &CpuBackend) -> (Gaussians, Vec<Tensor>) {
-    let tensors =
-        backend.state().iter().map(|name| backend.save(name).expect("an array")).collect();
+    let saved = |array: StateArray| backend.save(&array.name).expect("an array");
+    let tensors = backend.state().into_iter().map(saved).collect();
     (backend.download().expect("a model"), tensors)
 }
 

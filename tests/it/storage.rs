@@ -2,7 +2,9 @@
 //! on from a checkpoint to the same bytes, and takes the memory that the ledger says.
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::{Backend, MomentStorage, ParameterStorage, StepInput, Storage, Tensor};
+use densify::backend::{
+    Backend, MomentStorage, ParameterStorage, StateArray, StepInput, Storage, Tensor,
+};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
@@ -70,8 +72,8 @@ fn train(
 
 /// The bits of what a run goes on from: the model, and the optimiser's state.
 fn state(backend: &CpuBackend) -> (Gaussians, Vec<Tensor>) {
-    let tensors =
-        backend.state().iter().map(|name| backend.save(name).expect("an array")).collect();
+    let saved = |array: StateArray| backend.save(&array.name).expect("an array");
+    let tensors = backend.state().into_iter().map(saved).collect();
     (backend.download().expect("a model"), tensors)
 }
 

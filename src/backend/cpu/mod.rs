@@ -47,12 +47,12 @@ use pulp::Arch;
 
 use super::candidates::{Candidates, error_weights};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, RowDegrees, Shortcuts, StateError,
-    StepInput, StepOutput, Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, RowDegrees, Shortcuts, StateArray,
+    StateError, StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 use adam::BiasCorrection;
 use blocks::planes;
@@ -245,12 +245,8 @@ impl CpuBackend {
         target: &Image8,
         background: [f32; 3],
     ) -> (StepOutput, Vec<f32>) {
-        assert_eq!(
-            (rendering.width, rendering.height),
-            (target.width, target.height),
-            "rendering and target differ in size"
-        );
         let grid = Grid::new(rendering.width, rendering.height);
+        assert_eq!(grid, Grid::new(target.width, target.height), "rendering and target");
         self.resize_images(&grid);
         for (tile, canvas) in self.canvas.iter_mut().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {
@@ -275,6 +271,10 @@ impl CpuBackend {
 impl Backend for CpuBackend {
     fn rows(&self) -> usize {
         self.rows
+    }
+
+    fn sh_degree(&self) -> u8 {
+        self.sh_degree
     }
 
     fn budget(&self) -> usize {
@@ -371,17 +371,17 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
-    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
-        Ok(self.params.unpack(rows, self.sh_degree))
+        Ok(self.params.to_rows(rows, array.parameters(self.sh_degree)))
     }
 
-    fn state(&self) -> Vec<String> {
-        self.state_names()
-    }
-
-    fn is_by_rows(&self, name: &str) -> bool {
-        Self::state_is_by_rows(name)
+    fn state(&self) -> Vec<StateArray> {
+        self.state_arrays()
     }
 
     fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {

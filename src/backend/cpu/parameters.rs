@@ -14,7 +14,7 @@ use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, wide
 use super::simd::WIDTH;
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 use crate::backend::ParameterStorage;
-use crate::gaussians::{Gaussians, sh_coefficients};
+use crate::gaussians::Gaussians;
 
 /// Planes of means: the ones that are f32 in any case.
 const MEANS: usize = plane::LOG_SCALE;
@@ -162,21 +162,13 @@ impl Parameters {
         }
     }
 
-    /// Some rows as a host model.
-    pub(super) fn unpack(&self, rows: Range<usize>, sh_degree: u8) -> Gaussians {
-        let sh_planes = 3 * sh_coefficients(sh_degree);
-        let mut sh = Vec::with_capacity(rows.len() * sh_planes);
-        for row in rows.clone() {
-            sh.extend((0..sh_planes).map(|i| self.get(row, plane::SH + i)));
+    /// Some planes of some rows, row after row.
+    pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<f32> {
+        let mut values = Vec::with_capacity(rows.len() * planes.len());
+        for row in rows {
+            values.extend(planes.clone().map(|plane| self.get(row, plane)));
         }
-        Gaussians {
-            sh_degree,
-            means: rows.clone().map(|r| self.get_n(r, plane::MEAN)).collect(),
-            log_scales: rows.clone().map(|r| self.get_n(r, plane::LOG_SCALE)).collect(),
-            quats: rows.clone().map(|r| self.get_n(r, plane::QUAT)).collect(),
-            opacity_logits: rows.map(|r| self.get(r, plane::OPACITY)).collect(),
-            sh,
-        }
+        values
     }
 
     /// The blocks of the first `rows` rows, to read.

@@ -7,7 +7,7 @@ use super::CpuBackend;
 use super::blocks::planes;
 use super::signals::Accumulators;
 use super::summed::Summed;
-use crate::backend::{StateError, Tensor};
+use crate::backend::{StateArray, StateError, Tensor};
 
 const DEGREES: &str = "degrees";
 const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
@@ -19,25 +19,21 @@ const SIGNAL: &str = "signals.";
 const SUMMED: &str = "summed.";
 
 impl CpuBackend {
-    pub(super) fn state_names(&self) -> Vec<String> {
+    pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         // First: it says where the others have room.
-        let degrees = self.shortcuts.row_degrees.map(|_| DEGREES);
-        let mut names: Vec<String> =
-            degrees.into_iter().chain(MOMENTS).map(str::to_owned).collect();
-        names.push(AGES.to_owned());
-        names.extend(self.signals.layout().kept().map(|(name, _)| format!("{SIGNAL}{name}")));
+        let degrees = self.shortcuts.row_degrees.map(|_| StateArray::small(DEGREES));
+        let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::by_rows);
+        let mut arrays: Vec<StateArray> = degrees.into_iter().chain(of_rows).collect();
+        let signals = self.signals.layout().kept();
+        arrays.extend(signals.map(|(name, _)| StateArray::by_rows(format!("{SIGNAL}{name}"))));
         if self.candidates.is_wanted() {
-            names.push(CANDIDATES.to_owned());
+            arrays.push(StateArray::small(CANDIDATES));
         }
-        names.extend(self.summed.state().iter().map(|name| format!("{SUMMED}{name}")));
-        names
-    }
-
-    pub(super) fn state_is_by_rows(name: &str) -> bool {
-        match name.strip_prefix(SUMMED) {
-            Some(part) => Summed::is_by_rows(part),
-            None => ![DEGREES, CANDIDATES].contains(&name),
-        }
+        arrays.extend(self.summed.state().iter().map(|part| StateArray {
+            name: format!("{SUMMED}{part}"),
+            by_rows: Summed::is_by_rows(part),
+        }));
+        arrays
     }
 
     /// # Panics

@@ -41,11 +41,11 @@ use densify_policies::policy::{Cadence, Candidate, LossTerms, Needs, NoiseTerm, 
 
 use super::candidates::Candidates;
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateError, StepInput,
-    StepOutput, Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
+    StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 
 pub use accumulation::Accumulation;
@@ -242,6 +242,10 @@ impl Backend for GpuBackend {
         self.rows
     }
 
+    fn sh_degree(&self) -> u8 {
+        self.sizes.sh_degree
+    }
+
     fn budget(&self) -> usize {
         self.budget
     }
@@ -343,17 +347,17 @@ impl Backend for GpuBackend {
         self.rendering(camera.width, camera.height)
     }
 
-    fn download_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+    fn download_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
-        self.model(rows)
+        self.model_array(array, rows)
     }
 
-    fn state(&self) -> Vec<String> {
-        self.state_names()
-    }
-
-    fn is_by_rows(&self, name: &str) -> bool {
-        Self::state_is_by_rows(name)
+    fn state(&self) -> Vec<StateArray> {
+        self.state_arrays()
     }
 
     fn save_rows(&self, name: &str, rows: Range<usize>) -> Result<Tensor, BackendError> {

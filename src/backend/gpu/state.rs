@@ -7,7 +7,7 @@ use std::ops::Range;
 
 use super::GpuBackend;
 use super::buffers::{FIRST_SH, SECOND_SH, WAITING_SH, band_coefficients};
-use crate::backend::{BackendError, StateError, Tensor};
+use crate::backend::{BackendError, StateArray, StateError, Tensor};
 
 /// Before the name of a buffer.
 const BUFFER: &str = "device.";
@@ -49,19 +49,15 @@ impl GpuBackend {
         self.planes.kept().find(|(known, _)| known == name).map(|(_, plane)| plane)
     }
 
-    pub(super) fn state_names(&self) -> Vec<String> {
+    pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         let buffers = self.kept().into_iter().map(|(name, _)| format!("{BUFFER}{name}"));
         let signals = self.planes.kept().map(|(name, _)| format!("{SIGNAL}{name}"));
-        let mut names: Vec<String> = buffers.chain(signals).collect();
-        names.push(WAITS.to_owned());
+        let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::by_rows).collect();
+        arrays.push(StateArray::small(WAITS));
         if self.candidates.is_wanted() {
-            names.push(CANDIDATES.to_owned());
+            arrays.push(StateArray::small(CANDIDATES));
         }
-        names
-    }
-
-    pub(super) fn state_is_by_rows(name: &str) -> bool {
-        ![WAITS, CANDIDATES].contains(&name)
+        arrays
     }
 
     /// # Panics

@@ -8,7 +8,7 @@ use super::passes::Recorder;
 use super::{GpuBackend, readback};
 use crate::backend::{BackendError, Rendering};
 use crate::dataset::images::Image8;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, ModelArray};
 
 impl GpuBackend {
     pub(super) fn write(&self, name: &str, bytes: &[u8]) {
@@ -85,32 +85,37 @@ impl GpuBackend {
         })
     }
 
-    /// Some rows of the model.
-    pub(super) fn model(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
-        let (first_row, n) = (rows.start as u64, rows.len() as u64);
+    /// Some rows of one of the model's arrays.
+    pub(super) fn model_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
         let sh_degree = self.sizes.sh_degree;
-        let planes = self.sizes.sh_numbers();
-        let mut sh = vec![0.0; planes * rows.len()];
-        let rows = self.read("rows", 48 * first_row, 48 * n)?;
-        let rows = rows.as_chunks::<12>().0;
+        let read = |name, numbers: usize| {
+            let of_row = 4 * numbers as u64;
+            self.read(name, of_row * rows.start as u64, of_row * rows.len() as u64)
+        };
+        let parameters = array.parameters(sh_degree);
+        if array != ModelArray::Sh {
+            let all = read("rows", 12)?;
+            return Ok(all
+                .chunks_exact(12)
+                .flat_map(|row| &row[parameters.clone()])
+                .copied()
+                .collect());
+        }
+        let mut sh = vec![0.0; parameters.len() * rows.len()];
         let mut first = 0;
         for (band, name) in SH.into_iter().enumerate().take(usize::from(sh_degree) + 1) {
             let numbers = 3 * band_coefficients(band);
-            let bytes = 4 * numbers as u64;
-            let values = self.read(name, bytes * first_row, bytes * n)?;
-            for (row, values) in values.chunks_exact(numbers).enumerate() {
-                sh[row * planes + first..][..numbers].copy_from_slice(values);
+            let to = sh.chunks_exact_mut(parameters.len());
+            for (to, from) in to.zip(read(name, numbers)?.chunks_exact(numbers)) {
+                to[first..first + numbers].copy_from_slice(from);
             }
             first += numbers;
         }
-        Ok(Gaussians {
-            sh_degree,
-            means: rows.iter().map(|r| [r[0], r[1], r[2]]).collect(),
-            log_scales: rows.iter().map(|r| [r[3], r[4], r[5]]).collect(),
-            quats: rows.iter().map(|r| [r[6], r[7], r[8], r[9]]).collect(),
-            opacity_logits: rows.iter().map(|r| r[10]).collect(),
-            sh,
-        })
+        Ok(sh)
     }
 
     /// Some rows of the column of one plane of numbers.

@@ -2,7 +2,7 @@
 
 use densify_policies::plan::EditPlan;
 
-use crate::backend::{BackendError, Kept, LearningRates, Values};
+use crate::backend::{BackendError, Kept, LearningRates, StateArray, Values};
 use crate::camera::Camera;
 use crate::selftest::scenes;
 use crate::selftest::trial::{Trial, step};
@@ -32,7 +32,7 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     model.opacity_logits.fill(0.5);
     model.sh.fill(0.5);
     let mut backend = trial.bench.backend(&model)?;
-    for name in backend.state() {
+    for StateArray { name, .. } in backend.state() {
         let is_first = name.contains("first");
         if !is_first && !name.contains("second") {
             continue;

@@ -1,6 +1,6 @@
 //! What a checkpoint holds of a GPU backend is all that its future depends on.
 
-use densify::backend::{Backend, Tensor, Values};
+use densify::backend::{Backend, StateArray, Tensor, Values};
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, Signal, SignalSet,
 };
@@ -68,8 +68,8 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
         for i in 1..=BEFORE {
             step(&mut whole, &camera, i, CADENCE);
         }
-        let saved = |name: &String| whole.save(name).expect("an array of the state");
-        let state: Vec<Tensor> = whole.state().iter().map(saved).collect();
+        let saved = |array: StateArray| whole.save(&array.name).expect("an array of the state");
+        let state: Vec<Tensor> = whole.state().into_iter().map(saved).collect();
         let model = whole.download().expect("the model");
         let expected = future(&mut whole);
 

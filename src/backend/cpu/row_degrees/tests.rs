@@ -189,7 +189,7 @@ fn nothing_changes_where_nothing_can_be_dropped() {
     let mut backend = CpuBackend::new(&model, &options).expect("a small model fits");
     assert!(backend.drop_bands(0).expect("it is native").is_none());
     assert!(backend.download().expect("it is there") == model);
-    assert!(!backend.state().iter().any(|name| name == "degrees"));
+    assert!(!backend.state().iter().any(|array| array.name == "degrees"));
 }
 
 #[test]
