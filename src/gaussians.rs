@@ -82,6 +82,19 @@ impl Gaussians {
         })
     }
 
+    /// So many rows of zeros.
+    #[must_use]
+    pub fn zeros(rows: usize, sh_degree: u8) -> Self {
+        Self {
+            sh_degree,
+            means: vec![[0.0; 3]; rows],
+            log_scales: vec![[0.0; 3]; rows],
+            quats: vec![[0.0; 4]; rows],
+            opacity_logits: vec![0.0; rows],
+            sh: vec![0.0; rows * 3 * sh_coefficients(sh_degree)],
+        }
+    }
+
     /// Number of rows.
     #[must_use]
     pub fn len(&self) -> usize {

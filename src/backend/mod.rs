@@ -325,6 +325,20 @@ pub trait Backend: Send {
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError>;
 
+    /// Takes back what [`download_array`](Self::download_array) returned for the same rows.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When there are no such rows, or other numbers than they have: a bug in the caller.
+    fn upload_array(
+        &mut self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError>;
+
     /// The arrays that hold, beside the model, all that the future depends on: moments, ages,
     /// accumulated signals, and whatever else outlives a step. See [`Tensor`] for their order.
     fn state(&self) -> Vec<StateArray>;

@@ -73,12 +73,12 @@ impl Checkpoint {
         &self.header
     }
 
-    /// The model, in the coordinates of training.
+    /// A model of the checkpoint's size, of zeros: what a backend is made for, before it is
+    /// [restored](Self::restore).
     ///
     /// # Errors
-    /// [`CheckpointError::Invalid`] where it does not fit its own configuration;
-    /// [`CheckpointError::Read`].
-    pub fn model(&mut self) -> Result<Gaussians, CheckpointError> {
+    /// [`CheckpointError::Invalid`] where the model does not fit its own configuration.
+    pub fn blank_model(&self) -> Result<Gaussians, CheckpointError> {
         let train = &self.header.config.train;
         let (budget, sh_degree) = (train.budget, train.sh_degree);
         if sh_degree > MAX_SH_DEGREE {
@@ -89,19 +89,37 @@ impl Checkpoint {
         if rows > budget {
             return Err(self.invalid(format!("{rows} rows, but its budget is {budget}")));
         }
-        Gaussians::from_arrays(sh_degree, |array| {
-            let place = self.place(model::name(array))?;
-            let tensor = self.tensor(place)?;
-            let values = tensor.into_f32(&model::shape(array, rows, sh_degree));
-            values.map_err(CheckpointError::state(&self.path))
-        })
+        for array in ModelArray::ALL {
+            self.place_in_model(array, rows, sh_degree)?;
+        }
+        Ok(Gaussians::zeros(rows, sh_degree))
     }
 
-    /// Gives `backend`, which holds the [model](Self::model), the state of that moment.
+    /// Where an array of a model of this size is.
+    fn place_in_model(
+        &self,
+        array: ModelArray,
+        rows: usize,
+        sh_degree: u8,
+    ) -> Result<usize, CheckpointError> {
+        let name = model::name(array);
+        let place = self.place(name)?;
+        let Record { shape, kind, .. } = &self.places[place].1;
+        let needed = model::shape(array, rows, sh_degree);
+        if (shape, *kind) == (&needed, Dtype::F32) {
+            return Ok(place);
+        }
+        Err(self.invalid(format!(
+            "tensor `{name}`: it is {kind:?} of shape {shape:?}; this run needs F32 of {needed:?}"
+        )))
+    }
+
+    /// Gives `backend`, which was made for the [blank model](Self::blank_model), the model and the state
+    /// of that moment.
     ///
     /// # Errors
     /// [`CheckpointError::Invalid`] where the arrays are not those that this backend keeps;
-    /// [`CheckpointError::Read`].
+    /// [`CheckpointError::Read`], [`CheckpointError::Backend`].
     pub fn restore(&mut self, backend: &mut dyn Backend) -> Result<(), CheckpointError> {
         let wanted = backend.state();
         let known = |name: &str| {
@@ -112,10 +130,20 @@ impl Checkpoint {
             let name = &record.name;
             return Err(self.invalid(format!("this run keeps nothing like its tensor `{name}`")));
         }
-        let rows = backend.rows();
+        let refused = CheckpointError::state(&self.path);
+        let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
+        for array in ModelArray::ALL {
+            let place = self.place_in_model(array, rows, sh_degree)?;
+            let mut scan = Scan::new(self, place)?;
+            for rows in pieces(rows) {
+                let shape = model::shape(array, rows.len(), sh_degree);
+                let values = scan.tensor(rows.len())?.into_f32(&shape).map_err(&refused)?;
+                backend.upload_array(array, rows, &values)?;
+            }
+            scan.finish()?;
+        }
         for StateArray { name, by_rows } in wanted {
             let place = self.place(&name)?;
-            let refused = CheckpointError::state(&self.path);
             let has_rows = self.places[place].1.shape.first() == Some(&rows);
             if has_rows && by_rows {
                 let mut scan = Scan::new(self, place)?;
@@ -125,7 +153,7 @@ impl Checkpoint {
                 scan.finish()?;
             } else {
                 // What should have rows, and has not so many, is refused.
-                backend.restore(self.tensor(place)?).map_err(refused)?;
+                backend.restore(self.tensor(place)?).map_err(&refused)?;
             }
         }
         Ok(())

@@ -152,10 +152,10 @@ fn what_is_written_is_read_back_to_the_bit() {
     let (_root, path) = written();
     let mut checkpoint = Checkpoint::open(&path).unwrap();
     assert_eq!(*checkpoint.header(), header());
-    let model = checkpoint.model().unwrap();
-    assert_eq!(model, gaussians());
-    let mut restored = CpuBackend::new(&model, &options()).unwrap();
+    let blank = checkpoint.blank_model().unwrap();
+    let mut restored = CpuBackend::new(&blank, &options()).unwrap();
     checkpoint.restore(&mut restored).unwrap();
+    assert_eq!(restored.download().unwrap(), gaussians());
     let expected = backend();
     assert_eq!(restored.state().len(), 10);
     for StateArray { name, .. } in expected.state() {
@@ -248,6 +248,9 @@ fn a_state_of_another_run_is_refused_by_name() {
     let mut fewer = options();
     fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
     refused(fewer, "`candidates`: 4 of them; this run holds 3");
+    let mut small = CpuBackend::new(&Gaussians::zeros(3, 1), &options()).unwrap();
+    let problem = Checkpoint::open(&path).unwrap().restore(&mut small).unwrap_err().to_string();
+    assert!(problem.contains("`model.means`: it is F32 of shape [61, 3]"), "{problem}");
     // A model larger than its own budget, or of a degree that there is not.
     for (budget, sh_degree, words) in
         [(60, 1, "61 rows, but its budget is 60"), (64, 9, "at most 3")]
@@ -255,7 +258,7 @@ fn a_state_of_another_run_is_refused_by_name() {
         let mut header = header();
         (header.config.train.budget, header.config.train.sh_degree) = (budget, sh_degree);
         write(&path, &header, &backend()).unwrap();
-        let problem = Checkpoint::open(&path).unwrap().model().unwrap_err().to_string();
+        let problem = Checkpoint::open(&path).unwrap().blank_model().unwrap_err().to_string();
         assert!(problem.contains(words), "{problem}");
     }
 }

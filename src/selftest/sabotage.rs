@@ -195,6 +195,14 @@ impl Backend for Saboteur {
         }
         Ok(values)
     }
+    fn upload_array(
+        &mut self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        self.inner.upload_array(array, rows, values)
+    }
     fn state(&self) -> Vec<StateArray> {
         self.inner.state()
     }

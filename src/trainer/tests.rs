@@ -113,6 +113,14 @@ impl Backend for CountingBackend {
     ) -> Result<Vec<f32>, BackendError> {
         Ok(vec![0.0; array.parameters(0).len() * rows.len()])
     }
+    fn upload_array(
+        &mut self,
+        _: ModelArray,
+        _: std::ops::Range<usize>,
+        _: &[f32],
+    ) -> Result<(), BackendError> {
+        Ok(())
+    }
     fn state(&self) -> Vec<StateArray> {
         Vec::new()
     }

@@ -103,17 +103,22 @@ pub fn obj(bytes: &[u8]) -> bool {
     mesh(&[("mesh.obj", mesh_file), ("mesh.mtl", library), ("texture.png", PHOTOGRAPH)])
 }
 
-/// A checkpoint: its header, its model.
+/// A checkpoint: its header, its model, and what a backend keeps beside it.
 pub fn checkpoint(bytes: &[u8]) -> bool {
     within(&[("step.safetensors", bytes)], |folder| {
         let Ok(mut found) = Checkpoint::open(&folder.join("step.safetensors")) else {
             return false;
         };
         let budget = found.header().config.train.budget;
-        found.model().is_ok_and(|model| {
-            assert!(model.len() <= budget);
-            true
-        })
+        let Ok(model) = found.blank_model() else {
+            return false;
+        };
+        assert!(model.len() <= budget);
+        let options = CpuOptions { threads: Some(1), ..CpuOptions::new(model.len()) };
+        let mut backend = CpuBackend::new(&model, &options).expect("it is as small as its file");
+        // Whether this backend keeps what the file's kept is another question.
+        let _ = found.restore(&mut backend);
+        true
     })
 }
 

@@ -12,6 +12,7 @@ mod audit;
 mod blocks;
 mod budget;
 mod candidates;
+mod differentiate;
 mod footprint;
 mod fresh;
 mod loss;
@@ -51,24 +52,22 @@ use super::{
     StateError, StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
-use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 use adam::BiasCorrection;
 use blocks::planes;
 use loss::{ImageTerms, LossBuffers};
 use moments::Moments;
-use optimise::Differentiate;
 use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
 use project::Splat;
-use rasterize::{DARK, TileCanvas};
-use rasterize_bwd::{Detail, TileGradient};
+use rasterize::TileCanvas;
+use rasterize_bwd::TileGradient;
 use signals::Accumulators;
 use simd::WIDTH;
 use stage_clock::StageClock;
 use summed::Summed;
-use tiles::{Grid, TileLists};
+use tiles::TileLists;
 
 pub use optimise::{ImageGradient, ModelGradient};
 pub use options::CpuOptions;
@@ -180,91 +179,6 @@ impl CpuBackend {
             sums: vec![0.0; blocks * WIDTH * stride],
             clock: StageClock::default(),
         })
-    }
-
-    /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
-    /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
-    ///
-    /// Needs records of full detail, so that it allocates more than the ledger says where the
-    /// policy's needs are smaller: it is a tool for tests and for research, not part of training.
-    ///
-    /// # Errors
-    /// [`BackendError::ImageTooLarge`].
-    ///
-    /// # Panics
-    /// When `upstream` does not have the image's size.
-    pub fn differentiate(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        upstream: &ImageGradient,
-    ) -> Result<(Rendering, ModelGradient), BackendError> {
-        let pixels = camera.width as usize * camera.height as usize;
-        assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
-        assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
-        assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
-        let detail = Detail::All;
-        let records = self.record_cap * detail.stride();
-        if self.records.len() < records {
-            self.records = bytemuck::zeroed_vec(records);
-        }
-        self.sums.resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
-        let frame = self.forward(camera, background, sh_degree, true)?;
-        let rendering = self.rendering(&frame);
-        for (tile, gradient) in self.gradient.iter_mut().enumerate() {
-            gradient.planes = [DARK; 5];
-            for_each_pixel(&frame.grid, tile, |patch, lane, at| {
-                for channel in 0..3 {
-                    gradient.planes[channel][patch][lane] = upstream.rgb[3 * at + channel];
-                }
-                gradient.planes[3][patch][lane] = upstream.alpha[at];
-                gradient.planes[4][patch][lane] = upstream.depth[at];
-            });
-        }
-        self.backward(&frame, detail);
-        let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
-        self.arch.dispatch(Differentiate {
-            params: self.params.view(self.rows),
-            sums: &self.sums,
-            visible: &self.visible,
-            view: &frame.view,
-            out: &mut gradient,
-        });
-        Ok((rendering, gradient))
-    }
-
-    /// The training loss of a rendering against a target and its gradient by the rendering's
-    /// pixels. Shape of the gradient: `[height, width, 3]`.
-    ///
-    /// # Panics
-    /// When rendering and target differ in size.
-    pub fn loss(
-        &mut self,
-        rendering: &Rendering,
-        target: &Image8,
-        background: [f32; 3],
-    ) -> (StepOutput, Vec<f32>) {
-        let grid = Grid::new(rendering.width, rendering.height);
-        assert_eq!(grid, Grid::new(target.width, target.height), "rendering and target");
-        self.resize_images(&grid);
-        for (tile, canvas) in self.canvas.iter_mut().enumerate() {
-            for_each_pixel(&grid, tile, |patch, lane, at| {
-                for channel in 0..3 {
-                    canvas.planes[channel][patch][lane] = rendering.rgb[3 * at + channel];
-                }
-            });
-        }
-        let value = self.image_loss(&grid, target, background, ImageTerms::default());
-        let mut gradient = vec![0.0; rendering.rgb.len()];
-        for (tile, from) in self.gradient.iter().enumerate() {
-            for_each_pixel(&grid, tile, |patch, lane, at| {
-                for channel in 0..3 {
-                    gradient[3 * at + channel] = from.planes[channel][patch][lane];
-                }
-            });
-        }
-        (scalars(value), gradient)
     }
 }
 
@@ -378,6 +292,17 @@ impl Backend for CpuBackend {
     ) -> Result<Vec<f32>, BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
         Ok(self.params.to_rows(rows, array.parameters(self.sh_degree)))
+    }
+
+    fn upload_array(
+        &mut self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.params.set_rows(rows, array.parameters(self.sh_degree), values);
+        Ok(())
     }
 
     fn state(&self) -> Vec<StateArray> {

@@ -171,6 +171,15 @@ impl Parameters {
         values
     }
 
+    /// Takes back what [`to_rows`](Self::to_rows) returned.
+    pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[f32]) {
+        for (row, values) in rows.zip(values.chunks_exact(planes.len())) {
+            for (plane, &value) in planes.clone().zip(values) {
+                self.set(row, plane, value);
+            }
+        }
+    }
+
     /// The blocks of the first `rows` rows, to read.
     pub(super) fn view(&self, rows: usize) -> ParameterView<'_> {
         ParameterView {

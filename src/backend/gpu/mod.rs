@@ -356,6 +356,16 @@ impl Backend for GpuBackend {
         self.model_array(array, rows)
     }
 
+    fn upload_array(
+        &mut self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        self.set_model_array(array, rows, values)
+    }
+
     fn state(&self) -> Vec<StateArray> {
         self.state_arrays()
     }

@@ -118,6 +118,35 @@ impl GpuBackend {
         Ok(sh)
     }
 
+    /// Takes back what [`model_array`](Self::model_array) returned.
+    pub(super) fn set_model_array(
+        &self,
+        array: ModelArray,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
+        let parameters = array.parameters(self.sizes.sh_degree);
+        let (first_row, n) = (rows.start as u64, rows.len() as u64);
+        let of_rows = values.chunks_exact(parameters.len());
+        if array != ModelArray::Sh {
+            let mut all = self.read("rows", 48 * first_row, 48 * n)?;
+            for (row, values) in all.chunks_exact_mut(12).zip(of_rows) {
+                row[parameters.clone()].copy_from_slice(values);
+            }
+            self.write_at("rows", 48 * first_row, &all);
+            return Ok(());
+        }
+        let mut first = 0;
+        for (band, name) in SH.into_iter().enumerate().take(usize::from(self.sizes.sh_degree) + 1) {
+            let numbers = 3 * band_coefficients(band);
+            let of_band = |row: &[f32]| row[first..first + numbers].to_vec();
+            let band: Vec<f32> = of_rows.clone().flat_map(of_band).collect();
+            self.write_at(name, 4 * numbers as u64 * first_row, &band);
+            first += numbers;
+        }
+        Ok(())
+    }
+
     /// Some rows of the column of one plane of numbers.
     pub(super) fn column(&self, plane: u32, rows: Range<usize>) -> Result<Vec<f32>, BackendError> {
         let start = u64::from(plane) * self.sizes.budget + rows.start as u64;

@@ -278,7 +278,9 @@ impl Survey {
             let (width, height) = scene::largest_image(&self.dataset);
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
             let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
-            pass("measuring a view", rendering + image + scratch_bytes(width, threads));
+            // Weights and opacities of the rows, and their order, while it is asked which are missed.
+            let asked = if self.required.rows { budget * 4 * float } else { 0 };
+            pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
         }
         let process = self.process_bytes();
         if let Some(beyond) = self.peak.and_then(|peak| peak.checked_sub(process)) {

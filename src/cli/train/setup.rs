@@ -90,7 +90,7 @@ pub(super) fn prepare(
         Some(checkpoint) => {
             let TrainConfig { init, init_points, .. } = checkpoint.header().config.train;
             (
-                checkpoint.model()?,
+                checkpoint.blank_model()?,
                 args.init.map_or(init, Into::into),
                 args.init_points.or(init_points),
             )
@@ -191,7 +191,7 @@ pub(super) fn prepare(
     Ok(Prepared { config, output, trainer, test, dataset, ledger, fingerprint, last, kept })
 }
 
-/// Gives the trainer, which holds the model of the checkpoint, all else that is in it.
+/// Gives the trainer, which holds as many rows as the checkpoint, all that is in it.
 fn go_on(
     mut checkpoint: Checkpoint,
     trainer: &mut Trainer<DatasetViews>,
