@@ -32,7 +32,7 @@ pub struct StateArray {
 
 impl StateArray {
     /// An array with one entry per row.
-    pub(super) fn by_rows(name: impl Into<String>) -> Self {
+    pub(super) fn of_rows(name: impl Into<String>) -> Self {
         Self { name: name.into(), by_rows: true }
     }
 

@@ -22,10 +22,10 @@ impl CpuBackend {
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         // First: it says where the others have room.
         let degrees = self.shortcuts.row_degrees.map(|_| StateArray::small(DEGREES));
-        let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::by_rows);
+        let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::of_rows);
         let mut arrays: Vec<StateArray> = degrees.into_iter().chain(of_rows).collect();
         let signals = self.signals.layout().kept();
-        arrays.extend(signals.map(|(name, _)| StateArray::by_rows(format!("{SIGNAL}{name}"))));
+        arrays.extend(signals.map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))));
         if self.candidates.is_wanted() {
             arrays.push(StateArray::small(CANDIDATES));
         }

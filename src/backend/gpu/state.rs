@@ -52,7 +52,7 @@ impl GpuBackend {
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         let buffers = self.kept().into_iter().map(|(name, _)| format!("{BUFFER}{name}"));
         let signals = self.planes.kept().map(|(name, _)| format!("{SIGNAL}{name}"));
-        let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::by_rows).collect();
+        let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITS));
         if self.candidates.is_wanted() {
             arrays.push(StateArray::small(CANDIDATES));
