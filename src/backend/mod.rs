@@ -331,7 +331,7 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     ///
     /// # Panics
-    /// When there are no such rows, or other numbers than they have: a bug in the caller.
+    /// When there are no such rows: a bug in the caller.
     fn upload_array(
         &mut self,
         array: ModelArray,
