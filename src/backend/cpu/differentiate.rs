@@ -76,7 +76,11 @@ impl CpuBackend {
         background: [f32; 3],
     ) -> (StepOutput, Vec<f32>) {
         let grid = Grid::new(rendering.width, rendering.height);
-        assert_eq!(grid, Grid::new(target.width, target.height), "rendering and target");
+        assert_eq!(
+            grid,
+            Grid::new(target.width, target.height),
+            "rendering and target differ in size"
+        );
         self.resize_images(&grid);
         for (tile, canvas) in self.canvas.iter_mut().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {

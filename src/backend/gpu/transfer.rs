@@ -139,8 +139,8 @@ impl GpuBackend {
         let mut first = 0;
         for (band, name) in SH.into_iter().enumerate().take(usize::from(self.sizes.sh_degree) + 1) {
             let numbers = 3 * band_coefficients(band);
-            let of_band = |row: &[f32]| row[first..first + numbers].to_vec();
-            let band: Vec<f32> = of_rows.clone().flat_map(of_band).collect();
+            let of_band = of_rows.clone().flat_map(|row| &row[first..first + numbers]);
+            let band: Vec<f32> = of_band.copied().collect();
             self.write_at(name, 4 * numbers as u64 * first_row, &band);
             first += numbers;
         }
