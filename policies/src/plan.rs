@@ -37,6 +37,14 @@ enum Fate {
     Updated,
 }
 
+/// Most that a plan takes for each row, seeds apart `[bytes]`: a fate, and either an update of each row
+/// or, as each family has a child, a family with its child's slot for every second one.
+pub const BYTES_PER_ROW: usize = size_of::<Fate>() + {
+    let updates = size_of::<(u32, Update)>();
+    let families = (size_of::<Family>() + size_of::<u32>()).div_ceil(2);
+    if updates > families { updates } else { families }
+};
+
 /// The edits of one event.
 ///
 /// Rows are named by their index before the edit. At every call
@@ -49,7 +57,7 @@ pub struct EditPlan {
     pruned: usize,
     born: usize,
     denied: usize,
-    families: Vec<(u32, Offspring)>,
+    families: Vec<Family>,
     updates: Vec<(u32, Update)>,
     seeds: Vec<Seed>,
     clamp_opacity: Option<f32>,
@@ -133,8 +141,14 @@ impl EditPlan {
     pub fn grow(&mut self, parent: u32, offspring: Offspring) -> Result<(), Refused> {
         let children = offspring.children as usize;
         self.claim(parent, offspring.is_valid(), children, Fate::Grown)?;
+        if self.families.is_empty() {
+            // As many as there can be, if no more rows are pruned: growing step by step, the array
+            // would be there twice while it is moved.
+            self.families.reserve_exact(self.rows().min(self.room()));
+        }
+        let first_child = self.born_in_families() as u32;
+        self.families.push(Family { parent, first_child, offspring });
         self.born += children;
-        self.families.push((parent, offspring));
         Ok(())
     }
 
@@ -202,15 +216,7 @@ impl EditPlan {
         // the newborn, the rest (only where the model shrinks) for rows of the tail.
         let mut holes = (0..rows_before).filter(is_pruned).chain(rows_before..).map(|s| s as u32);
 
-        let born_in_families = self.born - self.seeds.len();
-        let child_slots: Vec<u32> = holes.by_ref().take(born_in_families).collect();
-        let mut first_child = 0;
-        let families = self.families.iter().map(|&(parent, offspring)| {
-            let family = Family { parent, first_child, offspring };
-            first_child += offspring.children;
-            family
-        });
-        let families: Vec<Family> = families.collect();
+        let child_slots: Vec<u32> = holes.by_ref().take(self.born_in_families()).collect();
         // Seeds lead the zip: it must not draw a hole when there is no seed left to fill it.
         let seeds = self.seeds.iter().zip(holes.by_ref()).map(|(&seed, slot)| (slot, seed));
         let seeds: Vec<(u32, Seed)> = seeds.collect();
@@ -221,14 +227,14 @@ impl EditPlan {
         let counts = EditCounts {
             removed: self.pruned,
             added: self.born,
-            updated: self.updates.len() + families.iter().filter(rewritten).count(),
+            updated: self.updates.len() + self.families.iter().filter(rewritten).count(),
             denied: self.denied,
         };
         let ops = RowOps {
             rows_before,
             rows_after,
             budget: self.budget,
-            families,
+            families: self.families,
             child_slots,
             updates: self.updates,
             seeds,
@@ -241,6 +247,10 @@ impl EditPlan {
         };
         ops.assert_valid();
         ops
+    }
+
+    fn born_in_families(&self) -> usize {
+        self.born - self.seeds.len()
     }
 
     /// Gives `row` its fate, if it is free, the edit's values are good and there is room.

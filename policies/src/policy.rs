@@ -6,6 +6,8 @@
 //! [`EditPlan`]. It touches no parameter and no device, so that every policy runs unchanged on
 //! every backend and can be tested without a renderer.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 pub use crate::error::PolicyError;
@@ -199,6 +201,13 @@ impl SignalSet {
         self.0 & (1 << signal as u32) != 0
     }
 
+    /// How many signals are in this set.
+    #[must_use]
+    #[expect(clippy::len_without_is_empty, reason = "nobody asks")]
+    pub fn len(self) -> usize {
+        self.0.count_ones() as usize
+    }
+
     /// The signals in this set, in declaration order.
     pub fn iter(self) -> impl Iterator<Item = Signal> {
         Signal::ALL.into_iter().filter(move |&s| self.contains(s))
@@ -268,18 +277,29 @@ pub struct Candidate {
 pub struct Signals {
     rows: usize,
     present: SignalSet,
-    columns: Vec<Vec<f32>>,
+    /// The columns, one after another in declaration order. Shape: `[present, rows]`.
+    values: Vec<f32>,
 }
 
 impl Signals {
     /// Columns for `set`, all zero. Each has `rows` values.
     #[must_use]
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
-        let columns = Signal::ALL
-            .iter()
-            .map(|&s| if set.contains(s) { vec![0.0; rows] } else { Vec::new() })
-            .collect();
-        Self { rows, present: set, columns }
+        Self::within(Vec::new(), rows, set)
+    }
+
+    /// The same in memory that is there: of `values` nothing but the capacity is used.
+    #[must_use]
+    pub fn within(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
+        values.clear();
+        values.resize(rows * set.len(), 0.0);
+        Self { rows, present: set, values }
+    }
+
+    /// The memory of all columns.
+    #[must_use]
+    pub fn into_values(self) -> Vec<f32> {
+        self.values
     }
 
     /// Number of rows.
@@ -291,12 +311,17 @@ impl Signals {
     /// The column of `signal`, if present. Shape: `[rows]`.
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
-        self.present.contains(signal).then(|| &self.columns[signal as usize][..])
+        self.place(signal).map(|place| &self.values[place])
     }
 
     /// The column of `signal` for writing, if present. Shape: `[rows]`.
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
-        self.present.contains(signal).then(|| &mut self.columns[signal as usize][..])
+        self.place(signal).map(|place| &mut self.values[place])
+    }
+
+    fn place(&self, signal: Signal) -> Option<Range<usize>> {
+        let before = self.present.iter().position(|s| s == signal)?;
+        Some(before * self.rows..(before + 1) * self.rows)
     }
 }
 

@@ -17,7 +17,7 @@ use std::ops::Range;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, Needs, Signals};
+use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, SignalSet, Signals};
 
 use serde::{Deserialize, Serialize};
 
@@ -242,12 +242,21 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError>;
 
-    /// Copies the signals named in `needs` and the candidates collected so far to the host.
-    /// `FreshWeightMax` starts anew, whether it was named or not.
+    /// Copies these signals to the host. `FreshWeightMax` starts anew, whether it is one of them or
+    /// not.
     ///
     /// # Errors
     /// See [`BackendError`].
-    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError>;
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError>;
+
+    /// Takes back the signals when they have been read: a backend may have lent memory of its own for
+    /// them, which it has to allocate anew otherwise.
+    fn give_back(&mut self, signals: Signals) {
+        drop(signals);
+    }
+
+    /// The candidates collected since their last reset.
+    fn candidates(&self) -> &[Candidate];
 
     /// Executes a plan of iteration `step`: parameters, moments and age in place.
     ///

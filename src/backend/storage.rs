@@ -37,4 +37,7 @@ pub enum MomentStorage {
     /// The second as [`Bf16`](Self::Bf16); the first in 1 byte, as a multiple of the root of the
     /// second, which bounds it.
     Ratio8,
+    /// Both in 1 byte: the first as in [`Ratio8`](Self::Ratio8), the second as a float of one
+    /// significant digit after the first, from 2⁻⁹⁶ to 1.5·2³⁰. What is below has a root near Adam's ε.
+    Both8,
 }

@@ -112,7 +112,7 @@ pub static PRESETS: &[Preset] = &[
         levels: &[
             ("image_cache", "0"),
             ("param_storage", "f16"),
-            ("moment_storage", "ratio8"),
+            ("moment_storage", "both8"),
             ("pairs_per_row", "1"),
         ],
         measured: Some(Measured {

@@ -117,6 +117,7 @@ impl Settings {
             moments: match self.text("moment_storage") {
                 "bf16" => MomentStorage::Bf16,
                 "ratio8" => MomentStorage::Ratio8,
+                "both8" => MomentStorage::Both8,
                 _ => MomentStorage::F32,
             },
         }

@@ -168,13 +168,13 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "moment_storage",
         default: "f32",
-        domain: Domain::Choice(&["f32", "bf16", "ratio8"]),
+        domain: Domain::Choice(&["f32", "bf16", "ratio8", "both8"]),
         unit: "",
         class: Bounded,
         on: On::Native,
         how: How::Knob,
-        what: "bf16: moments in 2 bytes, rounded at random; ratio8: the first in 1, in roots of the second",
-        levels: Values(&["bf16", "ratio8"]),
+        what: "bf16: moments in 2 bytes, rounded at random; ratio8: the first in 1, in roots of the second; both8: the second in 1, too",
+        levels: Values(&["bf16", "ratio8", "both8"]),
     },
     Knob {
         name: "sh_degree",

@@ -140,7 +140,7 @@ fn degree_left_out(config: &RunConfig, degree: u8, earned: Option<&Earned>) -> O
 }
 
 fn rows_left_out(growth: &Growth, rows: usize, budget: usize) -> Option<LeftOut> {
-    let last = growth.rungs.last()?;
+    let last = growth.rungs.iter().find(|rung| Some(rung.step) == growth.stopped)?;
     let gain = last.gain.filter(|_| rows < budget && growth.idle >= 2)?;
     growth.stopped.map(|step| LeftOut {
         what: format!("rows beyond {}", last.rows),
@@ -250,12 +250,16 @@ mod tests {
         let text = line(&config, 2, None, None);
         assert!(text.contains("degree 3 of") && text.contains("not measured"), "{text}");
         config.train.sh_degree = 3;
-        let rung = |rows, gain| Rung { step: 300, rows, psnr: 30.0, gain };
+        let rung = |step, rows, gain| Rung { step, rows, psnr: 30.0, settled: true, gain };
         let growth = Growth {
             limit: 900,
             stopped: Some(300),
             idle: 2,
-            rungs: vec![rung(700, Some(0.06)), rung(1000, Some(0.04))],
+            rungs: vec![
+                rung(200, 700, Some(0.06)),
+                rung(300, 1000, Some(0.04)),
+                rung(400, 1000, None),
+            ],
             shrinks: vec![
                 Shrink { step: 400, before: 1000, after: 900, change: -0.015 },
                 Shrink { step: 500, before: 900, after: 900, change: -0.125 },

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Candidate, Needs, Signals};
+use densify_policies::policy::{Candidate, SignalSet, Signals};
 
 use super::bench::{Bench, Subject};
 use super::cases;
@@ -154,8 +154,14 @@ impl Backend for Saboteur {
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         self.inner.observe(input)
     }
-    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
-        self.inner.take_signals(needs)
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
+        self.inner.take_signals(wanted)
+    }
+    fn give_back(&mut self, signals: Signals) {
+        self.inner.give_back(signals);
+    }
+    fn candidates(&self) -> &[Candidate] {
+        self.inner.candidates()
     }
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
         self.inner.apply(ops, seed, step)

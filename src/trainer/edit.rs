@@ -18,14 +18,16 @@ impl<V: ViewSource> Trainer<V> {
         let needs = self.measure_fresh(step)?;
         self.show_views(step)?;
         self.views_time = self.views_time.saturating_add(start.elapsed());
-        let (signals, candidates) =
-            self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
+        let signals =
+            self.backend.take_signals(needs.signals).map_err(|e| self.stopped(step, e))?;
         let limit = self.limit();
         let scene = SceneInfo { budget: limit, ..self.scene.clone() };
-        let now = Snapshot { step, scene: &scene, signals: &signals, candidates: &candidates };
+        let candidates = self.backend.candidates();
+        let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
         let mut plan = EditPlan::new(self.backend.rows(), limit);
         let rng = PolicyRng::new(self.options.seed, step);
         let planned = asked(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
+        self.backend.give_back(signals);
         planned.map_err(|source| self.refused(step, source))?;
         self.execute(step, plan)
     }

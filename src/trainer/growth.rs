@@ -8,13 +8,17 @@
 //! cannot be told from it: the slope is rather too large, so that growth stops too late rather than too
 //! early. It stops when the slope has been below [`PAYS`] twice in a row.
 //!
-//! What that has let in is sent out again. At the end of each later rung the rows are ordered by the
+//! Policies also do what makes images worse for a while: they insert rows, or reset opacities. Where
+//! the probes are worse than they have been by more than [`UNSETTLED`], nothing is concluded: the rung
+//! has no slope, the limit stays, and no row is removed.
+//!
+//! What growth has let in is sent out again. At the end of each later rung the rows are ordered by the
 //! largest weight that they have in any view; as many tenths of them as the probes miss, at once, by
 //! less than [`PAYS`] per doubling are removed. On one model at one step the difference is free of
 //! noise, and as the rows that stay learn to fill in, it is rather too large.
 
 use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
-use densify_policies::policy::{Needs, Signal, SignalSet};
+use densify_policies::policy::{Signal, SignalSet};
 use serde::{Deserialize, Serialize};
 
 use super::probe::mean;
@@ -24,6 +28,10 @@ use crate::views::ViewSource;
 
 /// What a doubling of rows must bring `[dB]`.
 pub const PAYS: f64 = 0.10;
+/// The probes' PSNR is so far below its best where a policy's edit is still being recovered from `[dB]`.
+/// Of views drawn anew at each step, as the loss is, the noise would be larger than this; the probes
+/// are the same views each time.
+const UNSETTLED: f64 = 0.5;
 /// Steps of a rung in a run of 30,000: ten rungs, or five doublings, until most policies stop to grow.
 const RUNG: u32 = 1_500;
 /// Rungs are whole multiples of this: policies are due every 100 steps at most.
@@ -55,7 +63,7 @@ pub struct Growth {
     pub limit: usize,
     /// The step at which growth was stopped, if it was.
     pub stopped: Option<u32>,
-    /// Ends of rungs so far.
+    /// Ends of rungs so far, also of those after growth at which rows might have been removed.
     pub rungs: Vec<Rung>,
     /// Attempts to do with fewer rows.
     pub shrinks: Vec<Shrink>,
@@ -73,8 +81,11 @@ pub struct Rung {
     pub rows: usize,
     /// Mean PSNR of the probes `[dB]`.
     pub psnr: f64,
-    /// What rows have brought in this rung and the two before, training included `[dB per doubling]`;
-    /// `None` where there are not so many, or rows did not become more.
+    /// Whether the probes are about as good as they have ever been; else nothing is concluded.
+    pub settled: bool,
+    /// What rows have brought in this settled rung and the two before, training included
+    /// `[dB per doubling]`; `None` where there are not so many, rows did not become more, or growth is
+    /// over.
     pub gain: Option<f64>,
 }
 
@@ -97,13 +108,21 @@ impl Growth {
         Self { limit: rows.max(LEAST_ROWS).min(budget), ..Self::default() }
     }
 
-    /// Takes the end of a rung into account, and what the probes show.
-    fn judge(&mut self, step: u32, rows: usize, psnr: f64, budget: usize) {
-        self.rungs.push(Rung { step, rows, psnr, gain: None });
-        let gain = slope(&self.rungs[self.rungs.len().saturating_sub(FITTED)..]);
-        if let Some(rung) = self.rungs.last_mut() {
-            rung.gain = gain;
-        }
+    /// Takes note of the end of a rung, and of whether anything may be concluded from it.
+    fn note(&mut self, step: u32, rows: usize, psnr: f64) -> bool {
+        let best = self.rungs.iter().map(|rung| rung.psnr).fold(f64::NEG_INFINITY, f64::max);
+        let settled = psnr >= best - UNSETTLED;
+        self.rungs.push(Rung { step, rows, psnr, settled, gain: None });
+        settled
+    }
+
+    /// Concludes from the last rung, a settled one, whether more rows pay.
+    fn judge(&mut self, budget: usize) {
+        let settled = self.rungs.iter().rev().filter(|rung| rung.settled);
+        let gain = slope(&settled.take(FITTED).copied().collect::<Vec<_>>());
+        let Some(rung) = self.rungs.last_mut() else { return };
+        rung.gain = gain;
+        let Rung { step, rows, .. } = *rung;
         // A limit that rows do not come near says nothing about more of them.
         let is_full = rows as f64 * FACTOR.sqrt() >= self.limit as f64;
         let is_idle = is_full && gain.is_some_and(|gain| gain < PAYS);
@@ -165,15 +184,20 @@ impl<V: ViewSource> Trainer<V> {
         };
         let grows = growth.stopped.is_none() && step <= iterations / 2;
         let rows = self.backend.rows();
-        let usable = self.options.savings.rows(self.backend.budget());
+        let shrinks = !grows && growth.may_shrink(step, iterations) && rows >= 10;
+        if !grows && !shrinks {
+            return Ok(None);
+        }
+        let psnr = mean(&self.probe(step, self.sh_degree(step))?);
+        let settled = growth.note(step, rows, psnr);
+        if settled && grows {
+            growth.judge(self.options.savings.rows(self.backend.budget()));
+        }
+        let (gain, limit) = (growth.rungs.last().and_then(|rung| rung.gain), growth.limit);
+        tracing::info!(step, rows, psnr, settled, gain, limit, "end of a rung");
         let mut event = None;
-        if grows {
-            let psnr = mean(&self.probe(step, self.sh_degree(step))?);
-            growth.judge(step, rows, psnr, usable);
-            let (gain, limit) = (growth.rungs.last().and_then(|rung| rung.gain), growth.limit);
-            tracing::info!(step, rows, psnr, gain, limit, "end of a rung");
-        } else if growth.may_shrink(step, iterations) && rows >= 10 {
-            let (least, change) = self.least_missed(step)?;
+        if settled && shrinks {
+            let (least, change) = self.least_missed(step, psnr)?;
             let after = rows - least.len();
             tracing::info!(step, before = rows, after, change, "fewer rows");
             growth.shrinks.push(Shrink { step, before: rows, after, change });
@@ -194,18 +218,16 @@ impl<V: ViewSource> Trainer<V> {
         Ok(event)
     }
 
-    /// The rows that are missed least, as many as may be, and what the probes lose without them `[dB]`;
-    /// what they lose without a tenth, if that is too much.
-    fn least_missed(&mut self, step: u32) -> Result<(Vec<u32>, f64), TrainError> {
-        let needs = Needs { signals: signals(), ..Needs::default() };
-        let taken = self.backend.take_signals(&needs).map_err(|e| self.stopped(step, e))?;
-        let of = |signal| taken.0.get(signal).unwrap_or_default();
+    /// The rows that are missed least, as many as may be, and what the probes change without them from
+    /// the PSNR that they have with `all` `[dB]`; what a tenth would change, if that is too much.
+    fn least_missed(&mut self, step: u32, all: f64) -> Result<(Vec<u32>, f64), TrainError> {
+        let signals = self.backend.take_signals(signals()).map_err(|e| self.stopped(step, e))?;
+        let of = |signal| signals.get(signal).unwrap_or_default();
         let (weights, opacities) = (of(Signal::WeightMax), of(Signal::Opacity));
         let mut least: Vec<u32> = (0..weights.len() as u32).collect();
         least.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
         let tenth = least.len() / 10;
         let degree = self.sh_degree(step);
-        let all = mean(&self.probe(step, degree)?);
         let (mut hidden, mut gone, mut change) = (0, 0, None);
         for tenths in 1..=MOST_TENTHS {
             self.set_opacities(step, &least[hidden..tenths * tenth], |_| HIDDEN)?;
@@ -220,6 +242,7 @@ impl<V: ViewSource> Trainer<V> {
             }
         }
         self.set_opacities(step, &least[..hidden], |row| opacities[row as usize])?;
+        self.backend.give_back(signals);
         least.truncate(gone);
         Ok((least, change.unwrap_or_default()))
     }

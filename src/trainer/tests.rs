@@ -77,8 +77,12 @@ impl Backend for CountingBackend {
         let columns = input.request.columns.iter().map(|&c| (c, vec![x as f32; self.rows]));
         Ok(AuxOutput { loss: 0.5, columns: columns.collect(), points: Vec::new() })
     }
-    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
-        Ok((Signals::zeros(self.rows, needs.signals), Vec::new()))
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
+        Ok(Signals::zeros(self.rows, wanted))
+    }
+
+    fn candidates(&self) -> &[Candidate] {
+        &[]
     }
     fn apply(&mut self, ops: &RowOps, _seed: u64, step: u32) -> Result<(), BackendError> {
         note(&self.diary, format!("apply {step}"));

@@ -243,7 +243,7 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
         }
         let signals = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightSum]);
         let needs = Needs { signals, ..Needs::default() };
-        let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+        let signals = backend.take_signals(needs.signals).expect("signals can be taken");
         let of = |signal| signals.get(signal).expect("a requested signal").to_vec();
         (backend.download().expect("a model"), of(Signal::ScreenGradient), of(Signal::WeightSum))
     };

@@ -418,7 +418,7 @@ fn present_values_are_those_of_the_model() {
     let wanted = [Signal::Opacity, Signal::ScaleMax, Signal::ScaleProduct];
     let needs = Needs { signals: SignalSet::of(&wanted), ..Needs::default() };
     let mut backend = backend(&model, needs.clone(), 1);
-    let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+    let signals = backend.take_signals(needs.signals).expect("signals can be taken");
     let of = |signal| signals.get(signal).expect("a requested signal");
     for row in 0..20 {
         let scales = model.log_scales[row].map(|x| f64::from(x).exp());

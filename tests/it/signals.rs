@@ -120,7 +120,7 @@ fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBacken
         };
         backend.train_step(&input).expect("a small image is rendered");
     }
-    let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+    let signals = backend.take_signals(needs.signals).expect("signals can be taken");
     let columns =
         wanted.iter().map(|&s| signals.get(s).expect("a requested signal").to_vec()).collect();
     (backend, columns)
@@ -206,7 +206,7 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
     let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), ..Needs::default() };
     let now = |backend: &mut CpuBackend| {
-        let (signals, _) = backend.take_signals(&needs).expect("signals can be taken");
+        let signals = backend.take_signals(needs.signals).expect("signals can be taken");
         signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
     };
     assert!(columns[0].iter().any(|&w| w > 0.1));

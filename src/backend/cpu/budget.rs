@@ -33,7 +33,8 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let budget = options.budget.max(1);
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
-    let stride = Accumulators::new(1, needs).detail().stride();
+    let signals = Accumulators::new(1, needs);
+    let stride = signals.detail().stride();
     let per_row = planes(sh_degree);
     let padded = budget.next_multiple_of(WIDTH) as u64;
     let (width, height) = options.largest_image;
@@ -68,7 +69,8 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
         "projected splats",
         budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
     );
-    ledger.add_to(Section::Gradients, "splat gradients", padded * stride as u64 * float);
+    let sums = padded * signals.sums() as u64 * float;
+    ledger.add_to(Section::Gradients, "splat gradients, signals at events", sums);
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
     let records = record_cap(options) as u64 * stride as u64 * float;
     ledger.add_to(Section::Tiles, "gradients per entry", records);
@@ -106,6 +108,7 @@ mod tests {
             (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
             (ParameterStorage::F16, MomentStorage::Bf16, 3 * 4 + 56 * 2, 2 * 59 * 2),
             (ParameterStorage::F16, MomentStorage::Ratio8, 3 * 4 + 56 * 2, 3 * 59),
+            (ParameterStorage::F16, MomentStorage::Both8, 3 * 4 + 56 * 2, 2 * 59),
         ];
         for (parameters, moments, of_parameters, of_moments) in formats {
             let options = CpuOptions {
@@ -130,7 +133,7 @@ mod tests {
             assert_eq!(line("optimiser moments"), Some(moments.held()));
             let bytes = |of: usize| Some(of as u64);
             assert_eq!(line("gradients per entry"), bytes(size_of_val(&records[..])));
-            assert_eq!(line("splat gradients"), bytes(size_of_val(&sums[..])));
+            assert_eq!(line("splat gradients, signals at events"), bytes(size_of_val(&sums[..])));
             let seen = size_of_val(&visible[..]);
             assert_eq!(line("projected splats"), bytes(size_of_val(&splats[..]) + seen));
         }

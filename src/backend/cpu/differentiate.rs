@@ -4,7 +4,6 @@ use super::loss::ImageTerms;
 use super::optimise::Differentiate;
 use super::rasterize::DARK;
 use super::rasterize_bwd::Detail;
-use super::simd::WIDTH;
 use super::tiles::Grid;
 use super::{CpuBackend, ImageGradient, ModelGradient, for_each_pixel, scalars};
 use crate::backend::{BackendError, Rendering, StepOutput};
@@ -39,7 +38,6 @@ impl CpuBackend {
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);
         }
-        self.sums.resize(self.visible.len() * WIDTH * detail.stride(), 0.0);
         let frame = self.forward(camera, background, sh_degree, true)?;
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient.iter_mut().enumerate() {

@@ -83,7 +83,7 @@ mod tests {
     }
 
     fn taken(backend: &mut CpuBackend, needs: &Needs, signal: Signal) -> Vec<u32> {
-        let (signals, _) = backend.take_signals(needs).unwrap();
+        let signals = backend.take_signals(needs.signals).unwrap();
         signals.get(signal).unwrap().iter().map(|v| v.to_bits()).collect()
     }
 

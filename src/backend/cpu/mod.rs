@@ -42,7 +42,7 @@ use std::sync::atomic::AtomicU32;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Candidate, LossTerms, Needs, NoiseTerm, Signals};
+use densify_policies::policy::{Candidate, LossTerms, NoiseTerm, SignalSet, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
@@ -112,7 +112,8 @@ pub struct CpuBackend {
     /// signals' detail]`.
     records: Vec<AtomicU32>,
     record_cap: usize,
-    /// One record per row. Shape: `[budget, stride of the signals' detail]`.
+    /// One record per row. Between steps it is lent to the host's copy of the signals, and has room
+    /// for these. Shape: `[budget, stride of the signals' detail]`, or more.
     sums: Vec<f32>,
     clock: StageClock,
 }
@@ -143,7 +144,7 @@ impl CpuBackend {
         let ledger = budget::ledger(model.sh_degree, options, pool.current_num_threads());
         budget::reserve(&ledger)?;
         let signals = Accumulators::new(budget, &options.needs);
-        let stride = signals.detail().stride();
+        let (stride, sums) = (signals.detail().stride(), signals.sums());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let blocks = budget.div_ceil(WIDTH);
         let per_row = planes(model.sh_degree);
@@ -176,7 +177,7 @@ impl CpuBackend {
             loss: LossBuffers::new(),
             records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
-            sums: vec![0.0; blocks * WIDTH * stride],
+            sums: vec![0.0; blocks * WIDTH * sums],
             clock: StageClock::default(),
         })
     }
@@ -238,10 +239,23 @@ impl Backend for CpuBackend {
         self.observe_view(input)
     }
 
-    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
-        let signals = self.signals.take(self.rows, needs.signals, &self.params, &self.ages);
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
+        // Between the backward pass of a step and that of the next, nobody reads the sums.
+        let memory = std::mem::take(&mut self.sums);
+        let mut signals = Signals::within(memory, self.rows, wanted);
+        self.signals.read(&mut signals, wanted, &self.params, &self.ages);
         self.signals.forget_measured(self.rows);
-        Ok((signals, self.candidates.list().to_vec()))
+        Ok(signals)
+    }
+
+    fn give_back(&mut self, signals: Signals) {
+        if self.sums.is_empty() {
+            self.sums = signals.into_values();
+        }
+    }
+
+    fn candidates(&self) -> &[Candidate] {
+        self.candidates.list()
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {

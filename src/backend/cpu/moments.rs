@@ -8,7 +8,7 @@
 use std::ops::Range;
 
 use super::blocks::{BlockTask, BlockView, Blocks, Degrees, Scratch};
-use super::narrow::{Bf16, Draws, Narrow, first_moment, first_moments, narrow, ratios, widen};
+use super::narrow::{Bf16, Draws, F8, Narrow, first_moment, first_moments, narrow, ratios, widen};
 use super::simd::WIDTH;
 use crate::backend::{MomentStorage, StateError, Tensor};
 
@@ -21,44 +21,30 @@ pub(super) enum Moments {
     Bf16([Blocks<Bf16>; 2]),
     /// See [`MomentStorage::Ratio8`].
     Ratio8(Blocks<i8>, Blocks<Bf16>),
+    /// See [`MomentStorage::Both8`].
+    Both8(Blocks<i8>, Blocks<F8>),
 }
 
 /// Does the same to both moments, whatever they are.
 macro_rules! each_moment {
     ($moments:expr, $blocks:ident => $do:expr) => {
         match $moments {
-            Moments::F32([first, second]) => {
-                {
-                    let $blocks = first;
-                    $do
-                }
-                {
-                    let $blocks = second;
-                    $do
-                }
-            }
-            Moments::Bf16([first, second]) => {
-                {
-                    let $blocks = first;
-                    $do
-                }
-                {
-                    let $blocks = second;
-                    $do
-                }
-            }
-            Moments::Ratio8(first, second) => {
-                {
-                    let $blocks = first;
-                    $do
-                }
-                {
-                    let $blocks = second;
-                    $do
-                }
-            }
+            Moments::F32([first, second]) => each_moment!(first, second, $blocks => $do),
+            Moments::Bf16([first, second]) => each_moment!(first, second, $blocks => $do),
+            Moments::Ratio8(first, second) => each_moment!(first, second, $blocks => $do),
+            Moments::Both8(first, second) => each_moment!(first, second, $blocks => $do),
         }
     };
+    ($first:ident, $second:ident, $blocks:ident => $do:expr) => {{
+        {
+            let $blocks = $first;
+            $do
+        }
+        {
+            let $blocks = $second;
+            $do
+        }
+    }};
 }
 
 impl Moments {
@@ -69,16 +55,21 @@ impl Moments {
             MomentStorage::Ratio8 => {
                 Self::Ratio8(Blocks::zeros(capacity, planes), Blocks::zeros(capacity, planes))
             }
+            MomentStorage::Both8 => {
+                Self::Both8(Blocks::zeros(capacity, planes), Blocks::zeros(capacity, planes))
+            }
         }
     }
 
     /// Bytes for `capacity` rows.
     pub(super) fn bytes(capacity: usize, planes: usize, storage: MomentStorage) -> u64 {
         let half = Blocks::<Bf16>::bytes(capacity, planes);
+        let byte = Blocks::<F8>::bytes(capacity, planes);
         match storage {
             MomentStorage::F32 => 2 * Blocks::<f32>::bytes(capacity, planes),
             MomentStorage::Bf16 => 2 * half,
-            MomentStorage::Ratio8 => Blocks::<i8>::bytes(capacity, planes) + half,
+            MomentStorage::Ratio8 => byte + half,
+            MomentStorage::Both8 => 2 * byte,
         }
     }
 
@@ -117,10 +108,8 @@ impl Moments {
         match self {
             Self::F32(both) => both.each_ref().map(|blocks| blocks.get(row, plane)),
             Self::Bf16(both) => both.each_ref().map(|blocks| blocks.get(row, plane).to_f32()),
-            Self::Ratio8(first, second) => {
-                let second = second.get(row, plane).to_f32();
-                [first_moment(first.get(row, plane), second), second]
-            }
+            Self::Ratio8(first, second) => pair(first, second, row, plane),
+            Self::Both8(first, second) => pair(first, second, row, plane),
         }
     }
 
@@ -130,6 +119,7 @@ impl Moments {
             Self::F32(both) => MomentView::F32(both.each_ref().map(|blocks| blocks.view(rows))),
             Self::Bf16(both) => MomentView::Bf16(both.each_ref().map(|blocks| blocks.view(rows))),
             Self::Ratio8(first, second) => MomentView::Ratio8(first.view(rows), second.view(rows)),
+            Self::Both8(first, second) => MomentView::Both8(first.view(rows), second.view(rows)),
         }
     }
 
@@ -148,11 +138,15 @@ impl Moments {
                 let both = m.tasks(rows).into_iter().zip(v.tasks(rows));
                 both.map(|(m, v)| MomentTask::Ratio8(m, v)).collect()
             }
+            Self::Both8(m, v) => {
+                let both = m.tasks(rows).into_iter().zip(v.tasks(rows));
+                both.map(|(m, v)| MomentTask::Both8(m, v)).collect()
+            }
         }
     }
 
     /// The first (0) or second (1) moments of some rows, as they are stored: numbers, the bits of
-    /// bfloat16, or ratios in two's complement. Shape: `[rows.len(), planes]`.
+    /// shorter ones, or ratios in two's complement. Shape: `[rows.len(), planes]`.
     pub(super) fn tensor(
         &self,
         which: usize,
@@ -168,11 +162,15 @@ impl Moments {
         match (self, which) {
             (Self::F32(both), _) => Tensor::f32(name, &shape, both[which].to_rows(rows, 0..planes)),
             (Self::Bf16(both), _) => halves(&both[which]),
-            (Self::Ratio8(first, _), 0) => {
+            (Self::Ratio8(first, _) | Self::Both8(first, _), 0) => {
                 let ratios = first.to_rows(rows, 0..planes);
                 Tensor::u8(name, &shape, ratios.into_iter().map(i8::cast_unsigned).collect())
             }
             (Self::Ratio8(_, second), _) => halves(second),
+            (Self::Both8(_, second), _) => {
+                let bits = second.to_rows(rows, 0..planes).into_iter().map(|x| x.0).collect();
+                Tensor::u8(name, &shape, bits)
+            }
         }
     }
 
@@ -196,14 +194,44 @@ impl Moments {
                 Ok(())
             }
             (Self::Bf16(both), _) => halves(&mut both[which], tensor),
-            (Self::Ratio8(first, _), 0) => {
+            (Self::Ratio8(first, _) | Self::Both8(first, _), 0) => {
                 let ratios = tensor.into_u8(&shape)?.into_iter().map(u8::cast_signed);
                 first.set_rows(rows, 0..planes, &ratios.collect::<Vec<i8>>());
                 Ok(())
             }
             (Self::Ratio8(_, second), _) => halves(second, tensor),
+            (Self::Both8(_, second), _) => {
+                let bits: Vec<F8> = tensor.into_u8(&shape)?.into_iter().map(F8).collect();
+                second.set_rows(rows, 0..planes, &bits);
+                Ok(())
+            }
         }
     }
+}
+
+/// Both moments of one parameter, of which the first is stored as a ratio.
+fn pair<T: Narrow>(first: &Blocks<i8>, second: &Blocks<T>, row: usize, plane: usize) -> [f32; 2] {
+    let second = second.get(row, plane).to_f32();
+    [first_moment(first.get(row, plane), second), second]
+}
+
+/// The same of whole planes.
+#[inline(always)]
+fn open_pair<T: Narrow>(first: &[i8], second: &[T], [m, v]: [&mut [f32]; 2]) {
+    widen(second, v);
+    first_moments(first, v, m);
+}
+
+/// Stores both moments of whole planes; the first as a multiple of what is stored of the second.
+#[inline(always)]
+fn close_pair<T: Narrow>(
+    [m, v]: [&[f32]; 2],
+    first: &mut [i8],
+    second: &mut [T],
+    [of_m, of_v]: [&mut Draws; 2],
+) {
+    narrow(v, second, of_v);
+    ratios(m, second, first, of_m);
 }
 
 /// The moments of some blocks, to read.
@@ -212,6 +240,7 @@ pub(super) enum MomentView<'a> {
     F32([BlockView<'a, f32>; 2]),
     Bf16([BlockView<'a, Bf16>; 2]),
     Ratio8(BlockView<'a, i8>, BlockView<'a, Bf16>),
+    Both8(BlockView<'a, i8>, BlockView<'a, F8>),
 }
 
 impl<'a> MomentView<'a> {
@@ -234,8 +263,12 @@ impl<'a> MomentView<'a> {
                 widen(&second.block(block)[..used], &mut v.0[..used]);
             }
             Self::Ratio8(first, second) => {
-                widen(&second.block(block)[..used], &mut v.0[..used]);
-                first_moments(&first.block(block)[..used], &v.0[..used], &mut m.0[..used]);
+                let to = [&mut m.0[..used], &mut v.0[..used]];
+                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
+            }
+            Self::Both8(first, second) => {
+                let to = [&mut m.0[..used], &mut v.0[..used]];
+                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
             }
         }
         [&m.0, &v.0]
@@ -248,6 +281,7 @@ pub(super) enum MomentTask<'a> {
     F32([BlockTask<'a, f32>; 2]),
     Bf16([BlockTask<'a, Bf16>; 2]),
     Ratio8(BlockTask<'a, i8>, BlockTask<'a, Bf16>),
+    Both8(BlockTask<'a, i8>, BlockTask<'a, F8>),
 }
 
 impl MomentTask<'_> {
@@ -268,8 +302,12 @@ impl MomentTask<'_> {
                 widen(&second.block(block)[..used], &mut v.0[..used]);
             }
             Self::Ratio8(first, second) => {
-                widen(&second.block(block)[..used], &mut v.0[..used]);
-                first_moments(&first.block(block)[..used], &v.0[..used], &mut m.0[..used]);
+                let to = [&mut m.0[..used], &mut v.0[..used]];
+                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
+            }
+            Self::Both8(first, second) => {
+                let to = [&mut m.0[..used], &mut v.0[..used]];
+                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
             }
         }
         [&mut m.0, &mut v.0]
@@ -293,9 +331,14 @@ impl MomentTask<'_> {
                 narrow(&v.0[..used], &mut second.block(block)[..used], of_v);
             }
             Self::Ratio8(first, second) => {
-                let second = &mut second.block(block)[..used];
-                narrow(&v.0[..used], second, of_v);
-                ratios(&m.0[..used], second, &mut first.block(block)[..used], of_m);
+                let (first, second) = (first.block(block), second.block(block));
+                let from = [&m.0[..used], &v.0[..used]];
+                close_pair(from, &mut first[..used], &mut second[..used], [of_m, of_v]);
+            }
+            Self::Both8(first, second) => {
+                let (first, second) = (first.block(block), second.block(block));
+                let from = [&m.0[..used], &v.0[..used]];
+                close_pair(from, &mut first[..used], &mut second[..used], [of_m, of_v]);
             }
         }
     }

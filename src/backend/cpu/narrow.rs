@@ -25,9 +25,19 @@ const INFINITE: u32 = 0x7f80_0000;
 const BF16_DROPPED: u32 = 16;
 /// Largest finite number of bf16.
 const BF16_MAX: u32 = 0x7f7f;
+/// Bits that [`F8`] lacks: all digits but one.
+const F8_DROPPED: u32 = 22;
+/// What the upper bits of f32 are too large by in [`F8`]: its least number, 2⁻⁹⁶, has the code 1.
+const F8_BIAS: u32 = ((127 - 96) << 1) - 1;
+/// 2⁹⁶: below its inverse there is nothing but 0.
+const F8_INVERSE_LEAST: f32 = 79_228_162_514_264_337_593_543_950_336.0;
+/// Code of the largest finite number of [`F8`], 1.5·2³⁰.
+const F8_MAX: u32 = 0xfe;
+/// Whatever is no finite number.
+const F8_NONE: u32 = 0xff;
 /// |first moment| / √(second moment) is at most this: by Cauchy and Schwarz,
 /// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999; and a little for the rounding of
-/// the second.
+/// the second. Where that is coarse, ratios of more than 6 may be cut; noise gives 0.23.
 const RATIO_MAX: f32 = 7.3;
 const RATIO_STEP: f32 = RATIO_MAX / 127.0;
 
@@ -84,6 +94,10 @@ pub(super) struct F16(pub(super) u16);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Bf16(pub(super) u16);
 
+/// A number that is not negative, in a byte: 7 bits of exponent and one digit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct F8(pub(super) u8);
+
 impl Narrow for F16 {
     #[inline(always)]
     fn to_f32(self) -> f32 {
@@ -130,6 +144,28 @@ impl Narrow for Bf16 {
         let beyond = INFINITE >> BF16_DROPPED | digit;
         let half = if magnitude >= INFINITE { beyond } else { drawn.min(BF16_MAX) };
         Self((half | (bits >> BF16_DROPPED & 0x8000)) as u16)
+    }
+}
+
+impl Narrow for F8 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        let code = u32::from(self.0);
+        let x = f32::from_bits((code + F8_BIAS) << F8_DROPPED);
+        let x = if code == 0 { 0.0 } else { x };
+        if code == F8_NONE { f32::NAN } else { x }
+    }
+
+    /// Of a negative number, 0.
+    #[inline(always)]
+    fn between(x: f32, random: u32) -> Self {
+        let size = x.max(0.0);
+        let drawn = (size.to_bits() + (random >> (32 - F8_DROPPED))) >> F8_DROPPED;
+        let code = drawn.wrapping_sub(F8_BIAS).min(F8_MAX);
+        let share = size * F8_INVERSE_LEAST;
+        let least = u32::from(share > unit(random, 23));
+        let code = if share < 1.0 { least } else { code };
+        Self(if x.is_finite() { code } else { F8_NONE } as u8)
     }
 }
 
@@ -246,7 +282,7 @@ pub(super) fn first_moments(ratios: &[i8], seconds: &[f32], to: &mut [f32]) {
 /// Draws are the middles of 2,048 steps, and so never as small as the rounding of the division: a ratio
 /// that is one already stays.
 #[inline(always)]
-pub(super) fn ratios(first: &[f32], second: &[Bf16], to: &mut [i8], draws: &mut Draws) {
+pub(super) fn ratios<T: Narrow>(first: &[f32], second: &[T], to: &mut [i8], draws: &mut Draws) {
     let (first, second) = (first.as_chunks::<WIDTH>().0, second.as_chunks::<WIDTH>().0);
     let to = to.as_chunks_mut::<WIDTH>().0;
     for ((first, second), to) in first.iter().zip(second).zip(to) {

@@ -119,6 +119,7 @@ impl CpuBackend {
     pub(super) fn backward(&mut self, frame: &Frame, detail: Detail) {
         let Frame { grid, background, bands, .. } = frame;
         let blending = self.shortcuts.into();
+        self.have_sums(detail);
         let Self {
             pool,
             arch,
@@ -168,6 +169,14 @@ impl CpuBackend {
                 }
             }
         });
+    }
+
+    /// Makes the sums whole again where they were lent, or too few for so much detail.
+    pub(super) fn have_sums(&mut self, detail: Detail) {
+        let whole = self.visible.len() * WIDTH * detail.stride();
+        if self.sums.len() < whole {
+            self.sums.resize(whole, 0.0);
+        }
     }
 
     /// Adds the worst pixels of the view to the candidates.

@@ -116,6 +116,12 @@ impl Accumulators {
         }
     }
 
+    /// Numbers per row where gradients of splats are summed in a step, and the requested signals lie
+    /// while they are read.
+    pub(super) fn sums(&self) -> usize {
+        self.detail().stride().max(self.requested.len())
+    }
+
     /// Whether views are to be measured.
     pub(super) fn measures(&self) -> bool {
         self.layout.fresh_weight_max.is_some()
@@ -175,15 +181,14 @@ impl Accumulators {
         }
     }
 
-    /// The requested signals of the first `rows` rows.
-    pub(super) fn take(
+    /// Writes the columns of the wanted signals.
+    pub(super) fn read(
         &self,
-        rows: usize,
+        signals: &mut Signals,
         wanted: SignalSet,
         params: &Parameters,
         ages: &[u16],
-    ) -> Signals {
-        let mut signals = Signals::zeros(rows, wanted);
+    ) {
         for signal in wanted.iter() {
             let value = |row: usize| -> f32 {
                 match signal {
@@ -219,6 +224,5 @@ impl Accumulators {
                 }
             }
         }
-        signals
     }
 }

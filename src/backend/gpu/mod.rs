@@ -37,7 +37,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Cadence, Candidate, LossTerms, Needs, NoiseTerm, Signal, Signals};
+use densify_policies::policy::{
+    Cadence, Candidate, LossTerms, NoiseTerm, Signal, SignalSet, Signals,
+};
 
 use super::candidates::Candidates;
 use super::{
@@ -286,9 +288,9 @@ impl Backend for GpuBackend {
         self.observe_view(input)
     }
 
-    fn take_signals(&mut self, needs: &Needs) -> Result<(Signals, Vec<Candidate>), BackendError> {
-        let mut signals = Signals::zeros(self.rows, needs.signals);
-        for signal in needs.signals.iter() {
+    fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
+        let mut signals = Signals::zeros(self.rows, wanted);
+        for signal in wanted.iter() {
             let values = match signal {
                 Signal::Opacity => self.present(0)?,
                 Signal::ScaleMax => self.present(1)?,
@@ -311,7 +313,11 @@ impl Backend for GpuBackend {
         if let Some(plane) = self.planes.fresh() {
             self.clear_planes(&[plane]);
         }
-        Ok((signals, self.candidates.list().to_vec()))
+        Ok(signals)
+    }
+
+    fn candidates(&self) -> &[Candidate] {
+        self.candidates.list()
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {

@@ -1,6 +1,7 @@
 //! What a run takes, buffer by buffer, for any size of it, before anything of it is allocated. The
 //! ledger of a run and that of `densify plan` are made here, so that they cannot disagree.
 
+use densify_policies::plan::BYTES_PER_ROW;
 use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::{PolicyEntry, find};
 use glam::DVec3;
@@ -37,6 +38,9 @@ const PROGRAM: u64 = 14 << 20;
 const PROGRAM_STEP: u64 = 8 << 20;
 /// What the system's allocator keeps between two uses of a piece. Measured at up to 5 MiB.
 const KEPT: u64 = 6 << 20;
+/// What a policy makes of its signals for each row before it plans: means, orders, sums of weights
+/// and draws. `taming` makes most: a weight, and a key with its row.
+const PLANNING: u64 = 20;
 /// A point with its colour.
 const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
 
@@ -290,20 +294,19 @@ impl Survey {
         ledger
     }
 
-    /// Signals and candidates on the host; fates, families and slots of the plan.
+    /// Signals on the host, the plan, and what the policy makes of the former.
     fn event_bytes(&self, setting: &Setting, needs: &Needs) -> u64 {
         let float = size_of::<f32>() as u64;
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
-        let signals = needs.signals.iter().count() as u64;
-        let candidates = needs.candidates.map_or(0, |request| request.capacity) as u64;
+        // The native backend has room for them.
+        let signals = if self.device.is_some() { needs.signals.len() as u64 } else { 0 };
         // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
         let aux = needs.aux.as_ref();
         let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
         let points = aux.map_or(0, |request| u64::from(request.points));
         // A point is kept by the policy, becomes a seed, and is compiled.
-        setting.rows as u64 * ((signals + columns) * float + 64)
-            + candidates * candidate
+        setting.rows as u64 * ((signals + columns) * float + BYTES_PER_ROW as u64 + PLANNING)
             + points * self.dataset.train.len() as u64 * (candidate + 3 * seed)
     }
 

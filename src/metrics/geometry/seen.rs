@@ -78,7 +78,7 @@ impl Seen {
         let enough = samples.into_iter().filter(|(_, views)| *views >= WITNESSES);
         seen.samples = enough.map(|(place, _)| place).collect();
         let failed = |source| GeometryError::Backend { view: "all".to_owned(), source };
-        let (signals, _) = backend.take_signals(&wanted).map_err(failed)?;
+        let signals = backend.take_signals(wanted.signals).map_err(failed)?;
         // Always among the signals: they are what `needs` names.
         seen.peaks = signals.get(Signal::FreshWeightMax).map(<[f32]>::to_vec).unwrap_or_default();
         Ok(seen)

@@ -14,7 +14,9 @@ fn climb(first: usize, training: f64) -> Growth {
     let mut growth = Growth::new(first, BUDGET);
     let mut rows = first;
     for end in 1..=20_u32 {
-        growth.judge(end * LENGTH, rows, reached(rows) + training * f64::from(end), 10 * BUDGET);
+        let psnr = reached(rows) + training * f64::from(end);
+        assert!(growth.note(end * LENGTH, rows, psnr), "it only becomes better");
+        growth.judge(10 * BUDGET);
         if growth.stopped.is_some() {
             break;
         }
@@ -49,18 +51,39 @@ fn what_training_brings_lets_growth_go_on() {
 fn a_limit_that_is_not_reached_says_nothing_and_rises_to_the_budget_at_most() {
     let mut growth = Growth::new(100_000, BUDGET);
     for end in 1..=6 {
-        growth.judge(end * LENGTH, 20_000, 30.0, BUDGET);
+        growth.note(end * LENGTH, 20_000, 30.0);
+        growth.judge(BUDGET);
     }
     assert_eq!((growth.limit, growth.stopped), (BUDGET, None));
     assert!(growth.rungs.iter().all(|rung| rung.gain.is_none()), "{:?}", growth.rungs);
     // Nor do rows that become more far below the limit.
     for end in 7..=12 {
-        growth.judge(end * LENGTH, 1_000 << (end - 7), 30.0, BUDGET);
+        growth.note(end * LENGTH, 1_000 << (end - 7), 30.0);
+        growth.judge(BUDGET);
     }
     assert!(growth.rungs.last().unwrap().gain.unwrap() < PAYS);
     assert_eq!((growth.idle, growth.stopped), (0, None));
     assert_eq!(Growth::new(10, BUDGET).limit, LEAST_ROWS);
     assert_eq!(Growth::new(10, 400).limit, 400);
+}
+
+#[test]
+fn nothing_is_concluded_until_an_edit_is_recovered_from() {
+    let psnr = [30.0, 33.0, 35.0, 35.6, 35.2, 29.0, 35.0, 35.2, 36.0];
+    let mut growth = Growth::new(5_000, BUDGET);
+    let settled: Vec<bool> = (1..).zip(psnr).map(|(end, psnr)| growth.note(end, 0, psnr)).collect();
+    assert_eq!(settled, [true, true, true, true, true, false, false, true, true]);
+    // The slope is that of the settled rungs, and goes over the others.
+    let mut growth = Growth::new(4_000, BUDGET);
+    for (rows, psnr) in [(4_000, 30.0), (8_000, 31.0), (12_000, 12.0), (16_000, 32.0)] {
+        if growth.note(rows as u32, rows, psnr) {
+            growth.judge(BUDGET);
+        }
+    }
+    let gains: Vec<Option<f64>> = growth.rungs.iter().map(|rung| rung.gain).collect();
+    assert_eq!(gains[..3], [None; 3]);
+    assert!((gains[3].unwrap() - 1.0).abs() < 1e-9, "1 dB per doubling: {gains:?}");
+    assert_eq!(growth.limit, 11_314, "it has risen at three of four rungs");
 }
 
 #[test]

@@ -113,6 +113,24 @@ fn a_run_takes_no_more_than_it_is_given() {
     }
 }
 
+/// All that grows with the rows: what lasts, and what an event of the policy takes beside it.
+#[test]
+fn a_row_takes_no_more_than_480_bytes_in_tiny_memory() {
+    let scene = Photographs::colmap_text();
+    for policy in ["vanilla", "diet", "mcmc"] {
+        let [less, more] = ["256MiB", "512MiB"].map(|memory| {
+            let flags = format!("--policy {policy} --preset tiny-memory --sh-degree 3");
+            let planned = call("plan", scene.path(), &format!("{flags} --memory {memory}")).ok();
+            let rows = budget(&planned).trim_start_matches("budget").trim_start();
+            let rows: String =
+                rows.chars().take_while(|c| *c != ' ').filter(|c| *c != ',').collect();
+            rows.parse::<u64>().expect("a number of rows")
+        });
+        let bytes = 256.0 * MIB as f64 / (more - less) as f64;
+        assert!(bytes > 300.0 && bytes <= 480.0, "{policy}: {bytes} bytes, {less} and {more} rows");
+    }
+}
+
 #[test]
 fn on_a_gpu_it_bounds_what_is_on_the_device() {
     let scene = Photographs::colmap_text();

@@ -105,7 +105,7 @@ fn colours(backend: &CpuBackend) -> impl Fn(usize) -> usize + use<> {
 
 fn rows(backend: &mut CpuBackend) -> Vec<Row> {
     let model = backend.download().expect("a model");
-    let (signals, _) = backend.take_signals(&needs()).expect("signals are there");
+    let signals = backend.take_signals(needs().signals).expect("signals are there");
     let of = |signal, row: usize| signals.get(signal).expect("it was asked for")[row];
     let row = |row: usize| Row {
         mean: model.means[row],

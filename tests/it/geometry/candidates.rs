@@ -101,8 +101,7 @@ fn candidates(model: &Gaussians, target: &Image8, request: CandidateRequest) -> 
         ssim_weight: 1.0,
     };
     backend.train_step(&input).expect("a step");
-    let needs = Needs { candidates: Some(request), ..Needs::default() };
-    backend.take_signals(&needs).expect("signals").1
+    backend.candidates().to_vec()
 }
 
 fn image(colour: impl Fn(usize) -> f32) -> Image8 {

@@ -99,7 +99,7 @@ fn an_edit_does_what_it_does_natively() {
             backend.apply(&ops, 5, 2).expect("a plan is applied");
             assert_eq!(backend.rows(), ops.rows_after);
             let edited = backend.download().expect("a model");
-            let signals = backend.take_signals(&needs).expect("signals").0;
+            let signals = backend.take_signals(needs.signals).expect("signals");
             // Moments and ages show in the next steps.
             for n in 3..=4 {
                 step(backend, &camera, n, needs.cadence);

@@ -132,9 +132,9 @@ fn candidates_are_those_of_the_native_backend() {
             let both: [&mut dyn Backend; 2] = [&mut cpu, &mut gpu];
             let [expected, found] = both.map(|backend| {
                 step(backend, &camera, 1, Cadence::default());
-                let first = backend.take_signals(&needs).expect("signals").1;
+                let first = backend.candidates().to_vec();
                 step(backend, &camera, 2, Cadence::default());
-                (first, backend.take_signals(&needs).expect("signals").1)
+                (first, backend.candidates().to_vec())
             });
             let what =
                 format!("{error:?}, {depth:?}, spaced {spaced}, of {rows_per_candidate} rows");
@@ -170,7 +170,7 @@ fn the_device_finds_the_pixels_that_the_host_would() {
                 for number in 1..4 {
                     step(&mut gpu, &camera, number, Cadence::default());
                 }
-                places(&gpu.take_signals(&needs).expect("signals").1)
+                places(gpu.candidates())
             });
             assert!(by_host.len() > 8 * 30, "{error:?}: {} numbers", by_host.len());
             assert_eq!(by_device, by_host, "{error:?}");
@@ -219,7 +219,7 @@ fn where_all_pixels_are_equally_wrong_the_first_is_taken() {
                 seed: 1,
             };
             backend.train_step(&input).expect("a small image is rendered");
-            backend.take_signals(&needs).expect("signals").1
+            backend.candidates().to_vec()
         });
         let mut table = Table::new("a candidate among equals, GPU against CPU");
         compare_points(&mut table, "the first pixel", &found, &expected);

@@ -42,7 +42,8 @@ fn future(backend: &mut dyn Backend) -> impl PartialEq + std::fmt::Debug + use<>
         }
         step(backend, &camera, i, CADENCE);
     }
-    let (signals, candidates) = backend.take_signals(&needs()).expect("signals");
+    let signals = backend.take_signals(needs().signals).expect("signals");
+    let candidates = backend.candidates().to_vec();
     let bits = |s: Signal| -> Vec<u32> {
         signals.get(s).expect("it was asked for").iter().map(|v| v.to_bits()).collect()
     };

@@ -37,7 +37,7 @@ pub(super) fn step(
 }
 
 fn columns(backend: &mut dyn Backend, needs: &Needs) -> Vec<(Signal, Vec<f32>)> {
-    let (signals, _) = backend.take_signals(needs).expect("signals");
+    let signals = backend.take_signals(needs.signals).expect("signals");
     let of = |s: Signal| signals.get(s).expect("it was asked for").to_vec();
     needs.signals.iter().map(|s| (s, of(s))).collect()
 }

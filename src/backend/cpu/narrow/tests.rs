@@ -19,8 +19,12 @@ fn numbers() -> impl Iterator<Item = f32> {
 }
 
 /// All codes are numbers of their own, and come back whatever the draw.
-fn all_come_back<T: Narrow + PartialEq + std::fmt::Debug>(of_bits: fn(u16) -> T) {
-    for bits in 0..=u16::MAX {
+fn all_come_back<T, B>(of_bits: fn(B) -> T, codes: impl Iterator<Item = B>)
+where
+    T: Narrow + PartialEq + std::fmt::Debug,
+    B: Copy + std::fmt::LowerHex,
+{
+    for bits in codes {
         let (stored, x) = (of_bits(bits), of_bits(bits).to_f32());
         for random in [0, 1, 1 << 31, u32::MAX] {
             let back = T::between(x, random);
@@ -38,8 +42,9 @@ fn all_come_back<T: Narrow + PartialEq + std::fmt::Debug>(of_bits: fn(u16) -> T)
 
 #[test]
 fn whatever_is_stored_comes_back() {
-    all_come_back(F16);
-    all_come_back(Bf16);
+    all_come_back(F16, 0..=u16::MAX);
+    all_come_back(Bf16, 0..=u16::MAX);
+    all_come_back(F8, 0..=u8::MAX);
 }
 
 /// The definition of binary16, IEEE 754-2008, section 3.4.
@@ -97,6 +102,37 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
     is_fair(Bf16, BF16_MAX as u16);
 }
 
+/// Bytes: 7 bits of exponent and one digit, without a sign.
+#[test]
+fn bytes_are_fair_and_cover_what_adam_needs() {
+    let all: Vec<f32> = (0..=F8_MAX as u8).map(|bits| F8(bits).to_f32()).collect();
+    assert!(all.is_sorted() && all[0] == 0.0, "{all:?}");
+    assert!(F8(F8_NONE as u8).to_f32().is_nan());
+    let (least, most) = (all[1], all[all.len() - 1]);
+    assert_eq!((least, most), (2_f32.powi(-96), 1.5 * 2_f32.powi(30)));
+    // The root of the least is no more than a few of Adam's epsilon, 1e-15.
+    assert!(least.sqrt() < 4e-15);
+    assert!(all[1..].windows(2).all(|pair| pair[1] <= 1.5 * pair[0]), "{all:?}");
+    for x in numbers() {
+        let above = all.partition_point(|&y| y < x);
+        if x < 0.0 || x > most {
+            let end = if x < 0.0 { 0.0 } else { most };
+            assert!(draws().all(|random| F8::between(x, random).to_f32() == end), "{x:e}");
+            continue;
+        }
+        let (low, high) = (all[above.saturating_sub(1)], all[above]);
+        let share = if high == low { 1.0 } else { (x - low) / (high - low) };
+        let mut ups = 0;
+        for random in draws() {
+            let y = F8::between(x, random).to_f32();
+            assert!(y == low || y == high, "{x:e} became {y:e}, not {low:e} or {high:e}");
+            ups += u32::from(y == high);
+        }
+        let found = ups as f32 / (1_u32 << F16_DROPPED) as f32;
+        assert!((found - share).abs() < 2.5e-4, "{x:e}: {found} instead of {share}");
+    }
+}
+
 /// Fixed point: all that is stored comes back, and what lies between is fair.
 #[test]
 fn fixed_point_is_fair_and_stays() {
@@ -140,11 +176,13 @@ fn what_is_no_number_stays_none() {
         for x in [f32::INFINITY, f32::NEG_INFINITY] {
             assert_eq!(F16::between(x, random).to_f32(), x);
             assert_eq!(Bf16::between(x, random).to_f32(), x);
+            assert!(F8::between(x, random).to_f32().is_nan());
         }
         for bits in [0x7f80_0001, 0x7fff_ffff, 0xff80_0001, 0xffff_ffff, 0x7fc0_0000] {
             let x = f32::from_bits(bits);
             assert!(F16::between(x, random).to_f32().is_nan(), "{bits:#x}");
             assert!(Bf16::between(x, random).to_f32().is_nan(), "{bits:#x}");
+            assert!(F8::between(x, random).to_f32().is_nan(), "{bits:#x}");
         }
     }
 }

@@ -92,7 +92,8 @@ fn backend(model: &Gaussians, storage: Storage, budget: usize) -> CpuBackend {
 }
 
 fn storages() -> Vec<Storage> {
-    let moments = [MomentStorage::F32, MomentStorage::Bf16, MomentStorage::Ratio8];
+    let moments =
+        [MomentStorage::F32, MomentStorage::Bf16, MomentStorage::Ratio8, MomentStorage::Both8];
     let both = |parameters| moments.map(|moments| Storage { parameters, moments });
     [ParameterStorage::F32, ParameterStorage::F16].into_iter().flat_map(both).collect()
 }
@@ -125,6 +126,7 @@ fn what_is_held_falls_by_what_is_dropped() {
                     MomentStorage::F32 => 8,
                     MomentStorage::Bf16 => 4,
                     MomentStorage::Ratio8 => 3,
+                    MomentStorage::Both8 => 2,
                 },
         ];
         let held = [backend.params.held(), backend.moments.held()];
