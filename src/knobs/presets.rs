@@ -108,7 +108,7 @@ pub static PRESETS: &[Preset] = &[
     Preset {
         name: "tiny-memory",
         what: "memory before time",
-        // 479 bytes per row at degree 3 with `diet`; docs/memory.md has the table.
+        // 478 bytes per row at degree 3 with `diet`; docs/memory.md has the table.
         levels: &[
             ("image_cache", "0"),
             ("param_storage", "f16"),

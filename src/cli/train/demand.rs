@@ -282,8 +282,9 @@ impl Survey {
             let (width, height) = scene::largest_image(&self.dataset);
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
             let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
-            // Weights and opacities of the rows, and their order, while it is asked which are missed.
-            let asked = if self.required.rows { budget * 4 * float } else { 0 };
+            // While it is asked which rows are missed: weights and opacities, their order, and a plan.
+            let row = 3 * float + BYTES_PER_ROW as u64;
+            let asked = if self.required.rows { budget * row } else { 0 };
             pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
         }
         let process = self.process_bytes();
