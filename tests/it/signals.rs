@@ -215,3 +215,52 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     backend.begin_epoch();
     assert!(now(&mut backend).iter().all(|&w| w.to_bits() == 0), "the one before does not");
 }
+
+/// Signals lie where a step sums gradients: whether they are given back or not, and however many they
+/// are, the steps after them and an image beside them are the same to the bit.
+#[test]
+fn what_is_lent_for_signals_changes_nothing() {
+    let views = views();
+    let declared = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightMax]);
+    let present = declared.with(Signal::Age).with(Signal::ScaleMax);
+    // More columns than a step has sums.
+    let many = SignalSet::of(&Signal::ALL);
+    let run = |read: Option<SignalSet>, gives_back: bool| {
+        let mut options = subject::options(views.model.len(), Resources::default());
+        options.needs = Needs { signals: declared, ..Needs::default() };
+        let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
+        let mut image = None;
+        for step in 1..=4 {
+            let (camera, target) = (&views.cameras[0], &views.targets[0]);
+            let input = StepInput {
+                step,
+                view: 0,
+                camera,
+                target,
+                background: BACKGROUND,
+                sh_degree: 2,
+                rates: subject::RATES,
+                cadence: Cadence::default(),
+                seed: 1,
+                ssim_weight: 1.0,
+            };
+            backend.train_step(&input).expect("a small image is rendered");
+            let taken = read.map(|wanted| backend.take_signals(wanted).expect("signals"));
+            image = Some(backend.render(camera, BACKGROUND, 2).expect("a small image"));
+            if let Some(signals) = taken.filter(|_| gives_back) {
+                backend.give_back(signals);
+            }
+        }
+        let signals = backend.take_signals(declared).expect("signals");
+        let of = |signal| signals.get(signal).expect("it was declared").to_vec();
+        let columns = [of(Signal::ScreenGradient), of(Signal::WeightMax)];
+        (backend.download().expect("a model"), image.expect("four").rgb, columns)
+    };
+    let expected = run(None, false);
+    assert!(expected.2.iter().all(|column| column.iter().any(|&x| x > 0.0)));
+    for wanted in [declared, present, many] {
+        for gives_back in [false, true] {
+            assert!(run(Some(wanted), gives_back) == expected, "{wanted:?}, {gives_back}");
+        }
+    }
+}
