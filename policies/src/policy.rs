@@ -203,8 +203,7 @@ impl SignalSet {
 
     /// How many signals are in this set.
     #[must_use]
-    #[expect(clippy::len_without_is_empty, reason = "nobody asks")]
-    pub fn len(self) -> usize {
+    pub fn count(self) -> usize {
         self.0.count_ones() as usize
     }
 
@@ -292,7 +291,7 @@ impl Signals {
     #[must_use]
     pub fn within(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
         values.clear();
-        values.resize(rows * set.len(), 0.0);
+        values.resize(rows * set.count(), 0.0);
         Self { rows, present: set, values }
     }
 

@@ -119,7 +119,7 @@ impl Accumulators {
     /// Numbers per row where gradients of splats are summed in a step, and the requested signals lie
     /// while they are read.
     pub(super) fn sums(&self) -> usize {
-        self.detail().stride().max(self.requested.len())
+        self.detail().stride().max(self.requested.count())
     }
 
     /// Whether views are to be measured.

@@ -301,7 +301,7 @@ impl Survey {
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
         // The native backend has room for them.
-        let signals = if self.device.is_some() { needs.signals.len() as u64 } else { 0 };
+        let signals = if self.device.is_some() { needs.signals.count() as u64 } else { 0 };
         // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
         let aux = needs.aux.as_ref();
         let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
