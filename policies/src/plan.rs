@@ -144,7 +144,7 @@ impl EditPlan {
         if self.families.is_empty() {
             // As many as there can be, if no more rows are pruned: growing step by step, the array
             // would be there twice while it is moved.
-            self.families.reserve_exact(self.rows().min(self.room()));
+            self.families.reserve_exact((self.rows() - self.pruned).min(self.room()));
         }
         let first_child = self.born_in_families() as u32;
         self.families.push(Family { parent, first_child, offspring });

@@ -8,9 +8,10 @@
 //! cannot be told from it: the slope is rather too large, so that growth stops too late rather than too
 //! early. It stops when the slope has been below [`PAYS`] twice in a row.
 //!
-//! Policies also do what makes images worse for a while: they insert rows, or reset opacities. Where
-//! the probes are worse than they have been by more than [`UNSETTLED`], nothing is concluded: the rung
-//! has no slope, the limit stays, and no row is removed.
+//! Policies also do what makes images worse for a while: they insert rows, or reset opacities; and
+//! views on which a degree is on trial are not trained on. Where the probes are worse by more than
+//! [`UNSETTLED`] than at the best of the last [`REMEMBERED`] rungs, nothing is concluded: the rung has
+//! no slope, the limit stays, and no row is removed.
 //!
 //! What growth has let in is sent out again. At the end of each later rung the rows are ordered by the
 //! largest weight that they have in any view; as many tenths of them as the probes miss, at once, by
@@ -32,6 +33,9 @@ pub const PAYS: f64 = 0.10;
 /// Of views drawn anew at each step, as the loss is, the noise would be larger than this; the probes
 /// are the same views each time.
 const UNSETTLED: f64 = 0.5;
+/// Rungs after which what is lost counts as lost for good. The insertions of `diet` take a sixth of a
+/// run, which is four.
+const REMEMBERED: usize = 6;
 /// Steps of a rung in a run of 30,000: ten rungs, or five doublings, until most policies stop to grow.
 const RUNG: u32 = 1_500;
 /// Rungs are whole multiples of this: policies are due every 100 steps at most.
@@ -81,7 +85,7 @@ pub struct Rung {
     pub rows: usize,
     /// Mean PSNR of the probes `[dB]`.
     pub psnr: f64,
-    /// Whether the probes are about as good as they have ever been; else nothing is concluded.
+    /// Whether the probes are about as good as they have been of late; else nothing is concluded.
     pub settled: bool,
     /// What rows have brought in this settled rung and the two before, training included
     /// `[dB per doubling]`; `None` where there are not so many, rows did not become more, or growth is
@@ -110,7 +114,8 @@ impl Growth {
 
     /// Takes note of the end of a rung, and of whether anything may be concluded from it.
     fn note(&mut self, step: u32, rows: usize, psnr: f64) -> bool {
-        let best = self.rungs.iter().map(|rung| rung.psnr).fold(f64::NEG_INFINITY, f64::max);
+        let last = self.rungs.iter().rev().take(REMEMBERED);
+        let best = last.map(|rung| rung.psnr).fold(f64::NEG_INFINITY, f64::max);
         let settled = psnr >= best - UNSETTLED;
         self.rungs.push(Rung { step, rows, psnr, settled, gain: None });
         settled

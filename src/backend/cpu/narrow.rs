@@ -37,7 +37,7 @@ const F8_MAX: u32 = 0xfe;
 const F8_NONE: u32 = 0xff;
 /// |first moment| / √(second moment) is at most this: by Cauchy and Schwarz,
 /// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999; and a little for the rounding of
-/// the second. Where that is coarse, ratios of more than 6 may be cut; noise gives 0.23.
+/// the second. Where that is coarse, large ratios may be cut; noise gives 0.23.
 const RATIO_MAX: f32 = 7.3;
 const RATIO_STEP: f32 = RATIO_MAX / 127.0;
 
@@ -77,7 +77,7 @@ pub(super) trait Narrow: Copy + Default {
     /// Exact.
     fn to_f32(self) -> f32;
     /// One of the two neighbours of `x`, by the upper bits of `random`. A finite number stays finite;
-    /// one that is not stays what it is.
+    /// one that is not stays none.
     fn between(x: f32, random: u32) -> Self;
     /// The nearest, as the draw in the middle gives it; of two, the larger.
     #[inline(always)]
@@ -94,7 +94,7 @@ pub(super) struct F16(pub(super) u16);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Bf16(pub(super) u16);
 
-/// A number that is not negative, in a byte: 7 bits of exponent and one digit.
+/// A number that is not negative, in a byte: 7 bits of exponent and one digit. What is not finite is NaN.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F8(pub(super) u8);
 

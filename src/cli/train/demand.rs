@@ -39,7 +39,7 @@ const PROGRAM_STEP: u64 = 8 << 20;
 /// What the system's allocator keeps between two uses of a piece. Measured at up to 5 MiB.
 const KEPT: u64 = 6 << 20;
 /// What a policy makes of its signals for each row before it plans: means, orders, sums of weights
-/// and draws. `taming` makes most: a weight, and a key with its row.
+/// and draws. Those that make more of auxiliary views' columns have these counted twice.
 const PLANNING: u64 = 20;
 /// A point with its colour.
 const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
@@ -282,8 +282,10 @@ impl Survey {
             let (width, height) = scene::largest_image(&self.dataset);
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
             let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
-            // While it is asked which rows are missed: weights and opacities, their order, and a plan.
-            let row = 3 * float + BYTES_PER_ROW as u64;
+            // While it is asked which rows are missed: their order and a plan, and weights and
+            // opacities, for which the native backend has room.
+            let columns = if self.device.is_some() { 2 } else { 0 };
+            let row = (1 + columns) * float + BYTES_PER_ROW as u64;
             let asked = if self.required.rows { budget * row } else { 0 };
             pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
         }

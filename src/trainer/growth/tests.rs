@@ -73,6 +73,11 @@ fn nothing_is_concluded_until_an_edit_is_recovered_from() {
     let mut growth = Growth::new(5_000, BUDGET);
     let settled: Vec<bool> = (1..).zip(psnr).map(|(end, psnr)| growth.note(end, 0, psnr)).collect();
     assert_eq!(settled, [true, true, true, true, true, false, false, true, true]);
+    // What does not come back is forgotten.
+    let mut growth = Growth::new(5_000, BUDGET);
+    let lost: Vec<bool> =
+        (0..8).map(|end| growth.note(end, 0, if end == 0 { 30.0 } else { 20.0 })).collect();
+    assert_eq!(lost, [true, false, false, false, false, false, false, true]);
     // The slope is that of the settled rungs, and goes over the others.
     let mut growth = Growth::new(4_000, BUDGET);
     for (rows, psnr) in [(4_000, 30.0), (8_000, 31.0), (12_000, 12.0), (16_000, 32.0)] {
