@@ -215,23 +215,27 @@ fn pair<T: Narrow>(first: &Blocks<i8>, second: &Blocks<T>, row: usize, plane: us
     [first_moment(first.get(row, plane), second), second]
 }
 
-/// The same of whole planes.
+/// The same of the first `used` numbers of a block.
 #[inline(always)]
-fn open_pair<T: Narrow>(first: &[i8], second: &[T], [m, v]: [&mut [f32]; 2]) {
-    widen(second, v);
-    first_moments(first, v, m);
+fn open_pair<T: Narrow>(first: &[i8], second: &[T], used: usize, [m, v]: [&mut Scratch; 2]) {
+    let (m, v) = (&mut m.0[..used], &mut v.0[..used]);
+    widen(&second[..used], v);
+    first_moments(&first[..used], v, m);
 }
 
-/// Stores both moments of whole planes; the first as a multiple of what is stored of the second.
+/// Stores the first `used` numbers of both moments of a block; the first as a multiple of what is
+/// stored of the second.
 #[inline(always)]
 fn close_pair<T: Narrow>(
-    [m, v]: [&[f32]; 2],
+    [m, v]: &[Scratch; 2],
+    used: usize,
     first: &mut [i8],
     second: &mut [T],
     [of_m, of_v]: [&mut Draws; 2],
 ) {
-    narrow(v, second, of_v);
-    ratios(m, second, first, of_m);
+    let second = &mut second[..used];
+    narrow(&v.0[..used], second, of_v);
+    ratios(&m.0[..used], second, &mut first[..used], of_m);
 }
 
 /// The moments of some blocks, to read.
@@ -263,12 +267,10 @@ impl<'a> MomentView<'a> {
                 widen(&second.block(block)[..used], &mut v.0[..used]);
             }
             Self::Ratio8(first, second) => {
-                let to = [&mut m.0[..used], &mut v.0[..used]];
-                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
+                open_pair(first.block(block), second.block(block), used, [m, v]);
             }
             Self::Both8(first, second) => {
-                let to = [&mut m.0[..used], &mut v.0[..used]];
-                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
+                open_pair(first.block(block), second.block(block), used, [m, v]);
             }
         }
         [&m.0, &v.0]
@@ -302,12 +304,10 @@ impl MomentTask<'_> {
                 widen(&second.block(block)[..used], &mut v.0[..used]);
             }
             Self::Ratio8(first, second) => {
-                let to = [&mut m.0[..used], &mut v.0[..used]];
-                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
+                open_pair(first.block(block), second.block(block), used, [m, v]);
             }
             Self::Both8(first, second) => {
-                let to = [&mut m.0[..used], &mut v.0[..used]];
-                open_pair(&first.block(block)[..used], &second.block(block)[..used], to);
+                open_pair(first.block(block), second.block(block), used, [m, v]);
             }
         }
         [&mut m.0, &mut v.0]
@@ -332,13 +332,11 @@ impl MomentTask<'_> {
             }
             Self::Ratio8(first, second) => {
                 let (first, second) = (first.block(block), second.block(block));
-                let from = [&m.0[..used], &v.0[..used]];
-                close_pair(from, &mut first[..used], &mut second[..used], [of_m, of_v]);
+                close_pair(scratch, used, first, second, [of_m, of_v]);
             }
             Self::Both8(first, second) => {
                 let (first, second) = (first.block(block), second.block(block));
-                let from = [&m.0[..used], &v.0[..used]];
-                close_pair(from, &mut first[..used], &mut second[..used], [of_m, of_v]);
+                close_pair(scratch, used, first, second, [of_m, of_v]);
             }
         }
     }
