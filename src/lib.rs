@@ -55,9 +55,6 @@
 //! # }
 //! ```
 
-// The reference renderer belongs to the tests and names this crate as they do; see `selftest`.
-extern crate self as densify;
-
 pub mod backend;
 pub mod camera;
 pub mod checkpoint;
@@ -72,8 +69,8 @@ pub mod metrics;
 pub mod output;
 pub mod ply;
 pub mod schedule;
-pub mod selftest;
 pub mod sh;
 pub mod spread;
 pub mod trainer;
+pub mod verify;
 pub mod views;

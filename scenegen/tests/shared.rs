@@ -9,7 +9,6 @@
 //! render; of a type that only an extension could explain, positions are no positions.
 //!
 //! One piece: the tables are rows, one a file.
-#![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,16 +16,13 @@ use std::path::{Path, PathBuf};
 use densify_scenegen::{Error, Options, Scene, Source};
 use serde_json::{Value, json};
 
-/// The shared data's meshes, or None with a word why.
-fn shared(folder: &str) -> Option<PathBuf> {
+/// A folder of the shared meshes.
+fn shared(folder: &str) -> PathBuf {
     let root = std::env::var_os("DENSIFY_SHARED")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
     let path = root.join("data/meshes").join(folder);
-    if path.is_dir() {
-        return Some(path);
-    }
-    eprintln!("skipped: there is no {}", path.display());
-    None
+    assert!(path.is_dir(), "there is no {}; set DENSIFY_SHARED", path.display());
+    path
 }
 
 /// All mesh files in a folder, sorted.
@@ -51,10 +47,10 @@ fn prepare(path: &Path) -> Result<Scene, Error> {
 }
 
 #[test]
+#[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
 fn every_mesh_renders() {
     for folder in ["gltf", "obj"] {
-        let Some(folder) = shared(folder) else { return };
-        let all = files(&folder);
+        let all = files(&shared(folder));
         assert!(all.len() > 10);
         for path in all {
             let scene = prepare(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
@@ -67,9 +63,9 @@ fn every_mesh_renders() {
 }
 
 #[test]
+#[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
 fn what_needs_other_software_is_refused_by_name() {
-    let Some(folder) = shared("refuse") else { return };
-    let all = files(&folder);
+    let all = files(&shared("refuse"));
     assert!(all.len() >= 7);
     for path in &all {
         let error = prepare(path).err().unwrap_or_else(|| panic!("{}", path.display()));
@@ -480,8 +476,9 @@ fn judge(
 }
 
 #[test]
+#[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
 fn every_malformed_file_does_what_the_table_says() {
-    let Some(root) = shared("malformed") else { return };
+    let root = shared("malformed");
     let folder = tempfile::tempdir().expect("folder");
     let mut complaints = Vec::new();
     let (mut plain, mut wired) = (AS_THEY_ARE.to_vec(), WITH_A_SCENE.to_vec());

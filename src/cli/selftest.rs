@@ -7,9 +7,10 @@ use clap::Args;
 use super::console::Console;
 use super::device::DeviceArgs;
 use super::failure::{Failure, OTHER};
+use crate::backend::cpu::InstructionSet;
 use crate::backend::gpu::{Accumulation, AdapterChoice, GpuDevice, adapters};
 use crate::output::write_atomically;
-use crate::selftest::{Bench, Case, Finding, Tested, cases, markdown, table};
+use crate::verify::{Case, Finding, Subject, Tested, cases, markdown, table};
 
 /// Holds this machine against a renderer in float64, where numbers are hardest.
 ///
@@ -56,17 +57,17 @@ const SUMS: Option<Accumulation> = Some(Accumulation::Slots);
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
     let chosen = chosen(&args.only)?;
     let mut tested: Vec<Tested> = Vec::new();
-    for bench in benches(args, console)? {
+    for subject in subjects(args, console)? {
         console.result(format_args!(
             "densify {} on {}: {}, {}",
             env!("CARGO_PKG_VERSION"),
-            bench.name(),
+            subject.name(),
             std::env::consts::OS,
             std::env::consts::ARCH
         ));
-        let mut here = Tested { bench: bench.name(), cases: Vec::new() };
+        let mut here = Tested { subject: subject.name(), cases: Vec::new() };
         for &case in &chosen {
-            let findings = case.run(&bench, args.long);
+            let findings = case.run(&subject, args.long);
             console.result(table(&case, &findings));
             here.cases.push((case, findings));
         }
@@ -99,18 +100,21 @@ fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
 }
 
 /// What is to be tested.
-fn benches(args: &SelftestArgs, console: &Console) -> Result<Vec<Bench>, Failure> {
-    let native = Bench::Native { threads: args.threads.map(usize::from) };
+fn subjects(args: &SelftestArgs, console: &Console) -> Result<Vec<Subject>, Failure> {
+    let native = Subject::Native {
+        instructions: InstructionSet::default(),
+        threads: args.threads.map(usize::from),
+    };
     if !args.all {
-        return Ok(vec![args.device.open(SUMS, console)?.map_or(native, Bench::Gpu)]);
+        return Ok(vec![args.device.open(SUMS, console)?.map_or(native, Subject::Gpu)]);
     }
-    let mut benches = vec![native];
+    let mut subjects = vec![native];
     for adapter in adapters().into_iter().filter(|adapter| adapter.missing.is_empty()) {
         let device =
             GpuDevice::open(&AdapterChoice { name: Some(adapter.name), accumulation: SUMS })?;
-        benches.push(Bench::Gpu(device));
+        subjects.push(Subject::Gpu(device));
     }
-    Ok(benches)
+    Ok(subjects)
 }
 
 /// The cases with these numbers, or all.
@@ -151,7 +155,7 @@ mod tests {
         };
         let tested = |errors: &[f64]| {
             let findings = errors.iter().map(|&error| finding(error)).collect();
-            vec![Tested { bench: "native".into(), cases: vec![(cases()[0], findings)] }]
+            vec![Tested { subject: "native".into(), cases: vec![(cases()[0], findings)] }]
         };
         assert_eq!(verdict(&tested(&[0.0, 1e-5])).unwrap(), 2);
         for wrong in [1.1e-5, f64::NAN, f64::INFINITY] {

@@ -14,12 +14,12 @@ use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::compare::{Table, relative_error};
-use crate::reference::blend::each_blended;
-use crate::reference::loss::loss;
-use crate::reference::project::{by_depth, project};
-use crate::reference::{Image, Model, Rules, View, render};
-use crate::scenes;
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::reference::blend::each_blended;
+use densify::verify::reference::loss::loss;
+use densify::verify::reference::project::{by_depth, project};
+use densify::verify::reference::{Image, Model, Rules, View, render};
+use densify::verify::scenes;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 /// That of sums over pixels in `signals`; a pixel at the step of alpha may be gained or lost.

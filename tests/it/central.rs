@@ -5,11 +5,11 @@ use densify::camera::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::compare::Table;
-use crate::reference::loss::loss;
-use crate::reference::project::{by_depth, project};
-use crate::reference::{CLASSES, Model, Rules, Upstream, View, blend, differentiate};
-use crate::scenes;
+use densify::verify::compare::Table;
+use densify::verify::reference::loss::loss;
+use densify::verify::reference::project::{by_depth, project};
+use densify::verify::reference::{CLASSES, Model, Rules, Upstream, View, blend, differentiate};
+use densify::verify::scenes;
 
 /// Half the distance between the two evaluations.
 const STEP: f64 = 1e-6;

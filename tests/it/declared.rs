@@ -15,8 +15,8 @@ use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::scenes;
 use crate::subject::{self, RATES};
+use densify::verify::scenes;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 const STILL: LearningRates =

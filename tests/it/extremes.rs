@@ -1,4 +1,4 @@
-//! Where numbers are hardest: the cases of the [selftest](densify::selftest) on the native backend
+//! Where numbers are hardest: the cases of the [selftest](densify::verify) on the native backend
 //! (`gpu/extremes.rs` runs them on every adapter), and where each extreme is tested.
 //!
 //! A backend is compared with the float64 reference, which `central.rs` checks by central differences;
@@ -41,23 +41,23 @@
 
 use std::path::Path;
 
-use densify::selftest::{Bench, cases, table};
+use densify::verify::{Subject, cases, table};
 
 /// Fails with the lines of all cases that do not hold; those numbered in `but` are not tried.
-pub(crate) fn check(bench: &Bench, but: &[u8]) {
+pub(crate) fn check(subject: &Subject, but: &[u8]) {
     let mut failed = Vec::new();
     for case in cases().iter().filter(|case| !but.contains(&case.number)) {
-        let findings = case.run(bench, false);
-        if !findings.iter().all(densify::selftest::Finding::holds) {
+        let findings = case.run(subject, false);
+        if !findings.iter().all(densify::verify::Finding::holds) {
             failed.push(table(case, &findings));
         }
     }
-    assert!(failed.is_empty(), "on {}:\n{}", bench.name(), failed.join("\n"));
+    assert!(failed.is_empty(), "on {}:\n{}", subject.name(), failed.join("\n"));
 }
 
 #[test]
 fn every_case_holds_on_the_native_backend() {
-    check(&Bench::Native { threads: None }, &[]);
+    check(&Subject::NATIVE, &[]);
 }
 
 /// The rows of the table at the head of a file: number of the extreme, and where it is tested.

@@ -1,8 +1,8 @@
 //! What the loss of the backend has in common with the metric, and what a mask does to it. Cases 23
-//! and 24 of the [selftest](densify::selftest) hold it against the reference's.
+//! and 24 of the [selftest](densify::verify) hold it against the reference's.
 
-use crate::scenes::noisy;
 use crate::subject;
+use densify::verify::scenes::noisy;
 
 #[test]
 fn a_masked_pixel_gets_no_gradient() {

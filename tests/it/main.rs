@@ -1,8 +1,8 @@
 //! The integration tests: one binary, so that it links once.
 //!
-//! `reference` is a second renderer in `f64` that shares no arithmetic with the backends; `central`
-//! checks it by central differences, and `oracle` holds both against stored float64 renders;
-//! `extremes` runs the cases of the selftest and says where every extreme is tested; `signals` and
+//! `central` checks the float64 renderer of `densify::verify` by central differences, and `oracle` holds
+//! it and the backends against stored float64 renders; `extremes` runs the cases of the selftest and says
+//! where every extreme is tested; `signals` and
 //! `loss` hold the rest against the reference; `properties` are of any scene; `sameness` compares
 //! bits; `shortcuts` holds the knobs of the backends
 //! to their errors; `declared` and `aux_views` hold the backend to what policies declare; `edits` applies any plan
@@ -13,7 +13,6 @@
 mod aux_views;
 mod central;
 mod cli;
-mod compare;
 mod declared;
 mod edits;
 mod extremes;
@@ -26,10 +25,8 @@ mod oracle;
 mod photographs;
 mod properties;
 mod quarantine;
-mod reference;
 mod row_degrees;
 mod sameness;
-mod scenes;
 mod shortcuts;
 mod signals;
 mod source_text;

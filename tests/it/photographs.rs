@@ -14,8 +14,8 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 use tempfile::TempDir;
 
-use crate::scenes;
 use crate::subject::{self, Resources};
+use densify::verify::scenes;
 
 /// Views taken.
 pub(crate) const VIEWS: usize = 14;

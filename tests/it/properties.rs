@@ -3,11 +3,11 @@
 use densify::backend::{Backend, Rendering};
 use densify::camera::Camera;
 use densify::gaussians::{Gaussians, sh_coefficients};
-use densify::selftest::values::SIZES;
+use densify::verify::values::SIZES;
 use proptest::prelude::*;
 
-use crate::scenes;
 use crate::subject::{self, Resources};
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 

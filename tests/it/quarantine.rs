@@ -4,12 +4,12 @@
 use densify::backend::{Attribute, Backend, Kept, StepInput, Unsound, Values};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
-use densify::selftest::values::{POISON, SLOTS, remove, slot_of};
+use densify::verify::values::{POISON, SLOTS, remove, slot_of};
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::Cadence;
 
-use crate::scenes;
 use crate::subject::{self, RATES, Resources};
+use densify::verify::scenes;
 
 /// The row that is poisoned where it is one.
 const POISONED: usize = 11;

@@ -11,10 +11,10 @@ use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
 use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
 
-use crate::compare::{Limits, Table, class, compare_images, relative_error};
-use crate::reference::{CLASSES, Model, Rules, View, blend, project};
-use crate::scenes;
 use crate::subject::RATES;
+use densify::verify::compare::{Limits, Table, class, compare_images, relative_error};
+use densify::verify::reference::{CLASSES, Model, Rules, View, blend, project};
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 const ROWS: usize = 170;

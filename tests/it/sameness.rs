@@ -11,9 +11,9 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::reference::CLASSES;
-use crate::scenes;
 use crate::subject::{self, RATES, Resources};
+use densify::verify::reference::CLASSES;
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 
@@ -162,7 +162,7 @@ fn the_order_of_the_rows_changes_nothing_where_depths_differ() {
     }
 }
 
-/// Case 15 of the [selftest](densify::selftest) holds the same against the reference.
+/// Case 15 of the [selftest](densify::verify) holds the same against the reference.
 #[test]
 fn equal_depths_are_drawn_in_row_order() {
     let camera = scenes::camera(40, 40, 36);

@@ -9,11 +9,11 @@ use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify_policies::policy::Cadence;
 
-use crate::compare::{Limits, Table, class, compare_images, relative_error};
 use crate::gpu::subjects;
-use crate::reference::{CLASSES, Image, Model, Rules, View, blend, project};
-use crate::scenes;
 use crate::subject::{self, RATES, Resources};
+use densify::verify::compare::{Limits, Table, class, compare_images, relative_error};
+use densify::verify::reference::{CLASSES, Image, Model, Rules, View, blend, project};
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 /// Gradients, as elsewhere, against the largest of their class.
@@ -40,7 +40,7 @@ fn truth(
     model: &Gaussians,
     camera: &Camera,
     rules: &Rules,
-) -> (Image, Model, crate::reference::Upstream) {
+) -> (Image, Model, densify::verify::reference::Upstream) {
     let view = View { camera, background: GREY.map(f64::from), sh_degree: 1 };
     let exact = Model::of(model);
     let splats = project::project(&exact, view, rules);

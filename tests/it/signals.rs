@@ -10,11 +10,11 @@ use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::compare::{Table, relative_error};
-use crate::reference::loss::loss;
-use crate::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
-use crate::scenes;
 use crate::subject::{self, Resources};
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::reference::loss::loss;
+use densify::verify::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
+use densify::verify::scenes;
 
 /// A quarter of the loss's gradient jumps with the sign of render − target, and a few pixels are
 /// near a step, so this is the tolerance of gradients, doubled.

@@ -12,8 +12,8 @@ use densify_policies::plan::EditPlan;
 use densify_policies::policy::{Cadence, SceneInfo};
 use densify_policies::registry::find;
 
-use crate::scenes;
 use crate::subject::RATES;
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 

@@ -6,10 +6,10 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 
-pub(crate) use crate::compare::class;
-use crate::reference::Upstream;
-use crate::scenes;
-pub(crate) use densify::selftest::values::RATES;
+pub(crate) use densify::verify::compare::class;
+use densify::verify::reference::Upstream;
+use densify::verify::scenes;
+pub(crate) use densify::verify::values::RATES;
 
 /// What must not change the outcome.
 #[derive(Debug, Clone, Copy, Default)]

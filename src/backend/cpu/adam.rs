@@ -158,7 +158,7 @@ mod tests {
     use pulp::{Arch, WithSimd};
 
     use super::*;
-    use crate::selftest::values::RATES;
+    use crate::verify::values::RATES;
 
     /// Steps of one plane of means, each lane with a gradient of its own.
     struct Steps<'a> {

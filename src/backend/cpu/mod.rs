@@ -15,6 +15,7 @@ mod candidates;
 mod differentiate;
 mod footprint;
 mod fresh;
+mod instructions;
 mod loss;
 mod moments;
 mod narrow;
@@ -69,6 +70,7 @@ use stage_clock::StageClock;
 use summed::Summed;
 use tiles::TileLists;
 
+pub use instructions::InstructionSet;
 pub use optimise::{ImageGradient, ModelGradient};
 pub use options::CpuOptions;
 
@@ -152,7 +154,7 @@ impl CpuBackend {
         let mut params = Parameters::zeros(budget, per_row, storage.parameters);
         params.pack(model);
         Ok(Self {
-            arch: Arch::new(),
+            arch: options.instructions.arch(),
             pool,
             ledger,
             budget,

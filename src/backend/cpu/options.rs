@@ -2,6 +2,7 @@
 
 use densify_policies::policy::Needs;
 
+use super::instructions::InstructionSet;
 use crate::backend::{Shortcuts, Storage};
 
 /// How to set up a [`CpuBackend`](super::CpuBackend).
@@ -17,6 +18,8 @@ pub struct CpuOptions {
     /// Most gradient records, one per entry, held at a time, >= 1; where the lists hold more entries,
     /// the backward pass takes them in parts.
     pub record_cap: usize,
+    /// What the kernels may use of the processor.
+    pub instructions: InstructionSet,
     /// Worker threads; `None` takes all cores.
     pub threads: Option<usize>,
     /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
@@ -39,6 +42,7 @@ impl CpuOptions {
             near: 0.01,
             tile_cap: budget.saturating_mul(16),
             record_cap: usize::MAX,
+            instructions: InstructionSet::default(),
             threads: None,
             largest_image: (0, 0),
             storage: Storage::default(),

@@ -18,7 +18,7 @@ use crate::cli::scene;
 use crate::gaussians::Gaussians;
 use crate::knobs::{How, Settings, find};
 use crate::output::{RunConfig, model_path};
-use crate::selftest::{Blended, reference_pixels};
+use crate::verify::reference::{Model, Rules, View, pixels};
 
 /// Views looked at, evenly spread over those held out.
 const VIEWS: usize = 4;
@@ -126,13 +126,15 @@ impl Looked {
         // The same pixels at every call.
         let mut draws = ChaCha8Rng::seed_from_u64(number as u64);
         let place = |_| [camera.width, camera.height].map(|side| draws.random_range(0..side));
-        let pixels: Vec<[u32; 2]> = (0..PIXELS).map(place).collect();
-        let truth = [Blended::Standard, Blended::Everything].map(|rules| {
-            let parts = pixels
-                .par_chunks(64)
-                .map(|pixels| reference_pixels(model, &camera, background, near, rules, pixels));
+        let looked_at: Vec<[u32; 2]> = (0..PIXELS).map(place).collect();
+        let exact = Model::of(model);
+        let sh_degree = model.sh_degree;
+        let view = View { camera: &camera, background: background.map(f64::from), sh_degree };
+        let truth = [Rules::STANDARD, Rules::SMOOTH].map(|rules| {
+            let rules = Rules { near: f64::from(near), ..rules };
+            let parts = looked_at.par_chunks(64).map(|some| pixels(&exact, view, &rules, some));
             parts.collect::<Vec<_>>().concat()
         });
-        Self { camera, pixels, truth }
+        Self { camera, pixels: looked_at, truth }
     }
 }

@@ -203,6 +203,7 @@ impl Survey {
             storage: self.settings.storage(),
             needs,
             shortcuts: self.settings.shortcuts(),
+            ..CpuOptions::new(setting.rows)
         }
     }
 

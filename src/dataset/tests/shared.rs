@@ -1,23 +1,17 @@
-//! Real datasets, where they are at hand (`DENSIFY_SHARED`, else `../shared`).
+//! Real datasets load: tests of the folder `DENSIFY_SHARED`, or `../shared`.
 
 use std::path::PathBuf;
 
 use super::super::*;
 use crate::init::{initialise, random_points};
 
-/// The folder of a real dataset, or none and a word about it.
-pub(crate) fn shared(name: &str) -> Option<PathBuf> {
+/// The folder of a real dataset.
+pub(crate) fn shared(name: &str) -> PathBuf {
     let root = std::env::var_os("DENSIFY_SHARED")
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
     let path = root.join("data").join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    #[expect(clippy::print_stderr, reason = "a skipped test says so")]
-    {
-        eprintln!("skipped: there is no {}; set DENSIFY_SHARED", path.display());
-    }
-    None
+    assert!(path.exists(), "there is no {}; set DENSIFY_SHARED", path.display());
+    path
 }
 
 struct Expected {
@@ -50,10 +44,11 @@ const DATASETS: [Expected; 6] = [
 ];
 
 #[test]
+#[ignore = "needs real photographs: set DENSIFY_SHARED"]
 fn real_datasets_load() {
     for expected in DATASETS {
         let name = expected.name;
-        let Some(path) = shared(name) else { continue };
+        let path = shared(name);
         let options = LoadOptions { split: Split::Eval, ..LoadOptions::default() };
         let data = Dataset::load(&path, &options).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_eq!((data.train.len(), data.test.len()), (expected.train, expected.test), "{name}");
@@ -107,10 +102,9 @@ fn real_datasets_load() {
 
 /// room256 comes in two formats: the poses agree.
 #[test]
+#[ignore = "needs real photographs: set DENSIFY_SHARED"]
 fn the_two_formats_of_room256_agree() {
-    let Some(path) = shared("room256") else {
-        return;
-    };
+    let path = shared("room256");
     let folder = tempfile::tempdir().unwrap();
     for name in ["images", "sparse/0"] {
         std::fs::create_dir_all(folder.path().join(name)).unwrap();
@@ -144,9 +138,10 @@ fn the_two_formats_of_room256_agree() {
 
 /// The focus of `chair` is its origin, of `fox` the fox: points are put there.
 #[test]
+#[ignore = "needs real photographs: set DENSIFY_SHARED"]
 fn random_points_lie_where_the_cameras_look() {
     for (name, background) in [("chair", false), ("fox", true)] {
-        let Some(path) = shared(name) else { continue };
+        let path = shared(name);
         let data = Dataset::load(&path, &LoadOptions::default()).unwrap();
         let cameras: Vec<_> = data.train.iter().map(|view| view.camera).collect();
         let points = random_points(2000, &cameras, background, 1);

@@ -23,9 +23,9 @@ use densify_policies::rng::PolicyRng;
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 
-use crate::scenes;
 use crate::subject::RATES;
 use calls::{Call, call, enter};
+use densify::verify::scenes;
 use plain::{Row, execute};
 
 const ROWS: usize = 37;

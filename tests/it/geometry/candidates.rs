@@ -11,7 +11,7 @@ use densify_policies::policy::{
 use densify_policies::registry::find;
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::scenes;
+use densify::verify::scenes;
 
 const SIDE: u32 = 96;
 const GREY: [f32; 3] = [0.2; 3];

@@ -8,8 +8,9 @@ use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 
 use super::{name, options, ways};
-use crate::compare::{Table, relative_error};
-use crate::{scenes, subject};
+use crate::subject;
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 /// Rows one behind the other, each of which all pixels of one tile take; what is behind all is still seen.

@@ -11,8 +11,8 @@ use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
 
 use super::subjects;
 use super::training::step;
-use crate::compare::{Table, relative_error};
-use crate::scenes;
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::scenes;
 
 const ROWS: usize = 90;
 const BUDGET: usize = 140;

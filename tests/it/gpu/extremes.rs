@@ -1,7 +1,7 @@
 //! Where numbers are hardest, on every adapter. In slots: some cases want the same bits of two runs, which
 //! sums by atomics do not have; `twins` and `oracle` hold those to the native backend and to the reference.
 
-use densify::selftest::Bench;
+use densify::verify::Subject;
 
 use super::subjects;
 use crate::extremes::check;
@@ -13,6 +13,6 @@ const SLOW: [u8; 3] = [11, 21, 30];
 #[test]
 fn every_case_holds_on_every_device() {
     for device in subjects() {
-        check(&Bench::Gpu(device.clone()), &SLOW);
+        check(&Subject::Gpu(device.clone()), &SLOW);
     }
 }

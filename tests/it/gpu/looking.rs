@@ -13,9 +13,9 @@ use densify_policies::policy::{
 
 use super::training::step;
 use super::{backend_for, name, subjects, ways};
-use crate::compare::{Table, relative_error};
-use crate::scenes;
 use crate::subject::RATES;
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::scenes;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 

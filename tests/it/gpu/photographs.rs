@@ -8,8 +8,8 @@ use densify::gaussians::Gaussians;
 use densify_policies::policy::Cadence;
 
 use super::{options, subjects};
-use crate::scenes;
 use crate::subject::RATES;
+use densify::verify::scenes;
 
 /// A view of this size, with a random image.
 fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {

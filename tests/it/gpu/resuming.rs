@@ -7,7 +7,7 @@ use densify_policies::policy::{
 
 use super::training::step;
 use super::{backend_for, subjects};
-use crate::scenes;
+use densify::verify::scenes;
 
 const CADENCE: Cadence = Cadence { all: 2, sh_rest: 3 };
 /// Steps before the state is taken: no optimiser step is due, and all have sums that wait.

@@ -9,9 +9,9 @@ use densify::gaussians::Gaussians;
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 
 use super::{backend_for, name, options, subjects, ways};
-use crate::compare::{Table, relative_error};
-use crate::scenes;
 use crate::subject::RATES;
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 

@@ -11,10 +11,10 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{atomics, backend, name, options, subjects, ways};
-use crate::compare::{Limits, Table, compare_images, relative_error};
-use crate::reference::{CLASSES, Model, Rules, View, render};
-use crate::scenes;
 use crate::subject::{self, Resources};
+use densify::verify::compare::{Limits, Table, compare_images, relative_error};
+use densify::verify::reference::{CLASSES, Model, Rules, View, render};
+use densify::verify::scenes;
 
 const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 

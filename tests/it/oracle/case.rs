@@ -1,14 +1,14 @@
 //! Reads the cases: `*.safetensors` with an `index.json` beside them.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use glam::{DMat3, DVec3};
 use safetensors::{Dtype, SafeTensors};
 
-use crate::reference::Upstream;
+use densify::verify::reference::Upstream;
 
 /// One scene with everything that is stored about it.
 #[derive(Debug)]
@@ -46,26 +46,14 @@ impl Part {
     }
 }
 
-/// The folder of data shared between projects: `DENSIFY_SHARED`, else `shared` beside the
-/// workspace.
-pub(crate) fn shared() -> PathBuf {
-    std::env::var_os("DENSIFY_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from)
-}
-
-/// All cases, or `None` (said aloud) where the data is absent.
-#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
-pub(crate) fn cases() -> Option<Vec<Case>> {
-    let folder = shared().join("oracle");
-    let index = folder.join("index.json");
-    let Ok(text) = std::fs::read_to_string(&index) else {
-        eprintln!("skipped: {} is absent; set DENSIFY_SHARED", index.display());
-        return None;
-    };
+/// All cases.
+pub(crate) fn cases() -> Vec<Case> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/oracle");
+    let text = std::fs::read_to_string(folder.join("index.json")).expect("the stored cases");
     let index: serde_json::Value = serde_json::from_str(&text).expect("index.json is JSON");
     let cases = index["cases"].as_object().expect("index.json lists cases");
     assert!(!cases.is_empty(), "index.json lists no case");
-    Some(cases.iter().map(|(name, entry)| Case::read(&folder, name, entry)).collect())
+    cases.iter().map(|(name, entry)| Case::read(&folder, name, entry)).collect()
 }
 
 impl Case {

@@ -3,10 +3,10 @@
 
 use pulp::{Arch, WithSimd};
 
-use super::super::{CpuBackend, CpuOptions, ImageGradient};
+use super::super::{CpuBackend, CpuOptions, ImageGradient, InstructionSet};
 use super::*;
 use crate::backend::Rendering;
-use crate::selftest::scenes;
+use crate::verify::scenes;
 
 struct Each<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
 #[derive(Clone, Copy)]
@@ -91,28 +91,13 @@ fn elementary_functions_are_accurate() {
     assert!(arch.dispatch(log2) < 3e-7);
 }
 
-/// Every instruction set that this machine has, the plainest first.
-fn all() -> Vec<(&'static str, Arch)> {
-    #[cfg(target_arch = "x86_64")]
-    {
-        let v3 = pulp::x86::V3::try_new().map(|v3| ("AVX2", Arch::V3(v3)));
-        let v4 = pulp::x86::V4::try_new().map(|v4| ("AVX-512", Arch::V4(v4)));
-        [Some(("scalar", Arch::Scalar)), v3, v4].into_iter().flatten().collect()
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    {
-        vec![("scalar", Arch::Scalar), ("best", Arch::new())]
-    }
-}
-
 /// What a view gives: scalars of the loss, the image, dL/dpixel, and gradients of the model.
-fn of_view(arch: Arch, (width, height): (u32, u32)) -> [Vec<f32>; 4] {
+fn of_view(instructions: InstructionSet, (width, height): (u32, u32)) -> [Vec<f32>; 4] {
     let camera = scenes::camera(width, height, 3);
     let model = scenes::cloud(70, 3, &camera, 4);
     let mut options = CpuOptions::new(model.len());
-    options.threads = Some(1);
+    (options.instructions, options.threads) = (instructions, Some(1));
     let mut backend = CpuBackend::new(&model, &options).expect("a small model fits");
-    backend.arch = arch;
     let (grey, target) = ([0.3, 0.4, 0.6], scenes::target(&camera));
     let pixels = (width * height) as usize;
     let nothing = || vec![0.0; pixels];
@@ -133,8 +118,8 @@ fn every_instruction_set_computes_the_same() {
     // Widths that leave every number of pixels for the last vector.
     let sizes = (33..49).map(|width| (width, 19)).chain([(1, 1), (5, 40), (16, 16)]);
     for size in sizes {
-        let views: Vec<_> =
-            all().into_iter().map(|(name, arch)| (name, of_view(arch, size))).collect();
+        let all = InstructionSet::available().into_iter();
+        let views: Vec<_> = all.map(|set| (set, of_view(set, size))).collect();
         let (_, plain) = &views[0];
         for (name, other) in &views[1..] {
             let kinds = ["scalars", "image", "dL/dpixel", "gradients"].into_iter();

@@ -4,10 +4,10 @@ use super::{GREY, flat_colour, straight};
 use crate::backend::BackendError;
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
-use crate::selftest::compare::{class, relative_error};
-use crate::selftest::reference::CLASSES;
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken};
+use crate::verify::compare::{class, relative_error};
+use crate::verify::reference::CLASSES;
+use crate::verify::scenes;
+use crate::verify::trial::{Trial, count_broken};
 
 pub(super) fn ordinary(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for degree in 0..=3 {
@@ -40,7 +40,7 @@ pub(super) fn scales(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     // Squares and determinants leave f32: no standard, but nothing breaks, and no other row.
     for value in [12.0, 20.0, 44.0, 60.0, 88.0, 89.0, 120.0] {
         let model = of_scale(&camera, value);
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let (image, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
@@ -70,7 +70,7 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         trial.check(&what, &model, &camera, GREY, 0)?;
         // Turning does not depend on the length, so that nothing pulls along it.
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let (_, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
         let wide = |q: &[f32; 4]| q.map(f64::from);
         let size = |q: [f64; 4]| q.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -87,7 +87,7 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let what = format!("length {length:e}");
         let mut model = scaled(1.0);
         model.quats[3] = [0.5 * length; 4];
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let image = backend.render(&camera, GREY, 0)?;
         trial.never(&what, "NaN or infinity", count_broken(&[&image.rgb, &image.depth]));
         trial.train(&what, &mut *backend, &camera, GREY, 0)?;

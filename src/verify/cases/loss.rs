@@ -6,21 +6,21 @@ use rand_chacha::ChaCha8Rng;
 use crate::backend::BackendError;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
-use crate::selftest::bench::{Bench, Subject};
-use crate::selftest::compare::relative_error;
-use crate::selftest::reference::loss::{Loss, loss};
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, step};
-use crate::selftest::values::SIZES;
+use crate::verify::compare::relative_error;
+use crate::verify::reference::loss::{Loss, loss};
+use crate::verify::scenes;
+use crate::verify::subject::{Differentiable, Subject};
+use crate::verify::trial::{Trial, count_broken, step};
+use crate::verify::values::SIZES;
 
 /// The pixels of the images of this file that are not of the table of sizes.
 const SIDES: (u32, u32) = (48, 40);
 
 /// How far the loss, L1 and the mean similarity may be off; and the gradient, against its largest
 /// value. Flat images lose most, as C₂ is small beside the rounding of their squares.
-fn tolerances(bench: &Bench) -> (f64, f64) {
-    match bench {
-        Bench::Gpu(_) => (2e-6, 1e-4),
+fn tolerances(subject: &Subject) -> (f64, f64) {
+    match subject {
+        Subject::Gpu(_) => (2e-6, 1e-4),
         _ => (1e-6, 5e-5),
     }
 }
@@ -54,7 +54,7 @@ fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
 
 fn check(
     trial: &mut Trial<'_>,
-    backend: &mut dyn Subject,
+    backend: &mut dyn Differentiable,
     what: &str,
     rendered: &[f32],
     target: &Image8,
@@ -62,7 +62,7 @@ fn check(
     let background = [0.1, 0.5, 0.9];
     let expected = expected(rendered, target, background);
     let (found, gradient) = backend.loss(&scenes::opaque(rendered, target), target, background)?;
-    let (value, slope) = tolerances(trial.bench);
+    let (value, slope) = tolerances(trial.subject);
     let scalars = [
         ("loss", found.loss, expected.loss),
         ("L1", found.l1, expected.l1),
@@ -78,7 +78,7 @@ fn check(
 }
 
 pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let mut backend = trial.bench.backend(&Gaussians::default())?;
+    let mut backend = trial.subject.backend(&Gaussians::default())?;
     let (noisy, photograph) = scenes::noisy(SIDES, 0.2, 23);
     let transparent = Image8 { alpha: Some(vec![0; photograph.rgb.len() / 3]), ..photograph };
     let targets = [
@@ -97,7 +97,7 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             backend.loss(&scenes::opaque(&rendered, &target), &target, [0.0; 3])?;
         let off = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
         // The GPU divides by 255 within 2.5 units in the last place.
-        let tolerance = if matches!(trial.bench, Bench::Gpu(_)) { 3e-7 } else { 0.0 };
+        let tolerance = if matches!(trial.subject, Subject::Gpu(_)) { 3e-7 } else { 0.0 };
         trial.figure(&what, "loss of equal images", off, tolerance);
         if tolerance == 0.0 {
             let pulled = gradient.iter().filter(|g| g.abs() > 1e-12).count();
@@ -108,7 +108,7 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(48, 40, 25);
     let model = scenes::cloud(10, 0, &camera, 26);
     let away = crate::camera::Camera { translation: glam::DVec3::new(0.0, 0.0, -1e3), ..camera };
-    let mut backend = trial.bench.backend(&model)?;
+    let mut backend = trial.subject.backend(&model)?;
     let output = step(&mut *backend, 1, &away, &flat_image(255), [1.0; 3], 0)?;
     let mut moved = usize::from(backend.download()?.means != model.means);
     moved += count_broken(&[&[output.loss, output.ssim]]) + output.visible;
@@ -117,7 +117,7 @@ pub(super) fn plain(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 }
 
 pub(super) fn flat(trial: &mut Trial<'_>) -> Result<(), BackendError> {
-    let mut backend = trial.bench.backend(&Gaussians::default())?;
+    let mut backend = trial.subject.backend(&Gaussians::default())?;
     // The reference's loss is too slow for the longest image.
     for (seed, size) in SIZES.into_iter().filter(|size| size.1 < 1000).enumerate() {
         for noise in [0.05, 1.0] {

@@ -1,46 +1,53 @@
-//! Where the cases run: a backend with what only tests and research look at.
+//! What is tested: a backend, made the same way whichever it is.
 
 use densify_policies::policy::Needs;
 
 use super::compare::Limits;
-use crate::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
+use crate::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, InstructionSet, ModelGradient};
 use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
-use crate::backend::{Backend, BackendError, Rendering, StepOutput};
+use crate::backend::{Backend, BackendError, Rendering, Shortcuts, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 
 /// What is tested.
 #[derive(Debug, Clone)]
-pub enum Bench {
+pub enum Subject {
     /// The native backend.
     Native {
+        /// What its kernels are compiled for.
+        instructions: InstructionSet,
         /// Worker threads; `None` takes all cores.
         threads: Option<usize>,
     },
     /// A GPU, or what stands for one.
     Gpu(GpuDevice),
-    /// The native backend, which errs on purpose.
+    /// The native backend with an error on purpose.
     #[cfg(test)]
     Sabotaged(super::sabotage::Sabotage),
 }
 
 /// What a backend is made for, beside its model. The default is what the model needs.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Room {
+pub struct Setup {
     /// Most rows; the model's, if these are more.
-    pub(super) budget: usize,
+    pub budget: usize,
     /// Most (row, tile) entries held at a time.
-    pub(super) tile_cap: Option<usize>,
+    pub tile_cap: Option<usize>,
     /// Largest image that its ledger shall cover `[px]`.
-    pub(super) largest_image: (u32, u32),
+    pub largest_image: (u32, u32),
     /// Signals to collect.
-    pub(super) needs: Needs,
+    pub needs: Needs,
+    /// Where to compute less than could be.
+    pub shortcuts: Shortcuts,
 }
 
 /// A backend with gradients and losses on their own.
-pub(super) trait Subject: Backend {
+pub trait Differentiable: Backend {
     /// Renders a view and differentiates Σ image · upstream.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
     fn differentiate(
         &mut self,
         camera: &Camera,
@@ -50,6 +57,9 @@ pub(super) trait Subject: Backend {
     ) -> Result<(Rendering, ModelGradient), BackendError>;
 
     /// The training loss of a rendering, and its gradient.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
     fn loss(
         &mut self,
         rendering: &Rendering,
@@ -58,7 +68,7 @@ pub(super) trait Subject: Backend {
     ) -> Result<(StepOutput, Vec<f32>), BackendError>;
 }
 
-impl Subject for CpuBackend {
+impl Differentiable for CpuBackend {
     fn differentiate(
         &mut self,
         camera: &Camera,
@@ -79,7 +89,7 @@ impl Subject for CpuBackend {
     }
 }
 
-impl Subject for GpuBackend {
+impl Differentiable for GpuBackend {
     fn differentiate(
         &mut self,
         camera: &Camera,
@@ -100,12 +110,16 @@ impl Subject for GpuBackend {
     }
 }
 
-impl Bench {
+impl Subject {
+    /// The native backend as a run has it by default.
+    pub const NATIVE: Self = Self::Native { instructions: InstructionSet::Best, threads: None };
+
     /// What is tested, for people.
     #[must_use]
     pub fn name(&self) -> String {
         match self {
-            Self::Native { .. } => "native".into(),
+            Self::Native { instructions: InstructionSet::Best, .. } => "native".into(),
+            Self::Native { instructions, .. } => format!("native ({instructions})"),
             #[cfg(test)]
             Self::Sabotaged(how) => format!("native, with errors in {how:?}"),
             Self::Gpu(device) => {
@@ -120,42 +134,67 @@ impl Bench {
     }
 
     /// A backend for a model.
-    pub(super) fn backend(&self, model: &Gaussians) -> Result<Box<dyn Subject>, BackendError> {
-        self.with(model, Room::default())
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    pub fn backend(&self, model: &Gaussians) -> Result<Box<dyn Differentiable>, BackendError> {
+        self.with(model, Setup::default())
     }
 
     /// A backend with room for more.
-    pub(super) fn with(
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    pub fn with(
         &self,
         model: &Gaussians,
-        room: Room,
-    ) -> Result<Box<dyn Subject>, BackendError> {
-        let Room { budget, tile_cap, largest_image, needs } = room;
+        setup: Setup,
+    ) -> Result<Box<dyn Differentiable>, BackendError> {
+        let Setup { budget, tile_cap, largest_image, needs, shortcuts } = setup;
         let budget = budget.max(model.len()).max(1);
-        let native = |threads: Option<usize>, needs| {
+        let native = |instructions, threads, needs| {
             let mut options = CpuOptions::new(budget);
-            options.threads = threads;
+            (options.instructions, options.threads) = (instructions, threads);
             options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
             (options.largest_image, options.needs) = (largest_image, needs);
+            options.shortcuts = shortcuts;
             CpuBackend::new(model, &options)
         };
         match self {
-            Self::Native { threads } => Ok(Box::new(native(*threads, needs)?)),
+            Self::Native { instructions, threads } => {
+                Ok(Box::new(native(*instructions, *threads, needs)?))
+            }
             #[cfg(test)]
             Self::Sabotaged(how) => {
-                Ok(Box::new(super::sabotage::Saboteur::new(native(None, needs)?, *how)))
+                let inner = native(InstructionSet::Best, None, needs)?;
+                Ok(Box::new(super::sabotage::Saboteur::new(inner, *how)))
             }
             Self::Gpu(device) => {
-                let options =
-                    GpuOptions { tile_cap, largest_image, needs, ..GpuOptions::new(budget) };
+                let options = GpuOptions {
+                    tile_cap,
+                    largest_image,
+                    needs,
+                    shortcuts,
+                    ..GpuOptions::new(budget)
+                };
                 Ok(Box::new(GpuBackend::new(model, &options, device)?))
             }
         }
     }
 
+    /// Whether two runs give the same bits.
+    #[must_use]
+    pub fn is_deterministic(&self) -> bool {
+        match self {
+            Self::Gpu(device) => device.accumulation().is_deterministic(),
+            _ => true,
+        }
+    }
+
     /// How far an image may be from the reference's. The functions of a GPU are less accurate: an
     /// exponential of WGSL may be off by 3 + 2·|x| units in the last place.
-    pub(super) fn limits(&self) -> Limits {
+    #[must_use]
+    pub fn limits(&self) -> Limits {
         match self {
             Self::Gpu(_) => Limits { interior: 1e-4, ..Limits::CPU },
             _ => Limits::CPU,
@@ -165,7 +204,8 @@ impl Bench {
     /// How far a gradient may be from the reference's, against the largest of its class. Single
     /// precision loses about 1e-6 in a sum over pixels; a hundred times that leaves room for
     /// cancellation and none for a wrong term.
-    pub(super) fn gradient(&self) -> f64 {
+    #[must_use]
+    pub fn gradient(&self) -> f64 {
         match self {
             Self::Gpu(_) => 1e-3,
             _ => 1e-4,

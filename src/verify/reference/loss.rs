@@ -7,12 +7,15 @@ const C2: f64 = 0.0009;
 
 /// The loss, its two parts, and dL/d(rendered).
 #[derive(Debug, Clone)]
-pub(crate) struct Loss {
-    pub(crate) loss: f64,
-    pub(crate) l1: f64,
-    pub(crate) ssim: f64,
+pub struct Loss {
+    /// 0.8 · L1 + 0.2 · (1 − SSIM).
+    pub loss: f64,
+    /// Mean over pixels and channels of the absolute error.
+    pub l1: f64,
+    /// Mean similarity.
+    pub ssim: f64,
     /// Shape: [height, width, 3].
-    pub(crate) gradient: Vec<f64>,
+    pub gradient: Vec<f64>,
 }
 
 /// Weights of the window, σ = 1.5 px, by (dy, dx); they sum to 1.
@@ -48,7 +51,8 @@ fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
 }
 
 /// `rendered` and `target`: [height, width, 3], not clamped.
-pub(crate) fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Loss {
+#[must_use]
+pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Loss {
     let n = rendered.len() as f64;
     let blurred = |image: &[f64]| blur(image, width, height);
     let (mx, my) = (blurred(rendered), blurred(target));

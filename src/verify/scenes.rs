@@ -1,10 +1,10 @@
 //! Small scenes to test with: deterministic, in front of a camera in general position.
 
-use densify::backend::Rendering;
-use densify::backend::cpu::ImageGradient;
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::{Gaussians, sh_coefficients};
+use crate::backend::Rendering;
+use crate::backend::cpu::ImageGradient;
+use crate::camera::Camera;
+use crate::dataset::images::Image8;
+use crate::gaussians::{Gaussians, sh_coefficients};
 use glam::{DMat3, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -12,7 +12,8 @@ use rand_chacha::ChaCha8Rng;
 use super::reference::Upstream;
 
 /// A camera with an arbitrary pose and a principal point off the image's middle.
-pub(crate) fn camera(width: u32, height: u32, seed: u64) -> Camera {
+#[must_use]
+pub fn camera(width: u32, height: u32, seed: u64) -> Camera {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut number = || rng.random_range(-1.0..1.0);
     let pose = DQuat::from_xyzw(number(), number(), number(), 1.5 + number()).normalize();
@@ -32,7 +33,8 @@ pub(crate) fn camera(width: u32, height: u32, seed: u64) -> Camera {
 
 /// The camera with every number rounded to `f32`, so that a backend that computes in `f32`
 /// starts from the same values as the reference.
-pub(crate) fn rounded(camera: &Camera) -> Camera {
+#[must_use]
+pub fn rounded(camera: &Camera) -> Camera {
     let round = |v: f64| f64::from(v as f32);
     Camera {
         fx: round(camera.fx),
@@ -46,13 +48,14 @@ pub(crate) fn rounded(camera: &Camera) -> Camera {
 }
 
 /// World position of a point given in camera axes.
-pub(crate) fn world(camera: &Camera, local: [f64; 3]) -> [f32; 3] {
+#[must_use]
+pub fn world(camera: &Camera, local: [f64; 3]) -> [f32; 3] {
     let world = camera.rotation.inverse() * (DVec3::from(local) - camera.translation);
     world.to_array().map(|v| v as f32)
 }
 
 /// Appends a row to `model`.
-pub(crate) fn push(
+pub fn push(
     model: &mut Gaussians,
     mean: [f32; 3],
     scale: [f32; 3],
@@ -69,7 +72,8 @@ pub(crate) fn push(
 
 /// `rows` Gaussians over the image and a little beyond, at depths of 2 to 5 that differ by more
 /// than rounding, 2 to 40 % of the image wide, translucent, with quaternions of any length.
-pub(crate) fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussians {
+#[must_use]
+pub fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut model = Gaussians { sh_degree, ..Gaussians::default() };
     let mut order: Vec<usize> = (0..rows).collect();
@@ -92,7 +96,8 @@ pub(crate) fn cloud(rows: usize, sh_degree: u8, camera: &Camera, seed: u64) -> G
 }
 
 /// One row at a place given in camera axes, with colour that depends on the view (degree 1).
-pub(crate) fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
+#[must_use]
+pub fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gaussians {
     let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
     let quat = [0.9, -0.3, 0.4, 0.2];
     push(&mut model, world(camera, local), scale, quat, 1.0, |k| 0.3 - 0.05 * k as f32);
@@ -100,14 +105,16 @@ pub(crate) fn one_at(camera: &Camera, local: [f64; 3], scale: [f32; 3]) -> Gauss
 }
 
 /// A photograph of a camera's size in which neighbouring pixels differ.
-pub(crate) fn target(camera: &Camera) -> Image8 {
+#[must_use]
+pub fn target(camera: &Camera) -> Image8 {
     let n = 3 * camera.width * camera.height;
     let rgb = (0..n).map(|i| (i * 37 % 251) as u8).collect();
     Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
 }
 
 /// A loss that weighs every pixel of every image, with both signs.
-pub(crate) fn upstream(camera: &Camera, seed: u64) -> Upstream {
+#[must_use]
+pub fn upstream(camera: &Camera, seed: u64) -> Upstream {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let pixels = (camera.width * camera.height) as usize;
     // Rounded to f32, as a backend takes them.
@@ -118,7 +125,8 @@ pub(crate) fn upstream(camera: &Camera, seed: u64) -> Upstream {
 }
 
 /// The same, as a backend takes it.
-pub(crate) fn narrowed(upstream: &Upstream) -> ImageGradient {
+#[must_use]
+pub fn narrowed(upstream: &Upstream) -> ImageGradient {
     let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect();
     ImageGradient {
         rgb: narrow(&upstream.rgb),
@@ -128,7 +136,8 @@ pub(crate) fn narrowed(upstream: &Upstream) -> ImageGradient {
 }
 
 /// A random photograph, and the colours of a rendering of it with noise.
-pub(crate) fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, Image8) {
+#[must_use]
+pub fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<f32>, Image8) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let n = 3 * (width * height) as usize;
     let rgb: Vec<u8> = (0..n).map(|_| rng.random()).collect();
@@ -140,7 +149,8 @@ pub(crate) fn noisy((width, height): (u32, u32), noise: f32, seed: u64) -> (Vec<
 }
 
 /// A rendering with these colours, of a photograph's size: opaque, at depth 1.
-pub(crate) fn opaque(rgb: &[f32], target: &Image8) -> Rendering {
+#[must_use]
+pub fn opaque(rgb: &[f32], target: &Image8) -> Rendering {
     let pixels = rgb.len() / 3;
     Rendering {
         width: target.width,

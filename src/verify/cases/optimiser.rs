@@ -4,9 +4,9 @@ use densify_policies::plan::EditPlan;
 
 use crate::backend::{BackendError, Kept, LearningRates, StateArray, Values};
 use crate::camera::Camera;
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, step};
-use crate::selftest::values::RATES;
+use crate::verify::scenes;
+use crate::verify::trial::{Trial, step};
+use crate::verify::values::RATES;
 
 /// Gradients whose square is nothing, subnormal, ordinary, nearly too large, and too large.
 const GRADIENTS: [f32; 8] = [0.0, 1e-45, 1e-23, 1e-15, 1e-6, 1.0, 1e19, 1e30];
@@ -31,7 +31,7 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     model.log_scales.as_flattened_mut().fill(-1.0);
     model.opacity_logits.fill(0.5);
     model.sh.fill(0.5);
-    let mut backend = trial.bench.backend(&model)?;
+    let mut backend = trial.subject.backend(&model)?;
     for StateArray { name, .. } in backend.state() {
         let is_first = name.contains("first");
         if !is_first && !name.contains("second") {

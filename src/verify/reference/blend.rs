@@ -75,19 +75,24 @@ fn visible_colour(splat: &Splat) -> [f64; 3] {
 
 /// One pixel of an [`Image`].
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Sample {
-    pub(crate) rgb: [f64; 3],
-    pub(crate) alpha: f64,
-    pub(crate) depth: f64,
-    pub(crate) transmittance: f64,
+pub struct Sample {
+    /// Background included, not clamped.
+    pub rgb: [f64; 3],
+    /// 1 − final transmittance.
+    pub alpha: f64,
+    /// Σ α·T·z.
+    pub depth: f64,
+    /// What is left for the background.
+    pub transmittance: f64,
     /// Rows blended.
-    pub(crate) blended: u32,
+    pub blended: u32,
     /// Some decision was close.
-    pub(crate) boundary: bool,
+    pub boundary: bool,
 }
 
 /// Renders one pixel of splats in the given order.
-pub(crate) fn sample(
+#[must_use]
+pub fn sample(
     splats: &[Splat],
     order: &[usize],
     view: View<'_>,
@@ -116,7 +121,8 @@ pub(crate) fn sample(
 }
 
 /// Renders splats in the given order.
-pub(crate) fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
+#[must_use]
+pub fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) -> Image {
     let (width, height) = (view.camera.width, view.camera.height);
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
     let samples: Vec<Sample> = pixels.map(|at| sample(splats, order, view, rules, at)).collect();
@@ -132,7 +138,7 @@ pub(crate) fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &
 
 /// Calls `f(pixel, row, weight, distance of the pixel's centre to the projected mean [px])` for every
 /// row blended into a pixel.
-pub(crate) fn each_blended(
+pub fn each_blended(
     splats: &[Splat],
     order: &[usize],
     view: View<'_>,
@@ -151,7 +157,8 @@ pub(crate) fn each_blended(
 }
 
 /// Gradients of Σ image · upstream with respect to the splats. Shape: [rows].
-pub(crate) fn backward(
+#[must_use]
+pub fn backward(
     splats: &[Splat],
     order: &[usize],
     view: View<'_>,
@@ -212,7 +219,8 @@ fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_e
 
 /// Per row, what pixels outside `counted` may add to its statistics if every close decision in
 /// them fell in the row's favour: largest weight, sum of weights, pixels.
-pub(crate) fn leeway(
+#[must_use]
+pub fn leeway(
     splats: &[Splat],
     order: &[usize],
     view: View<'_>,

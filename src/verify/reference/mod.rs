@@ -5,27 +5,26 @@
 //! conic are plain matrices, and the spherical harmonics are a table of monomials. The backends
 //! do none of that, which is the point: an error in one is not an error in the other.
 //! `tests/it/central.rs` checks its gradients by central differences, `tests/it/oracle/` checks it
-//! against stored arrays. `densify selftest` holds backends to it on users' machines, so it is part of
-//! the program too (`src/selftest/mod.rs`).
+//! against stored arrays.
 
-pub(crate) mod blend;
-pub(crate) mod loss;
-pub(crate) mod project;
+pub mod blend;
+pub mod loss;
+pub mod project;
 
-use densify::camera::Camera;
-use densify::gaussians::{Gaussians, sh_coefficients};
+use crate::camera::Camera;
+use crate::gaussians::{Gaussians, sh_coefficients};
 
 /// The constants at which renderers differ.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Rules {
+pub struct Rules {
     /// Rows at smaller camera z are not drawn [scene units].
-    pub(crate) near: f64,
+    pub near: f64,
     /// A fainter alpha is skipped.
-    pub(crate) alpha_min: f64,
+    pub alpha_min: f64,
     /// A larger alpha is clamped, and passes no gradient.
-    pub(crate) alpha_max: f64,
+    pub alpha_max: f64,
     /// A row that would bring transmittance down to this ends the pixel and is not blended.
-    pub(crate) transmittance_min: f64,
+    pub transmittance_min: f64,
 }
 
 /// Added to the diagonal of the projected covariance [px²].
@@ -36,30 +35,38 @@ const FRUSTUM_MARGIN: f64 = 1.3;
 
 impl Rules {
     /// The rules of the renderer.
-    pub(crate) const STANDARD: Self =
+    pub const STANDARD: Self =
         Self { near: 0.01, alpha_min: 1.0 / 255.0, alpha_max: 0.99, transmittance_min: 1e-4 };
     /// The same without the two steps that make a render discontinuous in its parameters, so
     /// that differences approximate derivatives.
-    pub(crate) const SMOOTH: Self =
+    pub const SMOOTH: Self =
         Self { alpha_min: 0.0, transmittance_min: f64::NEG_INFINITY, ..Self::STANDARD };
 }
 
 /// A model in `f64`, or a gradient with respect to one. Fields as in [`Gaussians`].
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Model {
-    pub(crate) coefficients: usize,
-    pub(crate) means: Vec<[f64; 3]>,
-    pub(crate) log_scales: Vec<[f64; 3]>,
-    pub(crate) quats: Vec<[f64; 4]>,
-    pub(crate) opacity_logits: Vec<f64>,
-    pub(crate) sh: Vec<f64>,
+pub struct Model {
+    /// Coefficients of spherical harmonics per row and channel.
+    pub coefficients: usize,
+    /// Shape: [rows].
+    pub means: Vec<[f64; 3]>,
+    /// Shape: [rows].
+    pub log_scales: Vec<[f64; 3]>,
+    /// (w, x, y, z) of any length. Shape: [rows].
+    pub quats: Vec<[f64; 4]>,
+    /// Shape: [rows].
+    pub opacity_logits: Vec<f64>,
+    /// Shape: [rows, coefficients, 3].
+    pub sh: Vec<f64>,
 }
 
 /// The parameter classes, by the names that stored arrays have too.
-pub(crate) const CLASSES: [&str; 5] = ["means", "log_scales", "quats", "opacity_logits", "sh"];
+pub const CLASSES: [&str; 5] = ["means", "log_scales", "quats", "opacity_logits", "sh"];
 
 impl Model {
-    pub(crate) fn zeros(rows: usize, coefficients: usize) -> Self {
+    /// A gradient to add to.
+    #[must_use]
+    pub fn zeros(rows: usize, coefficients: usize) -> Self {
         Self {
             coefficients,
             means: vec![[0.0; 3]; rows],
@@ -70,7 +77,9 @@ impl Model {
         }
     }
 
-    pub(crate) fn of(gaussians: &Gaussians) -> Self {
+    /// The same model in `f64`.
+    #[must_use]
+    pub fn of(gaussians: &Gaussians) -> Self {
         Self {
             coefficients: sh_coefficients(gaussians.sh_degree),
             means: gaussians.means.iter().map(|v| v.map(f64::from)).collect(),
@@ -81,12 +90,18 @@ impl Model {
         }
     }
 
-    pub(crate) fn rows(&self) -> usize {
+    /// Number of rows.
+    #[must_use]
+    pub fn rows(&self) -> usize {
         self.means.len()
     }
 
     /// All values of the parameter class `name`, row after row.
-    pub(crate) fn class(&self, name: &str) -> &[f64] {
+    ///
+    /// # Panics
+    /// When it is none of [`CLASSES`].
+    #[must_use]
+    pub fn class(&self, name: &str) -> &[f64] {
         match name {
             "means" => self.means.as_flattened(),
             "log_scales" => self.log_scales.as_flattened(),
@@ -97,7 +112,11 @@ impl Model {
         }
     }
 
-    pub(crate) fn class_mut(&mut self, name: &str) -> &mut [f64] {
+    /// The same, to be changed.
+    ///
+    /// # Panics
+    /// When it is none of [`CLASSES`].
+    pub fn class_mut(&mut self, name: &str) -> &mut [f64] {
         match name {
             "means" => self.means.as_flattened_mut(),
             "log_scales" => self.log_scales.as_flattened_mut(),
@@ -108,7 +127,8 @@ impl Model {
         }
     }
 
-    pub(crate) fn add(&mut self, other: &Self) {
+    /// Adds another gradient of the same shape.
+    pub fn add(&mut self, other: &Self) {
         for class in CLASSES {
             for (sum, value) in self.class_mut(class).iter_mut().zip(other.class(class)) {
                 *sum += value;
@@ -119,23 +139,30 @@ impl Model {
 
 /// Where from, on what, and with how many harmonics.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct View<'a> {
-    pub(crate) camera: &'a Camera,
-    pub(crate) background: [f64; 3],
-    pub(crate) sh_degree: u8,
+pub struct View<'a> {
+    /// The camera.
+    pub camera: &'a Camera,
+    /// Colour behind everything.
+    pub background: [f64; 3],
+    /// Degree that is evaluated, <= the model's.
+    pub sh_degree: u8,
 }
 
-/// dL/d(image): what the gradient is of. Shapes: [H, W, 3], [H, W], [H, W].
+/// dL/d(image).
 #[derive(Debug, Clone)]
-pub(crate) struct Upstream {
-    pub(crate) rgb: Vec<f64>,
-    pub(crate) alpha: Vec<f64>,
-    pub(crate) depth: Vec<f64>,
+pub struct Upstream {
+    /// Shape: [height, width, 3].
+    pub rgb: Vec<f64>,
+    /// Shape: [height, width].
+    pub alpha: Vec<f64>,
+    /// Shape: [height, width].
+    pub depth: Vec<f64>,
 }
 
 impl Upstream {
     /// The same where no decision is close, so that a gradient can be compared tightly everywhere.
-    pub(crate) fn ignoring(mut self, boundary: &[bool]) -> Self {
+    #[must_use]
+    pub fn ignoring(mut self, boundary: &[bool]) -> Self {
         for (p, _) in boundary.iter().enumerate().filter(|(_, close)| **close) {
             self.rgb[3 * p..3 * p + 3].fill(0.0);
             self.alpha[p] = 0.0;
@@ -145,22 +172,27 @@ impl Upstream {
     }
 }
 
-/// A render. Fields as in `backend::Rendering`, and what a test wants to know besides.
+/// A render, and what a test wants to know besides.
 #[derive(Debug, Clone)]
-pub(crate) struct Image {
-    pub(crate) rgb: Vec<f64>,
-    pub(crate) alpha: Vec<f64>,
-    pub(crate) depth: Vec<f64>,
-    pub(crate) transmittance: Vec<f64>,
+pub struct Image {
+    /// Background included, not clamped. Shape: [height, width, 3].
+    pub rgb: Vec<f64>,
+    /// 1 − final transmittance.
+    pub alpha: Vec<f64>,
+    /// Σ α·T·z.
+    pub depth: Vec<f64>,
+    /// What is left for the background.
+    pub transmittance: Vec<f64>,
     /// Rows blended into each pixel.
-    pub(crate) blended: Vec<u32>,
+    pub blended: Vec<u32>,
     /// Pixels where a decision is so close that `f32` may take the other side.
-    pub(crate) boundary: Vec<bool>,
+    pub boundary: Vec<bool>,
 }
 
 impl Image {
     /// Σ image · upstream.
-    pub(crate) fn dot(&self, upstream: &Upstream) -> f64 {
+    #[must_use]
+    pub fn dot(&self, upstream: &Upstream) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         dot(&self.rgb, &upstream.rgb)
             + dot(&self.alpha, &upstream.alpha)
@@ -170,42 +202,46 @@ impl Image {
 
 /// Gradients and per-row statistics of one view.
 #[derive(Debug, Clone)]
-pub(crate) struct Gradient {
-    pub(crate) model: Model,
-    pub(crate) screen: Vec<ScreenGradient>,
+pub struct Gradient {
+    /// Of the parameters.
+    pub model: Model,
+    /// Of the projected rows. Shape: [rows].
+    pub screen: Vec<ScreenGradient>,
 }
 
 /// One row's share, as the pixels see it.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct ScreenGradient {
+pub struct ScreenGradient {
     /// dL/d(projected mean) [1/px].
-    pub(crate) mean: [f64; 2],
+    pub mean: [f64; 2],
     /// Σ over pixels of the absolute values of that.
-    pub(crate) mean_abs: [f64; 2],
+    pub mean_abs: [f64; 2],
     /// dL/d(A, B, C), the conic of exp(−½(A·dx² + C·dy²) − B·dx·dy).
-    pub(crate) conic: [f64; 3],
+    pub conic: [f64; 3],
     /// dL/d(colour after its clamp at 0).
-    pub(crate) colour: [f64; 3],
+    pub colour: [f64; 3],
     /// dL/d(opacity).
-    pub(crate) opacity: f64,
+    pub opacity: f64,
     /// dL/d(camera z) through the depth image only.
-    pub(crate) depth: f64,
+    pub depth: f64,
     /// Largest alpha·T.
-    pub(crate) max_weight: f64,
+    pub max_weight: f64,
     /// Sum of alpha·T.
-    pub(crate) sum_weight: f64,
+    pub sum_weight: f64,
     /// Pixels blended into.
-    pub(crate) pixels: u32,
+    pub pixels: u32,
 }
 
 /// Renders a view.
-pub(crate) fn render(model: &Model, view: View<'_>, rules: &Rules) -> Image {
+#[must_use]
+pub fn render(model: &Model, view: View<'_>, rules: &Rules) -> Image {
     let splats = project::project(model, view, rules);
     blend::render(&splats, &project::by_depth(&splats), view, rules)
 }
 
 /// Renders a view and differentiates Σ image · upstream.
-pub(crate) fn differentiate(
+#[must_use]
+pub fn differentiate(
     model: &Model,
     view: View<'_>,
     rules: &Rules,
@@ -217,4 +253,12 @@ pub(crate) fn differentiate(
     let screen = blend::backward(&splats, &order, view, rules, upstream);
     let model = project::backward(model, view, &splats, &screen);
     (image, Gradient { model, screen })
+}
+
+/// Colours of some pixels (x, y) of a view, background included, not clamped.
+#[must_use]
+pub fn pixels(model: &Model, view: View<'_>, rules: &Rules, pixels: &[[u32; 2]]) -> Vec<[f64; 3]> {
+    let splats = project::project(model, view, rules);
+    let order = project::by_depth(&splats);
+    pixels.iter().map(|&at| blend::sample(&splats, &order, view, rules, at).rgb).collect()
 }

@@ -7,11 +7,11 @@ use crate::backend::BackendError;
 use crate::dataset::PointCloud;
 use crate::dataset::images::Image8;
 use crate::init::initialise;
-use crate::selftest::compare::class;
-use crate::selftest::reference::CLASSES;
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, step};
-use crate::selftest::values::without;
+use crate::verify::compare::class;
+use crate::verify::reference::CLASSES;
+use crate::verify::scenes;
+use crate::verify::trial::{Trial, count_broken, step};
+use crate::verify::values::without;
 
 pub(super) fn colours(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     any_coefficient(trial)?;
@@ -30,7 +30,7 @@ fn any_coefficient(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = scenes::cloud(16, 3, &camera, 23);
         model.sh[5 * 48..6 * 48].fill(value);
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let (image, gradient) = backend.differentiate(&camera, GREY, 3, &upstream)?;
         let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
         for name in CLASSES {
@@ -60,7 +60,7 @@ fn black_and_white_learn(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let points = PointCloud { colours: vec![[colour; 3]; positions.len()], positions };
         let (model, _) = initialise(&points, 12, 0, 1)
             .map_err(|error| BackendError::OverLimit(error.to_string()))?;
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         for number in 1..=200 {
             step(&mut *backend, number, &camera, &grey, [0.5; 3], 0)?;
         }

@@ -6,21 +6,21 @@ use super::{BLUR, FRUSTUM_MARGIN, Model, Rules, ScreenGradient, View};
 
 /// A row as the pixels see it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Splat {
+pub struct Splat {
     /// Whether it lies beyond the near plane; else all other fields are meaningless.
-    pub(crate) in_front: bool,
+    pub in_front: bool,
     /// Projected mean [px].
-    pub(crate) mean: [f64; 2],
+    pub mean: [f64; 2],
     /// Camera z [scene units].
-    pub(crate) depth: f64,
+    pub depth: f64,
     /// Projected covariance (xx, xy, yy) [px²], blur included.
-    pub(crate) covariance: [f64; 3],
+    pub covariance: [f64; 3],
     /// Its inverse (A, B, C) [1/px²].
-    pub(crate) conic: [f64; 3],
+    pub conic: [f64; 3],
     /// Colour before the clamp at 0.
-    pub(crate) colour: [f64; 3],
+    pub colour: [f64; 3],
     /// Opacity in (0, 1).
-    pub(crate) opacity: f64,
+    pub opacity: f64,
 }
 
 /// Everything about a row's projection that its derivative needs again.
@@ -71,7 +71,8 @@ impl Geometry {
 }
 
 /// All rows of a model, projected.
-pub(crate) fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
+#[must_use]
+pub fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat> {
     (0..model.rows())
         .map(|row| {
             let geometry = Geometry::of(model, row, view);
@@ -100,14 +101,16 @@ pub(crate) fn project(model: &Model, view: View<'_>, rules: &Rules) -> Vec<Splat
 }
 
 /// Rows in front of the camera, front to back; ties by row.
-pub(crate) fn by_depth(splats: &[Splat]) -> Vec<usize> {
+#[must_use]
+pub fn by_depth(splats: &[Splat]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..splats.len()).filter(|&i| splats[i].in_front).collect();
     order.sort_by(|&i, &j| splats[i].depth.total_cmp(&splats[j].depth).then(i.cmp(&j)));
     order
 }
 
 /// From gradients on the screen to gradients of the parameters.
-pub(crate) fn backward(
+#[must_use]
+pub fn backward(
     model: &Model,
     view: View<'_>,
     splats: &[Splat],

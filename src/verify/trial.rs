@@ -4,10 +4,10 @@ use densify_policies::adc;
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::Cadence;
 
-use super::bench::{Bench, Subject};
 use super::compare::{Limits, Table, class, compare_images, relative_error};
 use super::reference::{CLASSES, Image, Model, Rules, ScreenGradient, View, blend, project};
 use super::scenes;
+use super::subject::{Differentiable, Subject};
 use super::values::RATES;
 use crate::backend::cpu::ModelGradient;
 use crate::backend::{BackendError, Rendering, StepInput, StepOutput};
@@ -22,7 +22,7 @@ const NEVER: &str = "NaN or infinity in 5 steps and an edit";
 
 /// A case that is being tried.
 pub(super) struct Trial<'a> {
-    pub(super) bench: &'a Bench,
+    pub(super) subject: &'a Subject,
     /// Whether there is time for the whole of it.
     pub(super) long: bool,
     pub(super) table: Table,
@@ -33,15 +33,15 @@ pub(super) struct Trial<'a> {
 }
 
 impl<'a> Trial<'a> {
-    pub(super) fn new(bench: &'a Bench, long: bool) -> Self {
-        let (limits, gradient) = (bench.limits(), bench.gradient());
-        Self { bench, long, table: Table::new("selftest"), limits, gradient }
+    pub(super) fn new(subject: &'a Subject, long: bool) -> Self {
+        let (limits, gradient) = (subject.limits(), subject.gradient());
+        Self { subject, long, table: Table::new("selftest"), limits, gradient }
     }
 
     /// Whether what the process holds is the native backend's: other tests may run beside a case, but
     /// not where it is run in full.
     pub(super) fn is_alone(&self) -> bool {
-        self.long && matches!(self.bench, Bench::Native { .. })
+        self.long && matches!(self.subject, Subject::Native { .. })
     }
 
     /// Records a figure.
@@ -73,7 +73,7 @@ impl<'a> Trial<'a> {
         let screen = blend::backward(&splats, &order, view, &rules, &upstream);
         let expected = project::backward(&exact, view, &splats, &screen);
 
-        let mut backend = self.bench.backend(model)?;
+        let mut backend = self.subject.backend(model)?;
         let upstream = scenes::narrowed(&upstream);
         let (found, measured) = backend.differentiate(camera, background, sh_degree, &upstream)?;
         self.images(what, &found, &image);
@@ -97,7 +97,7 @@ impl<'a> Trial<'a> {
     ) -> Result<(), BackendError> {
         let view = View { camera, background: background.map(f64::from), sh_degree };
         let image = super::reference::render(&Model::of(model), view, &Rules::STANDARD);
-        let found = self.bench.backend(model)?.render(camera, background, sh_degree)?;
+        let found = self.subject.backend(model)?.render(camera, background, sh_degree)?;
         self.images(what, &found, &image);
         Ok(())
     }
@@ -150,7 +150,7 @@ impl<'a> Trial<'a> {
     pub(super) fn train(
         &mut self,
         what: &str,
-        backend: &mut dyn Subject,
+        backend: &mut dyn Differentiable,
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
@@ -180,7 +180,7 @@ impl<'a> Trial<'a> {
 
 /// One training step with the step sizes of the suite.
 pub(super) fn step(
-    backend: &mut dyn Subject,
+    backend: &mut dyn Differentiable,
     number: u32,
     camera: &Camera,
     target: &Image8,

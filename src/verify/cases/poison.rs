@@ -2,12 +2,12 @@
 
 use crate::backend::BackendError;
 use crate::gaussians::Gaussians;
-use crate::selftest::bench::Subject;
-use crate::selftest::compare::class;
-use crate::selftest::reference::CLASSES;
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, count_different};
-use crate::selftest::values::{EXTREMES, POISON, SLOTS, name_of_slot, remove, slot_of};
+use crate::verify::compare::class;
+use crate::verify::reference::CLASSES;
+use crate::verify::scenes;
+use crate::verify::subject::Differentiable;
+use crate::verify::trial::{Trial, count_broken, count_different};
+use crate::verify::values::{EXTREMES, POISON, SLOTS, name_of_slot, remove, slot_of};
 
 const GREY: [f32; 3] = [0.2, 0.5, 0.3];
 /// Sound rows among which the others lie.
@@ -32,9 +32,9 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(49, 40, 19);
     let model = scenes::cloud(SOUND, 3, &camera, 32);
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-    let run = |backend: &mut dyn Subject| backend.differentiate(&camera, GREY, 3, &upstream);
+    let run = |backend: &mut dyn Differentiable| backend.differentiate(&camera, GREY, 3, &upstream);
     // Of the image, and of the gradients of the rows that are sound.
-    let bits = |backend: &mut dyn Subject| -> Result<Vec<u32>, BackendError> {
+    let bits = |backend: &mut dyn Differentiable| -> Result<Vec<u32>, BackendError> {
         let (image, gradient) = run(backend)?;
         let rows = gradient.means.len();
         let sound = CLASSES.iter().flat_map(|name| {
@@ -44,11 +44,11 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let image = [&image.rgb, &image.alpha, &image.depth].into_iter().flatten();
         Ok(image.chain(sound).map(|v| v.to_bits()).collect())
     };
-    let clean = bits(&mut *trial.bench.backend(&model)?)?;
+    let clean = bits(&mut *trial.subject.backend(&model)?)?;
     for value in POISON {
         let what = format!("{value} in every number");
         let poisoned = with_each_slot(&model, value);
-        let mut backend = trial.bench.backend(&poisoned)?;
+        let mut backend = trial.subject.backend(&poisoned)?;
         let different = count_different(&bits(&mut *backend)?, &clean);
         trial.never(&what, "bits of other rows and pixels changed", different);
         let found: Vec<usize> = backend.audit()?.iter().map(|u| u.row as usize).collect();
@@ -60,7 +60,7 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for value in EXTREMES {
         let extreme = with_each_slot(&model, value);
         let extreme = remove(&extreme, 3);
-        let mut backend = trial.bench.backend(&extreme)?;
+        let mut backend = trial.subject.backend(&extreme)?;
         let (image, gradient) = run(&mut *backend)?;
         let what = format!("{value:e} in every number");
         let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);

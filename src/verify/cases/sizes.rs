@@ -5,11 +5,11 @@ use crate::backend::BackendError;
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 use crate::memory::resident;
-use crate::selftest::bench::Room;
-use crate::selftest::reference::{Model, Rules, View, blend, project};
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, step};
-use crate::selftest::values::{LARGE_SIZES, SIZES};
+use crate::verify::reference::{Model, Rules, View, blend, project};
+use crate::verify::scenes;
+use crate::verify::subject::Setup;
+use crate::verify::trial::{Trial, count_broken, step};
+use crate::verify::values::{LARGE_SIZES, SIZES};
 
 const BACKGROUNDS: [[f32; 3]; 3] = [[0.0; 3], [1.0; 3], [0.2, 0.7, 0.4]];
 
@@ -31,7 +31,7 @@ fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendEr
     let camera = scenes::camera(width, height, 60);
     let model = scenes::cloud(40, 1, &camera, 61);
     let what = format!("{width}x{height}");
-    let image = match trial.bench.backend(&model)?.render(&camera, GREY, 1) {
+    let image = match trial.subject.backend(&model)?.render(&camera, GREY, 1) {
         // A device with small buffers refuses such an image; there is nothing to compare then.
         Err(BackendError::OverLimit(_)) => return Ok(()),
         other => other?,
@@ -100,15 +100,15 @@ pub(super) fn crowd(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let expected = {
         let front = model(front);
         let tile_cap = Some(front.len() * TILES as usize);
-        let mut backend = trial.bench.with(&front, Room { tile_cap, ..Room::default() })?;
+        let mut backend = trial.subject.with(&front, Setup { tile_cap, ..Setup::default() })?;
         backend.render(&camera, GREY, 0)?
     };
     let all = model(rows);
     let target = scenes::target(&camera);
     let before = resident();
     let largest_image = (camera.width, camera.height);
-    let room = Room { largest_image, tile_cap, ..Room::default() };
-    let mut backend = trial.bench.with(&all, room)?;
+    let room = Setup { largest_image, tile_cap, ..Setup::default() };
+    let mut backend = trial.subject.with(&all, room)?;
     let output = step(&mut *backend, 1, &camera, &target, GREY, 0)?;
     if let (Some(before), Some(after), true) = (before, resident(), trial.is_alone()) {
         let held = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
@@ -119,7 +119,7 @@ pub(super) fn crowd(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let broken = backend.audit()?.len() + usize::from(!output.loss.is_finite());
     trial.never(&what, "NaN or infinity", broken);
     drop(backend);
-    let mut backend = trial.bench.with(&all, Room { tile_cap, ..Room::default() })?;
+    let mut backend = trial.subject.with(&all, Setup { tile_cap, ..Setup::default() })?;
     let image = backend.render(&camera, GREY, 0)?;
     let pairs = image.rgb.iter().zip(&expected.rgb).chain(image.depth.iter().zip(&expected.depth));
     let different = pairs.filter(|(a, b)| a.to_bits() != b.to_bits()).count();

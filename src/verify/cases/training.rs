@@ -14,10 +14,10 @@ use crate::dataset::images::{Image8, SharedImage};
 use crate::gaussians::Gaussians;
 use crate::init::initialise;
 use crate::schedule::{Background, RateOptions};
-use crate::selftest::bench::{Bench, Room};
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken};
 use crate::trainer::{OnNan, Savings, TrainOptions, Trainer, needs};
+use crate::verify::scenes;
+use crate::verify::subject::{Setup, Subject};
+use crate::verify::trial::{Trial, count_broken};
 use crate::views::{ViewError, ViewSource};
 
 const SIDE: u32 = 64;
@@ -85,7 +85,7 @@ fn blobs() -> Gaussians {
 
 fn photographs() -> Result<Photographs, BackendError> {
     // The same for every backend.
-    let mut native = Bench::Native { threads: Some(1) }.backend(&blobs())?;
+    let mut native = Subject::NATIVE.backend(&blobs())?;
     let cameras = cameras();
     let mut images = Vec::new();
     for camera in &cameras {
@@ -146,8 +146,8 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
     let needs = needs(policy.as_ref(), &scene, options.sh_every);
-    let room = Room { budget: BUDGET, needs, ..Room::default() };
-    let backend = trial.bench.with(&model, room)?;
+    let room = Setup { budget: BUDGET, needs, ..Setup::default() };
+    let backend = trial.subject.with(&model, room)?;
     let mut trainer = Trainer::new(photographs()?, backend, (name, policy), scene, options)?;
     let (mut over_budget, mut broken, mut looks) = (0, 0, 0);
     let (mut first, mut last) = (0.0, 0.0);

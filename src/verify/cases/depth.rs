@@ -3,10 +3,10 @@
 use super::{GREY, UPRIGHT, flat_colour, straight};
 use crate::backend::BackendError;
 use crate::gaussians::Gaussians;
-use crate::selftest::compare::class;
-use crate::selftest::reference::CLASSES;
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, bits, count_broken, count_different};
+use crate::verify::compare::class;
+use crate::verify::reference::CLASSES;
+use crate::verify::scenes;
+use crate::verify::trial::{Trial, bits, count_broken, count_different};
 
 /// The near plane of a backend's default options.
 const NEAR: f32 = 0.01;
@@ -35,7 +35,7 @@ pub(super) fn near(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for z in [NEAR.next_down(), NEAR, NEAR.next_up()] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, z], [z / 20.0; 3], UPRIGHT, 2.0, flat_colour);
-        let image = trial.bench.backend(&model)?.render(&camera, GREY, 0)?;
+        let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
         let is_drawn = image.alpha.iter().any(|a| *a > 0.5);
         let wrong = is_drawn != (z > NEAR);
         trial.never(&format!("z = {z:.9}"), "rows on the wrong side", usize::from(wrong));
@@ -73,7 +73,7 @@ pub(super) fn coincident(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             model.means[row] = direction.map(|d: f32| d * offset);
             model.log_scales[row] = [0.7, 0.0, 2.0];
         }
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let (image, gradient) = backend.differentiate(&camera, GREY, 2, &upstream)?;
         let gradients = CLASSES.map(|name| class(&gradient, name));
@@ -95,7 +95,7 @@ pub(super) fn ties(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     model.means.fill(place);
     trial.check("1000 rows at one place", &model, &camera, GREY, 0)?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 12));
-    let run = || trial.bench.backend(&model)?.differentiate(&camera, GREY, 0, &upstream);
+    let run = || trial.subject.backend(&model)?.differentiate(&camera, GREY, 0, &upstream);
     let first = bits(&run()?);
     let mut different = 0;
     for _ in 0..3 {
@@ -119,7 +119,7 @@ pub(super) fn order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
                 let scale = [z * 0.1; 3];
                 scenes::push(&mut model, [0.0, 0.0, z], scale, UPRIGHT, 4.0, |k| colour[k]);
             }
-            let image = trial.bench.backend(&model)?.render(&camera, [0.0; 3], 0)?;
+            let image = trial.subject.backend(&model)?.render(&camera, [0.0; 3], 0)?;
             let middle = 3 * (8 * 16 + 8);
             wrong += usize::from(image.rgb[middle] <= 2.0 * image.rgb[middle + 1]);
             looks += 1;
@@ -132,7 +132,7 @@ pub(super) fn order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for z in [0.0, -0.0, 1e-45, -1e-45, 1e-38, f32::MIN_POSITIVE] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, z], [1e-3; 3], UPRIGHT, 4.0, flat_colour);
-        let image = trial.bench.backend(&model)?.render(&camera, GREY, 0)?;
+        let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
         drawn += image.alpha.iter().filter(|a| **a != 0.0).count();
     }
     trial.never("depths around zero", "pixels of rows that are too near", drawn);

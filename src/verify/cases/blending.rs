@@ -3,10 +3,10 @@
 use super::{GREY, UPRIGHT, straight};
 use crate::backend::BackendError;
 use crate::gaussians::Gaussians;
-use crate::selftest::compare::class;
-use crate::selftest::reference::{CLASSES, Model, Rules, View, render};
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken};
+use crate::verify::compare::class;
+use crate::verify::reference::{CLASSES, Model, Rules, View, render};
+use crate::verify::scenes;
+use crate::verify::trial::{Trial, count_broken};
 
 /// The logit of an opacity, in f64, so that opacities next to 1 have one.
 fn logit(opacity: f64) -> f32 {
@@ -51,7 +51,7 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         model.sh.fill(-2.0);
         let view = View { camera: &camera, background: [1.0; 3], sh_degree: 0 };
         let exact = render(&Model::of(&model), view, &Rules::STANDARD);
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
         let (found, gradient) = backend.differentiate(&camera, [1.0; 3], 0, &upstream)?;
         let left = exact.transmittance.iter().zip(found.rgb.chunks_exact(3)).zip(&exact.boundary);
@@ -116,7 +116,7 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let camera = straight(17, 17);
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, 1.0], [0.05; 3], UPRIGHT, logit, |_| 0.0);
-        let mut backend = trial.bench.backend(&model)?;
+        let mut backend = trial.subject.backend(&model)?;
         let mut upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
         upstream.rgb.fill(0.0);
         upstream.depth.fill(0.0);

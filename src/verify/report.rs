@@ -46,8 +46,8 @@ must never happen is counted. The numbers of the cases are those of `tests/it/ex
 #[must_use]
 pub fn markdown(tested: &[Tested]) -> String {
     let mut text = HEAD.to_owned();
-    for Tested { bench, cases } in tested {
-        let _ = write!(text, "\n## {bench}\n\n{COLUMNS}");
+    for Tested { subject, cases } in tested {
+        let _ = write!(text, "\n## {subject}\n\n{COLUMNS}");
         for (case, findings) in cases {
             for (i, finding) in findings.iter().enumerate() {
                 let number = case.number.to_string();
@@ -74,7 +74,7 @@ const COLUMNS: &str = "\
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::selftest::cases;
+    use crate::verify::cases;
 
     fn finding(error: f64, tolerance: f64) -> Finding {
         Finding { number: 1, kind: "image".into(), place: "a|b".into(), error, tolerance }
@@ -88,7 +88,7 @@ mod tests {
         assert!(text.contains("ok       1.5e-5 of   2.0e-5"), "{text}");
         assert!(text.contains("FAILED        3 of        0"), "{text}");
         assert!(text.contains("FAILED        - of"), "{text}");
-        let text = markdown(&[Tested { bench: "native".into(), cases: vec![(case, findings)] }]);
+        let text = markdown(&[Tested { subject: "native".into(), cases: vec![(case, findings)] }]);
         assert!(text.contains("\n## native\n\n| case |"), "{text}");
         assert!(text.contains("| 1.5e-5 | 2.0e-5 | ok | a\\|b |"), "{text}");
         assert_eq!(text.matches("FAILED").count(), 2);

@@ -5,11 +5,11 @@ use densify_policies::plan::EditPlan;
 use super::{GREY, UPRIGHT, flat_colour, straight};
 use crate::backend::BackendError;
 use crate::gaussians::Gaussians;
-use crate::selftest::bench::Room;
-use crate::selftest::compare::class;
-use crate::selftest::reference::CLASSES;
-use crate::selftest::scenes;
-use crate::selftest::trial::{Trial, count_broken, step};
+use crate::verify::compare::class;
+use crate::verify::reference::CLASSES;
+use crate::verify::scenes;
+use crate::verify::subject::Setup;
+use crate::verify::trial::{Trial, count_broken, step};
 
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 
@@ -22,7 +22,7 @@ fn drawn(image: &crate::backend::Rendering) -> usize {
 pub(super) fn none(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(21, 13, 1);
     let model = Gaussians { sh_degree: 2, ..Gaussians::default() };
-    let mut backend = trial.bench.with(&model, Room { budget: 3, ..Room::default() })?;
+    let mut backend = trial.subject.with(&model, Setup { budget: 3, ..Setup::default() })?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 2, &upstream)?;
     trial.never("0 rows", "pixels other than the background", drawn(&image));
@@ -65,7 +65,7 @@ pub(super) fn invisible(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut model = scenes::cloud(20, 1, &camera, 4);
     // σ(−5.6) = 0.0037, below 1/255.
     model.opacity_logits.fill(-5.6);
-    let mut backend = trial.bench.backend(&model)?;
+    let mut backend = trial.subject.backend(&model)?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 1));
     let (image, gradient) = backend.differentiate(&camera, BACKGROUND, 1, &upstream)?;
     trial.never("all rows", "pixels other than the background", drawn(&image));

@@ -7,7 +7,7 @@ use crate::camera::Camera;
 use crate::dataset::PointCloud;
 use crate::dataset::normalise::Normalisation;
 use crate::init::initialise;
-use crate::selftest::trial::Trial;
+use crate::verify::trial::Trial;
 
 /// A rig of cameras that look at a cloud, in coordinates of the world.
 fn rig() -> (Vec<Camera>, Vec<DVec3>) {
@@ -55,7 +55,7 @@ fn picture(
         .map_err(|error| BackendError::OverLimit(error.to_string()))?;
     model.opacity_logits.fill(0.5);
     let camera = normalisation.camera(&cameras[0]);
-    Ok(trial.bench.backend(&model)?.render(&camera, [0.1; 3], 0)?.rgb)
+    Ok(trial.subject.backend(&model)?.render(&camera, [0.1; 3], 0)?.rgb)
 }
 
 fn rms(a: &[f32], b: &[f32]) -> f64 {

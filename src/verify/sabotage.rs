@@ -9,8 +9,8 @@ use std::time::Duration;
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{Candidate, SignalSet, Signals};
 
-use super::bench::{Bench, Subject};
 use super::cases;
+use super::subject::{Differentiable, Subject};
 use crate::backend::cpu::{CpuBackend, ImageGradient, ModelGradient};
 use crate::backend::{
     Attribute, AuxInput, AuxOutput, Backend, BackendError, Kept, Rendering, StateArray, StateError,
@@ -71,7 +71,7 @@ impl Saboteur {
     }
 }
 
-impl Subject for Saboteur {
+impl Differentiable for Saboteur {
     fn differentiate(
         &mut self,
         camera: &Camera,
@@ -223,19 +223,19 @@ impl Backend for Saboteur {
     }
 }
 
-/// Number and kind of the findings on a bench that hold, or that do not.
-fn kinds(bench: &Bench, hold: bool) -> BTreeSet<(u8, String)> {
-    let findings = cases().iter().flat_map(|case| case.run(bench, false));
+/// Number and kind of the findings on a subject that hold, or that do not.
+fn kinds(subject: &Subject, hold: bool) -> BTreeSet<(u8, String)> {
+    let findings = cases().iter().flat_map(|case| case.run(subject, false));
     findings.filter(|f| f.holds() == hold).map(|f| (f.number, f.kind)).collect()
 }
 
 #[test]
 fn every_figure_can_fail() {
-    let all = kinds(&Bench::Native { threads: None }, true);
+    let all = kinds(&Subject::NATIVE, true);
     assert!(all.len() > 80, "{all:?}");
     let mut failed = BTreeSet::new();
     for how in ALL {
-        failed.extend(kinds(&Bench::Sabotaged(how), false));
+        failed.extend(kinds(&Subject::Sabotaged(how), false));
     }
     // A backend over its budget does not get this far: the trainer stops before.
     failed.insert((30, "steps over the budget".into()));

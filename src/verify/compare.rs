@@ -8,28 +8,28 @@
 
 use std::fmt::Write as _;
 
-use densify::backend::cpu::ModelGradient;
+use crate::backend::cpu::ModelGradient;
 
 /// How far two images may differ.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Limits {
+pub struct Limits {
     /// Largest difference of a value where no decision is close.
-    pub(crate) interior: f64,
+    pub interior: f64,
     /// Largest difference of a value where one is.
-    pub(crate) step: f64,
+    pub step: f64,
     /// Largest share of all pixels that may differ by more than `interior`; one always may.
-    pub(crate) flipped: f64,
+    pub flipped: f64,
     /// Largest |mean sign| of these differences.
-    pub(crate) bias: f64,
+    pub bias: f64,
 }
 
 impl Limits {
     /// For values around 1 computed on a CPU.
-    pub(crate) const CPU: Self =
-        Self { interior: 2e-5, step: 1.5 / 255.0, flipped: 0.001, bias: 0.5 };
+    pub const CPU: Self = Self { interior: 2e-5, step: 1.5 / 255.0, flipped: 0.001, bias: 0.5 };
 
     /// The same for values around `scale`.
-    pub(crate) fn scaled(self, scale: f64) -> Self {
+    #[must_use]
+    pub fn scaled(self, scale: f64) -> Self {
         Self { interior: self.interior * scale, step: self.step * scale, ..self }
     }
 }
@@ -40,7 +40,10 @@ const FLIPS_WITH_DIRECTION: usize = 30;
 /// What is wrong with `measured`, or `Ok` with the largest difference away from boundaries.
 ///
 /// Shapes: `measured` and `expected` [pixels, channels], `boundary` [pixels].
-pub(crate) fn compare_images(
+///
+/// # Errors
+/// The first pixel that differs by more than is allowed, or too many that do.
+pub fn compare_images(
     measured: &[f32],
     expected: &[f64],
     boundary: &[bool],
@@ -92,7 +95,11 @@ pub(crate) fn compare_images(
 }
 
 /// max |measured − expected| / max |expected|; 0 where both are all zero, NaN where a NaN is.
-pub(crate) fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> f64 {
+///
+/// # Panics
+/// When they differ in length.
+#[must_use]
+pub fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f64]) -> f64 {
     assert_eq!(measured.len(), expected.len(), "two arrays of one quantity differ in length");
     let mut largest = 0.0_f64;
     let mut worst = 0.0_f64;
@@ -107,7 +114,11 @@ pub(crate) fn relative_error<M: Copy + Into<f64>>(measured: &[M], expected: &[f6
 }
 
 /// All values of a parameter class of a gradient, row after row.
-pub(crate) fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
+///
+/// # Panics
+/// When no class has this name.
+#[must_use]
+pub fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
     match name {
         "means" => gradient.means.as_flattened(),
         "log_scales" => gradient.log_scales.as_flattened(),
@@ -120,24 +131,26 @@ pub(crate) fn class<'a>(gradient: &'a ModelGradient, name: &str) -> &'a [f32] {
 
 /// Collects comparisons, so that a failing test shows all of them at once.
 #[derive(Debug)]
-pub(crate) struct Table {
+pub struct Table {
     title: String,
     rows: Vec<(String, String, f64, f64)>,
     messages: Vec<String>,
 }
 
 impl Table {
-    pub(crate) fn new(title: &str) -> Self {
+    /// An empty table.
+    #[must_use]
+    pub fn new(title: &str) -> Self {
         Self { title: title.into(), rows: Vec::new(), messages: Vec::new() }
     }
 
     /// Records that `quantity` of `case` is off by `error`.
-    pub(crate) fn check(&mut self, case: &str, quantity: &str, error: f64, tolerance: f64) {
+    pub fn check(&mut self, case: &str, quantity: &str, error: f64, tolerance: f64) {
         self.rows.push((case.into(), quantity.into(), error, tolerance));
     }
 
     /// Records the outcome of a comparison of images.
-    pub(crate) fn image(
+    pub fn image(
         &mut self,
         case: &str,
         quantity: &str,
@@ -154,7 +167,7 @@ impl Table {
     }
 
     /// Records a failure that has no error to show.
-    pub(crate) fn fail(&mut self, message: String) {
+    pub fn fail(&mut self, message: String) {
         self.messages.push(message);
     }
 
@@ -180,24 +193,28 @@ impl Table {
     }
 
     /// All comparisons: case, quantity, error, tolerance.
-    pub(crate) fn rows(&self) -> impl Iterator<Item = (&str, &str, f64, f64)> {
+    pub fn rows(&self) -> impl Iterator<Item = (&str, &str, f64, f64)> {
         self.rows.iter().map(|(case, quantity, error, tolerance)| {
             (case.as_str(), quantity.as_str(), *error, *tolerance)
         })
     }
 
     /// All failures that have no error to show.
-    pub(crate) fn messages(&self) -> impl Iterator<Item = &str> {
+    pub fn messages(&self) -> impl Iterator<Item = &str> {
         self.messages.iter().map(String::as_str)
     }
 
     /// The largest error in units of its tolerance.
-    pub(crate) fn worst(&self) -> f64 {
+    #[must_use]
+    pub fn worst(&self) -> f64 {
         self.rows.iter().map(|row| row.2 / row.3).fold(0.0, f64::max)
     }
 
-    /// Panics with the table of failures, if there are any, or if nothing was compared.
-    pub(crate) fn finish(self) {
+    /// Ends a test.
+    ///
+    /// # Panics
+    /// With the table of failures, if there are any, or if nothing was compared.
+    pub fn finish(self) {
         assert!(!self.rows.is_empty(), "{}: nothing was compared", self.title);
         if let Some(failures) = self.failures() {
             panic!("{failures}");
