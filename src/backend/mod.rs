@@ -19,14 +19,12 @@ use std::time::Duration;
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, SignalSet, Signals};
 
-use serde::{Deserialize, Serialize};
-
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
-pub use shortcuts::{Exp2, Shortcuts, Stepped};
+pub use shortcuts::Shortcuts;
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};
 pub use state::{StateArray, StateError, Tensor, Values};
 pub use storage::{MomentStorage, ParameterStorage, Storage};
@@ -136,19 +134,6 @@ pub struct Rendering {
     pub alpha: Vec<f32>,
     /// Σ α·T·z, camera z `[scene units]`, without a background term. Shape: `[height, width]`.
     pub depth: Vec<f32>,
-}
-
-/// What [`Backend::drop_bands`] has left.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RowDegrees {
-    /// By how much colours could change `[1/255]`; see [`Shortcuts::row_degrees`].
-    pub tolerance: f32,
-    /// Rows that have degree 0, 1, 2 and 3.
-    pub rows: [usize; 4],
-    /// Bytes of parameters and moments that were held before and are held now, with what is held for
-    /// rows up to the budget.
-    pub bytes: [u64; 2],
 }
 
 /// Why a backend cannot go on.
@@ -274,21 +259,6 @@ pub trait Backend: Send {
     /// # Errors
     /// See [`BackendError`].
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError>;
-
-    /// Gives each row the lowest degree of colour at which it looks as at the degree `in_use` but for
-    /// [`Shortcuts::row_degrees`], puts rows in order of falling degree with all that is theirs, and
-    /// gives back the memory of what they have lost. Bands beyond `in_use` are lost in any case. Every
-    /// array of [`state`](Self::state) keeps its shape; what was dropped is 0.
-    ///
-    /// Once: `None`, and nothing is done, where it has been done before, or was not asked for. The default
-    /// is for backends that cannot be asked.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    fn drop_bands(&mut self, in_use: u8) -> Result<Option<RowDegrees>, BackendError> {
-        let _ = in_use;
-        Ok(None)
-    }
 
     /// Renders a view.
     ///

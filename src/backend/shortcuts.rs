@@ -9,48 +9,11 @@ pub struct Shortcuts {
     pub alpha_min: f32,
     /// A pixel stops before its transmittance reaches this; above 0.
     pub transmittance_min: f32,
-    /// How exact 2^x is where alpha is computed.
-    pub exp2: Exp2,
-    /// Which rows the optimiser steps.
-    pub stepped: Stepped,
-    /// By how much the colour of a row may change `[1/255]`, as the root mean square over all directions
-    /// of view, where its higher bands are [dropped](crate::backend::Backend::drop_bands): a distance
-    /// of √3 times as much in RGB, > 0. `None`: none are dropped.
-    pub row_degrees: Option<f32>,
-}
-
-/// Degree of the polynomial of 2^x in alpha: what is left of x beside a whole number goes through
-/// it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Exp2 {
-    /// Relative error 1.8e-3.
-    Degree2,
-    /// Relative error 2.7e-6.
-    Degree4,
-    /// As exact as `f32` is.
-    #[default]
-    Degree6,
-}
-
-/// Which rows the optimiser steps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Stepped {
-    /// All: those that a view does not show go on by their momentum.
-    #[default]
-    All,
-    /// Those that the view shows; the others rest, and do not age.
-    Visible,
 }
 
 impl Default for Shortcuts {
     fn default() -> Self {
-        Self {
-            alpha_min: 1.0 / 255.0,
-            transmittance_min: 1e-4,
-            exp2: Exp2::default(),
-            stepped: Stepped::default(),
-            row_degrees: None,
-        }
+        Self { alpha_min: 1.0 / 255.0, transmittance_min: 1e-4 }
     }
 }
 

@@ -31,13 +31,8 @@ pub enum MomentStorage {
     /// 4 bytes each.
     #[default]
     F32,
-    /// 2 bytes each (bfloat16: 8 significant bits, the range of f32. The second moment is a squared
-    /// gradient, of 1e-20 and less, where binary16 ends at 6e-8).
-    Bf16,
-    /// The second as [`Bf16`](Self::Bf16); the first in 1 byte, as a multiple of the root of the
+    /// 1 byte each: the second, a squared gradient, as a float of one significant digit after the first,
+    /// from 2⁻⁹⁶ (whose root is near Adam's ε) to 1.5·2³⁰; the first as a multiple of the root of the
     /// second, which bounds it.
-    Ratio8,
-    /// Both in 1 byte: the first as in [`Ratio8`](Self::Ratio8), the second as a float of one
-    /// significant digit after the first, from 2⁻⁹⁶ to 1.5·2³⁰. What is below has a root near Adam's ε.
     Both8,
 }

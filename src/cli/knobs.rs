@@ -47,7 +47,6 @@ fn facts(knob: &Knob) -> String {
         How::Parameter(names) => {
             format!("; the same as --policy-set POLICY.{}", names.join(" or "))
         }
-        How::BuiltIn => "; built in".to_owned(),
     };
     let on = match knob.on {
         On::Both => "",

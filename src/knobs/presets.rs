@@ -66,12 +66,9 @@ pub static PRESETS: &[Preset] = &[
         levels: &[
             ("alpha_min", "1/255"),
             ("transmittance_stop", "1e-4"),
-            ("exp_degree", "6"),
             ("ssim_every", "1"),
             ("coarse_until", "0"),
             ("budget_share", "1"),
-            ("sparse_adam", "off"),
-            ("row_degrees", "off"),
             ("param_storage", "f32"),
             ("moment_storage", "f32"),
         ],

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{How, KNOBS, Knob, KnobError, find, number, parse};
 use crate::backend::gpu::Accumulation;
-use crate::backend::{Exp2, MomentStorage, ParameterStorage, Shortcuts, Stepped, Storage};
+use crate::backend::{MomentStorage, ParameterStorage, Shortcuts, Storage};
 use crate::trainer::Savings;
 
 /// All knobs that are set by `--knob` alone, by name, each with its value as the table spells it.
@@ -92,17 +92,6 @@ impl Settings {
         Shortcuts {
             alpha_min: number("alpha_min").unwrap_or(default.alpha_min),
             transmittance_min: number("transmittance_stop").unwrap_or(default.transmittance_min),
-            exp2: match self.text("exp_degree") {
-                "2" => Exp2::Degree2,
-                "4" => Exp2::Degree4,
-                _ => Exp2::Degree6,
-            },
-            stepped: match self.text("sparse_adam") {
-                "on" => Stepped::Visible,
-                _ => Stepped::All,
-            },
-            // "off" is no number.
-            row_degrees: number("row_degrees"),
         }
     }
 
@@ -115,8 +104,6 @@ impl Settings {
                 _ => ParameterStorage::F32,
             },
             moments: match self.text("moment_storage") {
-                "bf16" => MomentStorage::Bf16,
-                "ratio8" => MomentStorage::Ratio8,
                 "both8" => MomentStorage::Both8,
                 _ => MomentStorage::F32,
             },

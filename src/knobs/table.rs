@@ -2,7 +2,7 @@
 //! writes.
 
 use super::Class::{Bounded, Exact, Heuristic};
-use super::How::{BuiltIn, Flag, Parameter};
+use super::How::{Flag, Parameter};
 use super::Levels::{TimesBudget, TimesIterations, Values};
 use super::{Domain, How, Knob, On};
 
@@ -11,17 +11,6 @@ const MANY: u64 = u32::MAX as u64;
 
 /// All knobs: exact ones, then bounded ones, then heuristic ones.
 pub static KNOBS: &[Knob] = &[
-    Knob {
-        name: "tile_size",
-        default: "16",
-        domain: Domain::Choice(&["16"]),
-        unit: "px",
-        class: Exact,
-        on: On::Both,
-        how: BuiltIn,
-        what: "side of a tile; vectors, footprints and lists are laid out for it, so it has one level",
-        levels: Values(&[]),
-    },
     Knob {
         name: "tile_cap",
         default: "[16 per row of the budget]",
@@ -76,17 +65,6 @@ pub static KNOBS: &[Knob] = &[
         how: How::Knob,
         what: "a pixel that lets no more light through takes no more splats; a larger one stops sooner",
         levels: Values(&["1e-5", "1e-3", "1e-2"]),
-    },
-    Knob {
-        name: "exp_degree",
-        default: "6",
-        domain: Domain::Choice(&["2", "4", "6"]),
-        unit: "",
-        class: Bounded,
-        on: On::Native,
-        how: How::Knob,
-        what: "degree of the polynomial of 2^x in alpha; a lower one saves a multiplication per degree",
-        levels: Values(&["2", "4"]),
     },
     Knob {
         name: "accumulation",
@@ -144,17 +122,6 @@ pub static KNOBS: &[Knob] = &[
         levels: Values(&["0.25", "0.5", "0.75"]),
     },
     Knob {
-        name: "sparse_adam",
-        default: "off",
-        domain: Domain::Choice(&["off", "on"]),
-        unit: "",
-        class: Heuristic,
-        on: On::Native,
-        how: How::Knob,
-        what: "step only rows that the view shows: the optimiser then costs what is seen, not what is held",
-        levels: Values(&["on"]),
-    },
-    Knob {
         name: "param_storage",
         default: "f32",
         domain: Domain::Choice(&["f32", "f16"]),
@@ -168,13 +135,13 @@ pub static KNOBS: &[Knob] = &[
     Knob {
         name: "moment_storage",
         default: "f32",
-        domain: Domain::Choice(&["f32", "bf16", "ratio8", "both8"]),
+        domain: Domain::Choice(&["f32", "both8"]),
         unit: "",
         class: Bounded,
         on: On::Native,
         how: How::Knob,
-        what: "bf16: moments in 2 bytes, rounded at random; ratio8: the first in 1, in roots of the second; both8: the second in 1, too",
-        levels: Values(&["bf16", "ratio8", "both8"]),
+        what: "both8: Adam's two moments in 1 byte each, rounded at random; 354 bytes less per row of 59",
+        levels: Values(&["both8"]),
     },
     Knob {
         name: "sh_degree",
@@ -186,17 +153,6 @@ pub static KNOBS: &[Knob] = &[
         how: Flag("--sh-degree"),
         what: "how colour depends on the direction of view; 14, 23, 38 or 59 numbers per row",
         levels: Values(&["0", "1", "2"]),
-    },
-    Knob {
-        name: "row_degrees",
-        default: "off",
-        domain: Domain::OffOr { least: 0.25, most: 32.0 },
-        unit: "of 255",
-        class: Heuristic,
-        on: On::Native,
-        how: How::Knob,
-        what: "half-way rows lose bands of colour that change it by no more, and memory falls; rms over directions",
-        levels: Values(&["1", "3", "6"]),
     },
     Knob {
         name: "sh_every",

@@ -21,8 +21,7 @@ fn the_table_agrees_with_itself() {
             for level in values {
                 assert_eq!(knob.canonical(level).as_deref(), Ok(*level), "{name}");
             }
-            let measured = values.iter().filter(|level| **level != knob.default).count();
-            assert!(knob.how == How::BuiltIn || (1..=5).contains(&measured), "{name}");
+            assert!(values.iter().any(|level| *level != knob.default), "{name} has one level");
         }
     }
 }
@@ -34,11 +33,8 @@ fn equal_values_are_equal_texts() {
         (" alpha_min = 0.0078125", "alpha_min", "1/128"),
         ("alpha_min=0.005", "alpha_min", "5e-3"),
         ("transmittance_stop=0.0001", "transmittance_stop", "1e-4"),
-        ("exp_degree=4", "exp_degree", "4"),
+        ("moment_storage=both8", "moment_storage", "both8"),
         ("budget=2e5", "budget", "200000"),
-        ("tile_size=16", "tile_size", "16"),
-        ("row_degrees=3.0", "row_degrees", "3"),
-        ("row_degrees=off", "row_degrees", "off"),
     ] {
         let (knob, found) = parse(setting).unwrap();
         assert_eq!((knob.name, &*found), (name, value), "{setting}");
@@ -54,15 +50,12 @@ fn what_is_outside_is_refused_with_the_nearest_that_works() {
         ("alpha_min=-1/0", ["alpha_min", "1/1024 to 1/32", "works is 1/255"]),
         ("alpha_min=NaN", ["alpha_min", "NaN", "works is 1/255"]),
         ("transmittance_stop=1", ["transmittance_stop", "1e-5 to 1e-2", "works is 1e-2"]),
-        ("exp_degree=5", ["exp_degree", "2|4|6", "works is 4"]),
-        ("exp_degree=nine", ["exp_degree", "nine", "works is"]),
+        ("ssim_every=4", ["ssim_every", "1|2|5|10", "works is 5"]),
+        ("ssim_every=nine", ["ssim_every", "nine", "works is"]),
         ("sh_degree=4", ["sh_degree", "0 to 3", "works is 3"]),
         ("sh_degree=1.5", ["sh_degree", "1.5", "works is 2"]),
         ("sh_degree=", ["sh_degree", "``", "works is 0"]),
         ("budget=0", ["budget", "1 or more", "works is 1"]),
-        ("row_degrees=0.1", ["row_degrees", "off or 1/4 to 32", "works is 0.25"]),
-        ("row_degrees=none", ["row_degrees", "none", "works is off"]),
-        ("tile_size=8", ["tile_size", "8", "built in as 16"]),
         ("alpha_mim=1/64", ["alpha_mim", "alpha_min", "densify knobs"]),
         ("alpha_min", ["alpha_min", "NAME=VALUE", "1/128"]),
     ] {

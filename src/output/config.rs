@@ -108,8 +108,8 @@ pub enum DegreeChoice {
     Given,
     /// The colours of tracks, before training.
     Spread(Spread),
-    /// What raises of the degree have brought in training; the degree is the highest that may come.
-    Training,
+    /// Nothing: tracks were asked, and there were too few on surfaces.
+    Undecided,
 }
 
 /// How the first Gaussians are placed.

@@ -35,7 +35,7 @@ pub use records::{
     Mean, RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,
 };
-pub use requirements::{Found, LeftOut, Requirements};
+pub use requirements::{LeftOut, Requirements};
 pub use tensorboard::TensorBoard;
 
 use std::path::{Path, PathBuf};

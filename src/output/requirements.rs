@@ -3,11 +3,9 @@
 
 use serde::Serialize;
 
-use super::{DegreeChoice, RunConfig};
-use crate::backend::RowDegrees;
+use super::{DegreeChoice, TrainConfig};
 use crate::gaussians::MAX_SH_DEGREE;
-use crate::memory::Bytes;
-use crate::trainer::{Dropped, Earned, Growth, PAYS};
+use crate::trainer::{Growth, PAYS};
 
 /// The report of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -18,29 +16,12 @@ pub struct Requirements {
     pub sh_degree: u8,
     /// What decided it.
     pub sh_degree_from: DegreeChoice,
-    /// Trials of degrees along the run, where these decided.
-    pub degrees: Option<Earned>,
     /// Ends of rungs and attempts to do with fewer rows, where rows had to pay.
     pub rows: Option<Growth>,
-    /// Bands of colour that rows have lost along the run, where they may.
-    pub row_degrees: Option<Dropped>,
     /// Training views that were not rendered for scores, as others are nearly the same.
     pub unscored_views: usize,
     /// What was left out; nothing that the options themselves leave out.
     pub left_out: Vec<LeftOut>,
-}
-
-/// What a run has found.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Found<'a> {
-    /// Trials of degrees, where these decided.
-    pub degrees: Option<&'a Earned>,
-    /// The limit of rows, where they had to pay.
-    pub growth: Option<&'a Growth>,
-    /// Bands that rows have lost, where they may.
-    pub dropped: Option<&'a Dropped>,
-    /// Views that were not scored.
-    pub unscored_views: usize,
 }
 
 /// Something that was left out.
@@ -55,25 +36,26 @@ pub struct LeftOut {
 }
 
 impl Requirements {
-    /// The report of a run of this configuration that has come to `rows` rows at a degree.
+    /// The report of a run that has come to `rows` rows; `growth` where they had to pay, and the number
+    /// of views that were not scored.
     #[must_use]
-    pub fn of(config: &RunConfig, sh_degree: u8, rows: usize, found: Found<'_>) -> Self {
-        let train = &config.train;
-        let Found { degrees, growth, dropped, unscored_views } = found;
+    pub fn of(
+        train: &TrainConfig,
+        rows: usize,
+        growth: Option<&Growth>,
+        unscored_views: usize,
+    ) -> Self {
         let left_out = [
-            degree_left_out(config, sh_degree, degrees),
+            degree_left_out(train),
             growth.and_then(|growth| rows_left_out(growth, rows, train.budget)),
             growth.and_then(shrunk),
-            dropped.and_then(|dropped| bands_left_out(dropped, sh_degree)),
             (unscored_views > 0).then(|| unscored(unscored_views)),
         ];
         Self {
             full: train.full,
-            sh_degree,
+            sh_degree: train.sh_degree,
             sh_degree_from: train.sh_degree_from,
-            degrees: degrees.cloned(),
             rows: growth.cloned(),
-            row_degrees: dropped.copied(),
             unscored_views,
             left_out: left_out.into_iter().flatten().collect(),
         }
@@ -92,15 +74,11 @@ impl Requirements {
     }
 }
 
-fn degree_left_out(config: &RunConfig, degree: u8, earned: Option<&Earned>) -> Option<LeftOut> {
-    let train = &config.train;
-    let what = match (MAX_SH_DEGREE.checked_sub(degree)?, train.sh_degree_from) {
-        (0, _) => return None,
-        // The options say so.
-        (_, DegreeChoice::Given) if train.memory.is_none() || !train.sh_degree_lowered => {
-            return None;
-        }
-        (1, _) => format!("degree {MAX_SH_DEGREE} of colour"),
+fn degree_left_out(train: &TrainConfig) -> Option<LeftOut> {
+    let degree = train.sh_degree;
+    let what = match MAX_SH_DEGREE.checked_sub(degree)? {
+        0 => return None,
+        1 => format!("degree {MAX_SH_DEGREE} of colour"),
         _ => format!("degrees {} to {MAX_SH_DEGREE} of colour", degree + 1),
     };
     if train.sh_degree_lowered {
@@ -110,33 +88,20 @@ fn degree_left_out(config: &RunConfig, degree: u8, earned: Option<&Earned>) -> O
             loss: "its loss was not measured".to_owned(),
         });
     }
-    let (evidence, loss) = match train.sh_degree_from {
-        DegreeChoice::Spread(found) => (
-            format!(
-                "between their views, a twentieth of {} points differ by {:.2}/255 or more",
-                found.tracks, found.twentieth
-            ),
-            format!(
-                "the colours of all differ by {:.2}/255 (rms); at equal rows degree 3 was worth 0.5 to \
-                 1.4 dB on matt scenes all the same (docs/requirements.md)",
-                found.rms
-            ),
+    // Any other degree below the highest is what the options say.
+    let DegreeChoice::Spread(found) = train.sh_degree_from else { return None };
+    Some(LeftOut {
+        what,
+        evidence: format!(
+            "between their views, a twentieth of {} points differ by {:.2}/255 or more",
+            found.tracks, found.twentieth
         ),
-        DegreeChoice::Training | DegreeChoice::Given => {
-            let last = earned.and_then(|earned| earned.trials.last());
-            match last.and_then(|trial| Some((trial.degree, trial.gain?))) {
-                Some((tried, gain)) if tried > degree => (
-                    format!("degree {tried} was tried and taken back"),
-                    format!("it had brought {gain:.3} dB on views that it was not trained on"),
-                ),
-                _ => (
-                    "the run has ended before it was tried".to_owned(),
-                    "its loss was not measured".to_owned(),
-                ),
-            }
-        }
-    };
-    Some(LeftOut { what, evidence, loss })
+        loss: format!(
+            "the colours of all differ by {:.2}/255 (rms); at equal rows degree 3 was worth 0.5 to \
+             1.4 dB on matt scenes all the same (docs/requirements.md)",
+            found.rms
+        ),
+    })
 }
 
 fn rows_left_out(growth: &Growth, rows: usize, budget: usize) -> Option<LeftOut> {
@@ -170,25 +135,6 @@ fn shrunk(growth: &Growth) -> Option<LeftOut> {
     })
 }
 
-fn bands_left_out(dropped: &Dropped, sh_degree: u8) -> Option<LeftOut> {
-    let RowDegrees { tolerance, rows, bytes: [before, after] } = dropped.left;
-    let lower: Vec<String> = (0..usize::from(sh_degree))
-        .filter(|&degree| rows[degree] > 0)
-        .map(|degree| format!("{} rows at degree {degree}", rows[degree]))
-        .collect();
-    (!lower.is_empty()).then(|| LeftOut {
-        what: format!("higher bands of colour of {}", lower.join(", ")),
-        evidence: format!(
-            "after step {}, colours changed by no more than {tolerance}/255 without them (rms over \
-             directions of view); parameters and moments fell from {} to {}",
-            dropped.step,
-            Bytes(before),
-            Bytes(after)
-        ),
-        loss: "what that changes in images was not measured".into(),
-    })
-}
-
 fn unscored(views: usize) -> LeftOut {
     LeftOut {
         what: format!("{views} training views where rows are scored"),
@@ -203,7 +149,7 @@ mod tests {
     use super::*;
     use crate::output::config::tests::sample;
     use crate::spread::Spread;
-    use crate::trainer::{Rung, Shrink, Trial};
+    use crate::trainer::{Rung, Shrink};
 
     fn spread() -> Spread {
         let (median, tenth, twentieth, rms) = (0.0, 0.25, 0.5, 0.125);
@@ -212,44 +158,38 @@ mod tests {
 
     #[test]
     fn what_the_options_say_is_not_left_out() {
-        let mut config = sample();
-        config.train.sh_degree_from = DegreeChoice::Given;
-        let report = Requirements::of(&config, 0, 500, Found::default());
-        assert_eq!(report.lines(), ["left out nothing"]);
-        config.train.full = true;
-        let report = Requirements::of(&config, 3, 500, Found::default());
-        assert_eq!(report.lines(), ["left out nothing (--full)"]);
-        config.train.full = false;
-        let report =
-            Requirements::of(&config, 3, 500, Found { unscored_views: 4, ..Found::default() });
-        assert!(report.lines()[0].starts_with("left out 4 training views"), "{report:?}");
+        let mut train = sample().train;
+        let lines = |train: &TrainConfig, unscored| {
+            Requirements::of(train, 500, None, unscored).lines().join("\n")
+        };
+        train.sh_degree_from = DegreeChoice::Given;
+        train.sh_degree = 0;
+        assert_eq!(lines(&train, 0), "left out nothing");
+        train.sh_degree_from = DegreeChoice::Undecided;
+        train.sh_degree = MAX_SH_DEGREE;
+        assert_eq!(lines(&train, 0), "left out nothing");
+        assert!(lines(&train, 4).starts_with("left out 4 training views"));
+        train.full = true;
+        assert_eq!(lines(&train, 0), "left out nothing (--full)");
     }
 
     #[test]
     fn each_decision_has_its_evidence_and_its_loss() {
-        let mut config = sample();
-        let line =
-            |config: &RunConfig, degree, earned: Option<&Earned>, growth: Option<&Growth>| {
-                let found = Found { degrees: earned, growth, ..Found::default() };
-                Requirements::of(config, degree, 900, found).lines().join("\n")
-            };
-        config.train.sh_degree_from = DegreeChoice::Spread(spread());
-        let text = line(&config, 0, None, None);
+        let mut train = sample().train;
+        let line = |train: &TrainConfig, growth: Option<&Growth>| {
+            Requirements::of(train, 900, growth, 0).lines().join("\n")
+        };
+        train.sh_degree_from = DegreeChoice::Spread(spread());
+        train.sh_degree = 0;
+        let text = line(&train, None);
         for words in ["degrees 1 to 3", "4000 points", "0.50/255", "0.12/255"] {
             assert!(text.contains(words), "{words}: {text}");
         }
-        config.train.sh_degree_from = DegreeChoice::Training;
-        let trials = vec![
-            Trial { step: 100, degree: 1, gain: Some(0.2), kept: true },
-            Trial { step: 200, degree: 2, gain: Some(-0.011), kept: false },
-        ];
-        let earned = Earned { degree: 1, settled: true, trials, ..Earned::default() };
-        let text = line(&config, 1, Some(&earned), None);
-        assert!(text.contains("degree 2 was tried") && text.contains("-0.011 dB"), "{text}");
-        config.train.sh_degree_lowered = true;
-        let text = line(&config, 2, None, None);
+        train.sh_degree_lowered = true;
+        train.sh_degree = 2;
+        let text = line(&train, None);
         assert!(text.contains("degree 3 of") && text.contains("not measured"), "{text}");
-        config.train.sh_degree = 3;
+        train.sh_degree = 3;
         let rung = |step, rows, gain| Rung { step, rows, psnr: 30.0, settled: true, gain };
         let growth = Growth {
             limit: 900,
@@ -265,7 +205,7 @@ mod tests {
                 Shrink { step: 500, before: 900, after: 900, change: -0.125 },
             ],
         };
-        let text = line(&config, 3, None, Some(&growth));
+        let text = line(&train, Some(&growth));
         for words in ["rows beyond 1000", "step 300", "0.04 dB", "100 rows", "1 times", "-0.015 dB"]
         {
             assert!(text.contains(words), "{words}: {text}");

@@ -69,8 +69,6 @@ impl Default for Savings {
 /// What a run is to find out by itself about its scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Required {
-    /// The degree of colour, up to [`TrainOptions::sh_degree`].
-    pub degree: bool,
     /// The number of rows, up to the budget.
     pub rows: bool,
     /// Which training views say something that others do not, where rows are scored.

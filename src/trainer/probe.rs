@@ -1,5 +1,5 @@
-//! A few training views that are measured along a run, to see what a degree of colour or more rows
-//! have brought. Which ones follows from the seed.
+//! A few training views that are measured along a run, to see what more rows have brought. Which ones
+//! follows from the seed.
 
 use super::{TrainError, Trainer};
 use crate::metrics::psnr;

@@ -9,7 +9,7 @@ use densify_policies::policy::{PolicyError, PolicyState};
 use serde::{Deserialize, Serialize};
 
 use super::guard::asked;
-use super::{Dropped, Earned, EditEvent, Growth, Trainer};
+use super::{EditEvent, Growth, Trainer};
 use crate::schedule;
 use crate::views::ViewSource;
 
@@ -33,15 +33,9 @@ pub struct TrainerState {
     pub events: Vec<EditEvent>,
     /// What the policy remembers.
     pub policy: PolicyState,
-    /// Trials of degrees, where these are earned.
-    #[serde(default)]
-    pub earned: Option<Earned>,
     /// Ends of rungs, where rows must pay.
     #[serde(default)]
     pub growth: Option<Growth>,
-    /// Bands of colour that rows have lost, if they have.
-    #[serde(default)]
-    pub dropped: Option<Dropped>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -59,9 +53,7 @@ impl<V: ViewSource> Trainer<V> {
             views_time: self.views_time,
             events: self.events.clone(),
             policy: asked(|| self.policy.save())?,
-            earned: self.earned.clone(),
             growth: self.growth.clone(),
-            dropped: self.dropped,
         })
     }
 
@@ -80,9 +72,7 @@ impl<V: ViewSource> Trainer<V> {
         self.policy_time = state.policy_time;
         self.views_time = state.views_time;
         self.events = state.events;
-        self.earned = state.earned;
         self.growth = state.growth;
-        self.dropped = state.dropped;
         // Within an epoch its order is at hand, and the next one is drawn; at the end of an epoch
         // only the next one.
         let count = self.views.count();

@@ -12,8 +12,7 @@ use glam::{DMat3, DVec3};
 
 use super::*;
 use crate::backend::{
-    Attribute, AuxInput, AuxOutput, Kept, Rendering, RowDegrees, StateArray, StateError, Tensor,
-    Unsound,
+    Attribute, AuxInput, AuxOutput, Kept, Rendering, StateArray, StateError, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, SharedImage};
@@ -36,7 +35,6 @@ struct CountingBackend {
     budget: usize,
     lost_at: u32,
     unsound: u32,
-    drops: bool,
     diary: Diary,
     ledger: Ledger,
 }
@@ -94,13 +92,6 @@ impl Backend for CountingBackend {
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
         let unsound = |row| Unsound { row, attribute: Attribute::Opacity, kept: Kept::Moment };
         Ok((0..self.unsound).map(unsound).collect())
-    }
-    fn drop_bands(&mut self, in_use: u8) -> Result<Option<RowDegrees>, BackendError> {
-        let left = RowDegrees { tolerance: 1.0, rows: [0, 0, 0, self.rows], bytes: [2, 1] };
-        if self.drops {
-            note(&self.diary, format!("drop bands beyond {in_use}"));
-        }
-        Ok(self.drops.then_some(left))
     }
     fn render(
         &mut self,
@@ -285,7 +276,6 @@ struct Case {
     cadence: Cadence,
     lost_at: u32,
     unsound: u32,
-    drops: bool,
     unreadable: Option<usize>,
 }
 
@@ -299,7 +289,6 @@ const CASE: Case = Case {
     cadence: Cadence { all: 1, sh_rest: 1 },
     lost_at: 0,
     unsound: 0,
-    drops: false,
     unreadable: None,
 };
 
@@ -357,7 +346,6 @@ fn build(
         budget: case.budget,
         lost_at: case.lost_at,
         unsound: case.unsound,
-        drops: case.drops,
         diary: diary.clone(),
         ledger: Ledger::default(),
     };
@@ -416,40 +404,6 @@ fn edits_are_reported_and_the_budget_holds() {
     assert_eq!((events[0].updated, events[0].removed, &*events[0].cause), (3, 0, "told"));
     assert_eq!(trainer.events(), events);
     assert_eq!((trainer.peak_rows(), trainer.rows(), trainer.steps_done()), (10, 10, 9));
-}
-
-#[test]
-fn bands_are_dropped_once_half_way_and_when_degrees_are_settled() {
-    let run = |drops: bool, earned: Option<Earned>, settled: u32| {
-        let (mut trainer, diary, _) = trainer(&Case { drops, ..CASE });
-        trainer.earned = earned;
-        for step in 1..=9 {
-            if let Some(earned) = trainer.earned.as_mut().filter(|_| step == settled) {
-                earned.settled = true;
-            }
-            // As if it had been stopped here.
-            let state = trainer.state().unwrap();
-            trainer.dropped = None;
-            trainer.resume(state).unwrap();
-            trainer.step().unwrap();
-        }
-        let diary = diary.lock().unwrap().clone();
-        let is_it = |i: &usize| diary[*i].starts_with("drop");
-        let around = |i: usize| {
-            let word = |said: &String| said.split(" view").next().unwrap_or_default().to_owned();
-            diary[i - 1..=i + 1].iter().map(word).collect::<Vec<String>>().join(", ")
-        };
-        let dropped = trainer.dropped().map(|dropped| dropped.step);
-        ((0..diary.len()).filter(is_it).map(around).collect::<Vec<String>>(), dropped)
-    };
-    let once = |said: &str, step| (vec![said.to_owned()], Some(step));
-    // After the policy's edit of the step.
-    assert_eq!(run(true, None, 0), once("apply 4, drop bands beyond 3, step 5", 4));
-    let earned = |degree| Some(Earned { degree, ..Earned::default() });
-    assert_eq!(run(true, earned(2), 5), once("step 5, drop bands beyond 2, step 6", 5));
-    // On trial until the end; not asked for.
-    assert_eq!(run(true, earned(2), 0), (vec![], None));
-    assert_eq!(run(false, None, 0), (vec![], None));
 }
 
 #[test]

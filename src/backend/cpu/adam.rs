@@ -65,8 +65,7 @@ fn rate(rates: &LearningRates, p: usize) -> f32 {
     }
 }
 
-/// One step for those of the sixteen rows of a block that have a bit in `who`, and for the parameters
-/// in `planes`; the others rest.
+/// One step for the sixteen rows of a block, and for the parameters in `planes`.
 #[inline(always)]
 #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
 pub(super) fn step<S: Simd>(
@@ -78,20 +77,15 @@ pub(super) fn step<S: Simd>(
     planes: Range<usize>,
     rates: &LearningRates,
     bias: &BiasCorrection,
-    who: u16,
 ) {
     let c = |x: f32| V::splat(s, x);
     let mut correction = [[0.0_f32; WIDTH]; 2];
-    let mut steps = [0.0_f32; WIDTH];
     for (lane, age) in ages.iter_mut().enumerate() {
-        let is_one = who >> lane & 1;
-        steps[lane] = f32::from(is_one);
-        *age = age.saturating_add(is_one);
+        *age = age.saturating_add(1);
         let [first, second] = bias.of(*age);
         correction[0][lane] = first;
         correction[1][lane] = second;
     }
-    let all = who == u16::MAX;
     let [m, v] = moments;
     for p in planes {
         let rate = rate(rates, p);
@@ -104,17 +98,9 @@ pub(super) fn step<S: Simd>(
             let m_hat = m_new * V::load(s, &correction[0][lane..]);
             let v_hat = v_new.sqrt() * V::load(s, &correction[1][lane..]);
             let step = m_hat * rate / (v_hat + EPSILON);
-            let next = x - step;
-            if all {
-                m_new.store(&mut m[at..]);
-                v_new.store(&mut v[at..]);
-                next.store(&mut params[at..]);
-            } else {
-                let steps = V::zero(s).lt(V::load(s, &steps[lane..]));
-                steps.select(m_new, V::load(s, &m[at..])).store(&mut m[at..]);
-                steps.select(v_new, V::load(s, &v[at..])).store(&mut v[at..]);
-                steps.select(next, x).store(&mut params[at..]);
-            }
+            m_new.store(&mut m[at..]);
+            v_new.store(&mut v[at..]);
+            (x - step).store(&mut params[at..]);
         }
     }
 }
@@ -179,7 +165,7 @@ mod tests {
             let (mut params, mut ages) = ([0.0; WIDTH], [0; WIDTH]);
             for _ in 0..count {
                 let moments = [&mut m[..], &mut v[..]];
-                step(s, &mut params, moments, &mut ages, &gradients, 0..1, &RATES, bias, u16::MAX);
+                step(s, &mut params, moments, &mut ages, &gradients, 0..1, &RATES, bias);
                 path.push(params);
             }
         }

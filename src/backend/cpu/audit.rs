@@ -12,11 +12,10 @@ impl CpuBackend {
     pub(super) fn unsound(&self) -> Vec<Unsound> {
         let rows = self.rows;
         let (params, moments) = (self.params.view(rows), self.moments.view(rows));
+        let planes = planes(self.sh_degree);
         let find = |row: usize| {
             let first = |get: &dyn Fn(usize) -> f32, kept| {
-                // What was dropped is 0.
-                let number =
-                    (0..planes(self.sh_degree)).position(|plane| !get(plane).is_finite())?;
+                let number = (0..planes).position(|plane| !get(plane).is_finite())?;
                 Some(Unsound { row: row as u32, attribute: Attribute::of(number), kept })
             };
             first(&|plane| self.params.get(row, plane), Kept::Parameter)
@@ -28,7 +27,6 @@ impl CpuBackend {
                 .into_par_iter()
                 .filter(|&b| {
                     let mut scratch = [Scratch::ZERO; 2];
-                    let planes = planes(self.sh_degree.min(params.degree(b)));
                     if !is_sound(params.open(b, planes, &mut scratch[0])) {
                         return true;
                     }

@@ -77,10 +77,6 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
     ledger.add_to(Section::Renderer, "loss", LossBuffers::bytes(grid.width, grid.height, threads));
-    if options.shortcuts.row_degrees.is_some() {
-        // A number and a degree each, while they are put in order.
-        ledger.add_to(Section::Passing, "rows by degree", padded * 5);
-    }
     ledger
 }
 
@@ -106,8 +102,6 @@ mod tests {
     fn what_is_allocated_is_what_the_ledger_says() {
         let formats = [
             (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
-            (ParameterStorage::F16, MomentStorage::Bf16, 3 * 4 + 56 * 2, 2 * 59 * 2),
-            (ParameterStorage::F16, MomentStorage::Ratio8, 3 * 4 + 56 * 2, 3 * 59),
             (ParameterStorage::F16, MomentStorage::Both8, 3 * 4 + 56 * 2, 2 * 59),
         ];
         for (parameters, moments, of_parameters, of_moments) in formats {

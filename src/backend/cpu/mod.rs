@@ -30,7 +30,6 @@ mod rasterize;
 mod rasterize_bwd;
 mod records;
 mod regularise;
-mod row_degrees;
 mod signals;
 mod simd;
 mod stage_clock;
@@ -49,8 +48,8 @@ use pulp::Arch;
 
 use super::candidates::{Candidates, error_weights};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, RowDegrees, Shortcuts, StateArray,
-    StateError, StepInput, StepOutput, Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
+    StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
@@ -285,10 +284,6 @@ impl Backend for CpuBackend {
 
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
         Ok(self.unsound())
-    }
-
-    fn drop_bands(&mut self, in_use: u8) -> Result<Option<RowDegrees>, BackendError> {
-        Ok(self.lower_degrees(in_use))
     }
 
     fn render(

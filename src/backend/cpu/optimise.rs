@@ -16,8 +16,8 @@ use super::rasterize_bwd::{Detail, field};
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::summed::{Due, TaskSums};
+use crate::backend::LearningRates;
 use crate::backend::signal_planes::SignalPlanes;
-use crate::backend::{LearningRates, Stepped};
 use crate::gaussians::sh_coefficients;
 
 /// How far from 1 the squared length of a quaternion may be where it is stored in fewer bits. Were it
@@ -50,8 +50,6 @@ pub(super) struct Optimise<'a> {
     pub(super) terms: Option<Terms>,
     /// Noise on the means, if there is any.
     pub(super) noise: Option<Noise>,
-    /// Which rows step.
-    pub(super) stepped: Stepped,
     /// Row of the first block's first lane, and number of rows from there on.
     pub(super) first_row: usize,
     pub(super) rows: usize,
@@ -64,7 +62,7 @@ impl WithSimd for Optimise<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params: stored, moments, ages, signals, layout, sums, .. } = self;
         let Self { detail, visible, view, rates, bias, summed, due, terms, noise, .. } = self;
-        let stepped = self.stepped;
+        let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
         let signal_stride = signals.len() / visible.len().max(1);
@@ -73,13 +71,11 @@ impl WithSimd for Optimise<'_> {
         let mut scratch = Scratch::ZERO;
         let mut moment_scratch = [Scratch::ZERO; 2];
         for (b, &seen) in visible.iter().enumerate() {
-            let degree = view.sh_degree.min(stored.degree(b));
-            let trained = planes(degree);
             let params = stored.open(b, trained, &mut scratch);
             let per_block = WIDTH * detail.stride();
             let sums = &sums[b * per_block..(b + 1) * per_block];
             if seen != 0 || !was_zero {
-                gradient.compute(s, params, sums, detail, seen, view, degree);
+                gradient.compute(s, params, sums, detail, seen, view);
                 was_zero = seen == 0;
             }
             if seen != 0 && signal_stride > 0 {
@@ -98,39 +94,29 @@ impl WithSimd for Optimise<'_> {
             let ages = &mut ages[lanes.clone()];
             let (main, rest) = (0..trained.min(plane::SH_REST), plane::SH_REST..trained);
             let g = &gradient.params;
-            let who = match stepped {
-                Stepped::All => u16::MAX,
-                // Sums bring gradients of views before this one.
-                Stepped::Visible if due.sums_matter() => seen | with_any(g, trained),
-                Stepped::Visible => seen,
-            };
             match summed.rest_ages(lanes) {
-                _ if who == 0 => {}
                 // Bands 1–3 step with the others.
                 None if due.main => {
-                    adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias, who);
+                    adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias);
                 }
                 None => {}
                 Some(rest_ages) => {
                     if due.main {
-                        adam::step(s, params, [&mut *m, &mut *v], ages, g, main, rates, bias, who);
+                        adam::step(s, params, [&mut *m, &mut *v], ages, g, main, rates, bias);
                     }
                     if due.rest {
-                        adam::step(s, params, [m, v], rest_ages, g, rest, rates, bias, who);
+                        adam::step(s, params, [m, v], rest_ages, g, rest, rates, bias);
                     }
                 }
             }
             if due.main {
-                if who != 0 {
-                    adam::confine(s, params, slack);
-                }
+                adam::confine(s, params, slack);
                 if let Some(noise) = &noise {
                     let first = self.first_row + b * WIDTH;
                     noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
                 }
             }
-            // Noise moves means of rows that rest, too.
-            if is_narrow && (due.main || due.rest) && (who != 0 || noise.is_some()) {
+            if is_narrow && (due.main || due.rest) {
                 let first_row = self.first_row + b * WIDTH;
                 let [mut of_params, mut of_m, mut of_v] = Draws::of_block(self.storing, first_row);
                 stored.close(b, trained, &scratch, &mut of_params);
@@ -138,17 +124,6 @@ impl WithSimd for Optimise<'_> {
             }
         }
     }
-}
-
-/// Bit per lane of a block: whether its gradient has any number but 0.
-fn with_any(gradient: &[f32], planes: usize) -> u16 {
-    let mut lanes = 0;
-    for plane in gradient[..planes * WIDTH].as_chunks::<WIDTH>().0 {
-        for (lane, g) in plane.iter().enumerate() {
-            lanes |= u16::from(*g != 0.0) << lane;
-        }
-    }
-    lanes
 }
 
 /// dL/dpixel for [`CpuBackend::differentiate`](super::CpuBackend::differentiate).
@@ -230,12 +205,11 @@ impl WithSimd for Differentiate<'_> {
         let sh_planes = out.sh.len() / out.means.len().max(1);
         let mut g = BlockGradient::ZERO;
         let mut scratch = Scratch::ZERO;
+        let trained = planes(view.sh_degree) - plane::SH;
         for b in 0..params.blocks() {
-            let degree = view.sh_degree.min(params.degree(b));
-            let trained = planes(degree) - plane::SH;
-            let block = params.open(b, planes(degree), &mut scratch);
+            let block = params.open(b, planes(view.sh_degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
-            g.compute(s, block, sums, Detail::All, visible[b], view, degree);
+            g.compute(s, block, sums, Detail::All, visible[b], view);
             for lane in 0..WIDTH.min(out.means.len() - b * WIDTH) {
                 let row = b * WIDTH + lane;
                 let at = |p: usize| g.params[p * WIDTH + lane];

@@ -9,10 +9,10 @@
 
 use std::ops::Range;
 
-use super::blocks::{BlockTask, BlockView, Blocks, Degrees, Scratch, plane};
+use super::BLOCKS_PER_TASK;
+use super::blocks::{BlockTask, BlockView, Blocks, Scratch, plane};
 use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
 use super::simd::WIDTH;
-use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 use crate::backend::ParameterStorage;
 use crate::gaussians::Gaussians;
 
@@ -32,8 +32,6 @@ const fn digits(bounded: usize) -> u32 {
 /// The parameters of all rows.
 #[derive(Debug)]
 pub(super) struct Parameters {
-    /// Of colour, of each block.
-    degrees: Degrees,
     /// All planes, or the means.
     wide: Blocks,
     /// None, or the bounded planes.
@@ -54,7 +52,6 @@ impl Parameters {
     pub(super) fn zeros(capacity: usize, planes: usize, storage: ParameterStorage) -> Self {
         let [wide, fixed, half] = split(planes, storage);
         Self {
-            degrees: Degrees::ALL,
             wide: Blocks::zeros(capacity, wide),
             fixed: Blocks::zeros(capacity, fixed),
             half: Blocks::zeros(capacity, half),
@@ -70,13 +67,9 @@ impl Parameters {
     }
 
     /// Bytes that are there.
+    #[cfg(test)]
     pub(super) fn held(&self) -> u64 {
         self.wide.held() + self.fixed.held() + self.half.held()
-    }
-
-    /// The degree of colour of each block.
-    pub(super) fn degrees(&self) -> Degrees {
-        self.degrees
     }
 
     fn is_narrow(&self) -> bool {
@@ -127,22 +120,6 @@ impl Parameters {
         self.half.copy_row(from, to);
     }
 
-    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
-        self.wide.swap_rows(a, b);
-        self.fixed.swap_rows(a, b);
-        self.half.swap_rows(a, b);
-    }
-
-    /// See [`Blocks::drop_bands`].
-    pub(super) fn drop_bands(&mut self, rows: usize, of_model: u8, degrees: Degrees) {
-        self.degrees = degrees;
-        if self.is_narrow() {
-            self.half.drop_bands(rows, of_model, degrees);
-        } else {
-            self.wide.drop_bands(rows, of_model, degrees);
-        }
-    }
-
     pub(super) fn clear_row(&mut self, row: usize) {
         self.wide.clear_row(row);
         self.fixed.clear_row(row);
@@ -183,8 +160,7 @@ impl Parameters {
     /// The blocks of the first `rows` rows, to read.
     pub(super) fn view(&self, rows: usize) -> ParameterView<'_> {
         ParameterView {
-            degrees: self.degrees,
-            blocks: 0..rows.div_ceil(WIDTH),
+            blocks: rows.div_ceil(WIDTH),
             is_narrow: self.is_narrow(),
             wide: self.wide.view(rows),
             fixed: self.fixed.view(rows),
@@ -194,23 +170,17 @@ impl Parameters {
 
     /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
     pub(super) fn tasks(&mut self, rows: usize) -> Vec<ParameterTask<'_>> {
-        let (degrees, is_narrow) = (self.degrees, self.is_narrow());
+        let is_narrow = self.is_narrow();
         let (wide, fixed, half) = (&mut self.wide, &mut self.fixed, &mut self.half);
         let all = wide.tasks(rows).into_iter().zip(fixed.tasks(rows)).zip(half.tasks(rows));
-        let task = |(task, ((wide, fixed), half))| {
-            let first = task * BLOCKS_PER_TASK;
-            ParameterTask { degrees, first, is_narrow, wide, fixed, half }
-        };
-        all.enumerate().map(task).collect()
+        all.map(|((wide, fixed), half)| ParameterTask { is_narrow, wide, fixed, half }).collect()
     }
 }
 
 /// Some blocks, to read.
 #[derive(Debug, Clone)]
 pub(super) struct ParameterView<'a> {
-    degrees: Degrees,
-    /// Which of all blocks these are.
-    blocks: Range<usize>,
+    blocks: usize,
     is_narrow: bool,
     wide: BlockView<'a, f32>,
     fixed: BlockView<'a, i16>,
@@ -218,13 +188,12 @@ pub(super) struct ParameterView<'a> {
 }
 
 impl<'a> ParameterView<'a> {
-    /// The blocks of task `i`, each of `ROWS_PER_TASK` rows but the last.
+    /// The blocks of task `i`.
     pub(super) fn task(&self, i: usize) -> Self {
-        let first = (i * BLOCKS_PER_TASK).min(self.blocks());
-        let part = first..self.blocks().min(first + BLOCKS_PER_TASK);
+        let first = (i * BLOCKS_PER_TASK).min(self.blocks);
+        let part = first..self.blocks.min(first + BLOCKS_PER_TASK);
         Self {
-            degrees: self.degrees,
-            blocks: self.blocks.start + part.start..self.blocks.start + part.end,
+            blocks: part.len(),
             is_narrow: self.is_narrow,
             wide: self.wide.part(part.clone()),
             fixed: self.fixed.part(part.clone()),
@@ -233,17 +202,10 @@ impl<'a> ParameterView<'a> {
     }
 
     pub(super) fn blocks(&self) -> usize {
-        self.blocks.len()
+        self.blocks
     }
 
-    /// The degree of colour of a block; 3, and so at least the model's, where nothing was dropped.
-    #[inline(always)]
-    pub(super) fn degree(&self, block: usize) -> u8 {
-        self.degrees.of(self.blocks.start + block)
-    }
-
-    /// The first `planes` planes, or more, of a block that holds as many. Whole planes, one after the
-    /// other.
+    /// The first `planes` planes, or more, of a block. Whole planes, one after the other.
     #[inline(always)]
     pub(super) fn open<'b>(
         &self,
@@ -266,8 +228,6 @@ impl<'a> ParameterView<'a> {
 /// Some blocks, to change.
 #[derive(Debug)]
 pub(super) struct ParameterTask<'a> {
-    degrees: Degrees,
-    first: usize,
     is_narrow: bool,
     wide: BlockTask<'a, f32>,
     fixed: BlockTask<'a, i16>,
@@ -275,19 +235,13 @@ pub(super) struct ParameterTask<'a> {
 }
 
 impl ParameterTask<'_> {
-    /// The degree of colour of a block; 3, and so at least the model's, where nothing was dropped.
-    #[inline(always)]
-    pub(super) fn degree(&self, block: usize) -> u8 {
-        self.degrees.of(self.first + block)
-    }
-
     /// Whether what is stored is not what was computed.
     #[inline(always)]
     pub(super) fn is_narrow(&self) -> bool {
         self.is_narrow
     }
 
-    /// The first `planes` planes, or more, of a block that holds as many.
+    /// The first `planes` planes, or more, of a block.
     #[inline(always)]
     pub(super) fn open<'b>(
         &'b mut self,
@@ -339,5 +293,3 @@ fn to_scratch(wide: &[f32], narrow: (&[i16], &[F16]), planes: usize, scratch: &m
     }
     widen(&half[..colour.len()], colour);
 }
-
-const _: () = assert!(ROWS_PER_TASK == BLOCKS_PER_TASK * WIDTH, "a task is whole blocks");

@@ -7,6 +7,7 @@ use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode
 use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
+use super::blocks::parts;
 use super::candidates;
 use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
@@ -273,7 +274,6 @@ impl CpuBackend {
         let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
             self;
         let (rows, arch) = (*rows, *arch);
-        let stepped = self.shortcuts.stepped;
         let terms = Terms::new(self.terms, rows);
         let noise = self.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
@@ -318,7 +318,6 @@ impl CpuBackend {
                             due,
                             terms,
                             noise,
-                            stepped,
                             first_row: task * ROWS_PER_TASK,
                             rows: rows - task * ROWS_PER_TASK,
                         });
@@ -326,14 +325,6 @@ impl CpuBackend {
                 );
         });
     }
-}
-
-/// Cuts a buffer for so many tasks; a buffer of nothing has nothing for each.
-pub(super) fn parts<T>(buffer: &mut [T], per_task: usize, tasks: usize) -> Vec<&mut [T]> {
-    if buffer.is_empty() {
-        return (0..tasks).map(|_| Default::default()).collect();
-    }
-    buffer.chunks_mut(per_task).collect()
 }
 
 /// Calls `f(patch, lane, pixel of the image)` for every pixel of a tile inside the image.

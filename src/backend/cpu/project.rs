@@ -299,9 +299,9 @@ impl WithSimd for Project<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let view = self.view;
+        let degree = view.sh_degree;
         let mut scratch = Scratch::ZERO;
         for b in 0..self.params.blocks() {
-            let degree = view.sh_degree.min(self.params.degree(b));
             let block = self.params.open(b, planes(degree), &mut scratch);
             let mut out = [[0.0_f32; WIDTH]; SPLAT_FIELDS];
             let mut on_screen = [0.0_f32; WIDTH];

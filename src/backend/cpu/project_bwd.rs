@@ -50,15 +50,10 @@ impl BlockGradient {
         visible: [0.0; WIDTH],
     };
 
-    /// Differentiates the rows of `block` that are set in `visible`; the others get 0. `sh_degree` is
-    /// that of their colour in this view.
+    /// Differentiates the rows of `block` that are set in `visible`; the others get 0.
     ///
     /// `sums` has one record per row. Shape: `[WIDTH, detail.stride()]`.
     #[inline(always)]
-    #[expect(
-        clippy::too_many_arguments,
-        reason = "a kernel: each is a buffer or a setting of its own"
-    )]
     pub(super) fn compute<S: Simd>(
         &mut self,
         s: S,
@@ -67,7 +62,6 @@ impl BlockGradient {
         detail: Detail,
         visible: u16,
         view: &ViewParams,
-        sh_degree: u8,
     ) {
         if visible == 0 {
             *self = Self::ZERO;
@@ -81,7 +75,7 @@ impl BlockGradient {
             }
         }
         for at in (0..WIDTH).step_by(S::F32_LANES) {
-            self.lanes(s, block, at, detail, view, sh_degree);
+            self.lanes(s, block, at, detail, view);
         }
     }
 
@@ -93,8 +87,8 @@ impl BlockGradient {
         at: usize,
         detail: Detail,
         view: &ViewParams,
-        degree: u8,
     ) {
+        let degree = view.sh_degree;
         let c = |x: f32| V::splat(s, x);
         let zero = V::zero(s);
         let seen = zero.lt(V::load(s, &self.visible[at..]));

@@ -1,7 +1,6 @@
 //! Stage 3: tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255; a pixel stops, without that
-//! splat, where its transmittance would fall to 1e-4 or below. Both limits, and how exact the
-//! exponential is, are knobs ([`Blending`]).
+//! splat, where its transmittance would fall to 1e-4 or below. Both limits are knobs ([`Blending`]).
 //!
 //! One tile at a time, and within it one patch of 4×4 pixels per splat at a time: a vector. Most
 //! splats are a few pixels wide, and patches cover them with a third fewer vectors than rows of
@@ -16,7 +15,7 @@ use pulp::{Simd, WithSimd};
 use super::project::Splat;
 use super::simd::{V, WIDTH, each};
 use super::tiles::{Entry, Grid, TILE};
-use crate::backend::{Exp2, Shortcuts};
+use crate::backend::Shortcuts;
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
 pub(super) const ALPHA_MAX: f32 = 0.99;
@@ -27,13 +26,12 @@ pub(super) struct Blending {
     pub(super) log2_reach: f32,
     /// A pixel stops before its transmittance reaches this.
     pub(super) transmittance_min: f32,
-    pub(super) exp2: Exp2,
 }
 
 impl From<Shortcuts> for Blending {
     fn from(shortcuts: Shortcuts) -> Self {
-        let Shortcuts { transmittance_min, exp2, .. } = shortcuts;
-        Self { log2_reach: shortcuts.log2_reach(), transmittance_min, exp2 }
+        let transmittance_min = shortcuts.transmittance_min;
+        Self { log2_reach: shortcuts.log2_reach(), transmittance_min }
     }
 }
 
@@ -241,20 +239,16 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        match (self.blending.exp2, self.with_depth) {
-            (Exp2::Degree2, true) => self.run::<S, 2, true>(s),
-            (Exp2::Degree2, false) => self.run::<S, 2, false>(s),
-            (Exp2::Degree4, true) => self.run::<S, 4, true>(s),
-            (Exp2::Degree4, false) => self.run::<S, 4, false>(s),
-            (Exp2::Degree6, true) => self.run::<S, 6, true>(s),
-            (Exp2::Degree6, false) => self.run::<S, 6, false>(s),
+        match self.with_depth {
+            true => self.run::<S, true>(s),
+            false => self.run::<S, false>(s),
         }
     }
 }
 
 impl Rasterize<'_> {
     #[inline(always)]
-    fn run<S: Simd, const EXP2: u8, const WITH_DEPTH: bool>(self, s: S) {
+    fn run<S: Simd, const WITH_DEPTH: bool>(self, s: S) {
         let Self { splats, list, place, background, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
@@ -294,7 +288,7 @@ impl Rasterize<'_> {
                         let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
                         let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
                         let seen = faintest.le(e);
-                        let alpha = e.exp2_by::<EXP2>().min(c(ALPHA_MAX));
+                        let alpha = e.exp2().min(c(ALPHA_MAX));
                         let t = V::load(s, &light[p][at..]);
                         let next = alpha.neg_mul_add(t, t);
                         let goes_on = least_light.lt(next).and(seen);

@@ -26,7 +26,6 @@ use super::rasterize::{
 use super::records::TileRecords;
 use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
-use crate::backend::Exp2;
 
 /// Fields of a record.
 pub(super) mod field {
@@ -113,10 +112,10 @@ impl WithSimd for RasterizeBwd<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        match self.blending.exp2 {
-            Exp2::Degree2 => self.by_detail::<S, 2>(s),
-            Exp2::Degree4 => self.by_detail::<S, 4>(s),
-            Exp2::Degree6 => self.by_detail::<S, 6>(s),
+        match self.detail {
+            Detail::Gradients => self.run::<S, 0>(s),
+            Detail::WeightMax => self.run::<S, 1>(s),
+            Detail::All => self.run::<S, 2>(s),
         }
     }
 }
@@ -133,16 +132,7 @@ struct Sums<S: Simd> {
 
 impl RasterizeBwd<'_> {
     #[inline(always)]
-    fn by_detail<S: Simd, const EXP2: u8>(self, s: S) {
-        match self.detail {
-            Detail::Gradients => self.run::<S, EXP2, 0>(s),
-            Detail::WeightMax => self.run::<S, EXP2, 1>(s),
-            Detail::All => self.run::<S, EXP2, 2>(s),
-        }
-    }
-
-    #[inline(always)]
-    fn run<S: Simd, const EXP2: u8, const DETAIL: u8>(self, s: S) {
+    fn run<S: Simd, const DETAIL: u8>(self, s: S) {
         let Self { splats, list, place, background, canvas, upstream, records, .. } = self;
         let faintest = V::splat(s, -self.blending.log2_reach);
         let c = |x: f32| V::splat(s, x);
@@ -210,7 +200,7 @@ impl RasterizeBwd<'_> {
                         let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
                         let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
                         let seen = faintest.le(e).and(super::simd::before(s, here, stop));
-                        let unclamped = e.exp2_by::<EXP2>();
+                        let unclamped = e.exp2();
                         let alpha = seen.keep(unclamped.min(c(ALPHA_MAX)));
                         let t = V::load(s, &light[p][at..]) / (c(1.0) - alpha);
                         t.store(&mut light[p][at..]);

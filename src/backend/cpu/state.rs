@@ -9,7 +9,6 @@ use super::signals::Accumulators;
 use super::summed::Summed;
 use crate::backend::{StateArray, StateError, Tensor};
 
-const DEGREES: &str = "degrees";
 const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
 const AGES: &str = "ages";
 const CANDIDATES: &str = "candidates";
@@ -20,10 +19,8 @@ const SUMMED: &str = "summed.";
 
 impl CpuBackend {
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
-        // First: it says where the others have room.
-        let degrees = self.shortcuts.row_degrees.map(|_| StateArray::small(DEGREES));
         let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::of_rows);
-        let mut arrays: Vec<StateArray> = degrees.into_iter().chain(of_rows).collect();
+        let mut arrays: Vec<StateArray> = of_rows.collect();
         let signals = self.signals.layout().kept();
         arrays.extend(signals.map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))));
         if self.candidates.is_wanted() {
@@ -42,9 +39,6 @@ impl CpuBackend {
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
             return self.moments.tensor(i, name, rows, planes);
-        }
-        if name == DEGREES {
-            return self.degrees_tensor(name);
         }
         if name == AGES {
             return Tensor::u16(name, &[rows.len()], self.ages[rows].to_vec());
@@ -70,8 +64,6 @@ impl CpuBackend {
         if let Some(i) = MOMENTS.iter().position(|moments| *moments == name) {
             let planes = planes(self.sh_degree);
             self.moments.restore(i, rows, planes, tensor)?;
-        } else if name == DEGREES && self.shortcuts.row_degrees.is_some() {
-            self.restore_degrees(tensor)?;
         } else if name == AGES {
             let ages = tensor.into_u16(&[rows.len()])?;
             self.ages[rows].copy_from_slice(&ages);

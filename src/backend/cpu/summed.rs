@@ -11,8 +11,7 @@ use std::ops::Range;
 use densify_policies::policy::Cadence;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, Degrees, plane};
-use super::passes::parts;
+use super::blocks::{BlockTask, Blocks, parts, plane};
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
 
@@ -187,18 +186,6 @@ impl Summed {
         if !self.rest_ages.is_empty() {
             self.rest_ages[to] = self.rest_ages[from];
         }
-    }
-
-    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
-        self.sums.swap_rows(a, b);
-        if !self.rest_ages.is_empty() {
-            self.rest_ages.swap(a, b);
-        }
-    }
-
-    /// See [`Blocks::drop_bands`].
-    pub(super) fn drop_bands(&mut self, rows: usize, of_model: u8, degrees: Degrees) {
-        self.sums.drop_bands(rows, of_model, degrees);
     }
 
     /// As the opacity's moments are forgotten.

@@ -128,13 +128,7 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        let Shortcuts { exp2, stepped, row_degrees, .. } = Shortcuts::default();
         let shortcuts = options.shortcuts;
-        if (Shortcuts { exp2, stepped, row_degrees, ..shortcuts }) != shortcuts {
-            return Err(BackendError::OverLimit(
-                "the GPU backend lacks a shortcut that is asked for; use --backend cpu".into(),
-            ));
-        }
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let device = device.0.clone();

@@ -6,7 +6,7 @@ use super::TradeArgs;
 use crate::cli::console::Console;
 use crate::cli::failure::Failure;
 use crate::cli::train;
-use crate::knobs::{How, KNOBS, Knob, Levels, On, find};
+use crate::knobs::{KNOBS, Knob, Levels, On, find};
 
 /// A knob that is measured.
 #[derive(Debug, Clone)]
@@ -37,8 +37,7 @@ pub(super) fn chosen(args: &TradeArgs, console: &Console) -> Result<Vec<Chosen>,
     if args.knobs.is_empty() {
         let mut all = Vec::new();
         let is_there = |knob: &&Knob| knob.on != On::Gpu || is_on_gpu(&args.train);
-        let settable = KNOBS.iter().filter(|knob| knob.how != How::BuiltIn);
-        for knob in settable.filter(is_there) {
+        for knob in KNOBS.iter().filter(is_there) {
             let one = Chosen { knob, levels: levels(knob, args) };
             match check(args, &one) {
                 Ok(()) => all.push(one),
@@ -61,12 +60,6 @@ pub(super) fn chosen(args: &TradeArgs, console: &Console) -> Result<Vec<Chosen>,
         let own: Result<Vec<String>, _> = parts.map(|level| knob.canonical(level.trim())).collect();
         let own = own.map_err(fail)?;
         let levels = if own.is_empty() { levels(knob, args) } else { own };
-        if levels.is_empty() {
-            return Err(Failure::input(format!(
-                "--knobs {text}: it is built in as {} and has nothing to be compared with",
-                knob.default
-            )));
-        }
         let one = Chosen { knob, levels };
         check(args, &one)?;
         all.push(one);

@@ -17,7 +17,7 @@ use super::failure::Failure;
 use super::number;
 use super::study::{Records, labels};
 use super::train::DEFAULT_BUDGET;
-use crate::knobs::{Class, How};
+use crate::knobs::Class;
 use crate::output::write_atomically;
 use cell::{BASE, Cell, FACTORIAL, Outcome, Record, What, settings};
 use levels::{Chosen, chosen};
@@ -181,11 +181,7 @@ impl Study<'_> {
 
 /// Whether a knob can change the images of a model.
 fn is_in_images(one: &Chosen) -> bool {
-    match one.knob.class {
-        Class::Exact => one.knob.how != How::BuiltIn,
-        Class::Bounded => true,
-        Class::Heuristic => false,
-    }
+    one.knob.class != Class::Heuristic
 }
 
 /// All runs in which at most one knob is changed, in the order in which they run: seed after seed, so

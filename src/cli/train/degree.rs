@@ -9,7 +9,6 @@ use crate::cli::failure::Failure;
 use crate::cli::number::grouped;
 use crate::dataset::Dataset;
 use crate::gaussians::MAX_SH_DEGREE;
-use crate::knobs::Settings;
 use crate::output::{DegreeChoice, RunConfig};
 use crate::spread::{self, LEAST_TRACKS};
 
@@ -34,11 +33,8 @@ impl FromStr for ShDegree {
     }
 }
 
-/// The knob by which rows lose bands of colour.
-const ROW_DEGREES: &str = "row_degrees";
-
 /// Fails where `--full` and something that leaves out are both given.
-pub(super) fn check_full(args: &TrainArgs, settings: &Settings) -> Result<(), Failure> {
+pub(super) fn check_full(args: &TrainArgs) -> Result<(), Failure> {
     if args.full && args.budget == Some(Budget::Auto) {
         return Err(Failure::input(
             "--full leaves nothing out, --budget auto leaves out what does not pay; give one of the two, \
@@ -50,15 +46,6 @@ pub(super) fn check_full(args: &TrainArgs, settings: &Settings) -> Result<(), Fa
             "--full leaves nothing out, --sh-degree auto leaves out what the scene does not require; \
              give one of the two, or --full with --sh-degree 3",
         ));
-    }
-    let lost = settings.changed().find(|(knob, _)| knob.name == ROW_DEGREES);
-    if let Some((knob, value)) = lost.filter(|_| args.full) {
-        let name = knob.name;
-        return Err(Failure::input(format!(
-            "--full leaves nothing out, --knob {name}={value} leaves out bands of colour that rows do \
-             not need; give one of the two, or --full with {name}={}",
-            knob.default
-        )));
     }
     Ok(())
 }
@@ -112,14 +99,11 @@ impl Degree {
                     _ => Some(spread::measure(&dataset.tracks, &dataset.train)?),
                 };
                 let decided = found.and_then(|found| Some((found.degree()?, found)));
-                Ok(match decided {
-                    Some((degree, spread)) => {
-                        Self { range: 0..=degree, choice: DegreeChoice::Spread(spread), bytes }
-                    }
-                    None => {
-                        Self { range: 0..=MAX_SH_DEGREE, choice: DegreeChoice::Training, bytes }
-                    }
-                })
+                let (degree, choice) = match decided {
+                    Some((degree, spread)) => (degree, DegreeChoice::Spread(spread)),
+                    None => (MAX_SH_DEGREE, DegreeChoice::Undecided),
+                };
+                Ok(Self { range: 0..=degree, choice, bytes })
             }
         }
     }
@@ -135,9 +119,9 @@ impl Degree {
                 grouped(found.tracks),
                 found.twentieth,
             )),
-            DegreeChoice::Training => Some(format!(
-                "colour   degree 0 to {} (auto): raised while that pays, as no {LEAST_TRACKS} points of \
-                 surfaces are known in enough views",
+            DegreeChoice::Undecided => Some(format!(
+                "colour   degree {} (auto): points of a reconstruction decide nothing, as fewer than \
+                 {LEAST_TRACKS} are known in enough views, or fewer than half of them lie on surfaces",
                 self.highest()
             )),
         }

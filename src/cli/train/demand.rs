@@ -26,7 +26,7 @@ use crate::init::usable_points;
 use crate::knobs::Settings;
 use crate::memory::{IMAGES, Ledger, Section, Setting, peak_resident, resident};
 use crate::metrics::scratch_bytes;
-use crate::output::{DegreeChoice, InitChoice, RunConfig, SceneConfig};
+use crate::output::{InitChoice, RunConfig, SceneConfig};
 use crate::schedule::Background;
 use crate::trainer::{Required, growth_signals, needs};
 
@@ -78,7 +78,7 @@ impl Survey {
         let parameters = parameters(args, entry)?;
         let knob = |error| Failure::input(format!("--knob: {error}"));
         let mut settings = Settings::of(&args.knob).map_err(knob)?;
-        check_full(args, &settings)?;
+        check_full(args)?;
         let device = args.device.open(accumulation(args, &settings)?, console)?;
         settings.check_backend(device.is_some()).map_err(knob)?;
         if let Some(device) = &device {
@@ -101,7 +101,6 @@ impl Survey {
         let degree = Degree::decide(args, saved, &dataset)?;
         dataset.tracks = Tracks::default();
         let required = Required {
-            degree: degree.choice == DegreeChoice::Training,
             rows: args.budget == Some(Budget::Auto)
                 || saved.is_some_and(|saved| saved.train.budget_auto),
             scored_views: !args.full,
@@ -283,10 +282,9 @@ impl Survey {
             let (width, height) = scene::largest_image(&self.dataset);
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
             let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
-            // While it is asked which rows are missed: their order and a plan, and weights and
-            // opacities, for which the native backend has room.
-            let columns = if self.device.is_some() { 2 } else { 0 };
-            let row = (1 + columns) * float + BYTES_PER_ROW as u64;
+            // While it is asked which rows are missed: their order, and their opacities twice or, when
+            // that is done, a plan.
+            let row = float + (2 * float).max(BYTES_PER_ROW as u64);
             let asked = if self.required.rows { budget * row } else { 0 };
             pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
         }

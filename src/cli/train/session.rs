@@ -20,8 +20,8 @@ use crate::cli::progress::Progress;
 use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::memory::Bytes;
 use crate::output::{
-    CHECKPOINTS, Found, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json,
-    model_path, saved_iterations, write_atomically, write_json, write_scores,
+    CHECKPOINTS, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json, model_path,
+    saved_iterations, write_atomically, write_json, write_scores,
 };
 use crate::trainer::{StepReport, TrainError};
 use crate::views::ViewSource;
@@ -281,14 +281,10 @@ impl<'a> Session<'a> {
     /// Measures the views held out, if there are any.
     fn test(&mut self, step: u32, is_last: bool) -> Result<(), Failure> {
         let Prepared { trainer, test, config, .. } = &mut self.run;
-        let degree = match trainer.earned() {
-            Some(_) => trainer.sh_degree(step),
-            None => config.train.sh_degree,
-        };
         if test.count() == 0 {
             return Ok(());
         }
-        let background = config.scene.background.fixed();
+        let (background, degree) = (config.scene.background.fixed(), config.train.sh_degree);
         let interrupts = self.interrupts;
         let scores = evaluate(trainer.backend(), test, background, degree, |_| {
             interrupts.received().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
@@ -348,17 +344,8 @@ impl<'a> Session<'a> {
     /// What was left out.
     fn requirements(&self) -> Requirements {
         let Prepared { config, trainer, .. } = &self.run;
-        let degree = match trainer.earned() {
-            Some(earned) => earned.degree,
-            None => config.train.sh_degree,
-        };
-        let found = Found {
-            degrees: trainer.earned(),
-            growth: trainer.growth(),
-            dropped: trainer.dropped(),
-            unscored_views: trainer.unscored_views(),
-        };
-        Requirements::of(config, degree, trainer.rows(), found)
+        let (growth, unscored) = (trainer.growth(), trainer.unscored_views());
+        Requirements::of(&config.train, trainer.rows(), growth, unscored)
     }
 
     /// What came of it, in a few lines.

@@ -143,7 +143,6 @@ pub(super) fn spelled(words: &[OsString], resumed: Option<&str>) -> Result<Vec<O
     for wish in knobs.iter().map(wish).chain(wishes(&given, &knobs, resumed.is_some())?) {
         more.extend(match wish.knob.how {
             How::Knob => own(&knobs, &wish)?,
-            How::BuiltIn => None,
             How::Flag(flag) => option(&given, &wish, flag)?,
             How::Parameter(names) => parameter(&given, &wish, policy, names)?,
         });

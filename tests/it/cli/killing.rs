@@ -18,7 +18,7 @@ const KILLS: usize = 20;
 const ITERATIONS: u32 = 120;
 /// Checkpoints at every third step, so that many kills hit the writing of one.
 const FLAGS: &str = "--budget 360 --checkpoint-every 3 --eval --save-iterations 31,77 \
-                     --test-iterations 50 --policy-set diet.grow_every=7 --knob row_degrees=1";
+                     --test-iterations 50 --policy-set diet.grow_every=7";
 
 /// When to kill.
 #[derive(Debug, Clone, Copy)]

@@ -120,9 +120,8 @@ fn whatever_outlives_a_step_is_kept() {
         "--policy diet --policy-set diet.grow_every=9 --save-iterations 50,150 --eval \
          --test-iterations 30,101,160",
         // Candidates wait at the checkpoint.
-        // Bands of colour are dropped at the checkpoint, and long before it.
-        "--policy vanilla --policy-set vanilla.grow_every=9 --knob row_degrees=3",
-        "--policy mcmc --policy-set mcmc.grow_every=7 --knob row_degrees=1 --sh-every 4 --threads 2",
+        "--policy vanilla --policy-set vanilla.grow_every=9",
+        "--policy mcmc --policy-set mcmc.grow_every=7 --sh-every 4 --threads 2",
         "--policy diet --policy-set diet.grow_every=9 --policy-set diet.insert_every=19 \
          --policy-set diet.rows_per_candidate=20 --policy-set diet.compensate_from=60 \
          --policy-set diet.rho_c=0.1",

@@ -1,7 +1,6 @@
 //! Any plans, one after the other, on the backend and on a plain vector of Gaussians that follows
 //! the words of the plan's documentation: parameters, moments, ages and signals go where they
-//! should, and the rows never exceed the budget. Where rows have lost bands of colour, a row has the
-//! degree of its slot.
+//! should, and the rows never exceed the budget.
 //!
 //! Moments cannot be read. They show in a step that sees nothing: without a gradient a row moves by
 //! what its moments still hold, and by its age. A twin that is not edited tells how far.
@@ -14,9 +13,9 @@ mod plain;
 use std::sync::OnceLock;
 
 use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::{Backend, Shortcuts, StepInput, Values};
+use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
-use densify::gaussians::{Gaussians, sh_coefficients};
+use densify::gaussians::Gaussians;
 use densify_policies::plan::{EditPlan, OpacityRule, RowOps, ScaleRule, Seed, Update};
 use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
 use densify_policies::rng::PolicyRng;
@@ -29,8 +28,6 @@ use densify::verify::scenes;
 use plain::{Row, execute};
 
 const ROWS: usize = 37;
-/// At which about half of the rows lose their band 1 `[1/255]`.
-const TOLERANCE: f32 = 18.0;
 const SEED: u64 = 9;
 /// Signals whose sums are carried along, and age.
 const SIGNALS: [Signal; 3] = [Signal::ScreenGradient, Signal::WeightMax, Signal::Age];
@@ -70,14 +67,12 @@ fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
     backend.train_step(&input).expect("a small image is rendered").visible
 }
 
-/// A backend with a past: moments, signals, and rows of different ages; and of different degrees, where
-/// bands have been dropped.
-fn trained(budget: usize, dropped: bool) -> CpuBackend {
+/// A backend with a past: moments, signals, and rows of different ages.
+fn trained(budget: usize) -> CpuBackend {
     let model = scenes::cloud(ROWS, 1, &view(), 72);
     let mut options = CpuOptions::new(budget);
     options.threads = Some(1);
     options.needs = needs();
-    options.shortcuts = Shortcuts { row_degrees: Some(TOLERANCE), ..options.shortcuts };
     let mut backend = CpuBackend::new(&model, &options).expect("a small model fits");
     step(&mut backend, &view(), 1);
     step(&mut backend, &view(), 2);
@@ -87,20 +82,7 @@ fn trained(budget: usize, dropped: bool) -> CpuBackend {
     }
     backend.apply(&plan.compile(), SEED, 2).expect("a plan is applied");
     step(&mut backend, &view(), 3);
-    if dropped {
-        let left = backend.drop_bands(1).expect("it is native").expect("it was asked for");
-        assert_eq!(left.rows, [5, 32, 0, 0], "two blocks of degree 1 and one of degree 0");
-    }
     backend
-}
-
-/// Numbers of colour in a slot.
-fn colours(backend: &CpuBackend) -> impl Fn(usize) -> usize + use<> {
-    let degrees = backend.save("degrees").expect("an array").values;
-    move |slot| match &degrees {
-        Values::U8(degrees) => 3 * sh_coefficients(degrees[slot / 16]),
-        _ => panic!("degrees are small numbers"),
-    }
 }
 
 fn rows(backend: &mut CpuBackend) -> Vec<Row> {
@@ -121,10 +103,10 @@ fn rows(backend: &mut CpuBackend) -> Vec<Row> {
 }
 
 /// The twin before and after a step that sees nothing.
-fn twin(dropped: bool) -> &'static [Vec<Row>; 2] {
-    static TWINS: [OnceLock<[Vec<Row>; 2]>; 2] = [OnceLock::new(), OnceLock::new()];
-    TWINS[usize::from(dropped)].get_or_init(|| {
-        let mut backend = trained(ROWS, dropped);
+fn twin() -> &'static [Vec<Row>; 2] {
+    static TWIN: OnceLock<[Vec<Row>; 2]> = OnceLock::new();
+    TWIN.get_or_init(|| {
+        let mut backend = trained(ROWS);
         let before = rows(&mut backend);
         assert_eq!(step(&mut backend, &away(), 4), 0, "the camera sees something");
         [before, rows(&mut backend)]
@@ -154,8 +136,8 @@ fn check_rows(found: &[Row], expected: &[Row]) {
 
 /// Fails unless a step that sees nothing moves each row as it moves the row of the twin that has
 /// the same moments and age, and no other row at all.
-fn check_movement(before: &[Row], after: &[Row], expected: &[Row], dropped: bool) {
-    let [twin_before, twin_after] = twin(dropped);
+fn check_movement(before: &[Row], after: &[Row], expected: &[Row]) {
+    let [twin_before, twin_after] = twin();
     for (i, expected) in expected.iter().enumerate() {
         let (from, to) = (&before[i], &after[i]);
         assert_eq!(to.signals[2], from.signals[2] + 1.0, "age of row {i}");
@@ -182,12 +164,10 @@ proptest! {
     #[test]
     fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector(
         spare in 0..14_usize,
-        dropped in any::<bool>(),
         plans in prop::collection::vec(prop::collection::vec(call(), 0..40), 1..4),
     ) {
         let budget = ROWS + spare;
-        let mut backend = trained(budget, dropped);
-        let colours = colours(&backend);
+        let mut backend = trained(budget);
         let mut expected = rows(&mut backend);
         for (number, calls) in plans.iter().enumerate() {
             let event = 4 + number as u32;
@@ -197,19 +177,19 @@ proptest! {
             let ops = plan.compile();
             backend.apply(&ops, SEED, event).expect("a plan is applied");
             prop_assert!(backend.rows() <= backend.budget());
-            expected = execute(expected, &taken, budget, &PolicyRng::new(SEED, event), &colours);
+            expected = execute(expected, &taken, budget, &PolicyRng::new(SEED, event));
             check_rows(&rows(&mut backend), &expected);
         }
         let before = rows(&mut backend);
         prop_assert_eq!(step(&mut backend, &away(), 9), 0);
-        check_movement(&before, &rows(&mut backend), &expected, dropped);
+        check_movement(&before, &rows(&mut backend), &expected);
     }
 }
 
 // --- Plans that must not be applied -------------------------------------------------------------
 
 fn apply_corrupted(corrupt: impl FnOnce(&mut RowOps)) {
-    let mut backend = trained(ROWS + 2, false);
+    let mut backend = trained(ROWS + 2);
     let mut plan = EditPlan::new(ROWS, ROWS + 2);
     plan.append(Seed { position: [0.0; 3], colour: [0.5; 3], scale: 0.1, opacity: 0.1 })
         .expect("there is room");

@@ -112,14 +112,8 @@ impl Row {
     }
 }
 
-/// Executes accepted calls on the plain vector. `colours` are the numbers of colour that a slot holds.
-pub(super) fn execute(
-    model: Vec<Row>,
-    calls: &[Call],
-    budget: usize,
-    rng: &PolicyRng,
-    colours: &dyn Fn(usize) -> usize,
-) -> Vec<Row> {
+/// Executes accepted calls on the plain vector.
+pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &PolicyRng) -> Vec<Row> {
     let before = model;
     let mut slots: Vec<Option<Row>> = before.iter().cloned().map(Some).collect();
     let (mut children, mut seeds) = (Vec::new(), Vec::new());
@@ -147,9 +141,8 @@ pub(super) fn execute(
             Call::Reset => reset = true,
         }
     }
-    for mut newborn in children.into_iter().chain(seeds) {
+    for newborn in children.into_iter().chain(seeds) {
         let slot = slots.iter().position(Option::is_none).unwrap_or(slots.len());
-        newborn.sh[colours(slot)..].fill(0.0);
         if slot == slots.len() {
             slots.push(None);
         }

@@ -43,7 +43,6 @@ where
 #[test]
 fn whatever_is_stored_comes_back() {
     all_come_back(F16, 0..=u16::MAX);
-    all_come_back(Bf16, 0..=u16::MAX);
     all_come_back(F8, 0..=u8::MAX);
 }
 
@@ -99,7 +98,6 @@ fn is_fair<T: Narrow>(of_bits: fn(u16) -> T, largest: u16) {
 #[test]
 fn rounding_is_fair_and_stays_between_the_neighbours() {
     is_fair(F16, F16_MAX as u16);
-    is_fair(Bf16, BF16_MAX as u16);
 }
 
 /// Bytes: 7 bits of exponent and one digit, without a sign.
@@ -175,13 +173,11 @@ fn what_is_no_number_stays_none() {
     for random in [0, 1 << 31, u32::MAX] {
         for x in [f32::INFINITY, f32::NEG_INFINITY] {
             assert_eq!(F16::between(x, random).to_f32(), x);
-            assert_eq!(Bf16::between(x, random).to_f32(), x);
             assert!(F8::between(x, random).to_f32().is_nan());
         }
         for bits in [0x7f80_0001, 0x7fff_ffff, 0xff80_0001, 0xffff_ffff, 0x7fc0_0000] {
             let x = f32::from_bits(bits);
             assert!(F16::between(x, random).to_f32().is_nan(), "{bits:#x}");
-            assert!(Bf16::between(x, random).to_f32().is_nan(), "{bits:#x}");
             assert!(F8::between(x, random).to_f32().is_nan(), "{bits:#x}");
         }
     }
@@ -191,8 +187,8 @@ fn what_is_no_number_stays_none() {
 #[test]
 fn ratios_are_fair_and_stay() {
     let rng = PolicyRng::new(3, 1);
-    for second in [1e-37_f32, 3e-20, 1.7e-9, 0.4, 2e12] {
-        let second = Bf16::nearest(second);
+    for second in [2e-29_f32, 3e-20, 1.7e-9, 0.4, 1e9] {
+        let second = F8::nearest(second);
         for ratio in -127_i8..=127 {
             let x = first_moment(ratio, second.to_f32());
             let mut stored = [0; WIDTH];
@@ -226,7 +222,7 @@ fn ratios_of_nothing() {
     let [mut draws, ..] = Draws::of_block(&PolicyRng::new(0, 0), 0);
     for (first, second) in [(1e-30, 0.0), (0.0, 0.0), (f32::NAN, f32::NAN), (3.0, f32::INFINITY)] {
         let mut stored = [1; WIDTH];
-        ratios(&[first; WIDTH], &[Bf16::nearest(second); WIDTH], &mut stored, &mut draws);
+        ratios(&[first; WIDTH], &[F8::nearest(second); WIDTH], &mut stored, &mut draws);
         assert_eq!(stored, [0; WIDTH], "{first} of {second}");
         assert_eq!(first_moment(0, second).is_nan(), !second.is_finite(), "{first} of {second}");
     }
@@ -245,9 +241,7 @@ fn the_first_moment_is_bounded_by_the_second() {
             most = most.max(m / v.sqrt());
         }
     }
-    // The worst of the roundings of the second, too.
-    let worst = most / (1.0 - 2_f64.powi(-8)).sqrt();
-    assert!(most > 7.2 && worst < f64::from(RATIO_MAX), "{most}, {worst}");
+    assert!(most > 7.2 && most < f64::from(RATIO_MAX), "{most}");
 }
 
 /// What is stored after each of many small steps, on average over rows.
@@ -293,9 +287,7 @@ fn small_steps_are_not_lost() {
         },
     );
     assert!((fixed + 5.05).abs() < 2e-3, "{fixed}");
-    let second = after_steps(1.0, |x| 0.999 * x, stored::<Bf16>);
     let expected = 0.999_f32.powi(2000);
-    assert!((second / expected - 1.0).abs() < 0.05, "{second} instead of {expected}");
     // Of codes a third apart, each number wanders by its own size; their mean does not.
     let byte = after_steps(1.0, |x| 0.999 * x, stored::<F8>);
     assert!((byte / expected - 1.0).abs() < 0.2, "{byte} instead of {expected}");

@@ -12,8 +12,6 @@ struct Each<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
 #[derive(Clone, Copy)]
 enum Function {
     Exp2,
-    Exp2By2,
-    Exp2By4,
     Exp,
     Log2,
 }
@@ -30,8 +28,6 @@ impl WithSimd for Each<'_> {
                 let x = V::load(s, &chunk[at..]);
                 let y = match function {
                     Function::Exp2 => x.exp2(),
-                    Function::Exp2By2 => x.exp2_by::<2>(),
-                    Function::Exp2By4 => x.exp2_by::<4>(),
                     Function::Exp => x.exp(),
                     Function::Log2 => x.log2_of_1_to_2(),
                 };
@@ -80,11 +76,6 @@ fn elementary_functions_are_accurate() {
     let arch = Arch::new();
     let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), Function::Exp2, 0.0);
     assert!(arch.dispatch(exp2) < 2e-7);
-    for (function, bound) in [(Function::Exp2By2, 1.8e-3), (Function::Exp2By4, 2.8e-6)] {
-        let exp2 = Each(&grid(-30.0, 0.0), |x| f64::from(x).exp2(), function, 0.0);
-        let worst = arch.dispatch(exp2);
-        assert!(worst < bound && worst > 0.9 * bound, "{worst}");
-    }
     let exp = Each(&grid(-80.0, 80.0), |x| f64::from(x).exp(), Function::Exp, 0.0);
     assert!(arch.dispatch(exp) < 2e-7);
     let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);

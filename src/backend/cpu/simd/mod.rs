@@ -128,38 +128,24 @@ impl<S: Simd> V<S> {
     }
 
     /// 2^self for self in `[−126, 126]`; relative error below 2e-7. Outside, any value.
-    #[inline(always)]
-    pub(super) fn exp2(self) -> Self {
-        self.exp2_by::<6>()
-    }
-
-    /// The same by a polynomial of degree 2 (relative error below 1.8e-3), 4 (below 2.8e-6), or else 6.
     ///
     /// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest f, in
-    /// `[−½, ½]`, goes through the minimax polynomial of 2^f (relative errors of 1.7e-3, 2.6e-6 and
-    /// 2e-9 before rounding).
+    /// `[−½, ½]`, goes through the minimax polynomial of 2^f of degree 6 (relative error of 2e-9
+    /// before rounding).
     #[inline(always)]
-    pub(super) fn exp2_by<const DEGREE: u8>(self) -> Self {
+    pub(super) fn exp2(self) -> Self {
         let s = self.s;
         let magic = Self::splat(s, 12_582_912.0);
         let shifted = self + magic;
         let f = self - (shifted - magic);
         let c = |x: f32| Self::splat(s, x);
-        let p = match DEGREE {
-            2 => c(2.384_289_4e-1).mul_add(f, c(7.034_48e-1)).mul_add(f, c(1.000_443_1)),
-            4 => c(9.570_102e-3)
-                .mul_add(f, c(5.591_786e-2))
-                .mul_add(f, c(2.402_474_4e-1))
-                .mul_add(f, c(6.931_218e-1))
-                .mul_add(f, c(0.999_999_3)),
-            _ => c(1.534_581_2e-4)
-                .mul_add(f, c(1.339_993_1e-3))
-                .mul_add(f, c(9.618_489e-3))
-                .mul_add(f, c(5.550_328_8e-2))
-                .mul_add(f, c(2.402_264_7e-1))
-                .mul_add(f, c(6.931_472e-1))
-                .mul_add(f, c(1.0)),
-        };
+        let p = c(1.534_581_2e-4)
+            .mul_add(f, c(1.339_993_1e-3))
+            .mul_add(f, c(9.618_489e-3))
+            .mul_add(f, c(5.550_328_8e-2))
+            .mul_add(f, c(2.402_264_7e-1))
+            .mul_add(f, c(6.931_472e-1))
+            .mul_add(f, c(1.0));
         let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
         let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
         Self { s, v: s.transmute_f32s_u32s(bits) }

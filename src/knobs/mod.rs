@@ -15,9 +15,6 @@ pub use presets::{DEFAULT_PRESET, EXACT, Measured, PRESETS, Preset, preset};
 pub use settings::Settings;
 pub use table::KNOBS;
 
-/// A knob that is not used, in [`Domain::OffOr`].
-const OFF: &str = "off";
-
 /// A setting that trades speed or memory for accuracy.
 #[derive(Debug)]
 pub struct Knob {
@@ -48,13 +45,6 @@ pub enum Domain {
     Choice(&'static [&'static str]),
     /// A number, written as a decimal or a fraction such as 1/255.
     Number {
-        /// The least.
-        least: f64,
-        /// The most.
-        most: f64,
-    },
-    /// `off`, or a number.
-    OffOr {
         /// The least.
         least: f64,
         /// The most.
@@ -100,8 +90,6 @@ pub enum How {
     Flag(&'static str),
     /// With the first of these parameters that the policy has; `--knob` is another name for it.
     Parameter(&'static [&'static str]),
-    /// Not at all: it is built in. The table has it so that one knows what it is.
-    BuiltIn,
 }
 
 /// Values of a knob that `densify trade` measures, beside its default.
@@ -162,16 +150,6 @@ impl Knob {
                  {nearest}"
             ))
         };
-        if self.how == How::BuiltIn {
-            return if text == self.default {
-                Ok(text.to_owned())
-            } else {
-                Err(KnobError(format!(
-                    "knob {}: `{text}` cannot be had, it is built in as {}; leave it out",
-                    self.name, self.default
-                )))
-            };
-        }
         match self.domain {
             Domain::Choice(words) => {
                 if words.contains(&text) {
@@ -179,8 +157,7 @@ impl Knob {
                 }
                 Err(bad(nearest_word(text, words).to_owned()))
             }
-            Domain::OffOr { .. } if text == OFF => Ok(text.to_owned()),
-            Domain::Number { least, most } | Domain::OffOr { least, most } => match number(text) {
+            Domain::Number { least, most } => match number(text) {
                 Some(value) if (least..=most).contains(&value) => Ok(self.spelled(value)),
                 Some(value) if value < least => Err(bad(self.spelled(least))),
                 Some(value) if value > most => Err(bad(self.spelled(most))),
@@ -276,9 +253,6 @@ impl fmt::Display for Domain {
                     _ => plain(*x),
                 };
                 write!(f, "{} to {}", shown(least), shown(most))
-            }
-            Self::OffOr { least, most } => {
-                write!(f, "{OFF} or {}", Self::Number { least: *least, most: *most })
             }
             Self::Whole { least, most } if *most >= u64::from(u32::MAX) => {
                 write!(f, "{least} or more")

@@ -6,7 +6,6 @@
 //! model as the optimiser left it.
 
 mod check;
-mod degree;
 mod edit;
 mod error;
 mod fresh;
@@ -15,7 +14,6 @@ mod guard;
 mod options;
 mod probe;
 mod quarantine;
-mod row_degrees;
 mod scored;
 mod state;
 
@@ -31,13 +29,11 @@ use crate::gaussians::Gaussians;
 use crate::schedule;
 use crate::views::ViewSource;
 use check::{check, checked_needs};
-pub use degree::{Earned, Trial};
 pub use error::TrainError;
 pub use growth::{Growth, PAYS, Rung, Shrink, signals as growth_signals};
 use guard::asked;
 pub use options::{OnNan, Required, Savings, TrainOptions};
 use quarantine::AUDIT_EVERY;
-pub use row_degrees::Dropped;
 use scored::Scored;
 pub use state::TrainerState;
 
@@ -127,9 +123,7 @@ pub struct Trainer<V> {
     scored: Scored,
     /// Training views that are measured along the run; none where nothing asks for it.
     probes: Vec<usize>,
-    earned: Option<Earned>,
     growth: Option<Growth>,
-    dropped: Option<Dropped>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -166,9 +160,7 @@ impl<V: ViewSource> Trainer<V> {
             events: Vec::new(),
             scored: Scored::all(count),
             probes: Vec::new(),
-            earned: None,
             growth: None,
-            dropped: None,
         })
     }
 
@@ -176,22 +168,15 @@ impl<V: ViewSource> Trainer<V> {
     /// have been made with [`growth_signals`], too.
     #[must_use]
     pub fn requiring(mut self, what: Required) -> Self {
-        if what.degree || what.rows {
+        if what.rows {
             self.probes = probe::probes(self.views.count(), self.options.seed);
         }
         if what.scored_views {
             self.scored = Scored::distinct(&self.views, self.scene.extent);
         }
-        self.earned = what.degree.then(Earned::default);
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
         self.growth = what.rows.then(|| Growth::new(rows, budget));
         self
-    }
-
-    /// What trials of degrees have brought, where [they are earned](Required::degree).
-    #[must_use]
-    pub fn earned(&self) -> Option<&Earned> {
-        self.earned.as_ref()
     }
 
     /// What more rows have brought, where [they must pay](Required::rows).
@@ -253,8 +238,6 @@ impl<V: ViewSource> Trainer<V> {
             events.extend(self.edit(step)?);
         }
         self.policy_time = self.policy_time.saturating_add(start.elapsed());
-        self.earn(step)?;
-        self.drop_bands(step)?;
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
     }
 
@@ -303,10 +286,12 @@ impl<V: ViewSource> Trainer<V> {
             .take(self.options.prefetch.min(last))
             .collect();
         self.views.prefetch(&upcoming);
-        match &self.earned {
-            Some(earned) => earned.view(&self.order, place, &self.probes),
-            None => self.order[place],
-        }
+        self.order[place]
+    }
+
+    /// The spherical-harmonic degree at which a step's view is rendered.
+    fn sh_degree(&self, step: u32) -> u8 {
+        schedule::sh_degree(step, self.options.iterations, self.options.sh_degree)
     }
 
     fn stopped(&self, step: u32, source: BackendError) -> TrainError {
@@ -369,8 +354,7 @@ impl<V: ViewSource> Trainer<V> {
         &self.views
     }
 
-    /// A copy of the model as it is now, in the coordinates of training; where [degrees are
-    /// earned](Required::degree), without those that are not in use.
+    /// A copy of the model as it is now, in the coordinates of training.
     ///
     /// # Errors
     /// See [`BackendError`].
@@ -383,11 +367,7 @@ impl<V: ViewSource> Trainer<V> {
     /// # Errors
     /// See [`BackendError`].
     pub fn model_rows(&self, rows: std::ops::Range<usize>) -> Result<Gaussians, BackendError> {
-        let model = self.backend.download_rows(rows)?;
-        Ok(match &self.earned {
-            Some(earned) => model.up_to_degree(earned.degree),
-            None => model,
-        })
+        self.backend.download_rows(rows)
     }
 
     /// The backend, for rendering and its ledger.

@@ -8,22 +8,26 @@
 //! cannot be told from it: the slope is rather too large, so that growth stops too late rather than too
 //! early. It stops when the slope has been below [`PAYS`] twice in a row.
 //!
-//! Policies also do what makes images worse for a while: they insert rows, or reset opacities; and
-//! views on which a degree is on trial are not trained on. Where the probes are worse by more than
-//! [`UNSETTLED`] than at the best of the last [`REMEMBERED`] rungs, nothing is concluded: the rung has
-//! no slope, the limit stays, and no row is removed.
+//! Policies also do what makes images worse for a while: they insert rows, or reset opacities. Where
+//! the probes are worse by more than [`UNSETTLED`] than at the best of the last [`REMEMBERED`] rungs,
+//! nothing is concluded: the rung has no slope, the limit stays, and no row is removed.
 //!
 //! What growth has let in is sent out again. At the end of each later rung the rows are ordered by the
 //! largest weight that they have in any view; as many tenths of them as the probes miss, at once, by
 //! less than [`PAYS`] per doubling are removed. On one model at one step the difference is free of
 //! noise, and as the rows that stay learn to fill in, it is rather too large.
+//!
+//! Measuring leaves the model and all that its future depends on as they were, to the bit: rows are
+//! hidden by their opacity logits alone, which are then written back as they were read.
 
-use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
+use densify_policies::plan::EditPlan;
 use densify_policies::policy::{Signal, SignalSet};
 use serde::{Deserialize, Serialize};
 
 use super::probe::mean;
 use super::{EditEvent, TrainError, Trainer};
+use crate::backend::pieces;
+use crate::gaussians::ModelArray;
 use crate::schedule::scaled;
 use crate::views::ViewSource;
 
@@ -50,13 +54,13 @@ const FITTED: usize = 3;
 const LAST_SHRINK: f64 = 0.8;
 /// Most tenths of the rows that are removed at once.
 const MOST_TENTHS: usize = 5;
-/// An opacity that no pixel shows.
-const HIDDEN: f32 = 1e-6;
+/// The logit of an opacity that no pixel shows: of 1e-6.
+const HIDDEN: f32 = -13.8;
 
-/// What signals the limit needs of a backend, beside the policy's.
+/// The signals that the limit needs of a backend, beside the policy's.
 #[must_use]
 pub fn signals() -> SignalSet {
-    SignalSet::of(&[Signal::WeightMax, Signal::Opacity])
+    SignalSet::of(&[Signal::WeightMax])
 }
 
 /// A limit that rises while rows pay.
@@ -227,50 +231,63 @@ impl<V: ViewSource> Trainer<V> {
     /// the PSNR that they have with `all` `[dB]`; what a tenth would change, if that is too much.
     fn least_missed(&mut self, step: u32, all: f64) -> Result<(Vec<u32>, f64), TrainError> {
         let signals = self.backend.take_signals(signals()).map_err(|e| self.stopped(step, e))?;
-        let of = |signal| signals.get(signal).unwrap_or_default();
-        let (weights, opacities) = (of(Signal::WeightMax), of(Signal::Opacity));
+        let weights = signals.get(Signal::WeightMax).unwrap_or_default();
         let mut least: Vec<u32> = (0..weights.len() as u32).collect();
         least.sort_by(|&a, &b| weights[a as usize].total_cmp(&weights[b as usize]));
-        let tenth = least.len() / 10;
-        let degree = self.sh_degree(step);
-        let (mut hidden, mut gone, mut change) = (0, 0, None);
-        for tenths in 1..=MOST_TENTHS {
-            self.set_opacities(step, &least[hidden..tenths * tenth], |_| HIDDEN)?;
-            hidden = tenths * tenth;
-            let without = mean(&self.probe(step, degree)?) - all;
-            let is_missed = -without >= allowed(tenths);
-            if !is_missed {
-                (gone, change) = (hidden, Some(without));
-            } else {
-                change.get_or_insert(without);
-                break;
-            }
-        }
-        self.set_opacities(step, &least[..hidden], |row| opacities[row as usize])?;
         self.backend.give_back(signals);
+        let logits = self.opacity_logits(step)?;
+        let measured = self.hide(step, all, &least, logits.clone());
+        self.set_opacity_logits(step, &logits)?;
+        let (gone, change) = measured?;
         least.truncate(gone);
-        Ok((least, change.unwrap_or_default()))
+        Ok((least, change))
     }
 
-    /// Gives rows other opacities and nothing else; no event.
-    fn set_opacities(
+    /// Hides one tenth of the rows after the other, in the order of `least`, until they are missed.
+    /// Returns how many rows are not missed, and what the probes change without them.
+    fn hide(
         &mut self,
         step: u32,
-        rows: &[u32],
-        opacity: impl Fn(u32) -> f32,
-    ) -> Result<(), TrainError> {
-        let mut plan = EditPlan::new(self.backend.rows(), self.backend.budget());
-        for &row in rows {
-            let value = opacity(row).clamp(HIDDEN, 1.0 - f32::EPSILON);
-            let update = Update {
-                opacity: OpacityRule::Set(value),
-                scale: ScaleRule::Uniform(1.0),
-                keep_moments: true,
-            };
-            let _ = plan.update(row, update);
+        all: f64,
+        least: &[u32],
+        mut logits: Vec<f32>,
+    ) -> Result<(usize, f64), TrainError> {
+        let degree = self.sh_degree(step);
+        let (mut gone, mut change) = (0, 0.0);
+        for (tenth, rows) in (1..=MOST_TENTHS).zip(least.chunks((least.len() / 10).max(1))) {
+            for &row in rows {
+                logits[row as usize] = HIDDEN;
+            }
+            self.set_opacity_logits(step, &logits)?;
+            let without = mean(&self.probe(step, degree)?) - all;
+            let is_missed = -without >= allowed(tenth);
+            if !is_missed || gone == 0 {
+                change = without;
+            }
+            if is_missed {
+                break;
+            }
+            gone += rows.len();
         }
-        let ops = plan.compile();
-        self.backend.apply(&ops, self.options.seed, step).map_err(|e| self.stopped(step, e))
+        Ok((gone, change))
+    }
+
+    fn opacity_logits(&self, step: u32) -> Result<Vec<f32>, TrainError> {
+        let mut all = Vec::with_capacity(self.backend.rows());
+        for rows in pieces(self.backend.rows()) {
+            let some = self.backend.download_array(ModelArray::OpacityLogits, rows);
+            all.extend(some.map_err(|e| self.stopped(step, e))?);
+        }
+        Ok(all)
+    }
+
+    fn set_opacity_logits(&mut self, step: u32, logits: &[f32]) -> Result<(), TrainError> {
+        for rows in pieces(logits.len()) {
+            let some = &logits[rows.clone()];
+            let done = self.backend.upload_array(ModelArray::OpacityLogits, rows, some);
+            done.map_err(|e| self.stopped(step, e))?;
+        }
+        Ok(())
     }
 }
 

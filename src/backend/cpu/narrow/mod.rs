@@ -1,8 +1,7 @@
 //! Numbers in fewer bits than f32, sixteen at a time, and the random bits that round them.
 //!
 //! A number between two that can be stored becomes one of them, the nearer more often, so that its
-//! mean is what it was (stochastic rounding; Gupta et al. 2015, section 3.1; for bfloat16 in
-//! optimisers: Zamirai et al. 2020). One that can be stored stays as it is, whatever the draw.
+//! mean is what it was (stochastic rounding; Gupta et al. 2015, section 3.1). One that can be stored stays as it is, whatever the draw.
 //!
 //! Loops over arrays of integers and not `pulp`, which has no vectors of 8 and 16 bits to convert
 //! from: inlined into a dispatched kernel, the compiler makes vectors of them.
@@ -21,10 +20,6 @@ const F16_BIAS: u32 = 112 << 10;
 const F16_MAX: u32 = 0x7bff;
 const F16_INFINITE: u32 = 0x7c00;
 const INFINITE: u32 = 0x7f80_0000;
-/// Bits that bf16 lacks.
-const BF16_DROPPED: u32 = 16;
-/// Largest finite number of bf16.
-const BF16_MAX: u32 = 0x7f7f;
 /// Bits that [`F8`] lacks: all digits but one.
 const F8_DROPPED: u32 = 22;
 /// What the upper bits of f32 are too large by in [`F8`]: its least number, 2⁻⁹⁶, has the code 1.
@@ -36,8 +31,8 @@ const F8_MAX: u32 = 0xfe;
 /// Whatever is no finite number.
 const F8_NONE: u32 = 0xff;
 /// |first moment| / √(second moment) is at most this: by Cauchy and Schwarz,
-/// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999; and a little for the rounding of
-/// the second. Where that is coarse, large ratios may be cut; noise gives 0.23.
+/// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999. Where the second is rounded down,
+/// large ratios may be cut; noise gives 0.23.
 const RATIO_MAX: f32 = 7.3;
 const RATIO_STEP: f32 = RATIO_MAX / 127.0;
 
@@ -90,10 +85,6 @@ pub(super) trait Narrow: Copy + Default {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F16(pub(super) u16);
 
-/// The upper half of an f32 (bfloat16).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Bf16(pub(super) u16);
-
 /// A number that is not negative, in a byte: 7 bits of exponent and one digit. What is not finite is NaN.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct F8(pub(super) u8);
@@ -126,24 +117,6 @@ impl Narrow for F16 {
         let digit = u32::from(magnitude > INFINITE);
         let half = if magnitude >= INFINITE { F16_INFINITE | digit } else { half };
         Self((half | (bits >> 16 & 0x8000)) as u16)
-    }
-}
-
-impl Narrow for Bf16 {
-    #[inline(always)]
-    fn to_f32(self) -> f32 {
-        f32::from_bits(u32::from(self.0) << BF16_DROPPED)
-    }
-
-    #[inline(always)]
-    fn between(x: f32, random: u32) -> Self {
-        let bits = x.to_bits();
-        let magnitude = bits & 0x7fff_ffff;
-        let drawn = (magnitude + (random >> (32 - BF16_DROPPED))) >> BF16_DROPPED;
-        let digit = u32::from(magnitude > INFINITE);
-        let beyond = INFINITE >> BF16_DROPPED | digit;
-        let half = if magnitude >= INFINITE { beyond } else { drawn.min(BF16_MAX) };
-        Self((half | (bits >> BF16_DROPPED & 0x8000)) as u16)
     }
 }
 
@@ -282,7 +255,7 @@ pub(super) fn first_moments(ratios: &[i8], seconds: &[f32], to: &mut [f32]) {
 /// Draws are the middles of 2,048 steps, and so never as small as the rounding of the division: a ratio
 /// that is one already stays.
 #[inline(always)]
-pub(super) fn ratios<T: Narrow>(first: &[f32], second: &[T], to: &mut [i8], draws: &mut Draws) {
+pub(super) fn ratios(first: &[f32], second: &[F8], to: &mut [i8], draws: &mut Draws) {
     let (first, second) = (first.as_chunks::<WIDTH>().0, second.as_chunks::<WIDTH>().0);
     let to = to.as_chunks_mut::<WIDTH>().0;
     for ((first, second), to) in first.iter().zip(second).zip(to) {
