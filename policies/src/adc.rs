@@ -1,17 +1,17 @@
-//! The operators of adaptive density control that several policies share: which rows need detail,
-//! how they are cloned and split, which are dead.
+//! Building blocks of adaptive density control that several policies share: schedules, growth curves,
+//! clones, splits, pruning limits and opacity resets.
 //!
-//! Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance Field Rendering*, 2023, section 5.2;
-//! constants of its public code.
+//! Most are from Kerbl et al., *3D Gaussian Splatting for Real-Time Radiance Field Rendering*, 2023,
+//! section 5.2, and its public code.
 
 use std::ops::Bound::Excluded;
 
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
-use crate::policy::{PolicyError, SceneInfo};
+use crate::policy::{PolicyError, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
-/// Steps at which something happens: `from` < step < `until`, multiples of `every` (0: never).
+/// A schedule: the multiples of `every` with `from` < step < `until`; none if `every` is 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Window {
     /// Start (exclusive) `[steps]`.
@@ -23,13 +23,13 @@ pub struct Window {
 }
 
 impl Window {
-    /// Whether it happens at `step` (1-based).
+    /// Whether `step` (1-based) is one of them.
     #[must_use]
     pub fn is_due(&self, step: u32) -> bool {
         self.every > 0 && self.from < step && step < self.until && step.is_multiple_of(self.every)
     }
 
-    /// How often it has happened by the end of `step` (1-based).
+    /// How many of them are at or before `step` (1-based).
     #[must_use]
     pub fn count(&self, step: u32) -> u32 {
         let last = step.min(self.until.saturating_sub(1));
@@ -40,31 +40,33 @@ impl Window {
     }
 }
 
-/// The original's opacity resets: regular ones, and one more for scenes on a white background.
+/// The opacity resets of the original: regular ones, and one more for scenes on a white background.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpacityResets {
     regular: Window,
-    /// The extra one, if there is any `[step]`.
+    /// Step of the one on a white background, if any.
     white: Option<u32>,
-    /// What no opacity is above afterwards, in (0, 1).
-    most: f32,
+    /// Largest opacity after a reset, in (0, 1).
+    max_opacity: f32,
 }
 
 impl OpacityResets {
-    /// Resets to at most `opacity` at the multiples of `every` before `until`, and at `white_at` if
-    /// the scene's background is white (all in steps; 0: never).
+    /// Resets to at most `reset_opacity` at the multiples of `every` before `until`, and at
+    /// `white_at` if the scene's background is white (all in steps; 0: never).
     ///
     /// # Errors
-    /// When `reset_opacity` is not in (0, 1), as the f32 that the plan will check.
+    /// When `reset_opacity`, rounded to the f32 that plans take, is not in (0, 1).
     pub fn new(
-        (every, until, white_at): (u32, u32, u32),
-        opacity: f64,
+        every: u32,
+        until: u32,
+        white_at: u32,
+        reset_opacity: f64,
         scene: &SceneInfo,
     ) -> Result<Self, PolicyError> {
-        let most = opacity as f32;
-        in_range("reset_opacity", f64::from(most), (Excluded(0.0), Excluded(1.0)))?;
+        let max_opacity = reset_opacity as f32;
+        in_range("reset_opacity", f64::from(max_opacity), (Excluded(0.0), Excluded(1.0)))?;
         let white = (scene.white_background && white_at < until).then_some(white_at);
-        Ok(Self { regular: Window { from: 0, until, every }, white, most })
+        Ok(Self { regular: Window { from: 0, until, every }, white, max_opacity })
     }
 
     /// Whether there is a reset at `step` (1-based).
@@ -73,19 +75,19 @@ impl OpacityResets {
         step > 0 && (self.regular.is_due(step) || self.white == Some(step))
     }
 
-    /// Resets where it is due.
+    /// Adds the reset of `step` to the plan, if there is one.
     pub fn plan(&self, step: u32, plan: &mut EditPlan) {
         if self.is_due(step) {
             plan.cause("reset");
             // In range since `new`.
-            let _ = plan.clamp_opacity(self.most);
+            let _ = plan.clamp_opacity(self.max_opacity);
         }
     }
 }
 
-/// Rows that a concave curve allows at the event of `step`: N(x) = S + (B − S)(2x/M − (x/M)²) at event
-/// x of M, from `start` rows S before the first event to B = `end` after the last (*Taming 3DGS*,
-/// Mallick et al. 2024, equation 2). Its slope vanishes at the end.
+/// Number of rows allowed at `step` by the concave growth curve N(x) = S + (B − S)(2x/M − (x/M)²) at
+/// event x of M, from S = `start` rows before the first event to B = `end` after the last (*Taming
+/// 3DGS*, Mallick et al. 2024, equation 2).
 #[must_use]
 pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usize {
     let Window { from, until, every } = window;
@@ -99,8 +101,8 @@ pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usi
     (start + (end - start) * (2.0 * x - x * x)).floor() as usize
 }
 
-/// Mean per visible view of a signal that is summed over views; 0 for a row that no view saw, and
-/// where the mean is not finite. Shape: `[rows]`.
+/// Mean over the views that saw the row, from a sum over views; 0 for a row that no view saw, and where
+/// the mean is not finite. Shape: `[rows]`.
 #[must_use]
 pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     let mean = |(&sum, &views): (&f32, &f32)| {
@@ -110,7 +112,7 @@ pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     sum.iter().zip(views).map(mean).collect()
 }
 
-/// A copy beside a parent that stays as it is, at `offset` from it `[scene units]`.
+/// A clone: a copy at `offset` from the parent `[scene units]`, which stays as it is.
 #[must_use]
 pub fn clone_at(offset: [f32; 3]) -> Offspring {
     Offspring {
@@ -122,7 +124,7 @@ pub fn clone_at(offset: [f32; 3]) -> Offspring {
     }
 }
 
-/// Two samples of the parent, smaller by `factor`, in its place: the parent's slot and one more.
+/// A split: two samples of the parent replace it, smaller by `factor`.
 #[must_use]
 pub fn split_by(factor: f32) -> Offspring {
     Offspring {
@@ -134,12 +136,11 @@ pub fn split_by(factor: f32) -> Offspring {
     }
 }
 
-/// Two halves of the parent along its longest axis, in its place: the parent's slot and one more.
+/// A long-axis split: two halves of the parent along its longest axis replace it.
 ///
-/// With d = `share`, the children stand at ±3d standard deviations, their longest axis is (1 − d)
-/// times the parent's, the others √(1 − d²) times: 3d + 3(1 − d) = 3, so that both ends stay where
-/// they were (*Improving Densification in 3D Gaussian Splatting*, 2025). Opacities are multiplied by
-/// `opacity`.
+/// With d = `share`, the children are placed at ±3d standard deviations; their longest axis is 1 − d
+/// times the parent's, the others √(1 − d²) times. As 3d + 3(1 − d) = 3, both ends stay in place
+/// (*Improving Densification in 3D Gaussian Splatting*, 2025). Opacities are multiplied by `opacity`.
 #[must_use]
 pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
     Offspring {
@@ -151,28 +152,51 @@ pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
     }
 }
 
-/// What makes a row not worth its slot.
+/// Limits of opacity and size beyond which Gaussians are pruned.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Mortality {
-    /// Rows less opaque than this are dead.
+pub struct PruneLimits {
+    /// Gaussians less opaque than this are pruned.
     pub min_opacity: f32,
-    /// Rows larger than this are dead `[scene units]`.
+    /// Gaussians larger than this are pruned `[scene units]`.
     pub max_scale: f32,
 }
 
-impl Mortality {
-    /// Whether a row of this opacity and largest standard deviation `[scene units]` is dead. Numbers
-    /// that are not finite are: no gradient will ever mend them.
+impl PruneLimits {
+    /// The limits at an event. `max_scale` is a fraction of the scene extent and applies after step
+    /// `max_scale_from`; 0: no limit.
     #[must_use]
-    pub fn is_dead(&self, opacity: f32, scale: f32) -> bool {
+    pub fn at(now: &Snapshot<'_>, min_opacity: f64, max_scale: f64, max_scale_from: u32) -> Self {
+        let limits_size = max_scale > 0.0 && now.step > max_scale_from;
+        let max_scale = (max_scale * f64::from(now.scene.extent)) as f32;
+        Self {
+            min_opacity: min_opacity as f32,
+            max_scale: if limits_size { max_scale } else { f32::INFINITY },
+        }
+    }
+
+    /// Whether a Gaussian of this opacity and largest standard deviation `[scene units]` is pruned.
+    /// Values that are not finite are: no gradient will mend them.
+    #[must_use]
+    pub fn exceeded(&self, opacity: f32, scale: f32) -> bool {
         !(opacity.is_finite() && scale.is_finite())
             || opacity < self.min_opacity
             || scale > self.max_scale
     }
+
+    /// The rows to prune, ascending.
+    ///
+    /// # Errors
+    /// When the policy does not declare [`Signal::Opacity`] and [`Signal::ScaleMax`].
+    pub fn dead_rows(&self, now: &Snapshot<'_>) -> Result<Vec<u32>, PolicyError> {
+        let (opacity, scale) = (now.signal(Signal::Opacity)?, now.signal(Signal::ScaleMax)?);
+        let rows = (0..).zip(opacity).zip(scale);
+        let dead = rows.filter(|((_, opacity), scale)| self.exceeded(**opacity, **scale));
+        Ok(dead.map(|((row, _), _)| row).collect())
+    }
 }
 
-/// Takes the most opaque row (ties by row) off the list of the dead if all rows are on it: an
-/// empty model can never grow again.
+/// Removes the most opaque row (ties by row) from the list `dead` if all rows are on it: a model
+/// without rows could never grow again.
 pub fn spare_one(dead: &mut Vec<u32>, opacity: &[f32]) {
     if dead.len() == opacity.len() {
         let spared = top_k(opacity, 1);
@@ -241,13 +265,22 @@ mod tests {
     }
 
     #[test]
-    fn dead_are_the_faint_the_huge_and_the_undefined() {
-        let mortality = Mortality { min_opacity: 0.005, max_scale: 2.0 };
-        assert!(!mortality.is_dead(0.005, 2.0));
-        assert!(mortality.is_dead(0.0049, 1.0) && mortality.is_dead(0.5, 2.1));
-        assert!(mortality.is_dead(f32::NAN, 1.0) && mortality.is_dead(0.5, f32::NAN));
-        let boundless = Mortality { max_scale: f32::INFINITY, ..mortality };
-        assert!(!boundless.is_dead(0.5, 1e30) && boundless.is_dead(0.5, f32::INFINITY));
+    fn the_faint_the_huge_and_the_undefined_are_pruned() {
+        let limits = PruneLimits { min_opacity: 0.005, max_scale: 2.0 };
+        assert!(!limits.exceeded(0.005, 2.0));
+        assert!(limits.exceeded(0.0049, 1.0) && limits.exceeded(0.5, 2.1));
+        assert!(limits.exceeded(f32::NAN, 1.0) && limits.exceeded(0.5, f32::NAN));
+        let any_size = PruneLimits { max_scale: f32::INFINITY, ..limits };
+        assert!(!any_size.exceeded(0.5, 1e30) && any_size.exceeded(0.5, f32::INFINITY));
+    }
+
+    #[test]
+    fn resets_take_an_opacity_between_0_and_1() {
+        let scene = crate::event::Event::new(1, 1, 1).scene;
+        // The last is 1 as f32.
+        for opacity in [0.0, 1.0, f64::NAN, 0.999_999_99] {
+            assert!(OpacityResets::new(3000, 15_000, 500, opacity, &scene).is_err(), "{opacity}");
+        }
     }
 
     #[test]

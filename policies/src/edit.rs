@@ -1,15 +1,15 @@
-//! The vocabulary of edits: what a policy can ask for, row by row.
+//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets.
 
 use serde::{Deserialize, Serialize};
 
-/// How a parent's rows come to be: `count` Gaussians stand where one stood.
+/// The children of a clone or a split, and what becomes of the parent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offspring {
-    /// Rows born beside the parent's own slot, >= 1.
+    /// New rows beside the parent's own slot, >= 1.
     pub children: u32,
     /// What happens to the parent's own slot.
     pub parent: ParentFate,
-    /// Where the children stand.
+    /// Where the children are placed.
     pub placement: Placement,
     /// How the scales of children (and of a rewritten parent) follow from the parent's.
     pub scale: ScaleRule,
@@ -26,8 +26,7 @@ pub enum ParentFate {
     BecomesChild,
 }
 
-/// Where children stand. A rewritten parent is child 0, the new rows are children 1, 2, …; beside
-/// a parent that stays, the new rows are also numbered from 1.
+/// Where children are placed. New rows are children 1, 2, …; a rewritten parent is child 0.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Placement {
     /// New rows at the parent's mean + this offset `[scene units]`; a rewritten parent does not move.
@@ -65,8 +64,8 @@ pub enum OpacityRule {
     Set(f32),
     /// Multiplied by this factor, in (0, 1].
     Scaled(f32),
-    /// 1 − (1 − o)^(1/n), n = children (+ 1 if the parent becomes a child): n of them together
-    /// are as opaque as the parent was.
+    /// 1 − (1 − o)^(1/n), n = children (+ 1 if the parent becomes a child): together the n are as
+    /// opaque as the parent was.
     Conserved,
 }
 
@@ -81,7 +80,7 @@ pub struct Update {
     pub keep_moments: bool,
 }
 
-/// A row born without a parent: isotropic, unrotated, view-independent.
+/// A new row without a parent: isotropic, unrotated, view-independent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Seed {
     /// Mean `[scene units]`.
@@ -94,11 +93,11 @@ pub struct Seed {
     pub opacity: f32,
 }
 
-/// An accumulator that a plan starts anew.
+/// An accumulator that a plan resets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reset {
-    /// The sums of every [`Signal`](crate::policy::Signal), but not `WeightMax` (which is kept by
-    /// epoch) nor the present values (`Opacity`, `ScaleMax`, `Age`).
+    /// The sums of all [`Signal`](crate::signals::Signal)s; not `WeightMax` (kept per epoch) nor
+    /// current values (`Opacity`, `ScaleMax`, `Age`).
     Signals,
     /// The list of candidates.
     Candidates,
@@ -125,7 +124,7 @@ impl Offspring {
         self.children >= 1 && placement && self.scale.is_valid() && self.opacity.is_valid()
     }
 
-    /// How many Gaussians share the parent's opacity: its children, and itself if it becomes one.
+    /// How many Gaussians share the parent's opacity: its children, and the parent if it becomes one.
     #[must_use]
     pub fn siblings(&self) -> u32 {
         self.children.saturating_add(u32::from(self.parent == ParentFate::BecomesChild))
@@ -156,8 +155,8 @@ impl OpacityRule {
 }
 
 impl Update {
-    /// Whether its values are in range. [`OpacityRule::Conserved`] is not: nobody is born, so
-    /// there is nothing to share.
+    /// Whether its values are in range. [`OpacityRule::Conserved`] is not: there are no children to
+    /// share the opacity with.
     #[must_use]
     pub fn is_valid(&self) -> bool {
         self.scale.is_valid() && self.opacity.is_valid() && self.opacity != OpacityRule::Conserved
@@ -226,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_is_born_of_an_update() {
+    fn an_update_conserves_no_opacity() {
         let update = Update {
             opacity: OpacityRule::Same,
             scale: ScaleRule::Uniform(1.0),

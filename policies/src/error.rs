@@ -1,18 +1,19 @@
-//! What can go wrong with a policy.
+//! Errors of policies and of the registry.
 
-use crate::policy::{AuxColumn, Signal};
+use crate::signals::{AuxColumn, Signal};
 
 /// Why a policy cannot be built or cannot go on.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PolicyError {
-    /// A signal was read that [`DensityPolicy::needs`](crate::policy::DensityPolicy::needs) did not list, or that
-    /// [`DensityPolicy::wants_fresh`](crate::policy::DensityPolicy::wants_fresh) did not want at this event.
-    #[error("signal {signal:?} was read but not declared; list it in `needs`{}", and_ask(*.signal))]
+    /// The policy read a signal that its [`needs`](crate::policy::DensityPolicy::needs) do not
+    /// list, or that it did not [want](crate::policy::DensityPolicy::wants_fresh) at this event.
+    #[error("signal {signal:?} was read but not declared; list it in `needs`{}", fresh_hint(*.signal))]
     Undeclared {
         /// The signal in question.
         signal: Signal,
     },
-    /// A column of an auxiliary view was read that [`Needs::aux`](crate::policy::Needs::aux) did not list.
+    /// The policy read a column of an auxiliary view that its
+    /// [`Needs::aux`](crate::policy::Needs::aux) do not list.
     #[error("column {column:?} was read but not declared; list it in `needs` under `aux`")]
     UndeclaredColumn {
         /// The column in question.
@@ -21,9 +22,9 @@ pub enum PolicyError {
     /// No policy has this name.
     #[error("unknown policy `{name}`{}; `densify policies` lists them", did_you_mean(.nearest.as_deref()))]
     UnknownPolicy {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The registered name most like it.
+        /// The registered name most similar to it.
         nearest: Option<String>,
     },
     /// The policy has no such parameter.
@@ -31,9 +32,9 @@ pub enum PolicyError {
     UnknownParameter {
         /// The policy.
         policy: String,
-        /// The parameter asked for.
+        /// The requested parameter.
         parameter: String,
-        /// Its parameter most like it.
+        /// Its parameter most similar to it.
         nearest: Option<String>,
     },
     /// A parameter's value has the wrong type or is out of its range.
@@ -59,12 +60,12 @@ pub enum PolicyError {
     /// A saved state is not this policy's.
     #[error("saved state does not fit: {0}")]
     State(String),
-    /// Anything else that makes going on pointless.
+    /// Any other reason to stop.
     #[error("{0}")]
     Other(String),
 }
 
-fn and_ask(signal: Signal) -> &'static str {
+fn fresh_hint(signal: Signal) -> &'static str {
     match signal {
         Signal::FreshWeightMax => " with `fresh_views`, and want it at this event (`wants_fresh`)",
         _ => "",

@@ -1,20 +1,32 @@
-//! A hand-made event for the tests of policies: columns in, who was pruned and who grew out.
+//! Hand-made events for the tests of policies: signals in, pruned and grown rows out.
 
 use crate::plan::{EditPlan, ParentFate, RowOps};
 use crate::policy::{
     AuxColumn, AuxView, Candidate, DensityPolicy, PolicyError, SceneInfo, Signal, SignalSet,
     Signals, Snapshot,
 };
+use crate::registry::find;
 use crate::rng::PolicyRng;
 
-/// One event. Columns that are not given are zero.
+/// The policy `name` with the parameters in `set`, a TOML table.
+pub(crate) fn build(name: &str, set: &str, scene: &SceneInfo) -> Box<dyn DensityPolicy> {
+    find(name).unwrap().build(&set.parse().unwrap(), scene).unwrap()
+}
+
+/// The steps of a run at which the policy is due.
+pub(crate) fn due_steps(name: &str, set: &str, scene: &SceneInfo) -> Vec<u32> {
+    let policy = build(name, set, scene);
+    (0..=scene.iterations).filter(|&step| policy.is_due(step)).collect()
+}
+
+/// One event of a policy. Signals that are not given are zero.
 #[derive(Debug, Clone)]
 pub(crate) struct Event {
     pub(crate) step: u32,
     pub(crate) rows: usize,
     pub(crate) budget: usize,
     pub(crate) scene: SceneInfo,
-    pub(crate) columns: Vec<(Signal, Vec<f32>)>,
+    pub(crate) signals: Vec<(Signal, Vec<f32>)>,
     pub(crate) candidates: Vec<Candidate>,
     pub(crate) views: Vec<View>,
 }
@@ -53,31 +65,40 @@ impl Event {
             rows,
             budget,
             scene,
-            columns: Vec::new(),
+            signals: Vec::new(),
             candidates: Vec::new(),
             views: Vec::new(),
         }
     }
 
-    pub(crate) fn with(mut self, signal: Signal, column: &[f32]) -> Self {
-        assert_eq!(column.len(), self.rows);
-        self.columns.retain(|(given, _)| *given != signal);
-        self.columns.push((signal, column.to_vec()));
+    pub(crate) fn with(mut self, signal: Signal, values: &[f32]) -> Self {
+        assert_eq!(values.len(), self.rows);
+        self.signals.retain(|(given, _)| *given != signal);
+        self.signals.push((signal, values.to_vec()));
         self
     }
 
     pub(crate) fn with_all(self, signal: Signal, value: f32) -> Self {
-        let column = vec![value; self.rows];
-        self.with(signal, &column)
+        let values = vec![value; self.rows];
+        self.with(signal, &values)
+    }
+
+    /// What the policy `name` does with the parameters in `set`.
+    pub(crate) fn run(&self, name: &str, set: &str) -> Outcome {
+        self.run_policy(&mut *build(name, set, &self.scene)).unwrap()
     }
 
     /// Lets the policy plan, with exactly the signals and as many of the views as it asks for.
-    pub(crate) fn run(&self, policy: &mut dyn DensityPolicy) -> Result<Outcome, PolicyError> {
+    pub(crate) fn run_policy(
+        &self,
+        policy: &mut dyn DensityPolicy,
+    ) -> Result<Outcome, PolicyError> {
         let request = policy.needs(&self.scene).aux.unwrap_or_default();
         let wanted = policy.aux_views(self.step, self.rows, self.budget) as usize;
         for view in self.views.iter().take(wanted) {
-            let asked = |c: &AuxColumn| request.columns.contains(c);
-            let columns: Vec<_> = view.columns.iter().filter(|c| asked(&c.0)).cloned().collect();
+            let is_declared = |c: &AuxColumn| request.columns.contains(c);
+            let columns = view.columns.iter().filter(|c| is_declared(&c.0)).cloned();
+            let columns: Vec<_> = columns.collect();
             policy.observe(&AuxView {
                 step: self.step,
                 rows: self.rows,
@@ -91,7 +112,7 @@ impl Event {
             set = set.without(Signal::FreshWeightMax);
         }
         let mut signals = Signals::zeros(self.rows, set);
-        for (signal, values) in &self.columns {
+        for (signal, values) in &self.signals {
             if let Some(column) = signals.get_mut(*signal) {
                 column.copy_from_slice(values);
             }
@@ -104,27 +125,28 @@ impl Event {
         };
         let mut plan = EditPlan::new(self.rows, self.budget);
         policy.plan(&now, &PolicyRng::new(1, self.step), &mut plan)?;
-        Ok(Outcome::of(plan.compile()))
+        Ok(Outcome::new(plan.compile()))
     }
 }
 
 impl Outcome {
-    fn of(ops: RowOps) -> Self {
+    fn new(ops: RowOps) -> Self {
         let grown = |fate| {
-            let of_fate = ops.families.iter().filter(move |f| f.offspring.parent == fate);
-            of_fate.map(|family| family.parent).collect()
+            let families = ops.families.iter().filter(move |f| f.offspring.parent == fate);
+            families.map(|family| family.parent).collect()
         };
-        // A slot that is written or moved into was pruned; so was a row of the tail left behind.
-        let is_hole = |row: &u32| {
+        // Rows were pruned whose slots are overwritten, and rows of the tail that do not move.
+        let is_overwritten = |row: &u32| {
             ops.child_slots.contains(row)
                 || ops.seeds.iter().any(|(slot, _)| slot == row)
                 || ops.moves.iter().any(|(_, to)| to == row)
         };
-        let is_left = |row: &u32| {
+        let is_cut_off = |row: &u32| {
             *row as usize >= ops.rows_after && ops.moves.iter().all(|(from, _)| from != row)
         };
+        let rows = 0..ops.rows_before as u32;
         Self {
-            pruned: (0..ops.rows_before as u32).filter(|r| is_hole(r) || is_left(r)).collect(),
+            pruned: rows.filter(|row| is_overwritten(row) || is_cut_off(row)).collect(),
             cloned: grown(ParentFate::Stays),
             split: grown(ParentFate::BecomesChild),
             ops,

@@ -1,58 +1,80 @@
-//! Density-control policies for 3D Gaussian Splatting: where Gaussians are born and die.
+//! Density-control policies for 3D Gaussian Splatting: which Gaussians are cloned, split, pruned or added.
 //!
-//! This crate holds the interface ([`policy`], [`plan`]), the registry ([`registry`]), a
-//! conformance suite for any policy ([`conformance`]), and the built-in policies: [`vanilla`], the
-//! original adaptive density control; [`taming`], growth by score along a curve; [`diet`], growth by
-//! turnover and compensation; [`mcmc`], relocation and noise; [`igs`], long-axis splits by edges. It
+//! This crate holds the interface ([`policy`], [`plan`]), the registry ([`registry`]), a conformance
+//! suite for any policy ([`conformance`]), and the built-in policies: [`vanilla`], the original
+//! adaptive density control; [`taming`], growth by score along a curve; [`diet`], replacement of the
+//! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges. It
 //! knows no renderer, no image and no device.
+//!
+//! # For users of gsplat
+//!
+//! A policy is what gsplat calls a strategy, with one difference: it never touches parameters or
+//! optimiser state. It reads statistics as plain slices and returns a plan of edits, which a backend
+//! executes within the budget.
+//!
+//! | gsplat | here |
+//! |---|---|
+//! | a subclass of `Strategy` | a type that implements [`DensityPolicy`](policy::DensityPolicy) |
+//! | `state["grad2d"]`, `state["count"]` | [`Signal::ScreenGradient`](policy::Signal::ScreenGradient), [`Signal::VisibleCount`](policy::Signal::VisibleCount), declared in [`Needs`](policy::Needs) and accumulated by the backend |
+//! | `step_post_backward(step, ...)` | [`plan`](policy::DensityPolicy::plan), called after the optimiser's step of every iteration for which [`is_due`](policy::DensityPolicy::is_due) |
+//! | `duplicate` | [`plan.grow`](plan::EditPlan::grow)`(row, `[`clone_at`](adc::clone_at)`([0.0; 3]))` |
+//! | `split` | `plan.grow(row, `[`split_by`](adc::split_by)`(1.6))` |
+//! | `remove` | [`plan.prune`](plan::EditPlan::prune)`(row)` |
+//! | `relocate`, `sample_add` | `prune`, and `grow` with [`OpacityRule::Conserved`](plan::OpacityRule::Conserved) |
+//! | `reset_opa` | [`plan.clamp_opacity`](plan::EditPlan::clamp_opacity)`(max)` |
+//! | `inject_noise_to_position` | [`Needs::noise`](policy::Needs::noise) |
+//! | `cap_max` | the budget of the run, the same for every policy |
+//!
+//! A *row* is one Gaussian's index in the parameter arrays.
 //!
 //! # Writing a policy
 //!
 //! A policy is one file with five parts; the example below has them all.
 //!
-//! 1. **A manual page**: the leading `//!` block, with a table of the parameters. It is what
-//!    `densify policies NAME` prints, and [`conformance::check_manual`] compares it with the code.
-//! 2. **Parameters**: a struct with defaults. `--policy-set NAME.parameter=value` sets one. Those
-//!    named in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS) follow the run's
-//!    length.
-//! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and
-//!    reading another is an error. What is measured in training costs nothing more;
-//!    [`Signal::FreshWeightMax`](policy::Signal::FreshWeightMax) costs renders of training views, so
-//!    say [when it is wanted](policy::DensityPolicy::wants_fresh). So do auxiliary views
-//!    ([`Needs::aux`](policy::Needs::aux)), which the policy
-//!    [observes](policy::DensityPolicy::observe) one by one. Terms of the loss, noise, the optimiser's
-//!    cadence, step sizes and the start are declared there too.
-//! 4. **A plan**: at the steps for which it is due, the policy reads the
-//!    [`Snapshot`](policy::Snapshot) and calls [`EditPlan`](plan::EditPlan). It never touches a
-//!    parameter or a device, so that it runs unchanged on every backend.
-//! 5. **State**: what its future depends on beside the signals, as JSON for checkpoints.
+//! 1. **A manual page**: the leading `//!` block, with a table of the parameters. `densify policies NAME`
+//!    prints it, and [`conformance::check_manual`] compares it with the code. The cell `range` holds
+//!    `>= a`, `> a`, `a to b`, `a to b, both excluded` (or `a excluded`), a list of words, or nothing.
+//! 2. **Parameters**: a struct with defaults, which `--policy-set NAME.parameter=value` overrides. Those
+//!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS) scale with the length
+//!    of the run.
+//! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and reading
+//!    another is an error. Signals measured in training cost little.
+//!    [`Signal::FreshWeightMax`](policy::Signal::FreshWeightMax) and auxiliary views
+//!    ([`Needs::aux`](policy::Needs::aux)) cost extra renders, so the policy says at which events it
+//!    needs them ([`wants_fresh`](policy::DensityPolicy::wants_fresh),
+//!    [`aux_views`](policy::DensityPolicy::aux_views)). Loss terms, noise, learning rates, the interval
+//!    of optimiser steps and changes to the initial model are declared here too.
+//! 4. **A plan**: at the steps at which it is due, the policy reads the
+//!    [`Snapshot`](policy::Snapshot) and adds edits to the [`EditPlan`](plan::EditPlan).
+//! 5. **State**, if it has any: [`save`](policy::DensityPolicy::save) and
+//!    [`restore`](policy::DensityPolicy::restore) put into checkpoints whatever future decisions depend
+//!    on, beside parameters and signals. A policy without state writes neither.
 //!
-//! Rules to remember:
+//! Rules:
 //!
-//! - The budget is the plan's to keep. A call that would exceed it is refused and counted as denied;
-//!   a refusal is a value, not an error of the policy. At the budget, prune first, then grow: a
-//!   pruned row frees its slot within the same plan.
-//! - Each row has one fate in a plan. Rows are named by their index before the edit.
-//! - Signals may hold anything: zero views, NaN from a Gaussian gone wrong. [`sample`] sorts NaN
-//!   last.
-//! - Randomness comes from the [`PolicyRng`](rng::PolicyRng) only, keyed by row and purpose: the same
-//!   run must make the same plans. No clock, no thread, no iteration over a `HashMap`.
+//! - The plan keeps the budget. A call that would exceed it is refused and counted as denied; a refusal
+//!   is not an error. At the budget, prune first, then grow: a pruned row frees its slot within the
+//!   same plan.
+//! - Each row has at most one edit in a plan. Rows are named by their index before the edit.
+//! - Signals may hold anything, such as zero views, or NaN from a broken Gaussian. The functions of
+//!   [`sample`] sort NaN last.
+//! - The same run must make the same plans: draw random numbers only from the
+//!   [`PolicyRng`](rng::PolicyRng), and use no clock, no threads and no iteration over a `HashMap`.
 //! - Leave at least one row ([`adc::spare_one`]).
 //!
 //! ```
-//! //! # fade — replace the faintest
+//! //! # fade — replace the faintest Gaussians
 //! //!
-//! //! | name | default | range | unit | what |
+//! //! | name | default | range | unit | meaning |
 //! //! |---|---|---|---|---|
 //! //! | every | 200 | >= 1 | steps | interval |
-//! //! | share | 0.05 | 0 to 1 | rows | share of the rows that is replaced |
+//! //! | share | 0.05 | 0 to 1 | Gaussians | share that is replaced |
 //!
 //! use densify_policies::adc::split_by;
 //! use densify_policies::parameters::in_range;
 //! use densify_policies::plan::EditPlan;
 //! use densify_policies::policy::{
-//!     DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet, Snapshot,
-//!     restore_nothing,
+//!     DensityPolicy, Needs, PolicyError, SceneInfo, Signal, Snapshot,
 //! };
 //! use densify_policies::registry::ConfiguredPolicy;
 //! use densify_policies::rng::PolicyRng;
@@ -72,7 +94,7 @@
 //!     }
 //! }
 //!
-//! /// Prunes the faintest rows and splits those that carry most of the images.
+//! /// Prunes the faintest rows and splits those with the largest sums of blend weights.
 //! pub struct Fade(FadeParams);
 //!
 //! impl ConfiguredPolicy for Fade {
@@ -88,7 +110,7 @@
 //!
 //! impl DensityPolicy for Fade {
 //!     fn needs(&self, _scene: &SceneInfo) -> Needs {
-//!         let signals = SignalSet::of(&[Signal::Opacity, Signal::WeightSum]);
+//!         let signals = [Signal::Opacity, Signal::WeightSum].into();
 //!         Needs { signals, ..Needs::default() }
 //!     }
 //!
@@ -107,35 +129,25 @@
 //!         let rows: Vec<u32> = (0..now.rows() as u32).collect();
 //!         // One row fewer than all: a model without rows could never grow again.
 //!         let faintest = count.min(now.rows().saturating_sub(1));
-//!         for row in smallest(rows, now.signal(Signal::Opacity)?, faintest) {
-//!             let _ = plan.prune(row);
-//!         }
+//!         plan.prune_all(smallest(rows, now.signal(Signal::Opacity)?, faintest));
 //!         // Rows that were just pruned are refused here, and counted as denied.
 //!         for row in top_k(now.signal(Signal::WeightSum)?, count) {
 //!             let _ = plan.grow(row, split_by(1.6));
 //!         }
 //!         Ok(())
 //!     }
-//!
-//!     fn save(&self) -> PolicyState {
-//!         PolicyState::Null
-//!     }
-//!
-//!     fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
-//!         restore_nothing(&state)
-//!     }
 //! }
 //!
 //! densify_policies::register_policy!(
 //!     "fade",
 //!     Fade,
-//!     summary: "replaces the faintest rows by halves of the heaviest",
+//!     summary: "replaces the faintest Gaussians by splits of the heaviest",
 //!     source: "an example",
 //!     // In a file of its own: include_str!("fade.rs").
-//!     doc: "| name | default | range | unit | what |\n\
+//!     doc: "| name | default | range | unit | meaning |\n\
 //!           |---|---|---|---|---|\n\
 //!           | every | 200 | >= 1 | steps | interval |\n\
-//!           | share | 0.05 | 0 to 1 | rows | share of the rows that is replaced |\n",
+//!           | share | 0.05 | 0 to 1 | Gaussians | share that is replaced |\n",
 //! );
 //!
 //! // In the tests of your crate:
@@ -147,8 +159,8 @@
 //!
 //! # Using it
 //!
-//! A linker drops a crate that nothing names. The program that is to know an outside policy says so
-//! in its main file, `use my_policies as _;`, and calls the command line of `densify`.
+//! A linker drops crates that are never named. The main file of the program that uses your policy says
+//! `use my_policies as _;` and calls the command line of `densify`; CONTRIBUTING.md shows all of it.
 
 pub mod adc;
 pub mod conformance;
@@ -168,5 +180,6 @@ pub mod policy;
 pub mod registry;
 pub mod rng;
 pub mod sample;
+mod signals;
 pub mod taming;
 pub mod vanilla;

@@ -1,60 +1,61 @@
-//! What a policy declares: everything that others do for it.
+//! What a policy declares: the statistics it reads, and changes to initialisation, loss and optimiser.
 //!
-//! A declaration is data. The trainer and the backend fulfil it without knowing whose it is; what is
-//! not declared is neither computed nor allocated.
+//! The trainer and the backend act on these declarations without knowing the policy. What is not
+//! declared is neither computed nor allocated.
 
 use serde::{Deserialize, Serialize};
 
-use crate::policy::{Candidate, CandidateRequest, PolicyError, SignalSet};
+use crate::signals::{AuxColumn, SignalSet};
 
-/// What a policy reads, and how it wants the model to be started and trained.
+/// What a policy reads, and how it wants the model initialised and trained.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Needs {
     /// Per-row statistics.
     pub signals: SignalSet,
-    /// Camera depth z₀ from which on a view counts in full in the signals of gradients on screen and
-    /// by colour `[scene units]`, >= 0: it counts min(1, z/z₀)² times where the row's mean is at depth
-    /// z. 0: all views count in full.
+    /// Camera depth z₀ `[scene units]`, >= 0, below which a view counts less in the signals of screen
+    /// and colour gradients: it is weighted by min(1, z/z₀)², z the depth of the row's mean. 0: all
+    /// views count equally.
     ///
-    /// What is near a camera moves far on its image, but few other views show it; such rows are
-    /// mostly fog that explains one photograph (*Pixel-GS*, Zhang et al. 2024, section 3.3).
+    /// Gaussians near a camera have large screen gradients but appear in few other views; growing them
+    /// mostly produces floaters that explain one photograph (*Pixel-GS*, Zhang et al. 2024,
+    /// section 3.3).
     pub full_depth: f32,
-    /// Per-pixel candidates for new rows, if any.
+    /// Pixels to collect as candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
-    /// Training views, drawn at random without replacement, that are rendered anew for each event
-    /// that [wants them](crate::policy::DensityPolicy::wants_fresh): all of them if there are fewer.
-    /// Goes with [`Signal::FreshWeightMax`](crate::policy::Signal::FreshWeightMax); 0 without it.
+    /// Training views, drawn at random without replacement, that are rendered for each event that
+    /// [wants them](crate::policy::DensityPolicy::wants_fresh); all of them if there are fewer.
+    /// Required by [`Signal::FreshWeightMax`](crate::policy::Signal::FreshWeightMax); 0 without it.
     pub fresh_views: u32,
-    /// What [auxiliary views](crate::policy::DensityPolicy::observe) show, if any are wanted.
+    /// What is measured in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
     pub aux: Option<AuxRequest>,
-    /// Terms of the training loss beside the image's.
+    /// Terms added to the training loss.
     pub loss_terms: LossTerms,
     /// Noise on the means after each optimiser step.
     pub noise: Option<NoiseTerm>,
-    /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run: beyond 1, gradients are
-    /// summed between steps, and the sums need memory.
+    /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
+    /// summed between optimiser steps, and the sums need memory.
     pub cadence: Cadence,
-    /// Step sizes that replace the trainer's defaults, but not what the user sets.
+    /// Learning rates that replace the trainer's defaults, but not what the user sets.
     pub rates: RateOverrides,
-    /// How the initial rows differ from the trainer's.
+    /// Changes to the initial rows.
     pub start: StartRule,
 }
 
 impl Needs {
-    /// Checks every number that a backend would have to take on trust.
+    /// Checks that every number is finite and in its range.
     ///
     /// # Errors
-    /// What is out of range, with its value.
+    /// The first that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
-        let finite = |what: &str, value: f64, least: f64| {
+        let finite = |name: &str, value: f64, least: f64| {
             if value.is_finite() && value >= least {
                 return Ok(());
             }
-            Err(format!("{what} is {value}; it must be finite and at least {least}"))
+            Err(format!("{name} is {value}; it must be finite and at least {least}"))
         };
-        let above_zero = |what: &str, value: Option<f64>| match value {
+        let above_zero = |name: &str, value: Option<f64>| match value {
             Some(v) if !(v.is_finite() && v > 0.0) => {
-                Err(format!("{what} is {v}; it must be positive"))
+                Err(format!("{name} is {v}; it must be positive"))
             }
             _ => Ok(()),
         };
@@ -85,18 +86,63 @@ impl Needs {
     }
 }
 
-/// Terms added to the image's loss, as coefficients; 0 switches one off, at no cost.
+/// Which pixels of the training views to collect as candidates for new rows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CandidateRequest {
+    /// Start of the window (exclusive) `[step]`.
+    pub from: u32,
+    /// End of the window (exclusive) `[step]`.
+    pub until: u32,
+    /// Each step collects one candidate per this many rows, >= 1.
+    pub rows_per_candidate: u32,
+    /// Most candidates held at a time; later ones are dropped.
+    pub capacity: usize,
+    /// The error that ranks pixels.
+    pub error: ErrorMode,
+    /// How the surface point on the pixel's ray is chosen.
+    pub depth: DepthMode,
+    /// Least accumulated alpha of a pixel, in `[0, 1]`: a transparent pixel has no depth.
+    pub min_alpha: f32,
+    /// Non-maximum suppression: only pixels with the largest error of their 3×3 neighbours count.
+    pub spaced: bool,
+}
+
+/// The error of a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ErrorMode {
+    /// ‖dL/dC‖₂ of the rendered colour, as in the Diet code. It responds to blurred structure and
+    /// not to a constant colour offset.
+    #[serde(rename = "grad")]
+    Gradient,
+    /// Mean over channels of |I − G|.
+    L1,
+    /// 0.8 · L1 + 0.2 · (1 − SSIM), per pixel.
+    L1Dssim,
+}
+
+/// How the surface point of a pixel is chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DepthMode {
+    /// The ray's closest point, in Mahalanobis distance, to the Gaussian with the largest blend
+    /// weight (Mini-Splatting).
+    MaxWeight,
+    /// The same for the Gaussian at which transmittance first falls below one half.
+    Median,
+}
+
+/// Coefficients of terms added to the image loss; 0 switches a term off, at no cost.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct LossTerms {
-    /// Coefficient of the mean over rows of the opacity, >= 0.
+    /// Coefficient of the mean opacity over rows, >= 0.
     pub opacity: f32,
-    /// Coefficient of the mean over rows and axes of the standard deviation
-    /// `[1 / scene units]`, >= 0.
+    /// Coefficient of the mean standard deviation over rows and axes `[1 / scene units]`, >= 0.
     pub scale: f32,
 }
 
 impl LossTerms {
-    /// Whether no term is wanted.
+    /// Whether no term is added.
     #[must_use]
     pub fn is_none(&self) -> bool {
         !(self.opacity > 0.0 || self.scale > 0.0)
@@ -109,29 +155,29 @@ impl LossTerms {
 /// size of the means at that step `[scene units]`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NoiseTerm {
-    /// Factor of the noise `[1 / scene units²]`, >= 0.
+    /// Strength of the noise `[1 / scene units²]`, >= 0.
     pub strength: f32,
     /// How steeply noise falls with opacity, >= 0.
     pub sharpness: f32,
-    /// Opacity at which half of the noise is left.
+    /// Opacity at which the noise is halved.
     pub opacity: f32,
 }
 
 impl NoiseTerm {
-    /// The share of the noise that is left at this opacity, in (0, 1).
+    /// The factor of the noise at this opacity, in (0, 1).
     #[must_use]
     pub fn share(&self, opacity: f32) -> f32 {
         1.0 / (1.0 + (self.sharpness * (opacity - self.opacity)).exp())
     }
 }
 
-/// How often the optimiser steps. In between gradients are summed over the views.
+/// How often the optimiser steps; in between, gradients are summed over the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Cadence {
-    /// One optimiser step every so many iterations, for all parameters; >= 1.
+    /// Iterations per optimiser step, for all parameters; >= 1.
     pub all: u32,
-    /// The same for the spherical-harmonic coefficients of bands 1–3, which never step more often
-    /// than the others; >= 1.
+    /// The same for the spherical-harmonic coefficients of bands 1–3, which step at most as often as
+    /// the others; >= 1.
     pub sh_rest: u32,
 }
 
@@ -142,16 +188,16 @@ impl Default for Cadence {
 }
 
 impl Cadence {
-    /// Whether all parameters but the spherical-harmonic coefficients of bands 1–3 step after
-    /// iteration `step`, and whether these do: at multiples of their intervals.
+    /// Whether the optimiser steps after iteration `step`: first for all parameters but the
+    /// spherical-harmonic coefficients of bands 1–3, then for these.
     #[must_use]
     pub fn steps_at(self, step: u32) -> [bool; 2] {
         let all = self.all.max(1);
         [step.is_multiple_of(all), step.is_multiple_of(self.sh_rest.max(all))]
     }
 
-    /// Whether a backend that was made for `longest` keeps all that this cadence needs: sums of all
-    /// gradients or of those of bands 1–3, and a count of steps for these.
+    /// Whether a backend made for `longest` has the gradient sums and step counts that this cadence
+    /// needs.
     #[must_use]
     pub fn is_within(self, longest: Self) -> bool {
         let is_sound = self.all > 0 && self.sh_rest > 0;
@@ -161,7 +207,7 @@ impl Cadence {
     }
 }
 
-/// Step sizes that a policy is published with; `None` leaves the trainer's.
+/// Learning rates that a policy is published with; `None` leaves the trainer's.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct RateOverrides {
     /// Means, at the start of the run `[fraction of the extent per step]`, > 0.
@@ -172,12 +218,12 @@ pub struct RateOverrides {
     pub sh_rest: Option<f32>,
 }
 
-/// How the initial rows differ from the trainer's.
+/// Changes to the initial rows.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct StartRule {
-    /// Opacity of all rows, in (0, 1), if not the trainer's.
+    /// Opacity of all rows, in (0, 1); `None` leaves the trainer's.
     pub opacity: Option<f32>,
-    /// Factor of all standard deviations, > 0.
+    /// Factor on all standard deviations, > 0.
     pub scale: f32,
 }
 
@@ -187,24 +233,23 @@ impl Default for StartRule {
     }
 }
 
-/// What is measured in an auxiliary view: a training view that is rendered, as the model is now, for
-/// an event of the policy.
+/// What is measured in an auxiliary view: a training view rendered for one event of the policy.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AuxRequest {
     /// The pixel map M that [`AuxColumn::MapSum`] sums.
     pub map: PixelMap,
-    /// Per-row columns.
+    /// Per-row statistics.
     pub columns: Vec<AuxColumn>,
     /// Most surface points per view: pixels drawn without replacement in proportion to their
-    /// accumulated alpha. A pixel stands for the point where its ray passes closest to the Gaussian
-    /// with the largest blend weight ([`DepthMode::MaxWeight`](crate::policy::DepthMode::MaxWeight)).
+    /// accumulated alpha, with the point that [`DepthMode::MaxWeight`] chooses.
     pub points: u32,
 }
 
-/// M(p) = `error`·n(e) + `edge`·n(g), with n(·) the map brought to 0..1 by its least and its largest
-/// value in the view (0 where they are equal), e(p) the mean over channels of |I − G|, and g(p) the
-/// 8-neighbour Laplacian of the 8-bit luma of the ground truth, clipped to 0..255, its border
-/// repeated. Where the image is masked, e and g count by the mask.
+/// The pixel map M(p) = `error`·n(e) + `edge`·n(g).
+///
+/// n scales a map to 0..1 by its minimum and maximum in the view (0 where they are equal), e(p) is the
+/// mean over channels of |I − G|, and g(p) the 8-neighbour Laplacian of the 8-bit luma of the ground
+/// truth, clipped to 0..255, with repeated borders. The image's mask multiplies e and g.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PixelMap {
     /// Weight of the error, >= 0.
@@ -213,69 +258,12 @@ pub struct PixelMap {
     pub edge: f32,
 }
 
-/// A per-row column of one auxiliary view. The sums run over the pixels that the row was blended
-/// into; all are 0 for rows that are not on screen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub enum AuxColumn {
-    /// Sum of the pixel map, not weighted by alpha, >= 0.
-    MapSum,
-    /// Number of pixels, >= 0.
-    PixelCount,
-    /// Sum of the blend weights α·T, >= 0.
-    WeightSum,
-    /// Sum of the distances from the pixel's centre to the projected mean `[px]`, >= 0.
-    DistanceSum,
-    /// Camera z of the mean `[scene units]`.
-    Depth,
-    /// Radius on screen, three standard deviations along the longer axis, rounded up `[px]`.
-    Radius,
-}
-
-impl AuxColumn {
-    /// All columns, in declaration order.
-    pub const ALL: [Self; 6] = [
-        Self::MapSum,
-        Self::PixelCount,
-        Self::WeightSum,
-        Self::DistanceSum,
-        Self::Depth,
-        Self::Radius,
-    ];
-}
-
-/// One auxiliary view, as the policy sees it.
-#[derive(Debug, Clone, Copy)]
-pub struct AuxView<'a> {
-    /// Iteration just finished, 1-based.
-    pub step: u32,
-    /// Rows of the model.
-    pub rows: usize,
-    /// 0.8·L1 + 0.2·(1 − SSIM) of this view.
-    pub loss: f32,
-    /// The columns that were asked for. Shape of each: `[rows]`.
-    pub columns: &'a [(AuxColumn, Vec<f32>)],
-    /// Surface points, in the order in which their pixels were drawn. Their error is the alpha of
-    /// the pixel.
-    pub points: &'a [Candidate],
-}
-
-impl<'a> AuxView<'a> {
-    /// The values of `column`. Shape: `[rows]`.
-    ///
-    /// # Errors
-    /// [`PolicyError::UndeclaredColumn`] when the policy's [`AuxRequest`] did not list it.
-    pub fn column(&self, column: AuxColumn) -> Result<&'a [f32], PolicyError> {
-        let found = self.columns.iter().find(|(name, _)| *name == column);
-        found.map(|(_, values)| &values[..]).ok_or(PolicyError::UndeclaredColumn { column })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_a_backend_would_trust_are_checked() {
+    fn numbers_out_of_range_are_refused() {
         assert_eq!(Needs::default().check(), Ok(()));
         let noise = NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 };
         let wrong = [
@@ -307,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cadence_counts_multiples() {
+    fn the_optimiser_steps_at_multiples_of_the_cadence() {
         let due = |cadence: Cadence, class: usize| -> Vec<u32> {
             (1..=12).filter(|&step| cadence.steps_at(step)[class]).collect()
         };

@@ -1,16 +1,16 @@
-//! Distances to the nearest neighbours, by a k-d tree (Bentley 1975).
+//! Mean distances to the nearest neighbours, by a k-d tree (Bentley 1975).
 
-/// Points in a leaf of the tree: below, looking at all is faster than descending.
+/// Points in a leaf of the tree; so few are searched faster one by one.
 const LEAF: usize = 8;
-/// Neighbours that count.
+/// Number of neighbours.
 const NEIGHBOURS: usize = 3;
 
-/// Mean squared distance of each point to its three nearest others, or as many as there are; 0 where
-/// there is none. Coordinates must not be NaN. Shape: `[points]`.
+/// Mean squared distance of each point to its three nearest others, or all others if there are fewer; 0
+/// if there are none. Coordinates must not be NaN. Shape: `[points]`.
 pub(crate) fn mean_square_distances(points: &[[f32; 3]]) -> Vec<f64> {
     let tree = Tree::new(points);
     let mean = |index: usize| {
-        let mut nearest = Nearest { of: index as u32, squares: [f64::INFINITY; NEIGHBOURS] };
+        let mut nearest = Nearest { point: index as u32, squares: [f64::INFINITY; NEIGHBOURS] };
         tree.visit(0, points.len(), &mut nearest);
         let found = nearest.squares.iter().filter(|square| square.is_finite());
         let (count, sum) = found.fold((0.0, 0.0), |(n, sum), square| (n + 1.0, sum + square));
@@ -19,8 +19,7 @@ pub(crate) fn mean_square_distances(points: &[[f32; 3]]) -> Vec<f64> {
     (0..points.len()).map(mean).collect()
 }
 
-/// The points of each range `from..to` of `order` longer than a leaf are parted at their middle, by
-/// the axis that is noted there.
+/// Each range of `order` longer than a leaf is split at its middle, along the axis in `axes` there.
 struct Tree<'a> {
     points: &'a [[f32; 3]],
     order: Vec<u32>,
@@ -28,7 +27,7 @@ struct Tree<'a> {
 }
 
 struct Nearest {
-    of: u32,
+    point: u32,
     /// Ascending.
     squares: [f64; NEIGHBOURS],
 }
@@ -37,7 +36,7 @@ impl<'a> Tree<'a> {
     fn new(points: &'a [[f32; 3]]) -> Self {
         let mut order: Vec<u32> = (0..points.len() as u32).collect();
         let mut axes = vec![0; points.len()];
-        part(points, &mut order, &mut axes);
+        split(points, &mut order, &mut axes);
         Self { points, order, axes }
     }
 
@@ -51,7 +50,7 @@ impl<'a> Tree<'a> {
         let middle = from + (to - from) / 2;
         let axis = usize::from(self.axes[middle]);
         let here = |index: u32| f64::from(self.points[index as usize][axis]);
-        let beyond = here(nearest.of) - here(self.order[middle]);
+        let beyond = here(nearest.point) - here(self.order[middle]);
         let (near, far) = ((from, middle), (middle + 1, to));
         let (near, far) = if beyond < 0.0 { (near, far) } else { (far, near) };
         self.visit(near.0, near.1, nearest);
@@ -62,7 +61,7 @@ impl<'a> Tree<'a> {
     }
 }
 
-fn part(points: &[[f32; 3]], order: &mut [u32], axes: &mut [u8]) {
+fn split(points: &[[f32; 3]], order: &mut [u32], axes: &mut [u8]) {
     if order.len() <= LEAF {
         return;
     }
@@ -81,16 +80,16 @@ fn part(points: &[[f32; 3]], order: &mut [u32], axes: &mut [u8]) {
     axes[middle] = axis as u8;
     let (low, high) = order.split_at_mut(middle);
     let (low_axes, high_axes) = axes.split_at_mut(middle);
-    part(points, low, low_axes);
-    part(points, &mut high[1..], &mut high_axes[1..]);
+    split(points, low, low_axes);
+    split(points, &mut high[1..], &mut high_axes[1..]);
 }
 
 impl Nearest {
     fn take(&mut self, points: &[[f32; 3]], other: u32) {
-        if other == self.of {
+        if other == self.point {
             return;
         }
-        let (a, b) = (points[self.of as usize], points[other as usize]);
+        let (a, b) = (points[self.point as usize], points[other as usize]);
         let difference = |axis: usize| f64::from(a[axis]) - f64::from(b[axis]);
         let mut square = (0..3).map(|axis| difference(axis).powi(2)).sum::<f64>();
         for known in &mut self.squares {
@@ -107,7 +106,7 @@ mod tests {
     use crate::rng::{PolicyRng, Purpose};
 
     #[test]
-    fn by_hand() {
+    fn few_points_by_hand() {
         assert!(mean_square_distances(&[]).is_empty());
         assert_eq!(mean_square_distances(&[[1.0; 3]]), [0.0]);
         let line = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]];
@@ -119,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn as_by_looking_at_all() {
+    fn the_tree_agrees_with_a_full_search() {
         let rng = PolicyRng::new(1, 1);
         // Clustered, with ties and points that coincide.
         let points: Vec<[f32; 3]> = (0..700)

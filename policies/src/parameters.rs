@@ -1,4 +1,4 @@
-//! Parameters of policies: their names, their ranges, and how they follow the length of a run.
+//! Parameters of policies: names, ranges, overrides, and scaling with the length of a run.
 
 use std::collections::BTreeMap;
 use std::ops::{Bound, RangeBounds};
@@ -8,11 +8,11 @@ use toml::{Table, Value};
 
 use crate::policy::PolicyError;
 
-/// Length of the run for which the defaults of schedules are written `[steps]`.
+/// Length of the run that defaults in steps are written for `[steps]`.
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
-/// Checks that a parameter is finite and in its range; for [`ConfiguredPolicy::new`]. The
-/// registry fills in the policy's name.
+/// Checks that a parameter is finite and in its range, for [`ConfiguredPolicy::new`]. The registry adds
+/// the policy's name to the error.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
 ///
@@ -26,29 +26,31 @@ pub fn in_range(
     if value.is_finite() && range.contains(&value) {
         return Ok(());
     }
-    let mut must = Vec::new();
+    let mut limits = Vec::new();
     match range.start_bound() {
-        Bound::Included(low) => must.push(format!("at least {low}")),
-        Bound::Excluded(low) => must.push(format!("greater than {low}")),
+        Bound::Included(low) => limits.push(format!("at least {low}")),
+        Bound::Excluded(low) => limits.push(format!("greater than {low}")),
         Bound::Unbounded => {}
     }
     match range.end_bound() {
-        Bound::Included(high) => must.push(format!("at most {high}")),
-        Bound::Excluded(high) => must.push(format!("less than {high}")),
+        Bound::Included(high) => limits.push(format!("at most {high}")),
+        Bound::Excluded(high) => limits.push(format!("less than {high}")),
         Bound::Unbounded => {}
     }
-    if must.is_empty() {
-        must.push("finite".to_owned());
+    if limits.is_empty() {
+        limits.push("finite".to_owned());
     }
-    Err(bad(parameter, format!("{value} is out of range; it must be {}", must.join(" and "))))
+    Err(bad_parameter(
+        parameter,
+        format!("{value} is out of range; it must be {}", limits.join(" and ")),
+    ))
 }
 
-/// A [`PolicyError::BadParameter`]; for [`ConfiguredPolicy::new`]. The registry fills in the
-/// policy's name.
+/// A [`PolicyError::BadParameter`], for [`ConfiguredPolicy::new`]. The registry adds the policy's name.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
 #[must_use]
-pub fn bad(parameter: &str, reason: impl Into<String>) -> PolicyError {
+pub fn bad_parameter(parameter: &str, reason: impl Into<String>) -> PolicyError {
     PolicyError::BadParameter {
         policy: String::new(),
         parameter: parameter.to_owned(),
@@ -58,11 +60,11 @@ pub fn bad(parameter: &str, reason: impl Into<String>) -> PolicyError {
 
 /// Parses settings of the form `policy.parameter=value` into one table per policy.
 ///
-/// The value is TOML (`0.2`, `true`, `"text"`); what is no TOML value is taken as text, so that
-/// words need no quotes. Of several settings of one parameter the last holds.
+/// The value is TOML (`0.2`, `true`, `"text"`); anything that is not valid TOML is taken as text, so
+/// words need no quotes. Of several settings of one parameter the last one counts.
 ///
 /// # Errors
-/// [`PolicyError::Other`] naming the setting that has another form.
+/// [`PolicyError::Other`] naming a setting of another form.
 pub fn parse_overrides(
     settings: &[impl AsRef<str>],
 ) -> Result<BTreeMap<String, Table>, PolicyError> {
@@ -84,52 +86,51 @@ pub fn parse_overrides(
 
 pub(crate) fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
-    // A value with a line break could hold further keys; then it is no value.
+    // A text with a line break could set further keys; then it is not one value.
     let single = parsed.filter(|table| table.len() == 1);
     single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }
 
-/// Shortest interval that scaling leaves `[steps]`. Between two events rows must be seen from many
-/// views, and those just born must find their place: that takes as many steps in a short run as in
-/// a long one.
-pub(crate) const LEAST_INTERVAL: i64 = 100;
+/// Shortest interval after scaling `[steps]`. Between two events rows must be seen from many views, and
+/// new rows must settle, which takes as many steps in a short run as in a long one.
+const MIN_INTERVAL: i64 = 100;
 
 /// Multiplies the step counts named in `names` by `iterations` / 30,000: rounded, at least 1, but
 /// 0 (which switches something off) stays 0. Intervals, whose names end in `_every`, stop shrinking
-/// at [`LEAST_INTERVAL`].
+/// at [`MIN_INTERVAL`].
 pub(crate) fn scale_steps(table: &mut Table, names: &[&str], iterations: u32) {
     for name in names {
         if let Some(Value::Integer(steps)) = table.get_mut(*name)
             && *steps > 0
         {
             let factor = f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
-            let least = if name.ends_with("_every") { (*steps).min(LEAST_INTERVAL) } else { 1 };
+            let least = if name.ends_with("_every") { (*steps).min(MIN_INTERVAL) } else { 1 };
             *steps = ((*steps as f64 * factor).round() as i64).max(least);
         }
     }
 }
 
-/// The name in `known` most like `name`, if any is like it.
+/// The name in `known` most similar to `name`, if any is similar.
 pub(crate) fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
-    // 0.7 lets a missing or a wrong letter of a short name pass, but not another word.
-    let alike = known.into_iter().map(|k| (strsim::jaro_winkler(name, k), k));
-    let best = alike.filter(|(likeness, _)| *likeness >= 0.7).max_by(|a, b| a.0.total_cmp(&b.0));
+    // 0.7 accepts a missing or wrong letter in a short name, but not another word.
+    let scored = known.into_iter().map(|k| (strsim::jaro_winkler(name, k), k));
+    let best = scored.filter(|(score, _)| *score >= 0.7).max_by(|a, b| a.0.total_cmp(&b.0));
     best.map(|(_, k)| k.to_owned())
 }
 
-/// The names of the fields of `T`, a struct that derives `Deserialize`, in declaration order:
-/// those that are `None` by default included, which a table of defaults cannot hold. `None` when
-/// `T` is no plain struct.
+/// The names of the fields of `T`, a struct that derives `Deserialize`, in declaration order. Unlike a
+/// table of defaults, they include fields that are `None` by default. `None` when `T` is not a
+/// plain struct.
 pub(crate) fn field_names<T: DeserializeOwned>() -> Option<&'static [&'static str]> {
     let mut names = None;
-    // Always an error: the deserialiser only listens.
-    let _ = T::deserialize(Listener(&mut names));
+    // Always an error: this deserialiser only records the names.
+    let _ = T::deserialize(FieldNames(&mut names));
     names
 }
 
-struct Listener<'a>(&'a mut Option<&'static [&'static str]>);
+struct FieldNames<'a>(&'a mut Option<&'static [&'static str]>);
 
-impl<'de> Deserializer<'de> for Listener<'_> {
+impl<'de> Deserializer<'de> for FieldNames<'_> {
     type Error = value::Error;
 
     fn deserialize_struct<V: Visitor<'de>>(
@@ -167,20 +168,20 @@ mod tests {
     }
 
     #[test]
-    fn ranges_are_kept_and_told() {
+    fn values_out_of_range_are_refused_with_the_range() {
         assert_eq!(in_range("rho", 1.0, 0.0..=1.0), Ok(()));
         assert_eq!(in_range("rho", -5.0, ..), Ok(()));
-        let told = reason(in_range("rho", 1.5, 0.0..=1.0));
-        assert_eq!(told, "1.5 is out of range; it must be at least 0 and at most 1");
+        let message = reason(in_range("rho", 1.5, 0.0..=1.0));
+        assert_eq!(message, "1.5 is out of range; it must be at least 0 and at most 1");
         let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
-        let told = reason(in_range("rho", 0.0, open));
-        assert_eq!(told, "0 is out of range; it must be greater than 0 and less than 1");
+        let message = reason(in_range("rho", 0.0, open));
+        assert_eq!(message, "0 is out of range; it must be greater than 0 and less than 1");
         assert_eq!(reason(in_range("rho", f64::NAN, ..)), "NaN is out of range; it must be finite");
         reason(in_range("rho", f64::INFINITY, 0.0..));
     }
 
     #[test]
-    fn overrides_are_toml_or_words() {
+    fn overrides_are_toml_or_plain_text() {
         let settings = [
             "diet.rho=0.2",
             "vanilla.governor=true",
@@ -211,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn schedules_follow_the_run() {
+    fn schedules_scale_with_the_run() {
         let scaled = |steps: i64, iterations| {
             let mut table = Table::new();
             table.insert("every".into(), steps.into());
@@ -230,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_are_known_by_name() {
+    fn field_names_include_optional_ones() {
         #[derive(Deserialize)]
         #[serde(deny_unknown_fields)]
         #[expect(dead_code, reason = "only the names matter")]
@@ -243,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slip_finds_the_name() {
+    fn a_misspelt_name_finds_the_right_one() {
         let known = ["diet", "taming", "vanilla"];
         assert_eq!(nearest("dite", known).as_deref(), Some("diet"));
         assert_eq!(nearest("vanila", known).as_deref(), Some("vanilla"));

@@ -1,10 +1,10 @@
-//! Randomness without hidden state: every draw is a hash of (seed, step, row, purpose).
+//! Random numbers without state: every draw is a hash of (seed, step, row, purpose).
 //!
 //! The same four numbers give the same bits on every backend, in any order and at any thread
-//! count. The mixer is pcg4d (Jarzynski and Olano, *Hash Functions for GPU Rendering*, JCGT 9(3),
-//! 2020): 32-bit operations only, so that a shader can repeat it.
+//! count. The hash is pcg4d (Jarzynski and Olano, *Hash Functions for GPU Rendering*, JCGT 9(3),
+//! 2020): 32-bit operations only, so that a shader can compute it too.
 
-/// What a draw is for. Draws for different purposes are independent.
+/// The purpose of a draw. Draws for different purposes are independent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Purpose {
@@ -20,7 +20,7 @@ pub enum Purpose {
     Round = 5,
 }
 
-/// Draws of one policy event.
+/// Random draws of one policy event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PolicyRng {
     seed: u32,
@@ -35,8 +35,7 @@ impl PolicyRng {
         Self { seed: (seed ^ (seed >> 32).wrapping_mul(0x9e37_79b9)) as u32, step }
     }
 
-    /// Four independent 32-bit words for (row, purpose, counter). Draws are told apart for
-    /// `counter` < 65,536.
+    /// Four independent 32-bit words for (row, purpose, counter), with `counter` < 65,536.
     #[must_use]
     #[inline]
     pub fn bits(&self, row: u32, purpose: Purpose, counter: u32) -> [u32; 4] {

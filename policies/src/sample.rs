@@ -1,8 +1,7 @@
 //! Choosing rows: the largest, the smallest, or at random by weight.
 //!
-//! All choices are deterministic: ties go to the lower row, numbers that are NaN come last, and
-//! random draws are hashes of (seed, step, row, purpose). Each takes O(n) to select and
-//! O(k log k) to sort.
+//! All choices are deterministic: ties go to the lower row, NaN comes last, and random draws are hashes
+//! of (seed, step, row, purpose). Selecting takes O(n) and sorting the result O(k log k).
 
 use std::cmp::Ordering;
 
@@ -38,12 +37,12 @@ pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
     })
 }
 
-/// Draws `k` distinct rows, one after the other, each with a probability in proportion to its
-/// weight among those left. In the order drawn; fewer than `k` when fewer weights are positive.
+/// Draws `k` distinct rows without replacement, each with a probability in proportion to its weight
+/// among those left. In the order drawn; fewer than `k` when fewer weights are positive.
 ///
-/// A row is drawn by the smallest of −ln(u) / weight, an exponential variable whose rate is the
-/// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Weights
-/// that are zero, negative or NaN are never drawn; infinite ones always come first.
+/// The rows with the smallest −ln(u) / weight are drawn, an exponential variable whose rate is the
+/// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Weights that
+/// are zero, negative or NaN are never drawn; infinite ones always come first.
 #[must_use]
 pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     let drawn = (0..).zip(weights).filter(|(_, weight)| **weight > 0.0);
@@ -56,8 +55,8 @@ pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
     keyed.into_iter().map(|(_, row)| row).collect()
 }
 
-/// Draws `k` rows with replacement, each with a probability in proportion to its weight: the rows
-/// drawn, ascending, and how often; nothing when no weight is positive.
+/// Draws `k` rows with replacement, each with a probability in proportion to its weight. Returns the
+/// rows drawn, ascending, with their counts; nothing when no weight is positive.
 ///
 /// Weights that are zero, negative or NaN are never drawn; infinite ones count as `f32::MAX`.
 #[must_use]
@@ -78,7 +77,7 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
         .map(|draw| {
             let at = rng.uniform_f64(draw, Purpose::Draw) * total;
             let row = sums.partition_point(|&sum| sum <= at);
-            // The product may round up to the total itself: then the last row that adds to it.
+            // The product may round up to the total; then it is the last row with a weight.
             row.min(sums.partition_point(|&sum| sum < total)) as u32
         })
         .collect();
@@ -86,7 +85,7 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
     drawn.chunk_by(|a, b| a == b).map(|same| (same[0], same.len() as u32)).collect()
 }
 
-/// Numbers in the direction wanted (−0 equals 0), then NaN of either sign.
+/// Numbers in the given direction (−0 equals 0), then NaN of either sign.
 fn nan_last(x: f32, y: f32, direction: impl Fn(Ordering) -> Ordering) -> Ordering {
     x.partial_cmp(&y).map_or_else(|| x.is_nan().cmp(&y.is_nan()), direction)
 }

@@ -48,7 +48,7 @@ fn options() -> CpuOptions {
         spaced: false,
     };
     let needs = Needs {
-        signals: SignalSet::of(&[Signal::WeightMax, Signal::MeanGradientX, Signal::Age]),
+        signals: SignalSet::from([Signal::WeightMax, Signal::MeanGradientX, Signal::Age]),
         candidates: Some(candidates),
         cadence: Cadence { all: 2, sh_rest: 4 },
         ..Needs::default()

@@ -158,7 +158,7 @@ enum Told {
 
 impl DensityPolicy for ToldPolicy {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let (signals, fresh_views) = (SignalSet::of(&[Signal::Opacity]), self.fresh_views);
+        let (signals, fresh_views) = (SignalSet::from([Signal::Opacity]), self.fresh_views);
         let fresh = if fresh_views > 0 { signals.with(Signal::FreshWeightMax) } else { signals };
         let aux = (self.aux_views > 0)
             .then(|| AuxRequest { columns: vec![AuxColumn::Depth], ..AuxRequest::default() });

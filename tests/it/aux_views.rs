@@ -61,7 +61,7 @@ fn backend(scene: &Scene, request: &AuxRequest, cap: usize, threads: usize) -> C
     options.tile_cap = cap;
     options.record_cap = cap.div_ceil(2);
     options.needs = Needs {
-        signals: SignalSet::of(&[Signal::ScreenGradient, Signal::WeightSum, Signal::WeightMax]),
+        signals: SignalSet::from([Signal::ScreenGradient, Signal::WeightSum, Signal::WeightMax]),
         aux: Some(request.clone()),
         ..Needs::default()
     };
@@ -241,7 +241,7 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
                 observe(&mut backend, &scene, &request, 0);
             }
         }
-        let signals = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightSum]);
+        let signals = SignalSet::from([Signal::ScreenGradient, Signal::WeightSum]);
         let needs = Needs { signals, ..Needs::default() };
         let signals = backend.take_signals(needs.signals).expect("signals can be taken");
         let of = |signal| signals.get(signal).expect("a requested signal").to_vec();

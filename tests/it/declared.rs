@@ -416,7 +416,7 @@ fn what_is_declared_is_in_the_ledger() {
 fn present_values_are_those_of_the_model() {
     let model = model(20);
     let wanted = [Signal::Opacity, Signal::ScaleMax, Signal::ScaleProduct];
-    let needs = Needs { signals: SignalSet::of(&wanted), ..Needs::default() };
+    let needs = Needs { signals: SignalSet::from(wanted), ..Needs::default() };
     let mut backend = backend(&model, needs.clone(), 1);
     let signals = backend.take_signals(needs.signals).expect("signals can be taken");
     let of = |signal| signals.get(signal).expect("a requested signal");

@@ -101,7 +101,7 @@ fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
 
 /// The same, where views count in full from this depth on.
 fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBackend, Vec<Vec<f32>>) {
-    let needs = Needs { signals: SignalSet::of(wanted), full_depth, ..Needs::default() };
+    let needs = Needs { signals: wanted.iter().copied().collect(), full_depth, ..Needs::default() };
     let mut options = subject::options(views.model.len(), Resources::default());
     options.needs = needs.clone();
     let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
@@ -204,7 +204,7 @@ fn near_views_weigh_less_where_asked_for() {
 fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let views = views();
     let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
-    let needs = Needs { signals: SignalSet::of(&[Signal::WeightMax]), ..Needs::default() };
+    let needs = Needs { signals: SignalSet::from([Signal::WeightMax]), ..Needs::default() };
     let now = |backend: &mut CpuBackend| {
         let signals = backend.take_signals(needs.signals).expect("signals can be taken");
         signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
@@ -221,10 +221,10 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
 #[test]
 fn what_is_lent_for_signals_changes_nothing() {
     let views = views();
-    let declared = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightMax]);
+    let declared = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax]);
     let present = declared.with(Signal::Age).with(Signal::ScaleMax);
     // More columns than a step has sums.
-    let many = SignalSet::of(&Signal::ALL);
+    let many = SignalSet::from(Signal::ALL);
     let run = |read: Option<SignalSet>, gives_back: bool| {
         let mut options = subject::options(views.model.len(), Resources::default());
         options.needs = Needs { signals: declared, ..Needs::default() };

@@ -1,5 +1,6 @@
-//! The registered policies conform; policies with one fault each are caught. One piece, as all
-//! faults are those of one policy.
+//! Tests that the registered policies conform, and that policies with one fault each are caught.
+//!
+//! One piece, as all faults are those of one policy.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -7,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::*;
 use crate::adc::clone_at;
+use crate::parameters::in_range;
 use crate::plan::EditPlan;
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PolicyState, Signal, SignalSet,
@@ -70,58 +72,58 @@ fn every_registered_policy_is_documented() {
 enum Fault {
     None,
     ReadsUndeclared,
-    PeeksIfItCan,
-    PeeksAtCandidates,
-    RollsItsOwnDice,
-    ForgetsItsState,
+    ReadsUndeclaredIfPresent,
+    ReadsUndeclaredCandidates,
+    UsesItsOwnRandomness,
+    RestoresNothing,
     AcceptsAnyState,
-    FearsNan,
-    GivesUpWhenRefused,
+    PanicsOnNan,
+    FailsWhenRefused,
     PrunesAll,
-    SwapsItsPlan,
-    NeedsAtWhim,
-    ReadsFreshUnasked,
-    RendersNothing,
-    RendersForNothing,
-    WantsFreshAtWhim,
+    ReplacesThePlan,
+    HasRandomNeeds,
+    ReadsFreshUnwanted,
+    ReadsFreshWithoutViews,
+    RendersFreshWithoutReading,
+    WantsFreshAtRandom,
     WantsViewsUndeclared,
-    ReadsColumnUndeclared,
-    PeeksAtPoints,
-    ForgetsWhatItSaw,
+    ReadsUndeclaredColumn,
+    ReadsUndeclaredPoints,
+    SavesOnlyPart,
     DeclaresNan,
-    StepsTooSeldom,
+    HasUndeclaredCadence,
 }
 
 const FAULTS: [(Fault, Option<Check>); 22] = [
     (Fault::None, None),
-    (Fault::ReadsUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
-    (Fault::PeeksIfItCan, Some(Check::ReadsOnlyWhatItDeclares)),
-    (Fault::PeeksAtCandidates, Some(Check::ReadsOnlyWhatItDeclares)),
-    (Fault::RollsItsOwnDice, Some(Check::Repeats)),
-    (Fault::ForgetsItsState, Some(Check::Remembers)),
-    (Fault::AcceptsAnyState, Some(Check::RefusesForeignState)),
-    (Fault::FearsNan, Some(Check::GoesOn)),
-    (Fault::GivesUpWhenRefused, Some(Check::GoesOn)),
+    (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsUndeclaredCandidates, Some(Check::ReadsOnlyDeclared)),
+    (Fault::UsesItsOwnRandomness, Some(Check::IsDeterministic)),
+    (Fault::RestoresNothing, Some(Check::RestoresState)),
+    (Fault::AcceptsAnyState, Some(Check::RejectsForeignState)),
+    (Fault::PanicsOnNan, Some(Check::NeverFails)),
+    (Fault::FailsWhenRefused, Some(Check::NeverFails)),
     (Fault::PrunesAll, Some(Check::LeavesARow)),
-    (Fault::SwapsItsPlan, Some(Check::KeepsItsPlan)),
-    (Fault::NeedsAtWhim, Some(Check::Repeats)),
-    (Fault::ReadsFreshUnasked, Some(Check::ReadsOnlyWhatItDeclares)),
-    (Fault::RendersNothing, Some(Check::AsksForWhole)),
-    (Fault::RendersForNothing, Some(Check::AsksForWhole)),
-    (Fault::WantsFreshAtWhim, Some(Check::Repeats)),
-    (Fault::WantsViewsUndeclared, Some(Check::AsksForWhole)),
-    (Fault::ReadsColumnUndeclared, Some(Check::ReadsOnlyWhatItDeclares)),
-    (Fault::PeeksAtPoints, Some(Check::ReadsOnlyWhatItDeclares)),
-    (Fault::ForgetsWhatItSaw, Some(Check::Remembers)),
-    (Fault::DeclaresNan, Some(Check::DeclaresSoundly)),
-    (Fault::StepsTooSeldom, Some(Check::DeclaresSoundly)),
+    (Fault::ReplacesThePlan, Some(Check::KeepsPlan)),
+    (Fault::HasRandomNeeds, Some(Check::IsDeterministic)),
+    (Fault::ReadsFreshUnwanted, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsFreshWithoutViews, Some(Check::RequestsConsistently)),
+    (Fault::RendersFreshWithoutReading, Some(Check::RequestsConsistently)),
+    (Fault::WantsFreshAtRandom, Some(Check::IsDeterministic)),
+    (Fault::WantsViewsUndeclared, Some(Check::RequestsConsistently)),
+    (Fault::ReadsUndeclaredColumn, Some(Check::ReadsOnlyDeclared)),
+    (Fault::ReadsUndeclaredPoints, Some(Check::ReadsOnlyDeclared)),
+    (Fault::SavesOnlyPart, Some(Check::RestoresState)),
+    (Fault::DeclaresNan, Some(Check::DeclaresValidNumbers)),
+    (Fault::HasUndeclaredCadence, Some(Check::DeclaresValidNumbers)),
 ];
 
-/// Randomness that belongs to nobody.
-static DICE: AtomicU64 = AtomicU64::new(0);
+/// Shared state that makes policies nondeterministic.
+static CALLS: AtomicU64 = AtomicU64::new(0);
 
-fn roll() -> u64 {
-    DICE.fetch_add(1, Ordering::Relaxed)
+fn next_call() -> u64 {
+    CALLS.fetch_add(1, Ordering::Relaxed)
 }
 
 #[derive(Debug, Default, Serialize, Deserialize)]
@@ -131,7 +133,7 @@ struct Params {
 }
 
 /// A policy with a state: at every third event of its life it prunes the faintest row, at the
-/// others it clones two rows, one by gradient and one by chance. Sound, but for its fault.
+/// others it clones two rows, one by gradient and one at random. It conforms but for its fault.
 struct Faulty<const FAULT: usize> {
     events: u64,
     /// Bits of the numbers seen in the auxiliary views of its life.
@@ -154,19 +156,19 @@ impl<const FAULT: usize> Faulty<FAULT> {
 
 impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let mut signals = SignalSet::of(&[Signal::Opacity, Signal::ScreenGradient]);
-        if self.has(Fault::NeedsAtWhim) && roll().is_multiple_of(2) {
+        let mut signals = SignalSet::from([Signal::Opacity, Signal::ScreenGradient]);
+        if self.has(Fault::HasRandomNeeds) && next_call().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
-        let fresh = [Fault::None, Fault::ReadsFreshUnasked].contains(&FAULTS[FAULT].0);
-        if fresh || self.has(Fault::RendersNothing) {
+        let fresh = [Fault::None, Fault::ReadsFreshUnwanted].contains(&FAULTS[FAULT].0);
+        if fresh || self.has(Fault::ReadsFreshWithoutViews) {
             signals = signals.with(Signal::FreshWeightMax);
         }
-        let fresh_views = if fresh || self.has(Fault::RendersForNothing) { 3 } else { 0 };
+        let fresh_views = if fresh || self.has(Fault::RendersFreshWithoutReading) { 3 } else { 0 };
         let mut needs = Needs { signals, fresh_views, ..Needs::default() };
         if !self.has(Fault::WantsViewsUndeclared) {
             let columns = vec![AuxColumn::Depth];
-            let points = if self.has(Fault::PeeksAtPoints) { 0 } else { 2 };
+            let points = if self.has(Fault::ReadsUndeclaredPoints) { 0 } else { 2 };
             needs.aux = Some(AuxRequest { columns, points, ..AuxRequest::default() });
         }
         if self.has(Fault::DeclaresNan) {
@@ -182,7 +184,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
 
     fn cadence(&self, step: u32) -> Cadence {
         let all = if step > 100 { 3 } else { 1 };
-        let sh_rest = if self.has(Fault::StepsTooSeldom) && step > 90 { 2 } else { 1 };
+        let sh_rest = if self.has(Fault::HasUndeclaredCadence) && step > 90 { 2 } else { 1 };
         Cadence { all: if sh_rest > 1 { 0 } else { all }, sh_rest }
     }
 
@@ -191,22 +193,22 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     }
 
     fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
-        if self.has(Fault::ReadsColumnUndeclared) {
+        if self.has(Fault::ReadsUndeclaredColumn) {
             view.column(AuxColumn::Radius)?;
         }
-        let of = |x: f32| u64::from(x.to_bits());
+        let bits = |x: f32| u64::from(x.to_bits());
         let depths = view.column(AuxColumn::Depth)?;
-        let sum = depths.iter().fold(of(view.loss), |sum, &x| sum.rotate_left(5) ^ of(x));
+        let sum = depths.iter().fold(bits(view.loss), |sum, &x| sum.rotate_left(5) ^ bits(x));
         self.seen = self.seen.rotate_left(9) ^ sum;
         for point in view.points {
-            self.seen = self.seen.rotate_left(9) ^ of(point.error);
+            self.seen = self.seen.rotate_left(9) ^ bits(point.error);
         }
         Ok(())
     }
 
     fn wants_fresh(&self, step: u32, _rows: usize, _budget: usize) -> bool {
-        let at_whim = self.has(Fault::WantsFreshAtWhim) && roll().is_multiple_of(2);
-        at_whim || step.is_multiple_of(15)
+        let at_random = self.has(Fault::WantsFreshAtRandom) && next_call().is_multiple_of(2);
+        at_random || step.is_multiple_of(15)
     }
 
     fn plan(
@@ -219,7 +221,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         let opacity = now.signal(Signal::Opacity)?;
         let reads_fresh = match FAULTS[FAULT].0 {
             Fault::None => now.step.is_multiple_of(15),
-            Fault::ReadsFreshUnasked => now.step.is_multiple_of(10),
+            Fault::ReadsFreshUnwanted => now.step.is_multiple_of(10),
             _ => false,
         };
         if reads_fresh {
@@ -227,7 +229,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         }
         let gradient = now.signal(Signal::ScreenGradient)?;
         let rows: Vec<u32> = (0..now.rows() as u32).collect();
-        if self.has(Fault::SwapsItsPlan) {
+        if self.has(Fault::ReplacesThePlan) {
             *plan = EditPlan::new(now.rows(), plan.budget() + 1);
         }
         if self.events.is_multiple_of(3) {
@@ -237,7 +239,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
             }
             return Ok(());
         }
-        if self.has(Fault::FearsNan) {
+        if self.has(Fault::PanicsOnNan) {
             assert!(gradient.iter().all(|g| !g.is_nan()), "a gradient is not a number");
         }
         let mut by_chance: Vec<f32> =
@@ -246,21 +248,21 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         if self.has(Fault::ReadsUndeclared) {
             by_gradient = now.signal(Signal::ScreenGradientAbs)?.to_vec();
         }
-        if self.has(Fault::PeeksIfItCan) {
+        if self.has(Fault::ReadsUndeclaredIfPresent) {
             let better = now.signals.get(Signal::ScreenGradientAbs);
             by_gradient = better.unwrap_or(gradient).to_vec();
         }
-        if self.has(Fault::PeeksAtCandidates) {
+        if self.has(Fault::ReadsUndeclaredCandidates) {
             by_gradient.truncate(now.candidates.len());
         }
-        if self.has(Fault::RollsItsOwnDice) {
+        if self.has(Fault::UsesItsOwnRandomness) {
             for chance in &mut by_chance {
-                *chance = (roll() % 7) as f32;
+                *chance = (next_call() % 7) as f32;
             }
         }
         for row in top_k(&by_gradient, 1).into_iter().chain(top_k(&by_chance, 1)) {
             let grown = plan.grow(row, clone_at([0.0; 3]));
-            if self.has(Fault::GivesUpWhenRefused) {
+            if self.has(Fault::FailsWhenRefused) {
                 grown.map_err(|refused| PolicyError::Other(refused.to_string()))?;
             }
         }
@@ -268,14 +270,14 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     }
 
     fn save(&self) -> PolicyState {
-        if self.has(Fault::ForgetsWhatItSaw) {
+        if self.has(Fault::SavesOnlyPart) {
             return serde_json::json!({ "events": self.events, "seen": 0 });
         }
         serde_json::json!({ "events": self.events, "seen": self.seen })
     }
 
     fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
-        if self.has(Fault::ForgetsItsState) && state["events"].is_u64() {
+        if self.has(Fault::RestoresNothing) && state["events"].is_u64() {
             return Ok(());
         }
         match state["events"].as_u64() {
@@ -289,35 +291,16 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
 }
 
 fn faulty<const FAULT: usize>() -> PolicyEntry {
-    PolicyEntry::of::<Faulty<FAULT>>("faulty", "for tests", "nowhere", "", ("tests.rs", 1))
+    PolicyEntry::new::<Faulty<FAULT>>("faulty", "for tests", "nowhere", "", ("tests.rs", 1))
 }
 
 #[test]
 fn every_fault_is_found() {
-    let entries = [
-        faulty::<0>(),
-        faulty::<1>(),
-        faulty::<2>(),
-        faulty::<3>(),
-        faulty::<4>(),
-        faulty::<5>(),
-        faulty::<6>(),
-        faulty::<7>(),
-        faulty::<8>(),
-        faulty::<9>(),
-        faulty::<10>(),
-        faulty::<11>(),
-        faulty::<12>(),
-        faulty::<13>(),
-        faulty::<14>(),
-        faulty::<15>(),
-        faulty::<16>(),
-        faulty::<17>(),
-        faulty::<18>(),
-        faulty::<19>(),
-        faulty::<20>(),
-        faulty::<21>(),
-    ];
+    macro_rules! entries {
+        ($($fault:literal)*) => { [$(faulty::<$fault>()),*] };
+    }
+    let entries = entries!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21);
+    assert_eq!(entries.len(), FAULTS.len());
     let mut missed = Vec::new();
     for (entry, (fault, expected)) in entries.iter().zip(FAULTS) {
         let report = check_policy(entry);
@@ -336,12 +319,15 @@ fn every_fault_is_found() {
 #[test]
 fn a_report_names_the_policy_and_the_step() {
     let report = check_policy(&faulty::<1>()).unwrap_err().to_string();
-    assert!(report.starts_with("policy `faulty` (tests.rs:1) does not conform:\n- it reads only"));
+    assert!(
+        report
+            .starts_with("policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only")
+    );
     assert!(report.contains("an empty model") && report.contains("step 5"), "{report}");
     assert!(report.contains("ScreenGradientAbs"), "{report}");
 }
 
-/// Parameters that the registry cannot keep its promises for.
+/// Parameters that accept unknown names.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 struct Lax {
@@ -353,7 +339,8 @@ struct Unbuildable;
 impl ConfiguredPolicy for Unbuildable {
     type Params = Lax;
     const STEP_PARAMETERS: &'static [&'static str] = &["threshold"];
-    fn new(_params: Lax, scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: Lax, scene: &SceneInfo) -> Result<Self, PolicyError> {
+        in_range("threshold", params.threshold, 0.0..=1.0)?;
         if scene.iterations == 7 {
             Err(PolicyError::Other("not seven".to_owned()))
         } else {
@@ -377,17 +364,11 @@ impl DensityPolicy for Unbuildable {
     ) -> Result<(), PolicyError> {
         Ok(())
     }
-    fn save(&self) -> PolicyState {
-        PolicyState::Null
-    }
-    fn restore(&mut self, _state: PolicyState) -> Result<(), PolicyError> {
-        Ok(())
-    }
 }
 
 #[test]
 fn building_is_checked() {
-    let entry = PolicyEntry::of::<Unbuildable>("x", "", "", "", ("tests.rs", 2));
+    let entry = PolicyEntry::new::<Unbuildable>("x", "", "", "", ("tests.rs", 2));
     let failures = check_policy(&entry).unwrap_err().failures;
     assert_eq!(failures, [(Check::Builds, "for 7 steps: not seven".to_owned())]);
 }
@@ -395,16 +376,30 @@ fn building_is_checked() {
 #[test]
 fn manuals_are_checked() {
     let manual = |doc| {
-        let entry = PolicyEntry::of::<Unbuildable>("x", "", "", doc, ("tests.rs", 2));
+        let entry = PolicyEntry::new::<Unbuildable>("x", "", "", doc, ("tests.rs", 2));
         check_manual(&entry).map_err(|report| report.failures[0].1.clone())
     };
-    let head = "//! | name | default | range | unit | what |\n//! |---|---|---|---|---|\n";
+    let head = "//! | name | default | range | unit | meaning |\n//! |---|---|---|---|---|\n";
     let with = |rows: &str| -> &'static str { format!("{head}{rows}").leak() };
-    assert_eq!(manual(with("//! | threshold | 0 | | | what |\n//!\n")), Ok(()));
+    assert_eq!(manual(with("//! | threshold | 0 | | | meaning |\n//!\n")), Ok(()));
     assert_eq!(manual(""), Err("`threshold` is missing".to_owned()));
-    let wrong = manual(with("//! | threshold | 0.1 | | | what |\n//! | ghost | 1 | | | what |\n"));
-    let told = "`threshold` has the default 0.0, not 0.1, `ghost` is no parameter";
-    assert_eq!(wrong, Err(told.to_owned()));
-    let short = manual(with("//! | threshold | 0 | what |\n"));
+    let wrong =
+        manual(with("//! | threshold | 0.1 | | | meaning |\n//! | ghost | 1 | | | meaning |\n"));
+    let message = "`threshold` has the default 0.0, not 0.1, `ghost` is not a parameter";
+    assert_eq!(wrong, Err(message.to_owned()));
+    let short = manual(with("//! | threshold | 0 | meaning |\n"));
     assert_eq!(short, Err("`threshold` has 3 cells".to_owned()));
+    let range = |range| manual(with(&format!("//! | threshold | 0 | {range} | | meaning |\n")));
+    assert_eq!([range("0 to 1"), range(">= 0"), range("")], [Ok(()), Ok(()), Ok(())]);
+    for (wrong, value) in [
+        ("0 to 2", "2.0 is in its range"),
+        (">= -1", "-1.0 is in its range"),
+        ("> 0", "0.0 is accepted"),
+        ("0 to 1, 1 excluded", "1.0 is accepted"),
+        ("0 to 1, both excluded", "0.0 is accepted"),
+        ("about 1", "of no known form"),
+    ] {
+        let message = range(wrong).unwrap_err();
+        assert!(message.contains(value), "{wrong}: {message}");
+    }
 }

@@ -1,6 +1,6 @@
-//! Compensation: badly explained pixels become rows.
+//! Compensation: pixels with a large error become new rows.
 
-use super::shares::part;
+use super::quota::rows_of_event;
 use super::{Diet, NewbornSize};
 use crate::adc::Window;
 use crate::plan::{EditPlan, Seed};
@@ -8,13 +8,13 @@ use crate::policy::{CandidateRequest, PolicyError, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
 impl Diet {
-    /// The pixels to collect, if the policy compensates at all.
+    /// The pixels to collect, if compensation is on.
     pub(super) fn candidate_request(&self, scene: &SceneInfo) -> Option<CandidateRequest> {
         let Window { from, until, every } = self.insert;
         if every == 0 || from >= until {
             return None;
         }
-        // What one interval can bring at the budget, but no more than there can be rows.
+        // What one interval can collect at the budget, but at most the budget.
         let steps = every.min(until - from) as usize;
         let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
         let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);
@@ -30,12 +30,12 @@ impl Diet {
         })
     }
 
-    /// Appends the worst candidates, and prunes victims for those that have no room.
+    /// Appends the worst candidates, and evicts rows for those that have no room.
     pub(super) fn insert(
         &self,
         now: &Snapshot<'_>,
         plan: &mut EditPlan,
-        spared: &dyn Fn(u32) -> bool,
+        exempt: &dyn Fn(u32) -> bool,
     ) -> Result<(), PolicyError> {
         let code_size = match self.params.newborn_size {
             NewbornSize::Pixel => None,
@@ -50,22 +50,23 @@ impl Diet {
             };
             (candidate.error, seed)
         });
-        let (sound, unsound): (Vec<_>, Vec<_>) = seeds.partition(|(_, seed)| seed.is_valid());
-        // The plan refuses these and counts them; no victim shall die for them.
-        for (_, seed) in unsound {
+        let (valid, invalid): (Vec<_>, Vec<_>) = seeds.partition(|(_, seed)| seed.is_valid());
+        // The plan refuses and counts these; no row is evicted for them.
+        for (_, seed) in invalid {
             let _ = plan.append(seed);
         }
-        let errors: Vec<f32> = sound.iter().map(|(error, _)| *error).collect();
-        let worst = top_k(&errors, part(self.params.rho_c, self.insert, now.step, plan.budget()));
-        self.prune_victims(now, plan, worst.len().saturating_sub(plan.room()), spared)?;
+        let errors: Vec<f32> = valid.iter().map(|(error, _)| *error).collect();
+        let most = rows_of_event(self.params.rho_c, self.insert, now.step, plan.budget());
+        let worst = top_k(&errors, most);
+        self.evict(now, plan, worst.len().saturating_sub(plan.room()), exempt)?;
         for index in worst {
-            let _ = plan.append(sound[index as usize].1);
+            let _ = plan.append(valid[index as usize].1);
         }
         Ok(())
     }
 }
 
-/// (Geometric mean)² of the positive, finite values; NaN if there is none.
+/// The squared geometric mean of the positive, finite values; NaN if there is none.
 fn squared_geometric_mean(values: &[f32]) -> f32 {
     let logs = values.iter().filter(|v| v.is_finite() && **v > 0.0).map(|v| f64::from(*v).ln());
     let (count, sum) = logs.fold((0.0, 0.0), |(count, sum), log| (count + 1.0, sum + log));

@@ -1,4 +1,4 @@
-//! How a candidate grows: a clone, shifted or not, or a split.
+//! The children of a candidate: a clone, shifted or not, or a split.
 
 use super::{CloneOpacity, Diet, DietParams, MEAN_GRADIENT, Shift, Split};
 use crate::adc::{clone_at, split_by, split_long_axis};
@@ -6,7 +6,7 @@ use crate::plan::{Offspring, OpacityRule, ParentFate, ScaleRule};
 use crate::policy::{PolicyError, Signal, Snapshot};
 
 impl Diet {
-    /// How a candidate grows.
+    /// The children of a candidate.
     pub(super) fn offspring(
         &self,
         now: &Snapshot<'_>,
@@ -47,19 +47,19 @@ impl Diet {
             Shift::Paper => 1.0,
             Shift::Code => read(Signal::VisibleCount)?.powi(-2),
             Shift::Descent => {
-                // A sum is no longer than the sum of lengths, but for rounding.
+                // The length of a sum is at most the sum of lengths, but for rounding.
                 let length = sum.iter().map(|v| v * v).sum::<f32>().sqrt();
-                let of_lengths = read(Signal::MeanGradientNorm)?.max(length);
-                -(self.params.kappa as f32) * read(Signal::ScaleMax)? / of_lengths
+                let lengths = read(Signal::MeanGradientNorm)?.max(length);
+                -(self.params.kappa as f32) * read(Signal::ScaleMax)? / lengths
             }
         };
         let shift = sum.map(|v| factor * v);
-        // 0/0 where no view has seen the row.
+        // 0/0 where no view saw the row.
         Ok(if shift.iter().all(|v| v.is_finite()) { shift } else { [0.0; 3] })
     }
 }
 
-/// The factor by which two Gaussians of opacity 1 − √(1 − o) must shrink to render like one of
+/// The factor on the scales of two Gaussians of opacity 1 − √(1 − o) that together render like one of
 /// opacity o (Kheradmand et al. 2024, equation 9, for N = 2).
 pub(super) fn conserving_scale(opacity: f32) -> f32 {
     let shared = 1.0 - (1.0 - opacity).sqrt();

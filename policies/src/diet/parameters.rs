@@ -1,4 +1,4 @@
-//! The parameters of `diet`. Its manual page says what they mean.
+//! The parameters of `diet`, explained in its manual page.
 
 use std::ops::Bound::{Excluded, Included, Unbounded};
 
@@ -56,9 +56,9 @@ pub struct DietParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Growth {
-    /// As many as there is room for, and its part of `rho` · budget in exchange for victims.
+    /// As many as there is room for, and this event's part of `rho` · budget by eviction.
     Turnover,
-    /// As many as there are room and victims for.
+    /// As many as there is room for, and as many as there are other rows to evict.
     All,
 }
 
@@ -72,17 +72,17 @@ pub enum Split {
     LongAxis,
 }
 
-/// Where a clone stands.
+/// The offset of a clone from its parent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Shift {
-    /// Down the mean gradient, bounded by `kappa` standard deviations.
+    /// Down the mean gradient, by at most `kappa` standard deviations.
     Descent,
-    /// At the sum of the gradients.
+    /// The sum of the gradients.
     Paper,
-    /// At the mean gradient divided by the number of views.
+    /// The mean gradient divided by the number of views.
     Code,
-    /// Where its parent stands.
+    /// No offset.
     None,
 }
 
@@ -90,7 +90,7 @@ pub enum Shift {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CloneOpacity {
-    /// Parent and clone are as opaque as the parent was: together they are more so.
+    /// Parent and clone each keep the parent's opacity; together they are more opaque.
     Unchanged,
     /// Together they are as opaque as the parent was.
     Conserve,
@@ -110,7 +110,7 @@ pub enum Importance {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NewbornSize {
-    /// That of some pixels at the row's depth.
+    /// `size_pixels` pixels at the row's depth.
     Pixel,
     /// The square of the geometric mean of all sizes.
     Code,
@@ -125,14 +125,14 @@ impl Default for DietParams {
             tau: 3e-4,
             mixed_gradient: true,
             colour_weight: 30.0,
-            // Of 0, 0.37, 0.7, 0.8, 1 and 2: 2 costs room256 0.9 dB, and 1 starves scenes that are seen
-            // from all around.
+            // Tried: 0, 0.37, 0.7, 0.8, 1 and 2. 2 costs room256 0.9 dB, and with 1 too little grows in
+            // scenes seen from all around.
             full_depth: 0.8,
             growth: Growth::Turnover,
             rho: 0.25,
             small: 0.01,
-            // +0.2, +0.5, +0.6, +0.3, +1.3 and -0.1 dB in six pairs on four scenes, and a better SSIM in
-            // each.
+            // Against `Random`: +0.2, +0.5, +0.6, +0.3, +1.3 and -0.1 dB in six pairs of runs on four
+            // scenes, with a better SSIM in each.
             split: Split::LongAxis,
             split_factor: 1.6,
             split_share: 0.45,
@@ -180,13 +180,13 @@ impl DietParams {
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", self.max_scale, 0.0..)?;
         in_range("fresh_views", f64::from(self.fresh_views), 1.0..)?;
-        // `Signal::Age` goes no further.
+        // `Signal::Age` saturates there.
         in_range("protect", f64::from(self.protect), 0.0..=65_535.0)?;
         in_range("rho_c", self.rho_c, 0.0..)?;
         in_range("rows_per_candidate", f64::from(self.rows_per_candidate), 1.0..)?;
         in_range("min_alpha", self.min_alpha, 0.0..=1.0)?;
         in_range("size_pixels", self.size_pixels, (Excluded(0.0), Unbounded))?;
-        // As the f32 that the plan will check.
+        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
         let newborn_opacity = f64::from(self.newborn_opacity as f32);
         in_range("newborn_opacity", newborn_opacity, (Excluded(0.0), Excluded(1.0)))?;
         in_range("reinit_share", self.reinit_share, (Excluded(0.0), Included(1.0)))?;

@@ -1,45 +1,47 @@
-//! Re-initialisation: the whole model is replaced by points of the surfaces that the views show
-//! (*Mini-Splatting*, Fang and Wang 2024, "depth reinitialization", as the code of diet does it).
+//! Re-initialisation: the whole model is replaced by surface points seen in the training views.
+//!
+//! *Mini-Splatting*, Fang and Wang 2024, "depth reinitialization", as the published code of diet does
+//! it.
 
 use super::Diet;
-use super::shares::fraction;
+use super::quota::rows_of_share;
 use crate::neighbours::mean_square_distances;
 use crate::plan::{EditPlan, Reset, Seed};
 use crate::policy::{AuxRequest, Candidate, SceneInfo};
 
-/// Least root mean square distance that makes a size, in extents: nearer points are one sample of
-/// the surface (as at the start of training).
+/// Smallest size of a point, in extents: nearer points sample the surface at the same place (as in the
+/// initialisation).
 const LEAST_DISTANCE: f64 = 2e-4;
 /// Size of a point without neighbours, in extents.
 const LONE_SIZE: f64 = 0.02;
 
 impl Diet {
-    pub(super) fn replaces_at(&self, step: u32) -> bool {
+    /// Whether the model is replaced at `step`.
+    pub(super) fn is_reinit(&self, step: u32) -> bool {
         step > 0 && step == self.params.reinit_at
     }
 
-    /// What is to be measured in the views, if the model is ever replaced.
+    /// What to measure in the views, if the model is ever replaced.
     pub(super) fn surface_request(&self, scene: &SceneInfo) -> Option<AuxRequest> {
-        let most = fraction(self.params.reinit_share, scene.budget);
+        let most = rows_of_share(self.params.reinit_share, scene.budget);
         let per_view = (most / scene.train_views.max(1) as usize).max(1);
         let points = u32::try_from(per_view).unwrap_or(u32::MAX);
         (self.params.reinit_at > 0).then(|| AuxRequest { points, ..AuxRequest::default() })
     }
 
-    /// Prunes all rows and appends the surface points in their place. Without a point the model
-    /// stays.
-    pub(super) fn replace(&mut self, extent: f32, plan: &mut EditPlan) {
+    /// Prunes all rows and appends the surface points instead. Without any point the model is kept.
+    pub(super) fn reinit(&mut self, extent: f32, plan: &mut EditPlan) {
         let opacity = self.params.newborn_opacity as f32;
         let seed = |candidate: &Candidate| Seed {
             position: candidate.position,
             colour: candidate.colour,
-            // Any size will do until the neighbours are known.
+            // A valid size until the neighbours are known.
             scale: 1.0,
             opacity,
         };
         let surface = std::mem::take(&mut self.surface);
         let mut seeds: Vec<Seed> = surface.iter().map(seed).filter(Seed::is_valid).collect();
-        seeds.truncate(fraction(self.params.reinit_share, plan.budget()));
+        seeds.truncate(rows_of_share(self.params.reinit_share, plan.budget()));
         if seeds.is_empty() {
             return;
         }
@@ -52,10 +54,7 @@ impl Diet {
             seed.scale = size as f32;
         }
         plan.cause("reinit");
-        for row in 0..plan.rows() as u32 {
-            // Never refused: each row once, and it exists.
-            let _ = plan.prune(row);
-        }
+        plan.prune_all(0..plan.rows() as u32);
         for seed in seeds {
             // A refusal is counted by the plan.
             let _ = plan.append(seed);

@@ -1,23 +1,18 @@
-//! The rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
+//! Tests of the rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
 
 use super::offspring::conserving_scale;
-use super::shares::fraction;
+use super::quota::rows_of_share;
 use super::*;
 use crate::adc::{clone_at, split_by, split_long_axis};
-use crate::event::{Event, Outcome, View};
+use crate::event::{Event, Outcome, View, build, due_steps};
 use crate::plan::{EditCounts, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
-use crate::registry::find;
-
-fn diet(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
-    find("diet").unwrap().build(&set.parse().unwrap(), scene).unwrap()
-}
 
 fn run(event: &Event, set: &str) -> Outcome {
-    event.run(&mut *diet(&event.scene, set)).unwrap()
+    event.run("diet", set)
 }
 
-/// Grown-up rows of opacity 0.5, seen by four views, of size 0.05: small, as the extent is 10.
+/// Old rows of opacity 0.5, seen by four views, of size 0.05: small, as the extent is 10.
 /// Row i has importance i/100.
 fn event(step: u32, rows: usize, budget: usize) -> Event {
     let importance: Vec<f32> = (0..rows).map(|row| row as f32 / 100.0).collect();
@@ -60,8 +55,8 @@ fn the_gradient_mixes_screen_and_colour() {
 }
 
 #[test]
-fn at_the_budget_a_tenth_is_exchanged() {
-    // Budget 20, so two victims: of rows 0, 1, 2, … the least important that are no candidates.
+fn at_the_budget_the_least_important_are_replaced() {
+    // A tenth of 20: two rows, the least important of rows 0, 1, 2, … that are no candidates.
     let event = event(600, 20, 20).with(Signal::ScreenGradient, &wanting(20, &[0, 2, 9, 12, 19]));
     let done = run(&event, "rho = 9.4");
     assert_eq!(done.pruned, [1, 3]);
@@ -76,11 +71,11 @@ fn at_the_budget_a_tenth_is_exchanged() {
 }
 
 #[test]
-fn all_events_together_exchange_the_share() {
+fn all_events_together_replace_the_share() {
     let window = Window { from: 500, until: 10_000, every: 100 };
-    let parts = |of: f64, window: Window, budget: usize| -> Vec<usize> {
+    let parts = |share: f64, window: Window, budget: usize| -> Vec<usize> {
         let steps = (1..=30_000).filter(|&step| window.is_due(step));
-        steps.map(|step| part(of, window, step, budget)).collect()
+        steps.map(|step| rows_of_event(share, window, step, budget)).collect()
     };
     let quarter = parts(0.25, window, 200_000);
     assert_eq!((quarter.len(), quarter.iter().sum()), (94, 50_000));
@@ -88,15 +83,15 @@ fn all_events_together_exchange_the_share() {
     // Less than one per event.
     assert_eq!(parts(0.25, window, 100).iter().sum::<usize>(), 25);
     // Products just below the integer that is meant.
-    assert_eq!((fraction(0.29, 100), fraction(0.1, 29)), (29, 2));
+    assert_eq!((rows_of_share(0.29, 100), rows_of_share(0.1, 29)), (29, 2));
     let once = Window { from: 500, until: 601, every: 100 };
     assert_eq!((parts(0.29, once, 100), parts(0.1, once, 29)), (vec![29], vec![2]));
-    assert_eq!(part(1.0, window, 650, 100), 0);
+    assert_eq!(rows_of_event(1.0, window, 650, 100), 0);
 }
 
 #[test]
 fn the_dead_and_the_room_come_first() {
-    // 19 rows, one dead, budget 20: room for 2, and 2 more for victims.
+    // 19 rows, one dead, budget 20: room for 2, and 2 more by eviction.
     let mut opacity = [0.5; 19];
     opacity[7] = 0.0049;
     let event = event(600, 19, 20)
@@ -107,20 +102,20 @@ fn the_dead_and_the_room_come_first() {
     assert_eq!(done.cloned, [14, 13, 12, 11]);
     assert_eq!(done.ops.counts.denied, 1);
     assert_eq!(done.ops.rows_after, 20);
-    // With room for all there is no victim.
+    // With room for all, none is evicted.
     let roomy = run(&Event { budget: 23, ..event }, "");
     assert_eq!((roomy.pruned, roomy.cloned.len()), (vec![7], 5));
 }
 
 #[test]
-fn huge_rows_live_unless_a_size_is_named() {
+fn huge_rows_are_kept_unless_a_size_limit_is_set() {
     let event = event(3000, 4, 100)
         .with(Signal::ScaleMax, &[0.05, 1.01, 1.0, 1.01])
         .with(Signal::ScreenGradient, &[0.0, 0.0, 9.0, 8.0]);
     let late = Event { step: 3100, ..event.clone() };
     let lives = run(&late, "");
     assert_eq!((lives.pruned, lives.split), (vec![], vec![2, 3]));
-    // With one they die after step 3000, at growth only.
+    // With one they are pruned after step 3000, at growth only.
     let named = "max_scale = 0.1";
     let early = run(&event, named);
     assert_eq!((early.pruned, early.split), (vec![], vec![2, 3]));
@@ -152,9 +147,9 @@ fn importance_may_be_that_of_fresh_views() {
 }
 
 #[test]
-fn fresh_views_are_wanted_where_victims_may_fall() {
+fn fresh_views_are_wanted_where_rows_may_be_evicted() {
     let scene = Event::new(1, 1, 100).scene;
-    let policy = diet(&scene, "importance = \"fresh\"\nrho_c = 0.45");
+    let policy = build("diet", "importance = \"fresh\"\nrho_c = 0.45", &scene);
     let wants = |step, rows| policy.wants_fresh(step, rows, 100);
     // Growth may double the rows.
     assert_eq!([50, 51, 100].map(|rows| wants(600, rows)), [false, true, true]);
@@ -162,15 +157,15 @@ fn fresh_views_are_wanted_where_victims_may_fall() {
     assert_eq!([95, 96, 100].map(|rows| wants(10_500, rows)), [false, true, true]);
     // Pruning is for models that are too large.
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
-    let both = diet(&scene, "importance = \"fresh\"\nrho_c = 1.4\ncompensate_from = 500");
+    let both = build("diet", "importance = \"fresh\"\nrho_c = 1.4\ncompensate_from = 500", &scene);
     assert_eq!([47, 48].map(|rows| both.wants_fresh(1000, rows, 100)), [false, true]);
-    // Where all rows are replaced nobody has to fall.
-    let replaces = diet(&scene, "importance = \"fresh\"\nreinit_at = 600");
+    // Where all rows are replaced, none is evicted.
+    let replaces = build("diet", "importance = \"fresh\"\nreinit_at = 600", &scene);
     assert!(!replaces.wants_fresh(600, 100, 100) && replaces.wants_fresh(700, 100, 100));
 }
 
 #[test]
-fn newborns_are_protected_for_an_epoch() {
+fn new_rows_are_protected_for_an_epoch() {
     let mut age = [1000.0; 20];
     age[..5].copy_from_slice(&[0.0, 99.0, 100.0, 29.0, 30.0]);
     let mut event = event(600, 20, 20)
@@ -185,8 +180,8 @@ fn newborns_are_protected_for_an_epoch() {
 }
 
 #[test]
-fn where_all_are_newborn_the_oldest_fall() {
-    // One grown-up, three wanted: the grown-up first, then ages 60, 60 by importance.
+fn where_all_are_new_the_oldest_are_evicted() {
+    // One is old, three are needed: the old one first, then ages 60, 60 by importance.
     let event = event(600, 6, 6)
         .with(Signal::ScreenGradient, &wanting(6, &[5]))
         .with(Signal::Age, &[10.0, 60.0, 60.0, 59.0, 200.0, 0.0]);
@@ -288,8 +283,8 @@ fn a_model_too_large_is_cut_to_the_budget() {
 }
 
 #[test]
-fn what_goes_for_the_budget_does_not_grow() {
-    // Two of six rows are too many; candidate 0 is one of them, so one victim is enough.
+fn rows_pruned_for_the_budget_do_not_grow() {
+    // Two of six rows are too many; candidate 0 is one of them, so one eviction is enough.
     let event = event(600, 6, 4).with(Signal::ScreenGradient, &wanting(6, &[0, 5]));
     let done = run(&event, "rho = 47");
     assert_eq!(done.pruned, [0, 1, 2]);
@@ -298,7 +293,7 @@ fn what_goes_for_the_budget_does_not_grow() {
 
 #[test]
 fn the_worst_pixels_become_rows() {
-    // Budget 40: two rows per insertion. 39 rows: one victim.
+    // Budget 40: two rows per insertion. 39 rows: one is evicted.
     let mut event = event(10_500, 39, 40);
     event.candidates = vec![candidate(0.1, 0.01), candidate(0.3, 0.02), candidate(0.2, 0.03)];
     let done = run(&event, "rho_c = 0.45");
@@ -322,7 +317,7 @@ fn the_worst_pixels_become_rows() {
 }
 
 #[test]
-fn nobody_dies_for_a_pixel_without_a_point() {
+fn no_row_is_evicted_for_a_pixel_without_a_point() {
     let mut event = event(10_500, 40, 40);
     let nowhere = Candidate { position: [f32::NAN; 3], ..candidate(0.9, 0.01) };
     event.candidates = vec![nowhere, candidate(0.1, 0.0), candidate(0.2, 0.01)];
@@ -355,10 +350,8 @@ fn growth_pruning_and_insertion_can_fall_on_one_step() {
 
 #[test]
 fn windows_are_those_of_the_paper() {
-    let scene = Event::new(1, 1, 1).scene;
-    let due = |set: &str, iterations: u32| -> Vec<u32> {
-        let policy = diet(&SceneInfo { iterations, ..scene.clone() }, set);
-        (0..=iterations).filter(|&step| policy.is_due(step)).collect()
+    let due = |set: &str, iterations: u32| {
+        due_steps("diet", set, &SceneInfo { iterations, ..Event::new(1, 1, 1).scene })
     };
     let grow = due("prune_every = 0\ninsert_every = 0", 30_000);
     assert_eq!((grow.len(), grow[0], grow.last()), (94, 600, Some(&9900)));
@@ -375,9 +368,9 @@ fn windows_are_those_of_the_paper() {
 fn only_what_is_used_is_asked_for() {
     let mut scene = Event::new(1, 1, 1).scene;
     scene.budget = 30_000;
-    let needs = |set: &str| diet(&scene, set).needs(&scene);
+    let needs = |set: &str| build("diet", set, &scene).needs(&scene);
     let full = needs("");
-    assert_eq!(full.signals.iter().count(), 11);
+    assert_eq!(full.signals.count(), 11);
     assert!(full.signals.contains(Signal::MeanGradientNorm) && full.signals.contains(Signal::Age));
     let request = full.candidates.unwrap();
     // 500 steps of 30,000/3000 pixels.
@@ -403,7 +396,7 @@ fn only_what_is_used_is_asked_for() {
     assert_eq!(fresh(&needs("importance = \"fresh\"\nfresh_views = 7")), (7, true));
     // Views are no steps: a shorter run renders as many.
     let short = SceneInfo { iterations: 3000, ..scene.clone() };
-    assert_eq!(fresh(&diet(&short, "importance = \"fresh\"").needs(&short)), (100, true));
+    assert_eq!(fresh(&build("diet", "importance = \"fresh\"", &short).needs(&short)), (100, true));
     assert!(!needs("shift = \"paper\"").signals.contains(Signal::MeanGradientNorm));
     let switched =
         needs("error = \"grad\"\ndepth = \"median\"\nnms = false\nrows_per_candidate = 1");
@@ -412,45 +405,6 @@ fn only_what_is_used_is_asked_for() {
     assert_eq!((request.spaced, request.capacity), (false, 30_000));
     assert_eq!(needs("error = \"l1\"").candidates.unwrap().error, ErrorMode::L1);
     assert_eq!(needs("compensate_until = 10000").candidates, None);
-}
-
-#[test]
-fn ranges_are_checked_and_what_is_missing_is_said() {
-    let scene = Event::new(1, 1, 1).scene;
-    let refused = |set: &str| match find("diet").unwrap().build(&set.parse().unwrap(), &scene) {
-        Err(PolicyError::BadParameter { policy, parameter, reason }) => {
-            assert_eq!(
-                (policy.as_str(), parameter.as_str()),
-                ("diet", set.split(' ').next().unwrap())
-            );
-            reason
-        }
-        other => panic!("{set}: {:?}", other.err()),
-    };
-    for set in [
-        "tau = -1",
-        "colour_weight = inf",
-        "rho = -0.1",
-        "small = -0.1",
-        "split_factor = 0",
-        "kappa = -0.1",
-        "min_opacity = -1",
-        "max_scale = -0.1",
-        "protect = 65536",
-        "fresh_views = 0",
-        "importance = \"views\"",
-        "rho_c = inf",
-        "rows_per_candidate = 0",
-        "min_alpha = 1.5",
-        "size_pixels = 0",
-        "newborn_opacity = 1",
-        "growth = \"some\"",
-        "shift = \"up\"",
-        "error = \"l2\"",
-        "nms = 1",
-    ] {
-        refused(set);
-    }
 }
 
 /// A view that shows surface points in a row, one unit apart from `from` on.
@@ -466,7 +420,7 @@ fn the_model_is_replaced_by_surface_points() {
     let mut event = event(5000, 9, 10);
     event.scene.train_views = 2;
     event.views = vec![surface(0.0, 9), surface(100.0, 9)];
-    let policy = diet(&event.scene, "reinit_at = 5000");
+    let policy = build("diet", "reinit_at = 5000", &event.scene);
     assert_eq!(policy.needs(&event.scene).aux.unwrap().points, 4);
     assert_eq!([policy.aux_views(5000, 9, 10), policy.aux_views(5100, 9, 10)], [u32::MAX, 0]);
     let done = run(&event, "reinit_at = 5000");
@@ -490,7 +444,7 @@ fn the_model_is_replaced_by_surface_points() {
     assert!(run(&Event { step: 5050, ..event.clone() }, "reinit_at = 5000").ops.is_empty());
     event.views.clear();
     assert!(run(&event, "reinit_at = 5000").ops.is_empty());
-    assert!(diet(&event.scene, "").needs(&event.scene).aux.is_none());
+    assert!(build("diet", "", &event.scene).needs(&event.scene).aux.is_none());
 }
 
 #[test]
@@ -515,7 +469,7 @@ fn every_ingredient_can_be_switched_off() {
         .with(Signal::ScreenGradient, &wanting(20, &[18, 19]))
         .with_all(Signal::MeanGradientX, 1.0)
         .with_all(Signal::MeanGradientNorm, 1.0);
-    // Row 17 grows for its colour; the least important row is newborn.
+    // Row 17 grows for its colour; the least important row is new.
     let mut colour = [0.0; 20];
     colour[17] = 1.0;
     let mut age = [1000.0; 20];
@@ -539,9 +493,9 @@ fn every_ingredient_can_be_switched_off() {
         (&inserting, "newborn_size = \"code\""),
     ];
     let outcome = |event: &Event, set: &str| {
-        let mut policy = diet(&event.scene, set);
+        let mut policy = build("diet", set, &event.scene);
         let needs = policy.needs(&event.scene);
-        (event.run(&mut *policy).unwrap().ops, needs)
+        (event.run_policy(&mut *policy).unwrap().ops, needs)
     };
     for (event, off) in switches {
         let (name, _) = off.split_once(' ').expect("a name");

@@ -1,4 +1,4 @@
-//! The parameters of `igs`. Its manual page says what they mean.
+//! The parameters of `igs`, explained in its manual page.
 
 use std::ops::Bound::{Excluded, Included, Unbounded};
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::parameters::in_range;
 use crate::policy::PolicyError;
 
-/// Parameters of [`Igs`](super::Igs); its manual page says what they mean.
+/// Parameters of [`Igs`](super::Igs).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 #[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
@@ -76,16 +76,16 @@ impl IgsParams {
     pub(super) fn check(&self) -> Result<(), PolicyError> {
         let positive = (Excluded(0.0), Unbounded);
         let inside = (Excluded(0.0), Excluded(1.0));
-        // As the f32 that the plan will check.
-        let unit = |value: f64| f64::from(value as f32);
+        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
+        let rounded = |value: f64| f64::from(value as f32);
         in_range("tau", self.tau, 0.0..)?;
         in_range("views", self.views.into(), 1.0..)?;
-        in_range("split_share", unit(self.split_share), inside)?;
-        in_range("child_opacity", unit(self.child_opacity), (Excluded(0.0), Included(1.0)))?;
+        in_range("split_share", rounded(self.split_share), inside)?;
+        in_range("child_opacity", rounded(self.child_opacity), (Excluded(0.0), Included(1.0)))?;
         in_range("final_divisor", self.final_divisor, 1.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("first_prune_opacity", self.first_prune_opacity, 0.0..=1.0)?;
-        in_range("reset_opacity", unit(self.reset_opacity), inside)?;
+        in_range("reset_opacity", rounded(self.reset_opacity), inside)?;
         in_range("recover", self.recover.into(), 1.0..)?;
         in_range("recovery_share", self.recovery_share, 0.0..=1.0)?;
         in_range("sum", self.sum.into(), 1.0..=1000.0)?;

@@ -1,15 +1,10 @@
-//! The rules of `igs`, each worked out by hand.
+//! Tests of the rules of `igs`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome, View};
-use crate::registry::find;
-
-fn igs(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
-    find("igs").unwrap().build(&set.parse().unwrap(), scene).unwrap()
-}
+use crate::event::{Event, Outcome, View, build, due_steps};
 
 fn run(event: &Event, set: &str) -> Outcome {
-    event.run(&mut *igs(&event.scene, set)).unwrap()
+    event.run("igs", set)
 }
 
 /// Rows of opacity 0.5, seen by four views with a mean absolute gradient of 1, with these edge sums
@@ -25,12 +20,6 @@ fn event(step: u32, edges: &[f32], budget: usize) -> Event {
 
 fn view(edges: &[f32]) -> View {
     View { columns: vec![(AuxColumn::MapSum, edges.to_vec())], ..View::default() }
-}
-
-fn steps(set: &str, iterations: u32, holds: impl Fn(&dyn DensityPolicy, u32) -> bool) -> Vec<u32> {
-    let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
-    let policy = igs(&scene, set);
-    (0..=iterations).filter(|&step| holds(&*policy, step)).collect()
 }
 
 #[test]
@@ -49,7 +38,7 @@ fn growth_follows_the_square_root() {
 }
 
 #[test]
-fn only_the_eligible_with_edges_grow() {
+fn only_candidates_with_edges_are_split() {
     // Means 3.0e-4 (just enough), 2.9e-4, large, large without edges.
     let event = event(14_400, &[1.0, 5.0, 1.0, 0.0], 100)
         .with(Signal::ScreenGradientAbs, &[12.01e-4, 11.6e-4, 1.0, 1.0]);
@@ -71,7 +60,7 @@ fn rows_are_halved_along_their_longest_axis() {
 }
 
 #[test]
-fn each_view_counts_alike() {
+fn each_view_has_the_same_weight() {
     // View 1: mean of 1 and 3 is 2: 0.5, 1.5, 0. View 2, a hundred times brighter: 0, 0.5, 1.5.
     let mut score = EdgeScore::default();
     score.add(7, &[1.0, 3.0, 0.0]);
@@ -95,21 +84,21 @@ fn draws_follow_the_edges() {
 }
 
 #[test]
-fn the_faint_are_pruned_at_each_event_and_earlier_at_step_300() {
+fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
     let event = event(300, &[1.0; 4], 100).with(Signal::Opacity, &[0.0199, 0.02, 0.004, f32::NAN]);
     let first = run(&event, "");
     assert_eq!((first.pruned, first.ops.cause.as_str()), (vec![0, 2, 3], "first-prune"));
     assert!(first.split.is_empty() && !first.ops.reset_signals);
     let growing = run(&Event { step: 600, ..event.clone() }, "");
     assert_eq!(growing.pruned, [2, 3]);
-    // Who is pruned is not drawn.
+    // Pruned rows are not drawn.
     assert_eq!((growing.split.len(), growing.ops.counts.denied), (2, 0));
     let all = event.with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
     assert_eq!(run(&all, "").pruned, [0, 2, 3]);
 }
 
 #[test]
-fn a_fifth_falls_after_each_reset() {
+fn a_fifth_is_pruned_after_each_reset() {
     let opacity = [0.5, 0.01, 0.4, 0.3, 0.02, 0.2, 0.9, 0.03, 0.8, 0.7];
     let event = event(3300, &[1.0; 10], 10).with(Signal::Opacity, &opacity);
     let done = run(&event, "");
@@ -129,28 +118,27 @@ fn a_fifth_falls_after_each_reset() {
 fn opacities_are_reset_twice() {
     let at = |step| run(&event(step, &[1.0], 10), "").ops.clamp_opacity;
     assert_eq!([at(3000), at(6000), at(9000), at(3100)], [Some(0.05), Some(0.05), None, None]);
-    let grow_free = "grow_every = 0\nfirst_prune_at = 0";
-    let due = |set: &str| steps(&format!("{grow_free}\n{set}"), 30_000, |p, step| p.is_due(step));
-    assert_eq!(due(""), [3000, 3300, 6000, 6300]);
-    assert_eq!(due("resets = 9"), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
-    assert_eq!(due("recovery_share = 0"), [3000, 6000]);
-    assert_eq!(due("reset_every = 0"), [0; 0]);
-    // Recovery comes before the next reset: at most half the interval.
-    let short = steps(grow_free, 600, |p, step| p.is_due(step));
-    assert_eq!(short, [100, 150, 200, 250]);
+    let scene = Event::new(1, 1, 1).scene;
+    let due = |set: &str, scene| {
+        due_steps("igs", &format!("grow_every = 0\nfirst_prune_at = 0\n{set}"), scene)
+    };
+    assert_eq!(due("", &scene), [3000, 3300, 6000, 6300]);
+    assert_eq!(due("resets = 9", &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
+    assert_eq!(due("recovery_share = 0", &scene), [3000, 6000]);
+    assert_eq!(due("reset_every = 0", &scene), [0; 0]);
+    // The recovery prune comes before the next reset: after at most half the interval.
+    let short = SceneInfo { iterations: 600, ..scene };
+    assert_eq!(due("", &short), [100, 150, 200, 250]);
 }
 
 #[test]
-fn events_are_those_of_the_code() {
-    let due = steps("reset_every = 0", 30_000, |p, step| p.is_due(step));
-    assert_eq!((due[0], due[1], due.last(), due.len()), (300, 600, Some(&14_900), 145));
-}
-
-#[test]
-fn all_views_after_a_recovery_prune() {
-    let views = |wanted| steps("", 30_000, move |p, step| p.aux_views(step, 1, 9) == wanted);
+fn all_views_are_rendered_after_a_recovery_prune() {
+    let policy = build("igs", "", &Event::new(1, 1, 1).scene);
+    let views = |count: u32| -> Vec<u32> {
+        (0..=30_000).filter(|&step| policy.aux_views(step, 1, 9) == count).collect()
+    };
     assert_eq!(views(u32::MAX), [3400, 6400]);
-    // 600..14,400 but for these two.
+    // 600..14,400 except these two.
     let some = views(10);
     assert_eq!((some.len(), some[0], some.last()), (137, 600, Some(&14_400)));
 }
@@ -158,40 +146,17 @@ fn all_views_after_a_recovery_prune() {
 #[test]
 fn the_optimiser_steps_less_often_towards_the_end() {
     let scene = Event::new(1, 1, 1).scene;
-    let policy = igs(&scene, "");
+    let policy = build("igs", "", &scene);
     let all = |step| policy.cadence(step).all;
     assert_eq!([all(1), all(15_000), all(15_001), all(22_500)], [1, 1, 5, 5]);
     assert_eq!([all(22_501), all(30_000)], [20, 20]);
     let needs = policy.needs(&scene);
     assert_eq!(needs.cadence, Cadence { all: 20, sh_rest: 1 });
+    let rates = "mean_start = 0.5\nmean_end = 0.25\nsh_rest = 0.125";
     assert_eq!(
-        needs.rates,
-        RateOverrides { mean_start: Some(4e-5), mean_end: Some(2e-6), sh_rest: Some(2.5e-4) }
+        build("igs", rates, &scene).needs(&scene).rates,
+        RateOverrides { mean_start: Some(0.5), mean_end: Some(0.25), sh_rest: Some(0.125) }
     );
-    let plain = igs(&scene, "sum = 1\nsum_more = 1");
+    let plain = build("igs", "sum = 1\nsum_more = 1", &scene);
     assert_eq!(plain.needs(&scene).cadence, Cadence::default());
-}
-
-#[test]
-fn ranges_are_checked() {
-    let scene = Event::new(1, 1, 1).scene;
-    for set in [
-        "tau = -1",
-        "views = 0",
-        "split_share = 1",
-        "child_opacity = 0",
-        "final_divisor = 0.5",
-        "recovery_share = 1.5",
-        "recover = 0",
-        "reset_opacity = 0",
-        "sum = 0",
-        "mean_start = 0",
-    ] {
-        match find("igs").unwrap().build(&set.parse().unwrap(), &scene) {
-            Err(PolicyError::BadParameter { parameter, .. }) => {
-                assert_eq!(parameter, set.split(' ').next().unwrap());
-            }
-            other => panic!("{set}: {:?}", other.err()),
-        }
-    }
 }

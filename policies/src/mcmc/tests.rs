@@ -1,23 +1,18 @@
-//! The rules of `mcmc`, each worked out by hand.
+//! Tests of the rules of `mcmc`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome};
+use crate::event::{Event, Outcome, build};
 use crate::plan::EditCounts;
-use crate::registry::find;
-
-fn mcmc(scene: &SceneInfo, set: &str) -> Box<dyn DensityPolicy> {
-    find("mcmc").unwrap().build(&set.parse().unwrap(), scene).unwrap()
-}
 
 fn run(event: &Event, set: &str) -> Outcome {
-    event.run(&mut *mcmc(&event.scene, set)).unwrap()
+    event.run("mcmc", set)
 }
 
 fn event(opacity: &[f32], budget: usize) -> Event {
     Event::new(600, opacity.len(), budget).with(Signal::Opacity, opacity)
 }
 
-/// The double sum of the paper as printed.
+/// The double sum of the paper, as printed.
 fn denominator(share: f64, members: u32) -> f64 {
     let binomial =
         |n: u32, k: u32| (0..k).fold(1.0, |c, i| c * f64::from(n - i) / f64::from(i + 1));
@@ -60,7 +55,7 @@ fn two_shares_by_hand() {
 }
 
 #[test]
-fn the_dead_are_relocated_to_the_only_living() {
+fn the_dead_are_relocated_to_the_only_living_row() {
     let done = run(&event(&[0.005, 0.5, f32::NAN, 0.001], 4), "");
     // Three copies of row 1, in the slots of the dead.
     assert_eq!((done.pruned, done.split), (vec![0, 2, 3], vec![1]));
@@ -93,7 +88,7 @@ fn growth_is_five_percent_up_to_the_budget() {
     // A model that is too large loses its dead, and gets nothing for them.
     let over = run(&event(&[0.001, 0.5, 0.5, 0.001], 2), "");
     assert_eq!((over.pruned, over.ops.rows_after), (vec![0, 3], 2));
-    // Nobody is drawn in vain.
+    // No copy is drawn that has no room.
     assert_eq!(over.ops.counts.denied, 0);
 }
 
@@ -103,8 +98,8 @@ fn the_opaque_are_drawn_more_often() {
     let done = run(&event(&opacity, 4000), "growth = 1.0");
     let (mut faint, mut strong) = (0, 0);
     for family in &done.ops.families {
-        let of = if family.parent % 2 == 0 { &mut faint } else { &mut strong };
-        *of += family.offspring.children;
+        let copies = if family.parent % 2 == 0 { &mut faint } else { &mut strong };
+        *copies += family.offspring.children;
     }
     assert_eq!(faint + strong, 2000);
     // 400 of 2000, within five standard deviations (18 each).
@@ -130,20 +125,12 @@ fn without_the_living_nothing_is_done() {
 }
 
 #[test]
-fn the_window_is_that_of_the_paper() {
-    let scene = Event::new(1, 1, 1).scene;
-    let policy = mcmc(&scene, "");
-    let due: Vec<u32> = (0..=30_000).filter(|&step| policy.is_due(step)).collect();
-    assert_eq!((due.len(), due[0], due.last()), (244, 600, Some(&24_900)));
-}
-
-#[test]
 fn terms_and_noise_are_declared_in_the_unit_of_the_cameras() {
     let scene = Event::new(1, 1, 1).scene;
     let close = |a: f32, b: f32| (a / b - 1.0).abs() < 1e-5;
     for extent in [1.1, 11.0] {
         let scene = SceneInfo { extent, ..scene.clone() };
-        let needs = mcmc(&scene, "").needs(&scene);
+        let needs = build("mcmc", "", &scene).needs(&scene);
         let radius = extent / 1.1;
         assert_eq!(needs.check(), Ok(()));
         assert!(close(needs.loss_terms.opacity, 0.01));
@@ -152,30 +139,8 @@ fn terms_and_noise_are_declared_in_the_unit_of_the_cameras() {
         assert!(close(noise.strength * radius * radius, 5e5));
         assert!(close(noise.sharpness, 100.0) && close(noise.opacity, 0.005));
         assert_eq!(needs.start, StartRule { opacity: Some(0.5), scale: 0.1 });
-        assert_eq!(needs.signals, SignalSet::of(&[Signal::Opacity]));
+        assert_eq!(needs.signals, SignalSet::from([Signal::Opacity]));
     }
-    let off = mcmc(&scene, "noise = 0\nopacity_term = 0\nscale_term = 0").needs(&scene);
+    let off = build("mcmc", "noise = 0\nopacity_term = 0\nscale_term = 0", &scene).needs(&scene);
     assert!(off.noise.is_none() && off.loss_terms.is_none());
-}
-
-#[test]
-fn ranges_are_checked() {
-    let scene = Event::new(1, 1, 1).scene;
-    for set in [
-        "min_opacity = 0",
-        "growth = -0.1",
-        "most_shares = 1",
-        "most_shares = 52",
-        "noise = -1",
-        "start_opacity = 1",
-        "start_scale = 0",
-        "opacity_term = inf",
-    ] {
-        match find("mcmc").unwrap().build(&set.parse().unwrap(), &scene) {
-            Err(PolicyError::BadParameter { parameter, .. }) => {
-                assert_eq!(parameter, set.split(' ').next().unwrap());
-            }
-            other => panic!("{set}: {:?}", other.err()),
-        }
-    }
 }

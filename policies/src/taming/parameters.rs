@@ -1,4 +1,4 @@
-//! The parameters of `taming`. Its manual page says what they mean.
+//! The parameters of `taming`, explained in its manual page.
 
 use serde::{Deserialize, Serialize};
 
@@ -39,13 +39,13 @@ pub struct TamingParams {
     pub sh_rest: f64,
 }
 
-/// Among whom the rows to prune are drawn.
+/// Which rows the prune draws from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PruneDraw {
     /// The dead, by their own scores.
     Candidates,
-    /// All rows, by scores that belong to other rows; of those drawn only the dead are pruned.
+    /// All rows, by scores that belong to other rows; of those drawn, the dead are pruned.
     Published,
 }
 
@@ -87,7 +87,7 @@ impl Default for TamingParams {
 }
 
 impl TamingParams {
-    /// All weights by name.
+    /// All weights, by name.
     pub(super) fn weights(&self) -> [(&'static str, f64); 11] {
         [
             ("error_weight", self.error_weight),

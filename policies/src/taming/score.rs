@@ -1,31 +1,22 @@
-//! The score of `taming`: how much a row matters where the views are badly explained.
+//! The score of `taming`: how much a row matters in badly rendered views.
 //!
-//! Terms of the row itself (gradient, opacity, size) are the same in all views, so that of each view
-//! only Σ 50·L over those that show the row is kept for them.
+//! The terms of the row itself (gradient, opacity, size) are the same in all views, so only their
+//! common factor is summed over views: Σ 50·L over those that show the row.
 
 use super::TamingParams;
 use crate::policy::{AuxColumn, AuxView, PolicyError, Signal, Snapshot};
 
-/// What is measured in each view.
-pub(super) const COLUMNS: [AuxColumn; 6] = [
-    AuxColumn::MapSum,
-    AuxColumn::PixelCount,
-    AuxColumn::WeightSum,
-    AuxColumn::DistanceSum,
-    AuxColumn::Depth,
-    AuxColumn::Radius,
-];
-/// Factor of a view's loss in the published code. Only the 10⁻⁶ of pruning knows of it.
+/// Factor on a view's loss in the published code. It matters only beside the 10⁻⁶ of pruning.
 const VIEW_WEIGHT: f32 = 50.0;
 
-/// Sums over the views of the event at hand. Shape: `[rows]` each.
+/// Sums over the views of the current event. Shape: `[rows]` each.
 #[derive(Debug, Default)]
 pub(super) struct Score {
     step: u32,
     /// Σ 50·L·(terms of the view).
-    of_views: Vec<f32>,
+    view_terms: Vec<f32>,
     /// Σ 50·L.
-    losses: Vec<f32>,
+    loss_sums: Vec<f32>,
 }
 
 impl Score {
@@ -35,9 +26,9 @@ impl Score {
         view: &AuxView<'_>,
         params: &TamingParams,
     ) -> Result<(), PolicyError> {
-        if self.step != view.step || self.losses.len() != view.rows {
+        if self.step != view.step || self.loss_sums.len() != view.rows {
             let zeros = vec![0.0; view.rows];
-            *self = Self { step: view.step, of_views: zeros.clone(), losses: zeros };
+            *self = Self { step: view.step, view_terms: zeros.clone(), loss_sums: zeros };
         }
         let terms = [
             (params.depth_weight, AuxColumn::Depth),
@@ -53,32 +44,32 @@ impl Score {
         }
         let weight = VIEW_WEIGHT * view.loss;
         let shown = view.column(AuxColumn::Radius)?.iter().map(|radius| *radius > 0.0);
-        let scores = self.of_views.iter_mut().zip(&mut self.losses);
-        for ((is_shown, sum), (of_views, losses)) in shown.zip(sum).zip(scores) {
+        let scores = self.view_terms.iter_mut().zip(&mut self.loss_sums);
+        for ((is_shown, sum), (terms, losses)) in shown.zip(sum).zip(scores) {
             if is_shown {
-                *of_views += weight * sum;
+                *terms += weight * sum;
                 *losses += weight;
             }
         }
         Ok(())
     }
 
-    /// The score of every row; 0 where no view was added at this step.
+    /// The score of every row; 0 if no view was added at this step.
     pub(super) fn total(
         self,
         now: &Snapshot<'_>,
         gradient: &[f32],
         params: &TamingParams,
     ) -> Result<Vec<f32>, PolicyError> {
-        if self.step != now.step || self.losses.len() != now.rows() {
+        if self.step != now.step || self.loss_sums.len() != now.rows() {
             return Ok(vec![0.0; now.rows()]);
         }
         let mut own = vec![0.0; now.rows()];
         add_term(&mut own, params.gradient_weight as f32, gradient);
         add_term(&mut own, params.opacity_weight as f32, now.signal(Signal::Opacity)?);
         add_term(&mut own, params.scale_weight as f32, now.signal(Signal::ScaleProduct)?);
-        let parts = self.of_views.iter().zip(&self.losses).zip(own);
-        Ok(parts.map(|((of_views, losses), own)| of_views + losses * own).collect())
+        let parts = self.view_terms.iter().zip(&self.loss_sums).zip(own);
+        Ok(parts.map(|((terms, losses), own)| terms + losses * own).collect())
     }
 }
 

@@ -31,7 +31,7 @@ impl CpuBackend {
 
 #[cfg(test)]
 mod tests {
-    use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
+    use densify_policies::policy::{Cadence, Needs, Signal};
     use densify_policies::rng::{PolicyRng, Purpose};
     use glam::{DMat3, DVec3};
 
@@ -77,7 +77,7 @@ mod tests {
     }
 
     fn backend(signals: &[Signal], tile_cap: usize) -> (CpuBackend, Needs) {
-        let needs = Needs { signals: SignalSet::of(signals), ..Needs::default() };
+        let needs = Needs { signals: signals.iter().copied().collect(), ..Needs::default() };
         let options = CpuOptions { tile_cap, needs: needs.clone(), ..CpuOptions::new(ROWS + 9) };
         (CpuBackend::new(&model(), &options).unwrap(), needs)
     }

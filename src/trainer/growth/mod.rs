@@ -60,7 +60,7 @@ const HIDDEN: f32 = -13.8;
 /// The signals that the limit needs of a backend, beside the policy's.
 #[must_use]
 pub fn signals() -> SignalSet {
-    SignalSet::of(&[Signal::WeightMax])
+    SignalSet::from([Signal::WeightMax])
 }
 
 /// A limit that rises while rows pay.

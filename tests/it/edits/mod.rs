@@ -47,7 +47,7 @@ fn away() -> Camera {
 }
 
 fn needs() -> Needs {
-    let signals = SignalSet::of(&SIGNALS);
+    let signals = SignalSet::from(SIGNALS);
     Needs { signals, ..Needs::default() }
 }
 

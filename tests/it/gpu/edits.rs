@@ -82,7 +82,7 @@ fn an_edit_does_what_it_does_natively() {
     let camera = scenes::camera(40, 40, 71);
     let model = scenes::cloud(ROWS, 1, &camera, 72);
     let signals =
-        SignalSet::of(&[Signal::VisibleCount, Signal::WeightMax, Signal::Age, Signal::PixelCount]);
+        SignalSet::from([Signal::VisibleCount, Signal::WeightMax, Signal::Age, Signal::PixelCount]);
     let needs = Needs { signals, cadence: Cadence { all: 1, sh_rest: 3 }, ..Needs::default() };
     for device in subjects() {
         let mut table = Table::new("edits, GPU against CPU");

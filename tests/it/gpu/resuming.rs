@@ -16,7 +16,7 @@ const BEFORE: u32 = 7;
 fn needs() -> Needs {
     let signals = [Signal::VisibleCount, Signal::ScreenGradient, Signal::WeightMax, Signal::Age];
     Needs {
-        signals: SignalSet::of(&signals),
+        signals: SignalSet::from(signals),
         cadence: CADENCE,
         loss_terms: LossTerms { opacity: 0.01, scale: 0.0 },
         candidates: Some(CandidateRequest {

@@ -77,10 +77,10 @@ fn compare_models(table: &mut Table, what: &str, found: &Gaussians, expected: &G
 fn steps_are_those_of_the_native_backend() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
-    let all = SignalSet::of(&Signal::ALL);
+    let all = SignalSet::from(Signal::ALL);
     // Half of the rows are nearer.
     let full_depth = 3.5;
-    let some = SignalSet::of(&[Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
+    let some = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
     let noise = NoiseTerm { strength: 5e3, sharpness: 100.0, opacity: 0.3 };
     let runs = [
         ("plain", Needs::default(), Cadence::default()),

@@ -43,7 +43,10 @@ fn it_is_listed_and_explained() {
     }
     let (code, said) = densify(&["policies", "steady"]);
     assert_eq!(code, Some(0));
-    assert!(said.contains("drop the faint") && said.contains("steady.grow_every=100"), "{said}");
+    assert!(
+        said.contains("prune the faintest") && said.contains("steady.grow_every=100"),
+        "{said}"
+    );
 }
 
 #[test]

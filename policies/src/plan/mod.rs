@@ -1,9 +1,9 @@
-//! Edits as data: the only way to change the number of rows.
+//! The edits of a policy as data: the only way to change the number of rows.
 //!
 //! A policy writes into an [`EditPlan`]; the plan compiles to [`RowOps`]; a backend applies them.
-//! The plan keeps its invariants on every call, so that a plan over budget cannot be expressed:
-//! each row has one fate, and the number of rows after the edit, and at every instant of it, is at
-//! most the budget. A refused call changes nothing, returns why, and is counted.
+//! Every call keeps the invariants, so a plan over budget cannot be expressed: each row has at most
+//! one edit, and the number of rows never exceeds the budget, not even during the edit. A refused
+//! call changes nothing, returns the reason, and is counted.
 
 use crate::edit::in_open_unit;
 pub use crate::edit::{
@@ -11,14 +11,14 @@ pub use crate::edit::{
 };
 pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
 
-/// Why a plan refused an edit. A value, never a panic; each refusal is counted.
+/// Why a plan refused an edit. Each refusal is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// The edit would need more rows than the budget leaves.
     #[error("no room: the budget is used up")]
     NoRoom,
-    /// The row already has a fate in this plan.
-    #[error("the row already has a fate in this plan")]
+    /// The row already has an edit in this plan.
+    #[error("the row already has an edit in this plan")]
     Taken,
     /// The model has no such row.
     #[error("no such row")]
@@ -28,18 +28,18 @@ pub enum Refused {
     BadValue,
 }
 
-/// What a plan does with a row. One byte per row is all that a plan holds for untouched rows.
+/// The edit of a row; one byte, which is all that a plan stores for untouched rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Fate {
-    Free,
+enum RowEdit {
+    None,
     Pruned,
     Grown,
     Updated,
 }
 
-/// Most that a plan takes for each row, seeds apart `[bytes]`: a fate, and either an update of each row
-/// or, as each family has a child, a family with its child's slot for every second one.
-pub const BYTES_PER_ROW: usize = size_of::<Fate>() + {
+/// Most memory a plan takes per row, without seeds `[bytes]`: the edit's byte, and either an update of
+/// each row or, as each family has a child, a family with its child's slot for every second row.
+pub const BYTES_PER_ROW: usize = size_of::<RowEdit>() + {
     let updates = size_of::<(u32, Update)>();
     let families = (size_of::<Family>() + size_of::<u32>()).div_ceil(2);
     if updates > families { updates } else { families }
@@ -47,15 +47,15 @@ pub const BYTES_PER_ROW: usize = size_of::<Fate>() + {
 
 /// The edits of one event.
 ///
-/// Rows are named by their index before the edit. At every call
-/// `rows − pruned + grown <= budget` holds, so that a policy at its budget prunes first, then
-/// grows. (A plan that starts above its budget has no [`room`](Self::room) and can only shrink.)
+/// Rows are named by their index before the edit. `rows − pruned + added <= budget` holds at every
+/// call, so at the budget a policy prunes first, then grows. (A plan that starts above its budget has
+/// no [`room`](Self::room) and can only shrink.)
 #[derive(Debug)]
 pub struct EditPlan {
     budget: usize,
-    fates: Vec<Fate>,
+    edits: Vec<RowEdit>,
     pruned: usize,
-    born: usize,
+    added: usize,
     denied: usize,
     families: Vec<Family>,
     updates: Vec<(u32, Update)>,
@@ -67,14 +67,14 @@ pub struct EditPlan {
 }
 
 impl EditPlan {
-    /// An empty plan for a model of `rows` rows that may never have more than `budget`.
+    /// An empty plan for a model of `rows` rows with a limit of `budget` rows.
     #[must_use]
     pub fn new(rows: usize, budget: usize) -> Self {
         Self {
             budget,
-            fates: vec![Fate::Free; rows],
+            edits: vec![RowEdit::None; rows],
             pruned: 0,
-            born: 0,
+            added: 0,
             denied: 0,
             families: Vec::new(),
             updates: Vec::new(),
@@ -89,20 +89,20 @@ impl EditPlan {
     /// Rows before the edit.
     #[must_use]
     pub fn rows(&self) -> usize {
-        self.fates.len()
+        self.edits.len()
     }
 
-    /// Most rows there may ever be.
+    /// Most rows the model may have.
     #[must_use]
     pub fn budget(&self) -> usize {
         self.budget
     }
 
-    /// How many more rows this plan can bear: budget − (rows − pruned + grown).
+    /// How many more rows may be added: budget − (rows − pruned + added).
     #[must_use]
     pub fn room(&self) -> usize {
         // Slots are u32 on every backend, whatever the budget says.
-        self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.born)
+        self.budget.min(u32::MAX as usize).saturating_sub(self.rows() - self.pruned + self.added)
     }
 
     /// Rows pruned so far.
@@ -117,38 +117,45 @@ impl EditPlan {
         self.denied
     }
 
-    /// Whether `row` exists and has no fate yet.
+    /// Whether `row` exists and has no edit yet.
     #[must_use]
     pub fn is_free(&self, row: u32) -> bool {
-        self.fates.get(row as usize) == Some(&Fate::Free)
+        self.edits.get(row as usize) == Some(&RowEdit::None)
     }
 
-    /// Removes `row`. Its slot is free at once, within this plan.
+    /// Removes `row`. Its slot can be reused within this plan.
     ///
     /// # Errors
     /// [`Refused::NoSuchRow`], [`Refused::Taken`].
     pub fn prune(&mut self, row: u32) -> Result<(), Refused> {
-        self.claim(row, true, 0, Fate::Pruned)?;
+        self.claim(row, true, 0, RowEdit::Pruned)?;
         self.pruned += 1;
         Ok(())
     }
 
-    /// Lets `parent` have children: a clone or a split.
+    /// Prunes `rows`; refusals are counted like those of [`prune`](Self::prune).
+    pub fn prune_all(&mut self, rows: impl IntoIterator<Item = u32>) {
+        for row in rows {
+            let _ = self.prune(row);
+        }
+    }
+
+    /// Clones or splits `parent`.
     ///
     /// # Errors
     /// [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`], and [`Refused::NoRoom`]
     /// when there is not room for all the children.
     pub fn grow(&mut self, parent: u32, offspring: Offspring) -> Result<(), Refused> {
         let children = offspring.children as usize;
-        self.claim(parent, offspring.is_valid(), children, Fate::Grown)?;
+        self.claim(parent, offspring.is_valid(), children, RowEdit::Grown)?;
         if self.families.is_empty() {
-            // As many as there can be, if no more rows are pruned: growing step by step, the array
-            // would be there twice while it is moved.
+            // The most there can be, if no more rows are pruned: growing the array in steps would
+            // hold it twice while it is moved.
             self.families.reserve_exact((self.rows() - self.pruned).min(self.room()));
         }
-        let first_child = self.born_in_families() as u32;
+        let first_child = self.children() as u32;
         self.families.push(Family { parent, first_child, offspring });
-        self.born += children;
+        self.added += children;
         Ok(())
     }
 
@@ -157,23 +164,24 @@ impl EditPlan {
     /// # Errors
     /// [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
     pub fn update(&mut self, row: u32, update: Update) -> Result<(), Refused> {
-        self.claim(row, update.is_valid(), 0, Fate::Updated)?;
+        self.claim(row, update.is_valid(), 0, RowEdit::Updated)?;
         self.updates.push((row, update));
         Ok(())
     }
 
-    /// Adds a row that has no parent.
+    /// Adds a row without a parent.
     ///
     /// # Errors
     /// [`Refused::BadValue`], [`Refused::NoRoom`].
     pub fn append(&mut self, seed: Seed) -> Result<(), Refused> {
         self.check(seed.is_valid(), 1)?;
-        self.born += 1;
+        self.added += 1;
         self.seeds.push(seed);
         Ok(())
     }
 
-    /// Bounds the opacity of all rows, after all other edits. Of several bounds the lowest holds.
+    /// Limits the opacity of all rows, after all other edits; of several limits the lowest holds. Both
+    /// opacity moments become zero.
     ///
     /// # Errors
     /// [`Refused::BadValue`] when `max` is not in (0, 1).
@@ -183,17 +191,17 @@ impl EditPlan {
         Ok(())
     }
 
-    /// Starts an accumulator anew, after all other edits.
-    pub fn reset(&mut self, what: Reset) {
-        match what {
+    /// Resets an accumulator, after all other edits.
+    pub fn reset(&mut self, accumulator: Reset) {
+        match accumulator {
             Reset::Signals => self.reset_signals = true,
             Reset::Candidates => self.reset_candidates = true,
         }
     }
 
-    /// Says why, for the event log. Several tags are joined by `+`; one said twice counts once.
+    /// Names the reason, for the event log. Different tags are joined by `+`.
     pub fn cause(&mut self, tag: &str) {
-        if tag.is_empty() || self.cause.split('+').any(|said| said == tag) {
+        if tag.is_empty() || self.cause.split('+').any(|known| known == tag) {
             return;
         }
         if !self.cause.is_empty() {
@@ -202,21 +210,21 @@ impl EditPlan {
         self.cause.push_str(tag);
     }
 
-    /// Turns the edits into slots.
+    /// Assigns slots to the edits.
     ///
-    /// Children, family after family in the order of the calls, then seeds, fill the slots of
-    /// pruned rows in ascending order, then slots from `rows` upward. Live rows from the tail move
-    /// into the holes that are left, the order among them unchanged.
+    /// Children, family by family in the order of the calls, then seeds, fill the slots of pruned rows
+    /// in ascending order, then slots from `rows` upward. The last rows move into the holes that
+    /// remain, in unchanged order.
     #[must_use]
     pub fn compile(self) -> RowOps {
         let rows_before = self.rows();
-        let rows_after = rows_before - self.pruned + self.born;
-        let is_pruned = |&slot: &usize| self.fates[slot] == Fate::Pruned;
-        // Every slot in `0..rows_after` that holds no live row: the first `born` of them are for
-        // the newborn, the rest (only where the model shrinks) for rows of the tail.
+        let rows_after = rows_before - self.pruned + self.added;
+        let is_pruned = |&slot: &usize| self.edits[slot] == RowEdit::Pruned;
+        // Slots in `0..rows_after` without a live row: the first ones take the new rows, the rest
+        // (only where the model shrinks) take rows from the tail.
         let mut holes = (0..rows_before).filter(is_pruned).chain(rows_before..).map(|s| s as u32);
 
-        let child_slots: Vec<u32> = holes.by_ref().take(self.born_in_families()).collect();
+        let child_slots: Vec<u32> = holes.by_ref().take(self.children()).collect();
         // Seeds lead the zip: it must not draw a hole when there is no seed left to fill it.
         let seeds = self.seeds.iter().zip(holes.by_ref()).map(|(&seed, slot)| (slot, seed));
         let seeds: Vec<(u32, Seed)> = seeds.collect();
@@ -226,7 +234,7 @@ impl EditPlan {
         let rewritten = |f: &&Family| f.offspring.parent == ParentFate::BecomesChild;
         let counts = EditCounts {
             removed: self.pruned,
-            added: self.born,
+            added: self.added,
             updated: self.updates.len() + self.families.iter().filter(rewritten).count(),
             denied: self.denied,
         };
@@ -249,32 +257,39 @@ impl EditPlan {
         ops
     }
 
-    fn born_in_families(&self) -> usize {
-        self.born - self.seeds.len()
+    /// Rows added by families, without seeds.
+    fn children(&self) -> usize {
+        self.added - self.seeds.len()
     }
 
-    /// Gives `row` its fate, if it is free, the edit's values are good and there is room.
-    fn claim(&mut self, row: u32, good: bool, children: usize, fate: Fate) -> Result<(), Refused> {
-        match self.fates.get(row as usize) {
+    /// Records the edit of `row`, if it has none yet, the edit's values are valid and there is room.
+    fn claim(
+        &mut self,
+        row: u32,
+        valid: bool,
+        children: usize,
+        edit: RowEdit,
+    ) -> Result<(), Refused> {
+        match self.edits.get(row as usize) {
             None => return self.refuse(Refused::NoSuchRow),
-            Some(Fate::Free) => self.check(good, children)?,
+            Some(RowEdit::None) => self.check(valid, children)?,
             Some(_) => return self.refuse(Refused::Taken),
         }
-        self.fates[row as usize] = fate;
+        self.edits[row as usize] = edit;
         Ok(())
     }
 
-    fn check(&mut self, good: bool, births: usize) -> Result<(), Refused> {
-        match (good, births <= self.room()) {
+    fn check(&mut self, valid: bool, new_rows: usize) -> Result<(), Refused> {
+        match (valid, new_rows <= self.room()) {
             (false, _) => self.refuse(Refused::BadValue),
             (true, false) => self.refuse(Refused::NoRoom),
             (true, true) => Ok(()),
         }
     }
 
-    fn refuse(&mut self, why: Refused) -> Result<(), Refused> {
+    fn refuse(&mut self, reason: Refused) -> Result<(), Refused> {
         self.denied += 1;
-        Err(why)
+        Err(reason)
     }
 }
 

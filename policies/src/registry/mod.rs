@@ -1,8 +1,8 @@
 //! The registry: policies by name, from this crate and from any other that is linked.
 //!
-//! [`register_policy!`](crate::register_policy) enters a policy where it is defined; no central
-//! list names it. A linker drops a crate that nothing names, so an outside crate of policies is
-//! used with `use my_policies as _;` in the program's main file.
+//! [`register_policy!`](crate::register_policy) registers a policy where it is defined; no central list
+//! names it. A linker drops crates that are never named, so the main file of a program that uses an
+//! outside crate of policies says `use my_policies as _;`.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -14,19 +14,18 @@ use crate::policy::{DensityPolicy, PolicyError, SceneInfo};
 #[doc(hidden)]
 pub use inventory;
 
-/// A policy that is made from a table of parameters.
+/// A policy that can be built from a table of parameters.
 pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
-    /// The parameters: a struct with `#[serde(deny_unknown_fields, default)]`. Numbers are best
-    /// `f64`, `u32` or `bool`, choices enums without data, so that defaults print as written.
+    /// The parameters: a struct with `#[serde(deny_unknown_fields, default)]`. Use `f64`, `u32`, `bool`
+    /// and enums without data, so that defaults print as written.
     type Params: Serialize + DeserializeOwned + Default;
 
-    /// Integer parameters that count steps. Their defaults are written for a run of 30,000 and
-    /// scale with its length; what the user sets is taken as given. Those whose names end in
-    /// `_every` are intervals: they do not shrink below 100 steps (or below their default, if that
-    /// is less).
+    /// Integer parameters that count steps. Their defaults are for a run of 30,000 steps and scale with
+    /// its length; values set by the user do not. Names that end in `_every` are intervals, which do
+    /// not shrink below 100 steps (or below their default, if that is less).
     const STEP_PARAMETERS: &'static [&'static str] = &[];
 
-    /// Makes the policy. Check ranges here, with [`in_range`](crate::parameters::in_range).
+    /// Builds the policy. Check ranges here, with [`in_range`](crate::parameters::in_range).
     ///
     /// # Errors
     /// [`PolicyError::BadParameter`] when a value is out of range.
@@ -35,14 +34,14 @@ pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
 
 /// Registers a policy under a name.
 ///
-/// `doc` is the text of the defining file, `include_str!("this_file.rs")`: its leading `//!` block
-/// is the manual page. (A text without such a block is the manual page itself.) For an example see
-/// the [crate's guide](crate).
+/// `doc` is the text of the defining file, `include_str!("this_file.rs")`; its leading `//!` block is the
+/// manual page. (A text without such a block is the manual page itself.) The [crate's guide](crate)
+/// has an example.
 #[macro_export]
 macro_rules! register_policy {
     ($name:expr, $policy:ty, summary: $summary:expr, source: $source:expr, doc: $doc:expr $(,)?) => {
         $crate::registry::inventory::submit! {
-            $crate::registry::PolicyEntry::of::<$policy>(
+            $crate::registry::PolicyEntry::new::<$policy>(
                 $name,
                 $summary,
                 $source,
@@ -55,9 +54,9 @@ macro_rules! register_policy {
 
 inventory::collect!(PolicyEntry);
 
-type Built = Result<Box<dyn DensityPolicy>, PolicyError>;
+type BuildResult = Result<Box<dyn DensityPolicy>, PolicyError>;
 
-/// What the registry knows of a policy.
+/// A registered policy.
 #[derive(Debug, Clone, Copy)]
 pub struct PolicyEntry {
     /// Its name, as given on the command line.
@@ -69,16 +68,17 @@ pub struct PolicyEntry {
     doc: &'static str,
     place: (&'static str, u32),
     step_parameters: &'static [&'static str],
-    names: fn() -> Option<&'static [&'static str]>,
+    field_names: fn() -> Option<&'static [&'static str]>,
     defaults: fn() -> Result<Table, String>,
-    retyped: fn(Table) -> Result<Table, String>,
-    build: fn(Table, &SceneInfo) -> Built,
+    /// The table after a round trip through the parameters' types.
+    typed: fn(Table) -> Result<Table, String>,
+    build: fn(Table, &SceneInfo) -> BuildResult,
 }
 
 impl PolicyEntry {
     /// The entry of policy `P`; called by [`register_policy!`](crate::register_policy).
     #[must_use]
-    pub const fn of<P: ConfiguredPolicy>(
+    pub const fn new<P: ConfiguredPolicy>(
         name: &'static str,
         summary: &'static str,
         source: &'static str,
@@ -92,9 +92,9 @@ impl PolicyEntry {
             doc,
             place,
             step_parameters: P::STEP_PARAMETERS,
-            names: field_names::<P::Params>,
+            field_names: field_names::<P::Params>,
             defaults: || Table::try_from(P::Params::default()).map_err(first_line),
-            retyped: |table| {
+            typed: |table| {
                 let params: P::Params = table.try_into().map_err(first_line)?;
                 Table::try_from(params).map_err(first_line)
             },
@@ -124,7 +124,7 @@ impl PolicyEntry {
         text.trim().to_owned() + "\n"
     }
 
-    /// Names of the parameters that count steps and follow the run's length.
+    /// Names of the parameters that count steps and scale with the run's length.
     #[must_use]
     pub fn step_parameters(&self) -> &'static [&'static str] {
         self.step_parameters
@@ -133,55 +133,54 @@ impl PolicyEntry {
     /// Names of all parameters, in declaration order.
     #[must_use]
     pub fn parameter_names(&self) -> Vec<String> {
-        let known = (self.names)().unwrap_or_default();
+        let known = (self.field_names)().unwrap_or_default();
         let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
         let more = self.defaults().unwrap_or_default().into_iter().map(|(name, _)| name);
         names.extend(more.filter(|name| !known.contains(&name.as_str())));
         names
     }
 
-    /// Names and defaults for a run of 30,000 steps, in declaration order. A parameter that is
-    /// `None` by default is not listed, as TOML has no such value, but can be set. Empty when the
-    /// defaults have no form in TOML, which [`build`](Self::build) reports.
+    /// Names and defaults for a run of 30,000 steps, in declaration order. Parameters that are `None` by
+    /// default are not listed, as TOML has no such value. Empty when the defaults cannot be written in
+    /// TOML, which [`build`](Self::build) reports.
     #[must_use]
     pub fn parameters(&self) -> Vec<(String, Value)> {
         let mut defaults = self.defaults().unwrap_or_default();
-        let known = (self.names)().unwrap_or_default();
+        let known = (self.field_names)().unwrap_or_default();
         let in_order = known.iter().filter_map(|name| defaults.remove_entry(*name));
         let mut listed: Vec<(String, Value)> = in_order.collect();
         listed.extend(defaults);
         listed
     }
 
-    /// The parameters that a run uses: the defaults, scaled to its length, overlaid with `set`.
-    /// Ranges are checked by [`build`](Self::build).
+    /// The parameters of a run: the defaults, scaled to its length, overlaid with `set`. Ranges are
+    /// checked by [`build`](Self::build).
     ///
     /// # Errors
     /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type.
     pub fn effective(&self, set: &Table, scene: &SceneInfo) -> Result<Table, PolicyError> {
         let mut table = self.defaults()?;
         for parameter in set.keys() {
-            self.must_know(parameter)?;
+            self.check_known(parameter)?;
         }
         scale_steps(&mut table, self.step_parameters, scene.iterations);
         for (parameter, value) in set {
             // One at a time, so that the error can name the parameter.
             table.insert(parameter.clone(), value.clone());
-            (self.retyped)(table.clone()).map_err(|why| PolicyError::BadParameter {
+            (self.typed)(table.clone()).map_err(|reason| PolicyError::BadParameter {
                 policy: self.name.to_owned(),
                 parameter: parameter.clone(),
-                reason: format!("{value} does not fit: {why}"),
+                reason: format!("{value} does not fit: {reason}"),
             })?;
         }
-        (self.retyped)(table).map_err(|why| self.broken(&why))
+        (self.typed)(table).map_err(|reason| self.bad_defaults(&reason))
     }
 
-    /// Makes the policy with the parameters in `set`, all others at their
-    /// [effective](Self::effective) defaults.
+    /// Builds the policy with the parameters in `set` and [effective](Self::effective) defaults.
     ///
     /// # Errors
     /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type or a
-    /// value out of range; whatever else the policy says.
+    /// value out of range; any other error of the policy.
     pub fn build(
         &self,
         set: &Table,
@@ -195,7 +194,7 @@ impl PolicyEntry {
         })
     }
 
-    fn must_know(&self, parameter: &str) -> Result<(), PolicyError> {
+    fn check_known(&self, parameter: &str) -> Result<(), PolicyError> {
         let known = self.parameter_names();
         if known.iter().any(|name| name == parameter) {
             return Ok(());
@@ -208,19 +207,19 @@ impl PolicyEntry {
     }
 
     fn defaults(&self) -> Result<Table, PolicyError> {
-        (self.defaults)().map_err(|why| self.broken(&why))
+        (self.defaults)().map_err(|reason| self.bad_defaults(&reason))
     }
 
-    fn broken(&self, why: &str) -> PolicyError {
+    fn bad_defaults(&self, reason: &str) -> PolicyError {
         PolicyError::Other(format!(
-            "policy `{}` ({}) has defaults that are not its own parameters: {why}",
+            "policy `{}` ({}) has defaults that do not fit its parameters: {reason}",
             self.name,
             self.location()
         ))
     }
 }
 
-/// All policies, sorted by name. (The linker decides the order in which they are found.)
+/// All policies, sorted by name. (The linker finds them in any order.)
 ///
 /// # Errors
 /// [`PolicyError::DuplicateName`] when two have one name.

@@ -1,62 +1,65 @@
-//! # mcmc — relocation of the dead, noise on the faint
+//! # mcmc — relocation of dead Gaussians, noise on faint ones
 //!
-//! *3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand, Rebain, Sharma, Sun, Tseng, Isack,
-//! Kar, Tagliasacchi, Yi, NeurIPS 2024, arXiv 2404.09591, with the constants of its public code and of
-//! gsplat's.
+//! Moves dead Gaussians to places where others do the work, adds 5 % per event up to the budget, and
+//! lets faint Gaussians explore by adding noise to their means.
 //!
-//! ## What it does
+//! Source: *3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand, Rebain, Sharma, Sun, Tseng,
+//! Isack, Kar, Tagliasacchi, Yi, NeurIPS 2024, arXiv 2404.09591, with the constants of its public code
+//! and of gsplat.
 //!
-//! After every `grow_every` steps, between `grow_from` and `grow_until`:
+//! ## Method
 //!
-//! 1. Rows no more opaque than `min_opacity` are dead. Each gives its slot to a copy of a living row,
-//!    drawn with replacement in proportion to opacity.
-//! 2. As many rows as `growth` allows, up to the budget, are drawn in the same way and copied too.
+//! Every `grow_every` steps between `grow_from` and `grow_until`:
 //!
-//! A row drawn n times becomes N = n + 1 equal rows that render like the one did: each gets the
-//! opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and its standard deviations multiplied by
-//! o / Σₖ C(N, k)·(−1)^(k−1)·o′^k/√k, k from 1 to N (equation 9 of the paper, its double sum added up).
-//! From `most_shares` on, N counts as that. Mean, rotation and colour are copied.
+//! 1. Gaussians with an opacity of at most `min_opacity` are dead. Each is replaced by a copy of a
+//!    living Gaussian, drawn with replacement in proportion to opacity.
+//! 2. The model grows by the factor 1 + `growth`, up to the budget: that many more copies are drawn in
+//!    the same way.
+//!
+//! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each
+//! has the opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and standard deviations multiplied
+//! by o / Σₖ C(N, k)·(−1)^(k−1)·o′^k/√k, k from 1 to N (equation 9 of the paper with its double sum
+//! evaluated). N is capped at `most_shares` in these formulas. Mean, rotation and colour are copied.
 //!
 //! **In every step** two terms are added to the loss, `opacity_term` · mean opacity and
-//! `scale_term` · mean standard deviation, so that what is not needed fades and shrinks; and after
-//! the optimiser's step every mean moves by Σ·ξ · σ(−`noise_sharpness`·(o − `noise_opacity`)) ·
-//! `noise` · λ, with Σ the row's covariance, ξ ~ N(0, I) and λ the step size of the means: faint rows
-//! explore.
+//! `scale_term` · mean standard deviation, so that Gaussians which are not needed fade and shrink.
+//! After the optimiser's step every mean moves by Σ·ξ · σ(−`noise_sharpness`·(o − `noise_opacity`)) ·
+//! `noise` · λ, with Σ the Gaussian's covariance, ξ ~ N(0, I) and λ the learning rate of the means.
 //!
-//! **At the start** all rows have the opacity `start_opacity`, and standard deviations multiplied by
+//! **At the start** all opacities are `start_opacity`, and standard deviations are multiplied by
 //! `start_scale`. Opacities are never reset.
 //!
-//! ## Where we depart from the source
+//! ## Differences from the published code
 //!
-//! - Relocation and growth are one transaction: both draw from the opacities before the event, and a
-//!   row drawn by both shares equally among all its copies. The codes draw for growth from the
+//! - Relocation and growth are one edit. Both draw by the opacities before the event, and a Gaussian
+//!   drawn by both is shared equally among all its copies. The published code draws for growth by the
 //!   opacities after relocation.
-//! - All of a family start with zero moments and age 0. The codes keep stale moments in the slots of
-//!   the dead.
-//! - The published `noise` and `scale_term` depend on the unit of length. Ours is the radius of the
-//!   cameras (scene extent / 1.1), as in gsplat's normalised scenes.
-//! - Without a living row nothing is done.
+//! - All copies start with zero moments and age 0. The published code keeps stale moments in the slots
+//!   of dead Gaussians.
+//! - The published `noise` and `scale_term` depend on the unit of length. Here the unit is the camera
+//!   radius (scene extent / 1.1), as in gsplat's normalised scenes.
+//! - If no Gaussian is alive, nothing is done.
 //!
 //! ## Parameters
 //!
-//! | name | default | range | unit | what |
+//! | name | default | range | unit | meaning |
 //! |---|---|---|---|---|
 //! | grow_from | 500 | >= 0 | step | start of relocation and growth (exclusive) |
 //! | grow_until | 25000 | >= 0 | step | end of relocation and growth (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of relocation and growth; 0: never |
-//! | min_opacity | 0.005 | 0 to 1, both excluded | | opacity up to which a row is dead |
-//! | growth | 0.05 | 0 to 1 | rows | growth per event |
-//! | most_shares | 51 | 2 to 51 | rows | most rows that the formulas share a row among |
+//! | min_opacity | 0.005 | 0 to 1, both excluded | | Gaussians up to this opacity are dead |
+//! | growth | 0.05 | 0 to 1 | Gaussians | growth per event |
+//! | most_shares | 51 | 2 to 51 | Gaussians | largest N in the formulas |
 //! | opacity_term | 0.01 | >= 0 | loss | coefficient of the mean opacity |
 //! | scale_term | 0.01 | >= 0 | loss / camera radius | coefficient of the mean standard deviation |
 //! | noise | 500000.0 | >= 0 | 1 / camera radius² | strength of the noise; 0: none |
 //! | noise_sharpness | 100.0 | >= 0 | | how steeply the noise falls with opacity |
-//! | noise_opacity | 0.005 | 0 to 1 | | opacity at which half of the noise is left |
-//! | start_opacity | 0.5 | 0 to 1, both excluded | | opacity of the initial rows |
-//! | start_scale | 0.1 | > 0 | | factor of the initial standard deviations |
+//! | noise_opacity | 0.005 | 0 to 1 | | opacity at which the noise is halved |
+//! | start_opacity | 0.5 | 0 to 1, both excluded | | initial opacity |
+//! | start_scale | 0.1 | > 0 | | factor on the initial standard deviations |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
-//! down to 100 steps at most.
+//! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
+//! (`…_every`) do not shrink below 100 steps.
 
 use std::ops::Bound::{Excluded, Unbounded};
 
@@ -66,8 +69,8 @@ use crate::adc::Window;
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
 use crate::policy::{
-    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyError, PolicyState, SceneInfo, Signal,
-    SignalSet, Snapshot, StartRule, restore_nothing,
+    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyError, SceneInfo, Signal, SignalSet,
+    Snapshot, StartRule,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -76,15 +79,15 @@ use crate::sample::with_replacement;
 crate::register_policy!(
     "mcmc",
     Mcmc,
-    summary: "relocation of dead rows, steady growth to the budget, noise on faint rows",
+    summary: "relocation of dead Gaussians, steady growth to the budget, noise on faint ones",
     source: "Kheradmand et al. 2024, arXiv 2404.09591",
-    doc: include_str!("mcmc.rs"),
+    doc: include_str!("mod.rs"),
 );
 
-/// Margin of a scene's extent around its cameras.
+/// Scene extent / camera radius.
 const EXTENT_MARGIN: f64 = 1.1;
 
-/// Parameters of [`Mcmc`]; its manual page says what they mean.
+/// Parameters of [`Mcmc`], explained in its manual page.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 #[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
@@ -137,9 +140,9 @@ impl ConfiguredPolicy for Mcmc {
     const STEP_PARAMETERS: &'static [&'static str] = &["grow_from", "grow_until", "grow_every"];
 
     fn new(params: McmcParams, _scene: &SceneInfo) -> Result<Self, PolicyError> {
-        // As the f32 that the plan will check.
-        let unit = |value: f64| f64::from(value as f32);
-        in_range("min_opacity", unit(params.min_opacity), (Excluded(0.0), Excluded(1.0)))?;
+        // Rounded to the f32 that plans take: 0.99999999 becomes 1.
+        let rounded = |value: f64| f64::from(value as f32);
+        in_range("min_opacity", rounded(params.min_opacity), (Excluded(0.0), Excluded(1.0)))?;
         in_range("growth", params.growth, 0.0..=1.0)?;
         in_range("most_shares", params.most_shares.into(), 2.0..=51.0)?;
         in_range("opacity_term", params.opacity_term, 0.0..)?;
@@ -147,7 +150,7 @@ impl ConfiguredPolicy for Mcmc {
         in_range("noise", params.noise, 0.0..)?;
         in_range("noise_sharpness", params.noise_sharpness, 0.0..)?;
         in_range("noise_opacity", params.noise_opacity, 0.0..=1.0)?;
-        in_range("start_opacity", unit(params.start_opacity), (Excluded(0.0), Excluded(1.0)))?;
+        in_range("start_opacity", rounded(params.start_opacity), (Excluded(0.0), Excluded(1.0)))?;
         in_range("start_scale", params.start_scale, (Excluded(0.0), Unbounded))?;
         let McmcParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
         Ok(Self { grow: Window { from, until, every }, params })
@@ -164,7 +167,7 @@ impl DensityPolicy for Mcmc {
             opacity: params.noise_opacity as f32,
         };
         Needs {
-            signals: SignalSet::of(&[Signal::Opacity]),
+            signals: SignalSet::from([Signal::Opacity]),
             loss_terms: LossTerms {
                 opacity: params.opacity_term as f32,
                 scale: (params.scale_term / radius) as f32,
@@ -197,41 +200,30 @@ impl DensityPolicy for Mcmc {
             return Ok(());
         }
         let target = grown(now.rows(), self.params.growth).min(plan.budget());
-        let births = dead.len() + target.saturating_sub(now.rows());
+        let copies = dead.len() + target.saturating_sub(now.rows());
         if !dead.is_empty() {
             plan.cause("relocate");
         }
-        if births > dead.len() {
+        if copies > dead.len() {
             plan.cause("grow");
         }
-        for row in dead {
-            // Never refused: each row once, and it exists.
-            let _ = plan.prune(row);
-        }
-        for (row, copies) in with_replacement(&weights, births.min(plan.room()), rng) {
-            let _ = plan.grow(row, self.shared(opacity[row as usize], copies));
+        plan.prune_all(dead);
+        for (row, copies) in with_replacement(&weights, copies.min(plan.room()), rng) {
+            let _ = plan.grow(row, self.copies(opacity[row as usize], copies));
         }
         Ok(())
-    }
-
-    fn save(&self) -> PolicyState {
-        PolicyState::Null
-    }
-
-    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
-        restore_nothing(&state)
     }
 }
 
 /// ⌊(1 + `growth`)·`rows`⌋.
 fn grown(rows: usize, growth: f64) -> usize {
-    // 1.05 · 100 is 105.00000000000001, 1.05 · 20 is 21: a product is off by at most 2⁻⁵³ of itself.
+    // A product just below an integer counts as this integer: its error is at most 2⁻⁵³ of itself.
     ((1.0 + growth) * rows as f64 * (1.0 + f64::EPSILON)).floor() as usize
 }
 
 impl Mcmc {
-    /// A row and its copies, which together render like the row did.
-    fn shared(&self, opacity: f32, copies: u32) -> Offspring {
+    /// Copies of a row that together with it render like the row did.
+    fn copies(&self, opacity: f32, copies: u32) -> Offspring {
         let members = copies.saturating_add(1);
         let counted = members.min(self.params.most_shares);
         let least = self.params.min_opacity;
@@ -247,10 +239,10 @@ impl Mcmc {
     }
 }
 
-/// The opacity of each of `members` equal rows that stand for one of opacity `opacity`, at least
-/// `least`, and the factor of their standard deviations.
+/// The opacity, at least `least`, of each of `members` equal rows that replace one of opacity
+/// `opacity`, and the factor on their standard deviations.
 fn share(opacity: f64, members: u32, least: f64) -> (f64, f64) {
-    // As opaque as an f32 can be.
+    // Less than 1 also as an f32.
     let most = 1.0 - f64::from(f32::EPSILON);
     let opacity = opacity.clamp(0.0, most);
     let share = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(members))).clamp(least, most);

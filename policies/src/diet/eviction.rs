@@ -1,4 +1,4 @@
-//! Victims: the rows that fall where others want their place.
+//! Eviction: pruning the least important rows to make room for others.
 
 use super::{Diet, Importance};
 use crate::plan::EditPlan;
@@ -6,7 +6,7 @@ use crate::policy::{PolicyError, Signal, Snapshot};
 use crate::sample::smallest;
 
 impl Diet {
-    /// The signal that says how important a row is.
+    /// The signal that measures the importance of a row.
     pub(super) fn importance(&self) -> Signal {
         match self.params.importance {
             Importance::Epochs => Signal::WeightMax,
@@ -14,14 +14,14 @@ impl Diet {
         }
     }
 
-    /// Prunes the `count` least important rows that have no fate yet and are not `spared`; as many
-    /// as there are, if they are fewer.
-    pub(super) fn prune_victims(
+    /// Prunes the `count` least important rows that have no edit yet and are not `exempt`; all of
+    /// them if there are fewer. New rows are protected while there are enough others.
+    pub(super) fn evict(
         &self,
         now: &Snapshot<'_>,
         plan: &mut EditPlan,
         count: usize,
-        spared: &dyn Fn(u32) -> bool,
+        exempt: &dyn Fn(u32) -> bool,
     ) -> Result<(), PolicyError> {
         if count == 0 {
             return Ok(());
@@ -29,22 +29,20 @@ impl Diet {
         let importance = now.signal(self.importance())?;
         let protects = self.protected_age > 0.0;
         let age = if protects { now.signal(Signal::Age)? } else { &[] };
-        let eligible = (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !spared(row));
-        let (mut newborn, grown): (Vec<u32>, Vec<u32>) =
+        let eligible = (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !exempt(row));
+        let (mut new, old): (Vec<u32>, Vec<u32>) =
             eligible.partition(|&row| protects && age[row as usize] < self.protected_age);
-        let mut victims = smallest(grown, importance, count);
-        let missing = count - victims.len();
+        let mut evicted = smallest(old, importance, count);
+        let missing = count - evicted.len();
         if missing > 0 {
-            newborn.sort_unstable_by(|&a, &b| {
+            new.sort_unstable_by(|&a, &b| {
                 let (a_row, b_row) = (a as usize, b as usize);
                 let older_first = age[b_row].total_cmp(&age[a_row]);
                 older_first.then(importance[a_row].total_cmp(&importance[b_row])).then(a.cmp(&b))
             });
-            victims.extend(newborn.into_iter().take(missing));
+            evicted.extend(new.into_iter().take(missing));
         }
-        for row in victims {
-            let _ = plan.prune(row);
-        }
+        plan.prune_all(evicted);
         Ok(())
     }
 }

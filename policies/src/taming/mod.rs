@@ -1,58 +1,62 @@
 //! # taming — growth along a curve, by a score measured in rendered views
 //!
-//! *Taming 3DGS: High-Quality Radiance Fields with Limited Resources*, Mallick, Goel, Kerbl, Vicente
-//! Carrasco, Steinberger, De la Torre, SIGGRAPH Asia 2024, arXiv 2406.15643, with the constants of its
-//! public code.
+//! Densifies Gaussians with large screen gradients, drawn by a score that measures how much each one
+//! matters in badly rendered views, so that their number follows a concave curve up to the budget.
 //!
-//! ## What it does
+//! Source: *Taming 3DGS: High-Quality Radiance Fields with Limited Resources*, Mallick, Goel, Kerbl,
+//! Vicente Carrasco, Steinberger, De la Torre, SIGGRAPH Asia 2024, arXiv 2406.15643, with the constants
+//! of its public code.
 //!
-//! After every `grow_every` steps, between `grow_from` and `grow_until`:
+//! ## Method
 //!
-//! 1. `views` training views, chosen at random, are rendered for the score
+//! Every `grow_every` steps between `grow_from` and `grow_until`:
+//!
+//! 1. `views` random training views are rendered for the score
 //!    s = Σ over views v of 50·L_v·[z(25, g_p) + z(100, opacity) + z(5, depth) + z(10, radius) +
 //!    z(25, s_x·s_y·s_z) + z(50, Σ distance) + z(10, Σ M_v) + z(0.1, pixels) + z(50, Σ α·T)],
-//!    over the views that show the row, with L_v the view's loss, z(c, x) = c·x / median of the x > 0
-//!    (0 for x <= 0), Σ over the pixels that the row is blended into, and the pixel map
-//!    M_v = 50·n(|I − G|) + 50·n(edge), n bringing a map to 0..1. The coefficients are parameters
-//!    (`…_weight`).
-//! 2. Rows whose screen gradient g_p is at least `tau` qualify, and are cloned where small, split
-//!    where large, as by `vanilla`. The model grows by G rows, up to the curve
-//!    N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M, from the initial rows S to the budget B, and
-//!    by no more than qualify. Of the small and the large, each has its share of G, and is drawn
+//!    over the views that show the Gaussian. L_v is the view's loss, g_p the screen gradient,
+//!    z(c, x) = c·x / median of the positive x (0 for x <= 0), sums run over the pixels that the
+//!    Gaussian is blended into, and M_v = 50·n(|I − G|) + 50·n(edge) is a pixel map, where n scales to
+//!    0..1. The coefficients are parameters (`…_weight`).
+//! 2. Gaussians with g_p of at least `tau` are candidates; as in `vanilla`, small ones are cloned and
+//!    large ones split. The model grows by at most the number of candidates and at most up to the curve
+//!    N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M, from the S initial Gaussians to the budget B.
+//!    Small and large candidates share the growth in proportion to their numbers, and are drawn
 //!    without replacement in proportion to s.
-//! 3. Before step `prune_until`, half (`prune_share`) of those that `vanilla` would prune are pruned,
-//!    drawn in proportion to 1/(10⁻⁶ + s).
-//! 4. The gradient statistics start anew.
+//! 3. Before step `prune_until`, half (`prune_share`) of the Gaussians that `vanilla` would prune are
+//!    pruned, drawn in proportion to 1/(10⁻⁶ + s).
+//! 4. The gradient statistics are reset.
 //!
-//! Opacities are reset as by `vanilla`. The colour bands 1–3 have the step size `sh_rest` and step once
-//! for `sh_every` iterations, on the sum of their gradients (`--lr` and `--sh-every` win over these).
+//! Opacities are reset as in `vanilla`. SH bands 1–3 have the learning rate `sh_rest` and step once per
+//! `sh_every` iterations, on the summed gradients (`--lr` and `--sh-every` override these).
 //!
-//! With `multiplier` m > 0, B is ⌊m · S⌋, but never more than the budget.
+//! With `multiplier` m > 0, the curve ends at ⌊m · S⌋ instead, but never above the budget.
 //!
-//! ## Where we depart from the source
+//! ## Differences from the published code
 //!
-//! - `prune = "published"`: the code draws the rows to prune from all, and removes those dead ones
-//!   that happen to be among them; and it takes the scores of the rows as they were before splits
-//!   removed parents, so that they belong to other rows. Both are done by this choice; `candidates`
-//!   draws among the dead, by their own scores.
-//! - Rows that are dead do not grow.
-//! - One render per view gives colour, map and sums; the code renders twice.
-//! - Edges at the border of an image are found by repeating its outermost pixels; the code's filter
-//!   leaves the luma itself there.
-//! - Opacities are trained to the end. In the code they stop at step 15,000, by what seems to be a slip.
-//! - All rows step at every iteration; the code has a mode in which those off screen rest.
+//! - The published code draws the Gaussians to prune from all and removes those drawn that are dead; it
+//!   also uses scores from before splits removed parents, so that they belong to other Gaussians.
+//!   `prune = "published"` does both; the default, `candidates`, draws from the dead by their own
+//!   scores.
+//! - Dead Gaussians do not grow.
+//! - One render per view gives colour, map and sums; the published code renders twice.
+//! - The edge filter repeats the outermost pixels of an image; the published code leaves the luma itself
+//!   there.
+//! - Opacities are trained to the end. The published code stops at step 15,000, apparently by mistake.
+//! - All Gaussians step at every iteration; the published code has a mode in which those off screen do
+//!   not.
 //!
 //! ## Parameters
 //!
-//! | name | default | range | unit | what |
+//! | name | default | range | unit | meaning |
 //! |---|---|---|---|---|
 //! | grow_from | 500 | >= 0 | step | start of growth (exclusive) |
 //! | grow_until | 15000 | >= 0 | step | end of growth and opacity resets (exclusive) |
 //! | grow_every | 500 | >= 0 | steps | interval of growth; 0: never |
-//! | multiplier | 0.0 | >= 0 | initial rows | final rows; 0: the budget |
-//! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a row qualifies |
-//! | small | 0.01 | >= 0 | scene extent | up to this size a row is cloned, beyond it split |
-//! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales |
+//! | multiplier | 0.0 | >= 0 | initial Gaussians | final number of Gaussians; 0: the budget |
+//! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is a candidate |
+//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | views | 10 | >= 0 | views | views rendered per event; 0: all |
 //! | error_weight | 50.0 | >= 0 | | weight of the error in M |
 //! | edge_weight | 50.0 | >= 0 | | weight of the edges in M |
@@ -65,31 +69,32 @@
 //! | map_weight | 10.0 | >= 0 | | coefficient of the sum of M |
 //! | count_weight | 0.1 | >= 0 | | coefficient of the number of pixels |
 //! | blend_weight | 50.0 | >= 0 | | coefficient of the sum of blend weights |
-//! | min_opacity | 0.005 | 0 to 1 | | opacity below which a row is dead |
-//! | max_scale | 0.1 | > 0 | scene extent | size beyond which a row is dead |
-//! | max_scale_from | 3000 | >= 0 | step | start of death by size (exclusive) |
-//! | prune | "candidates" | candidates, published | | among whom the pruned are drawn |
+//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are dead |
+//! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are dead |
+//! | max_scale_from | 3000 | >= 0 | step | from when on size counts (exclusive) |
+//! | prune | "candidates" | candidates, published | | which Gaussians the prune draws from |
 //! | prune_share | 0.5 | 0 to 1 | the dead | share of the dead that is drawn |
 //! | prune_until | 14500 | >= 0 | step | end of pruning (exclusive) |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
-//! | sh_every | 16 | 1 to 1000 | steps | iterations per step of the colour bands 1–3 |
-//! | sh_rest | 0.00025 | > 0 | | step size of the colour bands 1–3 |
+//! | sh_every | 16 | 1 to 1000 | steps | iterations per optimiser step of SH bands 1–3 |
+//! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
-//! down to 100 steps at most; `sh_every` does not.
+//! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
+//! (`…_every`) do not shrink below 100 steps. `sh_every` does not scale.
 
 use std::ops::Bound::{Excluded, Unbounded};
 
 use crate::adc::{
-    Mortality, OpacityResets, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
+    OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
+    split_by,
 };
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyError, PolicyState,
-    RateOverrides, SceneInfo, Signal, SignalSet, Snapshot, restore_nothing,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyError,
+    RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -104,9 +109,9 @@ pub use parameters::{PruneDraw, TamingParams};
 crate::register_policy!(
     "taming",
     Taming,
-    summary: "growth along a concave curve, drawn by a score measured in rendered views",
+    summary: "growth along a concave curve, by a score measured in rendered views",
     source: "Taming 3DGS, Mallick et al. 2024, arXiv 2406.15643",
-    doc: include_str!("taming.rs"),
+    doc: include_str!("mod.rs"),
 );
 
 /// Growth along a curve, by score.
@@ -142,17 +147,17 @@ impl ConfiguredPolicy for Taming {
         in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
         in_range("prune_share", params.prune_share, 0.0..=1.0)?;
-        let resets = (params.reset_every, params.grow_until, params.white_reset_at);
-        let resets = OpacityResets::new(resets, params.reset_opacity, scene)?;
         in_range("sh_every", params.sh_every.into(), 1.0..=1000.0)?;
         in_range("sh_rest", params.sh_rest, (Excluded(0.0), Unbounded))?;
-        let TamingParams { grow_from: from, grow_until: until, .. } = params;
-        Ok(Self {
-            grow: Window { from, until, every: params.grow_every },
-            resets,
-            score: Score::default(),
-            params,
-        })
+        let TamingParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
+        let resets = OpacityResets::new(
+            params.reset_every,
+            until,
+            params.white_reset_at,
+            params.reset_opacity,
+            scene,
+        )?;
+        Ok(Self { grow: Window { from, until, every }, resets, score: Score::default(), params })
     }
 }
 
@@ -160,7 +165,7 @@ impl DensityPolicy for Taming {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
         Needs {
-            signals: SignalSet::of(&[
+            signals: SignalSet::from([
                 Signal::VisibleCount,
                 Signal::ScreenGradient,
                 Signal::Opacity,
@@ -172,7 +177,7 @@ impl DensityPolicy for Taming {
                     error: params.error_weight as f32,
                     edge: params.edge_weight as f32,
                 },
-                columns: score::COLUMNS.to_vec(),
+                columns: AuxColumn::ALL.to_vec(),
                 points: 0,
             }),
             cadence: Cadence { all: 1, sh_rest: params.sh_every },
@@ -218,18 +223,10 @@ impl DensityPolicy for Taming {
         self.resets.plan(now.step, plan);
         Ok(())
     }
-
-    fn save(&self) -> PolicyState {
-        PolicyState::Null
-    }
-
-    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
-        restore_nothing(&state)
-    }
 }
 
 impl Taming {
-    /// B, the rows at the end of the curve.
+    /// B, the number of rows at the end of the curve.
     fn end(&self, scene: &SceneInfo, budget: usize) -> usize {
         match self.params.multiplier {
             m if m > 0.0 => budget.min((m * scene.initial_rows as f64).floor() as usize),
@@ -247,25 +244,26 @@ impl Taming {
         let gradient = mean_over_views(now.signal(Signal::ScreenGradient)?, views);
         let scale = now.signal(Signal::ScaleMax)?;
         let score = std::mem::take(&mut self.score).total(now, &gradient, &self.params)?;
-        let dead = self.dead(now)?;
-        let extent = f64::from(now.scene.extent);
-        let small = (self.params.small * extent) as f32;
-        let qualifies = |row: &u32| {
+        let TamingParams { min_opacity, max_scale, max_scale_from, .. } = self.params;
+        let limits = PruneLimits::at(now, min_opacity, max_scale, max_scale_from);
+        let dead = limits.dead_rows(now)?;
+        let small = (self.params.small * f64::from(now.scene.extent)) as f32;
+        let is_candidate = |row: &u32| {
             gradient[*row as usize] >= self.params.tau as f32 && dead.binary_search(row).is_err()
         };
-        let (clones, splits): (Vec<u32>, Vec<u32>) =
-            (0..now.rows() as u32).filter(qualifies).partition(|&row| scale[row as usize] <= small);
+        let (clones, splits): (Vec<u32>, Vec<u32>) = (0..now.rows() as u32)
+            .filter(is_candidate)
+            .partition(|&row| scale[row as usize] <= small);
 
-        let wanted = clones.len() + splits.len();
+        let candidates = clones.len() + splits.len();
         let end = self.end(now.scene, plan.budget());
         let allowed = concave_curve(self.grow, now.step, now.scene.initial_rows, end);
-        let births = allowed.min(now.rows() + wanted).saturating_sub(now.rows());
+        let growth = allowed.min(now.rows() + candidates).saturating_sub(now.rows());
         let split = split_by(self.params.split_factor as f32);
         let mut is_split = vec![false; now.rows()];
-        for (set, offspring) in [(clones, clone_at([0.0; 3])), (splits, split)] {
-            // Nobody is wanted only where both sets are empty.
-            let share = births * set.len() / wanted.max(1);
-            for row in weighted(&among(&set, &score), share, rng) {
+        for (rows, offspring) in [(clones, clone_at([0.0; 3])), (splits, split)] {
+            let share = growth * rows.len() / candidates.max(1);
+            for row in weighted(&masked(&score, &rows), share, rng) {
                 // A refusal is counted by the plan.
                 if plan.grow(row, offspring).is_ok() {
                     is_split[row as usize] = offspring == split;
@@ -278,20 +276,7 @@ impl Taming {
         Ok(())
     }
 
-    /// Rows that `vanilla` would prune, ascending.
-    fn dead(&self, now: &Snapshot<'_>) -> Result<Vec<u32>, PolicyError> {
-        let opacity = now.signal(Signal::Opacity)?;
-        let scale = now.signal(Signal::ScaleMax)?;
-        let by_size = now.step > self.params.max_scale_from;
-        let max_scale = (self.params.max_scale * f64::from(now.scene.extent)) as f32;
-        let mortality = Mortality {
-            min_opacity: self.params.min_opacity as f32,
-            max_scale: if by_size { max_scale } else { f32::INFINITY },
-        };
-        let is_dead = |row: &u32| mortality.is_dead(opacity[*row as usize], scale[*row as usize]);
-        Ok((0..now.rows() as u32).filter(is_dead).collect())
-    }
-
+    /// Prunes some of the `dead` rows, drawn by their scores.
     fn prune(
         &self,
         now: &Snapshot<'_>,
@@ -303,27 +288,25 @@ impl Taming {
     ) -> Result<(), PolicyError> {
         let weights: Vec<f32> = score.iter().map(|s| 1.0 / (1e-6 + s)).collect();
         let count = (self.params.prune_share * dead.len() as f64).floor() as usize;
-        let mut victims = match self.params.prune {
-            PruneDraw::Candidates => weighted(&among(&dead, &weights), count, rng),
+        let mut pruned = match self.params.prune {
+            PruneDraw::Candidates => weighted(&masked(&weights, &dead), count, rng),
             PruneDraw::Published => {
-                // Without the parents of splits, rows are counted anew; the scores are not.
-                let survivors: Vec<u32> =
+                // Rows are renumbered without the parents of splits, but the scores are not.
+                let kept: Vec<u32> =
                     (0..now.rows() as u32).filter(|&row| !is_split[row as usize]).collect();
                 let drawn = weighted(&weights, count, rng).into_iter();
-                let hit = drawn.filter_map(|place| survivors.get(place as usize).copied());
-                hit.filter(|row| dead.binary_search(row).is_ok()).collect()
+                let rows = drawn.filter_map(|index| kept.get(index as usize).copied());
+                rows.filter(|row| dead.binary_search(row).is_ok()).collect()
             }
         };
-        spare_one(&mut victims, now.signal(Signal::Opacity)?);
-        for row in victims {
-            let _ = plan.prune(row);
-        }
+        spare_one(&mut pruned, now.signal(Signal::Opacity)?);
+        plan.prune_all(pruned);
         Ok(())
     }
 }
 
-/// The weights of these rows; 0 for all others.
-fn among(rows: &[u32], weights: &[f32]) -> Vec<f32> {
+/// The weights of these rows, and 0 for all others.
+fn masked(weights: &[f32], rows: &[u32]) -> Vec<f32> {
     let mut masked = vec![0.0; weights.len()];
     for &row in rows {
         masked[row as usize] = weights[row as usize];

@@ -1,15 +1,16 @@
-//! A compiled plan: slots, in the order in which a backend executes them.
+//! Compiled plans: the slots to write, in the order in which a backend writes them.
 
 use serde::{Deserialize, Serialize};
 
 use crate::edit::{Offspring, ParentFate, Seed, Update, in_open_unit};
 
-/// A plan as slots: what a backend executes, in this order. Rows `0..rows_before` are live before,
-/// rows `0..rows_after` after; no slot >= the budget is ever written.
+/// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it; no slot
+/// at or beyond the budget is ever written.
 ///
-/// Pass 1: `families` (the parent is read once, then its children and the parent itself are
-/// written), `updates`, `seeds`: no slot is written twice and no written slot is read by another
-/// entry. Pass 2: `moves`. Then `clamp_opacity` over all rows, then the resets.
+/// A backend executes in pass 1 `families` (the parent is read once, then its children and the
+/// parent itself are written), `updates` and `seeds`: no slot is written twice, and no written slot is
+/// read by another entry. In pass 2 it executes `moves`, then `clamp_opacity` over all rows, then the
+/// resets.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RowOps {
     /// Rows before the edit.
@@ -24,20 +25,20 @@ pub struct RowOps {
     pub child_slots: Vec<u32>,
     /// Rows rewritten in place.
     pub updates: Vec<(u32, Update)>,
-    /// Rows born without a parent, with their slots.
+    /// Rows added without a parent, with their slots.
     pub seeds: Vec<(u32, Seed)>,
     /// (from, to): live tail rows that fill the holes left by pruned rows; every `from` >=
     /// `rows_after` > every `to`.
     pub moves: Vec<(u32, u32)>,
     /// Upper bound for all opacities, in (0, 1); both opacity moments of all rows become zero.
     pub clamp_opacity: Option<f32>,
-    /// Whether the signal sums start anew; otherwise moved rows carry theirs.
+    /// Whether the signal sums are reset; otherwise moved rows keep theirs.
     pub reset_signals: bool,
-    /// Whether the candidate list starts anew.
+    /// Whether the candidate list is cleared.
     pub reset_candidates: bool,
-    /// What was done, for the event log.
+    /// Numbers of rows changed, for the event log.
     pub counts: EditCounts,
-    /// Why it was done, for the event log: tags joined by `+`.
+    /// The reason, for the event log: tags joined by `+`.
     pub cause: String,
 }
 
@@ -48,37 +49,37 @@ pub struct Family {
     pub parent: u32,
     /// Its first child's place in [`RowOps::child_slots`].
     pub first_child: u32,
-    /// How they come to be.
+    /// How the children follow from the parent.
     pub offspring: Offspring,
 }
 
-/// How many rows an edit touched.
+/// How many rows an edit changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct EditCounts {
     /// Rows pruned.
     pub removed: usize,
-    /// Rows born (children and seeds).
+    /// Rows added (children and seeds).
     pub added: usize,
     /// Rows rewritten in place (updates and parents that became children).
     pub updated: usize,
-    /// Edits refused: the policy wanted more.
+    /// Edits refused, mostly for lack of room.
     pub denied: usize,
 }
 
-/// What is wrong with a [`RowOps`].
+/// A broken invariant of a [`RowOps`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("broken row operations: {0}")]
 pub struct BrokenOps(String);
 
 impl RowOps {
-    /// Whether there is nothing to do: no row changes and no accumulator starts anew. A plan whose
-    /// edits were all refused is empty too; see [`EditCounts::denied`].
+    /// Whether nothing changes, neither rows nor accumulators. A plan whose edits were all refused is
+    /// empty too; see [`EditCounts::denied`].
     #[must_use]
     pub fn is_empty(&self) -> bool {
         !self.edits_rows() && !self.reset_signals && !self.reset_candidates
     }
 
-    /// Whether any row is born, removed, rewritten or clamped.
+    /// Whether any row is added, removed, rewritten or clamped.
     #[must_use]
     pub fn edits_rows(&self) -> bool {
         !(self.families.is_empty()
@@ -92,29 +93,29 @@ impl RowOps {
     /// The slots of `family`'s children.
     ///
     /// # Panics
-    /// When `family` is not one of this plan's.
+    /// When `family` does not belong to this plan.
     #[must_use]
     pub fn children(&self, family: &Family) -> &[u32] {
         &self.child_slots[family.first_child as usize..][..family.offspring.children as usize]
     }
 
-    /// Panics with the reason when [`check`](Self::check) finds one: going on would exceed the
-    /// budget or corrupt the model.
+    /// Panics if [`check`](Self::check) fails: executing the plan would exceed the budget or corrupt
+    /// the model.
     ///
     /// # Panics
-    /// See above.
+    /// With the reason that the check reports.
     pub fn assert_valid(&self) {
         if let Err(broken) = self.check() {
             panic!("{broken}");
         }
     }
 
-    /// Verifies everything this type promises: rows within the budget, no slot written twice, no
-    /// written slot read by another entry, rows `0..rows_after` dense, values in range, counts
-    /// right. Takes time in proportion to the operations, and one bit per row.
+    /// Checks all invariants: rows within the budget, no slot written twice, no written slot read by
+    /// another entry, rows `0..rows_after` dense, values in range, counts right. Takes linear time and
+    /// one bit per row.
     ///
     /// # Errors
-    /// The first promise that is broken, with the values.
+    /// The first broken invariant, with the values.
     pub fn check(&self) -> Result<(), BrokenOps> {
         self.check_totals()?;
         let slots = self.rows_before.max(self.rows_after);
@@ -127,7 +128,7 @@ impl RowOps {
         }
         for (slot, seed) in &self.seeds {
             require(seed.is_valid(), || format!("seed in slot {slot} has a bad value"))?;
-            self.check_birth("seed", *slot)?;
+            self.check_new_slot("seed", *slot)?;
             claimed.claim("seed", *slot)?;
         }
         self.check_moves(&mut claimed)
@@ -135,13 +136,13 @@ impl RowOps {
 
     fn check_totals(&self) -> Result<(), BrokenOps> {
         let Self { rows_before, rows_after, budget, counts, .. } = self;
-        let born = self.child_slots.len() + self.seeds.len();
-        require(rows_after <= budget || (rows_after <= rows_before && born == 0), || {
+        let added = self.child_slots.len() + self.seeds.len();
+        require(rows_after <= budget || (rows_after <= rows_before && added == 0), || {
             format!("{rows_after} rows after, budget {budget}")
         })?;
-        let holds = rows_before.checked_sub(counts.removed).map(|kept| kept + born);
-        require(holds == Some(*rows_after) && counts.added == born, || {
-            format!("{rows_before} rows, {counts:?}, {born} born: not {rows_after} rows after")
+        let expected = rows_before.checked_sub(counts.removed).map(|kept| kept + added);
+        require(expected == Some(*rows_after) && counts.added == added, || {
+            format!("{rows_before} rows, {counts:?}, {added} added: not {rows_after} rows after")
         })?;
         let is_child = |family: &&Family| family.offspring.parent == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
@@ -167,14 +168,14 @@ impl RowOps {
             format!("{} child slots for {first_child} children", self.child_slots.len())
         })?;
         for &slot in &self.child_slots {
-            self.check_birth("child", slot)?;
+            self.check_new_slot("child", slot)?;
             claimed.claim("child", slot)?;
         }
         Ok(())
     }
 
-    /// Every move ends in a hole; every parent and updated row of the tail is moved; the rows from
-    /// `rows_before` upward are all born.
+    /// Every move ends in a hole; every parent and updated row of the tail is moved; all rows from
+    /// `rows_before` upward are new.
     fn check_moves(&self, claimed: &mut Slots) -> Result<(), BrokenOps> {
         let Self { rows_before, rows_after, .. } = self;
         let mut moved = Slots::new(*rows_before);
@@ -189,32 +190,32 @@ impl RowOps {
         let parents = self.families.iter().map(|family| family.parent);
         for row in parents.chain(self.updates.iter().map(|update| update.0)) {
             require((row as usize) < *rows_after || moved.contains(row), || {
-                format!("row {row} lives on, but is beyond row {rows_after} and not moved")
+                format!("row {row} is kept, but is beyond row {rows_after} and not moved")
             })?;
         }
         let seeds = self.seeds.iter().map(|seed| &seed.0);
-        let births = self.child_slots.iter().chain(seeds);
-        let on_top = births.filter(|&&slot| slot as usize >= *rows_before).count();
+        let new_slots = self.child_slots.iter().chain(seeds);
+        let on_top = new_slots.filter(|&&slot| slot as usize >= *rows_before).count();
         require(on_top == rows_after.saturating_sub(*rows_before), || {
-            format!("{on_top} rows born on top of {rows_before}, {rows_after} rows after")
+            format!("{on_top} rows added on top of {rows_before}, {rows_after} rows after")
         })
     }
 
-    fn check_live(&self, what: &str, row: u32) -> Result<(), BrokenOps> {
+    fn check_live(&self, role: &str, row: u32) -> Result<(), BrokenOps> {
         require((row as usize) < self.rows_before, || {
-            format!("{what} {row} of {} rows", self.rows_before)
+            format!("{role} {row} of {} rows", self.rows_before)
         })
     }
 
-    fn check_birth(&self, what: &str, slot: u32) -> Result<(), BrokenOps> {
+    fn check_new_slot(&self, role: &str, slot: u32) -> Result<(), BrokenOps> {
         require((slot as usize) < self.rows_after.min(self.budget), || {
-            format!("{what} in slot {slot}, {} rows after, budget {}", self.rows_after, self.budget)
+            format!("{role} in slot {slot}, {} rows after, budget {}", self.rows_after, self.budget)
         })
     }
 }
 
-fn require(holds: bool, broken: impl FnOnce() -> String) -> Result<(), BrokenOps> {
-    if holds { Ok(()) } else { Err(BrokenOps(broken())) }
+fn require(holds: bool, message: impl FnOnce() -> String) -> Result<(), BrokenOps> {
+    if holds { Ok(()) } else { Err(BrokenOps(message())) }
 }
 
 /// A set of slots, one bit each.
@@ -229,9 +230,9 @@ impl Slots {
         self.0.get(slot as usize / 64).is_some_and(|word| word >> (slot % 64) & 1 == 1)
     }
 
-    fn claim(&mut self, what: &str, slot: u32) -> Result<(), BrokenOps> {
+    fn claim(&mut self, role: &str, slot: u32) -> Result<(), BrokenOps> {
         let is_new = !self.contains(slot);
-        require(is_new, || format!("{what} {slot} is used by another entry"))?;
+        require(is_new, || format!("{role} {slot} is used by another entry"))?;
         self.0[slot as usize / 64] |= 1 << (slot % 64);
         Ok(())
     }

@@ -1,83 +1,86 @@
-//! # igs — long-axis splits where the images have edges
+//! # igs — long-axis splits at image edges
 //!
-//! Improved-GS: *Improving Densification in 3D Gaussian Splatting for High-Fidelity Rendering*, Deng,
-//! Diao, Li, Yu, Xu, 2025, arXiv 2508.12313, with the constants of its public code.
+//! Splits Gaussians along their longest axis, those at image edges first, so that the number of
+//! Gaussians follows a square-root curve up to the budget.
 //!
-//! ## What it does
+//! Source: Improved-GS, *Improving Densification in 3D Gaussian Splatting for High-Fidelity Rendering*,
+//! Deng, Diao, Li, Yu, Xu, 2025, arXiv 2508.12313, with the constants of its public code.
 //!
-//! **Growth**, after every `grow_every` steps between `grow_from` and `grow_until`. The model may have
-//! as many rows as budget · √((step − `grow_from`) / (`curve_until` − `grow_from`)), at most the
-//! budget. Rows are eligible whose absolute screen gradient (mean over the views that saw them of the
-//! norm of the loss gradient by their mean on screen (NDC), its absolute values summed over pixels)
-//! is at least `tau`. Of these as many as there are to come are drawn without replacement, in
-//! proportion to their edge score: `views` training views, chosen at random, are rendered, each row's
-//! sum of the edge map over the pixels that it is blended into is divided by the mean of all rows
-//! that have any, and the quotients are added up. At the first growth after a recovery prune all
-//! views are used. From `final_from` on the gradient itself is the score, no view is rendered, and
-//! `tau` is divided by `final_divisor`.
+//! ## Method
 //!
-//! A row grows in one way: it is **split along its longest axis**. With d = `split_share`, two
-//! children stand at ±3d standard deviations; their longest axis is 1 − d times the parent's, the
-//! others √(1 − d²) times, so that the ends stay where they were; opacity is multiplied by
-//! `child_opacity`.
+//! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. The model may have
+//! budget · √((step − `grow_from`) / (`curve_until` − `grow_from`)) Gaussians, at most the budget.
+//! Candidates have an absolute screen gradient of at least `tau`: the norm of the loss gradient with
+//! respect to the projected mean (NDC), with absolute values summed over pixels, averaged over the
+//! views that saw the Gaussian. As many candidates as the curve allows are drawn without replacement,
+//! in proportion to their edge scores. For these, `views` random training views are rendered; in each,
+//! a Gaussian's score is the sum of the edge map over the pixels that it is blended into, divided by
+//! the mean of all Gaussians with a positive sum; the scores of all views are added. At the first
+//! growth after a recovery prune all views are used. From `final_from` on the gradient itself is the
+//! score, no view is rendered, and `tau` is divided by `final_divisor`.
 //!
-//! **Pruning**: at `first_prune_at`, rows less opaque than `first_prune_opacity`; at every growth,
-//! before it, those less opaque than `min_opacity`; and the `recovery_share` of all rows with the
-//! lowest opacity, `recover` steps after each opacity reset: what has not recovered is not needed.
+//! A candidate is **split along its longest axis**. With d = `split_share`, two children are placed at
+//! ±3d standard deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²)
+//! times, so that both ends stay in place. Their opacity is the parent's times `child_opacity`.
 //!
-//! **Opacity resets** to at most `reset_opacity` after every `reset_every` steps, `resets` of them in
-//! all, none from `grow_until` on.
+//! **Pruning** removes Gaussians less opaque than `first_prune_opacity` at step `first_prune_at`, and
+//! those less opaque than `min_opacity` before every growth. `recover` steps after each opacity reset
+//! it removes the share `recovery_share` of all Gaussians with the lowest opacity: those that have not
+//! recovered are not needed.
 //!
-//! **The optimiser** steps every iteration up to `sum_from`, then once for `sum` iterations, after
-//! `sum_more_from` once for `sum_more`, on the sum of their gradients. The means' step size falls from
-//! `mean_start` to `mean_end`; that of the colour bands 1–3 is `sh_rest`. (`--lr` wins over these.)
+//! **Opacity resets** limit opacities to `reset_opacity` every `reset_every` steps, `resets` times in
+//! all, and never from `grow_until` on.
 //!
-//! ## Where we depart from the source
+//! **The optimiser** steps at every iteration up to `sum_from`, then once per `sum` iterations, after
+//! `sum_more_from` once per `sum_more`, on the summed gradients. The learning rate of the means falls
+//! from `mean_start` to `mean_end`; that of SH bands 1–3 is `sh_rest`. (`--lr` overrides both.)
 //!
-//! - `recover` counts optimiser steps and does not scale with the length of the run; but it is never
-//!   more than half the interval of resets, so that no reset comes between.
-//! - The source normalises edge scores by their mean; we take the mean over the rows that a view
-//!   shows.
-//! - The last row is never pruned.
+//! ## Differences from the published code
+//!
+//! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half
+//!   the interval of resets, so that the prune comes before the next reset.
+//! - The published code divides edge scores by their mean over all Gaussians; here it is the mean over
+//!   those that the view shows.
+//! - The last Gaussian is never pruned.
 //!
 //! ## Parameters
 //!
-//! | name | default | range | unit | what |
+//! | name | default | range | unit | meaning |
 //! |---|---|---|---|---|
 //! | grow_from | 500 | >= 0 | step | start of growth and pruning (exclusive) |
 //! | grow_until | 15000 | >= 0 | step | end of growth, pruning and resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth and pruning; 0: never |
-//! | curve_until | 14500 | >= 0 | step | when the model may have as many rows as the budget |
-//! | tau | 0.0003 | >= 0 | 1 / NDC | absolute screen gradient from which a row may grow |
+//! | curve_until | 14500 | >= 0 | step | when the growth curve reaches the budget |
+//! | tau | 0.0003 | >= 0 | 1 / NDC | absolute screen gradient from which a Gaussian may be split |
 //! | views | 10 | >= 1 | views | views rendered per growth; all if there are fewer |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
-//! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor of the children's opacity |
+//! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the children's opacity |
 //! | final_from | 14500 | >= 0 | step | start of growth by gradient |
-//! | final_divisor | 1.5 | >= 1 | | by which `tau` is divided then |
-//! | min_opacity | 0.005 | 0 to 1 | | opacity below which a row is pruned |
+//! | final_divisor | 1.5 | >= 1 | | divides `tau` from then on |
+//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
 //! | first_prune_at | 300 | >= 0 | step | the first pruning; 0: none |
-//! | first_prune_opacity | 0.02 | 0 to 1 | | opacity below which it prunes |
+//! | first_prune_opacity | 0.02 | 0 to 1 | | opacity limit of the first pruning |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
 //! | resets | 2 | >= 0 | | number of opacity resets |
 //! | reset_opacity | 0.05 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | recover | 300 | >= 1 | steps | from a reset to the recovery prune |
-//! | recovery_share | 0.2 | 0 to 1 | rows | share of the rows that it prunes; 0: none |
+//! | recovery_share | 0.2 | 0 to 1 | Gaussians | share that the recovery prune removes; 0: none |
 //! | sum_from | 15000 | >= 0 | step | start of summed gradients (exclusive) |
-//! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step then; 1: every one |
+//! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step from then on |
 //! | sum_more_from | 22500 | >= 0 | step | start of longer sums (exclusive) |
-//! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step then; 1: every one |
-//! | mean_start | 0.00004 | > 0 | extent / step | step size of the means at the start |
-//! | mean_end | 0.000002 | > 0 | extent / step | step size of the means at the end |
-//! | sh_rest | 0.00025 | > 0 | | step size of the colour bands 1–3 |
+//! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step from then on |
+//! | mean_start | 0.00004 | > 0 | extent / step | learning rate of the means at the start |
+//! | mean_end | 0.000002 | > 0 | extent / step | learning rate of the means at the end |
+//! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
-//! down to 100 steps at most; `recover` and the sums do not.
+//! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
+//! (`…_every`) do not shrink below 100 steps. `recover`, `sum` and `sum_more` do not scale.
 
-use crate::adc::{Mortality, Window, mean_over_views, spare_one, split_long_axis};
+use crate::adc::{PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyError,
-    PolicyState, RateOverrides, SceneInfo, Signal, SignalSet, Snapshot, restore_nothing,
+    RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -90,9 +93,9 @@ pub use parameters::IgsParams;
 crate::register_policy!(
     "igs",
     Igs,
-    summary: "long-axis splits along a square-root curve, where the images have edges",
+    summary: "long-axis splits at image edges, along a square-root growth curve",
     source: "Improved-GS, Deng et al. 2025, arXiv 2508.12313",
-    doc: include_str!("igs.rs"),
+    doc: include_str!("mod.rs"),
 );
 
 /// Long-axis splits by edge score.
@@ -105,7 +108,7 @@ pub struct Igs {
     score: EdgeScore,
 }
 
-/// Edge scores of the event at hand. No state: they are gone with the event.
+/// Edge scores of the current event. They are not saved: each event starts anew.
 #[derive(Debug, Default)]
 struct EdgeScore {
     step: u32,
@@ -143,7 +146,7 @@ impl DensityPolicy for Igs {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
         Needs {
-            signals: SignalSet::of(&[
+            signals: SignalSet::from([
                 Signal::VisibleCount,
                 Signal::ScreenGradientAbs,
                 Signal::Opacity,
@@ -165,9 +168,9 @@ impl DensityPolicy for Igs {
 
     fn is_due(&self, step: u32) -> bool {
         self.grow.is_due(step)
-            || self.prunes_first_at(step)
-            || self.resets_at(step)
-            || self.recovered_at(step)
+            || self.is_first_prune(step)
+            || self.is_reset(step)
+            || self.is_recovery_prune(step)
     }
 
     fn cadence(&self, step: u32) -> Cadence {
@@ -185,7 +188,7 @@ impl DensityPolicy for Igs {
         }
         // The first growth after a recovery prune.
         let since = step - self.params.grow_every.min(step);
-        let after_prune = (since..step).any(|step| self.recovered_at(step));
+        let after_prune = (since..step).any(|step| self.is_recovery_prune(step));
         if after_prune { u32::MAX } else { self.params.views }
     }
 
@@ -207,31 +210,23 @@ impl DensityPolicy for Igs {
             self.split(now, &score, rng, plan)?;
             plan.reset(Reset::Signals);
         }
-        if self.resets_at(now.step) {
+        if self.is_reset(now.step) {
             plan.cause("reset");
-            // In range since `new`.
+            // `new` checked the range.
             let _ = plan.clamp_opacity(self.params.reset_opacity as f32);
         }
         Ok(())
     }
-
-    fn save(&self) -> PolicyState {
-        PolicyState::Null
-    }
-
-    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
-        restore_nothing(&state)
-    }
 }
 
 impl EdgeScore {
-    /// Adds one view: each row's sum, divided by the mean of the rows that have any.
+    /// Adds one view: each row's sum, divided by the mean of the positive sums.
     fn add(&mut self, step: u32, sums: &[f32]) {
         if self.step != step || self.rows.len() != sums.len() {
             *self = Self { step, rows: vec![0.0; sums.len()] };
         }
-        let shown = sums.iter().filter(|sum| **sum > 0.0).map(|sum| f64::from(*sum));
-        let (count, total) = shown.fold((0.0, 0.0), |(n, total), sum| (n + 1.0, total + sum));
+        let positive = sums.iter().filter(|sum| **sum > 0.0).map(|sum| f64::from(*sum));
+        let (count, total) = positive.fold((0.0, 0.0), |(n, total), sum| (n + 1.0, total + sum));
         for (score, &sum) in self.rows.iter_mut().zip(sums) {
             let relative = (f64::from(sum) * count / total) as f32;
             if relative > 0.0 {
@@ -242,12 +237,12 @@ impl EdgeScore {
 }
 
 impl Igs {
-    fn prunes_first_at(&self, step: u32) -> bool {
+    fn is_first_prune(&self, step: u32) -> bool {
         step > 0 && step == self.params.first_prune_at
     }
 
     /// Whether opacities are reset at `step`: the first multiples of the interval.
-    fn resets_at(&self, step: u32) -> bool {
+    fn is_reset(&self, step: u32) -> bool {
         let IgsParams { reset_every: every, resets, grow_until, .. } = self.params;
         every > 0
             && (1..=resets).contains(&(step / every))
@@ -255,13 +250,13 @@ impl Igs {
             && step < grow_until
     }
 
-    fn recovered_at(&self, step: u32) -> bool {
+    fn is_recovery_prune(&self, step: u32) -> bool {
         self.params.recovery_share > 0.0
             && step < self.params.grow_until
-            && step.checked_sub(self.recover).is_some_and(|reset| self.resets_at(reset))
+            && step.checked_sub(self.recover).is_some_and(|reset| self.is_reset(reset))
     }
 
-    /// Rows that the curve allows at `step`.
+    /// Number of rows that the growth curve allows at `step`.
     fn allowed(&self, step: u32, budget: usize) -> usize {
         let IgsParams { grow_from, curve_until, .. } = self.params;
         let length = f64::from(curve_until.saturating_sub(grow_from).max(1));
@@ -275,31 +270,27 @@ impl Igs {
         if self.grow.is_due(now.step) {
             least = self.params.min_opacity;
         }
-        if self.prunes_first_at(now.step) {
+        if self.is_first_prune(now.step) {
             least = least.max(self.params.first_prune_opacity);
             plan.cause("first-prune");
         }
-        let mortality = Mortality { min_opacity: least as f32, max_scale: f32::INFINITY };
-        let is_dead = |row: &u32| mortality.is_dead(opacity[*row as usize], 0.0);
+        let limits = PruneLimits { min_opacity: least as f32, max_scale: f32::INFINITY };
+        let is_dead = |row: &u32| limits.exceeded(opacity[*row as usize], 0.0);
         let (mut dead, mut living): (Vec<u32>, Vec<u32>) =
             (0..now.rows() as u32).partition(is_dead);
-        if self.recovered_at(now.step) {
+        if self.is_recovery_prune(now.step) {
             plan.cause("recovery-prune");
-            let share = (self.params.recovery_share * now.rows() as f64).floor() as usize;
-            let more = share.saturating_sub(dead.len());
-            living = smallest(living, opacity, more);
+            let count = (self.params.recovery_share * now.rows() as f64).floor() as usize;
+            living = smallest(living, opacity, count.saturating_sub(dead.len()));
             dead.append(&mut living);
             dead.sort_unstable();
         }
         spare_one(&mut dead, opacity);
-        for row in dead {
-            // Never refused: each row once, and it exists.
-            let _ = plan.prune(row);
-        }
+        plan.prune_all(dead);
         Ok(())
     }
 
-    /// Splits eligible rows, drawn by their scores, as far as the curve allows.
+    /// Splits candidates, drawn by their scores, as far as the curve allows.
     fn split(
         &self,
         now: &Snapshot<'_>,
@@ -313,16 +304,16 @@ impl Igs {
         let divisor = if by_gradient { self.params.final_divisor } else { 1.0 };
         let tau = (self.params.tau / divisor) as f32;
         let weight = |row: usize| {
-            let is_eligible = gradient[row] >= tau && plan.is_free(row as u32);
+            let is_candidate = gradient[row] >= tau && plan.is_free(row as u32);
             let score = if by_gradient { Some(&gradient[row]) } else { score.rows.get(row) };
-            if is_eligible { score.copied().unwrap_or(0.0) } else { 0.0 }
+            if is_candidate { score.copied().unwrap_or(0.0) } else { 0.0 }
         };
         let weights: Vec<f32> = (0..now.rows()).map(weight).collect();
         let rows = plan.rows() - plan.pruned();
-        let births = self.allowed(now.step, plan.budget()).saturating_sub(rows);
+        let count = self.allowed(now.step, plan.budget()).saturating_sub(rows);
         let split =
             split_long_axis(self.params.split_share as f32, self.params.child_opacity as f32);
-        for row in weighted(&weights, births, rng) {
+        for row in weighted(&weights, count, rng) {
             // A refusal is counted by the plan.
             let _ = plan.grow(row, split);
         }

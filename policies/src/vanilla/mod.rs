@@ -1,68 +1,71 @@
 //! # vanilla — the original adaptive density control
 //!
-//! Kerbl, Kopanas, Leimkühler, Drettakis, *3D Gaussian Splatting for Real-Time Radiance Field
+//! Clones or splits Gaussians with large screen gradients, prunes transparent and oversized ones, and
+//! resets opacities now and then.
+//!
+//! Source: Kerbl, Kopanas, Leimkühler, Drettakis, *3D Gaussian Splatting for Real-Time Radiance Field
 //! Rendering*, SIGGRAPH 2023, section 5.2, with the constants and the order of its public code.
 //!
-//! ## What it does
+//! ## Method
 //!
-//! After every `grow_every` steps, between `grow_from` and `grow_until`:
+//! Every `grow_every` steps between `grow_from` and `grow_until`:
 //!
-//! 1. Rows whose screen gradient g (mean over the views that saw them of the norm of the loss
-//!    gradient with respect to their mean on screen (NDC)) is at least `tau` need detail. Small ones
-//!    (largest standard deviation at most `small` · scene extent) are cloned: an exact copy, at the
-//!    same place. Larger ones are split into two samples of themselves, smaller by `split_factor`.
-//! 2. Rows less opaque than `min_opacity` are pruned; after step `max_scale_from` also rows larger
-//!    than `max_scale` · scene extent. (Pruning by size on screen is dead code in the original.)
-//!    The last row is never pruned.
-//! 3. The gradient statistics start anew.
+//! 1. Gaussians whose screen gradient g is at least `tau` are densified. g is the norm of the loss
+//!    gradient with respect to the projected mean (NDC), averaged over the views that saw the Gaussian.
+//!    Small Gaussians (largest standard deviation at most `small` · scene extent) are cloned: an exact
+//!    copy at the same place. Larger ones are split into two samples, with scales divided by
+//!    `split_factor`.
+//! 2. Gaussians less opaque than `min_opacity` are pruned; after step `max_scale_from` also those larger
+//!    than `max_scale` · scene extent. (Pruning by size on screen is dead code in the original.) The
+//!    last Gaussian is never pruned.
+//! 3. The gradient statistics are reset.
 //!
-//! After every `reset_every` steps until `grow_until`, and on a white background once at
-//! `white_reset_at`, no opacity may be above `reset_opacity`; opacity moments become zero.
+//! Every `reset_every` steps until `grow_until`, and on a white background once at `white_reset_at`,
+//! opacities are limited to `reset_opacity`, and their optimiser moments are set to zero.
 //!
 //! ## Under a budget
 //!
-//! Hard stop (default): growth comes before pruning, as in the original, and takes place as far as
-//! there is room, the largest g first; at the budget nothing grows until pruning has made room. What
-//! is refused is counted as denied. With `governor`, `tau` is not used: each event grows the rows
-//! with the largest g, as many as bring the model up to a curve that rises from the initial rows to
-//! the budget, N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M (*Taming 3DGS*, Mallick et al.
-//! 2024, equation 2). A hard stop spends the budget on whatever grows first, which some hold to be
-//! an unfair baseline.
+//! By default growth stops hard at the budget. As in the original, growth comes before pruning; the
+//! largest g grow first while there is room, and at the budget nothing grows until pruning has made
+//! room. What is refused is counted as denied. A hard stop spends the budget on whatever grows first,
+//! which some consider an unfair baseline.
+//!
+//! With `governor`, `tau` is not used. Each event grows the Gaussians with the largest g, as many as
+//! bring the model up to a curve that rises from the S initial Gaussians to the budget B:
+//! N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M (*Taming 3DGS*, Mallick et al. 2024, equation 2).
 //!
 //! ## Parameters
 //!
-//! | name | default | range | unit | what |
+//! | name | default | range | unit | meaning |
 //! |---|---|---|---|---|
 //! | grow_from | 500 | >= 0 | step | start of growth and pruning (exclusive) |
 //! | grow_until | 15000 | >= 0 | step | end of growth, pruning and opacity resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth and pruning; 0: never |
-//! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a row grows |
-//! | small | 0.01 | >= 0 | scene extent | up to this size a row is cloned, beyond it split |
-//! | split_factor | 1.6 | 1 to 100 | | by which a split divides the scales |
-//! | min_opacity | 0.005 | 0 to 1 | | opacity below which a row is pruned |
-//! | max_scale | 0.1 | > 0 | scene extent | size beyond which a row is pruned |
+//! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
+//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
+//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
+//! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned |
 //! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
 //! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
-//! | governor | false | | | follow a growth curve rather than `tau` |
+//! | governor | false | | | follow a growth curve instead of `tau` |
 //!
-//! Defaults that are steps are for a run of 30,000 and scale with its length, intervals (`…_every`)
-//! down to 100 steps at most.
+//! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
+//! (`…_every`) do not shrink below 100 steps.
 
 use std::ops::Bound::{Excluded, Unbounded};
 
 use serde::{Deserialize, Serialize};
 
 use crate::adc::{
-    Mortality, OpacityResets, Window, clone_at, concave_curve, mean_over_views, spare_one, split_by,
+    OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
+    split_by,
 };
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
-use crate::policy::{
-    DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Signal, SignalSet, Snapshot,
-    restore_nothing,
-};
+use crate::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Signal, SignalSet, Snapshot};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
@@ -72,10 +75,10 @@ crate::register_policy!(
     Vanilla,
     summary: "the original adaptive density control; hard stop or governed growth under a budget",
     source: "Kerbl et al. 2023, arXiv 2308.04079",
-    doc: include_str!("vanilla.rs"),
+    doc: include_str!("mod.rs"),
 );
 
-/// Parameters of [`Vanilla`]; its manual page says what they mean.
+/// Parameters of [`Vanilla`], explained in its manual page.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 #[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
@@ -141,16 +144,21 @@ impl ConfiguredPolicy for Vanilla {
         in_range("split_factor", params.split_factor, 1.0..=100.0)?;
         in_range("min_opacity", params.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", params.max_scale, (Excluded(0.0), Unbounded))?;
-        let resets = (params.reset_every, params.grow_until, params.white_reset_at);
-        let resets = OpacityResets::new(resets, params.reset_opacity, scene)?;
-        let VanillaParams { grow_from: from, grow_until: until, .. } = params;
-        Ok(Self { grow: Window { from, until, every: params.grow_every }, resets, params })
+        let VanillaParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
+        let resets = OpacityResets::new(
+            params.reset_every,
+            until,
+            params.white_reset_at,
+            params.reset_opacity,
+            scene,
+        )?;
+        Ok(Self { grow: Window { from, until, every }, resets, params })
     }
 }
 
 impl DensityPolicy for Vanilla {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let signals = SignalSet::of(&[
+        let signals = SignalSet::from([
             Signal::VisibleCount,
             Signal::ScreenGradient,
             Signal::Opacity,
@@ -177,70 +185,51 @@ impl DensityPolicy for Vanilla {
         self.resets.plan(now.step, plan);
         Ok(())
     }
-
-    fn save(&self) -> PolicyState {
-        PolicyState::Null
-    }
-
-    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
-        restore_nothing(&state)
-    }
 }
 
 impl Vanilla {
-    /// Growth, then pruning. In the original, too, rows are pruned as they are after growth: a huge
-    /// row that has been split is judged by its children's size.
+    /// Grows, then prunes. As in the original, rows are pruned as they are after growth: a huge row
+    /// that is split is judged by the size of its children.
     fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> Result<(), PolicyError> {
         let opacity = now.signal(Signal::Opacity)?;
         let scale = now.signal(Signal::ScaleMax)?;
         let screen_gradient = now.signal(Signal::ScreenGradient)?;
         let gradient = mean_over_views(screen_gradient, now.signal(Signal::VisibleCount)?);
-        let mortality = self.mortality(now);
+        let VanillaParams { min_opacity, max_scale, max_scale_from, .. } = self.params;
+        let limits = PruneLimits::at(now, min_opacity, max_scale, max_scale_from);
         let small = (self.params.small * f64::from(now.scene.extent)) as f32;
         let factor = self.params.split_factor as f32;
 
         let is_small = |row: usize| scale[row] <= small;
         let would_die = |row: usize| {
             let grown_scale = if is_small(row) { scale[row] } else { scale[row] / factor };
-            mortality.is_dead(opacity[row], grown_scale)
+            limits.exceeded(opacity[row], grown_scale)
         };
-        let is_wanted = |row: usize| match self.params.governor {
+        let needs_detail = |row: usize| match self.params.governor {
             true => gradient[row] > 0.0,
             false => gradient[row] >= self.params.tau as f32,
         };
-        let wanted = (0..now.rows()).filter(|&row| is_wanted(row) && !would_die(row));
-        let wanted: Vec<u32> = wanted.map(|row| row as u32).collect();
-        let most = match self.params.governor {
+        let parents = (0..now.rows()).filter(|&row| needs_detail(row) && !would_die(row));
+        let parents: Vec<u32> = parents.map(|row| row as u32).collect();
+        let count = match self.params.governor {
             true => self.governed_rows(now.scene, now.step).saturating_sub(now.rows()),
-            false => wanted.len(),
+            false => parents.len(),
         };
-        for row in largest(wanted, &gradient, most) {
+        for row in largest(parents, &gradient, count) {
             let offspring =
                 if is_small(row as usize) { clone_at([0.0; 3]) } else { split_by(factor) };
             // A refusal is counted by the plan.
             let _ = plan.grow(row, offspring);
         }
 
-        let is_dead = |row: usize| mortality.is_dead(opacity[row], scale[row]);
-        let dead = (0..now.rows() as u32).filter(|&r| plan.is_free(r) && is_dead(r as usize));
-        let mut dead: Vec<u32> = dead.collect();
+        let mut dead = limits.dead_rows(now)?;
+        dead.retain(|&row| plan.is_free(row));
         spare_one(&mut dead, opacity);
-        for row in dead {
-            let _ = plan.prune(row);
-        }
+        plan.prune_all(dead);
         Ok(())
     }
 
-    fn mortality(&self, now: &Snapshot<'_>) -> Mortality {
-        let by_size = now.step > self.params.max_scale_from;
-        let max_scale = (self.params.max_scale * f64::from(now.scene.extent)) as f32;
-        Mortality {
-            min_opacity: self.params.min_opacity as f32,
-            max_scale: if by_size { max_scale } else { f32::INFINITY },
-        }
-    }
-
-    /// Rows that the growth curve allows at the growth event of this step.
+    /// Number of rows that the growth curve allows at this step.
     fn governed_rows(&self, scene: &SceneInfo, step: u32) -> usize {
         concave_curve(self.grow, step, scene.initial_rows, scene.budget)
     }

@@ -1,0 +1,115 @@
+//! Checks a manual page: all parameters are in its table, with the defaults and ranges of the code.
+
+use toml::{Table, Value};
+
+use super::scenarios::scene;
+use super::{Check, Report};
+use crate::parameters::parse_value;
+use crate::policy::PolicyError;
+use crate::registry::PolicyEntry;
+
+/// Runs [`Check::IsDocumented`].
+///
+/// # Errors
+/// A report of all parameters whose row in the manual is missing or wrong.
+pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
+    let manual = entry.manual();
+    let table = manual.lines().skip_while(|line| !line.starts_with("| name | default |")).skip(2);
+    let rows: Vec<Vec<&str>> = table
+        .take_while(|line| line.starts_with('|'))
+        .map(|line| line.trim_matches('|').split('|').map(str::trim).collect())
+        .collect();
+    let mut wrong: Vec<String> = Vec::new();
+    for (name, default) in &entry.parameters() {
+        match rows.iter().find(|row| row[0] == name) {
+            None => wrong.push(format!("`{name}` is missing")),
+            Some(row) if row.len() != 5 => wrong.push(format!("`{name}` has {} cells", row.len())),
+            Some(row) => {
+                if !is_same(&parse_value(row[1]), default) {
+                    wrong.push(format!("`{name}` has the default {default}, not {}", row[1]));
+                }
+                wrong.extend(check_range(entry, name, default, row[2]));
+            }
+        }
+    }
+    let known = entry.parameter_names();
+    let unknown = rows.iter().map(|row| row[0]).filter(|name| known.iter().all(|k| k != name));
+    wrong.extend(unknown.map(|name| format!("`{name}` is not a parameter")));
+    let mut report = Report::new(entry);
+    if !wrong.is_empty() {
+        report.add(Check::IsDocumented, wrong.join(", "));
+    }
+    report.result()
+}
+
+fn is_same(documented: &Value, default: &Value) -> bool {
+    let number = |value: &Value| value.as_float().or_else(|| value.as_integer().map(|v| v as f64));
+    match (number(documented), number(default)) {
+        (Some(documented), Some(default)) => documented.total_cmp(&default).is_eq(),
+        _ => documented == default,
+    }
+}
+
+/// Builds the policy with values at the ends of the documented range and beyond them. Returns the first
+/// that is not accepted or refused as documented.
+fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) -> Option<String> {
+    let Some((inside, outside)) = values(range, default) else {
+        return Some(format!("`{name}` has the range `{range}`, which is of no known form"));
+    };
+    let build = |value: &Value| {
+        let set = Table::from_iter([(name.to_owned(), value.clone())]);
+        entry.build(&set, &scene(10, 100)).map(drop)
+    };
+    let inside = inside.iter().find_map(|value| {
+        let why = build(value).err()?;
+        Some(format!("`{name}` = {value} is in its range, but: {why}"))
+    });
+    inside.or_else(|| {
+        outside.iter().find_map(|value| match build(value) {
+            Ok(()) => Some(format!("`{name}` = {value} is accepted, but its range is `{range}`")),
+            Err(PolicyError::BadParameter { parameter, .. }) if parameter == name => None,
+            Err(error) => Some(format!("`{name}` = {value} is refused as: {error}")),
+        })
+    })
+}
+
+/// Values inside and outside of a range: `>= a`, `> a`, `a to b`, this followed by `, a excluded`,
+/// `, b excluded` or `, both excluded`, or a list of words. `None` for other forms.
+fn values(range: &str, default: &Value) -> Option<(Vec<Value>, Vec<Value>)> {
+    if range.is_empty() {
+        return Some((Vec::new(), Vec::new()));
+    }
+    if default.is_str() {
+        let words = range.split(", ").map(Value::from).collect();
+        return Some((words, vec!["no such choice".into()]));
+    }
+    let (ends, excluded) = range.split_once(", ").unwrap_or((range, ""));
+    let (low, high) = ends.split_once(" to ").unwrap_or((ends, ""));
+    let excludes = |end: &str| excluded == "both excluded" || excluded == format!("{end} excluded");
+    let (low, excludes_low) = match (low.strip_prefix(">= "), low.strip_prefix("> ")) {
+        (Some(low), _) => (low, false),
+        (_, Some(low)) => (low, true),
+        _ => (low, excludes(low)),
+    };
+    let number = |x: f64| match default {
+        Value::Integer(_) => Value::Integer(x as i64),
+        _ => Value::Float(x),
+    };
+    let (mut inside, mut outside) = (Vec::new(), Vec::new());
+    let mut end = |end: &str, is_excluded: bool, beyond: f64| {
+        let end: f64 = end.parse().ok()?;
+        if !is_excluded {
+            inside.push(number(end));
+        }
+        outside.push(number(if is_excluded { end } else { end + beyond }));
+        Some(())
+    };
+    end(low, excludes_low, -1.0)?;
+    if !high.is_empty() {
+        end(high, excludes(high), 1.0)?;
+    }
+    if default.is_float() {
+        outside.extend([f64::NAN, f64::INFINITY].map(Value::Float));
+    }
+    Some((inside, outside))
+}

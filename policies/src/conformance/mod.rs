@@ -1,0 +1,177 @@
+//! The conformance suite: tests that every policy must pass, built-in or not.
+//!
+//! Call [`check_policy`] in a test of the crate that defines the policy:
+//!
+//! ```
+//! # use densify_policies::{conformance, registry};
+//! let entry = registry::find("vanilla")?;
+//! conformance::check_policy(entry)?;
+//! conformance::check_manual(entry)?;
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! The suite builds the policy with its defaults and leads it through scripted runs: models that are
+//! empty, have one row, are full or have room, and plans that refuse all growth; statistics that are
+//! plausible, zero, all equal, negative, infinite, NaN or a mixture of these; auxiliary views with the
+//! same. [`Check`] lists what is checked of every plan:
+//!
+//! - the budget holds, and one row is left;
+//! - the same input gives the same plan, and a policy saved and restored in mid-run continues the same;
+//! - nothing is read that was not declared, and declarations are valid;
+//! - no statistics and no refusals cause an error or a panic;
+//! - the manual page lists all parameters with their defaults and ranges.
+//!
+//! The suite cannot know whether a rule is the published one. Test the identities of your policy
+//! yourself: children that conserve opacity, splits that keep their ends, curves that end at the budget.
+
+use std::fmt;
+
+use toml::{Table, Value};
+
+use crate::policy::{PolicyError, SceneInfo};
+use crate::registry::PolicyEntry;
+
+mod manual;
+mod run;
+mod scenarios;
+mod synthetic;
+
+pub use manual::check_manual;
+
+/// A property that every policy must have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum Check {
+    /// It can be built from its defaults for a run of any length, its step parameters are integer
+    /// parameters, and an unknown parameter is refused.
+    Builds,
+    /// It reads no signal, no candidates, and no column or point of an auxiliary view that its needs
+    /// do not list, not even if they are present.
+    ReadsOnlyDeclared,
+    /// It requests fresh views if and only if it requests the signal measured in them, and auxiliary
+    /// views only if its needs say what to measure there.
+    RequestsConsistently,
+    /// Every number in its needs is in its range, and at no step is its cadence longer than declared.
+    DeclaresValidNumbers,
+    /// It plans without error or panic, whatever the statistics hold and whatever the plan refuses.
+    NeverFails,
+    /// It returns the plan that it was given, for these rows and this budget.
+    KeepsPlan,
+    /// It leaves at least one row of a model that had any.
+    LeavesARow,
+    /// From the same inputs it makes the same plan, has the same needs and is due at the same steps.
+    IsDeterministic,
+    /// Saved as JSON in mid-run and restored, it continues the same.
+    RestoresState,
+    /// It refuses a saved state that is not its own.
+    RejectsForeignState,
+    /// Its manual page has a table `| name | default | range | unit | meaning |` of exactly its
+    /// parameters, with their defaults, and with ranges that the policy enforces.
+    IsDocumented,
+}
+
+impl fmt::Display for Check {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Builds => "can be built from its defaults",
+            Self::ReadsOnlyDeclared => "reads only what it declares",
+            Self::RequestsConsistently => "requests views together with what is measured in them",
+            Self::DeclaresValidNumbers => "declares valid numbers",
+            Self::NeverFails => "plans without error, whatever it is given",
+            Self::KeepsPlan => "keeps the plan that it is given",
+            Self::LeavesARow => "leaves at least one row",
+            Self::IsDeterministic => "makes the same plan from the same inputs",
+            Self::RestoresState => "continues the same after save and restore",
+            Self::RejectsForeignState => "refuses a state that is not its own",
+            Self::IsDocumented => "documents its parameters",
+        })
+    }
+}
+
+/// The checks that failed, each with its first failure.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Report {
+    /// The policy's name and where it is registered.
+    pub policy: String,
+    /// The failed checks, and how they failed.
+    pub failures: Vec<(Check, String)>,
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "policy {} does not conform:", self.policy)?;
+        for (check, how) in &self.failures {
+            write!(f, "\n- failed: it {check}; {how}")?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for Report {}
+
+impl Report {
+    fn new(entry: &PolicyEntry) -> Self {
+        let policy = format!("`{}` ({})", entry.name, entry.location());
+        Self { policy, failures: Vec::new() }
+    }
+
+    /// Keeps the first failure of each check.
+    fn add(&mut self, check: Check, how: String) {
+        if self.failures.iter().all(|(known, _)| *known != check) {
+            self.failures.push((check, how));
+        }
+    }
+
+    fn result(self) -> Result<(), Self> {
+        if self.failures.is_empty() { Ok(()) } else { Err(self) }
+    }
+}
+
+/// Runs every check but [`Check::IsDocumented`], with the policy's defaults.
+///
+/// # Errors
+/// A report of all checks that failed.
+pub fn check_policy(entry: &PolicyEntry) -> Result<(), Report> {
+    check_policy_with(entry, &Table::new())
+}
+
+/// Runs every check but [`Check::IsDocumented`], with some parameters set.
+///
+/// # Errors
+/// A report of all checks that failed.
+pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report> {
+    let mut report = Report::new(entry);
+    check_building(entry, set, &mut report);
+    if report.failures.is_empty() {
+        for scenario in scenarios::scenarios() {
+            if let Err((check, how)) = run::run(entry, set, &scenario) {
+                report.add(check, format!("{scenario}: {how}"));
+            }
+        }
+    }
+    report.result()
+}
+
+fn check_building(entry: &PolicyEntry, set: &Table, report: &mut Report) {
+    for iterations in [1, 7, 600, 30_000, u32::MAX] {
+        let scene = SceneInfo { iterations, ..scenarios::scene(10, 100) };
+        if let Err(error) = entry.build(set, &scene) {
+            report.add(Check::Builds, format!("for {iterations} steps: {error}"));
+        }
+    }
+    let parameters = entry.parameters();
+    for step in entry.step_parameters() {
+        if !parameters.iter().any(|(name, value)| name == step && value.is_integer()) {
+            report.add(Check::Builds, format!("`{step}` counts steps but is no integer parameter"));
+        }
+    }
+    let unknown = Table::from_iter([("no_such_parameter".to_owned(), Value::Integer(1))]);
+    match entry.build(&unknown, &scenarios::scene(10, 100)) {
+        Err(PolicyError::UnknownParameter { .. }) => {}
+        Err(error) => report.add(Check::Builds, format!("an unknown parameter gives: {error}")),
+        Ok(_) => report.add(Check::Builds, "an unknown parameter is accepted".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,233 @@
+//! Leads copies of a policy through a scripted run and compares what they do.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use toml::Table;
+
+use super::Check;
+use super::scenarios::Scenario;
+use super::synthetic::{Event, Model, View};
+use crate::plan::{EditPlan, RowOps};
+use crate::policy::{
+    AuxRequest, AuxView, DensityPolicy, Needs, PolicyError, PolicyState, Signal, Snapshot,
+};
+use crate::registry::PolicyEntry;
+use crate::rng::PolicyRng;
+
+/// Most events of one run, for policies that are due at every step.
+const MAX_EVENTS: usize = 400;
+/// Most auxiliary views of an event.
+const MAX_VIEWS: u32 = 3;
+
+type Failure = (Check, String);
+
+/// Runs a scenario with several copies of the policy: one as in training; a second one; one that is
+/// shown more than it declares; and, from a third and from two thirds of the run on, one that was saved
+/// and restored. All must make the same plans.
+pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<(), Failure> {
+    let scene = &scenario.scene;
+    let build = || {
+        let built = catch_panic(|| entry.build(set, scene));
+        built.and_then(|built| built.map_err(|e| e.to_string())).map_err(|why| (Check::Builds, why))
+    };
+    let mut policy = build()?;
+    let mut copies: Vec<(Check, Box<dyn DensityPolicy>)> =
+        vec![(Check::IsDeterministic, build()?), (Check::ReadsOnlyDeclared, build()?)];
+    rejects_foreign_state(&mut *build()?)?;
+    let needs = policy.needs(scene);
+    check_needs(&*policy, &needs, scenario)?;
+    if needs != policy.needs(scene) || needs != copies[0].1.needs(scene) {
+        return Err((Check::IsDeterministic, "its needs change".to_owned()));
+    }
+
+    let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
+    let mut model = Model { rows: scene.initial_rows, candidates: Vec::new() };
+    let events = due.len().min(MAX_EVENTS);
+    for (event, &step) in due.iter().take(events).enumerate() {
+        let rows = model.rows;
+        let at = |(check, why): Failure| (check, format!("step {step}, {rows} rows: {why}"));
+        if event == events / 3 || event == 2 * events / 3 {
+            copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(at)?));
+        }
+        let ops = run_event(&mut *policy, &mut copies, &needs, scenario, &mut model, step);
+        model.apply(&ops.map_err(at)?);
+    }
+    Ok(())
+}
+
+/// Checks that the needs are consistent and in range, and that no cadence exceeds the declared one.
+fn check_needs(
+    policy: &dyn DensityPolicy,
+    needs: &Needs,
+    scenario: &Scenario,
+) -> Result<(), Failure> {
+    let out_of_range = |why| (Check::DeclaresValidNumbers, why);
+    needs.check().map_err(out_of_range)?;
+    let has_fresh_signal = needs.signals.contains(Signal::FreshWeightMax);
+    if has_fresh_signal != (needs.fresh_views > 0) {
+        let (views, verb) =
+            (needs.fresh_views, if has_fresh_signal { "asks" } else { "does not ask" });
+        let why = format!("it {verb} for FreshWeightMax, but for {views} fresh views");
+        return Err((Check::RequestsConsistently, why));
+    }
+    let mut steps = 1..=scenario.scene.iterations;
+    match steps.find(|&step| !policy.cadence(step).is_within(needs.cadence)) {
+        None => Ok(()),
+        Some(step) => {
+            let (cadence, longest) = (policy.cadence(step), needs.cadence);
+            Err(out_of_range(format!("at step {step} {cadence:?}, but {longest:?} was declared")))
+        }
+    }
+}
+
+/// One event: the policy plans, and every copy must do the same.
+fn run_event(
+    policy: &mut dyn DensityPolicy,
+    copies: &mut [(Check, Box<dyn DensityPolicy>)],
+    needs: &Needs,
+    scenario: &Scenario,
+    model: &mut Model,
+    step: u32,
+) -> Result<RowOps, Failure> {
+    let (rows, budget) = (model.rows, scenario.budget(model.rows));
+    let fresh = policy.wants_fresh(step, rows, budget);
+    let event = model.event(scenario, step, needs, fresh);
+    let aux = policy.aux_views(step, rows, budget);
+    if aux > 0 && needs.aux.is_none() {
+        let why = "it wants auxiliary views, but its needs do not say what to measure there";
+        return Err((Check::RequestsConsistently, why.to_owned()));
+    }
+    let request = needs.aux.clone().unwrap_or_default();
+    let views: Vec<View> = (0..aux.min(scenario.scene.train_views).min(MAX_VIEWS))
+        .map(|view| model.view(scenario, step, view, &request))
+        .collect();
+    observe(policy, step, rows, &views, &request, false)?;
+    let ops = plan(policy, scenario, &event, needs, false)?;
+    for (check, copy) in copies {
+        let differs = |how: &str| (*check, format!("a copy {how}"));
+        if !copy.is_due(step) {
+            return Err(differs("is not due at this step"));
+        }
+        if copy.wants_fresh(step, rows, budget) != fresh {
+            return Err(differs("does not agree on fresh views"));
+        }
+        if copy.aux_views(step, rows, budget) != aux || copy.cadence(step) != policy.cadence(step) {
+            return Err(differs("wants other views or another cadence"));
+        }
+        let sees_all = *check == Check::ReadsOnlyDeclared;
+        observe(&mut **copy, step, rows, &views, &request, sees_all)?;
+        let again = plan(&mut **copy, scenario, &event, needs, sees_all)?;
+        if again != ops {
+            return Err((*check, format!("{ops:?}, but a copy planned {again:?}")));
+        }
+        if copy.save() != policy.save() {
+            return Err(differs("saves another state"));
+        }
+    }
+    Ok(ops)
+}
+
+/// Shows the views to a copy: what it declared, or everything.
+fn observe(
+    policy: &mut dyn DensityPolicy,
+    step: u32,
+    rows: usize,
+    views: &[View],
+    request: &AuxRequest,
+    sees_all: bool,
+) -> Result<(), Failure> {
+    for view in views {
+        let columns = view.columns.iter();
+        let columns = columns.filter(|(column, _)| sees_all || request.columns.contains(column));
+        let columns: Vec<_> = columns.cloned().collect();
+        // As many as were requested, or all if none were.
+        let most =
+            if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
+        let points = &view.points[..most.min(view.points.len())];
+        let view = AuxView { step, rows, loss: view.loss, columns: &columns, points };
+        let observed = catch_panic(|| policy.observe(&view)).map_err(never_fails)?;
+        observed.map_err(|error| match error {
+            PolicyError::UndeclaredColumn { column } => {
+                (Check::ReadsOnlyDeclared, format!("{column:?} was read but not declared"))
+            }
+            error => never_fails(error.to_string()),
+        })?;
+    }
+    Ok(())
+}
+
+/// Lets a copy plan, with what it declared or with everything.
+fn plan(
+    policy: &mut dyn DensityPolicy,
+    scenario: &Scenario,
+    event: &Event,
+    needs: &Needs,
+    sees_all: bool,
+) -> Result<RowOps, Failure> {
+    let has_candidates = sees_all || needs.candidates.is_some();
+    let now = Snapshot {
+        step: event.step,
+        scene: &scenario.scene,
+        signals: if sees_all { &event.all } else { &event.declared },
+        candidates: if has_candidates { &event.candidates } else { &[] },
+    };
+    let rows = now.rows();
+    let budget = scenario.budget(rows);
+    let mut plan = EditPlan::new(rows, budget);
+    let rng = PolicyRng::new(3, event.step);
+    let planned = catch_panic(|| policy.plan(&now, &rng, &mut plan)).map_err(never_fails)?;
+    planned.map_err(|error| match error {
+        PolicyError::Undeclared { signal } => {
+            (Check::ReadsOnlyDeclared, format!("{signal:?} was read but not declared"))
+        }
+        error => never_fails(error.to_string()),
+    })?;
+    let ops = plan.compile();
+    if (ops.rows_before, ops.budget) != (rows, budget) || ops.rows_after > budget {
+        let why = format!("budget {budget}, but the plan was made for {ops:?}");
+        return Err((Check::KeepsPlan, why));
+    }
+    if rows > 0 && ops.rows_after == 0 {
+        return Err((Check::LeavesARow, "all rows were pruned".to_owned()));
+    }
+    Ok(ops)
+}
+
+fn never_fails(why: String) -> Failure {
+    (Check::NeverFails, why)
+}
+
+/// A new copy with the policy's state, which passes through text as in a checkpoint.
+fn restored(
+    policy: &dyn DensityPolicy,
+    mut copy: Box<dyn DensityPolicy>,
+) -> Result<Box<dyn DensityPolicy>, Failure> {
+    let failure = |why| (Check::RestoresState, why);
+    let text = policy.save().to_string();
+    let state: PolicyState =
+        serde_json::from_str(&text).map_err(|error| failure(error.to_string()))?;
+    let result = catch_panic(|| copy.restore(state)).map_err(failure)?;
+    result.map_err(|error| failure(error.to_string()))?;
+    Ok(copy)
+}
+
+fn rejects_foreign_state(policy: &mut dyn DensityPolicy) -> Result<(), Failure> {
+    let foreign = serde_json::json!({ "conformance": "not a state" });
+    let why = match catch_panic(|| policy.restore(foreign)) {
+        Ok(Err(PolicyError::State(_))) => return Ok(()),
+        Ok(Err(error)) => format!("wrong error: {error}"),
+        Ok(Ok(())) => "it was accepted".to_owned(),
+        Err(panic) => panic,
+    };
+    Err((Check::RejectsForeignState, why))
+}
+
+/// The result of `action`, or the message of its panic.
+fn catch_panic<T>(action: impl FnOnce() -> T) -> Result<T, String> {
+    catch_unwind(AssertUnwindSafe(action)).map_err(|panic: Box<dyn Any + Send>| {
+        let text = panic.downcast_ref::<String>().map(String::as_str);
+        let text = text.or_else(|| panic.downcast_ref::<&str>().copied());
+        format!("panic: {}", text.unwrap_or("no message"))
+    })
+}

@@ -1,0 +1,67 @@
+//! The scripted runs of the suite: which model, which budget, which statistics.
+
+use std::fmt;
+
+use super::synthetic::{PATTERNS, Pattern};
+use crate::policy::SceneInfo;
+
+/// One run.
+#[derive(Debug, Clone)]
+pub(super) struct Scenario {
+    name: &'static str,
+    pub(super) scene: SceneInfo,
+    /// Whether plans refuse all growth, whatever the scene's budget.
+    refuses_growth: bool,
+    pattern: Pattern,
+}
+
+impl Scenario {
+    /// The budget of the plan for a model of `rows` rows.
+    pub(super) fn budget(&self, rows: usize) -> usize {
+        if self.refuses_growth { rows } else { self.scene.budget }
+    }
+
+    /// The pattern of the statistics at a step.
+    pub(super) fn pattern_at(&self, step: u32) -> Pattern {
+        match self.pattern {
+            Pattern::Changing => PATTERNS[step as usize % (PATTERNS.len() - 1)],
+            pattern => pattern,
+        }
+    }
+}
+
+impl fmt::Display for Scenario {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}, statistics {:?}, {} steps", self.name, self.pattern, self.scene.iterations)
+    }
+}
+
+/// A scene for a run of a fiftieth of the reference length.
+pub(super) fn scene(initial_rows: usize, budget: usize) -> SceneInfo {
+    SceneInfo {
+        extent: 3.0,
+        train_views: 7,
+        budget,
+        initial_rows,
+        iterations: 600,
+        white_background: true,
+    }
+}
+
+/// All runs that a policy must pass.
+pub(super) fn scenarios() -> Vec<Scenario> {
+    let models = [
+        ("an empty model", scene(0, 8), false),
+        ("one row at its budget", scene(1, 1), false),
+        ("one row", scene(1, 16), false),
+        ("a full model", scene(24, 24), false),
+        ("a model with room", scene(30, 300), false),
+        ("a single view", SceneInfo { train_views: 1, ..scene(30, 300) }, false),
+        ("plans that refuse growth", scene(20, 200), true),
+        ("full length", SceneInfo { iterations: 30_000, ..scene(20, 60) }, false),
+    ];
+    let runs = models.into_iter().flat_map(|(name, scene, refuses_growth)| {
+        PATTERNS.map(|pattern| Scenario { name, scene: scene.clone(), refuses_growth, pattern })
+    });
+    runs.collect()
+}

@@ -1,0 +1,189 @@
+//! The policy interface: what a policy declares, what it sees, and what it returns.
+//!
+//! A policy decides which Gaussians are cloned, split, pruned or added. It declares the statistics
+//! it needs ([`Needs`]), and the backend accumulates only these. At the steps at which it
+//! [`is_due`](DensityPolicy::is_due) it reads a [`Snapshot`] and writes its edits into an
+//! [`EditPlan`]. It touches no parameter and no device, so every policy runs unchanged on every
+//! backend and can be tested without a renderer.
+
+use serde::{Deserialize, Serialize};
+
+pub use crate::error::PolicyError;
+pub use crate::needs::{
+    AuxRequest, Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, NoiseTerm,
+    PixelMap, RateOverrides, StartRule,
+};
+use crate::plan::EditPlan;
+use crate::rng::PolicyRng;
+pub use crate::signals::{AuxColumn, Signal, SignalSet, Signals};
+
+/// A density-control policy.
+pub trait DensityPolicy: Send {
+    /// What this policy reads, and how it wants the model initialised and trained. Only this is
+    /// computed and allocated; reading anything else is a [`PolicyError::Undeclared`].
+    fn needs(&self, scene: &SceneInfo) -> Needs;
+
+    /// Whether this policy edits after the optimiser step of iteration `step` (1-based).
+    fn is_due(&self, step: u32) -> bool;
+
+    /// Whether the plan of iteration `step`, at which the policy is due, reads
+    /// [`Signal::FreshWeightMax`], given the current number of rows and the budget. If not, no view
+    /// is rendered for it, and reading it is a [`PolicyError::Undeclared`]. Only asked of policies
+    /// that declare [`Needs::fresh_views`].
+    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
+        let _ = (step, rows, budget);
+        true
+    }
+
+    /// How often the optimiser steps at iteration `step`; at most as rarely as
+    /// [declared](Needs::cadence). Gradients still summed when it changes are used at the next step.
+    fn cadence(&self, step: u32) -> Cadence {
+        let _ = step;
+        Cadence::default()
+    }
+
+    /// How many training views, drawn at random without replacement, are rendered and
+    /// [observed](Self::observe) before the plan of `step`, at which the policy is due; all of them
+    /// if there are fewer. 0 for a policy that declares no [`Needs::aux`].
+    fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
+        let _ = (step, rows, budget);
+        0
+    }
+
+    /// Reads one auxiliary view, before the plan of the same step. Views come one at a time, and
+    /// each is discarded before the next.
+    ///
+    /// # Errors
+    /// As for [`plan`](Self::plan).
+    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+        let _ = view;
+        Ok(())
+    }
+
+    /// Writes the edits of this event into `plan`. A pure function of its arguments and the
+    /// policy's own state: no device, no I/O, no randomness but `rng`.
+    ///
+    /// # Errors
+    /// [`PolicyError`] stops the run with the policy's name and the step; the plan is dropped.
+    fn plan(
+        &mut self,
+        now: &Snapshot<'_>,
+        rng: &PolicyRng,
+        plan: &mut EditPlan,
+    ) -> Result<(), PolicyError>;
+
+    /// The state that future decisions depend on, beside the parameters. The default is for
+    /// policies that have none.
+    fn save(&self) -> PolicyState {
+        PolicyState::Null
+    }
+
+    /// Restores what [`save`](Self::save) returned.
+    ///
+    /// # Errors
+    /// [`PolicyError::State`] when `state` is not this policy's.
+    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
+        if state.is_null() {
+            return Ok(());
+        }
+        Err(PolicyError::State(format!(
+            "this policy keeps no state, but the checkpoint holds {state}"
+        )))
+    }
+}
+
+/// A policy's state as JSON; `null` for a policy that has none.
+pub type PolicyState = serde_json::Value;
+
+/// The scene and the run, as known before the first step.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SceneInfo {
+    /// Size of the scene: 1.1 times the largest distance of a training camera from their mean
+    /// `[scene units]`, > 0. Size thresholds are fractions of it.
+    pub extent: f32,
+    /// Number of training views, >= 1; also the length of an epoch in steps.
+    pub train_views: u32,
+    /// Most rows the model may ever have.
+    pub budget: usize,
+    /// Rows after initialisation, <= `budget`.
+    pub initial_rows: usize,
+    /// Length of the run in steps.
+    pub iterations: u32,
+    /// Whether images are composited on white (the original then resets opacity at step 500).
+    pub white_background: bool,
+}
+
+/// What a policy sees at an event. Row `i` of every signal is row `i` of the model now.
+#[derive(Debug, Clone, Copy)]
+pub struct Snapshot<'a> {
+    /// Iteration just finished, 1-based.
+    pub step: u32,
+    /// The scene and the run.
+    pub scene: &'a SceneInfo,
+    /// The signals that the policy declared.
+    pub signals: &'a Signals,
+    /// Candidates since the last [`Reset::Candidates`](crate::plan::Reset::Candidates), in the
+    /// order in which they were found.
+    pub candidates: &'a [Candidate],
+}
+
+impl<'a> Snapshot<'a> {
+    /// Number of rows now.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.signals.rows()
+    }
+
+    /// The values of `signal`. Shape: `[rows]`.
+    ///
+    /// # Errors
+    /// [`PolicyError::Undeclared`] when the policy's needs do not list it, or when it is
+    /// [`Signal::FreshWeightMax`] and the policy [did not want it](DensityPolicy::wants_fresh) at
+    /// this event.
+    pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
+        self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
+    }
+}
+
+/// A pixel with a large error, and the surface point that it shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Candidate {
+    /// Surface point `[scene units]`.
+    pub position: [f32; 3],
+    /// Ground-truth colour, sRGB-encoded in `[0, 1]`.
+    pub colour: [f32; 3],
+    /// Width of one pixel at that depth, z / f `[scene units]`, > 0.
+    pub pixel_size: f32,
+    /// Error of the pixel in the requested mode, > 0.
+    pub error: f32,
+}
+
+/// One auxiliary view, as the policy sees it.
+#[derive(Debug, Clone, Copy)]
+pub struct AuxView<'a> {
+    /// Iteration just finished, 1-based.
+    pub step: u32,
+    /// Rows of the model.
+    pub rows: usize,
+    /// 0.8·L1 + 0.2·(1 − SSIM) of this view.
+    pub loss: f32,
+    /// The requested columns. Shape of each: `[rows]`.
+    pub columns: &'a [(AuxColumn, Vec<f32>)],
+    /// Surface points, in the order in which their pixels were drawn. Their `error` is the
+    /// accumulated alpha of the pixel.
+    pub points: &'a [Candidate],
+}
+
+impl<'a> AuxView<'a> {
+    /// The values of `column`. Shape: `[rows]`.
+    ///
+    /// # Errors
+    /// [`PolicyError::UndeclaredColumn`] when the policy's [`AuxRequest`] does not list it.
+    pub fn column(&self, column: AuxColumn) -> Result<&'a [f32], PolicyError> {
+        let listed = self.columns.iter().find(|(name, _)| *name == column);
+        listed.map(|(_, values)| &values[..]).ok_or(PolicyError::UndeclaredColumn { column })
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,229 @@
+//! Per-row statistics: the signals that training accumulates, and the columns of auxiliary views.
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+
+/// A per-row statistic that a policy may read: one `f32` per row.
+///
+/// Sums run over the views in which the row was visible since the last
+/// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum Signal {
+    /// Number of views whose image the row's projection overlaps, >= 0.
+    VisibleCount,
+    /// Sum over views of ‖dL/d(mean in NDC)‖₂, >= 0. NDC gradient = pixel gradient · (W/2, H/2).
+    /// [`Needs::full_depth`](crate::policy::Needs::full_depth) reduces the weight of near views in
+    /// this sum and in the next two.
+    ScreenGradient,
+    /// Sum over views of ‖Σ over pixels |dL/d(mean in NDC)|‖₂ (absolute per axis, AbsGS), >= 0.
+    ScreenGradientAbs,
+    /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. Ignores the
+    /// clamp at 0: a row clamped to black has a gradient too.
+    ColourGradient,
+    /// x of the sum over views of dL/d(mean) `[1 / scene units]`.
+    MeanGradientX,
+    /// y of the sum over views of dL/d(mean) `[1 / scene units]`.
+    MeanGradientY,
+    /// z of the sum over views of dL/d(mean) `[1 / scene units]`.
+    MeanGradientZ,
+    /// Sum over views of ‖dL/d(mean)‖₂ `[1 / scene units]`, >= 0.
+    MeanGradientNorm,
+    /// Largest blend weight α·T over all pixels of the previous and the current epoch, in `[0, 1]`.
+    WeightMax,
+    /// Largest blend weight α·T over all pixels of training views rendered for this event, in
+    /// `[0, 1]`; [`Needs::fresh_views`](crate::policy::Needs::fresh_views) of them, chosen at
+    /// random. 0 for a row that none of them shows.
+    FreshWeightMax,
+    /// Sum of the blend weights α·T over all pixels, >= 0.
+    WeightSum,
+    /// Number of pixels the row was blended into, >= 0.
+    PixelCount,
+    /// Opacity now, in (0, 1).
+    Opacity,
+    /// Largest of the three standard deviations now `[scene units]`, > 0.
+    ScaleMax,
+    /// Product of the three standard deviations now `[scene units³]`, >= 0.
+    ScaleProduct,
+    /// Optimiser steps since the row was created or rewritten, saturating at 65,535.
+    Age,
+}
+
+impl Signal {
+    /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
+    pub const ALL: [Self; 16] = [
+        Self::VisibleCount,
+        Self::ScreenGradient,
+        Self::ScreenGradientAbs,
+        Self::ColourGradient,
+        Self::MeanGradientX,
+        Self::MeanGradientY,
+        Self::MeanGradientZ,
+        Self::MeanGradientNorm,
+        Self::WeightMax,
+        Self::FreshWeightMax,
+        Self::WeightSum,
+        Self::PixelCount,
+        Self::Opacity,
+        Self::ScaleMax,
+        Self::ScaleProduct,
+        Self::Age,
+    ];
+}
+
+/// A set of [`Signal`]s.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SignalSet(u32);
+
+impl SignalSet {
+    /// This set with `signal`.
+    #[must_use]
+    pub fn with(self, signal: Signal) -> Self {
+        Self(self.0 | 1 << signal as u32)
+    }
+
+    /// This set without `signal`.
+    #[must_use]
+    pub fn without(self, signal: Signal) -> Self {
+        Self(self.0 & !(1 << signal as u32))
+    }
+
+    /// Whether `signal` is in the set.
+    #[must_use]
+    pub fn contains(self, signal: Signal) -> bool {
+        self.0 & (1 << signal as u32) != 0
+    }
+
+    /// Number of signals in the set.
+    #[must_use]
+    pub fn count(self) -> usize {
+        self.0.count_ones() as usize
+    }
+
+    /// The signals in the set, in declaration order.
+    pub fn iter(self) -> impl Iterator<Item = Signal> {
+        Signal::ALL.into_iter().filter(move |&s| self.contains(s))
+    }
+}
+
+impl FromIterator<Signal> for SignalSet {
+    fn from_iter<I: IntoIterator<Item = Signal>>(signals: I) -> Self {
+        signals.into_iter().fold(Self::default(), Self::with)
+    }
+}
+
+impl<const N: usize> From<[Signal; N]> for SignalSet {
+    fn from(signals: [Signal; N]) -> Self {
+        signals.into_iter().collect()
+    }
+}
+
+/// The values of some signals at one step.
+#[derive(Debug, Clone, Default)]
+pub struct Signals {
+    rows: usize,
+    present: SignalSet,
+    /// Columns, one after another in declaration order. Shape: `[present, rows]`.
+    values: Vec<f32>,
+}
+
+impl Signals {
+    /// Columns for `set`, all zero. Each has `rows` values.
+    #[must_use]
+    pub fn zeros(rows: usize, set: SignalSet) -> Self {
+        Self::within(Vec::new(), rows, set)
+    }
+
+    /// The same, reusing the allocation of `values`; its contents are discarded.
+    #[must_use]
+    pub fn within(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
+        values.clear();
+        values.resize(rows * set.count(), 0.0);
+        Self { rows, present: set, values }
+    }
+
+    /// The allocation of all columns, for reuse.
+    #[must_use]
+    pub fn into_values(self) -> Vec<f32> {
+        self.values
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// The column of `signal`, if present. Shape: `[rows]`.
+    #[must_use]
+    pub fn get(&self, signal: Signal) -> Option<&[f32]> {
+        self.range(signal).map(|range| &self.values[range])
+    }
+
+    /// The column of `signal` for writing, if present. Shape: `[rows]`.
+    pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
+        self.range(signal).map(|range| &mut self.values[range])
+    }
+
+    fn range(&self, signal: Signal) -> Option<Range<usize>> {
+        let before = self.present.iter().position(|s| s == signal)?;
+        Some(before * self.rows..(before + 1) * self.rows)
+    }
+}
+
+/// A per-row statistic of one auxiliary view. Sums run over the pixels that the row was blended
+/// into; all columns are 0 for rows that are not on screen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum AuxColumn {
+    /// Sum of the pixel map, not weighted by alpha, >= 0.
+    MapSum,
+    /// Number of pixels, >= 0.
+    PixelCount,
+    /// Sum of the blend weights α·T, >= 0.
+    WeightSum,
+    /// Sum of the distances from the pixel's centre to the projected mean `[px]`, >= 0.
+    DistanceSum,
+    /// Camera z of the mean `[scene units]`.
+    Depth,
+    /// Radius on screen, three standard deviations along the longer axis, rounded up `[px]`.
+    Radius,
+}
+
+impl AuxColumn {
+    /// All columns, in declaration order.
+    pub const ALL: [Self; 6] = [
+        Self::MapSum,
+        Self::PixelCount,
+        Self::WeightSum,
+        Self::DistanceSum,
+        Self::Depth,
+        Self::Radius,
+    ];
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_lists_every_signal_in_order() {
+        for (index, signal) in Signal::ALL.into_iter().enumerate() {
+            assert_eq!(signal as usize, index);
+        }
+        assert_eq!(SignalSet::from(Signal::ALL).iter().collect::<Vec<_>>(), Signal::ALL);
+    }
+
+    #[test]
+    fn a_set_holds_what_was_put_in() {
+        let set = SignalSet::from([Signal::Age, Signal::VisibleCount]).with(Signal::Opacity);
+        let listed: Vec<Signal> = set.iter().collect();
+        assert_eq!(listed, [Signal::VisibleCount, Signal::Opacity, Signal::Age]);
+        assert_eq!(set.with(Signal::Age), set);
+        let fewer = SignalSet::from([Signal::VisibleCount, Signal::Opacity]);
+        assert_eq!(set.without(Signal::Age), fewer);
+        assert_eq!(set.without(Signal::WeightMax), set);
+        assert!(!set.contains(Signal::WeightMax) && !SignalSet::default().contains(Signal::Age));
+    }
+}
