@@ -50,7 +50,7 @@
 //!     }
 //! }
 //! let model = dataset.normalisation.model_to_world(trainer.model()?);
-//! densify::ply::write_splats(&model, &mut std::fs::File::create("garden.ply")?)?;
+//! densify::export::PLY.write(&model, &mut std::fs::File::create("garden.ply")?)?;
 //! # Ok(())
 //! # }
 //! ```
@@ -61,13 +61,14 @@ pub mod checkpoint;
 pub mod cli;
 pub mod dataset;
 pub mod evaluate;
+pub mod export;
 pub mod gaussians;
+pub mod import;
 pub mod init;
 pub mod knobs;
 pub mod memory;
 pub mod metrics;
 pub mod output;
-pub mod ply;
 pub mod schedule;
 pub mod sh;
 pub mod spread;

@@ -111,7 +111,8 @@ pub(crate) fn scale_steps(table: &mut Table, names: &[&str], iterations: u32) {
 }
 
 /// The name in `known` most similar to `name`, if any is similar.
-pub(crate) fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
+#[must_use]
+pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
     // 0.7 accepts a missing or wrong letter in a short name, but not another word.
     let scored = known.into_iter().map(|k| (strsim::jaro_winkler(name, k), k));
     let best = scored.filter(|(score, _)| *score >= 0.7).max_by(|a, b| a.0.total_cmp(&b.0));

@@ -6,10 +6,10 @@ use crate::backend::BackendError;
 use crate::checkpoint::CheckpointError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
+use crate::import::ply::PlyError;
 use crate::init::InitError;
 use crate::metrics::geometry::GeometryError;
 use crate::output::OutputError;
-use crate::ply::PlyError;
 use crate::trainer::TrainError;
 
 /// Exit code of anything that has no code of its own.

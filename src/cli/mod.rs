@@ -18,6 +18,7 @@ mod console;
 mod device;
 mod devices;
 mod eval;
+mod export;
 mod failure;
 mod knobs;
 mod number;
@@ -59,6 +60,7 @@ Examples:
   densify plan data/garden --memory 512MiB                 how large a model that memory holds
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
+  densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
@@ -85,6 +87,7 @@ enum Command {
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
     Eval(eval::EvalArgs),
+    Export(export::ExportArgs),
     Render(Box<render::RenderArgs>),
     Compare(compare::CompareArgs),
     Devices(devices::DevicesArgs),
@@ -124,6 +127,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Plan(_) => train::arguments(&after(&words, "plan"))
             .and_then(|train| train::plan::run(&train, &console)),
         Command::Eval(eval) => eval::run(&eval, &console),
+        Command::Export(export) => export::run(&export, &console),
         Command::Render(render) => render::run(&render, &console),
         Command::Compare(compare) => compare::run(&compare, &console),
         Command::Devices(devices) => devices::run(&devices, &console),

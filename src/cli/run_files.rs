@@ -13,8 +13,8 @@ use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
 use crate::dataset::{Dataset, View};
 use crate::evaluate::Split;
 use crate::gaussians::Gaussians;
+use crate::import::ply::read_splats;
 use crate::output::{RunConfig, SceneConfig, model_path, saved_iterations};
-use crate::ply::read_splats;
 use crate::views::DatasetViews;
 
 /// Spelling of [`Split`] on the command line.
@@ -114,7 +114,7 @@ pub(super) fn open(
 ) -> Result<Opened, Failure> {
     use_threads(machine.threads);
     let dataset = scene::load(dataset, &config, false, console)?;
-    let model = read_model(model, &dataset, console)?;
+    let model = dataset.normalisation.model_from_world(read_model(model, console)?);
     let budget = model.len().max(1);
     let near = (near * dataset.extent()) as f32;
     let largest_image = scene::largest_image(&dataset);
@@ -133,12 +133,8 @@ pub(super) fn open(
     Ok(Opened { sh_degree: model.sh_degree, backend, dataset, scene: config })
 }
 
-/// Reads a model, by whatever program, into the coordinates of a dataset.
-pub(super) fn read_model(
-    path: &Path,
-    dataset: &Dataset,
-    console: &Console,
-) -> Result<Gaussians, Failure> {
+/// Reads a .ply of Gaussian splats by any program, in its own coordinates; says what was wrong with it.
+pub(super) fn read_model(path: &Path, console: &Console) -> Result<Gaussians, Failure> {
     let file = read_splats(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
@@ -148,7 +144,7 @@ pub(super) fn read_model(
             console.say(format_args!("note: {}: {number} rows {what}", path.display()));
         }
     }
-    Ok(dataset.normalisation.model_from_world(file.gaussians))
+    Ok(file.gaussians)
 }
 
 impl Opened {

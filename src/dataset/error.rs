@@ -133,7 +133,7 @@ pub enum DatasetError {
     },
     /// The point cloud's file is unusable.
     #[error(transparent)]
-    Ply(#[from] crate::ply::PlyError),
+    Ply(#[from] crate::import::ply::PlyError),
 }
 
 impl DatasetError {

@@ -147,7 +147,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     let listing = path.clone();
     let mut scene = Scene { frames, notes, points_file, listing, own_split, ..Scene::default() };
     if !held_out && let Some(file) = &scene.points_file {
-        scene.points = crate::ply::read_points(file)?;
+        scene.points = crate::import::ply::read_points(file)?;
     }
     Ok(scene)
 }

@@ -12,8 +12,8 @@ use densify::camera::Camera;
 use densify::checkpoint::Checkpoint;
 use densify::dataset::{Dataset, LoadOptions};
 use densify::gaussians::Gaussians;
+use densify::import::ply::{read_points, read_splats};
 use densify::output::RunConfig;
-use densify::ply::{read_points, read_splats};
 use densify_scenegen::{Options, PointOptions, Scene, Source};
 use glam::{DMat3, DQuat, DVec3};
 

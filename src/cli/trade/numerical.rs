@@ -50,7 +50,7 @@ impl Subject {
         let config = RunConfig::read(folder)?;
         let dataset = scene::load(&config.scene_path(), &config.scene, false, console)?;
         let path = model_path(folder, iteration(folder, None)?);
-        let model = read_model(&path, &dataset, console)?;
+        let model = dataset.normalisation.model_from_world(read_model(&path, console)?);
         let near = (config.train.near * dataset.extent()) as f32;
         let background = config.scene.background.fixed();
         let count = dataset.test.len();

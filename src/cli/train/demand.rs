@@ -21,6 +21,7 @@ use crate::cli::run_files::use_threads;
 use crate::cli::scene;
 use crate::dataset::images::ImageDemand;
 use crate::dataset::{Dataset, Tracks, View};
+use crate::export::{PLY, Shape};
 use crate::gaussians::sh_coefficients;
 use crate::init::usable_points;
 use crate::knobs::Settings;
@@ -274,9 +275,11 @@ impl Survey {
         let points = args.init_points.unwrap_or(self.dataset.points.len()) as u64;
         pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
         pass("a policy's event", self.event_bytes(setting, needs));
-        // So many rows, and as much again: of arrays that are freed, allocators keep some for a while.
+        // So many rows, as much again because allocators keep some freed arrays for a while, and
+        // what the writer holds.
         let piece = budget.min(ROWS_AT_A_TIME as u64);
-        pass("export of the model, checkpoint", 2 * piece * row);
+        let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
+        pass("export of the model, checkpoint", 2 * piece * row + held);
         let measures_test = !self.dataset.test.is_empty();
         if measures_test || self.required != Required::default() {
             let (width, height) = scene::largest_image(&self.dataset);

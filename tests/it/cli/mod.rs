@@ -2,6 +2,7 @@
 
 mod accumulation;
 mod comparing;
+mod exporting;
 mod faults;
 mod generated;
 mod killing;

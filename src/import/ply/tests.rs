@@ -3,25 +3,9 @@
 use std::path::PathBuf;
 
 use super::*;
-use crate::gaussians::{Gaussians, sh_coefficients};
-
-fn model(rows: usize, sh_degree: u8) -> Gaussians {
-    // Every value differs, so that a swapped column shows; odd bits, so that a conversion shows.
-    let mut next = 0u32;
-    let mut value = || {
-        next += 1;
-        f32::from_bits(0x3e80_0001 ^ ((next * 7919) & 0x007f_ffff) ^ ((next % 2) << 31))
-    };
-    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
-    for _ in 0..rows {
-        model.means.push([value(), value(), value()]);
-        model.log_scales.push([value(), value(), value()]);
-        model.quats.push([value(), value(), value(), value()]);
-        model.opacity_logits.push(value());
-        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| value()));
-    }
-    model
-}
+use crate::export::PLY;
+use crate::export::tests::model;
+use crate::gaussians::Gaussians;
 
 fn saved(contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
@@ -32,7 +16,7 @@ fn saved(contents: impl AsRef<[u8]>) -> (tempfile::TempDir, PathBuf) {
 
 fn written(model: &Gaussians) -> Vec<u8> {
     let mut bytes = Vec::new();
-    write_splats(model, &mut bytes).unwrap();
+    PLY.write(model, &mut bytes).unwrap();
     bytes
 }
 
@@ -53,49 +37,6 @@ fn splats_make_the_round_trip_bit_for_bit() {
             assert_eq!(written(&read.gaussians), bytes);
         }
     }
-}
-
-#[test]
-fn rows_in_pieces_make_the_same_file() {
-    let whole = model(300, 2);
-    let part = |rows: std::ops::Range<usize>| Gaussians {
-        sh_degree: 2,
-        means: whole.means[rows.clone()].to_vec(),
-        log_scales: whole.log_scales[rows.clone()].to_vec(),
-        quats: whole.quats[rows.clone()].to_vec(),
-        opacity_logits: whole.opacity_logits[rows.clone()].to_vec(),
-        sh: whole.sh[27 * rows.start..27 * rows.end].to_vec(),
-    };
-    let mut bytes = Vec::new();
-    write_splat_header(300, 2, &mut bytes).unwrap();
-    for rows in [0..0, 0..7, 7..270, 270..300] {
-        write_splat_rows(&part(rows), &mut bytes).unwrap();
-    }
-    assert!(bytes == written(&whole));
-}
-
-#[test]
-fn the_layout_is_the_original_one() {
-    let mut one = model(1, 1);
-    one.sh = (0..12u8).map(f32::from).collect();
-    let bytes = written(&one);
-    let header_end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
-    let header = std::str::from_utf8(&bytes[..header_end]).unwrap();
-    let names: Vec<&str> =
-        header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
-    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
-    let mut expected = vec!["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"];
-    expected.extend(rest.iter().map(String::as_str));
-    expected
-        .extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]);
-    assert_eq!(names, expected);
-    let values: Vec<f32> = bytes[header_end..]
-        .chunks_exact(4)
-        .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
-        .collect();
-    assert_eq!(values.len(), expected.len());
-    // Coefficient k of channel c is 3 + 3k + c here; the file goes channel by channel.
-    assert_eq!(values[3..18], [0., 0., 0., 0., 1., 2., 3., 6., 9., 4., 7., 10., 5., 8., 11.]);
 }
 
 /// The same splat in ascii and big endian, properties shuffled, of other types, with others

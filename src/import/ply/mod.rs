@@ -1,7 +1,7 @@
-//! PLY files: splats in the attribute order of the original 3DGS trainer, and point clouds.
+//! Reads PLY files: Gaussians in the layout of the original 3DGS trainer, and point clouds.
 //!
-//! Reading accepts ascii, little and big endian, properties in any order and of any numeric type,
-//! and skips what it does not know. Nothing is allocated from a declared count alone.
+//! Accepts ascii, little and big endian, and properties in any order and of any numeric type;
+//! unknown properties are skipped. Nothing is allocated from a declared count alone.
 
 mod header;
 mod points;
@@ -11,7 +11,8 @@ mod splats;
 use std::path::{Path, PathBuf};
 
 pub use points::read_points;
-pub use splats::{SplatFile, read_splats, write_splat_header, write_splat_rows, write_splats};
+pub(crate) use splats::splat_properties;
+pub use splats::{SplatFile, read_splats};
 
 /// Why a PLY file cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -47,7 +48,7 @@ pub enum PlyError {
     },
     /// A PLY in the compressed layout of PlayCanvas.
     #[error(
-        "{path} is a compressed splat PLY (element chunk, packed properties), which is not read; \
+        "{path} is a compressed splat PLY (element chunk, packed properties), which densify does not read; \
          export it as an uncompressed .ply, e.g. with SuperSplat or splat-transform"
     )]
     Compressed {

@@ -1,0 +1,172 @@
+//! Models as files: a registry of formats, each with a writer that takes the model in pieces.
+//!
+//! A new format is one file in this folder, which implements [`ModelWriter`] and registers a
+//! [`Format`] as `ply.rs` does, and its `mod` line below. The command line, the trainer and the
+//! memory ledger know formats only through this module.
+
+mod ply;
+
+use std::io::{self, Write};
+use std::ops::Range;
+use std::path::Path;
+
+use densify_policies::parameters::nearest;
+#[doc(hidden)]
+pub use inventory;
+
+use crate::backend::pieces;
+use crate::gaussians::Gaussians;
+use crate::output::{OutputError, Stop, write_atomically_from};
+
+/// The format that training exports to.
+pub const PLY: &Format = &ply::FORMAT;
+
+/// Size of a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shape {
+    /// Number of Gaussians.
+    pub rows: usize,
+    /// Spherical-harmonic degree, 0..=3.
+    pub sh_degree: u8,
+}
+
+/// Writes one model to one file: [`begin`](Self::begin), then [`rows`](Self::rows) for each piece
+/// in order, then [`finish`](Self::finish).
+pub trait ModelWriter {
+    /// Most memory that the writer takes at any time beside the piece it is given `[bytes]`. Part
+    /// of what a run promises, so it must hold for every model of this shape.
+    fn held_bytes(&self, shape: Shape) -> u64;
+
+    /// Writes what comes before the rows.
+    ///
+    /// # Errors
+    /// Those of `out`, and [`io::ErrorKind::InvalidInput`] where the format cannot hold the model.
+    fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()>;
+
+    /// Takes the next rows: some thousand at a time, in the dataset's own coordinates.
+    ///
+    /// # Errors
+    /// As [`begin`](Self::begin).
+    fn rows(&mut self, rows: &Gaussians, out: &mut dyn Write) -> io::Result<()>;
+
+    /// Writes what is still held and what comes after the rows.
+    ///
+    /// # Errors
+    /// As [`begin`](Self::begin).
+    fn finish(&mut self, out: &mut dyn Write) -> io::Result<()>;
+}
+
+/// A format that models are exported to. Registered with `inventory::submit!`.
+#[derive(Debug, Clone, Copy)]
+pub struct Format {
+    /// Its name on the command line.
+    pub name: &'static str,
+    /// Extension of its files, without the leading dot.
+    pub extension: &'static str,
+    /// What it is, in one line.
+    pub summary: &'static str,
+    /// Makes the writer of one file.
+    pub writer: fn() -> Box<dyn ModelWriter>,
+}
+
+inventory::collect!(Format);
+
+/// Why no format can be chosen.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FormatError {
+    /// No format has this name.
+    #[error("there is no format `{name}`{}; choose one of: {}", suggestion(name), names())]
+    UnknownName {
+        /// The name.
+        name: String,
+    },
+    /// No format has the extension of this file.
+    #[error("the name {file} has the extension of no format; choose one of: {}", names())]
+    UnknownExtension {
+        /// The file's name.
+        file: String,
+    },
+}
+
+fn suggestion(name: &str) -> String {
+    let nearest = nearest(name, formats().iter().map(|format| format.name));
+    nearest.map_or_else(String::new, |nearest| format!("; did you mean `{nearest}`?"))
+}
+
+fn names() -> String {
+    formats().iter().map(|format| format.name).collect::<Vec<_>>().join(", ")
+}
+
+/// All formats, sorted by name.
+#[must_use]
+pub fn formats() -> Vec<&'static Format> {
+    let mut formats: Vec<&Format> = inventory::iter::<Format>.into_iter().collect();
+    formats.sort_by_key(|format| format.name);
+    formats
+}
+
+/// The format of this name.
+///
+/// # Errors
+/// [`FormatError::UnknownName`], which names the nearest.
+pub fn find(name: &str) -> Result<&'static Format, FormatError> {
+    let found = formats().into_iter().find(|format| format.name == name);
+    found.ok_or_else(|| FormatError::UnknownName { name: name.to_owned() })
+}
+
+/// The format with the extension of `path`; the longest extension wins (`a.b` over `b`).
+///
+/// # Errors
+/// [`FormatError::UnknownExtension`].
+pub fn find_by_extension(path: &Path) -> Result<&'static Format, FormatError> {
+    let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let lower = file.to_lowercase();
+    let fits = |format: &&Format| {
+        lower.strip_suffix(format.extension).is_some_and(|stem| stem.ends_with('.'))
+    };
+    let found = formats().into_iter().filter(fits).max_by_key(|format| format.extension.len());
+    found.ok_or(FormatError::UnknownExtension { file })
+}
+
+impl Format {
+    /// Most memory that writing a model takes beside the piece at hand `[bytes]`.
+    #[must_use]
+    pub fn held_bytes(&self, shape: Shape) -> u64 {
+        (self.writer)().held_bytes(shape)
+    }
+
+    /// Writes a model that is in memory as a whole.
+    ///
+    /// # Errors
+    /// Those of [`ModelWriter`].
+    pub fn write(&self, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
+        let mut writer = (self.writer)();
+        writer.begin(Shape { rows: model.len(), sh_degree: model.sh_degree }, out)?;
+        writer.rows(model, out)?;
+        writer.finish(out)
+    }
+
+    /// Writes a model to a file that appears only when it is complete. `rows` is asked for one
+    /// piece after the other, as the model may be most of what there is memory for.
+    ///
+    /// # Errors
+    /// Those of `rows`, [`ModelWriter`] and [`write_atomically_from`].
+    pub fn write_file<E: From<OutputError>>(
+        &self,
+        path: &Path,
+        shape: Shape,
+        mut rows: impl FnMut(Range<usize>) -> Result<Gaussians, E>,
+    ) -> Result<(), E> {
+        write_atomically_from(path, |out| {
+            let mut writer = (self.writer)();
+            writer.begin(shape, out)?;
+            for piece in pieces(shape.rows) {
+                writer.rows(&rows(piece).map_err(Stop::Source)?, out)?;
+            }
+            Ok(writer.finish(out)?)
+        })
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests;

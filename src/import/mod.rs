@@ -1,0 +1,3 @@
+//! Readers of models and points by other programs, one folder per format.
+
+pub mod ply;
