@@ -1,9 +1,6 @@
-//! Built-in scenes by name: `scene:spheres` is rendered in memory, no file is read or written.
-//!
-//! Their images are as `densify scenegen --preset NAME` writes them with its defaults.
+//! Built-in scenes as datasets: `scene:spheres` is rendered in memory, without reading or writing
+//! files. The images are those that `densify scenegen --preset NAME` writes by default.
 
-use std::collections::HashMap;
-use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -13,15 +10,15 @@ use densify_scenegen::{
 
 use super::images::{Image8, ImageHeader, ImageSource};
 use super::normalise::Normalisation;
-use super::prepare::target_size;
-use super::tracks::Gathered;
-use super::{Dataset, DatasetError, LoadOptions, PointCloud, Split, View};
+use super::prepare::{Views, split, target_size};
+use super::tracks::TrackSampler;
+use super::{Dataset, DatasetError, LoadOptions, PointCloud, View};
 use crate::camera::Camera;
 
-/// What a path to a built-in scene begins with.
+/// Prefix of the path of a built-in scene.
 pub const PREFIX: &str = "scene:";
 
-/// The name of the built-in scene that a path stands for, if it does.
+/// The name of a built-in scene, if the path is one.
 #[must_use]
 pub fn name(path: &Path) -> Option<&str> {
     path.to_str()?.strip_prefix(PREFIX)
@@ -50,8 +47,7 @@ pub(super) fn ground_truth(name: &str) -> Result<GroundTruth, DatasetError> {
     Ok(GroundTruth::of_scene(scene))
 }
 
-/// A rendered scene as a dataset that goes by the name of `path`. `frames` are those of all its
-/// views, in their order.
+/// A rendered scene as a dataset named `path`. `frames` are the images of all its views, in order.
 ///
 /// # Errors
 /// When the options leave no view to train on.
@@ -62,53 +58,35 @@ pub fn dataset(
     points: InitPoints,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let mut views: Vec<(View, bool, u32)> = (0..)
+    let mut views: Vec<(View, bool, Option<u32>)> = (0..)
         .zip(&scene.views)
         .zip(frames)
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
             let held_out = view.split == densify_scenegen::Split::Test;
-            (posed(&view.name, camera, frame, options), held_out, number)
+            (dataset_view(&view.name, camera, frame, options), held_out, Some(number))
         })
         .collect();
     views.sort_by(|a, b| a.0.name.as_bytes().cmp(b.0.name.as_bytes()));
-    let every = match options.split {
-        Split::Every(every) => Some(NonZeroU32::get(every) as usize),
-        Split::None | Split::Eval => None,
-    };
-    let count = views.len();
-    let (mut train, mut test) = (Vec::new(), Vec::new());
-    let mut number_of = HashMap::new();
-    for (index, (view, held_out, number)) in views.into_iter().enumerate() {
-        let held_out = every.map_or(held_out, |every| index % every == 0);
-        if held_out {
-            test.push(view);
-        } else {
-            number_of.insert(number, train.len() as u32);
-            train.push(view);
-        }
-    }
-    if train.is_empty() {
-        return Err(DatasetError::NoTrainingViews { views: count });
-    }
+    let Views { mut train, mut test, number_of } = split(views.into_iter(), options.split, true)?;
     let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.camera(&view.camera);
     }
     let positions = points.positions.iter().map(|&point| normalisation.point(point)).collect();
-    let mut gathered = Gathered::new();
+    let mut sampler = TrackSampler::new();
     let found = points.positions.iter().zip(&points.colours);
     for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
         let views = seen_by.len() as u64;
-        if options.tracks && gathered.wants(views) {
-            gathered.take(position, colour, seen_by.iter().copied());
+        if options.tracks && sampler.wants(views) {
+            sampler.add(position, colour, seen_by.iter().copied());
         } else {
-            gathered.pass(views);
+            sampler.skip(views);
         }
     }
     let view_of = |number: u32| number_of.get(&number).copied();
-    let tracks = gathered.finish().of_training(&normalisation, view_of);
+    let tracks = sampler.finish().in_training_views(&normalisation, view_of);
     Ok(Dataset {
         root: path.to_owned(),
         train,
@@ -120,7 +98,7 @@ pub fn dataset(
     })
 }
 
-/// The trainer's camera for a rendered view.
+/// The trainer's camera of a rendered view.
 fn camera(from: &densify_scenegen::Camera) -> Camera {
     let rotation = from.world_from_camera.transpose();
     Camera {
@@ -135,7 +113,7 @@ fn camera(from: &densify_scenegen::Camera) -> Camera {
     }
 }
 
-fn posed(name: &str, camera: Camera, frame: Frame, options: &LoadOptions) -> View {
+fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions) -> View {
     let pixels = frame.rgba.chunks_exact(4);
     let rgb = pixels.clone().flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
     let alpha: Vec<u8> = pixels.map(|pixel| pixel[3]).collect();

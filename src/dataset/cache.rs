@@ -1,9 +1,9 @@
-//! A cache of decoded images of bounded bytes, filled ahead of use by background threads.
+//! A cache of decoded images with a limit in bytes, filled ahead of use by background threads.
 //!
-//! Training visits every view once per epoch, in a new order each time. A view just seen is
-//! therefore the one whose next use is, on average, furthest away: when room is needed, the most
-//! recently used image goes first, never one that was announced. (Least-recently-used eviction
-//! would miss every time as soon as the images do not all fit.) One piece: a cache and its threads.
+//! Training visits every view once per epoch, in a new order each time. The next use of a view just
+//! seen is therefore the furthest away on average, so that the most recently used image is evicted
+//! first, but never one that was announced. (Least-recently-used eviction would always miss as soon
+//! as the images do not all fit.) Over 400 lines because of its tests.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -13,7 +13,7 @@ use std::thread::JoinHandle;
 use super::error::DatasetError;
 use super::images::{Image8, ImageSource, SharedImage};
 
-/// Decoded images on demand. Which images are held never changes a pixel, only the time to wait.
+/// Decoded images on demand. Caching changes only the time to wait, never a pixel.
 #[derive(Debug)]
 pub struct ImageCache {
     shared: Arc<Shared>,
@@ -25,18 +25,18 @@ struct Shared {
     sources: Vec<ImageSource>,
     capacity: u64,
     state: Mutex<State>,
-    /// Something was queued, room was made, or it is time to end.
+    /// Signalled when something was queued, room was made, or the threads are to end.
     work: Condvar,
-    /// A slot is loading no longer.
+    /// Signalled when an image was loaded.
     loaded: Condvar,
 }
 
 #[derive(Debug, Default)]
 struct State {
     slots: Vec<Slot>,
-    /// Announced and not begun.
+    /// Announced images whose loading has not begun.
     queue: VecDeque<usize>,
-    /// Bytes held and being loaded for the cache.
+    /// Bytes held and being loaded.
     bytes: u64,
     clock: u64,
     end: bool,
@@ -45,7 +45,7 @@ struct State {
 #[derive(Debug, Default)]
 struct Slot {
     content: Content,
-    /// Announced and not fetched since.
+    /// Announced, and not fetched since.
     wanted: bool,
     /// Clock at the last use.
     used: u64,
@@ -61,8 +61,9 @@ enum Content {
 }
 
 impl ImageCache {
-    /// A cache that holds at most `cache_bytes` of decoded images, or two images if that is more.
-    /// `threads` decode what [`Self::prefetch`] announces; with 0, all is decoded on demand.
+    /// A cache of at most `cache_bytes` of decoded images, or of two images if that is more.
+    /// `threads` decode the images announced by [`Self::prefetch`]; with 0 threads, all images are
+    /// decoded on demand.
     #[must_use]
     pub fn new(sources: Vec<ImageSource>, cache_bytes: u64, threads: usize) -> Self {
         let capacity = ImageDemand::of(sources.iter()).capacity(cache_bytes);
@@ -78,8 +79,7 @@ impl ImageCache {
         let threads = (0..threads)
             .map_while(|index| {
                 let shared = Arc::clone(&shared);
-                // A thread that cannot be had costs time only: what is not prefetched is
-                // decoded on demand.
+                // Without the thread images are decoded on demand.
                 std::thread::Builder::new()
                     .name(format!("prefetch-{index}"))
                     .spawn(move || shared.serve())
@@ -124,7 +124,7 @@ impl ImageCache {
     /// The image at `index` of the sources; waits for its decoding, or decodes it.
     ///
     /// # Errors
-    /// When the file cannot be loaded; it is tried again on the next call.
+    /// When the file cannot be loaded. The next call tries again.
     ///
     /// # Panics
     /// When `index` is not below [`Self::len`].
@@ -140,7 +140,7 @@ impl ImageCache {
             match std::mem::take(&mut slot.content) {
                 Content::Ready(image) => {
                     slot.content = Content::Ready(Arc::clone(&image));
-                    // The image may go now, and a thread may be waiting for room.
+                    // The image may now be evicted, and a thread may be waiting for room.
                     self.shared.work.notify_all();
                     return Ok(image);
                 }
@@ -186,7 +186,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A background thread's life.
+    /// The loop of a background thread.
     fn serve(&self) {
         let mut state = self.lock();
         while !state.end {
@@ -225,7 +225,8 @@ impl State {
         true
     }
 
-    /// Ends a load that [`Self::make_room`] began. An error without a value was returned already.
+    /// Stores the result of a load for which [`Self::make_room`] reserved memory. `Err(None)` stands for
+    /// an error that the caller returns itself.
     fn finish(
         &mut self,
         shared: &Shared,
@@ -243,19 +244,19 @@ impl State {
     }
 }
 
-/// What decides how much memory images take.
+/// How much memory a set of images takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageDemand {
     /// Bytes of all images decoded.
     pub all: u64,
     /// Bytes of the largest one.
     pub largest: u64,
-    /// Most bytes in use while one is loaded, beyond its own.
+    /// Most additional bytes used while one is loaded.
     pub working: u64,
 }
 
 impl ImageDemand {
-    /// That of these images.
+    /// The demand of these images.
     #[must_use]
     pub fn of<'a>(sources: impl Iterator<Item = &'a ImageSource>) -> Self {
         sources.fold(Self { all: 0, largest: 0, working: 0 }, |sum, source| {
@@ -268,14 +269,14 @@ impl ImageDemand {
         })
     }
 
-    /// Most bytes of decoded images that a cache made with `cache_bytes` holds at a time, one handed
-    /// out and evicted since included.
+    /// Most bytes of decoded images with a cache of `cache_bytes`, including one image that is in use
+    /// but no longer in the cache.
     #[must_use]
     pub fn held(&self, cache_bytes: u64) -> u64 {
         self.all.min(self.capacity(cache_bytes).saturating_add(self.largest))
     }
 
-    /// Most bytes in use for decoding with so many threads: one image per thread, and one on demand.
+    /// Most bytes used for decoding by so many threads: one image per thread, and one on demand.
     #[must_use]
     pub fn decoding(&self, threads: usize) -> u64 {
         (threads as u64 + 1) * self.working + self.largest
@@ -286,7 +287,7 @@ impl ImageDemand {
     }
 }
 
-/// Loads, and turns a decoder's panic on a hostile file into an error.
+/// Loads an image; a panic of the decoder becomes an error.
 fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
     catch_unwind(AssertUnwindSafe(|| source.load())).unwrap_or_else(|_| {
         Err(DatasetError::Image { path: source.path.clone(), problem: "the decoder failed".into() })

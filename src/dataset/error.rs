@@ -1,4 +1,4 @@
-//! Why a dataset cannot be loaded: each message names the file, the field and the remedy.
+//! Errors of loading a dataset: each message names the file, the field and the remedy.
 
 use std::path::{Path, PathBuf};
 
@@ -17,14 +17,14 @@ pub enum DatasetError {
     /// A built-in scene cannot be made.
     #[error("{0}")]
     BuiltIn(#[from] densify_scenegen::Error),
-    /// The folder is in none of the known formats.
+    /// The folder has no supported format.
     #[error(
-        "{path} is no dataset: found neither {looked_for}; name a folder with a COLMAP model or transforms files"
+        "{path} is not a dataset: found neither {looked_for}; name a folder with a COLMAP model or transforms files"
     )]
     Unrecognised {
         /// The folder.
         path: PathBuf,
-        /// The files that would have told the format.
+        /// The files that were looked for.
         looked_for: &'static str,
     },
     /// A file's contents contradict its format or themselves.
@@ -39,7 +39,7 @@ pub enum DatasetError {
         /// What to do about it.
         remedy: &'static str,
     },
-    /// A path in a data file is not below the dataset's folder, or not a path at all.
+    /// A path in a data file leads out of the dataset's folder, or is not a path.
     #[error(
         "{path}: {field}: the path {value:?} {problem}; only paths below the dataset's folder are followed \
          (a folder elsewhere can be named with --images)"
@@ -54,7 +54,7 @@ pub enum DatasetError {
         /// What is wrong with it.
         problem: &'static str,
     },
-    /// A camera whose lens cannot be turned into a pinhole.
+    /// A lens that cannot be converted to a pinhole.
     #[error(
         "{path}: {field}: {problem}; undistort the images first, e.g. with `colmap image_undistorter`"
     )]
@@ -63,7 +63,7 @@ pub enum DatasetError {
         path: PathBuf,
         /// The camera.
         field: String,
-        /// The model or the parameters that are the matter.
+        /// The unsupported model or parameters.
         problem: String,
     },
     /// An image or mask whose size disagrees with its camera.
@@ -95,7 +95,7 @@ pub enum DatasetError {
     },
     /// An image that the dataset names is not there.
     #[error(
-        "{path}: {field}: there is no file {image}; restore it, or name the folder that holds the images with --images"
+        "{path}: {field}: the file {image} does not exist; restore it, or name the folder that holds the images with --images"
     )]
     MissingImage {
         /// The file that names it.
@@ -105,15 +105,15 @@ pub enum DatasetError {
         /// Where it was looked for.
         image: PathBuf,
     },
-    /// There is not one posed image.
-    #[error("{path} lists no image that exists; check the file and the images beside it")]
+    /// No image has a pose.
+    #[error("{path} lists no existing image; check the file and the images beside it")]
     NoImages {
         /// The file that should list them.
         path: PathBuf,
     },
     /// The test split takes every view.
     #[error(
-        "no view is left to train on: the test split takes all {views}; use a larger --test-every, or none"
+        "no view is left to train on: the test split takes all {views}; use a larger --test-every, or leave it out"
     )]
     NoTrainingViews {
         /// Number of views.
@@ -131,7 +131,7 @@ pub enum DatasetError {
         /// Number of points.
         total: usize,
     },
-    /// The point cloud's file is unusable.
+    /// The file of the point cloud is unusable.
     #[error(transparent)]
     Ply(#[from] crate::import::ply::PlyError),
 }

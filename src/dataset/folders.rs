@@ -1,33 +1,33 @@
-//! Where images and masks lie: `images`, `images_2`/`_4`/`_8`, `masks`, or `--images DIR`.
+//! Finds the files of images and masks: `images`, `images_2`/`_4`/`_8`, `masks`, or `--images DIR`.
 
 use std::path::{Path, PathBuf};
 
 use super::error::DatasetError;
-use super::paths::{Named, Root, relative};
+use super::paths::{DataPath, Root, relative};
 use super::{LoadOptions, Resolution};
 
-/// Endings tried for a name without one, as NeRF-synthetic files write them.
+/// Extensions tried for names without one, as in NeRF-synthetic files.
 const ENDINGS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG"];
 
 /// The folders of one dataset.
 #[derive(Debug)]
 pub(super) struct Folders {
     root: Root,
-    /// What `--images` names.
+    /// The folder named by `--images`.
     chosen: Option<Root>,
-    /// `images_K` and K, where `-r K` asks for it and it is there.
+    /// `images_K` and K, if requested by `-r K` and present.
     reduced: Option<(Root, u32)>,
     /// Whether names are relative to `images/` (COLMAP) or to the dataset.
     within_images: bool,
 }
 
-/// A file found.
+/// The file of an image.
 #[derive(Debug)]
-pub(super) struct Found {
+pub(super) struct ImageFile {
     pub(super) path: PathBuf,
-    /// The divisor of the folder `images_K` it was found in.
+    /// K, if it is in the folder `images_K`.
     pub(super) reduced: Option<u32>,
-    /// Whether `images_K` lacked it.
+    /// Whether it is missing in `images_K`, and the full size is used instead.
     pub(super) fell_back: bool,
 }
 
@@ -37,7 +37,7 @@ impl Folders {
         options: &LoadOptions,
         within_images: bool,
     ) -> Result<Self, DatasetError> {
-        // A folder that the user names may lie anywhere; one that is not absolute lies in the dataset.
+        // A folder named by the user may be anywhere; a relative one is relative to the dataset.
         let chosen = options
             .images
             .as_ref()
@@ -54,8 +54,8 @@ impl Folders {
     }
 
     /// The file of an image, if there is one.
-    pub(super) fn image(&self, named: Named<'_>) -> Result<Option<Found>, DatasetError> {
-        // Checked as written first, so that a path out of the folder is refused in every case.
+    pub(super) fn image(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
+        // Checked as written first: a path out of the folder is refused even if no file is there.
         self.root.join(named)?;
         let inside = self.inside_images(named.value);
         // COLMAP names files in full.
@@ -66,41 +66,41 @@ impl Folders {
             if let Some((folder, k)) = &self.reduced {
                 // The folder itself may be a link out of the dataset.
                 let below_root = format!("images_{k}/{within}");
-                self.root.existing(Named { value: &below_root, ..named })?;
-                if let Some(path) = folder.existing(Named { value: &within, ..named })? {
-                    return Ok(Some(Found { path, reduced: Some(*k), fell_back: false }));
+                self.root.existing(DataPath { value: &below_root, ..named })?;
+                if let Some(path) = folder.existing(DataPath { value: &within, ..named })? {
+                    return Ok(Some(ImageFile { path, reduced: Some(*k), fell_back: false }));
                 }
                 fell_back = true;
             }
             let path = match &self.chosen {
-                Some(folder) => folder.existing(Named { value: &within, ..named })?,
+                Some(folder) => folder.existing(DataPath { value: &within, ..named })?,
                 None => {
                     let value = self.below_root(named.value) + ending;
-                    self.root.existing(Named { value: &value, ..named })?
+                    self.root.existing(DataPath { value: &value, ..named })?
                 }
             };
             if let Some(path) = path {
-                return Ok(Some(Found { path, reduced: None, fell_back }));
+                return Ok(Some(ImageFile { path, reduced: None, fell_back }));
             }
         }
         Ok(None)
     }
 
-    /// The mask beside an image, if there is one: `masks/NAME.png`, with or without NAME's ending.
-    pub(super) fn mask(&self, named: Named<'_>) -> Result<Option<PathBuf>, DatasetError> {
+    /// The mask of an image, if there is one: `masks/NAME.png`, with or without the extension of NAME.
+    pub(super) fn mask(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
         let inside = self.inside_images(named.value);
         let stem = Path::new(&inside).with_extension("").to_string_lossy().into_owned();
         for value in
             [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")]
         {
-            if let Some(path) = self.root.existing(Named { value: &value, ..named })? {
+            if let Some(path) = self.root.existing(DataPath { value: &value, ..named })? {
                 return Ok(Some(path));
             }
         }
         Ok(None)
     }
 
-    pub(super) fn missing(&self, named: Named<'_>) -> DatasetError {
+    pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {
         let folder = self.chosen.as_ref().unwrap_or(&self.root);
         let within = if self.chosen.is_some() {
             self.inside_images(named.value)

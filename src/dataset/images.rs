@@ -1,6 +1,6 @@
-//! Images on demand: where a view's pixels come from, and how they are decoded.
+//! Decodes photographs and masks, and shrinks and undistorts them.
 //!
-//! Files are untrusted: sides, pixels and decoded bytes are bounded before anything is allocated.
+//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -19,42 +19,42 @@ use super::undistort::Undistortion;
 pub const MAX_SIDE: u32 = 16_384;
 /// Most pixels accepted.
 pub const MAX_PIXELS: u64 = 1 << 28;
-/// Most bytes of one image as its decoder yields it.
+/// Most bytes of one image as decoded.
 const MAX_DECODED_BYTES: u64 = 1 << 30;
-/// Formats of photographs.
+/// Supported formats.
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
-/// As much of a file as almost always holds the header, so that sizes are read cheaply.
+/// Almost always enough of a file to hold the header.
 const HEADER_BYTES: u64 = 256 << 10;
 
-/// Where a view's pixels come from and what is done to them on load.
+/// Where the pixels of a view come from, and how they are processed on load.
 #[derive(Debug, Clone)]
 pub struct ImageSource {
     /// The image file.
     pub path: PathBuf,
-    /// A greyscale file that says which pixels count in the loss (black: ignored), if any.
+    /// A greyscale image of the weights of pixels in the loss (black: ignored), if there is one.
     pub mask: Option<PathBuf>,
     /// Width after loading `[px]`.
     pub width: u32,
     /// Height after loading `[px]`.
     pub height: u32,
-    /// Resampling from the lens that took the image to a pinhole, at the file's size.
+    /// Resampling to a pinhole at the size of the file, if the lens has distortion.
     pub undistortion: Option<Undistortion>,
-    /// What the image file's header says.
+    /// Header of the image file.
     pub header: ImageHeader,
-    /// Pixels that are in memory already, of the size of the header; no file is read then.
+    /// Pixels already in memory, at the size of the header; then no file is read.
     pub rendered: Option<SharedImage>,
 }
 
-/// What an image file's header says.
+/// The header of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageHeader {
     /// Width `[px]`.
     pub width: u32,
     /// Height `[px]`.
     pub height: u32,
-    /// Whether pixels have coverage.
+    /// Whether there is an alpha channel.
     pub has_alpha: bool,
-    /// Size as the decoder yields it `[bytes]`.
+    /// Size as decoded `[bytes]`.
     pub decoded_bytes: u64,
     /// Size of the file `[bytes]`.
     pub file_bytes: u64,
@@ -69,7 +69,7 @@ pub struct Image8 {
     pub height: u32,
     /// sRGB-encoded, row-major, RGB interleaved. Shape: `[height, width, 3]`.
     pub rgb: Vec<u8>,
-    /// Coverage for compositing on the background (straight alpha), if the file has any.
+    /// Straight alpha for compositing on the background, if the file has any.
     /// Shape: `[height, width]`.
     pub alpha: Option<Vec<u8>>,
     /// Weight of each pixel in the loss: 0 = ignored, 255 = counted, if there is a mask.
@@ -81,7 +81,7 @@ pub struct Image8 {
 pub type SharedImage = Arc<Image8>;
 
 impl Image8 {
-    /// The pixel's colour over `background`, in `[0, 1]`.
+    /// The colour of a pixel over `background`, in `[0, 1]`.
     #[must_use]
     pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
         let pixel = y * self.width as usize + x;
@@ -99,7 +99,7 @@ impl Image8 {
         (self.rgb.len() + length(&self.alpha) + length(&self.mask)) as u64
     }
 
-    /// No pixels yet, room for all, and the channels of `like`.
+    /// An image without pixels yet, with reserved memory and the channels of `like`.
     pub(super) fn blank(width: u32, height: u32, like: &Self) -> Self {
         let pixels = width as usize * height as usize;
         let channel =
@@ -115,13 +115,13 @@ impl Image8 {
 }
 
 impl ImageSource {
-    /// Most bytes the loaded image takes.
+    /// Most bytes of the loaded image.
     #[must_use]
     pub fn loaded_bytes(&self) -> u64 {
         u64::from(self.width) * u64::from(self.height) * self.channels()
     }
 
-    /// Most bytes in use while loading, the result included.
+    /// Most bytes used while loading, including the result.
     #[must_use]
     pub fn working_bytes(&self) -> u64 {
         let packed = u64::from(self.header.width) * u64::from(self.header.height) * self.channels();
@@ -183,7 +183,7 @@ impl ImageSource {
     }
 }
 
-/// Packs what the decoder yielded, without a copy where it is RGB already.
+/// Converts to 8 bits per channel, without a copy if it is RGB already.
 fn pack(decoded: DynamicImage) -> Image8 {
     let (width, height) = (decoded.width(), decoded.height());
     if !decoded.color().has_alpha() {
@@ -225,12 +225,12 @@ pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
     let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
     let mut start = Vec::new();
     file.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
-    let header = header_of(ImageReader::new(Cursor::new(&start)), file_bytes);
+    let header = read_header(ImageReader::new(Cursor::new(&start)), file_bytes);
     let header = match header {
-        // A long preamble, such as a preview or a colour profile: read on.
+        // The header may follow a long preview or colour profile.
         Err(_) if file_bytes > HEADER_BYTES => {
             let file = File::open(path).map_err(DatasetError::io(path))?;
-            header_of(ImageReader::new(BufReader::new(file)), file_bytes)
+            read_header(ImageReader::new(BufReader::new(file)), file_bytes)
         }
         header => header,
     }
@@ -240,17 +240,20 @@ pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
         return Err(fault(path, "it has no pixels"));
     }
     if pixels > MAX_PIXELS || header.decoded_bytes > MAX_DECODED_BYTES {
-        return Err(fault(path, format!("{}x{} px are too many", header.width, header.height)));
+        return Err(fault(
+            path,
+            format!("{}x{} px are more than supported", header.width, header.height),
+        ));
     }
     Ok(header)
 }
 
-fn header_of<R: std::io::BufRead + std::io::Seek>(
+fn read_header<R: std::io::BufRead + std::io::Seek>(
     reader: ImageReader<R>,
     file_bytes: u64,
 ) -> Result<ImageHeader, image::ImageError> {
     let mut reader = reader.with_guessed_format().map_err(image::ImageError::IoError)?;
-    // Decoders of others may be there because another crate of the build asks for them.
+    // Other crates of the build may enable more decoders.
     if let Some(format) = reader.format().filter(|format| !FORMATS.contains(format)) {
         let hint = ImageFormatHint::Exact(format);
         return Err(image::ImageError::Unsupported(hint.into()));

@@ -1,8 +1,8 @@
-//! Posed images as one type, whatever format they come from.
+//! Loads datasets: photographs with known cameras, in any of the supported formats.
 //!
-//! The format is told by what the folder holds: `transforms_train.json` with
-//! `transforms_test.json`, else a COLMAP model under `sparse/0`, else `transforms.json`.
-//! All files are untrusted: see [`DatasetError`].
+//! The files in the folder decide the format: `transforms_train.json` with `transforms_test.json`,
+//! else a COLMAP model under `sparse/0`, else `transforms.json`. All files are untrusted: see
+//! [`DatasetError`].
 
 pub mod builtin;
 mod cache;
@@ -39,13 +39,13 @@ use folders::Folders;
 use normalise::Normalisation;
 pub use options::{LoadOptions, ParseResolutionError, Resolution, Split};
 use paths::Root;
-pub use tracks::{LEAST_VIEWS, Tracks};
+pub use tracks::{MIN_VIEWS, Tracks};
 use undistort::Lens;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
 #[derive(Debug)]
 pub struct Dataset {
-    /// Folder that holds it; no image lies outside, unless `--images` says so.
+    /// Folder of the dataset; no image lies outside it, except with `--images`.
     pub root: PathBuf,
     /// Views to train on, sorted by name; never empty.
     pub train: Vec<View>,
@@ -53,12 +53,11 @@ pub struct Dataset {
     pub test: Vec<View>,
     /// Points of the reconstruction, if the dataset has any.
     pub points: PointCloud,
-    /// Which training views show a point, if that was [asked for](LoadOptions::tracks) and the dataset
-    /// says it.
+    /// Which training views show which point, if [requested](LoadOptions::tracks) and known.
     pub tracks: Tracks,
     /// From the dataset's own coordinates to the normalised ones used here.
     pub normalisation: Normalisation,
-    /// What was noticed while loading and may interest the user (dropped points, missing frames).
+    /// Notes for the user from loading (dropped points, missing frames).
     pub notes: Vec<String>,
 }
 
@@ -69,7 +68,7 @@ pub struct View {
     pub name: String,
     /// Camera at training resolution, in normalised coordinates.
     pub camera: Camera,
-    /// How to get the pixels.
+    /// Where the pixels come from.
     pub source: images::ImageSource,
 }
 
@@ -105,7 +104,7 @@ impl PointCloud {
     }
 }
 
-/// What a format's reader makes of its files.
+/// What the reader of a format returns.
 #[derive(Debug, Default)]
 struct Scene {
     /// The file that lists the frames.
@@ -113,9 +112,9 @@ struct Scene {
     frames: Vec<Frame>,
     points: PointCloud,
     points_file: Option<PathBuf>,
-    /// Tracks, their views by [`Frame::id`].
+    /// Tracks; they name views by [`Frame::id`].
     tracks: Tracks,
-    /// Whether the dataset says itself which frames are held out.
+    /// Whether the dataset brings its own test split.
     own_split: bool,
     notes: Vec<String>,
 }
@@ -124,7 +123,7 @@ struct Scene {
 #[derive(Debug)]
 struct Frame {
     name: String,
-    /// What tracks call it, if there are any.
+    /// Name of the frame in tracks, if there are any.
     id: Option<u32>,
     /// File and frame, for messages.
     origin: String,
@@ -155,14 +154,14 @@ impl Dataset {
         if scene.frames.is_empty() {
             return Err(DatasetError::NoImages { path: scene.listing });
         }
-        prepare::dataset(path, scene, options)
+        prepare::prepare(path, scene, options)
     }
 
-    /// The geometry that the images were rendered from, in the dataset's own coordinates: there is
-    /// one for built-in scenes and in folders that `densify scenegen` wrote.
+    /// The geometry that the images were rendered from, in the dataset's own coordinates. Known for
+    /// built-in scenes and for folders that `densify scenegen` wrote.
     ///
     /// # Errors
-    /// When there is one, but it cannot be read.
+    /// When it exists but cannot be read.
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
         match builtin::name(&self.root) {
             Some(name) => builtin::ground_truth(name).map(Some),
@@ -170,9 +169,9 @@ impl Dataset {
         }
     }
 
-    /// The scene's extent [scene units]: 1.1 times the largest distance of a training camera from
-    /// their mean. The unit is chosen so that it is the same for every scene, and stands for the
-    /// points' spread where all cameras are at one place.
+    /// The scene's extent `[scene units]`: 1.1 times the largest distance of a training camera from
+    /// their mean. Normalisation makes it the same for every scene; where all cameras are at one
+    /// place, it follows the spread of the points instead.
     #[must_use]
     pub fn extent(&self) -> f64 {
         normalise::EXTENT

@@ -1,4 +1,4 @@
-//! What the user chooses about loading: images, resolution, test split.
+//! Options for loading a dataset: images, resolution, test split.
 
 use std::num::NonZeroU32;
 use std::path::PathBuf;
@@ -7,10 +7,10 @@ use std::str::FromStr;
 /// How to load a dataset.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LoadOptions {
-    /// Folder of the images (`--images`), instead of the one the dataset's files say; relative to
-    /// the dataset. The one way to use images outside the dataset's folder.
+    /// Folder of the images (`--images`) instead of the one named in the dataset's files; relative
+    /// to the dataset. The only way to use images outside the dataset's folder.
     pub images: Option<PathBuf>,
-    /// Size to train at (`--resolution`); the images' own without.
+    /// Size to train at (`--resolution`); `None`: the size of the images.
     pub resolution: Option<Resolution>,
     /// Which views are held out.
     pub split: Split,
@@ -24,7 +24,7 @@ pub enum Resolution {
     /// Sides divided by this: 1, 2, 4 or 8. Uses the folder `images_2`, `images_4` or `images_8`
     /// where there is one.
     Divisor(u32),
-    /// Images this wide `[px]`, above 8.
+    /// Width `[px]`, above 8.
     Width(u32),
 }
 
@@ -41,14 +41,14 @@ pub enum Split {
 }
 
 impl Split {
-    /// The convention of the field: every 8th view.
+    /// Every 8th view, as is usual in the literature.
     pub const EVAL_EVERY: u32 = 8;
 }
 
-/// A word that is no resolution.
+/// Not a valid resolution.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{0:?} is no resolution: give 1, 2, 4 or 8 to divide the images' sides by, or a width in px above 8"
+    "{0:?} is not a resolution: give 1, 2, 4 or 8 to divide the sides of images by, or a width in px above 8"
 )]
 pub struct ParseResolutionError(String);
 

@@ -1,4 +1,4 @@
-//! Paths that come from data files: untrusted, and never followed out of the dataset's folder.
+//! Paths in data files: untrusted, and never followed out of the dataset's folder.
 
 use std::path::{Path, PathBuf};
 
@@ -15,9 +15,9 @@ pub(super) struct Root {
     canonical: PathBuf,
 }
 
-/// A path from a data file, and where it stands, for messages.
+/// A path in a data file, with its place for error messages.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Named<'a> {
+pub(super) struct DataPath<'a> {
     pub(super) file: &'a Path,
     pub(super) field: &'a str,
     pub(super) value: &'a str,
@@ -39,16 +39,16 @@ impl Root {
         &self.shown
     }
 
-    /// Where `value` lies, after the checks that need no file system. It need not exist.
-    pub(super) fn join(&self, named: Named<'_>) -> Result<PathBuf, DatasetError> {
+    /// The full path, after all checks that need no file system. The file need not exist.
+    pub(super) fn join(&self, named: DataPath<'_>) -> Result<PathBuf, DatasetError> {
         match lexical_fault(named.value) {
             None => Ok(self.shown.join(relative(named.value))),
             Some(problem) => Err(named.fault(problem)),
         }
     }
 
-    /// `join`, and the check that no link leads out; `None` where there is no such file.
-    pub(super) fn existing(&self, named: Named<'_>) -> Result<Option<PathBuf>, DatasetError> {
+    /// As [`join`](Self::join), also refusing links that lead out; `None` if there is no such file.
+    pub(super) fn existing(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
         let path = self.join(named)?;
         match path.canonicalize() {
             Ok(real) if !real.starts_with(&self.canonical) => {
@@ -60,7 +60,7 @@ impl Root {
     }
 }
 
-impl Named<'_> {
+impl DataPath<'_> {
     fn fault(self, problem: &'static str) -> DatasetError {
         DatasetError::UnsafePath {
             path: self.file.to_owned(),
@@ -77,7 +77,7 @@ pub(super) fn relative(value: &str) -> String {
 }
 
 fn lexical_fault(value: &str) -> Option<&'static str> {
-    // Both separators count: a file written on another system must not mean something else here.
+    // Both separators count: paths may come from another system.
     let parts = || value.split(['/', '\\']);
     if relative(value).is_empty() {
         Some("is empty")
@@ -101,8 +101,8 @@ fn lexical_fault(value: &str) -> Option<&'static str> {
 mod tests {
     use super::*;
 
-    fn named(value: &str) -> Named<'_> {
-        Named { file: Path::new("x.json"), field: "file_path", value }
+    fn named(value: &str) -> DataPath<'_> {
+        DataPath { file: Path::new("x.json"), field: "file_path", value }
     }
 
     #[test]

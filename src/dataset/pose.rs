@@ -1,4 +1,4 @@
-//! Checks on what data files say about cameras: poses and intrinsics.
+//! Checks the poses and intrinsics in data files.
 
 use std::path::Path;
 
@@ -7,15 +7,15 @@ use glam::{DMat3, DVec2, DVec3};
 use super::error::DatasetError;
 use super::undistort::Lens;
 
-/// Fields of view that a pinhole camera can stand for `[degrees]`.
+/// Fields of view accepted for a pinhole camera `[degrees]`.
 const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
 
-/// Largest entry of |RᵀR − I| accepted; below it the rotation is made orthonormal.
+/// Largest entry of |RᵀR − I| accepted; smaller deviations are corrected.
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
 const POSE_REMEDY: &str = "repair the pose or remove the frame";
 
-/// A rotation and translation of camera_from_world, checked; the rotation made orthonormal.
+/// Checks `camera_from_world` and makes the rotation orthonormal.
 pub(super) fn checked_pose(
     file: &Path,
     frame: &str,
@@ -59,7 +59,7 @@ pub(super) fn checked_quaternion(
     Ok(DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w)))
 }
 
-/// Checks a lens's numbers, before anything is derived from them.
+/// Checks the parameters of a lens.
 pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), DatasetError> {
     let fault = |problem: String| {
         Err(DatasetError::malformed(file, camera, problem, "repair the camera's parameters"))

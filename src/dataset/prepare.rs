@@ -1,4 +1,4 @@
-//! From frames as files describe them to views to train on: sizes, lenses, split, coordinates.
+//! Turns the frames of any format into views: checks sizes and lenses, splits, normalises.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -12,21 +12,21 @@ use super::normalise::Normalisation;
 use super::{Dataset, Frame, LoadOptions, PointCloud, Resolution, Scene, Split, View};
 use crate::camera::Camera;
 
-/// Share of points that may be unusable.
+/// Fraction of the points that may be unusable.
 const MAX_BAD_POINTS: f64 = 0.01;
 
 /// Checks every frame, splits, and moves all into normalised coordinates.
-pub(super) fn dataset(
+pub(super) fn prepare(
     path: &Path,
     scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
     let Scene { listing, mut frames, mut points, points_file, tracks, own_split, mut notes } =
         scene;
-    // Bytewise, as the field sorts names for its test splits.
+    // Bytewise, as other trainers sort names for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
     refuse_duplicates(&listing, &frames)?;
-    // Collected before the first error is looked for, so that it is the same one every time.
+    // All views first, then the first error: the message does not depend on the threads.
     let views: Vec<Result<View, DatasetError>> =
         frames.par_iter().map(|frame| view(frame, options.resolution)).collect();
     let views: Vec<View> = views.into_iter().collect::<Result<_, _>>()?;
@@ -36,26 +36,9 @@ pub(super) fn dataset(
         notes.push(format!("images narrower than {width} px are not enlarged ({})", first.name));
     }
 
-    let every = match options.split {
-        Split::Every(every) => Some(every.get() as usize),
-        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
-        Split::None | Split::Eval => None,
-    };
-    let count = views.len();
-    let (mut train, mut test) = (Vec::new(), Vec::new());
-    let mut number_of = HashMap::new();
-    for (index, (view, frame)) in views.into_iter().zip(&frames).enumerate() {
-        let held_out = every.map_or(frame.held_out, |every| index % every == 0);
-        if held_out {
-            test.push(view);
-        } else {
-            number_of.extend(frame.id.map(|id| (id, train.len() as u32)));
-            train.push(view);
-        }
-    }
-    if train.is_empty() {
-        return Err(DatasetError::NoTrainingViews { views: count });
-    }
+    let candidates = views.into_iter().zip(&frames);
+    let candidates = candidates.map(|(view, frame)| (view, frame.held_out, frame.id));
+    let Views { mut train, mut test, number_of } = split(candidates, options.split, own_split)?;
 
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
@@ -79,8 +62,43 @@ pub(super) fn dataset(
     drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
         p.as_vec3().is_finite()
     })?;
-    let tracks = tracks.of_training(&normalisation, |id| number_of.get(&id).copied());
+    let tracks = tracks.in_training_views(&normalisation, |id| number_of.get(&id).copied());
     Ok(Dataset { root: path.to_owned(), train, test, points, tracks, normalisation, notes })
+}
+
+/// Views after the split.
+pub(super) struct Views {
+    pub(super) train: Vec<View>,
+    pub(super) test: Vec<View>,
+    /// Number of a training view by the id that tracks use.
+    pub(super) number_of: HashMap<u32, u32>,
+}
+
+/// Splits views, which are sorted by name. Each comes with whether the dataset holds it out, and with
+/// the id that tracks use.
+pub(super) fn split(
+    views: impl Iterator<Item = (View, bool, Option<u32>)>,
+    split: Split,
+    own_split: bool,
+) -> Result<Views, DatasetError> {
+    let every = match split {
+        Split::Every(every) => Some(every.get() as usize),
+        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
+        Split::None | Split::Eval => None,
+    };
+    let (mut train, mut test, mut number_of) = (Vec::new(), Vec::new(), HashMap::new());
+    for (index, (view, held_out, id)) in views.enumerate() {
+        if every.map_or(held_out, |every| index % every == 0) {
+            test.push(view);
+        } else {
+            number_of.extend(id.map(|id| (id, train.len() as u32)));
+            train.push(view);
+        }
+    }
+    if train.is_empty() {
+        return Err(DatasetError::NoTrainingViews { views: test.len() });
+    }
+    Ok(Views { train, test, number_of })
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
@@ -119,7 +137,7 @@ fn drop_bad(
     Ok(())
 }
 
-/// Checks an image's header against its camera and decides what loading will do.
+/// Checks an image's header against its camera and plans how it will be loaded.
 fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetError> {
     let header = images::probe(&frame.image)?;
     let lens = &frame.lens;
@@ -213,7 +231,7 @@ fn divided(side: u32, k: u32) -> u32 {
     ((f64::from(side) / f64::from(k.max(1))).round() as u32).max(1)
 }
 
-/// Whether one scale brings `of` to within 1 px of `size` along both axes.
+/// Whether scaling `of` by one factor gives `size` within 1 px along both axes.
 fn proportional(size: (u32, u32), of: (u32, u32)) -> bool {
     let range = |side: u32, of: u32| {
         let (side, of) = (f64::from(side), f64::from(of));

@@ -1,11 +1,11 @@
-//! Averages of pixels, coverage-aware, and the area filter that shrinks images.
+//! Coverage-aware means of pixels, and the area filter that shrinks images.
 
 use super::images::Image8;
 
-/// A weighted mean of pixels. Colours are weighted by coverage too: the colour of a pixel
-/// that is not there must not bleed into its neighbours.
+/// A weighted mean of pixels. Colours are also weighted by coverage: the colour of a transparent
+/// pixel must not bleed into its neighbours.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Mix {
+pub(super) struct PixelMean {
     rgb: [f32; 3],
     alpha: f32,
     mask: f32,
@@ -13,7 +13,7 @@ pub(super) struct Mix {
     colour_weight: f32,
 }
 
-impl Mix {
+impl PixelMean {
     pub(super) fn add(&mut self, image: &Image8, x: u32, y: u32, weight: f32) {
         let at = y as usize * image.width as usize + x as usize;
         let alpha = image.alpha.as_ref().map_or(255.0, |alpha| f32::from(alpha[at]));
@@ -27,10 +27,10 @@ impl Mix {
         self.colour_weight += colour_weight;
     }
 
-    /// Appends the mean to the channels that `out` has.
+    /// Appends the mean to all channels of `out`.
     pub(super) fn push_to(self, out: &mut Image8) {
         let quantise = |value: f32| (value + 0.5) as u8;
-        // Without any coverage the colour is invisible; black keeps files comparable.
+        // The colour of a transparent pixel is never seen; black makes it reproducible.
         let scale = if self.colour_weight > 0.0 { 1.0 / self.colour_weight } else { 0.0 };
         out.rgb.extend(self.rgb.map(|sum| quantise(sum * scale)));
         if let Some(alpha) = &mut out.alpha {
@@ -42,21 +42,21 @@ impl Mix {
     }
 }
 
-/// Shrinks an image with an area filter: every source pixel counts by the share of it that the
-/// target pixel covers.
+/// Shrinks an image with an area filter: every source pixel is weighted by its overlap with the
+/// target pixel.
 pub(super) fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
-    let columns = shares(image.width, width);
-    let rows = shares(image.height, height);
+    let columns = spans(image.width, width);
+    let rows = spans(image.height, height);
     let mut out = Image8::blank(width, height, image);
     for row in &rows {
         for column in &columns {
-            let mut mix = Mix::default();
+            let mut mean = PixelMean::default();
             for (y, wy) in row.each() {
                 for (x, wx) in column.each() {
-                    mix.add(image, x, y, wx * wy);
+                    mean.add(image, x, y, wx * wy);
                 }
             }
-            mix.push_to(&mut out);
+            mean.push_to(&mut out);
         }
     }
     out
@@ -64,9 +64,9 @@ pub(super) fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
 
 /// Resamples one channel with the same filter.
 pub(super) fn shrink_channel(channel: &[u8], from: (u32, u32), to: (u32, u32)) -> Vec<u8> {
-    let columns = shares(from.0, to.0);
+    let columns = spans(from.0, to.0);
     let mut out = Vec::with_capacity(to.0 as usize * to.1 as usize);
-    for row in shares(from.1, to.1) {
+    for row in spans(from.1, to.1) {
         for column in &columns {
             let (mut sum, mut weight) = (0.0, 0.0);
             for (y, wy) in row.each() {
@@ -81,15 +81,15 @@ pub(super) fn shrink_channel(channel: &[u8], from: (u32, u32), to: (u32, u32)) -
     out
 }
 
-/// The source pixels under one target pixel along one axis.
-struct Share {
+/// The source pixels under one target pixel, along one axis.
+struct Span {
     first: u32,
     last: u32,
     first_weight: f32,
     last_weight: f32,
 }
 
-impl Share {
+impl Span {
     fn each(&self) -> impl Iterator<Item = (u32, f32)> + '_ {
         (self.first..=self.last).map(|i| {
             let weight = match i {
@@ -102,7 +102,7 @@ impl Share {
     }
 }
 
-fn shares(from: u32, to: u32) -> Vec<Share> {
+fn spans(from: u32, to: u32) -> Vec<Span> {
     let scale = f64::from(from) / f64::from(to);
     (0..to)
         .map(|i| {
@@ -111,7 +111,7 @@ fn shares(from: u32, to: u32) -> Vec<Share> {
             let first = (low as u32).min(from - 1);
             let last = ((high.ceil() as u32).max(first + 1) - 1).min(from - 1);
             let first_end = f64::from(first + 1).min(high);
-            Share {
+            Span {
                 first,
                 last,
                 first_weight: (first_end - low) as f32,

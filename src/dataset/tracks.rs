@@ -1,26 +1,27 @@
-//! Tracks: which views a reconstruction has found a point in. They are read only where something
-//! asks for them, and thinned as they are read: a statistic over points needs some thousands, and a
-//! reconstruction may have millions.
+//! Tracks: the views in which a reconstruction has found a point.
+//!
+//! They are read only on request, and sampled while they are read: a statistic over points needs
+//! some thousands, and a reconstruction may have millions.
 
 use glam::DVec3;
 
 use super::normalise::Normalisation;
 
-/// Most tracks kept; fewer than half of it only where there are fewer.
-const MOST: usize = 1 << 15;
-/// Most views kept of one track.
-pub(super) const MOST_VIEWS: u64 = 64;
-/// A track in fewer views says nothing about how a colour changes with the view.
-pub const LEAST_VIEWS: usize = 4;
+/// Between this and twice as many tracks are kept, or all if there are fewer.
+const MAX_TRACKS: usize = 1 << 15;
+/// Most views kept per track.
+pub(super) const MAX_VIEWS: u64 = 64;
+/// Tracks in fewer views are ignored: they do not show how a colour changes with the view.
+pub const MIN_VIEWS: usize = 4;
 
-/// Points with the views that they were found in, in structure of arrays.
+/// Points with the views that show them, in structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Tracks {
     /// Positions. Shape: `[tracks]`.
     pub positions: Vec<DVec3>,
-    /// sRGB colours, as the reconstruction has them. Shape: `[tracks]`.
+    /// sRGB colours of the reconstruction. Shape: `[tracks]`.
     pub colours: Vec<[u8; 3]>,
-    /// Numbers of training views, ascending, each once, at least [`LEAST_VIEWS`]. Shape: `[tracks]`,
+    /// Numbers of training views, ascending, each once, at least [`MIN_VIEWS`]. Shape: `[tracks]`,
     /// then views.
     pub views: Vec<Vec<u32>>,
 }
@@ -38,7 +39,7 @@ impl Tracks {
         self.positions.is_empty()
     }
 
-    /// What they take `[bytes]`.
+    /// Their size `[bytes]`.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
@@ -46,9 +47,9 @@ impl Tracks {
         (self.len() * track + views * size_of::<u32>()) as u64
     }
 
-    /// The tracks as training sees them: `view_of` turns what a file calls a view into the number of
-    /// a training view, if it is one.
-    pub(super) fn of_training(
+    /// The tracks in normalised coordinates and in training views only: `view_of` returns the number
+    /// of a training view from its id in the file.
+    pub(super) fn in_training_views(
         self,
         normalisation: &Normalisation,
         view_of: impl Fn(u32) -> Option<u32>,
@@ -60,7 +61,7 @@ impl Tracks {
             let mut views: Vec<u32> = views.into_iter().filter_map(&view_of).collect();
             views.sort_unstable();
             views.dedup();
-            if position.as_vec3().is_finite() && views.len() >= LEAST_VIEWS {
+            if position.as_vec3().is_finite() && views.len() >= MIN_VIEWS {
                 kept.positions.push(position);
                 kept.colours.push(colour);
                 kept.views.push(views);
@@ -70,27 +71,27 @@ impl Tracks {
     }
 }
 
-/// Gathers tracks as a file is read; of too many, every second, fourth, … in their order.
+/// Samples tracks while a file is read: all, or every second, fourth, … if there are too many.
 #[derive(Debug)]
-pub(super) struct Gathered {
+pub(super) struct TrackSampler {
     tracks: Tracks,
-    /// One of so many is kept.
+    /// Every so many-th track is kept.
     stride: usize,
     seen: usize,
 }
 
-impl Gathered {
+impl TrackSampler {
     pub(super) fn new() -> Self {
         Self { tracks: Tracks::default(), stride: 1, seen: 0 }
     }
 
-    /// Whether the next track of so many views would be kept; those that are too short do not count.
+    /// Whether the next track, which has so many views, is to be added.
     pub(super) fn wants(&self, views: u64) -> bool {
-        views >= LEAST_VIEWS as u64 && self.seen.is_multiple_of(self.stride)
+        views >= MIN_VIEWS as u64 && self.seen.is_multiple_of(self.stride)
     }
 
-    /// Takes the next track. `views` are what the file calls them; of very many the first are kept.
-    pub(super) fn take(
+    /// Adds the next track, with the ids of its views; at most [`MAX_VIEWS`] of them are kept.
+    pub(super) fn add(
         &mut self,
         position: DVec3,
         colour: [u8; 3],
@@ -98,9 +99,9 @@ impl Gathered {
     ) {
         self.tracks.positions.push(position);
         self.tracks.colours.push(colour);
-        self.tracks.views.push(views.into_iter().take(MOST_VIEWS as usize).collect());
+        self.tracks.views.push(views.into_iter().take(MAX_VIEWS as usize).collect());
         self.seen += 1;
-        if self.tracks.len() >= 2 * MOST {
+        if self.tracks.len() >= 2 * MAX_TRACKS {
             self.stride *= 2;
             keep_every_second(&mut self.tracks.positions);
             keep_every_second(&mut self.tracks.colours);
@@ -108,9 +109,9 @@ impl Gathered {
         }
     }
 
-    /// Passes a track over that [was not wanted](Self::wants).
-    pub(super) fn pass(&mut self, views: u64) {
-        self.seen += usize::from(views >= LEAST_VIEWS as u64);
+    /// Skips the next track.
+    pub(super) fn skip(&mut self, views: u64) {
+        self.seen += usize::from(views >= MIN_VIEWS as u64);
     }
 
     pub(super) fn finish(self) -> Tracks {
@@ -132,17 +133,17 @@ mod tests {
 
     #[test]
     fn many_tracks_are_thinned_evenly_and_short_ones_left_out() {
-        let mut gathered = Gathered::new();
-        for i in 0..5 * MOST {
+        let mut sampler = TrackSampler::new();
+        for i in 0..5 * MAX_TRACKS {
             let views = if i % 2 == 0 { 5 } else { 3 };
-            if gathered.wants(views) {
-                gathered.take(DVec3::splat(i as f64), [0; 3], 0..views as u32);
+            if sampler.wants(views) {
+                sampler.add(DVec3::splat(i as f64), [0; 3], 0..views as u32);
             } else {
-                gathered.pass(views);
+                sampler.skip(views);
             }
         }
-        let tracks = gathered.finish();
-        assert!((MOST..2 * MOST).contains(&tracks.len()), "{}", tracks.len());
+        let tracks = sampler.finish();
+        assert!((MAX_TRACKS..2 * MAX_TRACKS).contains(&tracks.len()), "{}", tracks.len());
         let gaps: Vec<f64> =
             tracks.positions.windows(2).map(|pair| pair[1].x - pair[0].x).collect();
         assert!(gaps.iter().all(|gap| (gap - 4.0).abs() < 1e-9), "{:?}", &gaps[..4]);
@@ -157,7 +158,7 @@ mod tests {
             views: vec![vec![9, 7, 5, 3, 3], vec![9, 7, 5, 4], vec![1, 3, 5, 7]],
         };
         let odd = |id: u32| (id % 2 == 1).then_some(id / 2);
-        let kept = tracks.of_training(&Normalisation::IDENTITY, odd);
+        let kept = tracks.in_training_views(&Normalisation::IDENTITY, odd);
         assert_eq!(kept.views, [vec![1, 2, 3, 4]], "the second has three training views");
     }
 }

@@ -1,7 +1,8 @@
-//! `transforms.json` (nerfstudio, instant-ngp) and `transforms_{train,test}.json` (NeRF-synthetic).
+//! Reads `transforms.json` (nerfstudio, instant-ngp) and `transforms_{train,test}.json`
+//! (NeRF-synthetic).
 //!
-//! Poses are camera-to-world with OpenGL axes (x right, y up, looking along −z). Intrinsics stand
-//! at the top or, taking precedence, in the frame.
+//! Poses are `world_from_camera` with OpenGL axes (x right, y up, looking along −z). Intrinsics are
+//! at the top level or in the frame; those in the frame take precedence.
 
 use std::collections::HashSet;
 use std::fs::File;
@@ -14,7 +15,7 @@ use serde_json::{Map, Value};
 use super::error::DatasetError;
 use super::folders::Folders;
 use super::images;
-use super::paths::{Named, Root, relative};
+use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::undistort::Lens;
 use super::{Frame, Scene};
@@ -23,16 +24,15 @@ use super::{Frame, Scene};
 const MAX_JSON: u64 = 64 << 20;
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
-/// Names under which programs leave initial points beside the cameras, without saying so in the
-/// file: 3DGS and nerfstudio.
+/// File names of initial points that 3DGS and nerfstudio use without naming them in the JSON.
 const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
-/// Camera models that are a pinhole with k1, k2, p1, p2.
+/// Names of camera models that are a pinhole with k1, k2, p1, p2.
 const PINHOLES: [&str; 6] =
     ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"];
 
-/// The pair of files that brings its own test split.
+/// The pair of files that defines its own test split.
 pub(super) const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
-/// The file that does not.
+/// The single file.
 pub(super) const SINGLE: &str = "transforms.json";
 
 /// Reads `transforms_train.json` and `transforms_test.json`.
@@ -45,21 +45,21 @@ pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, Dataset
     Ok(scene)
 }
 
-/// Reads `transforms.json`. Frames that it lists under `test_filenames` (or `val_filenames`, if it
-/// has only these) are its own test split, as in nerfstudio.
+/// Reads `transforms.json`. Its own test split, if any, is under `test_filenames`, or under
+/// `val_filenames` if there is no other, as in nerfstudio.
 pub(super) fn read_single(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
     read(root, folders, SINGLE, false)
 }
 
 fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
     let path = root.path().join(name);
-    root.existing(Named { file: &path, field: "the file", value: name })?;
+    root.existing(DataPath { file: &path, field: "the file", value: name })?;
     let Value::Object(top) = parse(&path)? else {
-        return Err(DatasetError::malformed(&path, "the file", "it holds no JSON object", REMEDY));
+        return Err(DatasetError::malformed(&path, "the file", "it is not a JSON object", REMEDY));
     };
     let top = Fields { path: &path, place: String::new(), frame: None, top: &top };
     let Some(Value::Array(list)) = top.top.get("frames") else {
-        return Err(top.fault("frames", "there is no such list"));
+        return Err(top.fault("frames", "the list is missing"));
     };
     if list.len() > MAX_FRAMES {
         return Err(top.fault("frames", "there are more than a million"));
@@ -73,14 +73,14 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     for (index, entry) in list.iter().enumerate() {
         let place = format!("frames[{index}].");
         let Value::Object(entry) = entry else {
-            return Err(top.fault(&format!("frames[{index}]"), "it is no object"));
+            return Err(top.fault(&format!("frames[{index}]"), "it is not an object"));
         };
         let fields = Fields { path: &path, place, frame: Some(entry), top: top.top };
         let Some(file) = fields.text("file_path")? else {
             return Err(fields.fault("file_path", "it is missing"));
         };
         let field = fields.full("file_path");
-        let named = Named { file: &path, field: &field, value: file };
+        let named = DataPath { file: &path, field: &field, value: file };
         let Some(found) = folders.image(named)? else {
             missing.push(file.to_owned());
             continue;
@@ -90,7 +90,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
         let mask = match fields.text("mask_path")? {
             Some(value) => {
                 let field = fields.full("mask_path");
-                let named = Named { file: &path, field: &field, value };
+                let named = DataPath { file: &path, field: &field, value };
                 let missing = || DatasetError::MissingImage {
                     path: path.clone(),
                     field: field.clone(),
@@ -127,16 +127,15 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     }
     let mut points_file = None;
     if let Some(value) = top.text("ply_file_path")? {
-        let named = Named { file: &path, field: "ply_file_path", value };
+        let named = DataPath { file: &path, field: "ply_file_path", value };
         let found = root.existing(named)?;
-        points_file =
-            Some(found.ok_or_else(|| {
-                top.fault("ply_file_path", format!("there is no file {value:?}"))
-            })?);
+        points_file = Some(found.ok_or_else(|| {
+            top.fault("ply_file_path", format!("the file {value:?} does not exist"))
+        })?);
     } else if !held_out {
         for value in POINT_FILES {
             if let Some(found) =
-                root.existing(Named { file: &path, field: "initial points", value })?
+                root.existing(DataPath { file: &path, field: "initial points", value })?
             {
                 notes.push(format!("initial points are taken from {value}"));
                 points_file = Some(found);
@@ -159,15 +158,15 @@ fn parse(path: &Path) -> Result<Value, DatasetError> {
     if text.len() as u64 > MAX_JSON {
         return Err(DatasetError::malformed(path, "the file", "it is larger than 64 MiB", REMEDY));
     }
-    // serde_json says line and column.
+    // The message of serde_json has line and column.
     serde_json::from_slice(&text)
         .map_err(|e| DatasetError::malformed(path, "JSON", e.to_string(), REMEDY))
 }
 
-/// One frame's fields, with those at the top as defaults.
+/// The fields of one frame, with those at the top level as defaults.
 struct Fields<'a> {
     path: &'a Path,
-    /// Prefix that tells the frame.
+    /// Prefix of field names in messages: the frame.
     place: String,
     frame: Option<&'a Map<String, Value>>,
     top: &'a Map<String, Value>,
@@ -191,7 +190,7 @@ impl<'a> Fields<'a> {
         match self.own(field) {
             None => Ok(None),
             Some(Value::String(text)) => Ok(Some(text)),
-            Some(_) => Err(self.fault(field, "it is no string")),
+            Some(_) => Err(self.fault(field, "it is not a string")),
         }
     }
 
@@ -200,7 +199,7 @@ impl<'a> Fields<'a> {
         let Some(value) = self.own(field) else {
             return Ok(None);
         };
-        let fault = || self.fault(field, "it is no list of file names");
+        let fault = || self.fault(field, "it is not a list of file names");
         let list = value.as_array().ok_or_else(fault)?;
         let name = |name: &Value| name.as_str().map(relative).ok_or_else(fault);
         list.iter().map(name).collect::<Result<_, _>>().map(Some)
@@ -214,7 +213,7 @@ impl<'a> Fields<'a> {
         let Some(value) = self.inherited(field) else {
             return Ok(None);
         };
-        value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is no number"))
+        value.as_f64().map(Some).ok_or_else(|| self.fault(field, "it is not a number"))
     }
 
     fn side(&self, field: &str) -> Result<Option<u32>, DatasetError> {
@@ -224,13 +223,13 @@ impl<'a> Fields<'a> {
         if value >= 1.0 && value <= f64::from(u32::MAX) && value.fract().abs() < f64::EPSILON {
             return Ok(Some(value as u32));
         }
-        Err(self.fault(field, format!("{value} px is no image size")))
+        Err(self.fault(field, format!("{value} px is not an image size")))
     }
 
     /// camera_from_world with OpenCV axes.
     fn pose(&self, file: &str) -> Result<(DMat3, DVec3), DatasetError> {
         const FIELD: &str = "transform_matrix";
-        let shape = || self.fault(FIELD, "it is no matrix of 3 or 4 rows of 4 numbers");
+        let shape = || self.fault(FIELD, "it is not a matrix of 3 or 4 rows of 4 numbers");
         let rows = self.own(FIELD).and_then(Value::as_array).ok_or_else(shape)?;
         let mut m = [[0.0; 4]; 3];
         if !(3..=4).contains(&rows.len()) {
@@ -242,7 +241,7 @@ impl<'a> Fields<'a> {
                 *entry = value.as_f64().ok_or_else(shape)?;
             }
         }
-        // OpenCV's y and z point against OpenGL's.
+        // In OpenCV y and z point the opposite way.
         let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
         let world_from_camera = DMat3::from_cols(column(0), -column(1), -column(2));
         let frame = format!("{} ({file})", self.full(FIELD));
@@ -251,7 +250,7 @@ impl<'a> Fields<'a> {
         Ok((rotation, -(rotation * centre)))
     }
 
-    /// The lens, at the size the file states, else at the image's.
+    /// The lens, at the size stated in the file, or else at that of the image.
     fn lens(&self, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
         self.refuse_other_lenses()?;
         let (width, height) = match (self.side("w")?, self.side("h")?) {
@@ -268,7 +267,7 @@ impl<'a> Fields<'a> {
             (Some(fx), _) => fx,
             (None, Some(angle)) => from_angle(width, angle),
             (None, None) => {
-                return Err(self.fault("fl_x", "neither fl_x nor camera_angle_x is there"));
+                return Err(self.fault("fl_x", "both fl_x and camera_angle_x are missing"));
             }
         };
         let fy = match (self.number("fl_y")?, self.number("camera_angle_y")?) {
@@ -296,7 +295,7 @@ impl<'a> Fields<'a> {
         };
         if let Some(model) = self.inherited("camera_model") {
             let model =
-                model.as_str().ok_or_else(|| self.fault("camera_model", "it is no string"))?;
+                model.as_str().ok_or_else(|| self.fault("camera_model", "it is not a string"))?;
             if !PINHOLES.contains(&model) {
                 return Err(refusal(
                     "camera_model",
@@ -312,7 +311,7 @@ impl<'a> Fields<'a> {
             if value != 0.0 {
                 return Err(refusal(
                     field,
-                    format!("{value} is a term that is not supported (k1, k2, p1, p2 are)"),
+                    format!("the term {value} is not supported (k1, k2, p1, p2 are)"),
                 ));
             }
         }

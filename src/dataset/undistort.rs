@@ -1,14 +1,15 @@
 //! Lens distortion (Brown–Conrady: two radial, two tangential terms) and its removal.
 //!
-//! Distorted images are resampled on load to a pinhole camera of the same size that sees the
-//! largest axis-aligned rectangle without a pixel that the lens did not see.
+//! Distorted images are resampled on load to a pinhole camera of the same size. It covers the
+//! largest axis-aligned rectangle in which every pixel was seen by the lens.
 
 use glam::{DMat2, DVec2};
 
 use super::images::Image8;
-use super::resample::Mix;
+use super::resample::PixelMean;
 
-/// A pinhole with lens distortion. The image's left upper corner is (0, 0), pixel centres at +0.5.
+/// A pinhole with lens distortion. The upper left corner of the image is (0, 0); pixel centres are at
+/// +0.5.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
     /// Image width `[px]`.
@@ -32,7 +33,7 @@ pub struct Undistortion {
     to: Lens,
 }
 
-/// A lens whose distortion has no inverse over the image.
+/// The distortion has no inverse over the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the distortion cannot be inverted over the image")]
 pub struct NotInvertible;
@@ -41,7 +42,7 @@ pub struct NotInvertible;
 /// bend: below 0.01 px for a bend of 100 px.
 const BORDER_SAMPLES: u32 = 64;
 /// Steps from the principal point outwards, so that Newton's method stays on the branch of the
-/// inverse that holds the principal point.
+/// inverse that contains the principal point.
 const OUTWARD_STEPS: u32 = 24;
 
 impl Lens {
@@ -67,7 +68,7 @@ impl Lens {
         }
     }
 
-    /// Where the lens moves the point (x/z, y/z) of the image plane to.
+    /// Applies the distortion to a point (x/z, y/z) of the image plane.
     #[must_use]
     pub fn distort(&self, p: DVec2) -> DVec2 {
         let [k1, k2, p1, p2] = self.distortion;
@@ -141,7 +142,7 @@ impl Lens {
             high.y = high.y.min(self.undistort(DVec2::new(at.x, size.y))?.y);
         }
         if !(low.cmplt(DVec2::ZERO).all() && high.cmpgt(DVec2::ZERO).all()) {
-            // The principal point must be in view, else the path to the border is no guarantee.
+            // `undistort` starts at the principal point, so that it must be in view.
             return Err(NotInvertible);
         }
         let focal = size / (high - low);
@@ -151,7 +152,7 @@ impl Lens {
 }
 
 /// Whether the map has an inverse nearby on the branch of the principal point, where the
-/// determinant is 1. At 1e-6 areas shrink a million times: no lens images so.
+/// determinant is 1. At 1e-6 areas shrink a million times, which no lens does.
 fn keeps_orientation(jacobian: DMat2) -> bool {
     jacobian.determinant() > 1e-6
 }
@@ -163,7 +164,7 @@ impl Undistortion {
         &self.to
     }
 
-    /// Where in the distorted image the pinhole's `pixel` is seen `[px]`.
+    /// Position in the distorted image of a pixel of the pinhole `[px]`.
     #[must_use]
     pub fn source_of(&self, pixel: DVec2) -> DVec2 {
         let p = (pixel - self.to.principal) / self.to.focal;
@@ -183,12 +184,12 @@ impl Undistortion {
                 let (x0, y0) = (at.x as u32, at.y as u32);
                 let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
                 let (tx, ty) = ((at.x - f64::from(x0)) as f32, (at.y - f64::from(y0)) as f32);
-                let mut mix = Mix::default();
-                mix.add(image, x0, y0, (1.0 - tx) * (1.0 - ty));
-                mix.add(image, x1, y0, tx * (1.0 - ty));
-                mix.add(image, x0, y1, (1.0 - tx) * ty);
-                mix.add(image, x1, y1, tx * ty);
-                mix.push_to(&mut out);
+                let mut mean = PixelMean::default();
+                mean.add(image, x0, y0, (1.0 - tx) * (1.0 - ty));
+                mean.add(image, x1, y0, tx * (1.0 - ty));
+                mean.add(image, x0, y1, (1.0 - tx) * ty);
+                mean.add(image, x1, y1, tx * ty);
+                mean.push_to(&mut out);
             }
         }
         out

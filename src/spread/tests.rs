@@ -80,7 +80,7 @@ fn colours_that_change_with_the_view_ask_for_more() {
             _ => value,
         };
         let (tracks, views) = scene(shade);
-        let found = Spread { tracks: LEAST_TRACKS, ..measure(&tracks, &views).unwrap() };
+        let found = Spread { tracks: MIN_TRACKS, ..measure(&tracks, &views).unwrap() };
         assert_eq!(found.degree(), Some(degree), "{strength}: {found:?}");
     }
 }
@@ -104,11 +104,11 @@ fn points_that_are_not_on_a_surface_decide_nothing() {
     for colour in tracks.colours.iter_mut().step_by(3) {
         *colour = colour.map(|value| 255 - value);
     }
-    let some = Spread { tracks: LEAST_TRACKS, ..measure(&tracks, &views).unwrap() };
+    let some = Spread { tracks: MIN_TRACKS, ..measure(&tracks, &views).unwrap() };
     assert!(some.degree().is_some(), "{some:?}");
     let none = Spread { on_surface: 0.49, ..some };
     assert_eq!(none.degree(), None);
-    assert_eq!(Spread { tracks: LEAST_TRACKS - 1, ..some }.degree(), None);
+    assert_eq!(Spread { tracks: MIN_TRACKS - 1, ..some }.degree(), None);
     assert_eq!(measure(&Tracks::default(), &views).unwrap().degree(), None);
 }
 

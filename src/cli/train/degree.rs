@@ -10,7 +10,7 @@ use crate::cli::number::grouped;
 use crate::dataset::Dataset;
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::output::{DegreeChoice, RunConfig};
-use crate::spread::{self, LEAST_TRACKS};
+use crate::spread::{self, MIN_TRACKS};
 
 /// What is given with `--sh-degree`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,7 +95,7 @@ impl Degree {
             Some(ShDegree::Auto) => {
                 let bytes = dataset.tracks.bytes() + spread::bytes(&dataset.tracks);
                 let found = match dataset.tracks.len() {
-                    ..LEAST_TRACKS => None,
+                    ..MIN_TRACKS => None,
                     _ => Some(spread::measure(&dataset.tracks, &dataset.train)?),
                 };
                 let decided = found.and_then(|found| Some((found.degree()?, found)));
@@ -121,7 +121,7 @@ impl Degree {
             )),
             DegreeChoice::Undecided => Some(format!(
                 "colour   degree {} (auto): points of a reconstruction decide nothing, as fewer than \
-                 {LEAST_TRACKS} are known in enough views, or fewer than half of them lie on surfaces",
+                 {MIN_TRACKS} are known in enough views, or fewer than half of them lie on surfaces",
                 self.highest()
             )),
         }

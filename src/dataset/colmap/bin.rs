@@ -1,6 +1,6 @@
-//! COLMAP's binary files: little endian, no padding, counts first.
+//! Reads COLMAP's binary files: little endian, no padding, counts first.
 //!
-//! Nothing is allocated from a count before the bytes that would back it are known to be there.
+//! A count is checked against the size of the file before anything is allocated from it.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -11,13 +11,13 @@ use glam::DVec3;
 
 use super::super::error::DatasetError;
 use super::super::paths::MAX_NAME;
-use super::super::tracks::{Gathered, MOST_VIEWS};
+use super::super::tracks::{MAX_VIEWS, TrackSampler};
 use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, checked_size};
 
-/// A file being read, and how much of it is left.
+/// A file and the number of bytes left.
 struct Reader<'a> {
     path: &'a Path,
     input: BufReader<File>,
@@ -37,7 +37,7 @@ impl<'a> Reader<'a> {
         DatasetError::malformed(self.path, place, problem, REMEDY)
     }
 
-    /// Counts bytes as read, if there are so many.
+    /// Counts bytes as read; an error if the file has fewer.
     fn claim(&mut self, field: &str, bytes: u64) -> Result<(), DatasetError> {
         if bytes > self.left {
             let problem = format!(
@@ -86,7 +86,7 @@ impl<'a> Reader<'a> {
         self.input.seek_relative(bytes).map_err(DatasetError::io(self.path))
     }
 
-    /// The leading count of records that take at least `size` bytes each.
+    /// Reads a count of records that take at least `size` bytes each.
     fn count(&mut self, what: &str, size: u64, most: u64) -> Result<u64, DatasetError> {
         let count = self.u64(what)?;
         if count > most || count > self.left / size {
@@ -133,7 +133,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
         let id = reader.u32("camera id")?;
         let field = format!("camera {id}");
         let model = i32::from_le_bytes(reader.bytes(&field)?);
-        let model = Model::of_id(path, &field, model)?;
+        let model = Model::from_id(path, &field, model)?;
         let (width, height) = (reader.u64(&field)?, reader.u64(&field)?);
         let (width, height) = checked_size(path, &field, width, height)?;
         let mut parameters = [0.0; 8];
@@ -172,10 +172,10 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
     Ok(images)
 }
 
-/// Reads points3D.bin, with the tracks in it where they are wanted.
+/// Reads points3D.bin, and its tracks into `tracks`.
 pub(super) fn points(
     path: &Path,
-    mut tracks: Option<&mut Gathered>,
+    mut tracks: Option<&mut TrackSampler>,
 ) -> Result<PointCloud, DatasetError> {
     let mut reader = Reader::open(path)?;
     // id, position, colour, error, length of the track.
@@ -191,20 +191,20 @@ pub(super) fn points(
         let views = reader.u64(field)?;
         match tracks.as_deref_mut() {
             Some(tracks) if tracks.wants(views) => {
-                // Each with its place among the image's observations.
-                let (kept, rest) = (views.min(MOST_VIEWS), views.saturating_sub(MOST_VIEWS));
+                // Pairs of image id and observation index.
+                let (kept, rest) = (views.min(MAX_VIEWS), views.saturating_sub(MAX_VIEWS));
                 let mut ids = Vec::new();
                 for _ in 0..kept {
                     ids.push(reader.u32(field)?);
                     reader.skip(field, 1, 4)?;
                 }
                 reader.skip(field, rest, 8)?;
-                tracks.take(position, colour, ids);
+                tracks.add(position, colour, ids);
             }
             tracks => {
                 reader.skip(field, views, 8)?;
                 if let Some(tracks) = tracks {
-                    tracks.pass(views);
+                    tracks.skip(views);
                 }
             }
         }

@@ -1,6 +1,6 @@
-//! COLMAP sparse models: `images/` beside `sparse/0/{cameras,images,points3D}.{bin,txt}`.
+//! Reads COLMAP sparse models: `images/` beside `sparse/0/{cameras,images,points3D}.{bin,txt}`.
 //!
-//! Rigs and frames of newer versions are ignored: images.bin holds the poses still.
+//! Rigs and frames of newer versions are ignored: images.bin still holds the poses.
 
 mod bin;
 mod model;
@@ -13,9 +13,9 @@ use glam::{DMat3, DVec3};
 
 use super::error::DatasetError;
 use super::folders::Folders;
-use super::paths::{Named, Root, relative};
+use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
-use super::tracks::{Gathered, Tracks};
+use super::tracks::{TrackSampler, Tracks};
 use super::undistort::Lens;
 use super::{Frame, PointCloud, Scene};
 
@@ -24,7 +24,7 @@ const REMEDY: &str = "export the model again with COLMAP";
 /// Most records accepted.
 const MAX_IMAGES: u64 = 1_000_000;
 const MAX_POINTS: u64 = 1 << 28;
-/// Difference up to which two poses are one, written by two programs.
+/// Largest difference between the same pose written by two programs.
 const SAME_POSE: f64 = 1e-5;
 
 /// One registered image.
@@ -53,7 +53,7 @@ impl Image {
     }
 }
 
-/// A model as its three files hold it.
+/// The contents of the three files.
 #[derive(Debug, Default)]
 struct Model {
     cameras: HashMap<u32, Lens>,
@@ -90,7 +90,7 @@ pub(super) fn read(
             let problem = format!("its camera {} is not in {}", image.camera, cameras.display());
             return Err(DatasetError::malformed(&images, field, problem, REMEDY));
         };
-        let named = Named { file: &images, field: &field, value: &image.name };
+        let named = DataPath { file: &images, field: &field, value: &image.name };
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
         reduced_missing += usize::from(found.fell_back);
         let mask = folders.mask(named)?;
@@ -122,7 +122,7 @@ pub(super) fn read(
     })
 }
 
-/// The model's three files and what they hold.
+/// The paths of the three files and their contents.
 fn model(
     root: &Root,
     folder: &Path,
@@ -132,25 +132,25 @@ fn model(
     let ending = if binary { "bin" } else { "txt" };
     let file = |name: &str| folder.join(format!("{name}.{ending}"));
     let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
-    // Links out of the dataset are refused for the model's files too.
+    // Links out of the dataset are refused for these files too.
     for path in [&cameras, &images, &points] {
         let inside = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy();
-        root.existing(Named { file: path, field: "the file", value: &inside })?;
+        root.existing(DataPath { file: path, field: "the file", value: &inside })?;
     }
-    let mut gathered = with_tracks.then(Gathered::new);
-    let tracks = gathered.as_mut();
+    let mut sampler = with_tracks.then(TrackSampler::new);
+    let tracks = sampler.as_mut();
     let (lenses, posed, cloud) = if binary {
         (bin::cameras(&cameras)?, bin::images(&images)?, bin::points(&points, tracks)?)
     } else {
         (txt::cameras(&cameras)?, txt::images(&images)?, txt::points(&points, tracks)?)
     };
-    let tracks = gathered.map(Gathered::finish).unwrap_or_default();
+    let tracks = sampler.map(TrackSampler::finish).unwrap_or_default();
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
 }
 
-/// Gives a scene of another format the tracks of the model in `folder`, where that is of the same
-/// images with the same poses, as `densify scenegen` writes both. Where not, there are no tracks,
-/// which is no error: nobody said that the two belong together.
+/// Gives a scene of another format the tracks of the model in `folder` if both have the same images
+/// with the same poses, as written by `densify scenegen`. If not, the model is ignored: nothing says
+/// that the two belong together.
 pub(super) fn adopt_tracks(root: &Root, folder: &Path, scene: &mut Scene) {
     let Ok((_, model)) = model(root, folder, true) else { return };
     let by_name: HashMap<String, &Image> =
@@ -180,7 +180,7 @@ pub(super) fn adopt_tracks(root: &Root, folder: &Path, scene: &mut Scene) {
     }
 }
 
-/// A camera's size, if an image can have it.
+/// Checks the size of a camera.
 fn checked_size(
     file: &Path,
     field: &str,

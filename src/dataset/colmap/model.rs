@@ -1,4 +1,4 @@
-//! COLMAP's camera models by number and name, and the lenses they stand for.
+//! COLMAP's camera models by number and name, converted to lenses.
 
 use std::path::Path;
 
@@ -25,12 +25,12 @@ const MODELS: [(&str, usize); 12] = [
 
 const SUPPORTED: &str = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV";
 
-/// A model that can be loaded.
+/// A supported model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Model(usize);
 
 impl Model {
-    pub(super) fn of_id(file: &Path, camera: &str, id: i32) -> Result<Self, DatasetError> {
+    pub(super) fn from_id(file: &Path, camera: &str, id: i32) -> Result<Self, DatasetError> {
         let known = usize::try_from(id).ok().filter(|&id| id < MODELS.len());
         match known {
             Some(id) => Self::supported(file, camera, MODELS[id].0),
@@ -38,7 +38,7 @@ impl Model {
         }
     }
 
-    pub(super) fn of_name(file: &Path, camera: &str, name: &str) -> Result<Self, DatasetError> {
+    pub(super) fn from_name(file: &Path, camera: &str, name: &str) -> Result<Self, DatasetError> {
         Self::supported(file, camera, name)
     }
 

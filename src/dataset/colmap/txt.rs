@@ -1,4 +1,4 @@
-//! COLMAP's text files: a record per line (two per image), `#` for comments.
+//! Reads COLMAP's text files: one line per record (two per image), `#` for comments.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -10,7 +10,7 @@ use glam::DVec3;
 
 use super::super::error::DatasetError;
 use super::super::paths::MAX_NAME;
-use super::super::tracks::Gathered;
+use super::super::tracks::TrackSampler;
 use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
@@ -77,7 +77,7 @@ impl<'a> Lines<'a> {
         let word = words.next().ok_or_else(|| self.fault(field, "the line ends before it"))?;
         word.parse().map_err(|_| {
             let word: String = word.chars().take(40).collect();
-            self.fault(field, format!("{word:?} is no such number"))
+            self.fault(field, format!("{word:?} is not a valid number"))
         })
     }
 
@@ -103,7 +103,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
         let id: u32 = lines.number(&mut words, "camera id")?;
         let field = format!("camera {id}");
         let model = words.next().ok_or_else(|| lines.fault(&field, "the model is missing"))?;
-        let model = Model::of_name(path, &field, model)?;
+        let model = Model::from_name(path, &field, model)?;
         let width = lines.number(&mut words, "width")?;
         let height = lines.number(&mut words, "height")?;
         let (width, height) = checked_size(path, &field, width, height)?;
@@ -124,8 +124,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
     Ok(cameras)
 }
 
-/// Reads images.txt. The line of observations after each image may be empty, so that only
-/// comments may be skipped between the two.
+/// Reads images.txt. An image is two lines, of which the second, its observations, may be empty.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, DatasetError> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
@@ -170,10 +169,10 @@ fn after_words(text: &str, count: usize) -> &str {
     rest
 }
 
-/// Reads points3D.txt, with the tracks in it where they are wanted.
+/// Reads points3D.txt, and its tracks into `tracks`.
 pub(super) fn points(
     path: &Path,
-    mut tracks: Option<&mut Gathered>,
+    mut tracks: Option<&mut TrackSampler>,
 ) -> Result<PointCloud, DatasetError> {
     let mut lines = Lines::open(path)?;
     let mut points = PointCloud::default();
@@ -187,20 +186,21 @@ pub(super) fn points(
         }
         let position = DVec3::from(position);
         if let Some(tracks) = tracks.as_deref_mut() {
-            // The error, then pairs of an image and a place among its observations.
+            // The reprojection error, then pairs of image id and observation index.
             let _ = words.next();
             let views = words.clone().count() as u64 / 2;
             if tracks.wants(views) {
                 let mut ids = Vec::new();
                 while let (Some(id), Some(_)) = (words.next(), words.next()) {
                     ids.push(
-                        id.parse()
-                            .map_err(|_| lines.fault("track", format!("{id:?} is no image id")))?,
+                        id.parse().map_err(|_| {
+                            lines.fault("track", format!("{id:?} is not an image id"))
+                        })?,
                     );
                 }
-                tracks.take(position, colour, ids);
+                tracks.add(position, colour, ids);
             } else {
-                tracks.pass(views);
+                tracks.skip(views);
             }
         }
         points.positions.push(position);
