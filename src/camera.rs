@@ -31,20 +31,20 @@ impl Camera {
         -(self.rotation.transpose() * self.translation)
     }
 
-    /// The direction the camera looks into, in world coordinates, unit length.
+    /// The viewing direction in world coordinates, unit length.
     #[must_use]
     pub fn forward(&self) -> DVec3 {
         self.rotation.row(2)
     }
 
-    /// World point to pixel and depth (camera z). The pixel is meaningless where depth <= 0.
+    /// Projects a world point to pixel and depth (camera z). The pixel is meaningless where depth <= 0.
     #[must_use]
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let p = self.rotation * world + self.translation;
         (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
     }
 
-    /// The same camera with an image of another size: intrinsics scale per axis.
+    /// The same camera with an image of another size; intrinsics scale per axis.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let sx = f64::from(width) / f64::from(self.width);

@@ -1,18 +1,19 @@
-//! Scores of a model on held-out views.
+//! Scores a model on a set of views.
 
 use std::ops::ControlFlow;
 
+use serde::{Deserialize, Deserializer, Serialize};
+
 use crate::backend::{Backend, BackendError};
 use crate::metrics::{MetricError, flip, psnr, ssim};
-use crate::output::Mean;
 use crate::views::{ViewError, ViewSource};
 
-/// Which views of a dataset.
+/// Part of a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Split {
-    /// Those held out.
+    /// Views held out.
     Test,
-    /// Those trained on.
+    /// Views trained on.
     Train,
 }
 
@@ -29,6 +30,25 @@ pub struct ViewScore {
     pub flip: f64,
 }
 
+/// Mean scores of a set of views.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Mean {
+    /// Peak signal-to-noise ratio `[dB]`.
+    #[serde(rename = "PSNR", deserialize_with = "or_infinite")]
+    pub psnr: f64,
+    /// Structural similarity.
+    #[serde(rename = "SSIM")]
+    pub ssim: f64,
+    /// FLIP error: visible difference, 0 for equal images.
+    #[serde(rename = "FLIP")]
+    pub flip: f64,
+}
+
+/// JSON has no infinity, the ratio of two equal images, and writes it as null.
+fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
+}
+
 /// Scores of a set of views.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Scores {
@@ -37,7 +57,7 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// Mean over the views; NaN where there are none.
+    /// Mean over the views; NaN without views.
     #[must_use]
     pub fn mean(&self) -> Mean {
         let mean = |score: fn(&ViewScore) -> f64| {
@@ -59,7 +79,7 @@ pub enum EvaluateError {
     View {
         /// The view's name.
         view: String,
-        /// What the source of the views says.
+        /// The error of the source of views.
         source: ViewError,
     },
     /// It could not be rendered.
@@ -67,7 +87,7 @@ pub enum EvaluateError {
     Backend {
         /// The view's name.
         view: String,
-        /// What the backend says.
+        /// The error of the backend.
         source: BackendError,
     },
     /// Rendering and image cannot be compared.
@@ -75,16 +95,16 @@ pub enum EvaluateError {
     Metric {
         /// The view's name.
         view: String,
-        /// What the comparison says.
+        /// The error of the metric.
         source: MetricError,
     },
-    /// The caller wanted no more.
+    /// Stopped by the caller.
     #[error("stopped before all views were measured")]
     Stopped,
 }
 
-/// Renders every view and compares it with its image. `seen` is called after each view, and may stop
-/// it there.
+/// Renders every view and compares it with its image. `after_view` is called after each view and may
+/// stop the evaluation.
 ///
 /// # Errors
 /// [`EvaluateError`] at the first view that cannot be scored; [`EvaluateError::Stopped`].
@@ -93,7 +113,7 @@ pub fn evaluate(
     views: &impl ViewSource,
     background: [f32; 3],
     sh_degree: u8,
-    mut seen: impl FnMut(&ViewScore) -> ControlFlow<()>,
+    mut after_view: impl FnMut(&ViewScore) -> ControlFlow<()>,
 ) -> Result<Scores, EvaluateError> {
     let count = views.count();
     let mut scores = Scores::default();
@@ -113,7 +133,7 @@ pub fn evaluate(
             ssim: ssim(&rendering.rgb, &image, background).map_err(metric)?,
             flip: flip(&rendering.rgb, &image, background).map_err(metric)?,
         };
-        let flow = seen(&score);
+        let flow = after_view(&score);
         scores.views.push(score);
         if flow.is_break() {
             return Err(EvaluateError::Stopped);

@@ -1,4 +1,4 @@
-//! Posed images by number: what trainer and evaluation need of a dataset.
+//! Views by number: the part of a dataset that training and evaluation use.
 
 use std::error::Error;
 
@@ -6,10 +6,10 @@ use crate::camera::Camera;
 use crate::dataset::View;
 use crate::dataset::images::{ImageCache, ImageSource, SharedImage};
 
-/// Why a view cannot be had: whatever the source of the views says.
+/// The error of a source of views.
 pub type ViewError = Box<dyn Error + Send + Sync>;
 
-/// Posed images by number, as the trainer needs them.
+/// Views by number.
 pub trait ViewSource: Send {
     /// Number of views, >= 1.
     fn count(&self) -> usize;
@@ -17,34 +17,34 @@ pub trait ViewSource: Send {
     /// Name of a view, for messages.
     fn name(&self, view: usize) -> &str;
 
-    /// The view's camera.
+    /// Camera of a view.
     fn camera(&self, view: usize) -> &Camera;
 
-    /// The view's pixels, of the camera's size.
+    /// Pixels of a view, of the camera's size.
     ///
     /// # Errors
     /// When they cannot be read.
     fn image(&self, view: usize) -> Result<SharedImage, ViewError>;
 
-    /// Says which views will be asked for next, soonest first.
+    /// Announces the next views, soonest first.
     fn prefetch(&self, upcoming: &[usize]);
 
-    /// From now on cameras and images shall be so many times smaller along both sides. A source that
-    /// cannot shrink them leaves them as they are.
+    /// Divides both sides of all cameras and images by this from now on. Sources that cannot shrink
+    /// images ignore it.
     fn shrink(&mut self, divisor: u32) {
         let _ = divisor;
     }
 }
 
-/// Images are not shrunk to fewer pixels than this along a side: there is nothing left to learn from.
-const LEAST_SIDE: u32 = 16;
+/// Images are not shrunk below this side: nothing could be learned from them `[px]`.
+const MIN_SIDE: u32 = 16;
 
-/// Views of a dataset with their images, of which some are held decoded.
+/// Views of a dataset, with a cache of decoded images.
 #[derive(Debug)]
 pub struct DatasetViews {
     views: Vec<View>,
     divisor: u32,
-    /// Where images are shrunk: the cameras that go with them.
+    /// Cameras of the shrunk images; empty with divisor 1.
     cameras: Vec<Camera>,
     cache: ImageCache,
     cache_bytes: u64,
@@ -52,8 +52,8 @@ pub struct DatasetViews {
 }
 
 impl DatasetViews {
-    /// Serves `views`; holds decoded images of about `cache_bytes`, and decodes ahead with
-    /// `threads` threads of its own.
+    /// Serves `views` with a cache of about `cache_bytes` of decoded images, which `threads` threads
+    /// fill ahead of use.
     #[must_use]
     pub fn new(views: Vec<View>, cache_bytes: u64, threads: usize) -> Self {
         let sources = views.iter().map(|view| view.source.clone()).collect();
@@ -62,10 +62,10 @@ impl DatasetViews {
     }
 }
 
-/// The camera of an image so many times smaller, or as near to that as leaves something to see.
+/// The camera with both sides divided, as far as [`MIN_SIDE`] allows.
 fn shrunk(camera: &Camera, divisor: u32) -> Camera {
-    let least = camera.width.min(camera.height);
-    let divisor = f64::from((least / LEAST_SIDE).clamp(1, divisor.max(1)));
+    let shorter = camera.width.min(camera.height);
+    let divisor = f64::from((shorter / MIN_SIDE).clamp(1, divisor.max(1)));
     let side = |side: u32| ((f64::from(side) / divisor).round() as u32).max(1);
     camera.resized(side(camera.width), side(camera.height))
 }
@@ -105,7 +105,7 @@ impl ViewSource for DatasetViews {
             ImageSource { width, height, ..self.views[view].source.clone() }
         };
         let sources = (0..self.views.len()).map(source).collect();
-        // The threads end, and what is held is free, before the next cache holds anything.
+        // First the threads end and the memory is freed, then the new cache is made.
         self.cache = ImageCache::new(Vec::new(), 0, 0);
         self.cache = ImageCache::new(sources, self.cache_bytes, self.threads);
     }
@@ -129,7 +129,7 @@ mod tests {
             let least = camera.width.min(camera.height);
             match divisor {
                 1 => assert_eq!(camera, full),
-                1000 => assert!((LEAST_SIDE..2 * LEAST_SIDE).contains(&least), "{least}"),
+                1000 => assert!((MIN_SIDE..2 * MIN_SIDE).contains(&least), "{least}"),
                 _ => assert_eq!(camera.width, full.width / divisor),
             }
             // The same rays at the same share of the image.

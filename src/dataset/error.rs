@@ -106,7 +106,7 @@ pub enum DatasetError {
         image: PathBuf,
     },
     /// No image has a pose.
-    #[error("{path} lists no existing image; check the file and the images beside it")]
+    #[error("{path} lists no image that exists; check the file and the images beside it")]
     NoImages {
         /// The file that should list them.
         path: PathBuf,

@@ -1,8 +1,8 @@
-//! Scene normalisation, in f64: far-off or tiny scenes lose nothing to f32.
+//! Moves scenes to normalised coordinates, in f64: remote and tiny scenes lose no precision in f32.
 //!
-//! The scene's own unit becomes the largest distance of a training camera from their mean, as in
-//! the radius of nerf++ (Zhang et al. 2020, §4) that 3DGS calls the scene's extent. Rotations are
-//! left alone, so that quaternions and spherical harmonics need no change.
+//! The unit of the scene is the largest distance of a training camera from their mean, as in nerf++
+//! (Zhang et al. 2020, §4); 3DGS calls 1.1 times that the extent. Rotations do not change, and so
+//! neither do quaternions and spherical harmonics.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -10,21 +10,21 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 
-/// The margin of the scene's extent around the cameras (3DGS, `getNerfppNorm`).
+/// Factor between the radius of the cameras and the extent (3DGS, `getNerfppNorm`).
 const EXTENT_MARGIN: f64 = 1.1;
 /// Extent of every normalised scene `[scene units]`.
 pub const EXTENT: f64 = EXTENT_MARGIN;
-/// Rigs smaller than this share of their distance from the origin are one place: f64 has
-/// 2.2e-16, of which poses computed elsewhere keep a few digits less.
+/// Cameras are at one place if their radius is below this fraction of their distance from the origin:
+/// the precision of f64 is 2.2e-16, and poses from other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
-/// Offset in extents beyond which f32 world coordinates lose pixels: at 1e4 about half a pixel
-/// of a 1,500 px focal length at distance 10.
+/// Distance from the origin, in extents, beyond which f32 world coordinates are too coarse: at 1e4
+/// about half a pixel at a focal length of 1,500 px and distance 10.
 const F32_OFFSET: f64 = 1e4;
 
 /// scene = (world − centre) · scale.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Normalisation {
-    /// World point that becomes the origin.
+    /// The world point at the origin of the scene.
     pub centre: DVec3,
     /// Scene units per world unit, > 0.
     pub scale: f64,
@@ -43,12 +43,12 @@ fn rig(centres: &[DVec3]) -> (DVec3, f64) {
 }
 
 impl Normalisation {
-    /// Leaves everything as it is.
+    /// Changes nothing.
     pub const IDENTITY: Self = Self { centre: DVec3::ZERO, scale: 1.0 };
 
-    /// Puts the mean of the camera centres at the origin and the farthest of them at distance 1.
-    /// Where the cameras are all at one place, the median distance of the points from it becomes
-    /// 1; without points the unit stays.
+    /// Puts the mean of the camera centres at the origin and the farthest of them at distance 1. If
+    /// all cameras are at one place, the median distance of the points becomes 1; without points the
+    /// unit stays.
     #[must_use]
     pub fn fit(centres: &[DVec3], points: &[DVec3]) -> Self {
         let (centre, mut unit) = rig(centres);
@@ -62,49 +62,49 @@ impl Normalisation {
             };
         }
         let scale = 1.0 / unit;
-        // A unit of zero, or one whose inverse is not a normal number, cannot be one.
+        // Zero, and numbers without a normal inverse, cannot be the unit.
         Self { centre, scale: if scale.is_normal() { scale } else { 1.0 } }
     }
 
-    /// World point to scene point.
+    /// A point from world to scene coordinates.
     #[must_use]
     pub fn point(&self, world: DVec3) -> DVec3 {
         (world - self.centre) * self.scale
     }
 
-    /// Scene point to world point.
+    /// A point from scene to world coordinates.
     #[must_use]
     pub fn denormalise_point(&self, scene: DVec3) -> DVec3 {
         scene / self.scale + self.centre
     }
 
-    /// A camera of the world as one of the scene.
+    /// A camera from world to scene coordinates.
     #[must_use]
     pub fn camera(&self, world: &Camera) -> Camera {
         let translation = (world.rotation * self.centre + world.translation) * self.scale;
         Camera { translation, ..*world }
     }
 
-    /// A camera of the scene as one of the world.
+    /// A camera from scene to world coordinates.
     #[must_use]
     pub fn denormalise_camera(&self, scene: &Camera) -> Camera {
         let translation = scene.translation / self.scale - scene.rotation * self.centre;
         Camera { translation, ..*scene }
     }
 
-    /// A model in scene coordinates as one in world coordinates. Computed in f64.
+    /// A model from scene to world coordinates, computed in f64.
     #[must_use]
     pub fn model_to_world(&self, scene: Gaussians) -> Gaussians {
         self.mapped(scene, -self.scale.ln(), |mean| self.denormalise_point(mean))
     }
 
-    /// A model in world coordinates as one in scene coordinates. Computed in f64.
+    /// A model from world to scene coordinates, computed in f64.
     #[must_use]
     pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
         self.mapped(world, self.scale.ln(), |mean| self.point(mean))
     }
 
-    /// In place: a model may be most of what there is memory for.
+    /// In place: the model may be most of the memory.
     fn mapped(
         &self,
         mut model: Gaussians,
@@ -122,14 +122,15 @@ impl Normalisation {
         model
     }
 
-    /// What to say before world coordinates are written as f32, if they will suffer.
+    /// A warning if world coordinates lose precision in f32.
     #[must_use]
     pub fn f32_warning(&self) -> Option<String> {
         let offset = self.centre.length() * self.scale / EXTENT;
         (offset > F32_OFFSET).then(|| {
             format!(
-                "the scene lies {offset:.1e} of its extents from the origin: a PLY in f32 keeps only \
-                 {:.1e} of an extent; move the reconstruction near the origin before training",
+                "the scene is {offset:.1e} times its extent from the origin: f32 coordinates in the exported \
+                 model are only precise to {:.1e} of the extent; move the reconstruction near the \
+                 origin before training",
                 offset * f64::from(f32::EPSILON)
             )
         })

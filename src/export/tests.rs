@@ -103,7 +103,7 @@ fn names_and_extensions_are_unique() {
 
 #[test]
 fn an_unknown_format_names_the_nearest_and_the_list() {
-    let message = find("pyl").unwrap_err().to_string();
+    let message = find("plz").unwrap_err().to_string();
     assert!(
         message.contains("did you mean `ply`?") && message.contains("call-log, ply"),
         "{message}"

@@ -1,8 +1,8 @@
-//! Points to Gaussians, never more than the budget.
+//! Makes the first Gaussians from points, never more than the budget.
 //!
 //! As in 3DGS (Kerbl et al. 2023, §4 and its code): isotropic, the standard deviation the root
 //! mean square distance to the 3 nearest neighbours, opacity 0.1, colour in band 0. All in f64 and
-//! relative to the scene's size, so that neither far-off nor tiny scenes lose anything.
+//! relative to the scene's size, so that remote and tiny scenes lose no precision.
 
 mod random;
 
@@ -22,53 +22,53 @@ pub use random::random_points;
 
 /// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
 pub const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
-/// Neighbours whose distances make the scale.
+/// Number of neighbours that determine the scale.
 const NEIGHBOURS: usize = 3;
-/// Smallest root mean square distance used: below 1e-4·D points are one surface sample, and the
-/// original's absolute floor would exceed a whole scene of millimetres.
+/// Smallest root mean square distance used: points closer than 1e-4·D are one surface sample. (The
+/// absolute floor of the original would exceed a scene of a few millimetres.)
 const DISTANCE_FLOOR: f64 = 1e-4 * SCENE_DIAMETER;
-/// Standard deviation of a point without neighbours.
-const LONE_SCALE: f64 = 0.01 * SCENE_DIAMETER;
+/// Standard deviation if there is only one point.
+const SINGLE_POINT_SCALE: f64 = 0.01 * SCENE_DIAMETER;
 /// Opacity at the start.
 const OPACITY: f64 = 0.1;
-/// Colours keep half a step of 8 bits from the ends: at 0 the renderer's clamp would leave black
-/// without a gradient.
+/// Colours stay half an 8-bit step away from 0 and 1: the renderer clamps colours at 0, where black
+/// would have no gradient.
 const COLOUR_MARGIN: f64 = 1.0 / 510.0;
 
-/// What initialisation did.
+/// Numbers of points used and dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InitReport {
     /// Points given.
     pub points: usize,
-    /// Points left out because another lies at exactly the same place.
+    /// Points dropped because another is at exactly the same place.
     pub duplicates: usize,
-    /// Points left out because they are not finite in f32.
+    /// Points dropped because they are not finite in f32.
     pub unusable: usize,
-    /// Points left out because the budget is smaller than their number; chosen by the seed.
+    /// Points dropped, at random by the seed, because they exceed the budget.
     pub over_budget: usize,
-    /// Rows made: what is left.
+    /// Rows made from the others.
     pub rows: usize,
 }
 
-/// Why no model can be made.
+/// Why the first Gaussians cannot be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InitError {
     /// There is no usable point.
     #[error("there is no point to start from; start from random points instead")]
     NoPoints,
-    /// The budget has no room for a row.
-    #[error("a budget of 0 rows has no room for a model; give --budget at least 1")]
+    /// The budget is 0.
+    #[error("a budget of 0 Gaussians holds no model; give --budget at least 1")]
     NoBudget,
     /// The degree is not supported.
     #[error("spherical-harmonic degree {0} is not one of 0 to 3; choose --sh-degree accordingly")]
     ShDegree(u8),
-    /// The neighbours cannot be found.
-    #[error("the points' neighbours cannot be found: {0} points are too many; use fewer")]
+    /// The neighbour search does not support so many points.
+    #[error("{0} points are too many for the neighbour search; use fewer")]
     TooManyPoints(usize),
 }
 
-/// Makes one Gaussian per point, in normalised coordinates, or per point of a seeded subsample
-/// where there are more points than `budget`. Rows keep the order of the points.
+/// Makes one Gaussian per point, in normalised coordinates. If there are more points than `budget`,
+/// the seed chooses a subset. Rows keep the order of the points.
 ///
 /// # Errors
 /// See [`InitError`].
@@ -120,7 +120,7 @@ pub fn initialise(
     Ok((gaussians, report))
 }
 
-/// Rows that [`initialise`] makes of these points where the budget has room for all.
+/// Number of rows that [`initialise`] makes of these points without a limit.
 #[must_use]
 pub fn usable_points(points: &PointCloud) -> usize {
     let mut chosen = finite(points);
@@ -132,20 +132,20 @@ fn finite(points: &PointCloud) -> Vec<usize> {
     (0..points.len()).filter(|&i| points.positions[i].as_vec3().is_finite()).collect()
 }
 
-/// Changes initial rows as a policy wants them.
+/// Applies the start that a policy requests.
 pub fn restart(model: &mut Gaussians, rule: &StartRule) {
     if let Some(opacity) = rule.opacity {
         model.opacity_logits.fill(logit(opacity));
     }
-    let grown = rule.scale.ln();
+    let ln_scale = rule.scale.ln();
     for log_scale in model.log_scales.as_flattened_mut() {
-        *log_scale += grown;
+        *log_scale += ln_scale;
     }
 }
 
-/// Keeps the first of the points that share a place.
+/// Keeps the first of several points at the same place.
 fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
-    // −0 and 0 are one place.
+    // −0 equals 0.
     let key = |i: usize| positions[i].to_array().map(|v| (v + 0.0).to_bits());
     let mut order = chosen.clone();
     order.par_sort_unstable_by_key(|&i| (key(i), i));
@@ -154,8 +154,8 @@ fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
     *chosen = order;
 }
 
-/// Keeps `count` of them, each set equally likely, in their order. A partial Fisher–Yates shuffle
-/// by hand: sampling functions of libraries may change with their versions.
+/// Keeps `count` of them in order, all subsets equally likely. A partial Fisher–Yates shuffle, written
+/// out because the sampling functions of a library may change with its version.
 fn subsample(chosen: &mut Vec<usize>, count: usize, seed: u64) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     for i in 0..count {
@@ -167,16 +167,16 @@ fn subsample(chosen: &mut Vec<usize>, count: usize, seed: u64) {
     chosen.sort_unstable();
 }
 
-/// ln of the root mean square distance to the nearest neighbours, of which there may be fewer
-/// than three. The points are distinct.
+/// Logarithm of the root mean square distance to the (up to) three nearest neighbours. The points are
+/// distinct.
 fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
     let neighbours = NEIGHBOURS.min(positions.len() - 1);
     if neighbours == 0 {
-        return Ok(vec![LONE_SCALE.ln() as f32]);
+        return Ok(vec![SINGLE_POINT_SCALE.ln() as f32]);
     }
     let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(positions)
         .map_err(|_| InitError::TooManyPoints(positions.len()))?;
-    // One more: the point itself is its own nearest.
+    // One more, because each point finds itself.
     let wanted = NonZeroUsize::MIN.saturating_add(neighbours);
     let scale = |position: &[f64; 3]| {
         let found = tree.query(position).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();

@@ -1,4 +1,4 @@
-//! Points for datasets that bring none.
+//! Random points for datasets without points.
 
 use glam::{DMat3, DVec2, DVec3};
 use rand_chacha::ChaCha8Rng;
@@ -7,22 +7,22 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use crate::camera::Camera;
 use crate::dataset::PointCloud;
 
-/// Half side of the cube around the focus, in distances of the cameras from it. The original's
-/// cube of ±1.3 for NeRF-synthetic scenes, whose cameras are 4.03 away.
-const CUBE: f64 = 1.0 / 3.0;
-/// Depths of the surroundings, in distances of the cameras from their focus.
-const BEYOND: (f64, f64) = (2.0 / 3.0, 4.0);
-/// Depths in scenes without a focus `[scene units]`; the rig's radius is 1.
-const AROUND: (f64, f64) = (0.25, 5.0);
-/// Colours are drawn from the middle half, where no channel is near its clamp.
+/// Half side of the cube around the focus, as a fraction of the cameras' distance. As in the original:
+/// ±1.3 in NeRF-synthetic scenes, whose cameras are 4.03 away.
+const HALF_CUBE: f64 = 1.0 / 3.0;
+/// Depths of background points, as fractions of the cameras' distance from the focus.
+const BACKGROUND_DEPTHS: (f64, f64) = (2.0 / 3.0, 4.0);
+/// Depths in scenes without a focus `[scene units]`; the cameras are within a radius of 1.
+const FREE_DEPTHS: (f64, f64) = (0.25, 5.0);
+/// Smallest colour and width of the range: the middle half, away from the clamp.
 const COLOURS: (u8, u8) = (64, 128);
 
-/// Random points where the cameras look, in normalised coordinates, in random colours.
+/// Random points in view of the cameras, in normalised coordinates, with random colours.
 ///
-/// Where the cameras look at one thing, the points fill a cube around it; with a `background`
-/// (images without alpha) only every other point does, and the rest are spread over what the
-/// cameras see, uniformly in image and inverse depth. Where they look at no one thing (a room
-/// from inside, a street), all points are spread so. The same arguments give the same points.
+/// If the cameras look at one object, the points fill a cube around it. With a `background` (images
+/// without alpha) only every other point does; the rest are spread over the views, uniformly in image
+/// and inverse depth. If the cameras have no common focus (a room from inside, a street), all points
+/// are spread over the views. The same arguments give the same points.
 #[must_use]
 pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u64) -> PointCloud {
     let focus = focus(cameras);
@@ -31,13 +31,15 @@ pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u
     for index in 0..count {
         let position = match focus {
             Some((centre, distance)) if !background || index % 2 == 0 || cameras.is_empty() => {
-                centre + (2.0 * draw.unit3() - 1.0) * (CUBE * distance)
+                centre + (2.0 * draw.unit3() - 1.0) * (HALF_CUBE * distance)
             }
-            Some((_, distance)) => {
-                seen(&mut draw, cameras, (BEYOND.0 * distance, BEYOND.1 * distance))
-            }
+            Some((_, distance)) => point_in_view(
+                &mut draw,
+                cameras,
+                (BACKGROUND_DEPTHS.0 * distance, BACKGROUND_DEPTHS.1 * distance),
+            ),
             None if cameras.is_empty() => 2.0 * draw.unit3() - 1.0,
-            None => seen(&mut draw, cameras, AROUND),
+            None => point_in_view(&mut draw, cameras, FREE_DEPTHS),
         };
         points.positions.push(position);
         points
@@ -47,8 +49,8 @@ pub fn random_points(count: usize, cameras: &[Camera], background: bool, seed: u
     points
 }
 
-/// The point that the optical axes pass closest to, in least squares, and the cameras' median
-/// distance from it; none where the axes are parallel or meet nowhere in front of the cameras.
+/// The point closest to all optical axes in least squares, and the median distance of the cameras;
+/// `None` if the axes are parallel or do not meet in front of the cameras.
 fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
@@ -59,8 +61,8 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
         right += across * camera.centre();
     }
     let count = cameras.len() as f64;
-    // The smallest eigenvalue over `count` is the axes' mean square spread [rad²]: a milliradian
-    // of spread is noise, not a crossing.
+    // The smallest eigenvalue over `count` is the mean square spread of the axes [rad²]; a spread of
+    // a milliradian is noise.
     if (normal * (1.0 / count)).determinant() < 1e-6 || cameras.is_empty() {
         return None;
     }
@@ -70,7 +72,7 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
         .map(|camera| {
             let offset = focus - camera.centre();
             let depth = offset.dot(camera.forward());
-            // Behind the camera is missed by any measure.
+            // A focus behind the camera does not count.
             let miss = if depth > 0.0 {
                 (offset - depth * camera.forward()).length()
             } else {
@@ -82,13 +84,13 @@ fn focus(cameras: &[Camera]) -> Option<(DVec3, f64)> {
     distances.sort_unstable_by(f64::total_cmp);
     misses.sort_unstable_by(f64::total_cmp);
     let distance = distances[distances.len() / 2];
-    // Nine cameras of ten see the focus in the middle third of their image or so.
+    // Nine of ten cameras see the focus in about the middle third of their image.
     let miss = misses[misses.len() * 9 / 10];
     (miss < 0.5 * distance).then_some((focus, distance))
 }
 
 /// A point in view of one of the cameras.
-fn seen(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
+fn point_in_view(draw: &mut Draw, cameras: &[Camera], (near, far): (f64, f64)) -> DVec3 {
     let camera = &cameras[((draw.unit() * cameras.len() as f64) as usize).min(cameras.len() - 1)];
     let pixel =
         DVec2::new(draw.unit() * f64::from(camera.width), draw.unit() * f64::from(camera.height));

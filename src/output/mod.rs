@@ -32,11 +32,13 @@ pub use config::{
 };
 pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
 pub use records::{
-    Mean, RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
+    RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,
 };
 pub use requirements::{LeftOut, Requirements};
 pub use tensorboard::TensorBoard;
+
+pub use crate::evaluate::Mean;
 
 use std::path::{Path, PathBuf};
 

@@ -5,12 +5,12 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::disk::{Named, Operation, attempt};
 use super::{OutputError, write_atomically};
-use crate::evaluate::{Scores, Split, ViewScore};
+use crate::evaluate::{Mean, Scores, Split, ViewScore};
 use crate::memory::Ledger;
 use crate::metrics::geometry::Geometry;
 
@@ -169,25 +169,6 @@ pub struct Summary {
     pub test_views: usize,
     /// Mean scores of the test views, by iteration.
     pub test: BTreeMap<u32, Mean>,
-}
-
-/// Mean scores of a set of views.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Mean {
-    /// Peak signal-to-noise ratio `[dB]`.
-    #[serde(rename = "PSNR", deserialize_with = "or_infinite")]
-    pub psnr: f64,
-    /// Structural similarity.
-    #[serde(rename = "SSIM")]
-    pub ssim: f64,
-    /// FLIP error: what the eye sees of the difference, 0 for equal images.
-    #[serde(rename = "FLIP")]
-    pub flip: f64,
-}
-
-/// JSON has no infinity and writes null: the ratio of two equal images.
-fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
-    Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
 /// Writes a value as indented JSON.

@@ -1,7 +1,7 @@
-//! What changes along a run: step sizes, spherical-harmonic degree, view order, background.
+//! Schedules of a run: step sizes, spherical-harmonic degree, view order, background.
 //!
-//! Everything here is a pure function of its arguments, so that a run can be repeated, or resumed
-//! at any step, without replaying what came before. Constants are those of Kerbl et al., *3D
+//! All are pure functions of their arguments, so that a run can be repeated, or resumed at any
+//! step, without replaying the steps before. Constants are those of Kerbl et al., *3D
 //! Gaussian Splatting for Real-Time Radiance Field Rendering* (SIGGRAPH 2023), section 5 and its
 //! published code, for a run of 30,000 steps; shorter and longer runs scale them in proportion.
 
@@ -59,14 +59,14 @@ impl Default for RateOptions {
 }
 
 impl RateOptions {
-    /// The default step sizes of a run of so many iterations: with fewer than 30,000 it starts with
-    /// b = (30,000 / iterations)^0.6 times the published ones, at most 5 times, and that of the
-    /// colour bands 1–3 stays above the published one, by b or 2 if that is less.
+    /// The default step sizes of a run of so many iterations. Runs of fewer than 30,000 start with
+    /// b = (30,000 / iterations)^0.6 times the published ones, at most 5 times, and the step size of
+    /// colour bands 1–3 keeps an additional factor of min(b, 2) to the end.
     ///
-    /// A short run has the same way to go in fewer steps. Measured on three scenes at 2,000–3,000
+    /// A short run has to come as far in fewer steps. Measured on three scenes at 2,000–3,000
     /// iterations: with the published sizes rows are still far from their optimum at the end, and
-    /// training views are as blurred as test views. View-dependent colour, whose steps are the
-    /// smallest and begin last, lags behind even so: twice its step gave +0.39, +0.23 and +0.18 dB
+    /// training views are as blurred as test views. View-dependent colour, which has the smallest
+    /// steps and starts last, still lags behind: twice its step size gave +0.39, +0.23 and +0.18 dB
     /// (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256);
     /// four times gave less. It costs where colour does not depend on the view: −0.76 dB on the
     /// built-in `scene:room` (`--lr sh_rest=1.25e-4` is the published size).
@@ -78,7 +78,7 @@ impl RateOptions {
         Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
     }
 
-    /// These step sizes, but for those that a policy is published with.
+    /// These step sizes, overlaid with those of a policy's paper.
     #[must_use]
     pub fn with(self, overrides: &RateOverrides) -> Self {
         Self {
@@ -143,10 +143,10 @@ pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
     u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
 }
 
-/// By how much the images of iteration `step` are shrunk along both sides, where the first
-/// `coarse_until` of a run (a share of it) is trained coarsely: 2, then 1. (Chen et al. 2025,
-/// *DashGaussian*, lets resolution grow along the run by the images' spectra; this step stands for it.
-/// A quarter of the sides in the first third of it saved little more, and cost 0.5 dB and more.)
+/// Divisor of both sides of the images at iteration `step`, where the first `coarse_until` (a
+/// fraction) of the run trains on smaller images: 2, then 1. (Chen et al. 2025,
+/// *DashGaussian*, raises the resolution along the run according to the images' spectra; one step
+/// stands in for that. Starting with a divisor of 4 saved little more and cost 0.5 dB or more.)
 #[must_use]
 pub fn divisor(step: u32, iterations: u32, coarse_until: f64) -> u32 {
     let done = f64::from(step.saturating_sub(1)) / f64::from(iterations.max(1));
@@ -163,7 +163,7 @@ pub enum Background {
     White,
     /// This colour, sRGB-encoded.
     Colour([u8; 3]),
-    /// Another colour at each step, uniform in `[0, 1]`³.
+    /// A new colour at each step, uniform in `[0, 1]`³.
     Random,
 }
 
@@ -173,7 +173,7 @@ impl Background {
     pub fn at(self, seed: u64, step: u32) -> [f32; 3] {
         match self {
             Self::Random => {
-                let mut draws = stream(seed, Use::Background, u64::from(step));
+                let mut draws = random_stream(seed, Use::Background, u64::from(step));
                 // The top 24 bits fill an f32's significand exactly.
                 std::array::from_fn(|_| (draws.next_u32() >> 8) as f32 / 16_777_215.0)
             }
@@ -181,7 +181,7 @@ impl Background {
         }
     }
 
-    /// The background of a rendering for evaluation; black where training drew it at random.
+    /// The background for evaluation; black if training draws it at random.
     #[must_use]
     pub fn fixed(self) -> [f32; 3] {
         match self {
@@ -218,7 +218,7 @@ impl FromStr for Background {
             "white" => Ok(Self::White),
             "random" => Ok(Self::Random),
             _ => text.strip_prefix('#').and_then(colour).ok_or_else(|| {
-                format!("`{text}` is no background; give black, white, random or a colour such as #808080")
+                format!("`{text}` is not a background; give black, white, random or a colour such as #808080")
             }),
         }
     }
@@ -238,14 +238,13 @@ impl TryFrom<String> for Background {
     }
 }
 
-/// The views of one epoch (0-based) in the order in which they are trained on: a permutation of
+/// The order of training views in one epoch (0-based): a permutation of
 /// `0..views`, drawn from (seed, epoch).
 #[must_use]
 pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
     let mut order: Vec<usize> = (0..views).collect();
-    let mut draws = stream(seed, Use::Views, u64::from(epoch));
-    // Fisher–Yates. Written out, because a library's shuffle may change with its version and a
-    // run must not.
+    let mut draws = random_stream(seed, Use::Views, u64::from(epoch));
+    // Fisher–Yates, written out because the shuffle of a library may change with its version.
     for last in (1..views).rev() {
         order.swap(last, below(&mut draws, last as u64 + 1) as usize);
     }
@@ -253,13 +252,13 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
 }
 
 /// `count` of the training views, or all of them if there are fewer, drawn at random without
-/// replacement from (seed, step), for a policy that asks for fresh views.
+/// replacement from (seed, step), for policies that request fresh views.
 #[must_use]
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
-    let mut draws = stream(seed, Use::FreshViews, u64::from(step));
+    let mut draws = random_stream(seed, Use::FreshViews, u64::from(step));
     let count = count.min(views);
-    // The first places of a Fisher–Yates shuffle.
+    // The first elements of a Fisher–Yates shuffle.
     for place in 0..count {
         chosen.swap(place, place + below(&mut draws, (views - place) as u64) as usize);
     }
@@ -267,7 +266,7 @@ pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usiz
     chosen
 }
 
-/// What a stream of random numbers is for; streams for different uses are independent.
+/// What random numbers are used for; the streams of different uses are independent.
 #[derive(Debug, Clone, Copy)]
 enum Use {
     Views = 1,
@@ -275,8 +274,8 @@ enum Use {
     FreshViews = 3,
 }
 
-/// The stream number `counter` for one use: ChaCha is a hash of (key, stream, position).
-fn stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
+/// The stream number `counter` of one use: ChaCha is a hash of (key, stream, position).
+fn random_stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
     let mut key = [0_u8; 32];
     key[..8].copy_from_slice(&seed.to_le_bytes());
     key[8] = purpose as u8;
@@ -285,8 +284,7 @@ fn stream(seed: u64, purpose: Use, counter: u64) -> ChaCha8Rng {
     rng
 }
 
-/// A number in `0..n`. The high half of a 64 × 64-bit product: no value is favoured by more than
-/// n / 2⁶⁴.
+/// A number in `0..n`: the high half of a 64 × 64-bit product, with a bias of at most n / 2⁶⁴.
 fn below(rng: &mut ChaCha8Rng, n: u64) -> u64 {
     ((u128::from(rng.next_u64()) * u128::from(n)) >> 64) as u64
 }

@@ -26,8 +26,8 @@ use crate::dataset::{DatasetError, MIN_VIEWS, Tracks, View};
 
 /// With fewer measured tracks, the degree is not decided.
 pub const MIN_TRACKS: usize = 500;
-/// From these 95th percentiles on, degrees 1, 2 and 3 are chosen `[1/255]`. `docs/requirements.md`
-/// lists the scenes that they were fitted to.
+/// From these 95th percentiles on, degrees 1, 2 and 3 are chosen `[1/255]`. `docs/tradeoffs.md` lists
+/// the scenes that they were fitted to.
 pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
 /// Largest difference between the reconstruction's colour of a point and its colour in a view for
 /// the point to count as on a surface `[1/255]`.

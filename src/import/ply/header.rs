@@ -1,4 +1,4 @@
-//! The text at the head of a PLY file: encoding, elements, properties.
+//! Parses the header of a PLY file: encoding, elements, properties.
 
 use std::io::{BufRead, Read};
 use std::path::Path;
@@ -78,7 +78,7 @@ impl Scalar {
         }
     }
 
-    /// Largest value of an integer type; 1 for the others: what full intensity is written as.
+    /// The value of full intensity: the largest of an integer type, or 1.
     pub(super) fn full(self) -> f64 {
         match self {
             Self::I8 => 127.0,
@@ -93,15 +93,15 @@ impl Scalar {
 }
 
 impl Element {
-    /// Position of a property, by any of its names.
+    /// Index of a property that has one of these names.
     pub(super) fn find(&self, names: &[&str]) -> Option<usize> {
         names.iter().find_map(|name| {
             self.properties.iter().position(|p| p.list.is_none() && p.name == *name)
         })
     }
 
-    /// Fewest bytes of one row.
-    pub(super) fn least_bytes(&self, encoding: Encoding) -> u64 {
+    /// Smallest possible size of a row `[bytes]`.
+    pub(super) fn min_bytes(&self, encoding: Encoding) -> u64 {
         let size = |p: &Property| match encoding {
             // A digit and a separator.
             Encoding::Ascii => 2,
@@ -112,11 +112,11 @@ impl Element {
 }
 
 impl Header {
-    /// Reads the header; `input` stands at the first byte of data then.
+    /// Reads the header and leaves `input` at the first byte of data.
     pub(super) fn read(path: &Path, input: &mut impl BufRead) -> Result<Self, PlyError> {
         let mut lines = Lines { path, input, number: 0, read: 0 };
         if lines.next()?.trim_end() != "ply" {
-            return Err(lines.fault("it is no PLY file: the first line is not `ply`"));
+            return Err(lines.fault("it is not a PLY file: the first line is not `ply`"));
         }
         let mut encoding = None;
         let mut elements: Vec<Element> = Vec::new();
@@ -145,8 +145,9 @@ impl Header {
                         .then(|| rows.parse().ok())
                         .flatten();
                     let rows = rows.filter(|&rows| rows < MAX_ROWS);
-                    let rows = rows
-                        .ok_or_else(|| lines.fault("the number of rows is none, or above 2^32"))?;
+                    let rows = rows.ok_or_else(|| {
+                        lines.fault("the number of rows is not a number, or above 2^32")
+                    })?;
                     if elements.iter().any(|element| element.name == name) {
                         return Err(lines.fault(format!("the element {name:?} occurs twice")));
                     }
@@ -156,7 +157,9 @@ impl Header {
                     let length =
                         Scalar::parse(length).filter(|s| !matches!(s, Scalar::F32 | Scalar::F64));
                     let (Some(length), Some(kind)) = (length, Scalar::parse(kind)) else {
-                        return Err(lines.fault("a type is unknown, or a list's length no integer"));
+                        return Err(lines.fault(
+                            "a type is unknown, or the length of a list is not an integer",
+                        ));
                     };
                     lines.push(
                         &mut elements,
@@ -175,7 +178,7 @@ impl Header {
                 ["end_header"] => break,
                 _ => {
                     return Err(lines.fault(format!(
-                        "{:?} is no header line",
+                        "{:?} is not a header line",
                         line.trim().chars().take(60).collect::<String>()
                     )));
                 }

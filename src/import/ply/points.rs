@@ -1,4 +1,4 @@
-//! Point clouds: x y z, and red green blue where there are any.
+//! Reads point clouds: x y z, and red green blue if present.
 
 use std::path::Path;
 
@@ -6,13 +6,13 @@ use glam::DVec3;
 
 use super::PlyError;
 use super::rows::Ply;
-use crate::dataset::PointCloud;
+use crate::import::PointCloud;
 
-/// Colour of points without one.
+/// Colour of points that have none.
 const GREY: u8 = 128;
 
 /// Reads the vertices of a PLY file as points; other elements are skipped. Positions may be of any
-/// type and may be non-finite: whoever uses them decides.
+/// type, and non-finite.
 ///
 /// # Errors
 /// When the file is unreadable, contradicts itself, or its vertices have no x, y, z.

@@ -1,5 +1,4 @@
-//! The rows of one element, whatever the encoding, as chosen columns of f64 (which holds every
-//! type of the format exactly).
+//! Reads chosen columns of one element in any encoding, as f64 (which represents every type exactly).
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
@@ -70,11 +69,11 @@ impl<'a> Ply<'a> {
         each: &mut impl FnMut(&[f64]),
     ) -> Result<(), PlyError> {
         let encoding = self.header.encoding;
-        let least = element.least_bytes(encoding);
+        let min_bytes = element.min_bytes(encoding);
         // The last number of an ascii file needs no separator.
-        if element.rows.saturating_mul(least) > self.data + 1 {
+        if element.rows.saturating_mul(min_bytes) > self.data + 1 {
             let problem = format!(
-                "{} rows need {least} bytes each, but the file holds {}",
+                "{} rows need {min_bytes} bytes each, but the file holds {}",
                 element.rows, self.data
             );
             return Err(PlyError::malformed(
@@ -83,7 +82,7 @@ impl<'a> Ply<'a> {
                 problem,
             ));
         }
-        if least == 0 {
+        if min_bytes == 0 {
             return Ok(());
         }
         let mut row = vec![0.0; element.properties.len()];
@@ -200,7 +199,7 @@ impl<'a> Ply<'a> {
         let text = std::str::from_utf8(&word[..length]).ok();
         text.and_then(|text| text.parse().ok()).ok_or_else(|| {
             let text = String::from_utf8_lossy(&word[..length]).into_owned();
-            self.fault(element, row, format!("{text:?} is no number"))
+            self.fault(element, row, format!("{text:?} is not a number"))
         })
     }
 }

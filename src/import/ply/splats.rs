@@ -108,7 +108,7 @@ fn column(path: &Path, vertices: &Element, name: &str) -> Result<usize, PlyError
         path: path.to_owned(),
         property: name.to_owned(),
         remedy: "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 \
-                 (a point cloud is no splat file)",
+                 (a point cloud is not a splat file)",
     })
 }
 

@@ -123,7 +123,7 @@ fn what_cannot_be_splats_is_refused_by_name() {
             header("property float x\n", "property uint packed_position\n"),
             &["compressed", "SuperSplat"],
         ),
-        ("not PLY", "obj\n".into(), &["no PLY file"]),
+        ("not PLY", "obj\n".into(), &["not a PLY file"]),
         ("empty", String::new(), &["header"]),
         ("endless", "ply\n".to_owned() + &"comment\n".repeat(200_000), &["1 MiB"]),
     ] {

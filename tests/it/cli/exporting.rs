@@ -26,8 +26,8 @@ fn export_writes_the_model_of_a_run_or_a_file() {
     for (case, arguments, words) in [
         (
             "unknown format",
-            &[run, "-o", nowhere_text, "--format", "pyl"][..],
-            &["`pyl`", "`ply`"][..],
+            &[run, "-o", nowhere_text, "--format", "plz"][..],
+            &["`plz`", "`ply`"][..],
         ),
         ("no extension", &[run, "-o", "nowhere.zip"], &["nowhere.zip", "--format", "ply"]),
         ("unsaved iteration", &[run, "-o", nowhere_text, "--iteration", "7"], &["7", "10, 20"]),

@@ -64,7 +64,7 @@ fn damaged_text_is_refused() {
                 }
             },
             "",
-            &["is no dataset", "COLMAP"],
+            &["is not a dataset", "COLMAP"],
         ),
         ("no image", |scene| scene.write(IMAGES, "# none\n"), "", &["images.txt", "no image"]),
         (
