@@ -101,18 +101,6 @@ impl Gaussians {
         self.means.len()
     }
 
-    /// The same without the coefficients beyond a degree; itself where it has none.
-    #[must_use]
-    pub fn up_to_degree(mut self, sh_degree: u8) -> Self {
-        if sh_degree < self.sh_degree {
-            let (from, to) = (sh_coefficients(self.sh_degree), sh_coefficients(sh_degree));
-            let rows = self.sh.chunks_exact(3 * from);
-            self.sh = rows.flat_map(|row| row.iter().take(3 * to).copied()).collect();
-            self.sh_degree = sh_degree;
-        }
-        self
-    }
-
     /// Whether there is no row.
     #[must_use]
     pub fn is_empty(&self) -> bool {

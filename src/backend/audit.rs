@@ -1,4 +1,4 @@
-//! Rows that hold a number that is none.
+//! Rows that hold a number that is not finite.
 //!
 //! One NaN or infinity in a gradient makes the parameter that it steps NaN, or its second moment
 //! infinite, and neither ever leaves it again: [`Backend::audit`](super::Backend::audit) finds them
@@ -48,7 +48,7 @@ impl fmt::Display for Attribute {
     }
 }
 
-/// Where a number stands that is none.
+/// Where the number stands that is not finite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kept {
     /// Among the parameters.

@@ -38,7 +38,7 @@ pub enum TrainError {
         /// The loss.
         loss: f32,
     },
-    /// Rows hold numbers that are none: more of them than a sound run has, or any where none is
+    /// Rows hold numbers that are not finite: more of them than a sound run has, or any where none is
     /// wanted.
     #[error(
         "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \

@@ -59,7 +59,7 @@ pub struct StepReport {
     pub output: StepOutput,
     /// Rows after the step.
     pub rows: usize,
-    /// The edits of this step: of rows that hold a number that is none, and the policy's, where it was
+    /// The edits of this step: of rows that hold a number that is not finite, and the policy's, where it was
     /// due and had something to do.
     pub events: Vec<EditEvent>,
 }

@@ -20,7 +20,7 @@ pub struct TrainOptions {
     pub sh_every: Option<u32>,
     /// How many views ahead are announced to the [`ViewSource`](crate::views::ViewSource).
     pub prefetch: usize,
-    /// What becomes of rows that hold a number that is none.
+    /// What becomes of rows that hold a number that is not finite.
     pub on_nan: OnNan,
     /// Where less is computed than could be.
     pub savings: Savings,

@@ -1,4 +1,4 @@
-//! Rows that hold a number that is none are removed and named; more than a few of them end the run.
+//! Rows that hold a number that is not finite are removed and named; more than a few of them end the run.
 
 use densify_policies::plan::EditPlan;
 

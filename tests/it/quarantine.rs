@@ -1,4 +1,4 @@
-//! Rows that hold a number that is none: every one is found, none is lost sight of, and no other row
+//! Rows that hold a number that is not finite: every one is found, none is lost sight of, and no other row
 //! notices. The same for every backend.
 
 use densify::backend::{Attribute, Backend, Kept, StepInput, Unsound, Values};

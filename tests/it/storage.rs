@@ -157,7 +157,7 @@ fn moments_of_another_storage_are_refused() {
     assert!(refused.contains("`moments.first`: its type is U8; this run needs F32"), "{refused}");
 }
 
-/// A number that is none is found, wherever it is and however it is stored, and goes with its row.
+/// A number that is not finite is found, wherever it is and however it is stored, and goes with its row.
 #[test]
 fn an_audit_sees_what_is_no_number() {
     let (model, camera, target) = scene();

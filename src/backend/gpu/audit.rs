@@ -1,4 +1,4 @@
-//! Looks for rows that hold a number that is none; see [`audit`](crate::backend::audit). A mark per
+//! Looks for rows that hold a number that is not finite; see [`audit`](crate::backend::audit). A mark per
 //! row comes back, no parameter.
 
 use super::GpuBackend;
@@ -47,7 +47,7 @@ pub(super) fn launches(
 }
 
 impl GpuBackend {
-    /// The rows that hold a number that is none, in order.
+    /// The rows that hold a number that is not finite, in order.
     pub(super) fn unsound(&self) -> Result<Vec<Unsound>, BackendError> {
         let rows = self.rows as u32;
         let bytes = 4 * u64::from(rows);

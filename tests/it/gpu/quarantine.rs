@@ -1,4 +1,4 @@
-//! Rows that hold a number that is none, as on the native backend.
+//! Rows that hold a number that is not finite, as on the native backend.
 
 use densify::backend::Backend;
 use densify::gaussians::Gaussians;

@@ -72,7 +72,7 @@ pub(super) trait Narrow: Copy + Default {
     /// Exact.
     fn to_f32(self) -> f32;
     /// One of the two neighbours of `x`, by the upper bits of `random`. A finite number stays finite;
-    /// one that is not stays none.
+    /// one that is not finite does not become so.
     fn between(x: f32, random: u32) -> Self;
     /// The nearest, as the draw in the middle gives it; of two, the larger.
     #[inline(always)]

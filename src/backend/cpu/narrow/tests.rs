@@ -215,7 +215,7 @@ fn ratios_are_fair_and_stay() {
     }
 }
 
-/// Without a second moment there is no first; and with one that is no number, the first is none, so
+/// Without a second moment there is no first; and with one that is NaN, the first is NaN, so
 /// that an audit finds it.
 #[test]
 fn ratios_of_nothing() {
