@@ -98,7 +98,7 @@ fn degree_left_out(train: &TrainConfig) -> Option<LeftOut> {
         ),
         loss: format!(
             "the colours of all differ by {:.2}/255 (rms); at equal rows degree 3 was worth 0.5 to \
-             1.4 dB on matt scenes all the same (docs/requirements.md)",
+             1.4 dB on matt scenes all the same (docs/tradeoffs.md)",
             found.rms
         ),
     })
