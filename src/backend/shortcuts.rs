@@ -25,15 +25,3 @@ impl Shortcuts {
         -f64::from(self.alpha_min).log2() as f32
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    #[expect(clippy::float_cmp, reason = "the constant that results are the same with, to the bit")]
-    fn the_default_reaches_as_far_as_ever() {
-        assert_eq!(Shortcuts::default().log2_reach(), 7.994_353_4);
-        assert_eq!(Shortcuts { alpha_min: 0.25, ..Shortcuts::default() }.log2_reach(), 2.0);
-    }
-}

@@ -166,7 +166,7 @@ struct Replay<'a> {
     /// Sorted.
     list: &'a [AtomicU64],
     place: TilePlace,
-    /// Those of the forward pass, but for its exponential, which is exact here.
+    /// Those of the forward pass.
     blending: Blending,
     map: &'a Plane,
     /// This tile writes the records of its own entries, those that are held.

@@ -102,12 +102,6 @@ fn rows_are_removed_after_growth_and_not_at_the_end() {
 }
 
 #[test]
-fn half_of_the_rows_may_cost_what_a_doubling_must_bring() {
-    assert!((allowed(5) - PAYS).abs() < 1e-12);
-    assert!((allowed(1) - 0.0152).abs() < 1e-4);
-}
-
-#[test]
 fn rungs_are_whole_intervals_of_policies() {
     for (iterations, steps) in [(30_000, 1_500), (2_000, 100), (5_000, 300), (100, 100)] {
         assert_eq!(rung(iterations), steps);
