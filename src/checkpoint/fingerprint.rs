@@ -1,6 +1,6 @@
-//! What tells one dataset from another: a run goes on only with the views that it began with.
+//! Fingerprints of datasets: a run continues only with the views that it was started with.
 //!
-//! Pixels of files are not read for it, which could take minutes; their sizes stand for them.
+//! Reading all pixels could take minutes, so the sizes of image files stand in for them.
 
 use std::fmt::{self, Write};
 
@@ -9,29 +9,29 @@ use serde::{Deserialize, Serialize};
 use crate::dataset::normalise::Normalisation;
 use crate::dataset::{Dataset, View};
 
-/// A dataset as far as a run depends on it.
+/// The fingerprint of a dataset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Fingerprint {
     /// Views trained on.
-    pub train: ViewsPrint,
+    pub train: ViewsFingerprint,
     /// Views held out.
-    pub test: ViewsPrint,
-    /// From the dataset's coordinates to those of the model.
+    pub test: ViewsFingerprint,
+    /// From the dataset's coordinates to normalised ones.
     pub normalisation: Normalisation,
 }
 
-/// Views: how many, and checksums (CRC-32C) of what they are.
+/// The fingerprint of views: their number and checksums (CRC-32C).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct ViewsPrint {
+pub struct ViewsFingerprint {
     /// Number of views.
     pub count: usize,
     /// Their names, in order.
     pub names: u32,
     /// Poses, intrinsics and sizes.
     pub cameras: u32,
-    /// Sizes of image files and masks, lens distortions; pixels where no file holds them.
+    /// Sizes of image files and masks, lens distortions; pixels of images without a file.
     pub images: u32,
 }
 
@@ -40,13 +40,13 @@ impl Fingerprint {
     #[must_use]
     pub fn of(dataset: &Dataset) -> Self {
         Self {
-            train: ViewsPrint::of(&dataset.train),
-            test: ViewsPrint::of(&dataset.test),
+            train: ViewsFingerprint::of(&dataset.train),
+            test: ViewsFingerprint::of(&dataset.test),
             normalisation: dataset.normalisation,
         }
     }
 
-    /// In what another dataset differs from this one, if it does.
+    /// The first difference to another dataset, if there is one.
     #[must_use]
     pub fn difference(&self, other: &Self) -> Option<String> {
         let train = self.train.difference(&other.train, "views to train on");
@@ -59,7 +59,7 @@ impl Fingerprint {
     }
 }
 
-impl ViewsPrint {
+impl ViewsFingerprint {
     fn of(views: &[View]) -> Self {
         let [mut names, mut cameras, mut images] = [0; 3].map(Checksum);
         for View { name, camera, source } in views {
@@ -91,12 +91,12 @@ impl ViewsPrint {
     }
 }
 
-/// A running CRC-32C over text. Numbers as text are exact: each has a text of its own.
+/// A running CRC-32C over text. Different numbers always have different texts.
 struct Checksum(u32);
 
 impl Checksum {
     fn add(&mut self, text: fmt::Arguments<'_>) {
-        // Nothing here fails.
+        // Writing to a checksum never fails.
         let _ = self.write_fmt(text);
     }
 }

@@ -1,4 +1,4 @@
-//! Where a run keeps its checkpoints: the two newest, under the number of their step.
+//! Lists, finds and removes the checkpoints of a run; the two newest are kept.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -7,17 +7,17 @@ use std::path::{Path, PathBuf};
 use super::{Checkpoint, CheckpointError};
 use crate::output::CHECKPOINTS;
 
-/// How many are kept: a newer one may turn out to be damaged.
-const KEPT: usize = 2;
+/// Number of checkpoints kept: the newest may turn out to be damaged.
+const MAX_CHECKPOINTS: usize = 2;
 
-/// Where a run keeps the checkpoint of a step.
+/// Path of the checkpoint of a step.
 #[must_use]
 pub fn checkpoint_path(run: &Path, step: u32) -> PathBuf {
     run.join(CHECKPOINTS).join(format!("iteration_{step}.safetensors"))
 }
 
-/// The checkpoints in a run's folder, newest first, whether they are sound or not.
-fn listed(run: &Path) -> Vec<(u32, PathBuf)> {
+/// All checkpoints of a run, newest first, damaged ones included.
+fn list(run: &Path) -> Vec<(u32, PathBuf)> {
     let step = |name: &OsStr| -> Option<u32> {
         name.to_str()?.strip_prefix("iteration_")?.strip_suffix(".safetensors")?.parse().ok()
     };
@@ -29,12 +29,12 @@ fn listed(run: &Path) -> Vec<(u32, PathBuf)> {
     found
 }
 
-/// The newest checkpoint in a run's folder that is sound in every byte, if any is; and why newer
-/// ones, newest first, are not.
+/// The newest undamaged checkpoint of a run, if there is one, and why newer ones were rejected, newest
+/// first.
 #[must_use]
 pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     let mut rejected = Vec::new();
-    for (_, path) in listed(run) {
+    for (_, path) in list(run) {
         match Checkpoint::open(&path) {
             Ok(checkpoint) => return (Some(checkpoint), rejected),
             Err(error) => rejected.push(error),
@@ -43,12 +43,11 @@ pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
     (None, rejected)
 }
 
-/// Removes all but the two newest checkpoints up to `step`, which has just been written. One beyond
-/// `step` is not of this run's past (it may be a damaged one): it stays until it is written anew.
-/// Whatever cannot be removed stays.
+/// Removes all but the two newest checkpoints up to `step`, which has just been written. Later ones,
+/// which may be damaged, stay until they are overwritten. Errors are ignored.
 pub fn tidy(run: &Path, step: u32) {
-    let past = listed(run).into_iter().filter(|&(of, _)| of <= step);
-    for (_, path) in past.skip(KEPT) {
+    let past = list(run).into_iter().filter(|&(saved, _)| saved <= step);
+    for (_, path) in past.skip(MAX_CHECKPOINTS) {
         let _ = fs::remove_file(path);
     }
 }

@@ -1,18 +1,18 @@
-//! What the file is made of; `write.rs` and `read.rs` do the rest.
+//! The layout of a checkpoint file.
 
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
-/// Version of the format that this program writes, and the only one that it reads.
+/// Version of the format, for writing and reading.
 pub const VERSION: u32 = 1;
-/// Keys of the metadata.
+// Keys of the metadata.
 pub(super) const VERSION_KEY: &str = "densify.version";
 pub(super) const HEADER_KEY: &str = "densify.header";
 pub(super) const CHECKSUM_KEY: &str = "densify.crc32c";
-/// Bytes before the header: its length.
+/// Size of the length before the header `[bytes]`.
 pub(super) const LENGTH: u64 = 8;
 
-/// What is known of an array beside its values.
+/// Description of an array.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Record {

@@ -1,21 +1,21 @@
-//! Checkpoints: everything that the future of a run depends on, in one file.
+//! Saves the complete state of a run in one file, and restores it.
 //!
-//! A run that goes on from a checkpoint is the same to the bit as one that was never interrupted.
+//! A run that continues from a checkpoint gives the same bits as one that was never interrupted.
 //!
 //! ```text
 //! RUN/checkpoints/iteration_N.safetensors     the two newest are kept
 //! ```
 //!
-//! The file is [safetensors](https://github.com/huggingface/safetensors), which any language reads:
-//! eight bytes of length, a JSON header, and arrays. Those of the model are `model.means`,
+//! The file is [safetensors](https://github.com/huggingface/safetensors), which many languages read:
+//! eight bytes of length, a JSON header, and arrays. The arrays of the model are `model.means`,
 //! `model.log_scales`, `model.quats`, `model.opacity_logits`, `model.sh`
 //! ([`Gaussians`](crate::gaussians::Gaussians), in the coordinates of training); the others are the
-//! [backend's](crate::backend::Backend::state). The rest is JSON in the header's metadata: version
-//! of the format, [`Header`], list of the arrays with a checksum each (CRC-32C), and a checksum of
-//! that JSON. So every byte that counts is checked before it is used.
+//! [backend's](crate::backend::Backend::state). The rest is JSON in the metadata of the header:
+//! the version of the format, [`Header`], the arrays with a checksum each (CRC-32C), and a checksum
+//! of that JSON. So every byte is checked before it is used.
 //!
-//! A file appears under its name when it is complete and synced to disk. Files are not trusted:
-//! nothing is allocated before the bytes for it are known to be there.
+//! A file appears under its name when it is complete and synced to disk. Files are untrusted: sizes
+//! are checked against the length of the file before anything is allocated.
 
 mod fingerprint;
 mod folder;
@@ -24,7 +24,7 @@ mod model;
 mod read;
 mod write;
 
-pub use fingerprint::{Fingerprint, ViewsPrint};
+pub use fingerprint::{Fingerprint, ViewsFingerprint};
 pub use folder::{checkpoint_path, newest, tidy};
 pub use format::VERSION;
 pub use read::Checkpoint;
@@ -39,19 +39,19 @@ use crate::backend::{BackendError, StateError};
 use crate::output::{OutputError, RunConfig};
 use crate::trainer::TrainerState;
 
-/// A checkpoint but for its arrays.
+/// A checkpoint without its arrays.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Header {
     /// Version of densify that wrote it.
     pub densify: String,
-    /// The run as it was asked for.
+    /// The configuration of the run.
     pub config: RunConfig,
-    /// What the dataset was.
+    /// The dataset.
     pub dataset: Fingerprint,
-    /// Where the run is.
+    /// State of the trainer.
     pub trainer: TrainerState,
-    /// What the program around the trainer wants to find again; `null` if it wants nothing.
+    /// State of the program around the trainer; may be `null`.
     pub session: serde_json::Value,
 }
 
@@ -63,10 +63,10 @@ pub enum CheckpointError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
-    /// The file is damaged, or none of ours.
+    /// The file is damaged, or not a checkpoint.
     #[error("{path}: {problem}")]
     Invalid {
         /// The file.
@@ -77,13 +77,13 @@ pub enum CheckpointError {
     /// The file cannot be written.
     #[error(transparent)]
     Write(#[from] OutputError),
-    /// The policy does not give its state.
+    /// The policy cannot save its state.
     #[error("the policy's state: {source}")]
     Policy {
-        /// What it says.
+        /// The error of the policy.
         source: PolicyError,
     },
-    /// The backend does not give its state.
+    /// The backend cannot save or restore its state.
     #[error(transparent)]
     Backend(#[from] BackendError),
 }

@@ -1,4 +1,4 @@
-//! What the model's arrays are called in a checkpoint, and their shapes.
+//! Names and shapes of the model's arrays in a checkpoint.
 
 use crate::gaussians::{ModelArray, sh_coefficients};
 
@@ -13,7 +13,7 @@ pub(super) fn name(array: ModelArray) -> &'static str {
     }
 }
 
-/// The sides of an array of so many rows, of a model of a degree of at most
+/// The shape of an array of so many rows; `sh_degree` is at most
 /// [`MAX_SH_DEGREE`](crate::gaussians::MAX_SH_DEGREE).
 pub(super) fn shape(array: ModelArray, rows: usize, sh_degree: u8) -> Vec<usize> {
     match array {

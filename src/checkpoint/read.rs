@@ -1,4 +1,4 @@
-//! Reading: every part is checked before it is used, and arrays come some rows at a time.
+//! Reads checkpoints: checks everything before use, and reads arrays some rows at a time.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -16,13 +16,13 @@ const MAX_HEADER: u64 = 64 << 20;
 /// Bytes read at a time; a multiple of every type's size.
 const CHUNK: usize = 1 << 16;
 
-/// A checkpoint that is sound: every part of the file has been checked.
+/// An undamaged checkpoint: all of the file has been checked.
 #[derive(Debug)]
 pub struct Checkpoint {
     path: PathBuf,
     file: File,
     header: Header,
-    /// Where each array begins in the file, with what is known of it.
+    /// Offset and description of each array.
     places: Vec<(u64, Record)>,
 }
 
@@ -45,7 +45,7 @@ impl Checkpoint {
         let length = u64::from_le_bytes(length);
         if length > MAX_HEADER {
             return Err(invalid(
-                "it is no safetensors file: its header would be larger than 64 MiB".into(),
+                "it is not a safetensors file: its header would be larger than 64 MiB".into(),
             ));
         }
         if length > size - LENGTH {
@@ -56,28 +56,28 @@ impl Checkpoint {
         let (header, places) = parse(&bytes, LENGTH + length, size).map_err(invalid)?;
         let mut checkpoint = Self { path: path.to_owned(), file, header, places };
         for i in 0..checkpoint.places.len() {
-            Scan::new(&mut checkpoint, i)?.finish()?;
+            ArrayReader::new(&mut checkpoint, i)?.finish()?;
         }
         Ok(checkpoint)
     }
 
-    /// Where it was read from.
+    /// Path of the file.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// All but the arrays.
+    /// Everything but the arrays.
     #[must_use]
     pub fn header(&self) -> &Header {
         &self.header
     }
 
-    /// A model of the checkpoint's size, of zeros: what a backend is made for, before it is
+    /// A model of zeros of the checkpoint's size, to make the backend that is then
     /// [restored](Self::restore).
     ///
     /// # Errors
-    /// [`CheckpointError::Invalid`] where the model does not fit its own configuration.
+    /// [`CheckpointError::Invalid`] if the model contradicts its own configuration.
     pub fn blank_model(&self) -> Result<Gaussians, CheckpointError> {
         let train = &self.header.config.train;
         let (budget, sh_degree) = (train.budget, train.sh_degree);
@@ -95,7 +95,7 @@ impl Checkpoint {
         Ok(Gaussians::zeros(rows, sh_degree))
     }
 
-    /// Where an array of a model of this size is.
+    /// Index of an array of the model, after checking its shape.
     fn place_in_model(
         &self,
         array: ModelArray,
@@ -114,11 +114,11 @@ impl Checkpoint {
         )))
     }
 
-    /// Gives `backend`, which was made for the [blank model](Self::blank_model), the model and the state
-    /// of that moment.
+    /// Restores the model and the state of `backend`, which was made for the
+    /// [blank model](Self::blank_model).
     ///
     /// # Errors
-    /// [`CheckpointError::Invalid`] where the arrays are not those that this backend keeps;
+    /// [`CheckpointError::Invalid`] if the arrays are not those of this backend;
     /// [`CheckpointError::Read`], [`CheckpointError::Backend`].
     pub fn restore(&mut self, backend: &mut dyn Backend) -> Result<(), CheckpointError> {
         let wanted = backend.state();
@@ -128,31 +128,33 @@ impl Checkpoint {
         };
         if let Some((_, record)) = self.places.iter().find(|(_, record)| !known(&record.name)) {
             let name = &record.name;
-            return Err(self.invalid(format!("this run keeps nothing like its tensor `{name}`")));
+            return Err(
+                self.invalid(format!("it has a tensor `{name}`, which this run does not have"))
+            );
         }
         let refused = CheckpointError::state(&self.path);
         let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
         for array in ModelArray::ALL {
             let place = self.place_in_model(array, rows, sh_degree)?;
-            let mut scan = Scan::new(self, place)?;
+            let mut reader = ArrayReader::new(self, place)?;
             for rows in pieces(rows) {
                 let shape = model::shape(array, rows.len(), sh_degree);
-                let values = scan.tensor(rows.len())?.into_f32(&shape).map_err(&refused)?;
+                let values = reader.tensor(rows.len())?.into_f32(&shape).map_err(&refused)?;
                 backend.upload_array(array, rows, &values)?;
             }
-            scan.finish()?;
+            reader.finish()?;
         }
         for StateArray { name, by_rows } in wanted {
             let place = self.place(&name)?;
             let has_rows = self.places[place].1.shape.first() == Some(&rows);
             if has_rows && by_rows {
-                let mut scan = Scan::new(self, place)?;
+                let mut reader = ArrayReader::new(self, place)?;
                 for rows in pieces(rows) {
-                    backend.restore_rows(scan.tensor(rows.len())?, rows).map_err(&refused)?;
+                    backend.restore_rows(reader.tensor(rows.len())?, rows).map_err(&refused)?;
                 }
-                scan.finish()?;
+                reader.finish()?;
             } else {
-                // What should have rows, and has not so many, is refused.
+                // An array by rows with another number of rows is refused here.
                 backend.restore(self.tensor(place)?).map_err(&refused)?;
             }
         }
@@ -170,39 +172,39 @@ impl Checkpoint {
 
     /// A whole array.
     fn tensor(&mut self, place: usize) -> Result<Tensor, CheckpointError> {
-        let mut scan = Scan::new(self, place)?;
-        let whole = scan.tensor(scan.record.shape.first().copied().unwrap_or(0))?;
-        scan.finish()?;
+        let mut reader = ArrayReader::new(self, place)?;
+        let whole = reader.tensor(reader.record.shape.first().copied().unwrap_or(0))?;
+        reader.finish()?;
         Ok(whole)
     }
 }
 
-/// An array on its way from the file.
-struct Scan<'a> {
+/// Reads an array from the file.
+struct ArrayReader<'a> {
     path: &'a Path,
     file: &'a mut File,
     record: &'a Record,
-    /// Bytes that have not been read.
+    /// Bytes left to read.
     left: usize,
-    /// Of those that have.
+    /// Checksum of the bytes read.
     crc: u32,
 }
 
-impl<'a> Scan<'a> {
+impl<'a> ArrayReader<'a> {
     fn new(checkpoint: &'a mut Checkpoint, place: usize) -> Result<Self, CheckpointError> {
         let Checkpoint { path, file, places, .. } = checkpoint;
         let (start, record) = &places[place];
         let left = record.bytes().unwrap_or(usize::MAX);
-        let scan = Self { path, file, record, left, crc: 0 };
-        scan.file.seek(SeekFrom::Start(*start)).map_err(|e| scan.failed(e))?;
-        Ok(scan)
+        let reader = Self { path, file, record, left, crc: 0 };
+        reader.file.seek(SeekFrom::Start(*start)).map_err(|e| reader.failed(e))?;
+        Ok(reader)
     }
 
     fn failed(&self, source: io::Error) -> CheckpointError {
         CheckpointError::Read { path: self.path.to_owned(), source }
     }
 
-    /// The next entries of the first side, so many, which the file is known to hold.
+    /// The next `entries` along the first dimension.
     fn tensor(&mut self, entries: usize) -> Result<Tensor, CheckpointError> {
         let Record { name, kind, shape, .. } = self.record;
         let mut shape = shape.clone();
@@ -223,15 +225,15 @@ impl<'a> Scan<'a> {
         Ok(Tensor { name: name.clone(), shape, values })
     }
 
-    /// So many bytes, in pieces of whole values.
-    fn bytes(&mut self, count: usize, mut seen: impl FnMut(&[u8])) -> Result<(), CheckpointError> {
+    /// Reads `count` bytes in pieces of whole values.
+    fn bytes(&mut self, count: usize, mut sink: impl FnMut(&[u8])) -> Result<(), CheckpointError> {
         let mut left = count;
         let mut buffer = vec![0; left.min(CHUNK)];
         while left > 0 {
             let bytes = &mut buffer[..left.min(CHUNK)];
             self.file.read_exact(bytes).map_err(|e| self.failed(e))?;
             self.crc = crc32c::crc32c_append(self.crc, bytes);
-            seen(bytes);
+            sink(bytes);
             left -= bytes.len();
         }
         self.left -= count;
@@ -254,7 +256,7 @@ impl<'a> Scan<'a> {
         Ok(values)
     }
 
-    /// Reads what is left and checks the sum of all.
+    /// Reads the rest and checks the checksum.
     fn finish(mut self) -> Result<(), CheckpointError> {
         self.bytes(self.left, |_| ())?;
         let (Record { name, crc32c, .. }, crc) = (self.record, self.crc);
@@ -270,29 +272,29 @@ impl<'a> Scan<'a> {
 /// Reads the header of a file of `size` bytes whose arrays begin at `start`.
 fn parse(bytes: &[u8], start: u64, size: u64) -> Result<(Header, Vec<(u64, Record)>), String> {
     let table: Metadata =
-        serde_json::from_slice(bytes).map_err(|e| format!("its header is no safetensors: {e}"))?;
+        serde_json::from_slice(bytes).map_err(|e| format!("its header is not safetensors: {e}"))?;
     let metadata = table.metadata().as_ref();
     let entry = |key: &str| {
         let entry = metadata.and_then(|metadata| metadata.get(key));
-        entry.ok_or_else(|| format!("it is no checkpoint of densify: its header has no `{key}`"))
+        entry.ok_or_else(|| format!("it is not a checkpoint of densify: its header has no `{key}`"))
     };
     let version = entry(VERSION_KEY)?;
     if *version != VERSION.to_string() {
         return Err(format!(
-            "it is of version {version} of the format, but this densify reads version {VERSION}; \
-             go on with the densify that wrote it"
+            "it has version {version} of the format, but this densify reads version {VERSION}; \
+             continue with the densify that wrote it"
         ));
     }
     let json = entry(HEADER_KEY)?;
     let crc = format!("{:08x}", crc32c::crc32c(json.as_bytes()));
     if *entry(CHECKSUM_KEY)? != crc {
-        return Err("its header is damaged: the checksum does not hold".to_owned());
+        return Err("its header is damaged: the checksum is wrong".to_owned());
     }
     let contents: Contents<Header> =
         serde_json::from_str(json).map_err(|e| format!("its header: {e}"))?;
     let Contents { header, tensors } = contents;
     if tensors.len() != table.offset_keys().len() {
-        return Err("its header is damaged: it lists other tensors than the file".to_owned());
+        return Err("its header is damaged: it lists other tensors than the file has".to_owned());
     }
     let mut places = Vec::new();
     let mut end = start;
@@ -315,9 +317,8 @@ fn parse(bytes: &[u8], start: u64, size: u64) -> Result<(Header, Vec<(u64, Recor
         end = next;
     }
     if end != size {
-        let how =
-            if size < end { "it is cut short" } else { "there is more in it than there should" };
-        return Err(format!("{how}: {size} bytes, its header tells of {end}"));
+        let how = if size < end { "it is cut short" } else { "it is too long" };
+        return Err(format!("{how}: {size} bytes, its header says {end}"));
     }
     Ok((header, places))
 }

@@ -76,7 +76,7 @@ fn backend() -> CpuBackend {
 }
 
 fn header() -> Header {
-    let views = ViewsPrint { count: 3, names: 1, cameras: 2, images: 3 };
+    let views = ViewsFingerprint { count: 3, names: 1, cameras: 2, images: 3 };
     Header {
         densify: "0.1.0".into(),
         config: RunConfig {
@@ -184,7 +184,7 @@ fn a_file_cut_anywhere_is_refused() {
         assert!(problem.contains("cut.safetensors: it is cut short"), "{length}: {problem}");
     }
     std::fs::write(&cut, [&bytes[..], b"x"].concat()).unwrap();
-    assert!(problem(&cut).contains("more in it"));
+    assert!(problem(&cut).contains("too long"));
 }
 
 #[test]
@@ -235,7 +235,7 @@ fn a_state_of_another_run_is_refused_by_name() {
         assert!(problem.contains(words), "{problem}");
     };
     let plain = CpuOptions { needs: Needs::default(), ..options() };
-    refused(plain, "keeps nothing like its tensor `signals.MeanGradientX`");
+    refused(plain, "has a tensor `signals.MeanGradientX`, which this run does not have");
     let mut more = options();
     more.needs.signals = more.needs.signals.with(Signal::PixelCount);
     refused(more, "there is no tensor `signals.PixelCount`");

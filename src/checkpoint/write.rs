@@ -1,4 +1,4 @@
-//! Writing: array by array and some rows at a time, so that no more than these are held.
+//! Writes checkpoints array by array and some rows at a time, to limit memory.
 
 use std::collections::HashMap;
 use std::io;
@@ -11,21 +11,21 @@ use super::format::{CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION,
 use super::{CheckpointError, Header, model};
 use crate::backend::{Backend, BackendError, StateArray, Tensor, Values, pieces};
 use crate::gaussians::ModelArray;
-use crate::output::{Stop, write_atomically_from};
+use crate::output::{WriteError, write_atomically_from};
 
-/// Writes the state of a run: `header`, and the model and all else that `backend` holds. The file
-/// appears under its name when it is complete and on disk; whatever was there stays until then.
+/// Writes the state of a run: `header`, and the model and state of `backend`. The file appears under
+/// its name when it is complete and on disk; an existing file stays until then.
 ///
 /// # Errors
 /// [`CheckpointError::Write`], [`CheckpointError::Backend`].
 pub fn write(path: &Path, header: &Header, backend: &dyn Backend) -> Result<(), CheckpointError> {
     write_atomically_from(path, |out| {
-        // Twice over the arrays: the header, which comes first, has their checksums.
-        let records = records_of(backend, |_| Ok(()))?;
+        // Two passes over the arrays: the header, which comes first, has their checksums.
+        let records = write_arrays(backend, |_| Ok(()))?;
         let bytes = header_bytes(header, &records)?;
         out.write_all(&(bytes.len() as u64).to_le_bytes())?;
         out.write_all(&bytes)?;
-        let written = records_of(backend, |bytes| out.write_all(bytes))?;
+        let written = write_arrays(backend, |bytes| out.write_all(bytes))?;
         match records.iter().zip(&written).find(|(was, is)| was != is) {
             Some((Record { name, .. }, _)) => {
                 Err(io::Error::other(format!("`{name}` changed while it was written")).into())
@@ -35,12 +35,12 @@ pub fn write(path: &Path, header: &Header, backend: &dyn Backend) -> Result<(), 
     })
 }
 
-/// The arrays of the model and of the backend's state, in the order of the file, whose bytes `sink` gets
-/// some rows at a time.
-fn records_of(
+/// Passes the arrays of the model and of the backend's state to `sink`, some rows at a time, in the
+/// order of the file; returns their descriptions.
+fn write_arrays(
     backend: &dyn Backend,
     mut sink: impl FnMut(&[u8]) -> io::Result<()>,
-) -> Result<Vec<Record>, Stop<CheckpointError>> {
+) -> Result<Vec<Record>, WriteError<CheckpointError>> {
     let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
     let mut records = Vec::new();
     for array in ModelArray::ALL {
@@ -49,30 +49,30 @@ fn records_of(
             let values = backend.download_array(array, rows)?;
             Ok(Tensor::f32(model::name(array), &shape, values))
         };
-        records.push(Record::of(pieces(rows).map(piece), &mut sink)?);
+        records.push(Record::write(pieces(rows).map(piece), &mut sink)?);
     }
     for StateArray { name, by_rows } in backend.state() {
         let piece = |rows| backend.save_rows(&name, rows);
         records.push(match by_rows {
-            true => Record::of(pieces(rows).map(piece), &mut sink)?,
-            false => Record::of([piece(0..rows)], &mut sink)?,
+            true => Record::write(pieces(rows).map(piece), &mut sink)?,
+            false => Record::write([piece(0..rows)], &mut sink)?,
         });
     }
     Ok(records)
 }
 
 impl Record {
-    /// What is known of an array that comes in pieces, one below the other, of which there is at least
-    /// one; `sink` gets its bytes.
-    fn of(
+    /// Passes the bytes of an array, which comes in one or more pieces of rows, to `sink`; returns its
+    /// description.
+    fn write(
         pieces: impl IntoIterator<Item = Result<Tensor, BackendError>>,
         mut sink: impl FnMut(&[u8]) -> io::Result<()>,
-    ) -> Result<Self, Stop<CheckpointError>> {
+    ) -> Result<Self, WriteError<CheckpointError>> {
         let mut record = Self { name: String::new(), kind: Dtype::U8, shape: vec![], crc32c: 0 };
         let mut rows = 0;
         for piece in pieces {
             let Tensor { name, shape, values } =
-                piece.map_err(|error| Stop::Source(error.into()))?;
+                piece.map_err(|error| WriteError::Source(error.into()))?;
             rows += shape.first().copied().unwrap_or(0);
             let encoded = values.encode(|bytes| {
                 record.crc32c = crc32c::crc32c_append(record.crc32c, bytes);
@@ -93,7 +93,7 @@ impl Record {
     }
 }
 
-/// The header as safetensors has it, padded so that the arrays are aligned.
+/// The safetensors header, padded to align the arrays.
 fn header_bytes(header: &Header, records: &[Record]) -> io::Result<Vec<u8>> {
     let contents = Contents { header, tensors: records.to_vec() };
     let json = serde_json::to_string(&contents)?;

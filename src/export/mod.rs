@@ -16,7 +16,7 @@ pub use inventory;
 
 use crate::backend::pieces;
 use crate::gaussians::Gaussians;
-use crate::output::{OutputError, Stop, write_atomically_from};
+use crate::output::{OutputError, WriteError, write_atomically_from};
 
 /// The format that training exports to.
 pub const PLY: &Format = &ply::FORMAT;
@@ -161,7 +161,7 @@ impl Format {
             let mut writer = (self.writer)();
             writer.begin(shape, out)?;
             for piece in pieces(shape.rows) {
-                writer.rows(&rows(piece).map_err(Stop::Source)?, out)?;
+                writer.rows(&rows(piece).map_err(WriteError::Source)?, out)?;
             }
             Ok(writer.finish(out)?)
         })

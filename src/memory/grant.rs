@@ -1,27 +1,26 @@
-//! What the system still grants this process, where it says so (Linux). A run that would take more
-//! is refused before it begins: an allocation that fails ends a process without a word.
+//! The memory that the system still grants this process, where known (Linux). Runs that need more are
+//! refused before they start: a failed allocation would abort the process without a message.
 
 use std::fs::read_to_string;
 use std::path::Path;
 
 use super::{parse_status, status_line};
 
-/// What the system's allocator maps beyond what it is asked for.
-const SLACK: u64 = 16 << 20;
-/// What a thread takes of the address space, used or not: a stack, and a heap of its own (glibc).
-const THREAD: u64 = (2 + 64) << 20;
+/// Address space that the allocator maps in addition to requests `[bytes]`.
+const ALLOCATOR_SLACK: u64 = 16 << 20;
+/// Address space per thread: a stack, and a heap of its own (glibc) `[bytes]`.
+const ADDRESSES_PER_THREAD: u64 = (2 + 64) << 20;
 
-/// Memory that is left, and what bounds it.
+/// Memory left to the process, and its limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Grant {
     /// How much more the process can have `[bytes]`.
     pub left: u64,
-    /// What ends there, for messages.
+    /// Name of the limit, for messages.
     pub by: &'static str,
 }
 
-/// The least of what is granted to a process that is to have `threads` busy threads; `None` where
-/// the system does not say.
+/// The tightest limit for a process with `threads` busy threads; `None` if unknown.
 #[must_use]
 pub fn grant(threads: usize) -> Option<Grant> {
     let grants = [
@@ -35,7 +34,7 @@ pub fn grant(threads: usize) -> Option<Grant> {
 
 fn address_space(threads: usize) -> Option<u64> {
     let limit = parse_limit(&read_to_string("/proc/self/limits").ok()?)?;
-    let kept = THREAD.saturating_mul(threads as u64).saturating_add(SLACK);
+    let kept = ADDRESSES_PER_THREAD.saturating_mul(threads as u64).saturating_add(ALLOCATOR_SLACK);
     Some(limit.saturating_sub(status_line("VmSize:")?).saturating_sub(kept))
 }
 
@@ -46,7 +45,7 @@ fn parse_limit(limits: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// Control groups, version 2: within a container the group is the root that it sees.
+/// Control groups, version 2. In a container its group is the visible root.
 fn control_group() -> Option<u64> {
     let groups = read_to_string("/proc/self/cgroup").ok()?;
     let group = groups.lines().find_map(|line| line.strip_prefix("0::/"))?;
@@ -55,7 +54,7 @@ fn control_group() -> Option<u64> {
     group_left(&read("memory.max")?, &read("memory.current")?, &read("memory.stat")?)
 }
 
-/// Cached files count as used, and are given up first.
+/// Cached files count as used, but are evicted first.
 fn group_left(max: &str, current: &str, stat: &str) -> Option<u64> {
     // "max": no limit.
     let max: u64 = max.trim().parse().ok()?;
@@ -65,7 +64,7 @@ fn group_left(max: &str, current: &str, stat: &str) -> Option<u64> {
     Some(max.saturating_sub(current.saturating_sub(cached)))
 }
 
-/// `/proc/meminfo` is written as `/proc/self/status` is.
+/// `/proc/meminfo` has the format of `/proc/self/status`.
 fn available() -> Option<u64> {
     let memory = read_to_string("/proc/meminfo").ok()?;
     let free = parse_status(&memory, "MemAvailable:")?;
@@ -91,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn cached_files_are_no_use_of_a_group() {
+    fn cached_files_do_not_count_as_used() {
         let stat = "anon 100\nfile 500\ninactive_file 300\nactive_file 200\n";
         assert_eq!(group_left("1000\n", "900\n", stat), Some(400));
         assert_eq!(group_left("1000\n", "1300\n", stat), Some(0));

@@ -1,7 +1,7 @@
-//! The ledger: bytes per buffer, promised before training, and the peak that was measured.
+//! The ledger: the bytes of every buffer, promised before training; and the memory measured.
 //!
-//! Every buffer of a run has its size before the first step, because it is allocated once, at the
-//! budget. The ledger lists them, so that a user learns before training whether a run fits.
+//! Every buffer is allocated once, at the size of the budget. The ledger lists them, so that users
+//! learn before training whether a run fits.
 
 mod fit;
 mod grant;
@@ -14,7 +14,7 @@ pub(crate) use fit::IMAGES;
 pub use fit::{Fit, PAIRS, Setting, Wishes, fit, least_memory};
 pub use grant::{Grant, grant};
 
-/// What is allocated, line by line.
+/// All buffers of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct Ledger {
     /// One line per buffer.
@@ -24,13 +24,13 @@ pub struct Ledger {
 /// One buffer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LedgerLine {
-    /// What kind of thing it belongs to.
+    /// Part of the program that it belongs to.
     pub section: Section,
     /// What it holds.
     pub what: String,
     /// Its size `[bytes]`.
     pub bytes: u64,
-    /// Whether it lies in the memory of a GPU.
+    /// Whether it is in the memory of a GPU.
     #[serde(skip_serializing_if = "is_false")]
     pub on_device: bool,
 }
@@ -40,7 +40,7 @@ fn is_false(flag: &bool) -> bool {
     !flag
 }
 
-/// What a buffer belongs to. The table lists sections in this order.
+/// Part of the program, in the order of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Section {
@@ -56,9 +56,9 @@ pub enum Section {
     Policy,
     /// Decoded images.
     Images,
-    /// What is held for a moment only: evaluation, export. Its lines are not needed at once.
+    /// Held only for a moment, one at a time: evaluation, export.
     Passing,
-    /// What is held for a moment only, and given back before anything of the above is allocated.
+    /// Held only while loading, and freed before any of the above is allocated.
     Before,
     /// The program itself before any of the above.
     Process,
@@ -91,7 +91,7 @@ impl Ledger {
         self.lines.push(LedgerLine { section, what: what.into(), bytes, on_device: false });
     }
 
-    /// Adds a buffer in the memory of a GPU to a section, or its bytes to the line of that name.
+    /// Adds a buffer in the memory of a GPU, or adds its bytes to the line of that name.
     pub fn add_on_device(&mut self, section: Section, what: &str, bytes: u64) {
         let same =
             |line: &&mut LedgerLine| line.on_device && line.section == section && line.what == what;
@@ -109,15 +109,15 @@ impl Ledger {
         self.lines.extend_from_slice(&other.lines);
     }
 
-    /// The most that is held at a time `[bytes]`. Of the lines held in passing only the largest counts,
-    /// as they are never held together, and so with those held before, beside which there is nothing
-    /// but the process.
+    /// The most memory held at a time `[bytes]`. Of [`Section::Passing`] and [`Section::Before`] only the
+    /// largest lines count, as they are never held together; beside [`Section::Before`] there is only
+    /// the process.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.most_at_a_time(|_| true)
     }
 
-    /// The same of what does not lie in the memory of a GPU `[bytes]`.
+    /// The same without the memory of a GPU `[bytes]`.
     #[must_use]
     pub fn on_host(&self) -> u64 {
         self.most_at_a_time(|line| !line.on_device)
@@ -136,7 +136,7 @@ impl Ledger {
         process.saturating_add(before.max(lasting.saturating_add(passing)))
     }
 
-    /// Sum of what lies in the memory of a GPU `[bytes]`, where all of it lasts.
+    /// Sum of the buffers in the memory of a GPU, which are all held throughout `[bytes]`.
     #[must_use]
     pub fn on_device(&self) -> u64 {
         let lines = self.lines.iter().filter(|line| line.on_device);
@@ -171,7 +171,7 @@ impl fmt::Display for Ledger {
     }
 }
 
-/// A number of bytes, shown in the binary unit that suits it.
+/// A number of bytes, displayed with a binary unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bytes(pub u64);
 
@@ -192,13 +192,13 @@ impl fmt::Display for Bytes {
     }
 }
 
-/// Resident memory of this process now `[bytes]`; `None` where the system does not say.
+/// Resident memory of this process now `[bytes]`; `None` if unknown.
 #[must_use]
 pub fn resident() -> Option<u64> {
     status_line("VmRSS:")
 }
 
-/// Largest resident memory of this process so far `[bytes]`; `None` where the system does not say.
+/// Largest resident memory of this process so far `[bytes]`; `None` if unknown.
 #[must_use]
 pub fn peak_resident() -> Option<u64> {
     status_line("VmHWM:")
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn of_what_passes_only_the_largest_counts() {
+    fn of_passing_buffers_only_the_largest_counts() {
         assert_eq!(sample().total(), (40 << 20) + 1536);
         let mut full = Ledger::default();
         full.add("a", u64::MAX);
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_given_back_before_counts_only_where_it_is_the_most() {
+    fn buffers_freed_before_training_count_only_if_they_are_the_most() {
         let mut ledger = sample();
         let total = ledger.total();
         ledger.add_to(Section::Before, "loading", 30 << 20);
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn the_host_holds_what_the_device_does_not() {
+    fn the_host_holds_the_buffers_that_are_not_on_the_device() {
         let mut ledger = sample();
         let total = ledger.total();
         ledger.add_on_device(Section::Model, "more moments", 50 << 20);

@@ -1,12 +1,10 @@
-//! How like the photograph a render is, PSNR, SSIM and FLIP, and how like the surface the model is where
-//! that is known ([`geometry`]).
+//! Image metrics (PSNR, SSIM, FLIP) and errors against a known surface ([`geometry`]).
 //!
-//! All compare a rendered image with a packed target, both in sRGB encoding, and accumulate
-//! in `f64`, so that a figure does not depend on the image's size or on the number of threads.
-//! Renders are clamped to `[0, 1]` first, as a viewer would show them. A target with coverage is
-//! composited on the background the render was made with. A target with a mask is compared where
-//! the mask counts: the render's error is scaled by the mask before windows are taken, so what
-//! lies under the mask cannot leak into its neighbours' SSIM, and pixels are weighted by it.
+//! The image metrics compare a rendered image with a packed target, both in sRGB encoding, and sum
+//! in `f64`, so that results do not depend on the size of the image or the number of threads.
+//! Renders are clamped to `[0, 1]` first, as in a viewer. A target with coverage is composited on
+//! the background of the render. A mask weights the pixels, and scales the error of the render
+//! before windows are taken, so that masked pixels do not affect the SSIM of their neighbours.
 
 mod flip;
 pub mod geometry;
@@ -23,25 +21,25 @@ use rayon::prelude::*;
 
 use crate::dataset::images::Image8;
 
-/// Rows of pixels filtered together: few enough that their intermediate rows take a few megabytes,
-/// many enough that the rows filtered twice are less than half of the work.
+/// Rows of pixels filtered together: few enough that their buffers take a few megabytes, and enough
+/// that rows filtered twice are less than half of the work.
 const BLOCK: usize = 32;
-/// Blocks of rows filtered at a time: the memory of a score does not grow with the machine.
+/// Blocks filtered at a time, so that memory does not grow with the number of processor cores.
 const AT_ONCE: usize = 4;
 
-/// Memory that scoring an image of this width takes on so many threads `[bytes]`: that of [`flip()`],
-/// which takes the most.
+/// Memory for scoring an image of this width with so many threads `[bytes]`: that of [`flip()`],
+/// which needs the most.
 #[must_use]
 pub fn scratch_bytes(width: u32, threads: usize) -> u64 {
     flip::bytes_per_block(u64::from(width)) * threads.min(AT_ONCE) as u64
 }
 
-/// What `of` says of each block of rows of pixels, in order.
-fn by_blocks<T: Send>(height: usize, of: impl Fn(Range<usize>) -> T + Sync) -> Vec<T> {
+/// The results of `function` for each block of rows of pixels, in order.
+fn by_blocks<T: Send>(height: usize, function: impl Fn(Range<usize>) -> T + Sync) -> Vec<T> {
     let block = |first: usize| first..(first + BLOCK).min(height);
     let blocks: Vec<_> = (0..height).step_by(BLOCK).map(block).collect();
     let several = |blocks: &[Range<usize>]| -> Vec<T> {
-        blocks.par_iter().map(|rows| of(rows.clone())).collect()
+        blocks.par_iter().map(|rows| function(rows.clone())).collect()
     };
     blocks.chunks(AT_ONCE).flat_map(several).collect()
 }
@@ -64,12 +62,12 @@ pub enum MetricError {
         /// The target's height `[px]`.
         height: u32,
     },
-    /// A part of the target does not have as many values as its width and height say.
+    /// A channel of the target contradicts its width and height.
     #[error(
         "the target's {part} has {found} values, its size of {width}x{height} px needs {expected}"
     )]
     BadTarget {
-        /// Which part: colours, coverage or mask.
+        /// Colours, coverage or mask.
         part: &'static str,
         /// Values it has.
         found: usize,
@@ -80,7 +78,7 @@ pub enum MetricError {
         /// The target's height `[px]`.
         height: u32,
     },
-    /// No pixel counts.
+    /// The mask ignores every pixel.
     #[error("the mask ignores every pixel of the target; remove the mask, or leave this view out")]
     NothingToCompare,
 }
@@ -124,7 +122,7 @@ impl<'a> Pair<'a> {
         Ok(Self { rendered, target, background: background.map(f64::from), width, height })
     }
 
-    /// How much pixel `p` counts, in `[0, 1]`.
+    /// Weight of pixel `p`, in `[0, 1]`.
     fn weight(&self, p: usize) -> f64 {
         self.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
     }
@@ -138,7 +136,7 @@ impl<'a> Pair<'a> {
         })
     }
 
-    /// Render minus target in channel `c` of pixel `p`; NaN where the render is.
+    /// Render minus target in channel `c` of pixel `p`; NaN if the render is NaN.
     fn error(&self, p: usize, c: usize) -> f64 {
         f64::from(self.rendered[3 * p + c]).clamp(0.0, 1.0) - self.truth(p, c)
     }

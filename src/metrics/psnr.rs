@@ -7,8 +7,8 @@ use crate::dataset::images::Image8;
 
 /// PSNR `[dB]` of a render against a target: one mean over all pixels and channels of the image.
 ///
-/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is what
-/// a target with coverage is composited on. Infinite when both are equal, NaN when the render
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
+/// background of targets with coverage. Infinite when both are equal, NaN when the render
 /// holds a NaN.
 ///
 /// # Errors
@@ -22,7 +22,7 @@ pub fn psnr(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     if weight == 0.0 {
         return Err(MetricError::NothingToCompare);
     }
-    // 0 − x rather than −x: an infinite ratio, but never a negative zero.
+    // 0 − x instead of −x avoids a negative zero.
     Ok(0.0 - 10.0 * (squared / (3.0 * weight)).log10())
 }
 
@@ -31,7 +31,7 @@ fn row(pair: &Pair<'_>, y: usize) -> [f64; 2] {
     let mut sum = [0.0; 2];
     for p in y * pair.width..(y + 1) * pair.width {
         let weight = pair.weight(p);
-        // A pixel that is ignored may hold anything, NaN included.
+        // An ignored pixel may be NaN.
         if weight > 0.0 {
             sum[0] += weight * (0..3).map(|c| pair.error(p, c).powi(2)).sum::<f64>();
             sum[1] += weight;
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_images_are_infinitely_alike_and_the_render_is_clamped() {
+    fn equal_images_have_an_infinite_ratio_and_the_render_is_clamped() {
         let white = target(4, 4, 255);
         assert_eq!(psnr(&[1.0; 48], &white, [0.0; 3]), Ok(f64::INFINITY));
         assert_eq!(psnr(&[7.5; 48], &white, [0.0; 3]), Ok(f64::INFINITY));

@@ -3,14 +3,11 @@
 //! Gaussian window with σ = 1.5 px, zeros beyond the border, each colour channel by itself,
 //! mean over all pixels and channels.
 //!
-//! The textbook's product of 2·μx·μy + C₁ and 2·σxy + C₂ over their bounds loses its digits where
-//! the images are flat. With e = x − y it is, exactly,
+//! The textbook formula cancels badly where the images are flat. With e = x − y it is exactly
 //!
 //! > SSIM = (1 − μe² / (μx² + μy² + C₁)) · (1 − Var e / (Var x + Var y + C₂)),
 //!
-//! which is 1 where the images agree, whatever they show, and small errors stay small.
-//!
-//! One piece although over 400 lines: two thirds are tests, which need the private map.
+//! which is exactly 1 for equal images and precise for small errors.
 
 use super::{MetricError, Pair, by_blocks};
 use crate::dataset::images::Image8;
@@ -26,9 +23,9 @@ const C2: f64 = 0.03 * 0.03;
 
 /// Mean SSIM of a render against a target, <= 1.
 ///
-/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is what
-/// a target with coverage is composited on. Images smaller than the window need no special case:
-/// the window then sees zeros of both. NaN when the render holds a NaN.
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
+/// background of targets with coverage. Images smaller than the window need no special case: beyond
+/// the border both are zero. NaN when the render holds a NaN.
 ///
 /// # Errors
 /// When the sizes differ or the target's mask ignores every pixel.
@@ -67,7 +64,7 @@ fn window() -> [f64; 2 * REACH + 1] {
     window.map(|w| w / sum)
 }
 
-/// What is averaged over the window: e, y, e², x² + y².
+/// Values averaged over the window: e, y, e², x² + y².
 type Moments = [f64; 4];
 
 /// SSIM of rows `first..last`. Shape: `[last − first, width, 3]`.
@@ -118,7 +115,7 @@ fn moments_of_row(pair: &Pair<'_>, y: usize, row: &mut Vec<Moments>) {
         let weight = pair.weight(p);
         for c in 0..3 {
             let truth = pair.truth(p, c);
-            // An ignored pixel may hold anything, NaN included.
+            // An ignored pixel may be NaN.
             let error = if weight > 0.0 { weight * pair.error(p, c) } else { 0.0 };
             let x = truth + error;
             row.push([error, truth, error * error, x * x + truth * truth]);

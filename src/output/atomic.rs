@@ -1,81 +1,82 @@
-//! Files that are there in full or not at all.
+//! Writes files atomically: complete or not at all.
 
 use std::ffi::OsStr;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use super::OutputError;
-use super::disk::{Named, Operation, attempt};
+use super::disk::{Operation, WatchedFile, attempt};
 
-/// What the names of files and folders begin with that are not complete yet.
+/// Prefix of the names of incomplete files and folders.
 pub(super) const TEMPORARY: &str = ".densify-";
 
-/// Whether a file or folder of this name is one that a writer has not completed.
+/// Whether this is the name of an incomplete file or folder.
 pub(super) fn is_temporary(name: &OsStr) -> bool {
     name.to_string_lossy().starts_with(TEMPORARY)
 }
 
-/// Writes a file under a temporary name in the same folder, syncs it and renames it: whoever looks
-/// sees the old content or the new one, whatever happens in between. Creates missing folders.
+/// Writes a file under a temporary name in the same folder, syncs it and renames it: readers see the
+/// old or the new content, even after a crash. Creates missing folders.
 ///
 /// # Errors
-/// [`OutputError::Io`], also for an error that `write` returns; a file that was there is then
-/// unchanged and nothing is left behind.
+/// [`OutputError::Io`], also for an error that `write` returns. An existing file is then unchanged and
+/// nothing is left behind.
 pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
 ) -> Result<(), OutputError> {
-    write_atomically_from(path, |out| Ok::<_, Stop<OutputError>>(write(out)?))
+    write_atomically_from(path, |out| Ok::<_, WriteError<OutputError>>(write(out)?))
 }
 
-/// Why a file is not written to its end.
+/// Why writing a file was stopped.
 #[derive(Debug)]
-pub enum Stop<E> {
-    /// It cannot be written.
+pub enum WriteError<E> {
+    /// The file cannot be written.
     Io(io::Error),
-    /// What should stand in it cannot be had.
+    /// Its contents cannot be obtained.
     Source(E),
 }
 
-impl<E> From<io::Error> for Stop<E> {
+impl<E> From<io::Error> for WriteError<E> {
     fn from(error: io::Error) -> Self {
         Self::Io(error)
     }
 }
 
-/// As [`write_atomically`], of contents that may fail to come.
+/// As [`write_atomically`], for contents that may not be obtainable.
 ///
 /// # Errors
-/// [`OutputError::Io`], and what `write` has in a [`Stop::Source`]; a file that was there is then
-/// unchanged and nothing is left behind.
+/// [`OutputError::Io`], and the error in a [`WriteError::Source`]. An existing file is then unchanged
+/// and nothing is left behind.
 pub fn write_atomically_from<E: From<OutputError>>(
     path: &Path,
-    write: impl FnOnce(&mut dyn Write) -> Result<(), Stop<E>>,
+    write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
 ) -> Result<(), E> {
     let folder = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
     std::fs::create_dir_all(folder).map_err(OutputError::io("create the folder", folder))?;
-    replace(folder, path, write).map_err(|stop| match stop {
-        Stop::Io(error) => OutputError::io("write", path)(error).into(),
-        Stop::Source(error) => error,
+    replace(folder, path, write).map_err(|error| match error {
+        WriteError::Io(error) => OutputError::io("write", path)(error).into(),
+        WriteError::Source(error) => error,
     })
 }
 
 fn replace<E>(
     folder: &Path,
     path: &Path,
-    write: impl FnOnce(&mut dyn Write) -> Result<(), Stop<E>>,
-) -> Result<(), Stop<E>> {
+    write: impl FnOnce(&mut dyn Write) -> Result<(), WriteError<E>>,
+) -> Result<(), WriteError<E>> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY);
-    // Temporary files are private by default; a result is as readable as any other new file.
+    // Temporary files are private by default; results are to be as readable as other new files.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     attempt(Operation::Create, path)?;
     let mut file = builder.tempfile_in(folder)?;
-    let mut buffered = BufWriter::with_capacity(1 << 16, Named { file: file.as_file_mut(), path });
+    let mut buffered =
+        BufWriter::with_capacity(1 << 16, WatchedFile { file: file.as_file_mut(), path });
     write(&mut buffered)?;
     buffered.flush()?;
     drop(buffered);
@@ -83,21 +84,21 @@ fn replace<E>(
     file.as_file().sync_all()?;
     attempt(Operation::Rename, path)?;
     file.persist(path).map_err(io::Error::from)?;
-    // The rename lasts once the folder is synced; not every file system can do that.
+    // Syncing the folder makes the rename permanent; not every file system supports it.
     #[cfg(unix)]
     let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
     Ok(())
 }
 
-/// Folders within folders of a run: `point_cloud/iteration_N`.
-pub(super) const DEEPEST: u32 = 2;
+/// Depth of the folders of a run: `point_cloud/iteration_N`.
+pub(super) const RUN_FOLDER_DEPTH: u32 = 2;
 
-/// Removes the files that are not complete, down to folders so deep.
+/// Removes incomplete files, down to a depth of `deeper` folders.
 pub(super) fn remove_incomplete(folder: &Path, deeper: u32) {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     for entry in entries {
         let (name, path) = (entry.file_name(), entry.path());
-        // Links are not followed: what they lead to is the user's.
+        // Links are not followed: their targets belong to the user.
         match entry.file_type() {
             Ok(kind) if kind.is_dir() && !is_temporary(&name) && deeper > 0 => {
                 remove_incomplete(&path, deeper - 1);
@@ -133,14 +134,14 @@ mod tests {
     }
 
     #[test]
-    fn what_the_contents_fail_with_comes_back_as_it_is() {
+    fn an_error_of_the_contents_is_passed_on() {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("a");
         write_atomically(&path, |out| out.write_all(b"old")).unwrap();
         let lost = || OutputError::io("fetch", Path::new("b"))(io::Error::other("lost"));
         let error = write_atomically_from(&path, |out| {
             out.write_all(b"new")?;
-            Err(Stop::Source(lost()))
+            Err(WriteError::Source(lost()))
         });
         assert_eq!(error.unwrap_err().to_string(), lost().to_string());
         assert_eq!(std::fs::read(&path).unwrap(), b"old");

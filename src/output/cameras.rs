@@ -1,4 +1,4 @@
-//! `cameras.json` as the original trainer writes it and its viewers read it.
+//! Writes `cameras.json` in the format of the original trainer and its viewers.
 
 use serde::Serialize;
 
@@ -13,13 +13,13 @@ struct CameraRecord<'a> {
     height: u32,
     /// The camera's centre.
     position: [f64; 3],
-    /// Camera to world; columns are the camera's axes (x right, y down, z forward). Row by row.
+    /// `world_from_camera`, row by row; columns are the camera's axes (x right, y down, z forward).
     rotation: [[f64; 3]; 3],
     fy: f64,
     fx: f64,
 }
 
-/// Cameras in world coordinates with their images' names, numbered in the order given, as JSON.
+/// Cameras in world coordinates with the names of their images, numbered in order, as JSON.
 ///
 /// # Errors
 /// Those of [`serde_json`].
@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rotation_is_camera_to_world_and_position_is_in_the_world() {
+    fn rotation_is_world_from_camera_and_position_is_in_the_world() {
         // Turned by 90° about z: the camera's x axis is the world's −y.
         let rotation = DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z);
         let centre = DVec3::new(1.0, 2.0, 3.0);

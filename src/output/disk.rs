@@ -1,28 +1,28 @@
-//! Operations on the disk that can fail. Everything a run writes passes here, so that tests can make
-//! each of them fail; outside of tests nothing is added.
+//! Lets tests make disk operations fail: everything that a run writes passes through here. Outside of
+//! tests it adds nothing.
 
 use std::io::{self, Write};
 use std::path::Path;
 
-/// What is done to a file or folder.
+/// An operation on a file or folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Operation {
-    /// A file or a folder is made.
+    /// Creates a file or folder.
     Create,
-    /// Bytes are handed to the system.
+    /// Writes to a file.
     Write,
-    /// Buffered bytes are handed to the system.
+    /// Flushes a buffer.
     Flush,
-    /// Bytes are brought to the disk.
+    /// Syncs a file to the disk.
     Sync,
-    /// A complete file takes its name.
+    /// Renames a complete file.
     Rename,
 }
 
-/// Fails where a test wants it to.
+/// Fails if a test has requested it.
 ///
 /// # Errors
-/// What the test wants.
+/// The requested error.
 #[cfg(not(test))]
 pub(super) fn attempt(_: Operation, _: &Path) -> io::Result<()> {
     Ok(())
@@ -33,13 +33,13 @@ pub(super) use faults::attempt;
 #[cfg(test)]
 pub(crate) use faults::{Fault, with_fault};
 
-/// A file with its name.
-pub(super) struct Named<'a, W> {
+/// A file whose operations can be made to fail.
+pub(super) struct WatchedFile<'a, W> {
     pub(super) file: W,
     pub(super) path: &'a Path,
 }
 
-impl<W: Write> Write for Named<'_, W> {
+impl<W: Write> Write for WatchedFile<'_, W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         attempt(Operation::Write, self.path)?;
         #[cfg(test)]
@@ -55,19 +55,19 @@ impl<W: Write> Write for Named<'_, W> {
 
 #[cfg(test)]
 mod faults {
-    //! Faults on demand, for the thread that asks for them.
+    //! Faults requested by a test, for its own thread.
 
     use std::cell::RefCell;
 
     use super::{Operation, Path, io};
 
-    /// What is to fail.
+    /// An operation that is to fail.
     #[derive(Debug, Clone, Copy)]
     pub(crate) struct Fault {
         pub(crate) operation: Operation,
-        /// In files and folders whose path ends so.
+        /// End of the path.
         pub(crate) file: &'static str,
-        /// So many times it still works.
+        /// How many times it succeeds first.
         pub(crate) spared: u32,
         pub(crate) kind: io::ErrorKind,
     }
@@ -84,8 +84,8 @@ mod faults {
         static PLAN: RefCell<Plan> = RefCell::default();
     }
 
-    /// Runs `f` with a fault from its turn on, or, without one, with short writes. Returns how often
-    /// the fault was met, too.
+    /// Runs `f` with a fault, or with short writes if there is none. Also returns how often the fault
+    /// occurred.
     pub(crate) fn with_fault<T>(fault: Option<Fault>, f: impl FnOnce() -> T) -> (T, u32) {
         PLAN.replace(Plan { fault, met: 0, short: fault.is_none() });
         let done = f();

@@ -1,4 +1,4 @@
-//! The folder of a run: never mixed with another run's, replaced only as a whole.
+//! The folder of a run: two runs are never mixed, and a run is replaced only as a whole.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 use super::OutputError;
-use super::atomic::{DEEPEST, TEMPORARY, is_temporary, remove_incomplete};
+use super::atomic::{RUN_FOLDER_DEPTH, TEMPORARY, is_temporary, remove_incomplete};
 use super::disk::{Operation, attempt};
-use super::tensorboard::PREFIX as OWNED_PREFIX;
+use super::tensorboard::PREFIX as EVENTS_PREFIX;
 
-/// What a run owns in its folder. Anything else in there is the user's and is left alone.
+/// Files and folders of a run. Everything else in its folder belongs to the user and is left alone.
 const OWNED: [&str; 11] = [
     CHECKPOINTS,
     "config.toml",
@@ -29,7 +29,7 @@ const MODELS: &str = "point_cloud";
 /// Name of the folder of checkpoints in a run's folder.
 pub const CHECKPOINTS: &str = "checkpoints";
 
-/// Where a run keeps the model of an iteration.
+/// Path of the model of an iteration.
 #[must_use]
 pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
     run.join(MODELS).join(format!("iteration_{iteration}")).join("point_cloud.ply")
@@ -55,12 +55,12 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
 
 /// The folder that a run writes to.
 ///
-/// A new run writes in place. One that replaces another writes beside it, in a hidden folder
-/// inside, and takes its place in [`finish`](Self::finish): until then the old run stays whole.
+/// A new run writes in place. A run that replaces another writes to a hidden folder inside and takes
+/// its place in [`finish`](Self::finish); until then the old run is unchanged.
 #[derive(Debug)]
 pub struct RunFolder {
     target: PathBuf,
-    /// Whether this run made the folder.
+    /// Whether this run created the folder.
     is_new: bool,
     staging: Option<TempDir>,
 }
@@ -69,11 +69,11 @@ impl RunFolder {
     /// Checks, without writing anything, that a run may go to `target`.
     ///
     /// # Errors
-    /// [`OutputError::Occupied`] when it holds another run that `overwrite` does not give up;
+    /// [`OutputError::Occupied`] when it holds another run and `overwrite` is not set;
     /// [`OutputError::NotAFolder`]; [`OutputError::Io`].
     pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
         if !target.is_dir() {
-            // A dangling link has no target but is in the way too.
+            // A dangling link is in the way, too.
             return match target.symlink_metadata() {
                 Ok(_) => Err(OutputError::NotAFolder { path: target.to_owned() }),
                 Err(_) => Ok(()),
@@ -103,9 +103,8 @@ impl RunFolder {
         Ok(Self { target: target.to_owned(), is_new, staging })
     }
 
-    /// The folder of a run that goes on, or that begins anew because it has kept nothing; then what
-    /// it has written is removed. Files that a process which was killed has not completed are removed
-    /// in any case.
+    /// The folder of a run that continues, or that starts again (`anew`) because it has no checkpoint;
+    /// then its files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
     /// [`OutputError::NotAFolder`], [`OutputError::Io`].
@@ -114,13 +113,13 @@ impl RunFolder {
         if anew {
             remove_owned(target);
         }
-        remove_incomplete(target, DEEPEST);
+        remove_incomplete(target, RUN_FOLDER_DEPTH);
         let is_new = !target.exists();
         fs::create_dir_all(target).map_err(OutputError::io("create the folder", target))?;
         Ok(Self { target: target.to_owned(), is_new, staging: None })
     }
 
-    /// Hidden folders in `target` in which runs wait, or waited, to replace the one there.
+    /// Hidden folders in `target` of runs that are to replace the one there, or were.
     #[must_use]
     pub fn staged(target: &Path) -> Vec<PathBuf> {
         let entries = fs::read_dir(target).into_iter().flatten().flatten();
@@ -128,17 +127,16 @@ impl RunFolder {
         hidden.map(|entry| entry.path()).filter(|path| path.is_dir()).collect()
     }
 
-    /// Where to write now.
+    /// The folder to write to.
     #[must_use]
     pub fn path(&self) -> &Path {
         self.staging.as_ref().map_or(&self.target, |staging| staging.path())
     }
 
-    /// Takes the place of the run that was there, if any; returns where the run is.
+    /// Replaces the existing run, if there is one; returns the folder.
     ///
     /// # Errors
-    /// [`OutputError::NotReplaced`] with the hidden folder in which the new run then is; the old one
-    /// stays.
+    /// [`OutputError::NotReplaced`] with the hidden folder of the new run; the old run stays.
     pub fn finish(self) -> Result<PathBuf, OutputError> {
         let Self { target, staging, .. } = self;
         let Some(staging) = staging else {
@@ -151,49 +149,48 @@ impl RunFolder {
         }
     }
 
-    /// Ends a run that failed: the run that was there stays, and what the failed one has written
-    /// is kept in the folder returned.
+    /// Ends a failed run: an existing run stays, and the files of the failed one are kept in the
+    /// returned folder.
     #[must_use]
     pub fn abandon(self) -> PathBuf {
         self.staging.map_or(self.target, TempDir::keep)
     }
 
-    /// Ends a run that has nothing to show: removes what it has written. The run that was there,
-    /// and files that are no run's, stay.
+    /// Ends a run without results: removes its files. An existing run and other files stay.
     pub fn discard(self) {
-        // What is staged goes with its folder.
+        // Dropping the staging folder removes it.
         if self.staging.is_none() {
             remove_owned(&self.target);
             if self.is_new {
-                // It stays if the user has put something there meanwhile.
+                // It stays if the user has put something there.
                 let _ = fs::remove_dir(&self.target);
             }
         }
     }
 }
 
-/// Puts the run in `staging` in the place of the one in `target`, or leaves both as they are.
+/// Replaces the run in `target` by that in `staging`, or leaves both unchanged.
 fn replace(target: &Path, staging: &Path) -> Result<(), OutputError> {
     let aside = tempfile::Builder::new()
         .prefix(".densify-old-")
         .tempdir_in(target)
         .map_err(OutputError::io("create a folder in", target))?;
-    let moved = carry(target, aside.path())
+    let moved = move_run(target, aside.path())
         .map_err(|error| (error, false))
-        .and_then(|()| carry(staging, target).map_err(|error| (error, true)));
+        .and_then(|()| move_run(staging, target).map_err(|error| (error, true)));
     let Err((error, half)) = moved else {
         return fs::remove_dir_all(staging).map_err(OutputError::io("remove", staging));
     };
-    let back = if half { carry(target, staging) } else { Ok(()) };
-    if back.and_then(|()| carry(aside.path(), target)).is_err() {
-        // What cannot go back is not to go with its folder.
+    let back = if half { move_run(target, staging) } else { Ok(()) };
+    if back.and_then(|()| move_run(aside.path(), target)).is_err() {
+        // Files that cannot be moved back must not be removed with the folder.
         let _ = aside.keep();
     }
     Err(error)
 }
 
-/// Moves what belongs to a run to another folder.
-fn carry(from: &Path, to: &Path) -> Result<(), OutputError> {
+/// Moves the files of a run to another folder.
+fn move_run(from: &Path, to: &Path) -> Result<(), OutputError> {
     for name in owned_entries(from)? {
         let path = from.join(&name);
         attempt(Operation::Rename, &path)
@@ -203,7 +200,7 @@ fn carry(from: &Path, to: &Path) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// Removes what belongs to a run, as far as the system lets it.
+/// Removes the files of a run, as far as possible.
 fn remove_owned(folder: &Path) {
     for name in owned_entries(folder).unwrap_or_default() {
         let path = folder.join(name);
@@ -211,7 +208,7 @@ fn remove_owned(folder: &Path) {
     }
 }
 
-/// Names in `folder` that belong to a run.
+/// Names of the files of a run in `folder`.
 fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, OutputError> {
     let mut owned = Vec::new();
     for entry in fs::read_dir(folder).map_err(OutputError::io("read the folder", folder))? {
@@ -225,7 +222,7 @@ fn owned_entries(folder: &Path) -> Result<Vec<std::ffi::OsString>, OutputError> 
 
 fn is_owned(name: &OsStr) -> bool {
     let name = name.to_string_lossy();
-    OWNED.contains(&&*name) || name.starts_with(OWNED_PREFIX)
+    OWNED.contains(&&*name) || name.starts_with(EVENTS_PREFIX)
 }
 
 #[cfg(test)]

@@ -1,15 +1,14 @@
-//! What a run leaves behind: the folder that people and tools expect, written so that nothing is
-//! ever half there.
+//! Writes the folder of a run, and reads it back; no file in it is ever half written.
 //!
 //! ```text
 //! RUN/
 //!   config.toml                                  everything needed to repeat the run
 //!   cameras.json                                 all cameras, world coordinates
 //!   point_cloud/iteration_N/point_cloud.ply      the model
-//!   checkpoints/iteration_N.safetensors          what a run goes on from
+//!   checkpoints/iteration_N.safetensors          to continue the run from
 //!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
 //!   results.json  per_view.json                  test scores, as the original trainer lays them out
-//!   geometry.json                                how the model sits on a known surface
+//!   geometry.json                                errors against a known surface
 //!   events.out.tfevents.*                        the same curves for TensorBoard
 //! ```
 //!
@@ -25,7 +24,7 @@ mod records;
 mod requirements;
 mod tensorboard;
 
-pub use atomic::{Stop, write_atomically, write_atomically_from};
+pub use atomic::{WriteError, write_atomically, write_atomically_from};
 pub use cameras::cameras_json;
 pub use config::{
     CONFIG_FILE, DegreeChoice, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig,
@@ -42,7 +41,7 @@ pub use crate::evaluate::Mean;
 
 use std::path::{Path, PathBuf};
 
-/// Why a run's files cannot be written or read.
+/// Errors of writing and reading the files of a run.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
     /// The folder holds another run.
@@ -53,10 +52,10 @@ pub enum OutputError {
         /// The folder.
         path: PathBuf,
     },
-    /// The folder's name is that of something else.
+    /// The path is not a folder.
     #[error("{path} is not a folder; choose another one with -o")]
     NotAFolder {
-        /// What was named.
+        /// The path.
         path: PathBuf,
     },
     /// There is no run in the folder.
@@ -66,20 +65,20 @@ pub enum OutputError {
     NoRun {
         /// The folder.
         path: PathBuf,
-        /// What a run would have.
+        /// What is missing.
         missing: &'static str,
     },
-    /// A run cannot take the place of the one that is there.
+    /// A run cannot replace the existing one.
     #[error(
-        "{source}; the new run is complete in {staging}, the one that it was to replace is still there"
+        "{source}; the new run is complete in {staging}, and the run it was to replace is unchanged"
     )]
     NotReplaced {
-        /// Where the new run is.
+        /// Folder of the new run.
         staging: PathBuf,
-        /// What could not be moved.
+        /// Which file could not be moved.
         source: Box<OutputError>,
     },
-    /// A file of a run does not say what it should.
+    /// A file of a run is invalid.
     #[error("{path}: {problem}; this file was written by another version or changed by hand")]
     Malformed {
         /// The file.
@@ -90,11 +89,11 @@ pub enum OutputError {
     /// Reading or writing failed.
     #[error("cannot {action} {path}: {source}")]
     Io {
-        /// What was tried.
+        /// The attempted action.
         action: &'static str,
         /// The file or folder.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
 }

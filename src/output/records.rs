@@ -1,4 +1,4 @@
-//! Numbers of a run: the logs that grow, the summary, and the test scores.
+//! Writes the numbers of a run: logs, the summary, test scores.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::disk::{Named, Operation, attempt};
+use super::disk::{Operation, WatchedFile, attempt};
 use super::{OutputError, write_atomically};
 use crate::evaluate::{Mean, Scores, Split, ViewScore};
 use crate::memory::Ledger;
 use crate::metrics::geometry::Geometry;
 
-/// A file of JSON records, one a line, that grows by whole lines.
+/// A log of JSON records, one per line.
 #[derive(Debug)]
 pub struct RecordLog {
     file: File,
@@ -39,18 +39,17 @@ impl RecordLog {
         Ok(Self { file, path: path.to_owned() })
     }
 
-    /// Whether a process is writing to the log now, as far as the system says.
+    /// Whether a process is writing to the log now, if known.
     #[must_use]
     pub fn is_in_use(path: &Path) -> bool {
-        // Elsewhere a lock would keep readers out, too.
+        // On other systems the lock would also block readers.
         cfg!(unix)
             && File::open(path)
                 .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
     }
 
-    /// Goes on with a log that was `bytes` long when the run was last known to be sound: what was
-    /// written after that is cut off. Says whether all of it was there; what is missing stays
-    /// missing.
+    /// Continues a log, cut to the `bytes` that it had at the checkpoint. Also returns whether it still
+    /// had them; missing records stay missing.
     ///
     /// # Errors
     /// [`OutputError::Io`].
@@ -62,7 +61,7 @@ impl RecordLog {
         let mut cut = || {
             let there = file.metadata()?.len();
             if there < bytes {
-                // Whole lines only.
+                // Keep whole lines only.
                 let mut text = Vec::new();
                 file.read_to_end(&mut text)?;
                 let end = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
@@ -77,7 +76,7 @@ impl RecordLog {
         Ok((Self { file, path: path.to_owned() }, whole))
     }
 
-    /// Length `[bytes]`, all of it on disk.
+    /// Syncs the file; returns its length `[bytes]`.
     ///
     /// # Errors
     /// [`OutputError::Io`].
@@ -94,15 +93,14 @@ impl RecordLog {
     /// [`OutputError::Io`].
     pub fn append(&mut self, record: &impl Serialize) -> Result<(), OutputError> {
         let line = serde_json::to_string(record).map_err(std::io::Error::other);
-        // One write a line, so that a reader, or a kill, finds whole lines.
+        // One write per line: readers, and a killed process, leave whole lines.
         let Self { file, path } = self;
-        line.and_then(|line| Named { file, path }.write_all((line + "\n").as_bytes()))
+        line.and_then(|line| WatchedFile { file, path }.write_all((line + "\n").as_bytes()))
             .map_err(OutputError::io("write", path))
     }
 }
 
-/// For as long as the file is open; the system forgets it even where the process is killed. Not every
-/// file system can do that.
+/// Locks the file until it is closed, even by a kill. Not every file system supports it.
 fn mark_as_in_use(file: &File) {
     if cfg!(unix) {
         let _ = file.try_lock();
@@ -120,11 +118,11 @@ pub struct StepRecord {
     pub l1: f32,
     /// Mean structural similarity over the same steps.
     pub ssim: f32,
-    /// Rows now.
+    /// Number of rows.
     pub rows: usize,
     /// Wall time since the first step `[s]`.
     pub seconds: f64,
-    /// Resident memory of the process now `[bytes]`, where the system says.
+    /// Resident memory of the process `[bytes]`, if known.
     #[serde(default)]
     pub resident_bytes: Option<u64>,
 }
@@ -146,11 +144,11 @@ pub struct Summary {
     pub peak_rows: usize,
     /// Most rows allowed.
     pub budget: usize,
-    /// Training views rendered for the policy's decisions, beside one per step.
+    /// Training views rendered for the policy's decisions, in addition to one per step.
     pub extra_forwards: u64,
-    /// Largest resident memory of the process `[bytes]`, where the system says.
+    /// Largest resident memory of the process `[bytes]`, if known.
     pub peak_bytes: Option<u64>,
-    /// The memory that was given with `--memory` `[bytes]`.
+    /// The limit set by `--memory` `[bytes]`.
     pub memory: Option<u64>,
     /// The ledger's total `[bytes]`.
     pub ledger_bytes: u64,
@@ -158,10 +156,10 @@ pub struct Summary {
     pub ledger: Ledger,
     /// Wall time of all steps `[s]`.
     pub seconds: f64,
-    /// Wall time of each stage of the steps, of the policy's events, of the views rendered for these,
-    /// and of waiting for images, summed `[s]`.
+    /// Total wall time of each stage, of the policy's events, of the views rendered for them, and of
+    /// waiting for images `[s]`.
     pub stage_seconds: BTreeMap<String, f64>,
-    /// CPU time of all steps, all threads together `[s]`, where the system says.
+    /// CPU time of all steps, summed over the threads `[s]`, if known.
     pub cpu_seconds: Option<f64>,
     /// Number of views trained on.
     pub train_views: usize,
@@ -182,8 +180,8 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError
     })
 }
 
-/// Enters scores into the files of a split: mean scores into `results.json` as
-/// `{"ours_3000": {"PSNR": …, "SSIM": …, "FLIP": …}}`, scores by view into `per_view.json` as
+/// Adds scores to the files of a split: mean scores to `results.json` as
+/// `{"ours_3000": {"PSNR": …, "SSIM": …, "FLIP": …}}`, scores by view to `per_view.json` as
 /// `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`. Entries of other iterations stay.
 ///
 /// # Errors
@@ -206,12 +204,12 @@ pub fn write_scores(
         "SSIM": column(|v| v.ssim),
         "FLIP": column(|v| v.flip),
     });
-    enter(&run.join(per_view), iteration, views)?;
+    insert_entry(&run.join(per_view), iteration, views)?;
     let mean = serde_json::to_value(scores.mean()).unwrap_or_default();
-    enter(&run.join(results), iteration, mean)
+    insert_entry(&run.join(results), iteration, mean)
 }
 
-/// Enters geometric measurements into `geometry.json` (`geometry_train.json` for the views trained
+/// Adds geometric measurements to `geometry.json` (`geometry_train.json` for the views trained
 /// on) as `{"ours_3000": {"depth": {…}, …}}`. Entries of other iterations stay.
 ///
 /// # Errors
@@ -223,28 +221,28 @@ pub fn write_geometry(
     geometry: &Geometry,
 ) -> Result<(), OutputError> {
     let entry = serde_json::to_value(geometry).unwrap_or_default();
-    enter(&run.join(geometry_file(split)), iteration, entry)
+    insert_entry(&run.join(geometry_file(split)), iteration, entry)
 }
 
 /// The mean scores of an iteration on the test views, if there are any.
 ///
 /// # Errors
-/// [`OutputError`] when the file says something else.
+/// [`OutputError`] when the file is invalid.
 pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError> {
     let path = run.join("results.json");
     let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
-    let entry = read_all(&path)?.remove(&entry_name(iteration));
+    let entry = read_entries(&path)?.remove(&entry_name(iteration));
     entry.map(serde_json::from_value).transpose().map_err(|e| malformed(e.to_string()))
 }
 
 /// The geometric measurements of an iteration on the test views, if there are any.
 ///
 /// # Errors
-/// [`OutputError`] when the file says something else.
+/// [`OutputError`] when the file is invalid.
 pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, OutputError> {
     let path = run.join(geometry_file(Split::Test));
     let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
-    match read_all(&path)?.remove(&entry_name(iteration)) {
+    match read_entries(&path)?.remove(&entry_name(iteration)) {
         None => Ok(None),
         Some(entry) => {
             serde_json::from_value(entry).map(Some).map_err(|e| malformed(e.to_string()))
@@ -263,14 +261,14 @@ fn entry_name(iteration: u32) -> String {
     format!("ours_{iteration}")
 }
 
-fn enter(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
-    let mut all = read_all(path)?;
+fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
+    let mut all = read_entries(path)?;
     all.insert(entry_name(iteration), entry);
     write_json(path, &all)
 }
 
-/// The entries of a file; none where there is no file.
-fn read_all(path: &Path) -> Result<Map<String, Value>, OutputError> {
+/// The entries of a file; none if it does not exist.
+fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
     match std::fs::read_to_string(path) {
         Ok(text) => serde_json::from_str(&text)
             .map_err(|e| OutputError::Malformed { path: path.to_owned(), problem: e.to_string() }),

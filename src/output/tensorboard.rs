@@ -1,8 +1,8 @@
-//! Scalars for TensorBoard.
+//! Writes scalars for TensorBoard.
 //!
 //! The file is a sequence of TFRecords, each one an `Event` message in protobuf encoding. Only the
-//! four fields that a scalar needs are written (`event.proto` and `summary.proto` of TensorFlow),
-//! which spares a protobuf library.
+//! four fields of a scalar are written (`event.proto` and `summary.proto` of TensorFlow), so that no
+//! protobuf library is needed.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use super::OutputError;
-use super::disk::{Named, Operation, attempt};
+use super::disk::{Operation, WatchedFile, attempt};
 
-/// What the names of event files begin with.
+/// Prefix of the names of event files.
 pub(super) const PREFIX: &str = "events.out.tfevents.";
 
 /// An event file, open for appending.
@@ -39,9 +39,8 @@ impl TensorBoard {
         Ok(board)
     }
 
-    /// Goes on with the event file `name` in `folder`, which was `bytes` long when the run was last
-    /// known to be sound: what was written after that is cut off. Starts another file where it is
-    /// gone or shorter, or where the name is none of an event file.
+    /// Continues the event file `name` in `folder`, cut to the `bytes` that it had at the checkpoint.
+    /// Starts another file if it is missing or shorter, or if `name` is not the name of an event file.
     ///
     /// # Errors
     /// [`OutputError::Io`].
@@ -57,7 +56,7 @@ impl TensorBoard {
         Ok(Self { file: cut.map_err(OutputError::io("cut", &path))?, path })
     }
 
-    /// Name and length `[bytes]` of the file, all of it on disk.
+    /// Syncs the file; returns its name and length `[bytes]`.
     ///
     /// # Errors
     /// [`OutputError::Io`].
@@ -79,9 +78,9 @@ impl TensorBoard {
     }
 
     fn append(&mut self, event: &[u8]) -> Result<(), OutputError> {
-        // One write a record, so that a reader, or a kill, finds whole records.
+        // One write per record: readers, and a killed process, leave whole records.
         let Self { file, path } = self;
-        Named { file, path }.write_all(&record(event)).map_err(OutputError::io("write", path))
+        WatchedFile { file, path }.write_all(&record(event)).map_err(OutputError::io("write", path))
     }
 }
 
@@ -101,8 +100,8 @@ fn record(data: &[u8]) -> Vec<u8> {
     out
 }
 
-/// TFRecord's checksum: CRC-32C, rotated and offset, so that a record within a record does not
-/// check itself.
+/// The checksum of a TFRecord: CRC-32C, rotated and offset, so that the CRC of data that contains CRCs
+/// is not degenerate.
 fn masked_crc(data: &[u8]) -> u32 {
     crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }

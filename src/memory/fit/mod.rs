@@ -1,12 +1,12 @@
-//! How large a run may be in a memory that is given: rows, degree, tile lists and image cache.
+//! Finds the largest run that fits a memory limit: rows, degree, tile lists and image cache.
 //!
-//! Pure functions over the bytes that a setting takes. What is promised is that the setting found
-//! fits, that one row more would not (but where another limit holds), and that more memory never
-//! gives a smaller model: a lower degree, or fewer rows at the same degree.
+//! Pure functions of the bytes that a setting takes. Guaranteed: the result fits; one more row would
+//! not, unless another limit holds; and more memory never gives a lower degree, or fewer rows at the
+//! same degree.
 
 use std::ops::RangeInclusive;
 
-/// What decides how large a run is.
+/// The size of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
     /// Most rows there may ever be, >= 1.
@@ -19,52 +19,51 @@ pub struct Setting {
     pub image_cache: u64,
 }
 
-/// What is asked for, and what may be chosen.
+/// The limit, the wanted size, and what may be chosen.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Wishes {
     /// The limit `[bytes]`.
     pub memory: u64,
-    /// Fewer rows than this are no model, >= 1.
+    /// Fewest rows of a useful model, >= 1.
     pub least_rows: usize,
-    /// Rows that the scene starts with: a degree at which fewer fit is lowered.
+    /// Rows at the start: the degree is lowered if fewer fit.
     pub enough_rows: usize,
     /// Most rows wanted or possible, >= 1.
     pub most_rows: usize,
-    /// Degrees to choose from; the highest is the one that is wanted.
+    /// Degrees to choose from; the highest is the one wanted.
     pub sh_degree: RangeInclusive<u8>,
-    /// Most (row, tile) pairs, where they are not to be chosen.
+    /// Most (row, tile) pairs; `None`: to be chosen.
     pub tile_cap: Option<usize>,
-    /// (Row, tile) pairs per row where they are chosen: those for a start, and those where rows leave
-    /// room, in rising order.
+    /// (Row, tile) pairs per row if they are chosen: the minimum, and larger numbers that are used if
+    /// memory is left, in rising order.
     pub pairs: [usize; 3],
     /// Most (row, tile) pairs possible.
     pub most_pairs: usize,
-    /// Bytes of decoded images, where they are not to be chosen.
+    /// Bytes of decoded images; `None`: to be chosen.
     pub image_cache: Option<u64>,
     /// Bytes of all images decoded.
     pub all_images: u64,
 }
 
-/// What fits.
+/// The result of [`fit`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fit {
     /// The setting.
     pub setting: Setting,
-    /// Whether memory is what keeps the rows from being more.
+    /// Whether the number of rows is limited by the memory.
     pub by_memory: bool,
-    /// Rows that fit at the degree that was wanted.
+    /// Rows that fit at the wanted degree.
     pub at_wanted_degree: usize,
 }
 
-/// (Row, tile) pairs per row unless something else is wished: those for a start, then those where rows
-/// leave room. A view seldom has three per row; one that has more is rendered in bands, to the same
-/// bits.
+/// Default (row, tile) pairs per row: the minimum, and larger numbers if memory is left. A view rarely
+/// has three per row; views with more than the limit are rendered in bands, with the same result.
 pub const PAIRS: [usize; 3] = [4, 8, 16];
-/// The share of the memory that decoded images may have: one part in so many.
+/// Decoded images may take one part in so many of the memory.
 pub(crate) const IMAGES: u64 = 8;
 
 impl Wishes {
-    /// Where the search begins: the fewest pairs, and no more images than their share.
+    /// A setting with so many pairs per row, and at most [`IMAGES`] of the memory for images.
     fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> Setting {
         let most = self.most_pairs.max(rows);
         let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
@@ -74,13 +73,12 @@ impl Wishes {
     }
 }
 
-/// Finds the setting for what is wished. `bytes` says what a setting takes; it must not shrink as
-/// rows, pairs or images grow, and images must not take more than they are granted beyond a fixed
-/// part. `None`: not even the least rows fit.
+/// Finds the largest setting. `bytes` returns what a setting takes; it must not shrink as rows, pairs
+/// or images grow, and images must take at most their cache and a fixed part. `None`: not even the
+/// fewest rows fit.
 ///
-/// The degree is the one wanted, unless fewer rows than enough fit there: then the highest at which
-/// enough fit, or else the lowest. Rows are as many as fit; where the most wanted fit, what is left
-/// goes to the tile lists and then to the images.
+/// The degree is the highest at which enough rows fit, or else the lowest. Rows are as many as fit; if
+/// all wanted rows fit, the remaining memory goes to the tile lists and then to the images.
 ///
 /// # Errors
 /// Those of `bytes`.
@@ -94,8 +92,8 @@ pub fn fit<E>(
     let mut at_wanted_degree = None;
     let mut found = None;
     for degree in wishes.sh_degree.clone().rev() {
-        let of = |rows| wishes.setting(rows, degree, wishes.pairs[0]);
-        let rows = most_within(least, most, |rows| Ok(bytes(&of(rows))? <= wishes.memory))?;
+        let setting = |rows| wishes.setting(rows, degree, wishes.pairs[0]);
+        let rows = most_within(least, most, |rows| Ok(bytes(&setting(rows))? <= wishes.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
         found = rows.map(|rows| (rows, degree));
         if rows.is_some_and(|rows| rows >= enough) {
@@ -114,7 +112,7 @@ pub fn fit<E>(
         if wishes.image_cache.is_none() {
             let all = Setting { image_cache: wishes.all_images, ..setting };
             let left = wishes.memory.saturating_sub(bytes(&setting)?);
-            // What is in use at a time is counted even where the cache holds less.
+            // Images in use are counted even if the cache is smaller.
             setting.image_cache = match bytes(&all)? <= wishes.memory {
                 true => wishes.all_images,
                 false => setting.image_cache.saturating_add(left).min(wishes.all_images),
@@ -125,7 +123,7 @@ pub fn fit<E>(
     Ok(Some(Fit { setting, by_memory: rows < most, at_wanted_degree }))
 }
 
-/// The least memory in which a model fits, in whole steps of `step` bytes, if there is any.
+/// The smallest memory in which a model fits, in multiples of `step` bytes, if there is any.
 ///
 /// # Errors
 /// Those of `bytes`.
@@ -138,7 +136,7 @@ pub fn least_memory<E>(
         let wishes = Wishes { memory: steps as u64 * step, ..wishes.clone() };
         fit(&wishes, bytes).map(|fit| fit.is_some())
     };
-    // The least model with all of its images.
+    // The smallest model with all of its images.
     let all = Wishes { memory: u64::MAX, ..wishes.clone() };
     let least = wishes.least_rows.clamp(1, wishes.most_rows.max(1));
     let most = bytes(&all.setting(least, *wishes.sh_degree.start(), wishes.pairs[0]))?;
@@ -147,7 +145,8 @@ pub fn least_memory<E>(
     Ok(Some(too_little.map_or(0, |steps| steps as u64 + 1) * step))
 }
 
-/// The largest number in `least..=most` that `holds`, where all below it do, too.
+/// The largest number in `least..=most` for which `holds` is true; it must be true up to some number
+/// and false above.
 fn most_within<E>(
     least: usize,
     most: usize,

@@ -1,9 +1,9 @@
-//! LDR-FLIP: how different two images look when they are flipped between (Andersson, Nilsson,
+//! LDR-FLIP: the visible difference when alternating between two images (Andersson, Nilsson,
 //! Akenine-Möller, Oskarsson, Åström and Fairchild, *FLIP: A Difference Evaluator for Alternating
-//! Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; section and equation numbers are
-//! its). A colour pipeline filters both images by the eye's contrast sensitivity and measures a
-//! perceptual distance; a feature pipeline compares edges and points, and amplifies the first
-//! where they differ.
+//! Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; the source of section and equation
+//! numbers here). A colour pipeline filters both images by the contrast sensitivity of the eye and
+//! measures a perceptual distance. A feature pipeline compares edges and points, and amplifies the
+//! distance where they differ.
 
 use std::f64::consts::PI;
 
@@ -11,19 +11,19 @@ use super::{BLOCK, MetricError, Pair, by_blocks};
 use crate::dataset::images::Image8;
 
 /// Pixels per degree of the visual field: a monitor 0.7 m wide with 3840 px, seen from 0.7 m; the
-/// paper's default, with which published figures are made.
+/// default of the paper and of published figures.
 const PIXELS_PER_DEGREE: f64 = 3840.0 * PI / 180.0;
 /// Contrast sensitivity of each opponent channel, Σ a·√(π/b)·exp(−π²·x²/b) with x in degrees: its
 /// terms (a, b). Table 1.
 const SENSITIVITY: [[(f64, f64); 2]; 3] =
     [[(1.0, 0.0047), (0.0, 1e-5)], [(1.0, 0.0053), (0.0, 1e-5)], [(34.1, 0.04), (13.5, 0.025)]];
-/// Widest term of [`SENSITIVITY`]; all kernels reach as far as its own would.
+/// Widest term of [`SENSITIVITY`]; it sets the radius of all kernels.
 const WIDEST: f64 = 0.04;
 /// Exponent of colour distances, q_c.
 const COLOUR_EXPONENT: f64 = 0.7;
-/// Distances up to this share of the largest, p_c, …
+/// Distances up to this fraction of the largest, p_c, …
 const SMALL_SHARE: f64 = 0.4;
-/// … fill this share of the range of errors, p_t.
+/// … fill this fraction of the range of errors, p_t.
 const SMALL_RANGE: f64 = 0.95;
 /// Width of a feature `[degrees]`, w.
 const FEATURE_WIDTH: f64 = 0.082;
@@ -45,8 +45,8 @@ const RGB_OF_XYZ: [[f64; 3]; 3] = [
 
 /// Mean FLIP error of a render against a target, in `[0, 1]`; 0 when they are equal.
 ///
-/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is what
-/// a target with coverage is composited on. Beyond the border the images go on as they end. NaN when
+/// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. `background` in `[0, 1]` is the
+/// background of targets with coverage. Beyond the border the last pixels are repeated. NaN when
 /// the render holds a NaN.
 ///
 /// # Errors
@@ -58,7 +58,8 @@ pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     // One sum per block of rows, added in order: the same bits at any thread count.
     let sums = by_blocks(pair.height, |rows| {
         let pixels = rows.start * pair.width..rows.end * pair.width;
-        let [truth, render] = [false, true].map(|r| seen(&pair, &filters, rows.start, rows.end, r));
+        let [truth, render] =
+            [false, true].map(|r| responses(&pair, &filters, rows.start, rows.end, r));
         pixels.zip(truth.iter().zip(&render)).fold([0.0; 2], |sum, (p, (a, b))| {
             let weight = pair.weight(p);
             if weight > 0.0 {
@@ -76,16 +77,16 @@ pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     Ok(error / weight)
 }
 
-/// Most that a block of images of this width takes `[bytes]`: in `f64` eight planes of the rows that
-/// it sees and seven of its own rows, and what is [seen](Seen) in two images.
+/// Most memory for a block of this width `[bytes]`: in `f64` eight planes of the rows that its kernels
+/// reach and seven of its own rows, and the [responses](PixelResponse) to two images.
 pub(super) fn bytes_per_block(width: u64) -> u64 {
     let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().reach()) as u64);
     let float = size_of::<f64>() as u64;
-    width * (8 * lines * float + rows * (7 * float + 2 * size_of::<Seen>() as u64))
+    width * (8 * lines * float + rows * (7 * float + 2 * size_of::<PixelResponse>() as u64))
 }
 
-/// What the eye makes of a pixel.
-struct Seen {
+/// The response of the eye to a pixel.
+struct PixelResponse {
     /// Lightness and Hunt-adjusted chroma of the filtered image.
     colour: [f64; 3],
     /// Strengths of the edge and of the point at the pixel.
@@ -93,16 +94,16 @@ struct Seen {
 }
 
 /// Equation 11: the colour difference, amplified by the difference of features.
-fn difference(a: &Seen, b: &Seen, largest: f64) -> f64 {
+fn difference(a: &PixelResponse, b: &PixelResponse, largest: f64) -> f64 {
     let colour = redistributed(hyab(a.colour, b.colour).powf(COLOUR_EXPONENT), largest);
     let [edge, point] = [0, 1].map(|i| (a.features[i] - b.features[i]).abs());
-    // A NaN of either must not be lost, as `max` would lose it.
+    // `max` would lose a NaN.
     let feature = if point > edge { point } else { edge };
     let feature = (feature / 2.0_f64.sqrt()).powf(FEATURE_EXPONENT);
     colour.powf(1.0 - feature)
 }
 
-/// Section 4.1.4: the few large distances share a small part of the range.
+/// Section 4.1.4: compresses the few large distances.
 fn redistributed(distance: f64, largest: f64) -> f64 {
     let bend = SMALL_SHARE * largest;
     if distance < bend {
@@ -112,7 +113,7 @@ fn redistributed(distance: f64, largest: f64) -> f64 {
     }
 }
 
-/// The distance between pure green and pure blue, than which none is larger, c_max.
+/// The largest distance, c_max: between pure green and pure blue.
 fn largest_distance() -> f64 {
     let [green, blue] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(hunt_adjusted_lab);
     hyab(green, blue).powf(COLOUR_EXPONENT)
@@ -133,7 +134,7 @@ fn relative_xyz(rgb: [f64; 3]) -> [f64; 3] {
     [0, 1, 2].map(|i| xyz[i] / XYZ_OF_RGB[i].iter().sum::<f64>())
 }
 
-/// CIELAB's opponents without its cube root, in which filtering is linear: (Y, Cx, Cz).
+/// CIELAB without the cube root, so that filtering is linear: (Y, Cx, Cz).
 fn opponents(rgb: [f64; 3]) -> [f64; 3] {
     let [x, y, z] = relative_xyz(rgb);
     [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
@@ -160,12 +161,12 @@ fn linear(encoded: f64) -> f64 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
-/// The kernels of both pipelines, along one axis each: every filter is a sum of separable ones.
+/// The kernels of both pipelines along one axis; every filter is a sum of separable ones.
 struct Filters {
-    /// Terms of each opponent channel; both passes of a term together have the term's weight.
+    /// Terms of each opponent channel; the two passes of a term together have its weight.
     sensitivity: [Vec<Vec<f64>>; 3],
-    /// A Gaussian of the width of features, sum 1; its first derivative, whose halves sum to ∓1;
-    /// its second, whose parts of one sign sum to ∓1.
+    /// A Gaussian of the width of features, with sum 1; its first and second derivatives, whose
+    /// positive taps sum to 1 and negative taps to −1.
     feature: [Vec<f64>; 3],
 }
 
@@ -216,11 +217,17 @@ fn balanced(kernel: Vec<f64>) -> Vec<f64> {
     kernel.into_iter().map(|k| if k > 0.0 { k / positive } else { k / -negative }).collect()
 }
 
-/// Rows `first..last` of the render, or of the target.
-fn seen(pair: &Pair<'_>, filters: &Filters, first: usize, last: usize, render: bool) -> Vec<Seen> {
+/// Responses to rows `first..last` of the render, or of the target.
+fn responses(
+    pair: &Pair<'_>,
+    filters: &Filters,
+    first: usize,
+    last: usize,
+    render: bool,
+) -> Vec<PixelResponse> {
     let width = pair.width;
     let reach = filters.reach();
-    // Rows of the block and those that its kernels see; beyond the border the last one goes on.
+    // The rows that the kernels reach; beyond the border the last row is repeated.
     let lines = first..last + 2 * reach;
     let mut planes = [const { Vec::new() }; 3];
     for line in lines {
@@ -240,7 +247,7 @@ fn seen(pair: &Pair<'_>, filters: &Filters, first: usize, last: usize, render: b
         }
         sum
     });
-    // Luminance in [0, 1]; an offset is nothing to the derivatives.
+    // Luminance in [0, 1]; derivatives ignore an offset.
     let luminance: Vec<f64> = planes[0].iter().map(|y| (y + 16.0) / 116.0).collect();
     let [smooth, first_derivative, second_derivative] = &filters.feature;
     let along = [smooth, first_derivative, second_derivative]
@@ -255,7 +262,7 @@ fn seen(pair: &Pair<'_>, filters: &Filters, first: usize, last: usize, render: b
     (0..rows * width)
         .map(|i| {
             let rgb = rgb_of_opponents([0, 1, 2].map(|c| filtered[c][i]));
-            Seen {
+            PixelResponse {
                 colour: hunt_adjusted_lab(rgb.map(|v| v.clamp(0.0, 1.0))),
                 features: [&edges, &points].map(|[x, y]| x[i].hypot(y[i])),
             }
@@ -263,15 +270,15 @@ fn seen(pair: &Pair<'_>, filters: &Filters, first: usize, last: usize, render: b
         .collect()
 }
 
-/// Channel `c` of pixel `p`, sRGB-encoded; of the render where it counts.
+/// Channel `c` of pixel `p`, sRGB-encoded; of the target where the mask ignores the render.
 fn value(pair: &Pair<'_>, p: usize, c: usize, render: bool) -> f64 {
     let truth = pair.truth(p, c);
     let weight = pair.weight(p);
-    // An ignored pixel may hold anything, NaN included.
+    // An ignored pixel may be NaN.
     if render && weight > 0.0 { truth + weight * pair.error(p, c) } else { truth }
 }
 
-/// Every row filtered along itself.
+/// Filters along the rows.
 fn across(plane: &[f64], width: usize, kernel: &[f64]) -> Vec<f64> {
     let reach = kernel.len() / 2;
     let mut out = vec![0.0; plane.len()];
@@ -289,7 +296,7 @@ fn across(plane: &[f64], width: usize, kernel: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Adds a plane filtered down its columns. It has `reach` rows more above and below than `sum`.
+/// Filters along the columns and adds the result; `plane` has `reach` more rows above and below.
 fn add_down(sum: &mut [f64], plane: &[f64], width: usize, kernel: &[f64], reach: usize) {
     let skipped = reach - kernel.len() / 2;
     for (y, sum) in sum.chunks_exact_mut(width).enumerate() {

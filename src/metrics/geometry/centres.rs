@@ -1,35 +1,35 @@
-//! Centres against the mesh, and the mesh against the centres.
+//! Distances from centres to the mesh and back.
 
 use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
-use super::seen::Seen;
-use super::{CentreErrors, GeometryError, Ground, share};
+use super::visibility::Visibility;
+use super::{CentreErrors, GeometryError, Ground, ratio};
 
 pub(super) fn errors(
     rows: &Rows,
-    seen: &Seen,
+    visibility: &Visibility,
     ground: &Ground<'_>,
 ) -> Result<CentreErrors, GeometryError> {
     let diagonal = ground.diagonal();
     let finder = Finder::new(rows)?;
     let back: Vec<f64> =
-        seen.samples.par_iter().map(|&sample| finder.distance(sample) / diagonal).collect();
+        visibility.samples.par_iter().map(|&sample| finder.distance(sample) / diagonal).collect();
     let forth: Vec<(f64, f64)> = rows
         .distances
         .iter()
-        .zip(&seen.weights)
+        .zip(&visibility.weights)
         .filter(|&(_, &weight)| weight > 0.0)
         .map(|(&distance, &weight)| (distance / diagonal, weight))
         .collect();
     let total: f64 = forth.iter().map(|&(_, weight)| weight).sum();
-    let accuracy = share(forth.iter().map(|(distance, weight)| distance * weight).sum(), total);
-    let completeness = share(back.iter().sum(), back.len() as f64);
+    let accuracy = ratio(forth.iter().map(|(distance, weight)| distance * weight).sum(), total);
+    let completeness = ratio(back.iter().sum(), back.len() as f64);
     let f_score = |limit: f64| {
         let within = forth.iter().filter(|&&(distance, _)| distance <= limit);
-        let precision = share(within.map(|&(_, weight)| weight).sum(), total);
+        let precision = ratio(within.map(|&(_, weight)| weight).sum(), total);
         let reached = back.iter().filter(|&&distance| distance <= limit).count();
-        let recall = share(reached as f64, back.len() as f64);
+        let recall = ratio(reached as f64, back.len() as f64);
         let sum = precision + recall;
         if sum > 0.0 { 2.0 * precision * recall / sum } else { sum }
     };
@@ -43,16 +43,16 @@ pub(super) fn errors(
     })
 }
 
-/// The smallest value that a `share` of all weight does not exceed; NaN without weight.
-fn percentile(mut values: Vec<(f64, f64)>, share: f64) -> f64 {
+/// The weighted percentile of (value, weight) pairs; NaN without weight.
+fn percentile(mut values: Vec<(f64, f64)>, fraction: f64) -> f64 {
     values.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let goal = share * values.iter().map(|&(_, weight)| weight).sum::<f64>();
+    let goal = fraction * values.iter().map(|&(_, weight)| weight).sum::<f64>();
     let mut sum = 0.0;
     let reached = values.iter().find(|&&(_, weight)| {
         sum += weight;
         sum >= goal
     });
-    // Rounding of the sum may leave the last one short of the goal.
+    // Rounding may leave the sum just below the goal.
     reached.or(values.last()).map_or(f64::NAN, |&(value, _)| value)
 }
 

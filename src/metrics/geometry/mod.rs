@@ -1,15 +1,14 @@
-//! How well Gaussians sit on the surface that the images were made from, where that is known.
+//! Measures how well Gaussians match the surface that the images were rendered from, where known.
 //!
-//! The model and the cameras are in the dataset's normalised coordinates; everything is measured in
-//! the mesh's own, world coordinates, in `f64`. Lengths are reported as fractions of the diagonal
-//! of the mesh's bounding box. The weight of a row, w, is the sum of its blend weights α·T over
-//! all pixels of all training views. Samples are drawn by a fixed seed: the same model has the same
-//! numbers.
+//! The model and the cameras are in normalised coordinates; everything is measured in world
+//! coordinates, those of the mesh, in `f64`. Lengths are fractions of the diagonal of the mesh's
+//! bounding box. The weight of a row, w, is the sum of its blend weights α·T over all pixels of all
+//! training views. Samples have a fixed seed, so that results can be repeated.
 
 mod centres;
 mod pixels;
 mod rows;
-mod seen;
+mod visibility;
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, Signal, SignalSet};
 use densify_scenegen::{GroundTruth, Sight};
@@ -21,33 +20,32 @@ use crate::dataset::normalise::Normalisation;
 use crate::views::{ViewError, ViewSource};
 use pixels::Pixels;
 use rows::Rows;
-use seen::Seen;
+use visibility::Visibility;
 
-/// The numbers. Those of what is not there (no centre, no pixel, no wire) are NaN, or `null` in
+/// The results. Values without data (no centre, no pixel, no thin structure) are NaN, or `null` in
 /// JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Geometry {
     /// Depth on the views measured.
     pub depth: DepthErrors,
-    /// Median angle between the surface's normal and the shortest axis of the Gaussian that stands
-    /// for the pixel `[degrees]`, in 0..=90. That is, of the eight Gaussians of opacity above 0.1
-    /// whose centres are nearest to the surface point, the one that is densest there: a stand-in
-    /// for the one with the largest blend weight. Over pixels as in [`DepthErrors`], of which at
-    /// most some 2,000 per view are taken, on a regular grid.
+    /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel
+    /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
+    /// opacity above 0.1 with the nearest centres; it approximates the one with the largest blend
+    /// weight. Over the pixels of [`DepthErrors`], on a regular grid of about 2,000 per view.
     #[serde(with = "nullable")]
     pub normal_error: f64,
     /// Distance from centres to surface and back.
     pub centres: CentreErrors,
     /// Rows in empty space.
     pub floaters: Floaters,
-    /// Recall of thin structures, by width, thinnest first; empty where the scene has none.
+    /// Recall of thin structures by width, thinnest first; empty if the scene has none.
     pub thin: Vec<ThinRecall>,
     /// How much is spent on little.
     pub redundancy: Redundancy,
 }
 
-/// Rendered depth, Σ α·T·z / Σ α·T, against the first surface's. Over the pixels that show a surface
-/// and where the rendered alpha is above 0.5.
+/// Rendered depth, Σ α·T·z / Σ α·T, against that of the first surface, over the pixels that show a
+/// surface and have a rendered alpha above 0.5.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DepthErrors {
     /// Root mean square error `[diagonals]`.
@@ -56,30 +54,29 @@ pub struct DepthErrors {
     /// Mean of |error| / depth.
     #[serde(with = "nullable")]
     pub abs_rel: f64,
-    /// Share of the pixels that show a surface where the rendered alpha is above 0.5.
+    /// Fraction of the pixels showing a surface that have a rendered alpha above 0.5.
     #[serde(with = "nullable")]
     pub coverage: f64,
 }
 
-/// Centres as points on the surface. Big Gaussians legitimately have their centres off it.
+/// Distances between centres and surface. Large Gaussians may well have their centres off it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CentreErrors {
     /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
     #[serde(with = "nullable")]
     pub accuracy: f64,
-    /// The distance that 95 % of all weight w do not exceed `[diagonals]`.
+    /// 95th percentile of the distance, weighted by w `[diagonals]`.
     #[serde(with = "nullable")]
     pub accuracy_p95: f64,
     /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`. Over
-    /// samples of equal density, 20,000 on the whole mesh, of which those count that at least two
-    /// training views see.
+    /// those of 20,000 uniform samples of the mesh that at least two training views see.
     #[serde(with = "nullable")]
     pub completeness: f64,
     /// Accuracy + completeness `[diagonals]`.
     #[serde(with = "nullable")]
     pub chamfer: f64,
-    /// Harmonic mean of precision, the share of weight w within 0.5 % of the diagonal of the mesh,
-    /// and recall, the share of samples within that of a centre; in 0..=1.
+    /// Harmonic mean of precision (fraction of the weight w within 0.5 % of the diagonal from the
+    /// mesh) and recall (fraction of the samples within that of a centre), in 0..=1.
     #[serde(with = "nullable")]
     pub f_score_half_percent: f64,
     /// The same at 1 %.
@@ -87,41 +84,41 @@ pub struct CentreErrors {
     pub f_score_one_percent: f64,
 }
 
-/// Rows of opacity above 0.05, farther from the mesh than 1 % of the diagonal and than twice their
-/// largest standard deviation, at a place that at least two training views see through: what they
-/// show there is farther away, or nothing.
+/// Rows of opacity above 0.05 whose distance from the mesh exceeds 1 % of the diagonal and twice their
+/// largest standard deviation, at a place that is empty in at least two training views: their first
+/// surface is farther away, or there is none.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Floaters {
     /// Their number.
     pub count: usize,
-    /// Their share of the rows.
+    /// Fraction of the rows.
     #[serde(with = "nullable")]
     pub of_rows: f64,
-    /// Their share of the weight w.
+    /// Fraction of the weight w.
     #[serde(with = "nullable")]
     pub of_weight: f64,
 }
 
-/// Pixels that show a thin structure of about a width. Found are those where alpha is above 0.5,
-/// depth is off by less than the structure's thickness and 1 % of the depth, and colour by less than
-/// 0.1 in the mean over channels.
+/// Pixels that show a thin structure of about this width. They count as found if alpha is above 0.5,
+/// the depth error is below the thickness plus 1 % of the depth, and the colour error, mean over
+/// channels, is below 0.1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ThinRecall {
     /// Width in the image, to the nearest power of two `[px]`.
     pub width: f64,
     /// Pixels that show one.
     pub pixels: usize,
-    /// Share of these that are found.
+    /// Fraction of them that are found.
     pub recall: f64,
 }
 
-/// What rows do for the training views.
+/// How much rows contribute to the training views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Redundancy {
     /// Mean number of rows blended per pixel.
     #[serde(with = "nullable")]
     pub blended_per_pixel: f64,
-    /// Share of rows whose largest blend weight in any pixel of any view is below 0.01.
+    /// Fraction of the rows whose largest blend weight in any pixel of any view is below 0.01.
     #[serde(with = "nullable")]
     pub below_one_percent: f64,
 }
@@ -131,7 +128,7 @@ pub struct Redundancy {
 pub struct Ground<'a> {
     /// The surface.
     pub truth: &'a GroundTruth,
-    /// From the surface's coordinates to the model's and the cameras'.
+    /// From the coordinates of the surface to those of the model and the cameras.
     pub normalisation: &'a Normalisation,
     /// Background colour of the renders, sRGB-encoded in `[0, 1]`.
     pub background: [f32; 3],
@@ -147,7 +144,7 @@ pub enum GeometryError {
     Truth {
         /// The view's name.
         view: String,
-        /// What is wrong.
+        /// The error of the file.
         source: densify_scenegen::Error,
     },
     /// A view's pixels could not be read.
@@ -155,7 +152,7 @@ pub enum GeometryError {
     View {
         /// The view's name.
         view: String,
-        /// What the source of the views says.
+        /// The error of the source of views.
         source: ViewError,
     },
     /// A view could not be rendered.
@@ -163,18 +160,18 @@ pub enum GeometryError {
     Backend {
         /// The view's name.
         view: String,
-        /// What the backend says.
+        /// The error of the backend.
         source: BackendError,
     },
     /// The model could not be copied from the device.
     #[error(transparent)]
     Model(#[from] BackendError),
-    /// There are more rows than can be searched.
+    /// The neighbour search does not support so many rows.
     #[error("{0} rows are too many to search for neighbours")]
     TooManyRows(usize),
 }
 
-/// What a backend must be made for, so that [`measure`] can use it.
+/// The needs with which the backend for [`measure`] is made.
 #[must_use]
 pub fn needs() -> Needs {
     let columns = vec![AuxColumn::WeightSum, AuxColumn::PixelCount];
@@ -186,8 +183,8 @@ pub fn needs() -> Needs {
     }
 }
 
-/// Measures the model in `backend`, which was made for [`needs`]: weights, visibility and emptiness
-/// by the views trained on, depth, normals and thin structures by `views`.
+/// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the views
+/// trained on; depth, normals and thin structures in `views`.
 ///
 /// # Errors
 /// [`GeometryError`] at the first view that cannot be measured.
@@ -198,7 +195,7 @@ pub fn measure(
     views: &impl ViewSource,
 ) -> Result<Geometry, GeometryError> {
     let rows = Rows::new(&backend.download()?, ground);
-    let seen = Seen::by(backend, ground, &rows, train)?;
+    let visibility = Visibility::measure(backend, ground, &rows, train)?;
     let mut pixels = Pixels::new(&rows, ground)?;
     for view in 0..views.count() {
         pixels.add(backend, views, view)?;
@@ -206,10 +203,10 @@ pub fn measure(
     Ok(Geometry {
         depth: pixels.depth(),
         normal_error: pixels.normal_error(),
-        centres: centres::errors(&rows, &seen, ground)?,
-        floaters: seen.floaters(&rows, ground.diagonal()),
+        centres: centres::errors(&rows, &visibility, ground)?,
+        floaters: visibility.floaters(&rows, ground.diagonal()),
         thin: pixels.thin(),
-        redundancy: seen.redundancy(),
+        redundancy: visibility.redundancy(),
     })
 }
 
@@ -241,13 +238,13 @@ impl Ground<'_> {
     }
 }
 
-/// `sum / count`; NaN where there is nothing.
-fn share(sum: f64, count: f64) -> f64 {
+/// `sum / count`; NaN if `count` is 0.
+fn ratio(sum: f64, count: f64) -> f64 {
     // An empty sum is −0.
     if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
 }
 
-/// NaN as `null`, which JSON has for it, and back.
+/// Stores NaN as `null`, as JSON has no NaN.
 mod nullable {
     use serde::{Deserialize, Deserializer, Serializer};
 

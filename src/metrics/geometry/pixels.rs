@@ -1,4 +1,4 @@
-//! Pixel by pixel: depth, normals and thin structures in the views measured.
+//! Measures depth, normals and thin structures in every pixel of the views.
 
 use std::collections::BTreeMap;
 
@@ -6,18 +6,18 @@ use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
-use super::{DepthErrors, GeometryError, Ground, ThinRecall, share};
+use super::{DepthErrors, GeometryError, Ground, ThinRecall, ratio};
 use crate::backend::{Backend, Rendering};
 use crate::dataset::images::Image8;
 use crate::views::ViewSource;
 
 /// Alpha above which a pixel is covered.
 const COVERED: f32 = 0.5;
-/// Most pixels of a view whose normals are compared, about.
+/// Approximate number of pixels of a view whose normals are compared.
 const NORMALS: usize = 2000;
-/// Error of a thin structure's depth, beside its thickness `[depth]`.
+/// Largest depth error of a thin structure, in addition to its thickness `[fraction of the depth]`.
 const DEPTH_SLACK: f64 = 0.01;
-/// Largest error of its colour, mean over channels.
+/// Largest colour error of a thin structure, mean over channels.
 const COLOUR_SLACK: f32 = 0.1;
 
 /// Sums over the pixels.
@@ -31,7 +31,7 @@ pub(super) struct Pixels<'a> {
     relative: f64,
     /// `[degrees]`
     angles: Vec<f64>,
-    /// By the logarithm to base 2 of the width: pixels, and those found.
+    /// Pixels, and pixels found, by the base-2 logarithm of the width.
     thin: BTreeMap<i32, (usize, usize)>,
 }
 
@@ -91,7 +91,7 @@ impl<'a> Pixels<'a> {
         if ground.truth.has_thin() {
             let source = |source| GeometryError::View { view: name.to_owned(), source };
             let image = views.image(view).map_err(source)?;
-            let met: Vec<(i32, bool)> = shown
+            let thin_pixels: Vec<(i32, bool)> = shown
                 .par_iter()
                 .filter_map(|&i| {
                     let depth = f64::from(sight.depth[i]);
@@ -106,7 +106,7 @@ impl<'a> Pixels<'a> {
                     Some((octave, found))
                 })
                 .collect();
-            for (octave, found) in met {
+            for (octave, found) in thin_pixels {
                 let (pixels, hits) = self.thin.entry(octave).or_default();
                 *pixels += 1;
                 *hits += usize::from(found);
@@ -118,13 +118,13 @@ impl<'a> Pixels<'a> {
     pub(super) fn depth(&self) -> DepthErrors {
         let covered = self.covered as f64;
         DepthErrors {
-            rmse: share(self.squares, covered).sqrt() / self.ground.diagonal(),
-            abs_rel: share(self.relative, covered),
-            coverage: share(covered, self.surface as f64),
+            rmse: ratio(self.squares, covered).sqrt() / self.ground.diagonal(),
+            abs_rel: ratio(self.relative, covered),
+            coverage: ratio(covered, self.surface as f64),
         }
     }
 
-    /// The median; of an even number the upper one.
+    /// The (upper) median.
     pub(super) fn normal_error(&self) -> f64 {
         let mut angles = self.angles.clone();
         angles.sort_by(f64::total_cmp);
@@ -135,19 +135,19 @@ impl<'a> Pixels<'a> {
         let recall = |(&octave, &(pixels, hits)): (&i32, &(usize, usize))| ThinRecall {
             width: f64::from(octave).exp2(),
             pixels,
-            recall: share(hits as f64, pixels as f64),
+            recall: ratio(hits as f64, pixels as f64),
         };
         self.thin.iter().map(recall).collect()
     }
 }
 
-/// Rendered depth `[world units]` where the pixel is covered.
+/// Rendered depth of a covered pixel `[world units]`.
 fn depth_at(rendering: &Rendering, pixel: usize, scale: f64) -> Option<f64> {
     let alpha = rendering.alpha[pixel];
     (alpha > COVERED).then(|| f64::from(rendering.depth[pixel]) / f64::from(alpha) / scale)
 }
 
-/// Between two lines, in 0..=90 `[degrees]`.
+/// Angle between two lines, in 0..=90 `[degrees]`.
 fn angle(a: DVec3, b: DVec3) -> f64 {
     a.cross(b).length().atan2(a.dot(b).abs()).to_degrees()
 }

@@ -11,7 +11,7 @@ use crate::gaussians::{Gaussians, sigmoid};
 
 /// Opacity above which a row counts as part of the surface.
 const SOLID: f32 = 0.1;
-/// Nearest centres among which the row that stands for a surface point is sought.
+/// Nearest centres among which the row at a surface point is chosen.
 const NEIGHBOURS: usize = 8;
 
 /// Rows, structure of arrays. Shape of each: `[rows]`.
@@ -23,7 +23,7 @@ pub(super) struct Rows {
     /// Orientations: columns are the axes that the scales belong to.
     pub(super) axes: Vec<DMat3>,
     pub(super) opacities: Vec<f32>,
-    /// From centre to surface `[world units]`.
+    /// Distance from centre to surface `[world units]`.
     pub(super) distances: Vec<f64>,
 }
 
@@ -54,7 +54,7 @@ impl Rows {
     }
 }
 
-/// Finds solid rows near a place.
+/// Finds solid rows near a point.
 pub(super) struct Finder {
     tree: Option<ImmutableKdTree<f64, 3>>,
     /// Row of each entry of the tree.
@@ -76,7 +76,7 @@ impl Finder {
         Ok(Self { tree, rows: solid })
     }
 
-    /// Distance to the nearest solid centre; infinite where there is none.
+    /// Distance to the nearest solid centre; infinite if there is none.
     pub(super) fn distance(&self, place: DVec3) -> f64 {
         let Some(tree) = &self.tree else { return f64::INFINITY };
         let query = place.to_array();
@@ -85,8 +85,7 @@ impl Finder {
         found.iter().map(|hit| hit.distance.sqrt()).fold(f64::INFINITY, f64::min)
     }
 
-    /// The shortest axis of the solid row that is densest at a place, of those with the nearest
-    /// centres.
+    /// The shortest axis of the densest solid row at a point, among those with the nearest centres.
     pub(super) fn normal(&self, rows: &Rows, place: DVec3) -> Option<DVec3> {
         let tree = self.tree.as_ref()?;
         let query = place.to_array();

@@ -215,7 +215,7 @@ fn a_damaged_checkpoint_is_named_and_the_one_before_is_taken() {
         ("a bit of a tensor", flipped(sound.len() - 3), "damaged"),
         ("a bit of the header", flipped(find("rho")), "damaged"),
         ("newer", newer, "version 2"),
-        ("foreign", foreign, "no checkpoint of densify"),
+        ("foreign", foreign, "not a checkpoint of densify"),
         ("a picture", read(&scene.path().join("images/view_00.png")), "no safetensors"),
     ];
     for (what, bytes, words) in &faults {

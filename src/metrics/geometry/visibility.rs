@@ -1,47 +1,47 @@
-//! What the training views say about rows: their weight, and whether their place is empty.
+//! Measures rows in the training views: their weight, and whether their place is empty.
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Signal};
-use densify_scenegen::{Camera as Caster, Sight};
+use densify_scenegen::{Camera as RayCamera, Sight};
 use glam::DVec3;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::prelude::*;
 
 use super::rows::Rows;
-use super::{Floaters, GeometryError, Ground, Redundancy, needs, share};
+use super::{Floaters, GeometryError, Ground, Redundancy, needs, ratio};
 use crate::backend::{AuxInput, Backend};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::views::ViewSource;
 
-/// Points on the mesh.
+/// Number of points on the mesh.
 const SAMPLES: usize = 20_000;
 const SEED: u64 = 0x6d65_7368;
-/// Opacity above which a row can be a floater.
-const FAINT: f32 = 0.05;
-/// Distance from the mesh beyond which it can be one `[diagonals]`.
-const NEAR: f64 = 0.01;
-/// Largest blend weight below which a row does next to nothing.
-const IDLE: f32 = 0.01;
-/// Views that must agree.
-const WITNESSES: u32 = 2;
+/// Smallest opacity of a floater.
+const MIN_OPACITY: f32 = 0.05;
+/// Smallest distance of a floater from the mesh `[diagonals]`.
+const MIN_DISTANCE: f64 = 0.01;
+/// Largest blend weight of a row with negligible effect.
+const NEGLIGIBLE: f32 = 0.01;
+/// Number of views that must agree.
+const MIN_VIEWS: u32 = 2;
 
 /// Sums over the training views.
-pub(super) struct Seen {
+pub(super) struct Visibility {
     /// Σ α·T of each row.
     pub(super) weights: Vec<f64>,
     /// Largest α·T of each row.
     peaks: Vec<f32>,
-    /// Views that see through each row's place.
+    /// Number of views in which each row's place is empty.
     empty: Vec<u32>,
-    /// (row, pixel) pairs blended, and pixels.
+    /// Number of (row, pixel) pairs blended, and of pixels.
     blended: (f64, f64),
-    /// Points on the mesh that enough views see.
+    /// Points on the mesh that enough views show.
     pub(super) samples: Vec<DVec3>,
 }
 
-impl Seen {
-    pub(super) fn by(
+impl Visibility {
+    pub(super) fn measure(
         backend: &mut dyn Backend,
         ground: &Ground<'_>,
         rows: &Rows,
@@ -49,7 +49,7 @@ impl Seen {
     ) -> Result<Self, GeometryError> {
         let mut samples: Vec<(DVec3, u32)> =
             sample(&ground.truth.surface().triangles()).into_iter().map(|p| (p, 0)).collect();
-        let mut seen = Self {
+        let mut visibility = Self {
             weights: vec![0.0; rows.len()],
             peaks: Vec::new(),
             empty: vec![0; rows.len()],
@@ -62,26 +62,30 @@ impl Seen {
             let name = views.name(number);
             let failed = |source| GeometryError::Backend { view: name.to_owned(), source };
             let camera = views.camera(number);
-            seen.weigh(backend, ground, camera, &request).map_err(failed)?;
-            let (world, caster) = ground.cameras(camera);
-            let sight = ground.sight(name, &caster)?;
-            let places = seen.empty.par_iter_mut().zip(&rows.centres);
-            places.for_each(|(empty, &place)| *empty += u32::from(is_empty(&world, &sight, place)));
+            visibility.weigh(backend, ground, camera, &request).map_err(failed)?;
+            let (world, ray_camera) = ground.cameras(camera);
+            let sight = ground.sight(name, &ray_camera)?;
+            let places = visibility.empty.par_iter_mut().zip(&rows.centres);
+            places.for_each(|(empty, &place)| {
+                *empty += u32::from(sees_through(&world, &sight, place))
+            });
             let surface = ground.truth.surface();
-            samples.par_iter_mut().filter(|(_, views)| *views < WITNESSES).for_each(
+            samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS).for_each(
                 |(at, views)| {
-                    *views +=
-                        u32::from(shows(&caster, *at) && !surface.blocked(caster.centre, *at));
+                    *views += u32::from(
+                        in_image(&ray_camera, *at) && !surface.blocked(ray_camera.centre, *at),
+                    );
                 },
             );
         }
-        let enough = samples.into_iter().filter(|(_, views)| *views >= WITNESSES);
-        seen.samples = enough.map(|(place, _)| place).collect();
+        let enough = samples.into_iter().filter(|(_, views)| *views >= MIN_VIEWS);
+        visibility.samples = enough.map(|(place, _)| place).collect();
         let failed = |source| GeometryError::Backend { view: "all".to_owned(), source };
         let signals = backend.take_signals(wanted.signals).map_err(failed)?;
-        // Always among the signals: they are what `needs` names.
-        seen.peaks = signals.get(Signal::FreshWeightMax).map(<[f32]>::to_vec).unwrap_or_default();
-        Ok(seen)
+        // `needs` requests this signal.
+        visibility.peaks =
+            signals.get(Signal::FreshWeightMax).map(<[f32]>::to_vec).unwrap_or_default();
+        Ok(visibility)
     }
 
     /// Adds the blend weights of one view.
@@ -93,7 +97,7 @@ impl Seen {
         request: &AuxRequest,
     ) -> Result<(), crate::backend::BackendError> {
         let pixels = camera.width as usize * camera.height as usize;
-        // Only weights are asked for, and they do not depend on it.
+        // The weights, which are all that is requested, do not depend on it.
         let target = Image8 {
             width: camera.width,
             height: camera.height,
@@ -128,8 +132,10 @@ impl Seen {
 
     /// Whether rows are floaters, by the definition of [`Floaters`].
     fn is_floater(&self, rows: &Rows, row: usize, diagonal: f64) -> bool {
-        let clear = (NEAR * diagonal).max(2.0 * rows.scales[row].max_element());
-        rows.opacities[row] > FAINT && rows.distances[row] > clear && self.empty[row] >= WITNESSES
+        let clear = (MIN_DISTANCE * diagonal).max(2.0 * rows.scales[row].max_element());
+        rows.opacities[row] > MIN_OPACITY
+            && rows.distances[row] > clear
+            && self.empty[row] >= MIN_VIEWS
     }
 
     pub(super) fn floaters(&self, rows: &Rows, diagonal: f64) -> Floaters {
@@ -138,22 +144,22 @@ impl Seen {
         let weight: f64 = all.iter().map(|&row| self.weights[row]).sum();
         Floaters {
             count: all.len(),
-            of_rows: share(all.len() as f64, rows.len() as f64),
-            of_weight: share(weight, self.weights.iter().sum()),
+            of_rows: ratio(all.len() as f64, rows.len() as f64),
+            of_weight: ratio(weight, self.weights.iter().sum()),
         }
     }
 
     pub(super) fn redundancy(&self) -> Redundancy {
-        let idle = self.peaks.iter().filter(|&&peak| peak < IDLE).count();
+        let idle = self.peaks.iter().filter(|&&peak| peak < NEGLIGIBLE).count();
         Redundancy {
-            blended_per_pixel: share(self.blended.0, self.blended.1),
-            below_one_percent: share(idle as f64, self.peaks.len() as f64),
+            blended_per_pixel: ratio(self.blended.0, self.blended.1),
+            below_one_percent: ratio(idle as f64, self.peaks.len() as f64),
         }
     }
 }
 
-/// Whether a view shows something behind a place, or nothing at all there.
-fn is_empty(camera: &Camera, sight: &Sight, place: DVec3) -> bool {
+/// Whether a view shows a surface behind a point, or none.
+fn sees_through(camera: &Camera, sight: &Sight, place: DVec3) -> bool {
     let (pixel, depth) = camera.project(place);
     let (width, height) = (f64::from(sight.width), f64::from(sight.height));
     let on_image = (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y);
@@ -164,12 +170,12 @@ fn is_empty(camera: &Camera, sight: &Sight, place: DVec3) -> bool {
     shown <= 0.0 || depth < f64::from(shown)
 }
 
-fn shows(camera: &Caster, place: DVec3) -> bool {
+fn in_image(camera: &RayCamera, place: DVec3) -> bool {
     let (pixel, depth) = camera.project(place);
     depth > 0.0 && camera.contains(pixel)
 }
 
-/// Points of equal density on the triangles, in their order.
+/// Points of uniform density on the triangles, in their order.
 fn sample(triangles: &[[DVec3; 3]]) -> Vec<DVec3> {
     let area = |[a, b, c]: &[DVec3; 3]| 0.5 * (*b - *a).cross(*c - *a).length();
     let total: f64 = triangles.iter().map(area).sum();
