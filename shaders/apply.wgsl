@@ -9,11 +9,11 @@ const WORDS: u32 = 16u;
 // Any buffer with rows.
 @group(0) @binding(2) var<storage, read_write> buffer: array<u32>;
 // The geometry: twelve numbers per row.
-@group(0) @binding(3) var<storage, read_write> params: array<f32>;
-@group(0) @binding(4) var<storage, read_write> dc: array<f32>;
-@group(0) @binding(5) var<storage, read_write> first: array<f32>;
-@group(0) @binding(6) var<storage, read_write> second: array<f32>;
-@group(0) @binding(7) var<storage, read_write> waiting: array<f32>;
+@group(0) @binding(3) var<storage, read_write> rows: array<f32>;
+@group(0) @binding(4) var<storage, read_write> sh0: array<f32>;
+@group(0) @binding(5) var<storage, read_write> first_rows: array<f32>;
+@group(0) @binding(6) var<storage, read_write> second_rows: array<f32>;
+@group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
 
 // Operations (from, to): copies row `from`, or clears `to` where it is NONE. now.a: operations,
 // now.b: numbers per row, now.c: distance between rows, now.d: between the numbers of a row.
@@ -104,13 +104,13 @@ fn real(at: u32) -> f32 {
 fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: f32) {
     let base = 12u * row;
     for (var k = 0u; k < 3u; k++) {
-        params[base + k] = mean[k];
-        params[base + 3u + k] = log_scale[k];
+        rows[base + k] = mean[k];
+        rows[base + 3u + k] = log_scale[k];
     }
     for (var k = 0u; k < 4u; k++) {
-        params[base + 6u + k] = quat[k];
+        rows[base + 6u + k] = quat[k];
     }
-    params[base + 10u] = logit;
+    rows[base + 10u] = logit;
 }
 
 // Families; now.a: how many, now.b: seed, now.c: step. An operation: parent, place of the first
@@ -129,11 +129,11 @@ fn breed(
     let op = i * WORDS;
     let parent = ops[op];
     let base = 12u * parent;
-    let mean = vec3(params[base], params[base + 1u], params[base + 2u]);
-    let log_scale = vec3(params[base + 3u], params[base + 4u], params[base + 5u]);
-    let quat = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
+    let mean = vec3(rows[base], rows[base + 1u], rows[base + 2u]);
+    let log_scale = vec3(rows[base + 3u], rows[base + 4u], rows[base + 5u]);
+    let quat = vec4(rows[base + 6u], rows[base + 7u], rows[base + 8u], rows[base + 9u]);
     let scales = scales_of(log_scale, ops[op + 9u], vec2(real(op + 10u), real(op + 11u)));
-    let logit = logit_after(params[base + 10u], ops[op + 12u], real(op + 13u));
+    let logit = logit_after(rows[base + 10u], ops[op + 12u], real(op + 13u));
     let children = ops[op + 2u];
     for (var k = 0u; k < children; k++) {
         let at = mean + offset_of(op, ops[op + 3u] + k, parent, log_scale, quat);
@@ -180,12 +180,12 @@ fn rewrite(
     }
     let op = i * WORDS;
     let base = 12u * ops[op];
-    let log_scale = vec3(params[base + 3u], params[base + 4u], params[base + 5u]);
+    let log_scale = vec3(rows[base + 3u], rows[base + 4u], rows[base + 5u]);
     let scales = scales_of(log_scale, ops[op + 1u], vec2(real(op + 2u), real(op + 3u)));
     for (var k = 0u; k < 3u; k++) {
-        params[base + 3u + k] = scales[k];
+        rows[base + 3u + k] = scales[k];
     }
-    params[base + 10u] = logit_after(params[base + 10u], ops[op + 4u], real(op + 5u));
+    rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 4u], real(op + 5u));
 }
 
 // Seeds; now.a: how many. An operation: row, mean, log-scale, logit, three coefficients of band 0,
@@ -204,7 +204,7 @@ fn sow(
     let mean = vec3(real(op + 1u), real(op + 2u), real(op + 3u));
     put(row, mean, vec3(real(op + 4u)), vec4(1.0, 0.0, 0.0, 0.0), real(op + 5u));
     for (var k = 0u; k < 3u; k++) {
-        dc[3u * row + k] = real(op + 6u + k);
+        sh0[3u * row + k] = real(op + 6u + k);
     }
 }
 
@@ -220,10 +220,10 @@ fn clamp_opacity(
         return;
     }
     let at = 12u * row + 10u;
-    params[at] = min(params[at], bitcast<f32>(now.b));
-    first[at] = 0.0;
-    second[at] = 0.0;
+    rows[at] = min(rows[at], bitcast<f32>(now.b));
+    first_rows[at] = 0.0;
+    second_rows[at] = 0.0;
     if now.c != 0u {
-        waiting[at] = 0.0;
+        waiting_rows[at] = 0.0;
     }
 }

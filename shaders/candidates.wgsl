@@ -6,7 +6,7 @@
 @group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read> params: array<f32>;
+@group(0) @binding(6) var<storage, read> rows: array<f32>;
 // Numbers of the pixels.
 @group(0) @binding(7) var<storage, read> pixels: array<u32>;
 // Where the surface is, and its depth; depth 0 where there is none.
@@ -76,13 +76,13 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
     // Camera z along this vector is 1, so that the parameter of the ray is the depth.
     let ray = frame.rotation[0].xyz * ratio.x + frame.rotation[1].xyz * ratio.y + frame.rotation[2].xyz;
     let base = 12u * row;
-    let mean = vec3(params[base], params[base + 1u], params[base + 2u]);
+    let mean = vec3(rows[base], rows[base + 1u], rows[base + 2u]);
     let scale = vec3(
-        exp_exact(params[base + 3u]),
-        exp_exact(params[base + 4u]),
-        exp_exact(params[base + 5u]),
+        exp_exact(rows[base + 3u]),
+        exp_exact(rows[base + 4u]),
+        exp_exact(rows[base + 5u]),
     );
-    let back = vec4(params[base + 6u], -params[base + 7u], -params[base + 8u], -params[base + 9u]);
+    let back = vec4(rows[base + 6u], -rows[base + 7u], -rows[base + 8u], -rows[base + 9u]);
     let direction = rotate(back, ray) / scale;
     let offset = rotate(back, frame.centre.xyz - mean) / scale;
     let depth = -dot(direction, offset) / dot(direction, direction);

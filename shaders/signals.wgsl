@@ -8,7 +8,7 @@
 @group(0) @binding(4) var<storage, read> row_sums: array<f32>;
 @group(0) @binding(5) var<storage, read> depths: array<u32>;
 @group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read> params: array<f32>;
+@group(0) @binding(7) var<storage, read> rows: array<f32>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
 
 override DETAIL: u32 = 0u;
@@ -139,8 +139,8 @@ fn present(
     if row >= frame.model.x {
         return;
     }
-    let s = vec3(params[12u * row + 3u], params[12u * row + 4u], params[12u * row + 5u]);
-    let logit = params[12u * row + 10u];
+    let s = vec3(rows[12u * row + 3u], rows[12u * row + 4u], rows[12u * row + 5u]);
+    let logit = rows[12u * row + 10u];
     var value = f32(ages[row] & 0xffffu);
     switch now.a {
         case 0u: {

@@ -10,7 +10,7 @@
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 // Groups of indirect dispatches, three numbers each; see ARGS_*.
-@group(0) @binding(2) var<storage, read_write> groups_of: array<u32>;
+@group(0) @binding(2) var<storage, read_write> groups: array<u32>;
 @group(0) @binding(3) var<storage, read> depths: array<u32>;
 @group(0) @binding(4) var<storage, read> footprints: array<vec4<u32>>;
 @group(0) @binding(5) var<storage, read> keys_in: array<u32>;
@@ -35,7 +35,7 @@ const EACH: u32 = 8u;
 // Where sums saturate: beyond any cap.
 const MOST: u32 = 0x40000000u;
 
-// Places in groups_of.
+// Places in groups.
 const ARGS_ROWS: u32 = 0u;
 const ARGS_ROW_BLOCKS: u32 = 3u;
 const ARGS_ROW_DIGITS: u32 = 6u;
@@ -55,9 +55,9 @@ fn ceil_div(a: u32, b: u32) -> u32 {
 }
 
 fn set_groups(at: u32, count: u32) {
-    groups_of[at] = min(count, ACROSS);
-    groups_of[at + 1u] = ceil_div(count, ACROSS);
-    groups_of[at + 2u] = 1u;
+    groups[at] = min(count, ACROSS);
+    groups[at + 1u] = ceil_div(count, ACROSS);
+    groups[at + 2u] = 1u;
 }
 
 // --- Sums ---------------------------------------------------------------------------------------

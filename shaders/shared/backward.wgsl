@@ -4,7 +4,7 @@
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
 // dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set.
-@group(0) @binding(7) var<storage, read> gradient: array<f32>;
+@group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
 // Fields of a sum: 0: what training needs, 1: and the largest blend weight, 2: every field.
 override DETAIL: u32 = 0u;
@@ -33,7 +33,7 @@ fn plane(n: u32, quad: Quad) -> vec4<f32> {
     var g = vec4(0.0);
     for (var p = 0u; p < 4u; p++) {
         if quad.inside[p] {
-            g[p] = gradient[first + quad.place[p]];
+            g[p] = pixel_gradient[first + quad.place[p]];
         }
     }
     return g;

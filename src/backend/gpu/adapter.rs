@@ -5,7 +5,8 @@ use wgpu::{
 };
 
 use super::accumulation::Accumulation;
-use super::device::wait;
+use super::rows::widest_row;
+use super::wait::wait;
 use crate::backend::BackendError;
 
 /// What an adapter is.
@@ -71,8 +72,8 @@ impl AdapterSummary {
     /// band of the coefficients, or the geometry, or the gradients of a row.
     #[must_use]
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
-        let per_row = if sh_degree >= 3 { 84 } else { 80 };
-        (self.largest_binding.min(self.largest_buffer) / per_row).min(MOST_ROWS)
+        let largest = self.largest_binding.min(self.largest_buffer);
+        (largest / widest_row(sh_degree)).min(MOST_ROWS)
     }
 
     /// How it adds up gradients where nobody says: as fast as it can.

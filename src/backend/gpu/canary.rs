@@ -5,6 +5,7 @@ use densify_policies::policy::{Cadence, Needs};
 use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DMat3, DVec3};
 
+use super::signals::Planes;
 use super::{GpuBackend, GpuDevice, GpuOptions};
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::backend::{Backend, BackendError, LearningRates, StepInput, StepOutput};
@@ -86,11 +87,31 @@ fn run(
     Ok((outputs, backend.render(camera, BACKGROUND, 1)?.rgb))
 }
 
+impl GpuBackend {
+    /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
+    /// shown on a small scene that it computes what the native backend does.
+    ///
+    /// # Errors
+    /// [`BackendError`]: a limit of the device, its memory, or a driver that computes wrongly.
+    ///
+    /// # Panics
+    /// When the model has more rows than the budget: the caller subsamples before.
+    pub fn new(
+        model: &Gaussians,
+        options: &GpuOptions,
+        device: &GpuDevice,
+    ) -> Result<Self, BackendError> {
+        let detail = Planes::new(&options.needs).detail;
+        device.0.prove(detail, || check(device, &options.needs))?;
+        Self::without_canary(model, options, device)
+    }
+}
+
 /// Compares the device with the native backend, with the kernels that these needs take.
 ///
 /// # Errors
 /// [`BackendError::Device`] with what differs.
-pub(super) fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
+fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
     let (model, camera, target) = scene();
     let needs = Needs { signals: needs.signals, ..Needs::default() };
     let rows = model.len();

@@ -1,30 +1,14 @@
 //! An open device with its kernels, and how its errors become ours.
 
-use std::future::Future;
-use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::task::{Context, Poll, Waker};
 
 use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::accumulation::Accumulation;
 use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
-use super::buffers::{Planned, Sizes};
 use super::pipelines::{Pipelines, Variant};
+use super::wait::wait;
 use crate::backend::BackendError;
-use crate::memory::Bytes;
-
-/// Runs a future of wgpu's to its end; on native systems they are ready at once.
-pub(super) fn wait<T>(future: impl Future<Output = T>) -> T {
-    let mut future = pin!(future);
-    let mut context = Context::from_waker(Waker::noop());
-    loop {
-        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
-            return value;
-        }
-        std::thread::yield_now();
-    }
-}
 
 /// What a device tells outside of any call.
 #[derive(Debug, Default)]
@@ -174,35 +158,6 @@ impl Device {
         }
         self.check()?;
         Ok(made)
-    }
-
-    /// Refuses what this device could not bind: a driver may take it and fail later.
-    pub(super) fn check_sizes(
-        &self,
-        planned: &[Planned],
-        sizes: &Sizes,
-    ) -> Result<(), BackendError> {
-        let most = self.largest_binding();
-        // Photographs that are kept are copied only, and as many as a buffer holds.
-        let bound = planned.iter().filter(|p| p.name != "photographs");
-        let Some(worst) = bound.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
-            return Ok(());
-        };
-        let device = &self.summary.name;
-        let (needs, has) = (Bytes(worst.bytes), Bytes(most));
-        let remedy = match worst.name {
-            "records" | "keys 0" | "sums" => {
-                format!("use --tile-cap {}", most / (worst.bytes / sizes.cap).max(1))
-            }
-            "canvas" | "finish" | "pixel gradient" | "derivatives" => {
-                "shrink the images with --resolution".into()
-            }
-            _ => format!("use --budget {}", self.summary.largest_budget(sizes.sh_degree)),
-        };
-        Err(BackendError::OverLimit(format!(
-            "{}: {needs} in one buffer, but {device} takes {has} at most; {remedy}",
-            worst.what
-        )))
     }
 
     /// Largest buffer that a kernel can use `[bytes]`.

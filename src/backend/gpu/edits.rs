@@ -4,14 +4,11 @@
 use densify_policies::plan::{OpacityRule, ParentFate, Placement, RowOps, ScaleRule};
 
 use super::GpuBackend;
-use super::buffers::{
-    Buffers, FIRST_SH, OPS_BYTES, SECOND_SH, SH, Sizes, WAITING_SH, band_coefficients,
-};
-use super::device::Device;
 use super::frame::folded_seed;
+use super::launches::{Launch, RowLaunch};
 use super::passes::Recorder;
-use super::pipelines::{Kernel, Launch, Pipelines};
-use super::signals::Planes;
+use super::rows::Edited;
+use super::sizes::OPS_BYTES;
 use crate::gaussians::{logit, rgb_to_dc};
 
 /// Numbers that fit one chunk.
@@ -20,80 +17,6 @@ const CHUNK: usize = (OPS_BYTES / 4) as usize;
 const WORDS: usize = 16;
 /// In place of a source: clear the row.
 const NOTHING: u32 = u32::MAX;
-
-/// A buffer with rows: how many numbers a row has, how far apart rows are, and a row's numbers.
-#[derive(Debug)]
-pub(super) struct RowBuffer {
-    launch: Launch,
-    words: u32,
-    pitch: [u32; 2],
-}
-
-/// The edits' kernels with their buffers.
-#[derive(Debug)]
-pub(super) struct EditLaunches {
-    /// The geometry, and the bands of colour.
-    rows: RowBuffer,
-    bands: Vec<RowBuffer>,
-    /// What a newborn row has none of: moments, gradients that wait, age, signals.
-    past: Vec<RowBuffer>,
-    breed: Launch,
-    rewrite: Launch,
-    sow: Launch,
-    clamp: Launch,
-}
-
-impl EditLaunches {
-    pub(super) fn new(
-        device: &Device,
-        sizes: &Sizes,
-        planes: &Planes,
-        buffers: &Buffers,
-        pipelines: &Pipelines,
-    ) -> Self {
-        let bind = |kernel, names: &[&'static str]| {
-            pipelines.launch(&device.device, buffers, kernel, names)
-        };
-        let dense = |name: &'static str, words: usize| RowBuffer {
-            launch: bind(Kernel::CopyRows, &["ops", name]),
-            words: words as u32,
-            pitch: [words as u32, 1],
-        };
-        let bands = 0..=usize::from(sizes.sh_degree);
-        let [main_waits, rest_waits] = sizes.waits();
-        let mut past = vec![dense("first rows", 12), dense("second rows", 12), dense("ages", 1)];
-        if main_waits {
-            past.push(dense("waiting rows", 12));
-        }
-        for band in bands.clone() {
-            let words = 3 * band_coefficients(band);
-            past.push(dense(FIRST_SH[band], words));
-            past.push(dense(SECOND_SH[band], words));
-            if if band == 0 { main_waits } else { rest_waits } {
-                past.push(dense(WAITING_SH[band], words));
-            }
-        }
-        if planes.count > 0 {
-            past.push(RowBuffer {
-                launch: bind(Kernel::CopyRows, &["ops", "signals"]),
-                words: planes.count,
-                pitch: [1, sizes.budget as u32],
-            });
-        }
-        Self {
-            rows: dense("rows", 12),
-            bands: bands.map(|band| dense(SH[band], 3 * band_coefficients(band))).collect(),
-            past,
-            breed: bind(Kernel::Breed, &["ops", "rows"]),
-            rewrite: bind(Kernel::Rewrite, &["ops", "rows"]),
-            sow: bind(Kernel::Sow, &["ops", "rows", SH[0]]),
-            clamp: bind(
-                Kernel::ClampOpacity,
-                &["rows", "first rows", "second rows", "waiting rows"],
-            ),
-        }
-    }
-}
 
 fn scale_words(rule: ScaleRule) -> [u32; 3] {
     match rule {
@@ -184,23 +107,23 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
 
 impl GpuBackend {
     /// Uploads one chunk of operations and executes what `encode` records.
-    fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_, '_>)) {
+    fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_>)) {
         self.device.queue.write_buffer(self.buffers.get("ops"), 0, bytemuck::cast_slice(words));
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&mut Recorder { pass, pipelines: &self.pipelines });
+        encode(&mut Recorder { pass });
         self.device.queue.submit([encoder.finish()]);
     }
 
-    /// Copies rows (from, to), or clears them, in all of these buffers.
-    fn copy_rows(&self, pairs: &[[u32; 2]], buffers: &[&[RowBuffer]]) {
+    /// Copies rows (from, to), or clears them, in all arrays that are edited in one of these ways.
+    fn copy_rows(&self, pairs: &[[u32; 2]], ways: &[Edited]) {
         for chunk in pairs.chunks(CHUNK / 2) {
             self.execute(chunk.as_flattened(), |to| {
-                for RowBuffer { launch, words, pitch: [row, word] } in
-                    buffers.iter().copied().flatten()
-                {
+                for array in self.launches.copy_rows.iter().filter(|a| ways.contains(&a.edited)) {
+                    let RowLaunch { launch, numbers, pitch: [row, number], .. } = array;
                     let count = chunk.len() as u32;
-                    to.run(launch, [count, *words, *row, *word], (count * words).div_ceil(256));
+                    let now = [count, *numbers, *row, *number];
+                    to.run(launch, now, (count * numbers).div_ceil(256));
                 }
             });
         }
@@ -218,11 +141,11 @@ impl GpuBackend {
 
     /// Executes a plan that holds, in the order of [`RowOps`].
     pub(super) fn edit(&mut self, ops: &RowOps, seed: u64, step: u32) {
-        let edits = &self.edits;
+        let launches = &self.launches;
         let clear = |row: u32| [NOTHING, row];
         for (count, words) in family_chunks(ops, CHUNK) {
             let now = [count as u32, folded_seed(seed), step, 0];
-            self.execute(&words, |to| to.run(&edits.breed, now, (count as u32).div_ceil(256)));
+            self.execute(&words, |to| to.run(&launches.breed, now, (count as u32).div_ceil(256)));
         }
         let mut births: Vec<[u32; 2]> = Vec::new();
         let mut reborn: Vec<[u32; 2]> = Vec::new();
@@ -234,7 +157,7 @@ impl GpuBackend {
                 reborn.push(clear(family.parent));
             }
         }
-        self.copy_rows(&births, &[&edits.bands]);
+        self.copy_rows(&births, &[Edited::Inherited]);
         let updates: Vec<_> = ops
             .updates
             .iter()
@@ -246,10 +169,10 @@ impl GpuBackend {
                 words
             })
             .collect();
-        self.run_ops(&edits.rewrite, &updates);
+        self.run_ops(&launches.rewrite, &updates);
         reborn.extend(ops.updates.iter().filter(|(_, u)| !u.keep_moments).map(|u| clear(u.0)));
         let seeded: Vec<_> = ops.seeds.iter().map(|&(row, _)| clear(row)).collect();
-        self.copy_rows(&seeded, &[&edits.bands]);
+        self.copy_rows(&seeded, &[Edited::Inherited]);
         let seeds: Vec<_> = ops
             .seeds
             .iter()
@@ -263,16 +186,16 @@ impl GpuBackend {
                 words
             })
             .collect();
-        self.run_ops(&edits.sow, &seeds);
+        self.run_ops(&launches.sow, &seeds);
         reborn.extend(seeded);
-        self.copy_rows(&reborn, &[&edits.past]);
+        self.copy_rows(&reborn, &[Edited::Cleared]);
         let moves: Vec<_> = ops.moves.iter().map(|&(from, to)| [from, to]).collect();
-        self.copy_rows(&moves, &[std::slice::from_ref(&edits.rows), &edits.bands, &edits.past]);
+        self.copy_rows(&moves, &[Edited::Computed, Edited::Inherited, Edited::Cleared]);
         if let Some(most) = ops.clamp_opacity {
             let rows = ops.rows_after as u32;
             let waits = u32::from(self.sizes.waits()[0]);
             let now = [rows, logit(most).to_bits(), waits, 0];
-            self.execute(&[0], |to| to.run(&edits.clamp, now, rows.div_ceil(256)));
+            self.execute(&[0], |to| to.run(&launches.clamp_opacity, now, rows.div_ceil(256)));
         }
         if ops.reset_signals {
             let planes: Vec<u32> = self.planes.sums().collect();

@@ -1,208 +1,231 @@
-//! Which buffers every kernel works on.
+//! Every dispatch of a kernel with the buffers that it works on.
+//!
+//! A kernel's variable is bound to the buffer of its own name. Where one kernel works on several
+//! buffers, or on one that is only borrowed, the pairs here say which.
 
-use wgpu::Device;
+use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, ComputePipeline, Device};
 
 use super::accumulation::Accumulation;
-use super::buffers::{Buffers, FIRST_SH, SECOND_SH, SH, Sizes, WAITING_SH};
-use super::pipelines::{Kernel, Launch, Pipelines};
+use super::buffers::Buffers;
+use super::pipelines::{Compiled, Pipelines};
+use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
 use super::signals::record_stride;
+use super::sizes::Sizes;
+use crate::backend::Kept;
 
 /// What errors are read from: the loss's error per pixel, or its gradient.
 const MAPS: [&str; 2] = ["error", "pixel gradient"];
+const KEYS: [&str; 2] = ["keys 0", "keys 1"];
+const VALUES: [&str; 2] = ["values 0", "values 1"];
 
-/// All kernels with their buffers. Of pairs, the first reads `keys 0` and `values 0`.
+/// A kernel's variable, and the buffer bound to it.
+pub(super) type Instead = (&'static str, &'static str);
+
+/// A kernel with its buffers.
 #[derive(Debug)]
-pub(super) struct Launches {
-    pub(super) project: Launch,
-    pub(super) scan_blocks: Launch,
-    pub(super) scan_sums: Launch,
-    pub(super) compact: Launch,
-    pub(super) count_digits: [Launch; 2],
-    pub(super) scatter: [Launch; 2],
-    pub(super) scatter_order: Launch,
-    pub(super) count_entries: Launch,
-    pub(super) emit_entries: Launch,
-    pub(super) count_tiles: Launch,
-    pub(super) cut_bands: Launch,
-    pub(super) find_tiles: [Launch; 2],
-    pub(super) rasterize: [Launch; 2],
-    pub(super) similarity: Launch,
-    pub(super) pixel_gradient: Launch,
-    pub(super) loss_total: Launch,
-    pub(super) rasterize_bwd: [Launch; 2],
-    pub(super) project_bwd: Launch,
-    pub(super) adam_bands: [Launch; 4],
-    pub(super) adam_geometry: Launch,
-    pub(super) accumulate: Launch,
-    pub(super) measure: Launch,
-    pub(super) present: Launch,
-    pub(super) surface: [Launch; 2],
-    pub(super) count_errors: [Launch; 2],
-    pub(super) narrow: Launch,
-    pub(super) write_worst: [Launch; 2],
-    pub(super) replay: [Launch; 2],
-    pub(super) sums: Sums,
+pub(super) struct Launch {
+    pub(super) pipeline: ComputePipeline,
+    pub(super) bindings: BindGroup,
+}
+
+/// All dispatches. Of pairs, the first reads `keys 0` and `values 0`.
+#[derive(Debug)]
+pub(super) struct Launches<L = Launch> {
+    pub(super) project: L,
+    pub(super) scan_blocks: L,
+    pub(super) scan_sums: L,
+    pub(super) compact: L,
+    pub(super) count_digits: [L; 2],
+    pub(super) scatter: [L; 2],
+    pub(super) scatter_order: L,
+    pub(super) count_entries: L,
+    pub(super) emit_entries: L,
+    pub(super) count_tiles: L,
+    pub(super) cut_bands: L,
+    pub(super) find_tiles: [L; 2],
+    pub(super) rasterize: [L; 2],
+    pub(super) similarity: L,
+    pub(super) pixel_gradient: L,
+    pub(super) loss_total: L,
+    pub(super) rasterize_bwd: [L; 2],
+    pub(super) project_bwd: L,
+    pub(super) adam_bands: [L; 4],
+    pub(super) adam_geometry: L,
+    pub(super) accumulate: L,
+    pub(super) measure: L,
+    pub(super) present: L,
+    pub(super) surface: [L; 2],
+    pub(super) count_errors: [L; 2],
+    pub(super) narrow: L,
+    pub(super) write_worst: [L; 2],
+    pub(super) replay: [L; 2],
+    pub(super) sums: Sums<L>,
+    /// Copies or clears rows, for every array that an edit touches.
+    pub(super) copy_rows: Vec<RowLaunch<L>>,
+    pub(super) breed: L,
+    pub(super) rewrite: L,
+    pub(super) sow: L,
+    pub(super) clamp_opacity: L,
+    pub(super) audits: Vec<Audit<L>>,
 }
 
 /// What comes before or after a tile kernel, so that its sums are those of rows.
 #[derive(Debug)]
-pub(super) enum Sums {
+pub(super) enum Sums<L> {
     /// After each band: of the backward pass, and of an auxiliary view.
-    Slots { gather: Launch, gather_columns: Launch },
+    Slots { gather: L, gather_columns: L },
     /// Before the first one, the sums being of so many numbers per row.
-    Atomics { clear: Launch, numbers: u32 },
+    Atomics { clear: L, numbers: u32 },
 }
 
+/// A kernel for one array of rows: how many numbers a row has, how far apart rows are, and a row's
+/// numbers.
+#[derive(Debug)]
+pub(super) struct RowLaunch<L> {
+    pub(super) launch: L,
+    pub(super) edited: Edited,
+    pub(super) numbers: u32,
+    pub(super) pitch: [u32; 2],
+}
+
+/// The audit of one array: how many numbers a row has, and the place of the first of them.
+#[derive(Debug)]
+pub(super) struct Audit<L> {
+    pub(super) launch: L,
+    pub(super) numbers: u32,
+    pub(super) place: u32,
+}
+
+/// From a parameter's place to that of its moments; no row has as many parameters.
+pub(super) const MOMENTS: u32 = 64;
+
 impl Launches {
-    pub(super) fn new(
+    /// All dispatches on these buffers.
+    pub(super) fn bound(
         device: &Device,
         pipelines: &Pipelines,
         buffers: &Buffers,
         sizes: &Sizes,
     ) -> Self {
-        let bind =
-            |kernel, names: &[&'static str]| pipelines.launch(device, buffers, kernel, names);
-        let keys = ["keys 0", "keys 1"];
-        let values = ["values 0", "values 1"];
-        let both = |f: &dyn Fn(usize) -> Launch| [f(0), f(1)];
-        let [sh0, sh1, sh2, sh3] = SH;
-        let in_slots = sizes.accumulation == Accumulation::Slots;
-        let (backward, replay, sums_to) = match in_slots {
-            true => (Kernel::RasterizeBwd, Kernel::Replay, "records"),
-            false => (Kernel::RasterizeBwdAtomic, Kernel::ReplayAtomic, "row sums"),
+        Self::new(&|kernel, instead| launch(device, pipelines.get(kernel), buffers, instead), sizes)
+    }
+}
+
+fn launch(device: &Device, kernel: &Compiled, buffers: &Buffers, instead: &[Instead]) -> Launch {
+    let entries: Vec<_> = kernel
+        .bindings
+        .iter()
+        .map(|binding| {
+            let other = instead.iter().find(|(variable, _)| *variable == binding.name);
+            let name = other.map_or(&*binding.name, |(_, buffer)| buffer);
+            BindGroupEntry {
+                binding: binding.number,
+                resource: buffers.get(name).as_entire_binding(),
+            }
+        })
+        .collect();
+    let bindings = device.create_bind_group(&BindGroupDescriptor {
+        label: None,
+        layout: &kernel.pipeline.get_bind_group_layout(0),
+        entries: &entries,
+    });
+    Launch { pipeline: kernel.pipeline.clone(), bindings }
+}
+
+impl<L> Launches<L> {
+    /// Binds each kernel by name, with the buffers that are not those of its variables' names.
+    pub(super) fn new(bind: &dyn Fn(&'static str, &[Instead]) -> L, sizes: &Sizes) -> Self {
+        let both = |kernel, instead: &dyn Fn(usize) -> Vec<Instead>| {
+            [bind(kernel, &instead(0)), bind(kernel, &instead(1))]
         };
+        let list = |i: usize| vec![("list", VALUES[i])];
+        let in_slots = sizes.accumulation == Accumulation::Slots;
+        let scatter = |i: usize, values_to| {
+            let from = [("keys in", KEYS[i]), ("values in", VALUES[i])];
+            [&from[..], &[("keys out", KEYS[1 - i]), ("values out", values_to)]].concat()
+        };
+        let replay = if in_slots { "replay" } else { "replay_atomic" };
+        let adam = |part: usize| {
+            let moments = [("first", FIRST[part]), ("second", SECOND[part])];
+            [&[("params", PARAMETERS[part]), ("waiting", WAITING[part])], &moments[..]].concat()
+        };
+        let row_launch = |array: &RowArray| RowLaunch {
+            launch: bind("copy_rows", &[("buffer", array.name)]),
+            edited: array.holds.traits().edited,
+            numbers: array.numbers as u32,
+            pitch: array.pitch(sizes.budget),
+        };
+        let mut edited = sizes.row_arrays();
+        edited.retain(|array| array.holds.traits().edited != Edited::Untouched);
         Self {
-            project: bind(
-                Kernel::Project,
-                &["frame", "rows", sh0, sh1, sh2, sh3, "splats", "footprints", "depths"],
-            ),
-            scan_blocks: bind(
-                Kernel::ScanBlocks,
-                &["frame", "state", "depths", "sums", "block sums"],
-            ),
-            scan_sums: bind(Kernel::ScanSums, &["frame", "state", "groups", "block sums"]),
-            compact: bind(
-                Kernel::Compact,
-                &["frame", "depths", "keys 0", "values 0", "sums", "block sums"],
-            ),
-            count_digits: both(&|i| bind(Kernel::CountDigits, &["state", keys[i], "sums"])),
-            scatter: both(&|i| {
-                let (keys_to, values_to) = (keys[1 - i], values[1 - i]);
-                let names = ["state", keys[i], values[i], keys_to, values_to, "sums", "block sums"];
-                bind(Kernel::Scatter, &names)
-            }),
-            scatter_order: bind(
-                Kernel::Scatter,
-                &["state", "keys 1", "values 1", "keys 0", "order", "sums", "block sums"],
-            ),
-            count_entries: bind(
-                Kernel::CountEntries,
-                &["frame", "state", "footprints", "sums", "order"],
-            ),
-            emit_entries: bind(
-                Kernel::EmitEntries,
-                &[
-                    "frame",
-                    "state",
-                    "footprints",
-                    "keys 0",
-                    "sums",
-                    "block sums",
-                    "order",
-                    "row of slot",
-                    "slots of row",
-                ],
-            ),
-            count_tiles: bind(
-                Kernel::CountTiles,
-                &["frame", "state", "footprints", "order", "tile counts"],
-            ),
-            cut_bands: bind(Kernel::CutBands, &["frame", "state", "tile counts"]),
-            find_tiles: both(&|i| {
-                bind(Kernel::FindTiles, &["frame", "state", keys[i], "tile starts"])
-            }),
-            rasterize: both(&|i| {
-                let lists = [values[i], "row of slot", "tile starts"];
-                let names = [&["frame", "state"], &lists[..], &["splats", "canvas", "finish"]];
-                bind(Kernel::Rasterize, &names.concat())
-            }),
-            similarity: bind(
-                Kernel::Similarity,
-                &["frame", "canvas", "truth", "mask", "derivatives", "tile sums", "error"],
-            ),
-            pixel_gradient: bind(
-                Kernel::PixelGradient,
-                &["frame", "canvas", "truth", "mask", "derivatives", "pixel gradient"],
-            ),
-            loss_total: bind(Kernel::LossTotal, &["frame", "state", "tile sums"]),
-            rasterize_bwd: both(&|i| {
-                let lists = [values[i], "row of slot", "tile starts"];
-                let pixels = ["splats", "finish", "pixel gradient", sums_to];
-                bind(backward, &[&["frame", "state"], &lists[..], &pixels[..]].concat())
-            }),
-            project_bwd: bind(
-                Kernel::ProjectBwd,
-                &["frame", "rows", sh0, sh1, sh2, sh3, "row sums", "depths", "gradient"],
-            ),
-            adam_bands: std::array::from_fn(|i| {
-                let own = [SH[i], FIRST_SH[i], SECOND_SH[i], WAITING_SH[i]];
-                bind(
-                    Kernel::AdamBand,
-                    &[&["frame", "state"], &own[..], &["ages", "gradient", "bias"]].concat(),
-                )
-            }),
-            adam_geometry: bind(
-                Kernel::AdamGeometry,
-                &[
-                    "frame",
-                    "state",
-                    "rows",
-                    "first rows",
-                    "second rows",
-                    "waiting rows",
-                    "ages",
-                    "gradient",
-                    "bias",
-                ],
-            ),
-            accumulate: bind(
-                Kernel::Accumulate,
-                &["frame", "state", "signals", "gradient", "row sums", "depths", "splats"],
-            ),
-            measure: bind(Kernel::Measure, &["frame", "state", "signals", "row sums", "depths"]),
-            // The sums of the sorts are a buffer of enough numbers that nobody needs then.
-            present: bind(Kernel::Present, &["frame", "sums", "rows", "ages"]),
-            // The gradients of the rows are a buffer that nobody needs between two steps.
-            surface: both(&|i| {
-                let lists = [values[i], "row of slot", "tile starts"];
-                let names = ["splats", "rows", "ops", "gradient"];
-                bind(Kernel::Surface, &[&["frame", "state"], &lists[..], &names[..]].concat())
-            }),
-            count_errors: both(&|i| {
-                bind(Kernel::CountErrors, &["frame", "finish", MAPS[i], "selection"])
-            }),
-            narrow: bind(Kernel::Narrow, &["selection", "gradient"]),
-            write_worst: both(&|i| {
-                let names = ["frame", "finish", MAPS[i], "selection", "gradient"];
-                bind(Kernel::WriteWorst, &names)
-            }),
-            replay: both(&|i| {
-                let lists = [values[i], "row of slot", "tile starts"];
-                let names = ["splats", "pixel gradient", sums_to];
-                bind(replay, &[&["frame", "state"], &lists[..], &names[..]].concat())
-            }),
-            sums: if in_slots {
-                let names = ["frame", "depths", "slots of row", "records", "row sums"];
-                Sums::Slots {
-                    gather: bind(Kernel::Gather, &names),
-                    gather_columns: bind(Kernel::GatherColumns, &names),
-                }
-            } else {
-                Sums::Atomics {
-                    clear: bind(Kernel::ClearSums, &["frame", "row sums"]),
-                    numbers: record_stride(sizes.detail) as u32,
-                }
+            project: bind("project", &[]),
+            scan_blocks: bind("scan_blocks", &[]),
+            scan_sums: bind("scan_sums", &[]),
+            compact: bind("compact", &[("keys out", KEYS[0]), ("values out", VALUES[0])]),
+            count_digits: both("count_digits", &|i| vec![("keys in", KEYS[i])]),
+            scatter: both("scatter", &|i| scatter(i, VALUES[1 - i])),
+            scatter_order: bind("scatter", &scatter(1, "order")),
+            count_entries: bind("count_entries", &[]),
+            emit_entries: bind("emit_entries", &[("keys out", KEYS[0])]),
+            count_tiles: bind("count_tiles", &[]),
+            cut_bands: bind("cut_bands", &[]),
+            find_tiles: both("find_tiles", &|i| vec![("keys in", KEYS[i])]),
+            rasterize: both("rasterize", &list),
+            similarity: bind("similarity", &[]),
+            pixel_gradient: bind("pixel_gradient", &[("gradient", "pixel gradient")]),
+            loss_total: bind("total", &[]),
+            rasterize_bwd: match in_slots {
+                true => both("rasterize_bwd", &list),
+                false => both("rasterize_bwd_atomic", &list),
             },
+            project_bwd: bind("project_bwd", &[]),
+            adam_bands: std::array::from_fn(|band| bind("adam_band", &adam(1 + band))),
+            adam_geometry: bind("adam_geometry", &adam(0)),
+            accumulate: bind("accumulate", &[]),
+            measure: bind("measure", &[]),
+            // The sums of the sorts are a buffer of enough numbers that nobody needs then.
+            present: bind("present", &[("signals", "sums")]),
+            // The gradients of the rows are a buffer that nobody needs between two steps.
+            surface: both("surface", &|i| {
+                [list(i), vec![("pixels", "ops"), ("points", "gradient")]].concat()
+            }),
+            count_errors: both("count_errors", &|i| vec![("map", MAPS[i])]),
+            narrow: bind("narrow", &[("worst", "gradient")]),
+            write_worst: both("write_worst", &|i| vec![("map", MAPS[i]), ("worst", "gradient")]),
+            replay: both(replay, &|i| [list(i), vec![("map", "pixel gradient")]].concat()),
+            sums: match in_slots {
+                true => Sums::Slots {
+                    gather: bind("gather", &[("all records", "records")]),
+                    gather_columns: bind("gather_columns", &[("all records", "records")]),
+                },
+                false => Sums::Atomics {
+                    clear: bind("clear_sums", &[]),
+                    numbers: record_stride(sizes.detail) as u32,
+                },
+            },
+            copy_rows: edited.iter().map(row_launch).collect(),
+            breed: bind("breed", &[]),
+            rewrite: bind("rewrite", &[]),
+            sow: bind("sow", &[]),
+            clamp_opacity: bind("clamp_opacity", &[]),
+            audits: audits(bind, sizes),
         }
     }
+}
+
+/// Marks go to the sums of the sorts, which nobody needs between two steps.
+fn audits<L>(bind: &dyn Fn(&'static str, &[Instead]) -> L, sizes: &Sizes) -> Vec<Audit<L>> {
+    let arrays = sizes.row_arrays();
+    let audit = |array: &RowArray| {
+        let first = array.parameters.start as u32;
+        Some(Audit {
+            launch: bind("audit", &[("marks", "sums"), ("numbers", array.name)]),
+            numbers: array.numbers as u32,
+            place: match array.holds.traits().audited? {
+                Kept::Parameter => first,
+                Kept::Moment => MOMENTS + first,
+            },
+        })
+    };
+    arrays.iter().filter_map(audit).collect()
 }

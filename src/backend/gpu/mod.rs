@@ -26,11 +26,15 @@ mod photographs;
 mod pipelines;
 mod promise;
 mod readback;
+mod rows;
+mod shaders;
 mod signals;
+mod sizes;
 mod state;
 mod step;
 mod submit;
 mod transfer;
+mod wait;
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -38,7 +42,7 @@ use std::time::Duration;
 
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{
-    Cadence, Candidate, LossTerms, NoiseTerm, Signal, SignalSet, Signals,
+    Cadence, Candidate, LossTerms, Needs, NoiseTerm, Signal, SignalSet, Signals,
 };
 
 use super::candidates::Candidates;
@@ -52,23 +56,20 @@ use crate::memory::Ledger;
 
 pub use accumulation::Accumulation;
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
-use audit::Audited;
-use buffers::{Buffers, Sizes, bias_table};
+use buffers::{Buffers, bias_table};
 use device::Device;
 pub use device::GpuDevice;
 #[cfg(test)]
 pub(crate) use device::faults::with_device_lost_after;
-use edits::EditLaunches;
 use frame::Frame;
 use launches::Launches;
 pub use options::GpuOptions;
+use options::MAX_SIDE;
 use photographs::Kept;
 pub use photographs::KeptPhotographs;
-use pipelines::{Pipelines, Variant};
+use pipelines::Variant;
 use signals::Planes;
-
-/// Largest image side `[px]`; at this size every index of the stages still fits its type.
-const MAX_SIDE: u32 = 16_384;
+use sizes::Sizes;
 
 /// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
 #[derive(Debug, Clone, Copy, Default)]
@@ -83,10 +84,7 @@ pub struct GpuBackend {
     device: Arc<Device>,
     sizes: Sizes,
     buffers: Buffers,
-    pipelines: Arc<Pipelines>,
     launches: Launches,
-    edits: EditLaunches,
-    audited: Vec<Audited>,
     ledger: Ledger,
     budget: usize,
     rows: usize,
@@ -105,22 +103,17 @@ pub struct GpuBackend {
 }
 
 impl GpuBackend {
-    /// Takes over `model` and allocates everything for `options.budget` rows, after the device has
-    /// shown on a small scene that it computes what the native backend does.
-    ///
-    /// # Errors
-    /// [`BackendError`]: a limit of the device, its memory, or a driver that computes wrongly.
-    ///
-    /// # Panics
-    /// When the model has more rows than the budget: the caller subsamples before.
-    pub fn new(
-        model: &Gaussians,
-        options: &GpuOptions,
-        device: &GpuDevice,
-    ) -> Result<Self, BackendError> {
-        let detail = Planes::new(&options.needs).detail;
-        device.0.prove(detail, || canary::check(device, &options.needs))?;
-        Self::without_canary(model, options, device)
+    /// Bytes per buffer of a backend made with these options for models of this degree; nothing is
+    /// allocated.
+    #[must_use]
+    pub fn promise(sh_degree: u8, options: &GpuOptions, device: &GpuDevice) -> Ledger {
+        promise::ledger(&promise::sizes(&device.0, sh_degree, options), &options.needs)
+    }
+
+    /// Most (row, tile) pairs that this device can hold at a time for such needs.
+    #[must_use]
+    pub fn most_pairs(needs: &Needs, device: &GpuDevice) -> u64 {
+        promise::most_pairs(&device.0, needs)
     }
 
     fn without_canary(
@@ -142,24 +135,14 @@ impl GpuBackend {
         let planes = Planes::new(&options.needs);
         let sizes = promise::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
-        let Sizes { detail, more, accumulation, .. } = sizes;
-        let variant = Variant { detail, more, shortcuts, accumulation };
-        let pipelines = device.pipelines(variant)?;
-        let launches = device.guarded("the kernels", 0, |device| {
-            Launches::new(device, &pipelines, &buffers, &sizes)
-        })?;
-        let edits = EditLaunches::new(&device, &sizes, &planes, &buffers, &pipelines);
-        let audited = audit::launches(&device, &sizes, &buffers, &pipelines);
+        let launches = launches(&device, &sizes, shortcuts, &buffers)?;
         let ledger = promise::ledger(&sizes, &options.needs);
         let gpu = Self {
             ledger,
             device,
             sizes,
             buffers,
-            pipelines,
             launches,
-            edits,
-            audited,
             budget,
             rows: model.len(),
             near: options.near,
@@ -206,7 +189,8 @@ impl GpuBackend {
         let (most_wide, most_high) = self.sizes.image;
         if width > most_wide || height > most_high {
             self.sizes.image = (most_wide.max(width), most_high.max(height));
-            self.kept.clear();
+            // Their places have moved.
+            self.kept.places.clear();
             self.rebuild()?;
         }
         Ok(())
@@ -215,14 +199,7 @@ impl GpuBackend {
     /// Allocates buffers whose size has changed, and binds all of them anew.
     fn rebuild(&mut self) -> Result<(), BackendError> {
         self.buffers.resize(&self.device, &self.sizes)?;
-        let Self { device, sizes, pipelines, buffers, .. } = self;
-        let Sizes { detail, more, accumulation, .. } = *sizes;
-        let shortcuts = self.shortcuts;
-        *pipelines = device.pipelines(Variant { detail, more, shortcuts, accumulation })?;
-        self.launches = device
-            .guarded("the kernels", 0, |device| Launches::new(device, pipelines, buffers, sizes))?;
-        self.edits = EditLaunches::new(device, sizes, &self.planes, buffers, pipelines);
-        self.audited = audit::launches(device, sizes, buffers, pipelines);
+        self.launches = launches(&self.device, &self.sizes, self.shortcuts, &self.buffers)?;
         Ok(())
     }
 
@@ -231,6 +208,18 @@ impl GpuBackend {
         let of_model = [self.rows as u32, degree, self.sizes.cap as u32, self.budget as u32];
         Frame::of_view(camera, background, self.near, of_model)
     }
+}
+
+/// The kernels for these sizes, bound to these buffers.
+fn launches(
+    device: &Device,
+    sizes: &Sizes,
+    shortcuts: Shortcuts,
+    buffers: &Buffers,
+) -> Result<Launches, BackendError> {
+    let &Sizes { detail, more, accumulation, .. } = sizes;
+    let pipelines = device.pipelines(Variant { detail, more, shortcuts, accumulation })?;
+    device.guarded("the kernels", 0, |device| Launches::bound(device, &pipelines, buffers, sizes))
 }
 
 impl Backend for GpuBackend {

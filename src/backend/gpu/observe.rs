@@ -7,9 +7,10 @@ use densify_policies::policy::ErrorMode;
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
 
 use super::GpuBackend;
-use super::buffers::OPS_BYTES;
 use super::frame::Frame;
 use super::passes::{Search, Shape};
+use super::rows::GRADIENT;
+use super::sizes::OPS_BYTES;
 use crate::backend::candidates::ranked;
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::backend::{AuxInput, AuxOutput, BackendError};
@@ -46,7 +47,7 @@ impl GpuBackend {
 
     /// Pixels of which the gradients of the rows have room, beside their number.
     fn found_room(&self) -> usize {
-        (10 * self.budget - 1).min(u32::MAX as usize)
+        (GRADIENT / 2 * self.budget - 1).min(u32::MAX as usize)
     }
 
     /// Adds the worst pixels of the view to the candidates; `search` is what was looked for, if it was.
@@ -132,8 +133,8 @@ impl GpuBackend {
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
         let which = u32::from(mode == DepthMode::Median);
         let mut found = Vec::new();
-        // What fits the upload, and five points per row of the budget that come back.
-        let room = (OPS_BYTES / 4).min(5 * self.sizes.budget) as usize;
+        // What fits the upload, and the points, of four numbers each, that come back.
+        let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.budget);
         for chunk in pixels.chunks(room) {
             let numbers: Vec<u32> =
                 chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();
@@ -218,11 +219,4 @@ impl GpuBackend {
         let of = |c: AuxColumn| (c, (0..self.rows).map(|row| value(c, row)).collect());
         Ok(request.columns.iter().map(|&c| of(c)).collect())
     }
-}
-
-/// Bytes that the host holds meanwhile, for an image of so many pixels.
-pub(super) fn host_bytes(request: &AuxRequest, pixels: u64) -> u64 {
-    let drawing = if request.points > 0 { 20 } else { 0 };
-    // The image as copied, its map, error, edge and luma.
-    pixels * (20 + 24 + 13 + drawing) + u64::from(request.points) * size_of::<Candidate>() as u64
 }

@@ -5,6 +5,9 @@ use densify_policies::policy::Needs;
 use super::photographs::KeptPhotographs;
 use crate::backend::Shortcuts;
 
+/// Largest image side `[px]`; at this size every index of the stages still fits its type.
+pub(super) const MAX_SIDE: u32 = 16_384;
+
 /// How to set up a [`GpuBackend`](super::GpuBackend).
 #[derive(Debug, Clone)]
 pub struct GpuOptions {

@@ -3,9 +3,8 @@
 
 use wgpu::ComputePass;
 
-use super::buffers::{BLOCK, band_coefficients};
-use super::launches::{Launches, Sums};
-use super::pipelines::{Launch, Pipelines};
+use super::launches::{Launch, Launches, Sums};
+use super::sizes::BLOCK;
 
 /// Workgroups in the first of two dimensions; see `shaders/shared/view.wgsl`.
 const ACROSS: u32 = 32_768;
@@ -61,14 +60,13 @@ pub(super) struct Search {
 }
 
 /// Encodes dispatches into one pass.
-pub(super) struct Recorder<'a, 'e> {
+pub(super) struct Recorder<'e> {
     pub(super) pass: ComputePass<'e>,
-    pub(super) pipelines: &'a Pipelines,
 }
 
-impl Recorder<'_, '_> {
+impl Recorder<'_> {
     fn set(&mut self, launch: &Launch, now: [u32; 4]) {
-        self.pass.set_pipeline(self.pipelines.pipeline(launch.kernel));
+        self.pass.set_pipeline(&launch.pipeline);
         self.pass.set_bind_group(0, &launch.bindings, &[]);
         self.pass.set_immediates(0, bytemuck::bytes_of(&now));
     }
@@ -97,7 +95,7 @@ pub(super) struct Passes<'a> {
 
 impl Passes<'_> {
     /// One digit of a stable sort. `items` is 1 for entries and 0 for rows.
-    fn sort_digit(&self, to: &mut Recorder<'_, '_>, pass: u32, items: u32, scatter: &Launch) {
+    fn sort_digit(&self, to: &mut Recorder<'_>, pass: u32, items: u32, scatter: &Launch) {
         let l = self.launches;
         let source = (pass % 2) as usize;
         let (blocks, digits, what) = if items == 1 {
@@ -114,7 +112,7 @@ impl Passes<'_> {
 
     /// Stages 1–3. Afterwards the canvas holds the image and, if there is one band, the lists hold
     /// its entries.
-    pub(super) fn forward(&self, to: &mut Recorder<'_, '_>) {
+    pub(super) fn forward(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let Shape { rows, bands, .. } = self.shape;
         to.run(&l.project, [0; 4], rows.div_ceil(256));
@@ -137,7 +135,7 @@ impl Passes<'_> {
         }
     }
 
-    fn count(&self, to: &mut Recorder<'_, '_>, band: u32, what: u32) {
+    fn count(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
         let l = self.launches;
         to.run_counted(&l.count_entries, [band, 0, 0, 0], self.groups, args::ROWS);
         to.run_counted(&l.scan_blocks, [what, 0, 0, 0], self.groups, args::ROW_BLOCKS);
@@ -150,7 +148,7 @@ impl Passes<'_> {
     }
 
     /// The lists of a band. With one band its entries are counted already.
-    fn lists(&self, to: &mut Recorder<'_, '_>, band: u32, what: u32) {
+    fn lists(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
         let l = self.launches;
         let several = self.shape.bands > 1;
         if several {
@@ -166,7 +164,7 @@ impl Passes<'_> {
     }
 
     /// Stage 4, with the weights of |e| and 1 − SSIM in the error per pixel.
-    pub(super) fn loss(&self, to: &mut Recorder<'_, '_>, error_weights: [f32; 2]) {
+    pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [f32; 2]) {
         let l = self.launches;
         let [a, b] = error_weights.map(f32::to_bits);
         to.run(&l.similarity, [a, b, 0, 0], self.shape.tiles);
@@ -175,7 +173,7 @@ impl Passes<'_> {
     }
 
     /// Stage 5: from the pixels' gradients to one sum per row.
-    pub(super) fn backward(&self, to: &mut Recorder<'_, '_>) {
+    pub(super) fn backward(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let Shape { rows, tiles, bands } = self.shape;
         let groups = rows.div_ceil(256);
@@ -194,12 +192,12 @@ impl Passes<'_> {
     }
 
     /// Stage 6.
-    pub(super) fn differentiate(&self, to: &mut Recorder<'_, '_>) {
+    pub(super) fn differentiate(&self, to: &mut Recorder<'_>) {
         to.run(&self.launches.project_bwd, [0; 4], self.shape.rows.div_ceil(256));
     }
 
     /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends.
-    pub(super) fn optimise(&self, to: &mut Recorder<'_, '_>, sh_degree: u8, signals: bool) {
+    pub(super) fn optimise(&self, to: &mut Recorder<'_>, sh_degree: u8, signals: bool) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);
         self.differentiate(to);
@@ -207,7 +205,7 @@ impl Passes<'_> {
             to.run(&l.accumulate, [0; 4], groups);
         }
         for band in 0..=usize::from(sh_degree) {
-            let now = [(band * band) as u32, band_coefficients(band) as u32, 0, 0];
+            let now = [(band * band) as u32, (2 * band + 1) as u32, 0, 0];
             to.run(&l.adam_bands[band], now, groups);
         }
         to.run(&l.adam_geometry, [0; 4], groups);
@@ -215,7 +213,7 @@ impl Passes<'_> {
 
     /// Writes the `wanted` worst pixels, and those as bad as the last of them, to the gradients of the
     /// rows: how many there are, then bits of the error and number of each, as far as there is room.
-    pub(super) fn worst(&self, to: &mut Recorder<'_, '_>, search: &Search) {
+    pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
         let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
@@ -231,7 +229,7 @@ impl Passes<'_> {
     }
 
     /// Surface points of the pixels whose numbers are uploaded, from place `first` on.
-    pub(super) fn surface(&self, to: &mut Recorder<'_, '_>, pixels: u32, mode: u32, first: u32) {
+    pub(super) fn surface(&self, to: &mut Recorder<'_>, pixels: u32, mode: u32, first: u32) {
         for band in 0..self.shape.bands {
             if self.shape.bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
@@ -242,7 +240,7 @@ impl Passes<'_> {
     }
 
     /// Each row's sums over the pixels of a view that it is blended into.
-    pub(super) fn columns(&self, to: &mut Recorder<'_, '_>) {
+    pub(super) fn columns(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);
         if let Sums::Atomics { clear, .. } = &l.sums {
@@ -260,7 +258,7 @@ impl Passes<'_> {
     }
 
     /// Counts the view for the largest weight of fresh views.
-    pub(super) fn measure(&self, to: &mut Recorder<'_, '_>) {
+    pub(super) fn measure(&self, to: &mut Recorder<'_>) {
         to.run(&self.launches.measure, [0; 4], self.shape.rows.div_ceil(256));
     }
 }

@@ -1,16 +1,17 @@
-//! What a backend of given options takes, before anything is allocated.
+//! What a backend with given options needs, before anything is allocated.
 
-use densify_policies::policy::Needs;
+use densify_policies::policy::{AuxRequest, Candidate, Needs};
 
 use super::accumulation::Accumulation;
-use super::buffers::{MOST_ENTRIES, Sizes};
-use super::device::{Device, GpuDevice};
+use super::device::Device;
+use super::options::{GpuOptions, MAX_SIDE};
 use super::signals::{Planes, record_stride};
-use super::{GpuBackend, GpuOptions, MAX_SIDE, observe};
+use super::sizes::{MOST_ENTRIES, Sizes};
 use crate::backend::candidates::Candidates;
 use crate::memory::{Ledger, Section};
 
-fn most_pairs(device: &Device, needs: &Needs) -> u64 {
+/// Most (row, tile) pairs that this device can hold at a time for such needs.
+pub(super) fn most_pairs(device: &Device, needs: &Needs) -> u64 {
     // Of the largest buffer that grows with them: records, or lists.
     let numbers = match device.accumulation {
         Accumulation::Slots => record_stride(Planes::new(needs).detail),
@@ -45,23 +46,15 @@ pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     let candidates = Candidates::bytes(needs.candidates, pixels as usize);
     ledger.add_to(Section::Policy, "candidates", candidates);
     if let Some(request) = &needs.aux {
-        let bytes = observe::host_bytes(request, pixels);
+        let bytes = aux_bytes(request, pixels);
         ledger.add_to(Section::Policy, "auxiliary views", bytes);
     }
     ledger
 }
 
-impl GpuBackend {
-    /// Bytes per buffer of a backend made with these options for models of this degree; nothing is
-    /// allocated.
-    #[must_use]
-    pub fn promise(sh_degree: u8, options: &GpuOptions, device: &GpuDevice) -> Ledger {
-        ledger(&sizes(&device.0, sh_degree, options), &options.needs)
-    }
-
-    /// Most (row, tile) pairs that this device can hold at a time for such needs.
-    #[must_use]
-    pub fn most_pairs(needs: &Needs, device: &GpuDevice) -> u64 {
-        most_pairs(&device.0, needs)
-    }
+/// Bytes that the host holds while it measures an auxiliary view of so many pixels.
+fn aux_bytes(request: &AuxRequest, pixels: u64) -> u64 {
+    let drawing = if request.points > 0 { 20 } else { 0 };
+    // The image as copied, its map, error, edge and luma.
+    pixels * (20 + 24 + 13 + drawing) + u64::from(request.points) * size_of::<Candidate>() as u64
 }

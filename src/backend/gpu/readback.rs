@@ -2,8 +2,8 @@
 
 use wgpu::{Buffer, CommandEncoder, MapMode, PollType};
 
-use super::buffers::READ_BYTES;
 use super::device::Device;
+use super::sizes::READ_BYTES;
 use crate::backend::BackendError;
 
 /// Copies `bytes` bytes from `from` of `buffer` to the host.

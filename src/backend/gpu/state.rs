@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use super::GpuBackend;
-use super::buffers::{FIRST_SH, SECOND_SH, WAITING_SH, band_coefficients};
+use super::rows::{Holds, RowArray};
 use crate::backend::{BackendError, StateArray, StateError, Tensor};
 
 /// Before the name of a buffer.
@@ -15,33 +15,16 @@ const BUFFER: &str = "device.";
 const SIGNAL: &str = "device.signals.";
 const WAITS: &str = "device.waits";
 const CANDIDATES: &str = "candidates";
-/// The buffer whose numbers are whole.
-const AGES: &str = "ages";
 
 impl GpuBackend {
-    /// The buffers that outlive a step, beside the model: name and numbers per row.
-    fn kept(&self) -> Vec<(&'static str, usize)> {
-        let mut all = vec![("first rows", 12), ("second rows", 12), (AGES, 1)];
-        let bands = usize::from(self.sizes.sh_degree) + 1;
-        for names in [FIRST_SH, SECOND_SH] {
-            let names = names.into_iter().take(bands).enumerate();
-            all.extend(names.map(|(band, name)| (name, 3 * band_coefficients(band))));
-        }
-        let [main_waits, rest_waits] = self.sizes.waits();
-        if main_waits {
-            all.push(("waiting rows", 12));
-        }
-        for (band, name) in WAITING_SH.into_iter().take(bands).enumerate() {
-            if if band == 0 { main_waits } else { rest_waits } {
-                all.push((name, 3 * band_coefficients(band)));
-            }
-        }
-        all
+    /// The arrays that outlive a step, beside the model and the signals.
+    fn saved(&self) -> impl Iterator<Item = RowArray> {
+        self.sizes.row_arrays().into_iter().filter(|array| array.holds.traits().is_saved)
     }
 
-    fn buffer(&self, name: &str) -> Option<(&'static str, usize)> {
+    fn array(&self, name: &str) -> Option<RowArray> {
         let name = name.strip_prefix(BUFFER)?;
-        self.kept().into_iter().find(|(known, _)| *known == name)
+        self.saved().find(|array| array.name == name)
     }
 
     fn signal(&self, name: &str) -> Option<u32> {
@@ -50,7 +33,7 @@ impl GpuBackend {
     }
 
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
-        let buffers = self.kept().into_iter().map(|(name, _)| format!("{BUFFER}{name}"));
+        let buffers = self.saved().map(|array| format!("{BUFFER}{}", array.name));
         let signals = self.planes.kept().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITS));
@@ -77,17 +60,15 @@ impl GpuBackend {
         if let Some(plane) = self.signal(name) {
             return Ok(Tensor::f32(name, &[rows.len()], self.column(plane, rows)?));
         }
-        let found = self.buffer(name);
-        let (buffer, numbers) =
-            found.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
-        // Ages are whole numbers in the same four bytes.
-        let of_row = 4 * numbers as u64;
-        let values = self.read(buffer, of_row * rows.start as u64, of_row * rows.len() as u64)?;
-        if buffer == AGES {
+        let array = self.array(name);
+        let array = array.unwrap_or_else(|| panic!("there is no `{name}` in this backend's state"));
+        let values = self.read_rows(&array, rows.clone())?;
+        if array.holds == Holds::Ages {
+            // Whole numbers in the same four bytes.
             let bytes = bytemuck::cast_slice(&values).to_vec();
             return Ok(Tensor::u8(name, &[rows.len(), 4], bytes));
         }
-        Ok(Tensor::f32(name, &[rows.len(), numbers], values))
+        Ok(Tensor::f32(name, &[rows.len(), array.numbers], values))
     }
 
     pub(super) fn restore_tensor(
@@ -107,13 +88,12 @@ impl GpuBackend {
             let values = tensor.into_f32(&[rows.len()])?;
             let start = u64::from(plane) * self.sizes.budget + first;
             self.write_at("signals", 4 * start, &values);
-        } else if let Some((buffer, numbers)) = self.buffer(&name) {
-            if buffer == AGES {
-                let ages = tensor.into_u8(&[rows.len(), 4])?;
-                self.write_at(buffer, 4 * first, &ages);
+        } else if let Some(array) = self.array(&name) {
+            let at = array.row_bytes() * first;
+            if array.holds == Holds::Ages {
+                self.write_at(array.name, at, &tensor.into_u8(&[rows.len(), 4])?);
             } else {
-                let values = tensor.into_f32(&[rows.len(), numbers])?;
-                self.write_at(buffer, 4 * numbers as u64 * first, &values);
+                self.write_at(array.name, at, &tensor.into_f32(&[rows.len(), array.numbers])?);
             }
         } else {
             return Err(tensor.error("this run keeps nothing of that name"));

@@ -45,7 +45,7 @@ impl GpuBackend {
         frame.draw[3] = self.bring_photograph(input.view, target);
         frame.for_step(input, due, (self.terms, self.noise), &self.planes);
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
-        let step = |passes: &Passes<'_>, to: &mut Recorder<'_, '_>| {
+        let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.backward(to);
             passes.optimise(to, degree, signals);
         };

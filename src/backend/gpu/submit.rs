@@ -12,7 +12,7 @@ impl GpuBackend {
     pub(super) fn run(
         &mut self,
         frame: &Frame,
-        encode: impl Fn(&Passes<'_>, &mut Recorder<'_, '_>),
+        encode: impl Fn(&Passes<'_>, &mut Recorder<'_>),
     ) -> Result<(State, Shape), BackendError> {
         self.write("frame", bytemuck::bytes_of(frame));
         let [rows, ..] = frame.model;
@@ -26,7 +26,7 @@ impl GpuBackend {
                 encoder.clear_buffer(self.buffers.get("tile counts"), 0, None);
             }
             let pass = encoder.begin_compute_pass(&Default::default());
-            encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
+            encode(&passes, &mut Recorder { pass });
             let staging = self.buffers.get("read");
             let bytes = size_of::<State>() as u64;
             encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, bytes);
@@ -47,16 +47,12 @@ impl GpuBackend {
     }
 
     /// Encodes more passes over the view at hand and submits them.
-    pub(super) fn go_on(
-        &self,
-        shape: Shape,
-        encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_, '_>),
-    ) {
+    pub(super) fn go_on(&self, shape: Shape, encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_>)) {
         let groups = self.buffers.get("groups");
         let passes = Passes { launches: &self.launches, groups, shape };
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&passes, &mut Recorder { pass, pipelines: &self.pipelines });
+        encode(&passes, &mut Recorder { pass });
         self.device.queue.submit([encoder.finish()]);
     }
 

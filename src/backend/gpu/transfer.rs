@@ -2,9 +2,9 @@
 
 use std::ops::Range;
 
-use super::buffers::{SH, band_coefficients};
 use super::frame::target;
 use super::passes::Recorder;
+use super::rows::{Holds, RowArray};
 use super::{GpuBackend, readback};
 use crate::backend::{BackendError, Rendering};
 use crate::dataset::images::Image8;
@@ -24,21 +24,21 @@ impl GpuBackend {
     }
 
     pub(super) fn upload(&self, model: &Gaussians) {
-        let mut rows = Vec::with_capacity(12 * model.len());
-        for i in 0..model.len() {
-            rows.extend_from_slice(&model.means[i]);
-            rows.extend_from_slice(&model.log_scales[i]);
-            rows.extend_from_slice(&model.quats[i]);
-            rows.extend_from_slice(&[model.opacity_logits[i], 0.0]);
-        }
-        self.write("rows", bytemuck::cast_slice(&rows));
-        let mut first = 0;
-        for (band, name) in SH.into_iter().enumerate().take(usize::from(model.sh_degree) + 1) {
-            let numbers = 3 * band_coefficients(band);
-            let of_row = |i| &model.sh_of(i)[first..first + numbers];
-            let values: Vec<f32> = (0..model.len()).flat_map(of_row).copied().collect();
-            self.write(name, bytemuck::cast_slice(&values));
-            first += numbers;
+        for array in self.sizes.parameters() {
+            let mut values = Vec::with_capacity(array.numbers * model.len());
+            for i in 0..model.len() {
+                if array.holds == Holds::Geometry {
+                    values.extend_from_slice(&model.means[i]);
+                    values.extend_from_slice(&model.log_scales[i]);
+                    values.extend_from_slice(&model.quats[i]);
+                    values.extend_from_slice(&[model.opacity_logits[i], 0.0]);
+                } else {
+                    let Range { start, end } = array.parameters;
+                    let first = ModelArray::Sh.parameters(model.sh_degree).start;
+                    values.extend_from_slice(&model.sh_of(i)[start - first..end - first]);
+                }
+            }
+            self.write(array.name, bytemuck::cast_slice(&values));
         }
     }
 
@@ -70,6 +70,49 @@ impl GpuBackend {
             | (if image.mask.is_some() { target::HAS_MASK } else { 0 })
     }
 
+    /// Brings a view's photograph to where the loss reads it; returns the bits that say what it has.
+    /// Views keep their photographs.
+    pub(super) fn bring_photograph(&mut self, view: usize, image: &Image8) -> u32 {
+        let size = [image.width, image.height];
+        if let Some(&(place, kept, bits)) = self.kept.places.get(&view)
+            && kept == size
+        {
+            self.copy_photograph(place, size, bits, false);
+            return bits;
+        }
+        let bits = self.upload_target(image);
+        let room = self.sizes.photographs;
+        // A view whose image has another size now keeps its place.
+        let own = self.kept.places.get(&view).map(|&(place, ..)| place);
+        let place = own.unwrap_or(self.kept.places.len() as u64);
+        if place < room.count as u64 && (bits & target::HAS_MASK == 0 || room.with_masks) {
+            self.copy_photograph(place, size, bits, true);
+            self.kept.places.insert(view, (place, size, bits));
+        }
+        bits
+    }
+
+    /// Copies between a place and where the loss reads.
+    fn copy_photograph(&self, place: u64, [width, height]: [u32; 2], bits: u32, keeps: bool) {
+        let pixels = u64::from(width) * u64::from(height);
+        let [truth_bytes, mask_bytes] = self.sizes.photograph_bytes();
+        let truth = place * (truth_bytes + mask_bytes);
+        let mut parts = vec![("truth", truth, 4 * pixels)];
+        if bits & target::HAS_MASK != 0 {
+            parts.push(("mask", truth + truth_bytes, pixels.next_multiple_of(4)));
+        }
+        let all = self.buffers.get("photographs");
+        let mut encoder = self.device.device.create_command_encoder(&Default::default());
+        for (name, at, bytes) in parts {
+            let one = self.buffers.get(name);
+            match keeps {
+                true => encoder.copy_buffer_to_buffer(one, 0, all, at, bytes),
+                false => encoder.copy_buffer_to_buffer(all, at, one, 0, bytes),
+            }
+        }
+        self.device.queue.submit([encoder.finish()]);
+    }
+
     /// The image of the last view rendered.
     pub(super) fn rendering(&self, width: u32, height: u32) -> Result<Rendering, BackendError> {
         let pixels = width as usize * height as usize;
@@ -85,64 +128,56 @@ impl GpuBackend {
         })
     }
 
+    /// Some rows of an array.
+    pub(super) fn read_rows(
+        &self,
+        array: &RowArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let bytes = array.row_bytes();
+        self.read(array.name, bytes * rows.start as u64, bytes * rows.len() as u64)
+    }
+
     /// Some rows of one of the model's arrays.
     pub(super) fn model_array(
         &self,
         array: ModelArray,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let sh_degree = self.sizes.sh_degree;
-        let read = |name, numbers: usize| {
-            let of_row = 4 * numbers as u64;
-            self.read(name, of_row * rows.start as u64, of_row * rows.len() as u64)
-        };
-        let parameters = array.parameters(sh_degree);
-        if array != ModelArray::Sh {
-            let all = read("rows", 12)?;
-            return Ok(all
-                .chunks_exact(12)
-                .flat_map(|row| &row[parameters.clone()])
-                .copied()
-                .collect());
-        }
-        let mut sh = vec![0.0; parameters.len() * rows.len()];
-        let mut first = 0;
-        for (band, name) in SH.into_iter().enumerate().take(usize::from(sh_degree) + 1) {
-            let numbers = 3 * band_coefficients(band);
-            let to = sh.chunks_exact_mut(parameters.len());
-            for (to, from) in to.zip(read(name, numbers)?.chunks_exact(numbers)) {
-                to[first..first + numbers].copy_from_slice(from);
+        let wanted = array.parameters(self.sizes.sh_degree);
+        let mut all = vec![0.0; wanted.len() * rows.len()];
+        for from in self.sizes.parameters() {
+            if let Some((here, there)) = shared(&wanted, &from.parameters) {
+                let read = self.read_rows(&from, rows.clone())?;
+                let to = all.chunks_exact_mut(wanted.len());
+                for (to, from) in to.zip(read.chunks_exact(from.numbers)) {
+                    to[here.clone()].copy_from_slice(&from[there.clone()]);
+                }
             }
-            first += numbers;
         }
-        Ok(sh)
+        Ok(all)
     }
 
-    /// Takes back what [`model_array`](Self::model_array) returned.
+    /// Writes what [`model_array`](Self::model_array) returned for the same rows.
     pub(super) fn set_model_array(
         &self,
         array: ModelArray,
         rows: Range<usize>,
         values: &[f32],
     ) -> Result<(), BackendError> {
-        let parameters = array.parameters(self.sizes.sh_degree);
-        let (first_row, n) = (rows.start as u64, rows.len() as u64);
-        let of_rows = values.chunks_exact(parameters.len());
-        if array != ModelArray::Sh {
-            let mut all = self.read("rows", 48 * first_row, 48 * n)?;
-            for (row, values) in all.chunks_exact_mut(12).zip(of_rows) {
-                row[parameters.clone()].copy_from_slice(values);
+        let given = array.parameters(self.sizes.sh_degree);
+        for to in self.sizes.parameters() {
+            if let Some((here, there)) = shared(&given, &to.parameters) {
+                let mut all = match there.len() == to.numbers {
+                    true => vec![0.0; to.numbers * rows.len()],
+                    false => self.read_rows(&to, rows.clone())?,
+                };
+                let of_rows = all.chunks_exact_mut(to.numbers);
+                for (to, from) in of_rows.zip(values.chunks_exact(given.len())) {
+                    to[there.clone()].copy_from_slice(&from[here.clone()]);
+                }
+                self.write_at(to.name, to.row_bytes() * rows.start as u64, &all);
             }
-            self.write_at("rows", 48 * first_row, &all);
-            return Ok(());
-        }
-        let mut first = 0;
-        for (band, name) in SH.into_iter().enumerate().take(usize::from(self.sizes.sh_degree) + 1) {
-            let numbers = 3 * band_coefficients(band);
-            let of_band = of_rows.clone().flat_map(|row| &row[first..first + numbers]);
-            let band: Vec<f32> = of_band.copied().collect();
-            self.write_at(name, 4 * numbers as u64 * first_row, &band);
-            first += numbers;
         }
         Ok(())
     }
@@ -157,10 +192,16 @@ impl GpuBackend {
     pub(super) fn present(&self, which: u32) -> Result<Vec<f32>, BackendError> {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
-        let mut to = Recorder { pass, pipelines: &self.pipelines };
+        let mut to = Recorder { pass };
         to.run(&self.launches.present, [which, 0, 0, 0], (self.rows as u32).div_ceil(256));
         drop(to);
         self.device.queue.submit([encoder.finish()]);
         self.read("sums", 0, 4 * self.rows as u64)
     }
+}
+
+/// Where two ranges of parameters have the ones that they share; `None` where they share none.
+fn shared(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<usize>)> {
+    let (start, end) = (a.start.max(b.start), a.end.min(b.end));
+    (start < end).then(|| (start - a.start..end - a.start, start - b.start..end - b.start))
 }

@@ -1,23 +1,24 @@
-//! Shaders and the table of kernels, offline; and what shaders draw, on a device.
+//! Shaders and their kernels, offline; and what shaders draw, on a device.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::mem::offset_of;
 
-use naga::valid::{Capabilities, ValidationFlags, Validator};
-use naga::{AddressSpace, Module, TypeInner};
+use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
+use wgpu::naga::{AddressSpace, Module, StructMember, TypeInner};
 
+use densify_policies::policy::{
+    Cadence, CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet,
+};
 use densify_policies::rng::{PolicyRng, Purpose};
 
 use super::super::adapter::AdapterChoice;
 use super::super::device::Device as Opened;
 use super::super::frame::{Frame, State, folded_seed};
+use super::super::launches::Launches;
+use super::super::photographs::KeptPhotographs;
 use super::super::readback;
+use super::super::sizes::Sizes;
 use super::*;
-
-fn module(stage: usize, text: &str) -> Module {
-    naga::front::wgsl::parse_str(text)
-        .unwrap_or_else(|e| panic!("{}: {}", STAGES[stage].0, e.emit_to_string(text)))
-}
 
 /// What naga must allow, beside what WebGPU has everywhere.
 fn capabilities(accumulation: Accumulation) -> Capabilities {
@@ -32,13 +33,13 @@ fn capabilities(accumulation: Accumulation) -> Capabilities {
 }
 
 #[test]
-fn every_shader_is_valid_and_binds_what_the_table_says() {
-    let mut seen = std::collections::BTreeSet::new();
+fn every_shader_is_valid_and_within_the_portable_limits() {
+    let mut seen = BTreeSet::new();
     for accumulation in Accumulation::ALL {
-        for (stage, (name, ..)) in STAGES.iter().enumerate() {
-            if let Some(text) = text(stage, accumulation) {
+        for stage in &STAGES {
+            if let Some(text) = stage.text(accumulation) {
                 check_stage(stage, &text, capabilities(accumulation));
-                seen.insert(*name);
+                seen.insert(stage.name);
             }
         }
     }
@@ -48,13 +49,12 @@ fn every_shader_is_valid_and_binds_what_the_table_says() {
 /// A device is asked for no more than its way to add up needs, and for all of that.
 #[test]
 fn a_shader_needs_what_its_way_to_add_up_asks_for() {
-    let is_valid = |stage: usize, accumulation, allowed| {
-        let text = text(stage, accumulation).expect("it has the stage");
-        Validator::new(ValidationFlags::all(), allowed).validate(&module(stage, &text)).is_ok()
+    let is_valid = |stage: &Stage, accumulation, allowed| {
+        let text = stage.text(accumulation).expect("it has the stage");
+        let module = stage.parse(&text);
+        Validator::new(ValidationFlags::all(), allowed).validate(&module).is_ok()
     };
-    let stage = |wanted: &str| STAGES.iter().position(|(name, ..)| *name == wanted);
-    let of_atomics = ["rasterize_bwd_atomic", "observe_atomic"];
-    for stage in of_atomics.map(|name| stage(name).expect("it is in the table")) {
+    for stage in STAGES.iter().filter(|stage| stage.on == On::Atomics) {
         for accumulation in [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics] {
             let all = capabilities(accumulation);
             assert!(is_valid(stage, accumulation, all), "{accumulation}");
@@ -65,51 +65,85 @@ fn a_shader_needs_what_its_way_to_add_up_asks_for() {
     }
 }
 
-fn check_stage(stage: usize, text: &str, capabilities: Capabilities) {
-    let name = STAGES[stage].0;
-    let module = module(stage, text);
+/// Every device has the portable limits of WebGPU.
+fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
+    let module = stage.parse(text);
     let info = Validator::new(ValidationFlags::all(), capabilities)
         .validate(&module)
-        .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(text)));
-    let of_stage: Vec<_> = KERNELS.iter().filter(|(of, ..)| *of == name).collect();
-    assert_eq!(of_stage.len(), module.entry_points.len(), "{name}: kernels");
+        .unwrap_or_else(|e| panic!("{}: {}", stage.name, e.emit_to_string(text)));
     for (i, entry) in module.entry_points.iter().enumerate() {
-        let (_, _, bindings) = of_stage
-            .iter()
-            .find(|(_, kernel, _)| *kernel == entry.name)
-            .unwrap_or_else(|| panic!("{name}: {} is in no table", entry.name));
         let uses = info.get_entry_point(i);
-        let mut used: Vec<u32> = Vec::new();
         let (mut storage, mut shared) = (0, 0);
         for (handle, variable) in module.global_variables.iter() {
             if uses[handle].is_empty() {
                 continue;
-            }
-            if let Some(binding) = &variable.binding {
-                used.push(binding.binding);
-                let writes = match variable.space {
-                    AddressSpace::Storage { access } => {
-                        Some(access.contains(naga::StorageAccess::STORE))
-                    }
-                    _ => None,
-                };
-                let bound = match binding_type(text, binding.binding) {
-                    wgpu::BufferBindingType::Uniform => None,
-                    wgpu::BufferBindingType::Storage { read_only } => Some(!read_only),
-                };
-                assert_eq!(bound, writes, "{name}: binding {}", binding.binding);
             }
             storage += u32::from(matches!(variable.space, AddressSpace::Storage { .. }));
             if variable.space == AddressSpace::WorkGroup {
                 shared += module.types[variable.ty].inner.size(module.to_ctx());
             }
         }
-        used.sort_unstable();
-        assert_eq!(&used[..], *bindings, "{name}: {}", entry.name);
-        // What every device has: the portable limits of WebGPU.
         assert!(storage <= 8, "{}: {storage} storage buffers", entry.name);
         assert!(shared <= 16_384, "{}: {shared} bytes of shared memory", entry.name);
         assert!(entry.workgroup_size.iter().product::<u32>() <= 256, "{}", entry.name);
+    }
+}
+
+/// The sizes of a backend that has every buffer there is.
+fn largest_sizes(accumulation: Accumulation) -> Sizes {
+    let candidates = CandidateRequest {
+        from: 0,
+        until: 1,
+        rows_per_candidate: 1,
+        capacity: 1,
+        error: ErrorMode::L1,
+        depth: DepthMode::Median,
+        min_alpha: 0.0,
+        spaced: false,
+    };
+    let needs = Needs {
+        signals: SignalSet::of(&Signal::ALL),
+        candidates: Some(candidates),
+        cadence: Cadence { all: 2, sh_rest: 2 },
+        ..Needs::default()
+    };
+    let mut sizes = Sizes::new(10, 100, 3, (32, 32), &needs, accumulation);
+    sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
+    sizes
+}
+
+/// A variable that no buffer has the name of would be bound to nothing.
+#[test]
+fn every_kernel_is_launched_and_every_variable_has_a_buffer() {
+    for accumulation in Accumulation::ALL {
+        let mut kernels = BTreeMap::new();
+        for stage in &STAGES {
+            let Some(text) = stage.text(accumulation) else { continue };
+            for Kernel { entry, bindings } in stage.kernels(&text, &stage.parse(&text)) {
+                assert!(kernels.insert(entry.clone(), bindings).is_none(), "two kernels `{entry}`");
+            }
+        }
+        let sizes = largest_sizes(accumulation);
+        let buffers: BTreeSet<_> = sizes.planned().into_iter().map(|p| p.name).collect();
+        let launched = std::cell::RefCell::new(BTreeSet::new());
+        let _ = Launches::new(
+            &|kernel, instead| {
+                let bindings = &kernels[kernel];
+                for (variable, buffer) in instead {
+                    let is_used = bindings.iter().any(|binding| binding.name == *variable);
+                    assert!(is_used, "{kernel}: it uses no `{variable}`");
+                    assert!(buffers.contains(buffer), "{kernel}: there is no `{buffer}`");
+                }
+                for Binding { name, .. } in bindings {
+                    let is_given = instead.iter().any(|(variable, _)| variable == name);
+                    assert!(is_given || buffers.contains(&**name), "{kernel}: `{name}`");
+                }
+                launched.borrow_mut().insert(kernel);
+            },
+            &sizes,
+        );
+        let all: BTreeSet<_> = kernels.keys().map(|name| &**name).collect();
+        assert_eq!(*launched.borrow(), all, "{accumulation}");
     }
 }
 
@@ -117,7 +151,7 @@ fn offsets(module: &Module, name: &str) -> (BTreeMap<String, u32>, u32) {
     let found = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some(name));
     let Some((_, ty)) = found else { panic!("no struct {name}") };
     let TypeInner::Struct { members, span } = &ty.inner else { panic!("{name} is no struct") };
-    let of = |m: &naga::StructMember| (m.name.clone().unwrap_or_default(), m.offset);
+    let of = |m: &StructMember| (m.name.clone().unwrap_or_default(), m.offset);
     (members.iter().map(of).collect(), *span)
 }
 
@@ -130,8 +164,8 @@ fn structs_lie_as_the_shaders_read_them() {
             [$(stringify!($field)),*].len()
         }};
     }
-    let text = text(1, Accumulation::Slots).expect("all devices have it");
-    let module = module(1, &text);
+    let tiles = &STAGES[1];
+    let module = tiles.parse(&tiles.text(Accumulation::Slots).expect("all devices have it"));
     let (frame, span) = offsets(&module, "Frame");
     let fields = check!(frame, Frame, rotation centre lens ratio background image model rates
         more_rates noise draw planes);
@@ -160,15 +194,9 @@ fn drawn(device: &Opened, rows: u32, now: [u32; 4]) -> Vec<[u32; 8]> {
         label: None,
         source: wgpu::ShaderSource::Wgsl((&text).into()),
     });
-    let layout = bind_group_layout(gpu, "draws", &text, &[1]);
-    let all = gpu.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: None,
-        bind_group_layouts: &[Some(&layout)],
-        immediate_size: NOW_BYTES,
-    });
     let pipeline = gpu.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: None,
-        layout: Some(&all),
+        layout: None,
         module: &module,
         entry_point: Some("draws"),
         compilation_options: wgpu::PipelineCompilationOptions::default(),
@@ -182,10 +210,10 @@ fn drawn(device: &Opened, rows: u32, now: [u32; 4]) -> Vec<[u32; 8]> {
     };
     let found = buffer(wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
     let staging = buffer(wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
-    let bindings = gpu.create_bind_group(&BindGroupDescriptor {
+    let bindings = gpu.create_bind_group(&wgpu::BindGroupDescriptor {
         label: None,
-        layout: &layout,
-        entries: &[BindGroupEntry { binding: 1, resource: found.as_entire_binding() }],
+        layout: &pipeline.get_bind_group_layout(0),
+        entries: &[wgpu::BindGroupEntry { binding: 1, resource: found.as_entire_binding() }],
     });
     let mut encoder = gpu.create_command_encoder(&Default::default());
     {
