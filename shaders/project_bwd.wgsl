@@ -8,8 +8,6 @@
 // projected mean x | colour (through its clamp), projected mean y | direction of view, unused.
 @group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
 
-override DETAIL: u32 = 0u;
-
 @compute @workgroup_size(256)
 fn project_bwd(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -25,8 +23,7 @@ fn project_bwd(
         }
         return;
     }
-    let stride = select(select(9u, 10u, DETAIL == 1u), 15u, DETAIL == 2u);
-    let at = i * stride;
+    let at = i * RECORD;
     let row = load_row(i);
     let g = geometry(row);
     let factor = conic(g);
@@ -75,8 +72,8 @@ fn project_bwd(
     let free = g.clamped == g.ratio;
     let by_ratio = frame.lens.xy * (dm - select(vec2(0.0), g.inv_z * vec2(j02, j12), free));
     var by_depth = 0.0;
-    if DETAIL == 2u {
-        by_depth = row_sums[at + 13u];
+    if DEPTH_AT > 0u {
+        by_depth = row_sums[at + DEPTH_AT];
     }
     let dp = vec3(
         by_ratio * g.inv_z,

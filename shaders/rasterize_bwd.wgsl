@@ -19,9 +19,8 @@ fn put(
     if i >= 0 {
         _ = differentiated(held(u32(i)), first + u32(i), quad, own, pixels, &sums);
     }
-    let stride = fields();
-    for (var f = 0u; f < stride; f++) {
-        put_part(k * stride + f, lane, sums[f]);
+    for (var f = 0u; f < RECORD; f++) {
+        put_part(k * RECORD + f, lane, sums[f]);
     }
 }
 
@@ -43,13 +42,12 @@ fn rasterize_bwd(
 
     let m = member(lane);
     let reached = largest_of_all(m, last_of(pixels));
-    let stride = fields();
     // Nobody takes these.
     var i = reached + lane;
     for (; i < length; i += MEMBERS) {
         let slot = list[begin + i];
-        for (var f = 0u; f < stride; f++) {
-            records[slot * stride + f] = 0.0;
+        for (var f = 0u; f < RECORD; f++) {
+            records[slot * RECORD + f] = 0.0;
         }
     }
     var has_ended = i >= length;
@@ -70,10 +68,10 @@ fn rasterize_bwd(
             put(3u, top - 4, first, lane, quad, own, &pixels);
             meet();
             // One invocation per field of each splat.
-            let which = top - 1 - i32(lane / stride);
-            if lane < SPLATS * stride && which >= 0 {
-                let f = lane % stride;
-                records[slots[which] * stride + f] = summed(lane, f == maximum());
+            let which = top - 1 - i32(lane / RECORD);
+            if lane < SPLATS * RECORD && which >= 0 {
+                let f = lane % RECORD;
+                records[slots[which] * RECORD + f] = summed(lane, f == maximum());
             }
             meet();
         }
@@ -99,22 +97,21 @@ fn gather(
     if row >= frame.model.x || depths[row] == NONE {
         return;
     }
-    let stride = fields();
     let slots = slots_of_row[row];
     var totals: array<f32, FIELDS>;
     if now.a > 0u {
-        for (var f = 0u; f < stride; f++) {
-            totals[f] = row_sums[row * stride + f];
+        for (var f = 0u; f < RECORD; f++) {
+            totals[f] = row_sums[row * RECORD + f];
         }
     }
     for (var i = 0u; i < slots.y; i++) {
-        let source = (slots.x + i) * stride;
-        for (var f = 0u; f < stride; f++) {
+        let source = (slots.x + i) * RECORD;
+        for (var f = 0u; f < RECORD; f++) {
             let x = all_records[source + f];
             totals[f] = select(totals[f] + x, max(totals[f], x), f == maximum());
         }
     }
-    for (var f = 0u; f < stride; f++) {
-        row_sums[row * stride + f] = totals[f];
+    for (var f = 0u; f < RECORD; f++) {
+        row_sums[row * RECORD + f] = totals[f];
     }
 }

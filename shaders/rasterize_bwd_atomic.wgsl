@@ -14,7 +14,7 @@ fn find(
     var sums = array<f32, FIELDS>();
     let is_taken = differentiated(held(i), n + i, quad, own, pixels, &sums);
     if subgroupAny(is_taken) {
-        deliver(m, i, sums, fields(), maximum());
+        deliver(m, i, sums, RECORD, maximum());
     }
 }
 

@@ -11,21 +11,25 @@
 @group(0) @binding(7) var<storage, read> rows: array<f32>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
 
-override DETAIL: u32 = 0u;
-
 const FOLD: f32 = 0.8493218;
 
-// Places in frame.planes.
-const VISIBLE_COUNT: u32 = 0u;
-const SCREEN_GRADIENT: u32 = 1u;
-const SCREEN_GRADIENT_ABS: u32 = 2u;
-const COLOUR_GRADIENT: u32 = 3u;
-const MEAN_GRADIENT: u32 = 4u;
-const MEAN_GRADIENT_NORM: u32 = 7u;
-const WEIGHT_SUM: u32 = 8u;
-const PIXEL_COUNT: u32 = 9u;
-const WEIGHT_MAX: u32 = 10u;
-const FRESH_WEIGHT_MAX: u32 = 11u;
+// The signals' numbers, which are places in frame.planes; policies/src/signals.rs has the table.
+override VISIBLE_COUNT: u32;
+override SCREEN_GRADIENT: u32;
+override SCREEN_GRADIENT_ABS: u32;
+override COLOUR_GRADIENT: u32;
+override MEAN_GRADIENT_X: u32;
+override MEAN_GRADIENT_Y: u32;
+override MEAN_GRADIENT_Z: u32;
+override MEAN_GRADIENT_NORM: u32;
+override WEIGHT_MAX: u32;
+override FRESH_WEIGHT_MAX: u32;
+override WEIGHT_SUM: u32;
+override PIXEL_COUNT: u32;
+override OPACITY: u32;
+override SCALE_MAX: u32;
+override SCALE_PRODUCT: u32;
+override AGE: u32;
 
 fn plane(signal: u32) -> u32 {
     return frame.planes[signal / 4u][signal % 4u];
@@ -46,16 +50,6 @@ fn raise(signal: u32, row: u32, value: f32) {
     }
 }
 
-fn largest_weight(row: u32) -> f32 {
-    if DETAIL == 1u {
-        return row_sums[10u * row + 9u];
-    }
-    if DETAIL == 2u {
-        return row_sums[15u * row + 14u];
-    }
-    return 0.0;
-}
-
 @compute @workgroup_size(256)
 fn accumulate(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -68,7 +62,7 @@ fn accumulate(
     let half = 0.5 * vec2<f32>(frame.image.xy);
     let by_mean = gradient[5u * row].xyz;
     let by_projected = vec2(gradient[5u * row + 2u].w, gradient[5u * row + 3u].w);
-    let at = row * select(select(9u, 10u, DETAIL == 1u), 15u, DETAIL == 2u);
+    let at = row * RECORD;
     let by_colour = vec3(row_sums[at + 6u], row_sums[at + 7u], row_sums[at + 8u]);
     add(VISIBLE_COUNT, row, 1.0);
     let depth = bitcast<f32>(depths[row]);
@@ -79,21 +73,26 @@ fn accumulate(
     }
     add(SCREEN_GRADIENT, row, weight * norm2(by_projected * half));
     add(COLOUR_GRADIENT, row, weight * norm3(by_colour));
-    for (var k = 0u; k < 3u; k++) {
-        add(MEAN_GRADIENT + k, row, by_mean[k]);
-    }
+    add(MEAN_GRADIENT_X, row, by_mean.x);
+    add(MEAN_GRADIENT_Y, row, by_mean.y);
+    add(MEAN_GRADIENT_Z, row, by_mean.z);
     add(MEAN_GRADIENT_NORM, row, norm3(by_mean));
-    if DETAIL == 2u {
+    if ABS_X_AT > 0u {
         // The sums are in folded units, and l1 is not in the first.
         let unfold = 1.0 / FOLD;
         let l1 = splats[3u * row].z * unfold;
-        let abs_gradient = vec2(l1 * unfold * row_sums[at + 9u], unfold * unfold * row_sums[at + 10u]);
-        add(SCREEN_GRADIENT_ABS, row, weight * norm2(abs_gradient * half));
-        add(WEIGHT_SUM, row, row_sums[at + 11u]);
-        add(PIXEL_COUNT, row, row_sums[at + 12u]);
+        let by_x = l1 * unfold * row_sums[at + ABS_X_AT];
+        let by_y = unfold * unfold * row_sums[at + ABS_Y_AT];
+        add(SCREEN_GRADIENT_ABS, row, weight * norm2(vec2(by_x, by_y) * half));
     }
-    if DETAIL >= 1u {
-        raise(WEIGHT_MAX, row, largest_weight(row));
+    if WEIGHT_SUM_AT > 0u {
+        add(WEIGHT_SUM, row, row_sums[at + WEIGHT_SUM_AT]);
+    }
+    if PIXEL_COUNT_AT > 0u {
+        add(PIXEL_COUNT, row, row_sums[at + PIXEL_COUNT_AT]);
+    }
+    if WEIGHT_MAX_AT > 0u {
+        raise(WEIGHT_MAX, row, row_sums[at + WEIGHT_MAX_AT]);
     }
 }
 
@@ -123,13 +122,12 @@ fn measure(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row < frame.model.x && state.short == 0u && depths[row] != NONE {
-        raise(FRESH_WEIGHT_MAX, row, largest_weight(row));
+    if WEIGHT_MAX_AT > 0u && row < frame.model.x && state.short == 0u && depths[row] != NONE {
+        raise(FRESH_WEIGHT_MAX, row, row_sums[row * RECORD + WEIGHT_MAX_AT]);
     }
 }
 
-// Present values into the first plane of `signals`, which is a scratch buffer then; now.a: 0
-// opacity, 1 largest scale, 2 product of the scales, 3 age.
+// Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal.
 @compute @workgroup_size(256)
 fn present(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -141,15 +139,16 @@ fn present(
     }
     let s = vec3(rows[12u * row + 3u], rows[12u * row + 4u], rows[12u * row + 5u]);
     let logit = rows[12u * row + 10u];
-    var value = f32(ages[row] & 0xffffu);
-    switch now.a {
-        case 0u: {
-            let e = exp_exact(-abs(logit));
-            value = select(e, 1.0, logit >= 0.0) / (1.0 + e);
-        }
-        case 1u: { value = exp_exact(max(max(s.x, s.y), s.z)); }
-        case 2u: { value = exp_exact(s.x + s.y + s.z); }
-        default: {}
+    var value = 0.0;
+    if now.a == OPACITY {
+        let e = exp_exact(-abs(logit));
+        value = select(e, 1.0, logit >= 0.0) / (1.0 + e);
+    } else if now.a == SCALE_MAX {
+        value = exp_exact(max(max(s.x, s.y), s.z));
+    } else if now.a == SCALE_PRODUCT {
+        value = exp_exact(s.x + s.y + s.z);
+    } else if now.a == AGE {
+        value = f32(ages[row] & 0xffffu);
     }
     signals[row] = value;
 }

@@ -4,73 +4,117 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-/// A per-row statistic that a policy may read: one `f32` per row.
-///
-/// Sums run over the views in which the row was visible since the last
-/// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum Signal {
+/// How a signal comes about, which decides where a backend keeps it and when it starts anew.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SignalKind {
+    /// Summed over the views in which the row was visible since the last
+    /// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
+    Sum,
+    /// The same, of whole numbers.
+    Count,
+    /// The largest value of the previous and the current epoch.
+    EpochMaximum,
+    /// The largest value in views that are rendered for the event.
+    FreshMaximum,
+    /// Read from the row as it is now; costs no memory.
+    Present,
+}
+
+/// What a view's backward pass must sum over the pixels of each row for a signal, beyond what training
+/// itself needs: it costs a backend memory and time for every (row, tile) pair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PixelSum {
+    /// |dL/d(projected mean)|, for each axis.
+    AbsGradient,
+    /// The blend weight α·T.
+    Weight,
+    /// 1 where the row was blended.
+    Count,
+    /// The largest blend weight α·T, rather than a sum.
+    LargestWeight,
+}
+
+/// The table of signals: each is one entry of name, kind, unit and what it is summed from.
+macro_rules! signals {
+    ($($(#[$doc:meta])* $name:ident: $kind:ident $unit:literal [$($sum:ident),*];)*) => {
+        /// A per-row statistic that a policy may read: one `f32` per row.
+        #[derive(
+            Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize,
+        )]
+        #[serde(rename_all = "snake_case")]
+        pub enum Signal {
+            $($(#[$doc])* $name,)*
+        }
+
+        impl Signal {
+            /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
+            pub const ALL: [Self; [$(stringify!($name)),*].len()] = [$(Self::$name),*];
+
+            /// How it comes about.
+            #[must_use]
+            pub const fn kind(self) -> SignalKind {
+                match self {
+                    $(Self::$name => SignalKind::$kind,)*
+                }
+            }
+
+            /// Its unit; `1` for a number without one.
+            #[must_use]
+            pub const fn unit(self) -> &'static str {
+                match self {
+                    $(Self::$name => $unit,)*
+                }
+            }
+
+            /// What it costs in every backward pass.
+            #[must_use]
+            pub const fn pixel_sums(self) -> &'static [PixelSum] {
+                match self {
+                    $(Self::$name => &[$(PixelSum::$sum),*],)*
+                }
+            }
+        }
+    };
+}
+
+signals! {
     /// Number of views whose image the row's projection overlaps, >= 0.
-    VisibleCount,
+    VisibleCount: Count "views" [];
     /// Sum over views of ‖dL/d(mean in NDC)‖₂, >= 0. NDC gradient = pixel gradient · (W/2, H/2).
     /// [`Needs::full_depth`](crate::policy::Needs::full_depth) reduces the weight of near views in
     /// this sum and in the next two.
-    ScreenGradient,
+    ScreenGradient: Sum "1" [];
     /// Sum over views of ‖Σ over pixels |dL/d(mean in NDC)|‖₂ (absolute per axis, AbsGS), >= 0.
-    ScreenGradientAbs,
+    ScreenGradientAbs: Sum "1" [AbsGradient];
     /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. Ignores the
     /// clamp at 0: a row clamped to black has a gradient too.
-    ColourGradient,
+    ColourGradient: Sum "1" [];
     /// x of the sum over views of dL/d(mean) `[1 / scene units]`.
-    MeanGradientX,
+    MeanGradientX: Sum "1 / scene units" [];
     /// y of the sum over views of dL/d(mean) `[1 / scene units]`.
-    MeanGradientY,
+    MeanGradientY: Sum "1 / scene units" [];
     /// z of the sum over views of dL/d(mean) `[1 / scene units]`.
-    MeanGradientZ,
+    MeanGradientZ: Sum "1 / scene units" [];
     /// Sum over views of ‖dL/d(mean)‖₂ `[1 / scene units]`, >= 0.
-    MeanGradientNorm,
+    MeanGradientNorm: Sum "1 / scene units" [];
     /// Largest blend weight α·T over all pixels of the previous and the current epoch, in `[0, 1]`.
-    WeightMax,
+    WeightMax: EpochMaximum "1" [LargestWeight];
     /// Largest blend weight α·T over all pixels of training views rendered for this event, in
     /// `[0, 1]`; [`Needs::fresh_views`](crate::policy::Needs::fresh_views) of them, chosen at
     /// random. 0 for a row that none of them shows.
-    FreshWeightMax,
+    FreshWeightMax: FreshMaximum "1" [LargestWeight];
     /// Sum of the blend weights α·T over all pixels, >= 0.
-    WeightSum,
+    WeightSum: Sum "pixels" [Weight];
     /// Number of pixels the row was blended into, >= 0.
-    PixelCount,
+    PixelCount: Count "pixels" [Count];
     /// Opacity now, in (0, 1).
-    Opacity,
+    Opacity: Present "1" [];
     /// Largest of the three standard deviations now `[scene units]`, > 0.
-    ScaleMax,
+    ScaleMax: Present "scene units" [];
     /// Product of the three standard deviations now `[scene units³]`, >= 0.
-    ScaleProduct,
+    ScaleProduct: Present "scene units³" [];
     /// Optimiser steps since the row was created or rewritten, saturating at 65,535.
-    Age,
-}
-
-impl Signal {
-    /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
-    pub const ALL: [Self; 16] = [
-        Self::VisibleCount,
-        Self::ScreenGradient,
-        Self::ScreenGradientAbs,
-        Self::ColourGradient,
-        Self::MeanGradientX,
-        Self::MeanGradientY,
-        Self::MeanGradientZ,
-        Self::MeanGradientNorm,
-        Self::WeightMax,
-        Self::FreshWeightMax,
-        Self::WeightSum,
-        Self::PixelCount,
-        Self::Opacity,
-        Self::ScaleMax,
-        Self::ScaleProduct,
-        Self::Age,
-    ];
+    Age: Present "steps" [];
 }
 
 /// A set of [`Signal`]s.

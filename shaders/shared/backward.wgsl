@@ -6,8 +6,6 @@
 // dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
-// Fields of a sum: 0: what training needs, 1: and the largest blend weight, 2: every field.
-override DETAIL: u32 = 0u;
 // Whether alpha and depth have gradients.
 override MORE: bool = false;
 
@@ -63,13 +61,9 @@ fn behind_all(quad: Quad, own: Upstream, length: u32) -> Behind {
     return pixels;
 }
 
-fn fields() -> u32 {
-    return select(select(9u, 10u, DETAIL == 1u), FIELDS, DETAIL == 2u);
-}
-
-// The field that is the largest of its values rather than their sum; none: NONE.
+// The number that is the largest of its values rather than their sum; none: NONE.
 fn maximum() -> u32 {
-    return select(select(NONE, 9u, DETAIL == 1u), 14u, DETAIL == 2u);
+    return select(NONE, WEIGHT_MAX_AT, WEIGHT_MAX_AT > 0u);
 }
 
 // How many splats, from the front, pixels go through before all have stopped.
@@ -118,18 +112,25 @@ fn differentiated(
     (*sums)[6] = total(w * own.red);
     (*sums)[7] = total(w * own.green);
     (*sums)[8] = total(w * own.blue);
-    if DETAIL == 1u {
-        (*sums)[9] = largest(w);
+    if ABS_X_AT > 0u {
+        (*sums)[ABS_X_AT] = total(abs(qu));
     }
-    if DETAIL == 2u {
+    if ABS_Y_AT > 0u {
         let a = splat.a;
         let l3 = splat.b.x;
-        (*sums)[9] = total(abs(qu));
-        (*sums)[10] = total(abs(l3 * qz - a.z * a.w * qu));
-        (*sums)[11] = total(w);
-        (*sums)[12] = total(select(vec4(0.0), vec4(1.0), w > vec4(0.0)));
-        (*sums)[13] = total(w * own.depth);
-        (*sums)[14] = largest(w);
+        (*sums)[ABS_Y_AT] = total(abs(l3 * qz - a.z * a.w * qu));
+    }
+    if WEIGHT_SUM_AT > 0u {
+        (*sums)[WEIGHT_SUM_AT] = total(w);
+    }
+    if PIXEL_COUNT_AT > 0u {
+        (*sums)[PIXEL_COUNT_AT] = total(select(vec4(0.0), vec4(1.0), w > vec4(0.0)));
+    }
+    if DEPTH_AT > 0u {
+        (*sums)[DEPTH_AT] = total(w * own.depth);
+    }
+    if WEIGHT_MAX_AT > 0u {
+        (*sums)[WEIGHT_MAX_AT] = largest(w);
     }
     return true;
 }

@@ -14,7 +14,7 @@
 // Invocations of a tile.
 const MEMBERS: u32 = 64u;
 
-// Fields of the longest sum over a tile's pixels.
+// Numbers of the longest record.
 const FIELDS: u32 = 15u;
 
 struct Splat {

@@ -24,8 +24,8 @@ struct Frame {
     noise: vec4<f32>,
     // Seed, step, bits of what is due (see adam.wgsl), kind of target (see loss.wgsl).
     draw: vec4<u32>,
-    // Planes of the signals' accumulators, NONE where not asked for.
-    planes: array<vec4<u32>, 4>,
+    // Planes of the signals' accumulators, by their numbers; NONE where not asked for.
+    planes: array<vec4<u32>, 8>,
 }
 
 struct State {

@@ -9,7 +9,7 @@ pub mod cpu;
 pub mod gpu;
 mod pixel_map;
 mod shortcuts;
-mod signal_planes;
+mod signals;
 mod state;
 mod storage;
 

@@ -34,7 +34,7 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
     let signals = Accumulators::new(1, needs);
-    let stride = signals.detail().stride();
+    let stride = signals.layout().stride();
     let per_row = planes(sh_degree);
     let padded = budget.next_multiple_of(WIDTH) as u64;
     let (width, height) = options.largest_image;

@@ -3,9 +3,9 @@
 use super::loss::ImageTerms;
 use super::optimise::Differentiate;
 use super::rasterize::DARK;
-use super::rasterize_bwd::Detail;
 use super::tiles::Grid;
 use super::{CpuBackend, ImageGradient, ModelGradient, for_each_pixel, scalars};
+use crate::backend::signals::RecordLayout;
 use crate::backend::{BackendError, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -14,7 +14,7 @@ impl CpuBackend {
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
     /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
     ///
-    /// Needs records of full detail, so that it allocates more than the ledger says where the
+    /// Needs every field of a record, so that it allocates more than the ledger says where the
     /// policy's needs are smaller: it is a tool for tests and for research, not part of training.
     ///
     /// # Errors
@@ -33,8 +33,7 @@ impl CpuBackend {
         assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
         assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
         assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
-        let detail = Detail::All;
-        let records = self.record_cap * detail.stride();
+        let records = self.record_cap * RecordLayout::MOST;
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);
         }
@@ -50,7 +49,7 @@ impl CpuBackend {
                 gradient.planes[4][patch][lane] = upstream.depth[at];
             });
         }
-        self.backward(&frame, detail);
+        self.backward(&frame, RecordLayout::ALL);
         let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
         self.arch.dispatch(Differentiate {
             params: self.params.view(self.rows),

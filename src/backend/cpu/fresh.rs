@@ -20,7 +20,7 @@ impl CpuBackend {
             for gradient in &mut self.gradient {
                 gradient.planes = [DARK; 5];
             }
-            self.backward(&frame, self.signals.detail());
+            self.backward(&frame, self.signals.layout());
             let Self { pool, signals, sums, visible, rows, .. } = self;
             pool.install(|| signals.measure(*rows, sums, visible));
         });

@@ -110,11 +110,11 @@ pub struct CpuBackend {
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
     /// Bits of one record per entry, as far as there is room. Shape: `[record cap, stride of the
-    /// signals' detail]`.
+    /// records]`.
     records: Vec<AtomicU32>,
     record_cap: usize,
     /// One record per row. Between steps it is lent to the host's copy of the signals, and has room
-    /// for these. Shape: `[budget, stride of the signals' detail]`, or more.
+    /// for these. Shape: `[budget, stride of the records]`, or more.
     sums: Vec<f32>,
     clock: StageClock,
 }
@@ -145,7 +145,7 @@ impl CpuBackend {
         let ledger = budget::ledger(model.sh_degree, options, pool.current_num_threads());
         budget::reserve(&ledger)?;
         let signals = Accumulators::new(budget, &options.needs);
-        let (stride, sums) = (signals.detail().stride(), signals.sums());
+        let (stride, sums) = (signals.layout().stride(), signals.sums());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let blocks = budget.div_ceil(WIDTH);
         let per_row = planes(model.sh_degree);
@@ -220,9 +220,8 @@ impl Backend for CpuBackend {
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);
         }
-        let detail = self.signals.detail();
-        self.backward(&frame, detail);
-        self.optimise(&frame, input, detail);
+        self.backward(&frame, self.signals.layout());
+        self.optimise(&frame, input);
         self.clock.lap("project_bwd + adam");
         Ok(StepOutput {
             visible: frame.visible,

@@ -108,7 +108,7 @@ impl CpuBackend {
     fn columns(&mut self, frame: &Frame, wanted: &[AuxColumn]) -> Vec<(AuxColumn, Vec<f32>)> {
         let Frame { grid, bands, .. } = frame;
         let blending = self.shortcuts.into();
-        self.have_sums(self.signals.detail());
+        self.have_sums(self.signals.layout());
         let Self { pool, arch, lists, splats, records, sums, visible, gradient, rows, .. } = self;
         let rows = *rows;
         let sums = &mut sums[..rows * STRIDE];

@@ -12,12 +12,12 @@ use super::narrow::Draws;
 use super::parameters::{ParameterTask, ParameterView};
 use super::project::ViewParams;
 use super::project_bwd::BlockGradient;
-use super::rasterize_bwd::{Detail, field};
+use super::rasterize_bwd::field;
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::summed::{Due, TaskSums};
 use crate::backend::LearningRates;
-use crate::backend::signal_planes::SignalPlanes;
+use crate::backend::signals::{Field, RecordLayout, SignalPlanes};
 use crate::gaussians::sh_coefficients;
 
 /// How far from 1 the squared length of a quaternion may be where it is stored in fewer bits. Were it
@@ -33,10 +33,10 @@ pub(super) struct Optimise<'a> {
     pub(super) ages: &'a mut [u16],
     /// Accumulators of these blocks; empty if no sum is requested.
     pub(super) signals: &'a mut [f32],
-    pub(super) layout: SignalPlanes,
-    /// Shape: `[rows, detail.stride()]`.
+    pub(super) planes: SignalPlanes,
+    /// Shape: `[rows, layout.stride()]`.
     pub(super) sums: &'a [f32],
-    pub(super) detail: Detail,
+    pub(super) layout: RecordLayout,
     /// Shape: `[blocks]`.
     pub(super) visible: &'a [u16],
     pub(super) view: &'a ViewParams,
@@ -60,8 +60,8 @@ impl WithSimd for Optimise<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { params: stored, moments, ages, signals, layout, sums, .. } = self;
-        let Self { detail, visible, view, rates, bias, summed, due, terms, noise, .. } = self;
+        let Self { params: stored, moments, ages, signals, planes: to, sums, .. } = self;
+        let Self { layout, visible, view, rates, bias, summed, due, terms, noise, .. } = self;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
@@ -72,15 +72,15 @@ impl WithSimd for Optimise<'_> {
         let mut moment_scratch = [Scratch::ZERO; 2];
         for (b, &seen) in visible.iter().enumerate() {
             let params = stored.open(b, trained, &mut scratch);
-            let per_block = WIDTH * detail.stride();
+            let per_block = WIDTH * layout.stride();
             let sums = &sums[b * per_block..(b + 1) * per_block];
             if seen != 0 || !was_zero {
-                gradient.compute(s, params, sums, detail, seen, view);
+                gradient.compute(s, params, sums, layout, seen, view);
                 was_zero = seen == 0;
             }
             if seen != 0 && signal_stride > 0 {
                 let block = &mut signals[b * signal_stride..(b + 1) * signal_stride];
-                layout.accumulate(s, block, &gradient, detail, view);
+                to.accumulate(s, block, &gradient, view);
             }
             if let Some(terms) = &terms {
                 terms.add(s, params, &mut gradient.params);
@@ -188,7 +188,7 @@ impl ModelGradient {
 /// The gradients of a whole model, without a step.
 pub(super) struct Differentiate<'a> {
     pub(super) params: ParameterView<'a>,
-    /// Records of [`Detail::All`].
+    /// Records with every field.
     pub(super) sums: &'a [f32],
     pub(super) visible: &'a [u16],
     pub(super) view: &'a ViewParams,
@@ -201,7 +201,7 @@ impl WithSimd for Differentiate<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params, sums, visible, view, out } = self;
-        let per_block = WIDTH * Detail::All.stride();
+        let per_block = WIDTH * RecordLayout::MOST;
         let sh_planes = out.sh.len() / out.means.len().max(1);
         let mut g = BlockGradient::ZERO;
         let mut scratch = Scratch::ZERO;
@@ -209,7 +209,7 @@ impl WithSimd for Differentiate<'_> {
         for b in 0..params.blocks() {
             let block = params.open(b, planes(view.sh_degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
-            g.compute(s, block, sums, Detail::All, visible[b], view);
+            g.compute(s, block, sums, RecordLayout::ALL, visible[b], view);
             for lane in 0..WIDTH.min(out.means.len() - b * WIDTH) {
                 let row = b * WIDTH + lane;
                 let at = |p: usize| g.params[p * WIDTH + lane];
@@ -224,9 +224,9 @@ impl WithSimd for Differentiate<'_> {
                 out.mean2d[row] = g.mean2d.map(|line| line[lane]);
                 out.mean2d_abs[row] = g.mean2d_abs.map(|line| line[lane]);
                 out.colour[row] = [0, 1, 2].map(|i| sum(field::COLOUR + i));
-                out.max_weight[row] = sum(field::WEIGHT_MAX);
-                out.sum_weight[row] = sum(field::WEIGHT_SUM);
-                out.pixel_count[row] = sum(field::PIXELS) as u32;
+                out.max_weight[row] = sum(Field::WeightMax.number());
+                out.sum_weight[row] = sum(Field::WeightSum.number());
+                out.pixel_count[row] = sum(Field::PixelCount.number()) as u32;
                 out.visible[row] = g.visible[lane] != 0.0;
             }
         }

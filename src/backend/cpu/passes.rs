@@ -15,12 +15,13 @@ use super::project::{Project, ViewParams};
 use super::rasterize::{
     Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
-use super::rasterize_bwd::{Detail, RasterizeBwd, TileGradient, gather};
+use super::rasterize_bwd::{RasterizeBwd, TileGradient, gather};
 use super::records::parts as parts_of_records;
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
 use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
+use crate::backend::signals::{Field, RecordLayout};
 use crate::backend::{BackendError, Rendering, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -117,10 +118,10 @@ impl CpuBackend {
     }
 
     /// Stage 5: from `self.gradient` to one record per row in `self.sums`.
-    pub(super) fn backward(&mut self, frame: &Frame, detail: Detail) {
+    pub(super) fn backward(&mut self, frame: &Frame, layout: RecordLayout) {
         let Frame { grid, background, bands, .. } = frame;
         let blending = self.shortcuts.into();
-        self.have_sums(detail);
+        self.have_sums(layout);
         let Self {
             pool,
             arch,
@@ -135,7 +136,7 @@ impl CpuBackend {
             rows,
             ..
         } = self;
-        let stride = detail.stride();
+        let stride = layout.stride();
         pool.install(|| {
             for band in bands {
                 if bands.len() > 1 {
@@ -154,8 +155,8 @@ impl CpuBackend {
                             blending,
                             canvas: &canvas[tile],
                             upstream: [r, g, b],
-                            upstream_more: (detail == Detail::All).then_some([alpha, depth]),
-                            detail,
+                            upstream_more: layout.has(Field::Depth).then_some([alpha, depth]),
+                            layout,
                             records: part.records(lists, i, records, stride),
                         });
                     });
@@ -163,7 +164,7 @@ impl CpuBackend {
                     // Slots of rows that are gone are those of an older frame.
                     let visible = &visible[..rows.div_ceil(WIDTH)];
                     part.gather(lists, records, sums, visible, (stride, fresh), |sum, records| {
-                        gather(sum, detail, records);
+                        gather(sum, layout, records);
                     });
                     fresh = false;
                     clock.lap("gather");
@@ -172,9 +173,9 @@ impl CpuBackend {
         });
     }
 
-    /// Makes the sums whole again where they were lent, or too few for so much detail.
-    pub(super) fn have_sums(&mut self, detail: Detail) {
-        let whole = self.visible.len() * WIDTH * detail.stride();
+    /// Allocates the sums anew where they were lent, or are too few for these records.
+    pub(super) fn have_sums(&mut self, layout: RecordLayout) {
+        let whole = self.visible.len() * WIDTH * layout.stride();
         if self.sums.len() < whole {
             self.sums.resize(whole, 0.0);
         }
@@ -270,14 +271,14 @@ impl CpuBackend {
     }
 
     /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
-    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>, detail: Detail) {
+    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
         let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
             self;
         let (rows, arch) = (*rows, *arch);
         let terms = Terms::new(self.terms, rows);
         let noise = self.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
-        let layout = signals.layout();
+        let (planes, layout) = (signals.planes(), signals.layout());
         let signal_stride = signals.blocks.stride();
         let storing = PolicyRng::new(input.seed, input.step);
         let blocks = rows.div_ceil(WIDTH);
@@ -293,8 +294,8 @@ impl CpuBackend {
                 moment_tasks.par_iter_mut(),
                 ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
                 signal_blocks.par_iter_mut(),
-                sums[..blocks * WIDTH * detail.stride()]
-                    .par_chunks(ROWS_PER_TASK * detail.stride()),
+                sums[..blocks * WIDTH * layout.stride()]
+                    .par_chunks(ROWS_PER_TASK * layout.stride()),
                 visible[..blocks].par_chunks(BLOCKS_PER_TASK),
                 summed.par_iter_mut().enumerate(),
             )
@@ -307,9 +308,9 @@ impl CpuBackend {
                             storing: &storing,
                             ages,
                             signals,
-                            layout,
+                            planes,
                             sums,
-                            detail,
+                            layout,
                             visible,
                             view: &frame.view,
                             rates: &input.rates,

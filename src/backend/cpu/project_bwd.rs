@@ -19,8 +19,9 @@ use super::project::{
     FOLD, Geometry, ViewParams, conic, direction, dot, geometry, lanes, raw_colour, rotation,
     sh_basis,
 };
-use super::rasterize_bwd::{Detail, field};
+use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
+use crate::backend::signals::{BASE, Field, RecordLayout};
 use crate::gaussians::sh_coefficients;
 use crate::sh;
 
@@ -34,8 +35,8 @@ pub(super) struct BlockGradient {
     pub(super) mean2d_abs: [[f32; WIDTH]; 2],
     /// 1 / depth in the camera `[1/scene unit]`.
     pub(super) inv_z: [f32; WIDTH],
-    /// The record sums, field after field.
-    pub(super) sums: [[f32; WIDTH]; field::ALL],
+    /// The record sums, number after number; those that records do not have are of no use.
+    pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],
     /// 1 for visible rows, 0 for others.
     pub(super) visible: [f32; WIDTH],
 }
@@ -46,20 +47,20 @@ impl BlockGradient {
         mean2d: [[0.0; WIDTH]; 2],
         mean2d_abs: [[0.0; WIDTH]; 2],
         inv_z: [0.0; WIDTH],
-        sums: [[0.0; WIDTH]; field::ALL],
+        sums: [[0.0; WIDTH]; RecordLayout::MOST],
         visible: [0.0; WIDTH],
     };
 
     /// Differentiates the rows of `block` that are set in `visible`; the others get 0.
     ///
-    /// `sums` has one record per row. Shape: `[WIDTH, detail.stride()]`.
+    /// `sums` has one record per row. Shape: `[WIDTH, layout.stride()]`.
     #[inline(always)]
     pub(super) fn compute<S: Simd>(
         &mut self,
         s: S,
         block: &[f32],
         sums: &[f32],
-        detail: Detail,
+        layout: RecordLayout,
         visible: u16,
         view: &ViewParams,
     ) {
@@ -67,15 +68,19 @@ impl BlockGradient {
             *self = Self::ZERO;
             return;
         }
-        for (lane, record) in sums.chunks_exact(detail.stride()).enumerate() {
+        for (lane, record) in sums.chunks_exact(layout.stride()).enumerate() {
             let seen = visible >> lane & 1 == 1;
             self.visible[lane] = f32::from(u8::from(seen));
-            for (line, &x) in self.sums.iter_mut().zip(record) {
+            let (base, extras) = record.split_at(BASE);
+            for (line, &x) in self.sums.iter_mut().zip(base) {
                 line[lane] = if seen { x } else { 0.0 };
+            }
+            for (&number, &x) in layout.extras().iter().zip(extras) {
+                self.sums[usize::from(number)][lane] = if seen { x } else { 0.0 };
             }
         }
         for at in (0..WIDTH).step_by(S::F32_LANES) {
-            self.lanes(s, block, at, detail, view);
+            self.lanes(s, block, at, layout, view);
         }
     }
 
@@ -85,7 +90,7 @@ impl BlockGradient {
         s: S,
         block: &[f32],
         at: usize,
-        detail: Detail,
+        layout: RecordLayout,
         view: &ViewParams,
     ) {
         let degree = view.sh_degree;
@@ -120,9 +125,10 @@ impl BlockGradient {
         for (slot, x) in self.mean2d.iter_mut().zip(dm) {
             seen.keep(x).store(&mut slot[at..]);
         }
-        if detail == Detail::All {
+        if layout.has(Field::AbsX) {
             // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with folded u', z', l'.
-            let abs = [l1 * sum!(field::ABS_X) * unfold, sum!(field::ABS_Y) * unfold2];
+            let abs =
+                [l1 * sum!(Field::AbsX.number()) * unfold, sum!(Field::AbsY.number()) * unfold2];
             for (slot, x) in self.mean2d_abs.iter_mut().zip(abs) {
                 seen.keep(x).store(&mut slot[at..]);
             }
@@ -166,7 +172,7 @@ impl BlockGradient {
             let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
             focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
         });
-        let by_depth = if detail == Detail::All { sum!(field::DEPTH) } else { zero };
+        let by_depth = if layout.has(Field::Depth) { sum!(Field::Depth.number()) } else { zero };
         let dp = [
             by_ratio[0] * inv_z,
             by_ratio[1] * inv_z,

@@ -26,8 +26,9 @@ use super::rasterize::{
 use super::records::TileRecords;
 use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
+use crate::backend::signals::{BASE, Field, RecordLayout};
 
-/// Fields of a record.
+/// The numbers that every record has.
 pub(super) mod field {
     pub(in super::super) const Q: usize = 0;
     pub(in super::super) const U: usize = 1;
@@ -36,53 +37,22 @@ pub(super) mod field {
     pub(in super::super) const UZ: usize = 4;
     pub(in super::super) const ZZ: usize = 5;
     pub(in super::super) const COLOUR: usize = 6;
-    /// Σ|q·u| and Σ|q·(l3·z − l1·shear·u)|: the absolute gradients of the projected mean.
-    pub(in super::super) const ABS_X: usize = 9;
-    pub(in super::super) const ABS_Y: usize = 10;
-    /// Σw, number of pixels, Σw·(gradient of depth), max w.
-    pub(in super::super) const WEIGHT_SUM: usize = 11;
-    pub(in super::super) const PIXELS: usize = 12;
-    pub(in super::super) const DEPTH: usize = 13;
-    pub(in super::super) const WEIGHT_MAX: usize = 14;
-    /// Fields that are always there.
-    pub(in super::super) const FEW: usize = 9;
-    /// All fields.
-    pub(in super::super) const ALL: usize = 15;
 }
 
-/// Which fields a record has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Detail {
-    /// What training needs.
-    Gradients,
-    /// That, and the largest blend weight.
-    WeightMax,
-    /// Every field, alpha and depth gradients included.
-    All,
+/// What the kernel is compiled for, beside the base of a record.
+mod extra {
+    /// The absolute gradients.
+    pub(super) const ABS: u8 = 1;
+    /// The sum of weights and the number of pixels.
+    pub(super) const WEIGHTS: u8 = 2;
+    /// The largest weight.
+    pub(super) const LARGEST: u8 = 4;
+    /// Everything, with the gradients of alpha and depth.
+    pub(super) const ALL: u8 = 15;
 }
 
-impl Detail {
-    /// Numbers per record: with [`Detail::WeightMax`] the maximum takes the place after colour.
-    pub(super) const fn stride(self) -> usize {
-        match self {
-            Self::Gradients => field::FEW,
-            Self::WeightMax => field::FEW + 1,
-            Self::All => field::ALL,
-        }
-    }
-
-    /// Which field is a maximum; all others are sums.
-    pub(super) const fn maximum(self) -> Option<usize> {
-        match self {
-            Self::Gradients => None,
-            Self::WeightMax => Some(field::FEW),
-            Self::All => Some(field::WEIGHT_MAX),
-        }
-    }
-}
-
-/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are read for
-/// [`Detail::All`] only.
+/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are read for records with
+/// [`Field::Depth`] only.
 #[derive(Debug, Clone)]
 #[repr(C, align(64))]
 pub(super) struct TileGradient {
@@ -100,9 +70,9 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) blending: Blending,
     pub(super) canvas: &'a TileCanvas,
     pub(super) upstream: [&'a Plane; 3],
-    /// Alpha and depth, for [`Detail::All`].
+    /// Alpha and depth, for records with every field.
     pub(super) upstream_more: Option<[&'a Plane; 2]>,
-    pub(super) detail: Detail,
+    pub(super) layout: RecordLayout,
     /// This tile writes the records of its own entries, those that are held.
     pub(super) records: TileRecords<'a>,
 }
@@ -112,17 +82,37 @@ impl WithSimd for RasterizeBwd<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        match self.detail {
-            Detail::Gradients => self.run::<S, 0>(s),
-            Detail::WeightMax => self.run::<S, 1>(s),
-            Detail::All => self.run::<S, 2>(s),
+        let has = |field| self.layout.has(field);
+        let mut extras = 0;
+        if has(Field::AbsX) {
+            extras |= extra::ABS;
+        }
+        if has(Field::WeightSum) || has(Field::PixelCount) {
+            extras |= extra::WEIGHTS;
+        }
+        if has(Field::WeightMax) {
+            extras |= extra::LARGEST;
+        }
+        if self.upstream_more.is_some() {
+            extras = extra::ALL;
+        }
+        match extras {
+            0 => self.run::<S, 0>(s),
+            1 => self.run::<S, 1>(s),
+            2 => self.run::<S, 2>(s),
+            3 => self.run::<S, 3>(s),
+            4 => self.run::<S, 4>(s),
+            5 => self.run::<S, 5>(s),
+            6 => self.run::<S, 6>(s),
+            7 => self.run::<S, 7>(s),
+            _ => self.run::<S, { extra::ALL }>(s),
         }
     }
 }
 
 /// Sums of one entry, lane by lane.
 struct Sums<S: Simd> {
-    few: [V<S>; field::FEW],
+    base: [V<S>; BASE],
     abs: [V<S>; 2],
     weight: V<S>,
     pixels: V<S>,
@@ -132,8 +122,9 @@ struct Sums<S: Simd> {
 
 impl RasterizeBwd<'_> {
     #[inline(always)]
-    fn run<S: Simd, const DETAIL: u8>(self, s: S) {
-        let Self { splats, list, place, background, canvas, upstream, records, .. } = self;
+    #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
+    fn run<S: Simd, const EXTRAS: u8>(self, s: S) {
+        let Self { splats, list, place, background, canvas, upstream, layout, records, .. } = self;
         let faintest = V::splat(s, -self.blending.log2_reach);
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb] = upstream;
@@ -156,7 +147,8 @@ impl RasterizeBwd<'_> {
         }
         let list_end = patch_end.iter().copied().max().unwrap_or(0) as usize;
         for (i, entry) in list[list_end..].iter().enumerate() {
-            write(records.of(Entry::load(entry), list_end + i), &[0.0; field::ALL]);
+            let record = records.of(Entry::load(entry), list_end + i);
+            write(record, &[0.0; RecordLayout::MOST], layout);
         }
 
         let mut batch = [Splat::default(); BATCH];
@@ -183,7 +175,7 @@ impl RasterizeBwd<'_> {
                 let y2_u = c(-splat.l1 * splat.shear);
                 let zero = V::zero(s);
                 let mut sums = Sums {
-                    few: [zero; field::FEW],
+                    base: [zero; BASE],
                     abs: [zero; 2],
                     weight: zero,
                     pixels: zero,
@@ -211,7 +203,7 @@ impl RasterizeBwd<'_> {
                             V::load(s, &gb[p][at..]),
                         );
                         let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
-                        if DETAIL == 2 {
+                        if EXTRAS == extra::ALL {
                             let d = V::load(s, &gd[p][at..]);
                             own = at_depth.mul_add(d, own + V::load(s, &ga[p][at..]));
                             sums.depth = w.mul_add(d, sums.depth);
@@ -223,77 +215,94 @@ impl RasterizeBwd<'_> {
                         let q = unclamped.le(c(ALPHA_MAX)).keep(w * ahead);
                         let qu = q * u;
                         let qz = q * z;
-                        let few = &mut sums.few;
-                        few[field::Q] = few[field::Q] + q;
-                        few[field::U] = few[field::U] + qu;
-                        few[field::Z] = few[field::Z] + qz;
-                        few[field::UU] = qu.mul_add(u, few[field::UU]);
-                        few[field::UZ] = qu.mul_add(z, few[field::UZ]);
-                        few[field::ZZ] = qz.mul_add(z, few[field::ZZ]);
-                        few[field::COLOUR] = w.mul_add(r, few[field::COLOUR]);
-                        few[field::COLOUR + 1] = w.mul_add(g, few[field::COLOUR + 1]);
-                        few[field::COLOUR + 2] = w.mul_add(b, few[field::COLOUR + 2]);
-                        if DETAIL >= 1 {
+                        let base = &mut sums.base;
+                        base[field::Q] = base[field::Q] + q;
+                        base[field::U] = base[field::U] + qu;
+                        base[field::Z] = base[field::Z] + qz;
+                        base[field::UU] = qu.mul_add(u, base[field::UU]);
+                        base[field::UZ] = qu.mul_add(z, base[field::UZ]);
+                        base[field::ZZ] = qz.mul_add(z, base[field::ZZ]);
+                        base[field::COLOUR] = w.mul_add(r, base[field::COLOUR]);
+                        base[field::COLOUR + 1] = w.mul_add(g, base[field::COLOUR + 1]);
+                        base[field::COLOUR + 2] = w.mul_add(b, base[field::COLOUR + 2]);
+                        if EXTRAS & extra::LARGEST != 0 {
                             sums.weight_max = sums.weight_max.max(w);
                         }
-                        if DETAIL == 2 {
+                        if EXTRAS & extra::ABS != 0 {
                             sums.abs[0] = sums.abs[0] + qu.abs();
                             let y2 = y2_u.mul_add(qu, qz * splat.l3);
                             sums.abs[1] = sums.abs[1] + y2.abs();
+                        }
+                        if EXTRAS & extra::WEIGHTS != 0 {
                             sums.weight = sums.weight + w;
                             sums.pixels = sums.pixels + zero.lt(w).keep(c(1.0));
                         }
                     }
                 }
-                let mut record = [0.0; field::ALL];
-                let [q, u, z, uu, uz, zz, red, green, blue] = sums.few;
+                let mut record = [0.0; RecordLayout::MOST];
+                let [q, u, z, uu, uz, zz, red, green, blue] = sums.base;
                 record[..4].copy_from_slice(&sums_of_four([q, u, z, uu]));
                 record[4..8].copy_from_slice(&sums_of_four([uz, zz, red, green]));
                 record[field::COLOUR + 2] = blue.sum();
-                match DETAIL {
-                    1 => record[field::FEW] = sums.weight_max.max_lane(),
-                    2 => {
-                        record[field::ABS_X] = sums.abs[0].sum();
-                        record[field::ABS_Y] = sums.abs[1].sum();
-                        record[field::WEIGHT_SUM] = sums.weight.sum();
-                        record[field::PIXELS] = sums.pixels.sum();
-                        record[field::DEPTH] = sums.depth.sum();
-                        record[field::WEIGHT_MAX] = sums.weight_max.max_lane();
-                    }
-                    _ => {}
+                if EXTRAS & extra::ABS != 0 {
+                    record[Field::AbsX.number()] = sums.abs[0].sum();
+                    record[Field::AbsY.number()] = sums.abs[1].sum();
                 }
-                write(records.of(Entry::load(&chunk[i]), first + i), &record);
+                if EXTRAS & extra::WEIGHTS != 0 {
+                    record[Field::WeightSum.number()] = sums.weight.sum();
+                    record[Field::PixelCount.number()] = sums.pixels.sum();
+                }
+                if EXTRAS == extra::ALL {
+                    record[Field::Depth.number()] = sums.depth.sum();
+                }
+                if EXTRAS & extra::LARGEST != 0 {
+                    record[Field::WeightMax.number()] = sums.weight_max.max_lane();
+                }
+                write(records.of(Entry::load(&chunk[i]), first + i), &record, layout);
             }
         }
     }
 }
 
+/// Writes those numbers that the records have.
 #[inline(always)]
-fn write(to: Option<&[AtomicU32]>, record: &[f32; field::ALL]) {
-    for (to, x) in to.into_iter().flatten().zip(record) {
+fn write(to: Option<&[AtomicU32]>, all: &[f32; RecordLayout::MOST], layout: RecordLayout) {
+    let Some((base, extras)) = to.and_then(|to| to.split_at_checked(BASE)) else { return };
+    for (to, x) in base.iter().zip(all) {
         to.store(x.to_bits(), Relaxed);
+    }
+    for (to, &number) in extras.iter().zip(layout.extras()) {
+        to.store(all[usize::from(number)].to_bits(), Relaxed);
     }
 }
 
 /// The sums over the records of one row, which lie side by side, in order. `sums` has the shape of a
 /// record.
-pub(super) fn gather(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
-    match detail {
-        Detail::Gradients => gather_all::<{ Detail::Gradients.stride() }>(sums, detail, records),
-        Detail::WeightMax => gather_all::<{ Detail::WeightMax.stride() }>(sums, detail, records),
-        Detail::All => gather_all::<{ Detail::All.stride() }>(sums, detail, records),
+pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU32]) {
+    let maximum = layout.has(Field::WeightMax);
+    match sums.len() {
+        9 => gather_all::<9>(sums, maximum, records),
+        10 => gather_all::<10>(sums, maximum, records),
+        11 => gather_all::<11>(sums, maximum, records),
+        12 => gather_all::<12>(sums, maximum, records),
+        13 => gather_all::<13>(sums, maximum, records),
+        14 => gather_all::<14>(sums, maximum, records),
+        _ => gather_all::<{ RecordLayout::MOST }>(sums, maximum, records),
     }
 }
 
-/// Adds to what `sums` holds.
+/// Adds to what `sums` holds; the last number may be a maximum.
 #[inline(always)]
-fn gather_all<const STRIDE: usize>(sums: &mut [f32], detail: Detail, records: &[AtomicU32]) {
+fn gather_all<const STRIDE: usize>(sums: &mut [f32], maximum: bool, records: &[AtomicU32]) {
     let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
     for record in records.as_chunks::<STRIDE>().0 {
         for i in 0..STRIDE {
             let x = f32::from_bits(record[i].load(Relaxed));
-            total[i] = if detail.maximum() == Some(i) { total[i].max(x) } else { total[i] + x };
+            let is_maximum = maximum && i == STRIDE - 1;
+            total[i] = if is_maximum { total[i].max(x) } else { total[i] + x };
         }
     }
     sums.copy_from_slice(&total);
 }
+
+const _: () = assert!(BASE == 9 && RecordLayout::MOST == 15, "`gather` knows each length");

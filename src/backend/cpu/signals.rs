@@ -1,6 +1,6 @@
 //! Stage 8: what policies ask for, summed over views. Only requested signals have memory.
 
-use densify_policies::policy::{Needs, Signal, SignalSet, Signals};
+use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet, Signals};
 use pulp::Simd;
 use rayon::prelude::*;
 
@@ -8,15 +8,15 @@ use super::blocks::{Blocks, plane};
 use super::parameters::Parameters;
 use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
-use super::rasterize_bwd::{Detail, field};
+use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
-use crate::backend::signal_planes::{SUMS, SignalPlanes};
+use crate::backend::signals::{Field, RecordLayout, SignalPlanes};
 
 /// The accumulators of the requested signals.
 #[derive(Debug)]
 pub(super) struct Accumulators {
     requested: SignalSet,
-    layout: SignalPlanes,
+    planes: SignalPlanes,
     pub(super) blocks: Blocks,
 }
 
@@ -38,7 +38,6 @@ impl SignalPlanes {
         s: S,
         block: &mut [f32],
         g: &BlockGradient,
-        detail: Detail,
         view: &ViewParams,
     ) {
         let half = [V::splat(s, 0.5 * view.width as f32), V::splat(s, 0.5 * view.height as f32)];
@@ -58,8 +57,8 @@ impl SignalPlanes {
             let one = V::splat(s, 1.0);
             let depth = (one / (line!(g.inv_z) * self.full_depth)).min(one);
             let weight = depth * depth;
-            for (signal, plane) in SUMS.iter().zip(self.sums) {
-                let Some(plane) = plane else { continue };
+            for signal in Signal::ALL {
+                let Some(plane) = self.current(signal) else { continue };
                 let x = match signal {
                     Signal::VisibleCount => line!(g.visible),
                     Signal::ScreenGradient => {
@@ -76,15 +75,20 @@ impl SignalPlanes {
                     Signal::MeanGradientY => mean[1],
                     Signal::MeanGradientZ => mean[2],
                     Signal::MeanGradientNorm => norm3(mean),
-                    Signal::WeightSum => sum!(field::WEIGHT_SUM),
-                    _ => sum!(field::PIXELS),
+                    Signal::WeightMax => sum!(Field::WeightMax.number()),
+                    Signal::WeightSum => sum!(Field::WeightSum.number()),
+                    Signal::PixelCount => sum!(Field::PixelCount.number()),
+                    // Of views that are rendered for it, and of the row as it is when it is read.
+                    Signal::FreshWeightMax
+                    | Signal::Opacity
+                    | Signal::ScaleMax
+                    | Signal::ScaleProduct
+                    | Signal::Age => continue,
                 };
                 let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
-                (V::load(s, to) + x).store(to);
-            }
-            if let (Some([_, current]), Some(maximum)) = (self.weight_max, detail.maximum()) {
-                let to = &mut block[current * WIDTH + at..(current + 1) * WIDTH];
-                V::load(s, to).max(sum!(maximum)).store(to);
+                let was = V::load(s, to);
+                let is_maximum = matches!(signal.kind(), SignalKind::EpochMaximum);
+                (if is_maximum { was.max(x) } else { was + x }).store(to);
             }
         }
     }
@@ -92,59 +96,51 @@ impl SignalPlanes {
 
 impl Accumulators {
     pub(super) fn new(budget: usize, needs: &Needs) -> Self {
-        let layout = SignalPlanes::new(needs);
-        Self { requested: needs.signals, layout, blocks: Blocks::zeros(budget, layout.count) }
+        let planes = SignalPlanes::new(needs);
+        Self { requested: needs.signals, planes, blocks: Blocks::zeros(budget, planes.count) }
     }
 
     pub(super) fn bytes(budget: usize, needs: &Needs) -> u64 {
         Blocks::<f32>::bytes(budget, SignalPlanes::new(needs).count)
     }
 
-    pub(super) fn layout(&self) -> SignalPlanes {
-        self.layout
+    pub(super) fn planes(&self) -> SignalPlanes {
+        self.planes
     }
 
-    /// Which record fields the requested signals need.
-    pub(super) fn detail(&self) -> Detail {
-        let any = |signals: &[Signal]| signals.iter().any(|&s| self.requested.contains(s));
-        if any(&[Signal::ScreenGradientAbs, Signal::WeightSum, Signal::PixelCount]) {
-            Detail::All
-        } else if any(&[Signal::WeightMax, Signal::FreshWeightMax]) {
-            Detail::WeightMax
-        } else {
-            Detail::Gradients
-        }
+    /// Which numbers the requested signals need in a record.
+    pub(super) fn layout(&self) -> RecordLayout {
+        RecordLayout::new(self.requested)
     }
 
     /// Numbers per row where gradients of splats are summed in a step, and the requested signals lie
     /// while they are read.
     pub(super) fn sums(&self) -> usize {
-        self.detail().stride().max(self.requested.count())
+        self.layout().stride().max(self.requested.count())
     }
 
     /// Whether views are to be measured.
     pub(super) fn measures(&self) -> bool {
-        self.layout.fresh_weight_max.is_some()
+        !self.planes.fresh().is_empty()
     }
 
     /// Counts one more view for the largest weight of fresh views.
     ///
-    /// `sums` has one record per row. Shape: `[rows, self.detail().stride()]`.
+    /// `sums` has one record per row. Shape: `[rows, self.layout().stride()]`.
     pub(super) fn measure(&mut self, rows: usize, sums: &[f32], visible: &[u16]) {
-        let detail = self.detail();
-        let (Some(plane), Some(field)) = (self.layout.fresh_weight_max, detail.maximum()) else {
-            return;
-        };
+        let layout = self.layout();
+        let plane = self.planes.current(Signal::FreshWeightMax);
+        let (Some(plane), Some(field)) = (plane, layout.at(Field::WeightMax)) else { return };
         let per_block = self.blocks.stride();
         (
             self.blocks.of_rows_mut(rows).par_chunks_mut(per_block),
-            sums.par_chunks(WIDTH * detail.stride()),
+            sums.par_chunks(WIDTH * layout.stride()),
             visible,
         )
             .into_par_iter()
             .for_each(|(block, sums, &seen)| {
                 let line = &mut block[plane * WIDTH..(plane + 1) * WIDTH];
-                let records = sums.chunks_exact(detail.stride());
+                let records = sums.chunks_exact(layout.stride());
                 for (lane, (most, record)) in line.iter_mut().zip(records).enumerate() {
                     if seen >> lane & 1 == 1 {
                         *most = most.max(record[field]);
@@ -155,26 +151,22 @@ impl Accumulators {
 
     /// Forgets the views measured so far.
     pub(super) fn forget_measured(&mut self, rows: usize) {
-        if let Some(plane) = self.layout.fresh_weight_max {
-            for row in 0..rows {
-                self.blocks.set(row, plane, 0.0);
-            }
-        }
+        self.clear(&self.planes.fresh(), rows);
     }
 
     /// The current epoch's largest weights become the previous one's.
     pub(super) fn begin_epoch(&mut self, rows: usize) {
-        if let Some([previous, current]) = self.layout.weight_max {
-            for row in 0..rows {
-                self.blocks.set(row, previous, self.blocks.get(row, current));
-                self.blocks.set(row, current, 0.0);
-            }
-        }
+        let cleared = self.planes.begin_epoch();
+        self.clear(&cleared, rows);
     }
 
     /// Sums start anew; the largest weights stay.
     pub(super) fn reset(&mut self, rows: usize) {
-        for plane in self.layout.sums.into_iter().flatten() {
+        self.clear(&self.planes.sums(), rows);
+    }
+
+    fn clear(&mut self, planes: &[usize], rows: usize) {
+        for &plane in planes {
             for row in 0..rows {
                 self.blocks.set(row, plane, 0.0);
             }
@@ -190,33 +182,13 @@ impl Accumulators {
         ages: &[u16],
     ) {
         for signal in wanted.iter() {
+            let planes = self.planes.of(signal);
             let value = |row: usize| -> f32 {
-                match signal {
-                    Signal::WeightMax => {
-                        self.layout.weight_max.map_or(0.0, |[previous, current]| {
-                            self.blocks.get(row, previous).max(self.blocks.get(row, current))
-                        })
-                    }
-                    Signal::FreshWeightMax => self
-                        .layout
-                        .fresh_weight_max
-                        .map_or(0.0, |plane| self.blocks.get(row, plane)),
-                    Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
-                    Signal::ScaleMax => {
-                        let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);
-                        x.max(y).max(z).exp()
-                    }
-                    Signal::ScaleProduct => {
-                        let [x, y, z] = params.get_n::<3>(row, plane::LOG_SCALE);
-                        (x + y + z).exp()
-                    }
-                    Signal::Age => f32::from(ages[row]),
-                    sum => SUMS
-                        .iter()
-                        .position(|&s| s == sum)
-                        .and_then(|i| self.layout.sums[i])
-                        .map_or(0.0, |plane| self.blocks.get(row, plane)),
+                if signal.kind() == SignalKind::Present {
+                    return present(signal, row, params, ages);
                 }
+                let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
+                parts.reduce(f32::max).unwrap_or(0.0)
             };
             if let Some(column) = signals.get_mut(signal) {
                 for (row, slot) in column.iter_mut().enumerate() {
@@ -224,5 +196,22 @@ impl Accumulators {
                 }
             }
         }
+    }
+}
+
+fn present(signal: Signal, row: usize, params: &Parameters, ages: &[u16]) -> f32 {
+    let log_scales = || params.get_n::<3>(row, plane::LOG_SCALE);
+    match signal {
+        Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
+        Signal::ScaleMax => {
+            let [x, y, z] = log_scales();
+            x.max(y).max(z).exp()
+        }
+        Signal::ScaleProduct => {
+            let [x, y, z] = log_scales();
+            (x + y + z).exp()
+        }
+        Signal::Age => f32::from(ages[row]),
+        summed => unreachable!("{summed:?} is no present value"),
     }
 }

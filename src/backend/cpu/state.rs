@@ -21,8 +21,10 @@ impl CpuBackend {
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::of_rows);
         let mut arrays: Vec<StateArray> = of_rows.collect();
-        let signals = self.signals.layout().kept();
-        arrays.extend(signals.map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))));
+        let signals = self.signals.planes().kept();
+        arrays.extend(
+            signals.into_iter().map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))),
+        );
         if self.candidates.is_wanted() {
             arrays.push(StateArray::small(CANDIDATES));
         }
@@ -83,5 +85,5 @@ impl CpuBackend {
 
 fn signal_plane(signals: &Accumulators, name: &str) -> Option<usize> {
     let name = name.strip_prefix(SIGNAL)?;
-    signals.layout().kept().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
+    signals.planes().kept().into_iter().find(|(signal, _)| signal == name).map(|(_, plane)| plane)
 }

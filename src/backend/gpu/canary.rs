@@ -5,9 +5,9 @@ use densify_policies::policy::{Cadence, Needs};
 use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DMat3, DVec3};
 
-use super::signals::Planes;
 use super::{GpuBackend, GpuDevice, GpuOptions};
 use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::signals::RecordLayout;
 use crate::backend::{Backend, BackendError, LearningRates, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -101,8 +101,8 @@ impl GpuBackend {
         options: &GpuOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        let detail = Planes::new(&options.needs).detail;
-        device.0.prove(detail, || check(device, &options.needs))?;
+        let records = RecordLayout::new(options.needs.signals);
+        device.0.prove(records, || check(device, &options.needs))?;
         Self::without_canary(model, options, device)
     }
 }

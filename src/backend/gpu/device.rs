@@ -9,6 +9,7 @@ use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
 use super::pipelines::{Pipelines, Variant};
 use super::wait::wait;
 use crate::backend::BackendError;
+use crate::backend::signals::RecordLayout;
 
 /// What a device tells outside of any call.
 #[derive(Debug, Default)]
@@ -54,8 +55,8 @@ pub(super) struct Device {
     told: Arc<Mutex<Told>>,
     /// By what they are compiled for; there are few.
     pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
-    /// Details of the records for which the canary has sung.
-    proven: Mutex<Vec<u32>>,
+    /// The records for which the device has passed the canary.
+    proven: Mutex<Vec<RecordLayout>>,
 }
 
 impl Device {
@@ -108,16 +109,16 @@ impl Device {
         Ok(made)
     }
 
-    /// Runs `prove` once for each detail of the records.
+    /// Runs `prove` once for each layout of the records.
     pub(super) fn prove(
         &self,
-        detail: u32,
+        records: RecordLayout,
         prove: impl FnOnce() -> Result<(), BackendError>,
     ) -> Result<(), BackendError> {
         let mut proven = self.proven.lock().unwrap_or_else(PoisonError::into_inner);
-        if !proven.contains(&detail) {
+        if !proven.contains(&records) {
             prove()?;
-            proven.push(detail);
+            proven.push(records);
         }
         Ok(())
     }

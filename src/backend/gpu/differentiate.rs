@@ -3,6 +3,7 @@
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
 use crate::backend::cpu::{ImageGradient, ModelGradient};
+use crate::backend::signals::{Field, RecordLayout};
 use crate::backend::{BackendError, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -16,7 +17,7 @@ impl GpuBackend {
     /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
     /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
     ///
-    /// Needs records of full detail, so that it allocates more than the ledger says where the
+    /// Needs every field of a record, so that it allocates more than the ledger says where the
     /// policy's needs are smaller: it is a tool for tests and for research, not part of training.
     ///
     /// # Errors
@@ -36,7 +37,7 @@ impl GpuBackend {
         assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
         assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
         if !self.sizes.more {
-            (self.sizes.more, self.sizes.detail) = (true, 2);
+            (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;
@@ -58,16 +59,17 @@ impl GpuBackend {
     fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
         let n = self.rows as u64;
         let gradient = self.read("gradient", 0, 80 * n)?;
-        let sums = self.read("row sums", 0, 60 * n)?;
+        let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
         let planes = self.sizes.sh_numbers();
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
-        let rows = gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<15>().0);
+        let rows =
+            gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<{ RecordLayout::MOST }>().0);
         let rest = splats.as_chunks::<12>().0.iter().zip(depths);
         for (row, ((g, sums), (splat, depth))) in rows.zip(rest).enumerate() {
             let seen = depth.to_bits() != u32::MAX;
-            let sums = if seen { *sums } else { [0.0; 15] };
+            let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
             let l1 = if seen { splat[2] } else { 0.0 };
             let unfold = 1.0 / FOLD;
             out.means.push([g[0], g[1], g[2]]);
@@ -75,11 +77,15 @@ impl GpuBackend {
             out.quats.push([g[6], g[7], g[8], g[9]]);
             out.opacity_logits.push(g[10]);
             out.mean2d.push([g[11], g[15]]);
-            out.mean2d_abs.push([l1 * unfold * unfold * sums[9], unfold * unfold * sums[10]]);
+            let sum = |field: Field| sums[field.number()];
+            out.mean2d_abs.push([
+                l1 * unfold * unfold * sum(Field::AbsX),
+                unfold * unfold * sum(Field::AbsY),
+            ]);
             out.colour.push([sums[6], sums[7], sums[8]]);
-            out.max_weight.push(sums[14]);
-            out.sum_weight.push(sums[11]);
-            out.pixel_count.push(sums[12] as u32);
+            out.max_weight.push(sum(Field::WeightMax));
+            out.sum_weight.push(sum(Field::WeightSum));
+            out.pixel_count.push(sum(Field::PixelCount) as u32);
             out.visible.push(seen);
             let mut y = [0.0_f32; 16];
             y[0] = sh::C0;

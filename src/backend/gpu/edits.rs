@@ -198,18 +198,17 @@ impl GpuBackend {
             self.execute(&[0], |to| to.run(&launches.clamp_opacity, now, rows.div_ceil(256)));
         }
         if ops.reset_signals {
-            let planes: Vec<u32> = self.planes.sums().collect();
-            self.clear_planes(&planes);
+            self.clear_planes(&self.planes.sums());
         }
         self.rows = ops.rows_after;
     }
 
     /// Sets planes of the signals to 0.
-    pub(super) fn clear_planes(&self, planes: &[u32]) {
+    pub(super) fn clear_planes(&self, planes: &[usize]) {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let bytes = 4 * self.sizes.budget;
         for &plane in planes {
-            let from = u64::from(plane) * bytes;
+            let from = plane as u64 * bytes;
             encoder.clear_buffer(self.buffers.get("signals"), from, Some(bytes));
         }
         self.device.queue.submit([encoder.finish()]);

@@ -2,9 +2,9 @@
 //! `shaders/shared/view.wgsl`. That both sides agree is checked offline, field by field.
 
 use bytemuck::{Pod, Zeroable};
-use densify_policies::policy::{LossTerms, NoiseTerm};
+use densify_policies::policy::{LossTerms, NoiseTerm, Signal};
 
-use super::signals::Planes;
+use crate::backend::signals::SignalPlanes;
 use crate::backend::{StepInput, StepOutput};
 use crate::camera::Camera;
 
@@ -30,7 +30,7 @@ pub(super) struct Frame {
     pub(super) more_rates: [f32; 4],
     pub(super) noise: [f32; 4],
     pub(super) draw: [u32; 4],
-    pub(super) planes: [[u32; 4]; 4],
+    pub(super) planes: [[u32; 4]; 8],
 }
 
 /// See `State` in `shaders/shared/view.wgsl`; the cuts of the bands follow it.
@@ -88,6 +88,8 @@ pub(super) mod target {
     pub(in super::super) const WITH_ERROR: u32 = 4;
 }
 
+const _: () = assert!(Signal::ALL.len() <= 4 * 8, "a place in `Frame::planes` for each signal");
+
 /// An image as a grid of tiles: columns and tiles.
 pub(super) fn grid(width: u32, height: u32) -> [u32; 2] {
     let columns = width.div_ceil(TILE);
@@ -136,7 +138,7 @@ impl Frame {
         input: &StepInput<'_>,
         due: u32,
         (terms, noise): (LossTerms, Option<NoiseTerm>),
-        planes: &Planes,
+        planes: &SignalPlanes,
     ) {
         let rates = &input.rates;
         let rows = self.model[0].max(1) as f32;
@@ -149,8 +151,15 @@ impl Frame {
         let adds = (if terms.is_none() { 0 } else { due::TERMS })
             | (if noise.is_some() { due::NOISE } else { 0 });
         self.draw = [folded_seed(input.seed), input.step, due | adds, self.draw[3]];
-        self.planes = planes.in_frame();
-        self.background[3] = planes.full_depth();
+        self.add_to(planes);
+        self.background[3] = planes.full_depth;
+    }
+
+    /// Says to which planes the view adds.
+    pub(super) fn add_to(&mut self, planes: &SignalPlanes) {
+        for (signal, plane) in Signal::ALL.into_iter().zip(self.planes.as_flattened_mut()) {
+            *plane = planes.current(signal).map_or(u32::MAX, |plane| plane as u32);
+        }
     }
 }
 

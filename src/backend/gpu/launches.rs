@@ -9,7 +9,6 @@ use super::accumulation::Accumulation;
 use super::buffers::Buffers;
 use super::pipelines::{Compiled, Pipelines};
 use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
-use super::signals::record_stride;
 use super::sizes::Sizes;
 use crate::backend::Kept;
 
@@ -200,7 +199,7 @@ impl<L> Launches<L> {
                 },
                 false => Sums::Atomics {
                     clear: bind("clear_sums", &[]),
-                    numbers: record_stride(sizes.detail) as u32,
+                    numbers: sizes.records.stride() as u32,
                 },
             },
             copy_rows: edited.iter().map(row_launch).collect(),

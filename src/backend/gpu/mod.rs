@@ -28,7 +28,6 @@ mod promise;
 mod readback;
 mod rows;
 mod shaders;
-mod signals;
 mod sizes;
 mod state;
 mod step;
@@ -42,10 +41,11 @@ use std::time::Duration;
 
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{
-    Cadence, Candidate, LossTerms, Needs, NoiseTerm, Signal, SignalSet, Signals,
+    Cadence, Candidate, LossTerms, Needs, NoiseTerm, SignalKind, SignalSet, Signals,
 };
 
 use super::candidates::Candidates;
+use super::signals::SignalPlanes;
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
     StepInput, StepOutput, Tensor, Unsound,
@@ -68,7 +68,6 @@ use options::MAX_SIDE;
 use photographs::Kept;
 pub use photographs::KeptPhotographs;
 use pipelines::Variant;
-use signals::Planes;
 use sizes::Sizes;
 
 /// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
@@ -90,7 +89,7 @@ pub struct GpuBackend {
     rows: usize,
     near: f32,
     shortcuts: Shortcuts,
-    planes: Planes,
+    planes: SignalPlanes,
     terms: LossTerms,
     noise: Option<NoiseTerm>,
     cadence: Cadence,
@@ -132,7 +131,7 @@ impl GpuBackend {
                 device.summary.name, model.sh_degree
             )));
         }
-        let planes = Planes::new(&options.needs);
+        let planes = SignalPlanes::new(&options.needs);
         let sizes = promise::sizes(&device, model.sh_degree, options);
         let buffers = Buffers::new(&device, &sizes)?;
         let launches = launches(&device, &sizes, shortcuts, &buffers)?;
@@ -217,8 +216,8 @@ fn launches(
     shortcuts: Shortcuts,
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
-    let &Sizes { detail, more, accumulation, .. } = sizes;
-    let pipelines = device.pipelines(Variant { detail, more, shortcuts, accumulation })?;
+    let &Sizes { records, more, accumulation, .. } = sizes;
+    let pipelines = device.pipelines(Variant { records, more, shortcuts, accumulation })?;
     device.guarded("the kernels", 0, |device| Launches::bound(device, &pipelines, buffers, sizes))
 }
 
@@ -240,9 +239,8 @@ impl Backend for GpuBackend {
     }
 
     fn begin_epoch(&mut self) {
-        if let Some(plane) = self.planes.begin_epoch() {
-            self.clear_planes(&[plane]);
-        }
+        let cleared = self.planes.begin_epoch();
+        self.clear_planes(&cleared);
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
@@ -250,12 +248,12 @@ impl Backend for GpuBackend {
     }
 
     fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
-        if self.planes.fresh().is_none() {
+        if self.planes.fresh().is_empty() {
             return Ok(());
         }
         self.fit_image(camera.width, camera.height)?;
         let mut frame = self.frame(camera, [0.0; 3], sh_degree);
-        frame.planes = self.planes.in_frame();
+        frame.add_to(&self.planes);
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         encoder.clear_buffer(self.buffers.get("pixel gradient"), 0, None);
         self.device.queue.submit([encoder.finish()]);
@@ -274,28 +272,21 @@ impl Backend for GpuBackend {
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
         let mut signals = Signals::zeros(self.rows, wanted);
         for signal in wanted.iter() {
-            let values = match signal {
-                Signal::Opacity => self.present(0)?,
-                Signal::ScaleMax => self.present(1)?,
-                Signal::ScaleProduct => self.present(2)?,
-                Signal::Age => self.present(3)?,
-                sum => {
-                    let planes = self.planes.of(sum).into_iter();
-                    let columns: Result<Vec<_>, _> =
-                        planes.map(|p| self.column(p, 0..self.rows)).collect();
-                    let most = |a: Vec<f32>, b: Vec<f32>| {
-                        a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect()
-                    };
-                    columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows])
-                }
+            let values = if signal.kind() == SignalKind::Present {
+                self.present(signal)?
+            } else {
+                let planes = self.planes.of(signal);
+                let columns: Result<Vec<_>, _> =
+                    planes.map(|plane| self.column(plane, 0..self.rows)).collect();
+                let most =
+                    |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect();
+                columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows])
             };
             if let Some(column) = signals.get_mut(signal) {
                 column.copy_from_slice(&values);
             }
         }
-        if let Some(plane) = self.planes.fresh() {
-            self.clear_planes(&[plane]);
-        }
+        self.clear_planes(&self.planes.fresh());
         Ok(signals)
     }
 

@@ -2,17 +2,18 @@
 
 use std::collections::HashMap;
 
+use densify_policies::policy::Signal;
 use wgpu::{ComputePipeline, Device, ShaderModule};
 
 use super::accumulation::Accumulation;
 use super::shaders::{Binding, STAGES};
 use crate::backend::Shortcuts;
+use crate::backend::signals::{Field, RecordLayout};
 
 /// What kernels are compiled for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Variant {
-    /// Detail of the records.
-    pub(super) detail: u32,
+    pub(super) records: RecordLayout,
     /// Whether alpha and depth have gradients.
     pub(super) more: bool,
     pub(super) shortcuts: Shortcuts,
@@ -21,15 +22,31 @@ pub(super) struct Variant {
 
 impl Variant {
     /// The shaders' `override` constants; a module is given those that it declares.
-    fn constants(&self) -> [(&'static str, f64); 5] {
-        [
-            ("DETAIL", f64::from(self.detail)),
-            ("MORE", f64::from(u8::from(self.more))),
-            ("ALPHA_MIN", f64::from(self.shortcuts.alpha_min)),
-            ("LOG2_REACH", f64::from(self.shortcuts.log2_reach())),
-            ("TRANSMITTANCE_MIN", f64::from(self.shortcuts.transmittance_min)),
-        ]
+    pub(super) fn constants(&self) -> Vec<(String, f64)> {
+        let mut all = vec![
+            ("RECORD".to_owned(), self.records.stride() as f64),
+            ("MORE".to_owned(), f64::from(u8::from(self.more))),
+            ("ALPHA_MIN".to_owned(), f64::from(self.shortcuts.alpha_min)),
+            ("LOG2_REACH".to_owned(), f64::from(self.shortcuts.log2_reach())),
+            ("TRANSMITTANCE_MIN".to_owned(), f64::from(self.shortcuts.transmittance_min)),
+        ];
+        let place = |field| self.records.at(field).unwrap_or(0) as f64;
+        all.extend(Field::ALL.map(|field| (field.constant().to_owned(), place(field))));
+        all.extend(Signal::ALL.map(|signal| (constant(signal), f64::from(signal as u32))));
+        all
     }
+}
+
+/// The name of a signal's number in shaders: `WEIGHT_MAX`.
+pub(super) fn constant(signal: Signal) -> String {
+    let mut name = String::new();
+    for c in format!("{signal:?}").chars() {
+        if c.is_uppercase() && !name.is_empty() {
+            name.push('_');
+        }
+        name.push(c.to_ascii_uppercase());
+    }
+    name
 }
 
 /// A compiled kernel and the buffers that it uses.
@@ -56,10 +73,11 @@ impl Pipelines {
                 label: Some(stage.name),
                 source: wgpu::ShaderSource::Wgsl((&text).into()),
             });
-            let mut constants = variant.constants().to_vec();
             let is_declared =
                 |name: &str| parsed.overrides.iter().any(|(_, o)| o.name.as_deref() == Some(name));
-            constants.retain(|(name, _)| is_declared(name));
+            let constants = variant.constants();
+            let declared = constants.iter().filter(|(name, _)| is_declared(name));
+            let constants: Vec<_> = declared.map(|(name, value)| (&**name, *value)).collect();
             for kernel in stage.kernels(&text, &parsed) {
                 let pipeline = compile(device, &module, &kernel.entry, &constants);
                 kernels.insert(kernel.entry, Compiled { pipeline, bindings: kernel.bindings });

@@ -5,16 +5,16 @@ use densify_policies::policy::{AuxRequest, Candidate, Needs};
 use super::accumulation::Accumulation;
 use super::device::Device;
 use super::options::{GpuOptions, MAX_SIDE};
-use super::signals::{Planes, record_stride};
 use super::sizes::{MOST_ENTRIES, Sizes};
 use crate::backend::candidates::Candidates;
+use crate::backend::signals::RecordLayout;
 use crate::memory::{Ledger, Section};
 
 /// Most (row, tile) pairs that this device can hold at a time for such needs.
 pub(super) fn most_pairs(device: &Device, needs: &Needs) -> u64 {
     // Of the largest buffer that grows with them: records, or lists.
     let numbers = match device.accumulation {
-        Accumulation::Slots => record_stride(Planes::new(needs).detail),
+        Accumulation::Slots => RecordLayout::new(needs.signals).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
     (device.largest_binding() / (4 * numbers)).min(MOST_ENTRIES)

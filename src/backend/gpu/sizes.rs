@@ -7,7 +7,7 @@ use super::accumulation::Accumulation;
 use super::frame::{Frame, State, grid};
 use super::photographs::KeptPhotographs;
 use super::rows::{Holds, RowArray, row_arrays};
-use super::signals::{Planes, record_stride};
+use crate::backend::signals::{RecordLayout, SignalPlanes};
 use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, Section};
 
@@ -32,8 +32,8 @@ pub(super) struct Sizes {
     pub(super) photographs: KeptPhotographs,
     /// Planes of the signals.
     pub(super) planes: usize,
-    /// Records and their sums.
-    pub(super) detail: u32,
+    /// Of the records and their sums.
+    pub(super) records: RecordLayout,
     /// How sums come about: whether there are records at all.
     pub(super) accumulation: Accumulation,
     /// Whether the gradients of alpha and depth are given, too.
@@ -61,15 +61,14 @@ impl Sizes {
         needs: &Needs,
         accumulation: Accumulation,
     ) -> Self {
-        let planes = Planes::new(needs);
         Self {
             budget: budget as u64,
             cap,
             sh_degree,
             image,
             photographs: KeptPhotographs::default(),
-            planes: planes.count as usize,
-            detail: planes.detail,
+            planes: SignalPlanes::new(needs).count,
+            records: RecordLayout::new(needs.signals),
             accumulation,
             more: false,
             cadence: needs.cadence,
@@ -85,8 +84,7 @@ impl Sizes {
 
     /// Every array with an entry per row.
     pub(super) fn row_arrays(&self) -> Vec<RowArray> {
-        let fields = record_stride(self.detail) as usize;
-        row_arrays(self.sh_degree, self.waits(), self.planes, fields)
+        row_arrays(self.sh_degree, self.waits(), self.planes, self.records.stride())
     }
 
     /// The arrays that hold the model.
@@ -114,7 +112,7 @@ impl Sizes {
             add(Section::Tiles, "entries", name, 4 * cap);
         }
         if self.accumulation == Accumulation::Slots {
-            let bytes = 4 * record_stride(self.detail) * cap;
+            let bytes = 4 * self.records.stride() as u64 * cap;
             add(Section::Tiles, "gradients per entry", "records", bytes);
         }
         let sums = b.max(16 * cap.div_ceil(BLOCK));

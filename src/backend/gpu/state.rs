@@ -27,14 +27,14 @@ impl GpuBackend {
         self.saved().find(|array| array.name == name)
     }
 
-    fn signal(&self, name: &str) -> Option<u32> {
+    fn signal(&self, name: &str) -> Option<usize> {
         let name = name.strip_prefix(SIGNAL)?;
-        self.planes.kept().find(|(known, _)| known == name).map(|(_, plane)| plane)
+        self.planes.kept().into_iter().find(|(known, _)| known == name).map(|(_, plane)| plane)
     }
 
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         let buffers = self.saved().map(|array| format!("{BUFFER}{}", array.name));
-        let signals = self.planes.kept().map(|(name, _)| format!("{SIGNAL}{name}"));
+        let signals = self.planes.kept().into_iter().map(|(name, _)| format!("{SIGNAL}{name}"));
         let mut arrays: Vec<StateArray> = buffers.chain(signals).map(StateArray::of_rows).collect();
         arrays.push(StateArray::small(WAITS));
         if self.candidates.is_wanted() {
@@ -86,7 +86,7 @@ impl GpuBackend {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal(&name) {
             let values = tensor.into_f32(&[rows.len()])?;
-            let start = u64::from(plane) * self.sizes.budget + first;
+            let start = plane as u64 * self.sizes.budget + first;
             self.write_at("signals", 4 * start, &values);
         } else if let Some(array) = self.array(&name) {
             let at = array.row_bytes() * first;

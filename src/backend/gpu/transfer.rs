@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use densify_policies::policy::Signal;
+
 use super::frame::target;
 use super::passes::Recorder;
 use super::rows::{Holds, RowArray};
@@ -183,17 +185,21 @@ impl GpuBackend {
     }
 
     /// Some rows of the column of one plane of numbers.
-    pub(super) fn column(&self, plane: u32, rows: Range<usize>) -> Result<Vec<f32>, BackendError> {
-        let start = u64::from(plane) * self.sizes.budget + rows.start as u64;
+    pub(super) fn column(
+        &self,
+        plane: usize,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let start = plane as u64 * self.sizes.budget + rows.start as u64;
         self.read("signals", 4 * start, 4 * rows.len() as u64)
     }
 
     /// A column of present values; see `present` in `shaders/signals.wgsl`.
-    pub(super) fn present(&self, which: u32) -> Result<Vec<f32>, BackendError> {
+    pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
         let mut to = Recorder { pass };
-        to.run(&self.launches.present, [which, 0, 0, 0], (self.rows as u32).div_ceil(256));
+        to.run(&self.launches.present, [signal as u32, 0, 0, 0], (self.rows as u32).div_ceil(256));
         drop(to);
         self.device.queue.submit([encoder.finish()]);
         self.read("sums", 0, 4 * self.rows as u64)

@@ -27,6 +27,7 @@ const SUBGROUPS: &str = shader!("shared/subgroups");
 const ATOMICS: &str = shader!("shared/atomics");
 const BACKWARD: &str = shader!("shared/backward");
 const BLENDED: &str = shader!("shared/blended");
+const RECORD: &str = shader!("shared/record");
 
 /// Which devices have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,15 +60,15 @@ pub(super) const STAGES: [Stage; 14] = [
     stage("tiles", On::All, &[VIEW, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
-    stage("rasterize_bwd", On::Slots, &[VIEW, QUADS, BACKWARD, shader!("rasterize_bwd")]),
+    stage("rasterize_bwd", On::Slots, &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd")]),
     stage(
         "rasterize_bwd_atomic",
         On::Atomics,
-        &[VIEW, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
+        &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
-    stage("project_bwd", On::All, &[VIEW, GAUSSIAN, shader!("project_bwd")]),
+    stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")]),
     stage("adam", On::All, &[VIEW, RANDOM, shader!("adam")]),
-    stage("signals", On::All, &[VIEW, shader!("signals")]),
+    stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]),
     stage("apply", On::All, &[VIEW, RANDOM, shader!("apply")]),
     stage("candidates", On::All, &[VIEW, RANDOM, shader!("candidates")]),
     stage("observe", On::Slots, &[VIEW, QUADS, BLENDED, shader!("observe")]),

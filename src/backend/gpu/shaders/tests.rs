@@ -102,7 +102,7 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
         spaced: false,
     };
     let needs = Needs {
-        signals: SignalSet::of(&Signal::ALL),
+        signals: SignalSet::from(Signal::ALL),
         candidates: Some(candidates),
         cadence: Cadence { all: 2, sh_rest: 2 },
         ..Needs::default()

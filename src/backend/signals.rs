@@ -1,0 +1,248 @@
+//! Where signals come from and where they lie: fields of gradient records and planes of accumulators,
+//! for both backends.
+//!
+//! What a signal is stands in its one entry in the policies' table ([`Signal`]); record layouts,
+//! strides, planes and the shaders' constants follow from it. Only what is asked for has memory.
+
+use densify_policies::policy::{Needs, PixelSum, Signal, SignalKind, SignalSet};
+
+/// Numbers of a record that training itself needs: Σq, Σq·u, Σq·z, Σq·u², Σq·u·z, Σq·z² and the
+/// gradients by colour.
+pub(super) const BASE: usize = 9;
+
+/// An optional number of a record, in the order in which records have them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Field {
+    /// Σ|q·u|; with the next one, the absolute gradients of the projected mean.
+    AbsX,
+    /// Σ|q·(l3·z − l1·shear·u)|.
+    AbsY,
+    /// Σw.
+    WeightSum,
+    /// Number of pixels with w > 0.
+    PixelCount,
+    /// Σw·(gradient by depth): for given gradients of an image, never in training.
+    Depth,
+    /// max w; the last one, as it is the only one that is not a sum.
+    WeightMax,
+}
+
+impl Field {
+    pub(super) const ALL: [Self; 6] =
+        [Self::AbsX, Self::AbsY, Self::WeightSum, Self::PixelCount, Self::Depth, Self::WeightMax];
+
+    const fn of(sum: PixelSum) -> &'static [Self] {
+        match sum {
+            PixelSum::AbsGradient => &[Self::AbsX, Self::AbsY],
+            PixelSum::Weight => &[Self::WeightSum],
+            PixelSum::Count => &[Self::PixelCount],
+            PixelSum::LargestWeight => &[Self::WeightMax],
+        }
+    }
+
+    /// The place of this number among all that a record can have.
+    pub(super) const fn number(self) -> usize {
+        BASE + self as usize
+    }
+
+    /// The shaders' constant for its place in a record.
+    pub(super) const fn constant(self) -> &'static str {
+        match self {
+            Self::AbsX => "ABS_X_AT",
+            Self::AbsY => "ABS_Y_AT",
+            Self::WeightSum => "WEIGHT_SUM_AT",
+            Self::PixelCount => "PIXEL_COUNT_AT",
+            Self::Depth => "DEPTH_AT",
+            Self::WeightMax => "WEIGHT_MAX_AT",
+        }
+    }
+}
+
+/// Which numbers the records of a backend have: the base, and the fields that its signals need.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct RecordLayout {
+    /// A bit per [`Field`].
+    fields: u8,
+    /// The optional fields by their place among all numbers that a record can have, in order.
+    extras: [u8; Field::ALL.len()],
+}
+
+impl RecordLayout {
+    /// Every field: what [`differentiate`](super::cpu::CpuBackend::differentiate) needs.
+    pub(super) const ALL: Self = Self::with((1 << Field::ALL.len()) - 1);
+    /// Numbers of a record that has every field.
+    pub(super) const MOST: usize = BASE + Field::ALL.len();
+
+    pub(super) fn new(signals: SignalSet) -> Self {
+        let fields = signals.iter().flat_map(Signal::pixel_sums).flat_map(|&sum| Field::of(sum));
+        Self::with(fields.fold(0, |bits, &field| bits | 1 << field as u8))
+    }
+
+    const fn with(fields: u8) -> Self {
+        let mut extras = [0; Field::ALL.len()];
+        let (mut field, mut place) = (0, 0);
+        while field < Field::ALL.len() {
+            if fields >> field & 1 == 1 {
+                extras[place] = (BASE + field) as u8;
+                place += 1;
+            }
+            field += 1;
+        }
+        Self { fields, extras }
+    }
+
+    pub(super) const fn has(self, field: Field) -> bool {
+        self.fields >> field as u8 & 1 == 1
+    }
+
+    /// Numbers per record.
+    pub(super) const fn stride(self) -> usize {
+        BASE + self.fields.count_ones() as usize
+    }
+
+    /// Where in a record the field is.
+    pub(super) fn at(self, field: Field) -> Option<usize> {
+        let before = self.fields & ((1 << field as u8) - 1);
+        self.has(field).then(|| BASE + before.count_ones() as usize)
+    }
+
+    /// For each number of a record beyond the base, its place among all that a record can have.
+    pub(super) fn extras(&self) -> &[u8] {
+        &self.extras[..self.stride() - BASE]
+    }
+}
+
+/// The planes of the requested signals.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SignalPlanes {
+    /// First plane of each signal, in the order of [`Signal::ALL`].
+    first: [Option<usize>; Signal::ALL.len()],
+    /// How many there are.
+    pub(super) count: usize,
+    /// See [`Needs::full_depth`].
+    pub(super) full_depth: f32,
+    /// Whether the current epoch's plane is the first of two, rather than the second.
+    swapped: bool,
+}
+
+/// How many planes a signal has.
+const fn planes(kind: SignalKind) -> usize {
+    match kind {
+        SignalKind::Sum | SignalKind::Count | SignalKind::FreshMaximum => 1,
+        // The previous epoch, and the current one.
+        SignalKind::EpochMaximum => 2,
+        SignalKind::Present => 0,
+    }
+}
+
+impl SignalPlanes {
+    pub(super) fn new(needs: &Needs) -> Self {
+        let mut count = 0;
+        let first = Signal::ALL.map(|signal| {
+            let own = planes(signal.kind());
+            let first = (own > 0 && needs.signals.contains(signal)).then_some(count);
+            count += if first.is_some() { own } else { 0 };
+            first
+        });
+        Self { first, count, full_depth: needs.full_depth, swapped: false }
+    }
+
+    /// The planes of a signal; its value is the largest of theirs.
+    pub(super) fn of(&self, signal: Signal) -> std::ops::Range<usize> {
+        self.first[signal as usize].map_or(0..0, |first| first..first + planes(signal.kind()))
+    }
+
+    /// The plane to which a view adds.
+    #[inline(always)]
+    pub(super) fn current(&self, signal: Signal) -> Option<usize> {
+        let is_second = matches!(signal.kind(), SignalKind::EpochMaximum) && !self.swapped;
+        self.first[signal as usize].map(|first| first + usize::from(is_second))
+    }
+
+    /// The planes of all signals of some kinds.
+    fn of_kinds(&self, kinds: &[SignalKind]) -> Vec<usize> {
+        let some = Signal::ALL.into_iter().filter(|signal| kinds.contains(&signal.kind()));
+        some.flat_map(|signal| self.of(signal)).collect()
+    }
+
+    /// Those that start anew when a policy resets its signals.
+    pub(super) fn sums(&self) -> Vec<usize> {
+        self.of_kinds(&[SignalKind::Sum, SignalKind::Count])
+    }
+
+    /// Those that start anew when signals have been taken.
+    pub(super) fn fresh(&self) -> Vec<usize> {
+        self.of_kinds(&[SignalKind::FreshMaximum])
+    }
+
+    /// The current epoch becomes the previous one: planes change places. Returns those to clear.
+    pub(super) fn begin_epoch(&mut self) -> Vec<usize> {
+        self.swapped = !self.swapped;
+        let by_epoch = |signal: &Signal| matches!(signal.kind(), SignalKind::EpochMaximum);
+        Signal::ALL.into_iter().filter(by_epoch).filter_map(|s| self.current(s)).collect()
+    }
+
+    /// What is kept between steps, by name and plane. Fresh views are not: they are measured and
+    /// taken within one event.
+    pub(super) fn kept(&self) -> Vec<(String, usize)> {
+        let mut kept = Vec::new();
+        for signal in Signal::ALL {
+            let Some(current) = self.current(signal) else { continue };
+            match signal.kind() {
+                SignalKind::Sum | SignalKind::Count => kept.push((format!("{signal:?}"), current)),
+                SignalKind::EpochMaximum => {
+                    let both = self.of(signal);
+                    let previous = both.start + both.end - 1 - current;
+                    kept.push((format!("{signal:?}.previous"), previous));
+                    kept.push((format!("{signal:?}.current"), current));
+                }
+                SignalKind::FreshMaximum | SignalKind::Present => {}
+            }
+        }
+        kept
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_record_has_the_base_and_what_its_signals_need() {
+        let layout = |signals: &[Signal]| RecordLayout::new(signals.iter().copied().collect());
+        assert_eq!(layout(&[Signal::ScreenGradient, Signal::Age]).stride(), BASE);
+        let abs = layout(&[Signal::ScreenGradientAbs]);
+        assert_eq!(
+            (abs.stride(), abs.at(Field::Depth), abs.at(Field::WeightMax)),
+            (11, None, None)
+        );
+        let some = layout(&[Signal::WeightMax, Signal::PixelCount]);
+        assert_eq!((some.at(Field::PixelCount), some.at(Field::WeightMax)), (Some(9), Some(10)));
+        assert_eq!(some.extras(), [12, 14]);
+        // The largest weight comes last, whatever else there is.
+        let all = layout(&Signal::ALL);
+        assert_eq!(all.at(Field::WeightMax), Some(all.stride() - 1));
+        assert!(!all.has(Field::Depth) && RecordLayout::ALL.has(Field::Depth));
+    }
+
+    #[test]
+    fn epochs_change_places_and_keep_their_names() {
+        let signals = [Signal::PixelCount, Signal::WeightMax, Signal::FreshWeightMax, Signal::Age];
+        let needs = Needs { signals: signals.into_iter().collect(), ..Needs::default() };
+        let mut planes = SignalPlanes::new(&needs);
+        assert_eq!(planes.count, 4);
+        let place = |planes: &SignalPlanes, name: &str| {
+            planes.kept().iter().find(|(kept, _)| kept == name).expect("it is kept").1
+        };
+        let current = place(&planes, "WeightMax.current");
+        assert_eq!(planes.current(Signal::WeightMax), Some(current));
+        let cleared = planes.begin_epoch();
+        assert_eq!(place(&planes, "WeightMax.previous"), current);
+        assert_eq!(cleared, [place(&planes, "WeightMax.current")]);
+        // Every plane belongs to one signal.
+        let mut all: Vec<_> = signals.into_iter().flat_map(|signal| planes.of(signal)).collect();
+        all.sort_unstable();
+        assert_eq!(all, [0, 1, 2, 3]);
+        assert_eq!(planes.kept().len(), 3, "fresh views are not kept");
+    }
+}
