@@ -1,4 +1,4 @@
-// Looks for rows that hold a number that is none; src/backend/audit.rs. Numbers are read as bits:
+// Finds rows with a number that is not finite; src/backend/audit.rs. Numbers are read as bits:
 // WGSL may assume that there is no NaN. One row per invocation.
 
 // 0, or 1 + the place of the row's first such number.

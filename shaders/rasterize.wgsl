@@ -1,4 +1,4 @@
-// Stage 3: tile lists to pixels; src/backend/cpu/rasterize.rs, and quads.wgsl for who does what.
+// Stage 3: tile lists to pixels; src/backend/cpu/rasterize.rs. quads.wgsl says which invocation has which pixels.
 
 // Red, green, blue (background included), depth.
 @group(0) @binding(6) var<storage, read_write> canvas: array<vec4<f32>>;

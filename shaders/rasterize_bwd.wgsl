@@ -1,5 +1,5 @@
 // Stage 5 in slots: pixel gradients to splat gradients, one record per entry, then one sum per row.
-// rasterize_bwd_atomic.wgsl is the other way; both build on backward.wgsl.
+// rasterize_bwd_atomic.wgsl does the same with atomics; both build on backward.wgsl.
 
 // One record per slot.
 @group(0) @binding(8) var<storage, read_write> records: array<f32>;

@@ -1,5 +1,5 @@
 // Stage 5 with atomics: pixel gradients straight to the sums of rows, without records. The sums are those
-// of rasterize_bwd.wgsl, in an order that is chance.
+// of rasterize_bwd.wgsl, added in no fixed order.
 
 // What the subgroup finds of splat i at hand, the first of which is the nth of the list.
 fn find(

@@ -1,4 +1,4 @@
-// Stage 8: what policies ask for, summed over views; src/backend/cpu/signals.rs. One row per
+// Stage 8: the signals that policies ask for, accumulated over views; src/backend/cpu/signals.rs. One row per
 // invocation. Accumulators are planes of budget numbers; only what was asked for has one.
 
 @group(0) @binding(1) var<storage, read> state: State;

@@ -1,6 +1,7 @@
 // Sums over a tile's pixels that are added to those of rows at once, by atomics: a subgroup (subgroups.wgsl)
 // adds up what it finds in its pixels, and adds that to the sums of the splat's row, one invocation per
-// field. slots.wgsl is the other way.
+// field. slots.wgsl replaces this file where sums must have a
+// fixed order.
 
 // Adds to the sums of the row of splat i at hand what the subgroup has found; `maximum`: the field that is
 // the largest of its values, which are >= 0; none: NONE.

@@ -1,6 +1,5 @@
-// What both ways of differentiating a tile share (rasterize_bwd.wgsl, rasterize_bwd_atomic.wgsl): what
-// they read beside quads.wgsl, what happens at the pixels, and what the parameters need of it.
-// src/backend/cpu/rasterize_bwd.rs tells why the sums are what they are.
+// The backward pass of a splat in a tile's pixels, for rasterize_bwd.wgsl and rasterize_bwd_atomic.wgsl.
+// src/backend/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
 // dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set.

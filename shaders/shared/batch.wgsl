@@ -1,5 +1,5 @@
-// The invocations of a tile that work together: all of them, through shared memory. subgroups.wgsl is the
-// other way.
+// The invocations of a tile share splats through shared memory. subgroups.wgsl replaces this file on
+// devices with subgroups.
 
 struct Member {
     place: u32,
@@ -25,7 +25,7 @@ fn is_needed(wants: bool) -> bool {
     return wants;
 }
 
-// The largest that any of them has; nobody needs the splats at hand any more.
+// The largest value of any of them; the splats at hand are no longer needed.
 fn largest_of_all(m: Member, x: u32) -> u32 {
     if m.place == 0u {
         atomicStore(&largest_found, 0u);

@@ -1,4 +1,4 @@
-// What a splat is blended into, for both ways to add it up (observe.wgsl, observe_atomic.wgsl).
+// A splat's sums over the pixels of an auxiliary view, for observe.wgsl and observe_atomic.wgsl.
 
 // Sums of the map, of pixels, of weights, of distances.
 const COLUMNS: u32 = 4u;

@@ -1,5 +1,5 @@
-// A row's projection and its colour, for the forward and the backward pass: the functions of
-// src/backend/cpu/project.rs. Why the formulas are as they are is told there.
+// A row's projection and colour, for the forward and the backward pass: the functions of
+// src/backend/cpu/project.rs, which derives the formulas.
 
 @group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> sh0: array<f32>;

@@ -1,5 +1,5 @@
-// What the kernels share that work tile by tile (rasterize, rasterize_bwd, observe and the atomic ones):
-// what they read, an invocation and its pixels, and what a splat is in them.
+// Shared by the kernels that work tile by tile (rasterize, rasterize_bwd, observe and the atomic ones):
+// their inputs, the pixels of an invocation, and a splat's blending there.
 //
 // One tile per group of 64 invocations. Each has four pixels that make a square, the four numbers of a
 // vec4: a splat is read once for all of them, and what they add to its sums meets in registers.

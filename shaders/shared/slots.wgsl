@@ -1,6 +1,6 @@
-// Sums over a tile's pixels that go to one record per entry, in its slot: what each invocation has found
-// in its four pixels is put side by side, and added in order. So the sum over a tile has one order,
-// whatever the device, and four splats share two barriers. atomics.wgsl is the other way.
+// Sums over a tile's pixels, written to one record per entry in its slot. What each invocation finds in
+// its four pixels is stored in shared memory and added in a fixed order, the same on every device; four
+// splats share two barriers. atomics.wgsl replaces this file where gradients are added by atomics.
 
 // Splats at a time, and loaded at a time, at most.
 const SPLATS: u32 = 4u;

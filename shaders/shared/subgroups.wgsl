@@ -1,6 +1,5 @@
-// The invocations of a tile that work together: each subgroup by itself, without shared memory or a
-// barrier. It has as many splats at hand as it has invocations, one each, which they hand to one another.
-// batch.wgsl is the other way.
+// The invocations of a subgroup share splats, without shared memory or barriers: each holds one splat
+// and passes it to the others. batch.wgsl replaces this file on devices without subgroups.
 
 // An invocation among those of its subgroup, which may be of any size. They are counted, as sizes that
 // drivers tell may be more than there are.

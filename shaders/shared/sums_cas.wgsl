@@ -1,5 +1,5 @@
-// The sums of rows where a device adds whole numbers only: bits of f32, exchanged if nobody else was
-// faster. What an addition comes after is chance, and so are its last bits.
+// The sums of rows, on devices whose atomics are whole numbers only: additions compare and exchange the
+// bits of f32. The order of additions varies, and so do the last bits of a sum.
 
 @group(0) @binding(8) var<storage, read_write> row_sums: array<atomic<u32>>;
 

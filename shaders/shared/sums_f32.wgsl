@@ -1,5 +1,5 @@
-// The sums of rows where a device adds f32 atomically. What an addition comes after is chance, and so
-// are its last bits.
+// The sums of rows, on devices with atomic addition of f32. The order of additions varies, and so do
+// the last bits of a sum.
 
 @group(0) @binding(8) var<storage, read_write> row_sums: array<atomic<f32>>;
 
@@ -11,8 +11,8 @@ fn add(at: u32, x: f32) {
     atomicAdd(&row_sums[at], x);
 }
 
-// Makes a sum the larger of itself and x. There is no such atomic of f32: values are exchanged, and
-// whoever takes out a larger one than it has put in puts that in again.
+// Makes a sum the larger of itself and x. f32 has no atomic maximum: values are exchanged, and an
+// invocation that gets back a larger value than it stored stores that one again.
 fn raise(at: u32, x: f32) {
     var mine = x;
     loop {

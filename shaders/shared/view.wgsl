@@ -1,5 +1,5 @@
-// What all stages share: the view at hand and the numbers of a step (one uniform buffer), the
-// scalars that stay on the device (one storage buffer), how work is numbered, and e^x.
+// Shared by all stages: the view and the settings of a step (one uniform buffer), the scalars that stay
+// on the device (one storage buffer), the numbering of work, and e^x.
 
 struct Frame {
     // Rows of camera_from_world's rotation; w: its translation.

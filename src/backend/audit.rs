@@ -1,8 +1,8 @@
-//! Rows that hold a number that is not finite.
+//! Rows with a number that is not finite.
 //!
 //! One NaN or infinity in a gradient makes the parameter that it steps NaN, or its second moment
 //! infinite, and neither ever leaves it again: [`Backend::audit`](super::Backend::audit) finds them
-//! whenever it looks. Until then such a row harms nobody, as projection leaves out whatever has a
+//! whenever it looks. Until then such a row does no harm, as projection skips every row that has a
 //! parameter that is not finite.
 
 use std::fmt;
@@ -48,7 +48,7 @@ impl fmt::Display for Attribute {
     }
 }
 
-/// Where the number stands that is not finite.
+/// Where a number that is not finite was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kept {
     /// Among the parameters.

@@ -1,4 +1,4 @@
-//! Candidates for new rows, as every backend lists them: which pixels of a view are the worst
+//! The list of candidates for new rows, the same for every backend: the worst pixels of a view
 //! (*Gaussians on a Diet*, arXiv 2604.20046, "compensation").
 
 use std::collections::HashMap;

@@ -1,5 +1,5 @@
-//! What backends measure in an auxiliary view in the same way: the pixel map, the pixels whose
-//! surface points a policy wants, and a row's radius. On the host, for every backend: it happens at a policy's events only.
+//! Measurements of auxiliary views that every backend makes on the host: the pixel map, the choice of
+//! pixels for surface points, and a row's radius.
 
 use densify_policies::policy::PixelMap;
 use densify_policies::rng::PolicyRng;

@@ -1,5 +1,4 @@
-//! Where a backend computes less than it could, for speed: the knobs of `densify knobs` that are a
-//! backend's.
+//! The knobs of `densify knobs` that make a backend compute less, for speed.
 
 /// Where a backend computes less than it could. The default is the renderer as published, and what
 /// every other renderer of Gaussian splats does.

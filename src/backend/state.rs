@@ -1,5 +1,4 @@
-//! What a backend keeps beside the model, as named arrays: how its state goes to a checkpoint and
-//! comes back.
+//! A backend's state beside the model, as named arrays: how it is saved in checkpoints and restored.
 //!
 //! An array has one entry per row in use, in the order of the rows, however a backend lays them out
 //! itself. Parameters of a row stand in this order: mean 3, log-scale 3, quaternion (w, x, y, z) 4,

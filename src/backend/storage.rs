@@ -1,8 +1,8 @@
-//! In how many bits numbers that last from step to step are stored. Arithmetic is f32 throughout.
+//! The formats in which parameters and moments are stored between steps; arithmetic is always f32.
 //!
-//! A number that is stored in fewer bits is rounded to one of its two neighbours at random, so that
-//! on average it is what it was: a step of Adam is often smaller than half the distance of two
-//! neighbours, and would be lost for good if it were always rounded to the nearer.
+//! Numbers stored in fewer bits are rounded stochastically, without bias: a step of Adam is often
+//! smaller than half the distance between two neighbours and would always be lost if it were rounded
+//! to the nearest.
 
 /// How the numbers of a model and of its optimiser are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

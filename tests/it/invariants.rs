@@ -184,7 +184,10 @@ fn only_the_gpu_backend_names_wgpu() {
 fn every_shader_has_a_native_file_of_the_same_name() {
     let names = |folder: &str, ending: &str| -> BTreeSet<String> {
         let sources = sources().into_iter().map(|s| s.path);
-        let of = |path: String| Some(path.strip_prefix(folder)?.strip_suffix(ending)?.to_owned());
+        let of = |path: String| {
+            let name = path.strip_prefix(folder)?.strip_suffix(ending)?;
+            Some(name.trim_end_matches("/mod").to_owned())
+        };
         sources.filter_map(of).collect()
     };
     let mut shaders = names("shaders/", ".wgsl");

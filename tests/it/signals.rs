@@ -5,7 +5,7 @@ use densify::backend::{Backend, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
+use densify_policies::policy::{Cadence, Needs, Signal, SignalKind, SignalSet};
 use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -130,21 +130,20 @@ fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBacken
 fn every_signal_whatever_else_is_asked_for() {
     let views = views();
     let gradients: Vec<Gradient> = (0..views.cameras.len()).map(|v| reference(&views, v)).collect();
-    let gradient_sums = [
-        Signal::VisibleCount,
-        Signal::ScreenGradient,
-        Signal::ColourGradient,
-        Signal::MeanGradientX,
-        Signal::MeanGradientY,
-        Signal::MeanGradientZ,
-        Signal::MeanGradientNorm,
-    ];
-    let weights = [Signal::WeightMax, Signal::WeightSum, Signal::PixelCount];
-    let everything = [&gradient_sums[..], &[Signal::ScreenGradientAbs], &weights].concat();
-    let few = [&gradient_sums[..], &[Signal::WeightMax]].concat();
-    let mut requests = vec![gradient_sums.to_vec(), few, everything.clone()];
-    // Each alone: a backend keeps only what is asked for, and must not lose its place.
-    requests.extend(everything.iter().map(|&s| vec![s]));
+    let is_accumulated =
+        |s: &Signal| !matches!(s.kind(), SignalKind::Present | SignalKind::FreshMaximum);
+    let everything: Vec<Signal> = Signal::ALL.into_iter().filter(is_accumulated).collect();
+    let mut base = everything.clone();
+    base.retain(|signal| signal.pixel_sums().is_empty());
+    // Alone, beside the others that cost nothing, and all together: a backend keeps only what is asked
+    // for, and must not lose its place.
+    let mut requests = vec![base.clone(), everything.clone()];
+    for &signal in &everything {
+        requests.push(vec![signal]);
+        if !base.contains(&signal) {
+            requests.push([&base[..], &[signal]].concat());
+        }
+    }
 
     let mut table = Table::new("signals");
     for request in requests {
@@ -154,7 +153,8 @@ fn every_signal_whatever_else_is_asked_for() {
             for (gradient, camera) in gradients.iter().zip(&views.cameras) {
                 let parts = contribution(signal, gradient, camera);
                 for (sum, part) in expected.iter_mut().zip(parts) {
-                    *sum = if signal == Signal::WeightMax { part.max(*sum) } else { *sum + part };
+                    let is_maximum = signal.kind() == SignalKind::EpochMaximum;
+                    *sum = if is_maximum { part.max(*sum) } else { *sum + part };
                 }
             }
             let what = format!("{} signals", request.len());

@@ -1,4 +1,4 @@
-//! Looks for rows that hold a number that is not finite; see [`audit`](crate::backend::audit).
+//! Finds rows with a number that is not finite; see [`audit`](crate::backend::audit).
 
 use rayon::prelude::*;
 
@@ -8,7 +8,7 @@ use super::simd::WIDTH;
 use crate::backend::{Attribute, Kept, Unsound};
 
 impl CpuBackend {
-    /// The rows that hold a number that is not finite, in order.
+    /// The rows with a number that is not finite, in order.
     pub(super) fn unsound(&self) -> Vec<Unsound> {
         let rows = self.rows;
         let (params, moments) = (self.params.view(rows), self.moments.view(rows));

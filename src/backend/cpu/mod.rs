@@ -240,7 +240,7 @@ impl Backend for CpuBackend {
     }
 
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
-        // Between two steps nobody reads the sums.
+        // The sums are not used between two steps.
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::within(memory, self.rows, wanted);
         self.signals.read(&mut signals, wanted, &self.params, &self.ages);

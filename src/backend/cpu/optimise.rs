@@ -44,7 +44,7 @@ pub(super) struct Optimise<'a> {
     pub(super) bias: &'a BiasCorrection,
     /// Gradients kept for a later step.
     pub(super) summed: &'a mut TaskSums<'a>,
-    /// Who steps now.
+    /// Which parameters step now.
     pub(super) due: Due,
     /// Terms of the loss that concern every row, if there are any.
     pub(super) terms: Option<Terms>,

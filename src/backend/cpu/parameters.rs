@@ -1,7 +1,8 @@
-//! The model's parameters: f32 in blocks; or the means so, and all other planes in 16 bits. Colour
-//! then is f16. Log-scales, quaternions and opacity logits, which the optimiser keeps within bounds,
-//! are in fixed point: of f16, log-scales of −5 would lie 0.004 apart, four times an ordinary step, and
-//! the rounding of it would be more than the step.
+//! The model's parameters in blocks: all as f32, or all but the means in 16 bits.
+//!
+//! In 16 bits, colour is f16. Log-scales, quaternions and opacity logits, which the optimiser keeps
+//! within bounds, are in fixed point: around −5 the values of f16 are 0.004 apart, four times an
+//! ordinary step of a log-scale.
 //!
 //! Kernels read and write planes of f32. Where a block is f32 they get the block itself; else its
 //! planes are widened to an array ([`open`](ParameterTask::open)) and stored from it, rounded at

@@ -1,8 +1,8 @@
-//! Where the backward pass writes one record per (row, tile) entry, and what becomes of them.
+//! Where the backward pass writes its gradient records, one per (row, tile) entry, and how they are summed.
 //!
 //! Where there is room for a record of every entry that the lists hold, an entry's record lies in its
-//! slot, and a row finds its records side by side. Records are three quarters of what an entry takes,
-//! though, and all that they are for is to be summed. With room for fewer, a band is taken in parts:
+//! slot, and a row finds its records side by side. Records are three quarters of the
+//! memory of an entry, though, and are only needed to be summed. With room for fewer, a band is taken in parts:
 //! runs of tiles, whose records lie in the order of the lists, and of which each row takes its own
 //! before the next part. A tile with more entries than there is room for is done again for each piece
 //! of its list. A row's records are added in order of tile number in any case, so that parts, as bands,

@@ -1,4 +1,4 @@
-//! What a policy adds to the optimisation of every row, seen or not: terms of the loss, and noise on
+//! Terms of the loss and noise that a policy adds for every row, visible or not; noise is added to
 //! the means (*3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand et al. 2024).
 
 use densify_policies::policy::{LossTerms, NoiseTerm};

@@ -1,4 +1,4 @@
-//! Stage 8: what policies ask for, summed over views. Only requested signals have memory.
+//! Stage 8: the signals that policies ask for, accumulated over views. Only requested signals have memory.
 
 use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet, Signals};
 use pulp::Simd;

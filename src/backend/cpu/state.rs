@@ -1,5 +1,5 @@
 //! The native backend's state as named arrays. Each stage that keeps something between steps says
-//! what it is; lanes beyond the last row are nobody's and are left out.
+//! what it is; lanes beyond the last row are left out.
 
 use std::ops::Range;
 

@@ -1,6 +1,5 @@
 //! Gradients summed between optimiser steps, where a policy wants steps less often than every
-//! iteration ([`Cadence`]). Without such a policy there is no buffer, and nothing of this costs
-//! anything.
+//! iteration ([`Cadence`]). Without such a policy there is no buffer and no cost.
 //!
 //! A step then takes the sum of the gradients of all views since the last one. Bands 1–3 of the
 //! colour can step less often than all others; they then have ages of their own, as Adam's bias
@@ -83,7 +82,7 @@ impl Summed {
         sums + (rows * size_of::<u16>()) as u64
     }
 
-    /// Who steps now. Remembers who waits afterwards.
+    /// The parameter groups that step now; records those that wait.
     ///
     /// # Panics
     /// When the cadence needs sums that were not declared: a bug in the caller, and going on would

@@ -1,5 +1,5 @@
-//! How the gradients that a row gets from its tiles are added up: in slots, in one order, or at once by
-//! atomics, in any order. Which of them a device does is chosen when it is opened.
+//! How a row's gradients are added up over tiles: in slots, always in the same order, or by atomics, in
+//! any order. The way is chosen when a device is opened.
 
 use std::fmt;
 

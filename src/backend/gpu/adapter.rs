@@ -1,4 +1,4 @@
-//! The adapters that there are: what they are, what they lack, and which one is taken.
+//! The available adapters: what they are, what they lack, and which one is chosen.
 
 use wgpu::{
     Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
@@ -39,7 +39,7 @@ pub struct AdapterSummary {
     pub largest_binding: u64,
     /// Largest buffer `[bytes]`.
     pub largest_buffer: u64,
-    /// What it lacks to be used, if anything.
+    /// What it lacks to be usable; empty if it is.
     pub missing: Vec<String>,
     /// The ways of adding up gradients that it has, the fastest last; always [`Accumulation::Slots`].
     pub accumulations: Vec<Accumulation>,
@@ -76,7 +76,7 @@ impl AdapterSummary {
         (largest / widest_row(sh_degree)).min(MOST_ROWS)
     }
 
-    /// How it adds up gradients where nobody says: as fast as it can.
+    /// How it adds up gradients by default: the fastest way it supports.
     #[must_use]
     pub fn accumulation(&self) -> Accumulation {
         self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
@@ -98,10 +98,10 @@ pub fn may_be_present() -> bool {
     !cfg!(target_os = "linux") || NODES.iter().any(|node| std::path::Path::new(node).exists())
 }
 
-/// Rows that the numbering of work allows: 2³² bytes of nothing are indexed beyond.
+/// Most rows whose numbers, times their width, fit the shaders' 32-bit indices.
 const MOST_ROWS: u64 = 1 << 25;
 
-/// What every kernel is written for; all of it is what WebGPU promises everywhere.
+/// The limits that every kernel is written for: WebGPU promises them everywhere.
 const STORAGE_BUFFERS: u32 = 8;
 const INVOCATIONS: u32 = 256;
 const SHARED_BYTES: u32 = 16_384;
@@ -155,7 +155,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
     enumerate().into_iter().map(|(_, summary)| summary).collect()
 }
 
-/// Which adapter to take, and how it is to work.
+/// Which adapter to take, and how it adds up gradients.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct AdapterChoice {
     /// Part of its name or its driver's, in any case of letters; the best there is without one.
@@ -267,7 +267,7 @@ mod tests {
             let choice = AdapterChoice { name: None, accumulation };
             choice.accumulation(&of(features), features)
         };
-        // As fast as it can, where nobody says.
+        // By default the fastest.
         for (features, expected) in [
             (Features::empty(), Slots),
             (subgroups, SubgroupCas),

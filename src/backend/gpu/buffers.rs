@@ -32,7 +32,7 @@ impl Buffers {
         Ok(Self { named, nothing })
     }
 
-    /// Allocates those again whose size is another now.
+    /// Reallocates the buffers whose size has changed.
     pub(super) fn resize(&mut self, device: &Device, sizes: &Sizes) -> Result<(), BackendError> {
         let planned = sizes.planned();
         check_sizes(device, &planned, sizes)?;
@@ -53,8 +53,8 @@ impl Buffers {
         Ok(())
     }
 
-    /// The buffer of this name; a few bytes that nobody reads where there is none, such as of bands
-    /// beyond the model's degree.
+    /// The buffer of this name; where there is none, such as for bands beyond the model's degree, a few
+    /// bytes that are never read.
     pub(super) fn get(&self, name: &str) -> &Buffer {
         self.named.get(name).unwrap_or(&self.nothing)
     }

@@ -1,5 +1,5 @@
-//! The canary: before a device trains anything, it takes two steps on a fixed small scene, and so does
-//! the native backend. A driver that miscompiles a kernel is then an error and not a bad model.
+//! The canary: before a device trains anything, two steps on a fixed small scene are compared with the
+//! native backend. A driver that miscompiles a kernel is then an error instead of a bad model.
 
 use densify_policies::policy::{Cadence, Needs};
 use densify_policies::rng::{PolicyRng, Purpose};

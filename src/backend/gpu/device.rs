@@ -1,4 +1,4 @@
-//! An open device with its kernels, and how its errors become ours.
+//! An open device with its kernels; translates its errors to [`BackendError`].
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -11,7 +11,7 @@ use super::wait::wait;
 use crate::backend::BackendError;
 use crate::backend::signals::RecordLayout;
 
-/// What a device tells outside of any call.
+/// Errors that a device reports outside of any call.
 #[derive(Debug, Default)]
 struct Told {
     lost: Option<String>,

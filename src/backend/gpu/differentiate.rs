@@ -1,4 +1,4 @@
-//! Gradients and losses on their own, without a step: what tests and research look at.
+//! Gradients and losses without a training step: tools for tests and research.
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};

@@ -1,5 +1,5 @@
-//! A compiled plan on its way to the device: operations as numbers, in chunks of fixed size, and the
-//! dispatches that execute them in place. See `shaders/apply.wgsl` for the numbers' meaning.
+//! Executes a compiled plan on the device, in place: encodes its operations as numbers, in chunks of
+//! fixed size, and dispatches them. `shaders/apply.wgsl` says what the numbers mean.
 
 use densify_policies::plan::{OpacityRule, ParentFate, Placement, RowOps, ScaleRule};
 

@@ -1,5 +1,5 @@
-//! The uniform buffer that all stages read, and the scalars that they leave: the Rust side of
-//! `shaders/shared/view.wgsl`. That both sides agree is checked offline, field by field.
+//! The uniform buffer that all stages read and the scalars that they return: the Rust side of
+//! `shaders/shared/view.wgsl`. A test compares both sides field by field.
 
 use bytemuck::{Pod, Zeroable};
 use densify_policies::policy::{LossTerms, NoiseTerm, Signal};

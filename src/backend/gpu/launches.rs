@@ -182,9 +182,9 @@ impl<L> Launches<L> {
             adam_geometry: bind("adam_geometry", &adam(0)),
             accumulate: bind("accumulate", &[]),
             measure: bind("measure", &[]),
-            // The sums of the sorts are a buffer of enough numbers that nobody needs then.
+            // Borrows the sums of the sorts, which are not needed then and are long enough.
             present: bind("present", &[("signals", "sums")]),
-            // The gradients of the rows are a buffer that nobody needs between two steps.
+            // Borrows the gradients of the rows, which are not needed between two steps.
             surface: both("surface", &|i| {
                 [list(i), vec![("pixels", "ops"), ("points", "gradient")]].concat()
             }),
@@ -212,7 +212,7 @@ impl<L> Launches<L> {
     }
 }
 
-/// Marks go to the sums of the sorts, which nobody needs between two steps.
+/// The marks borrow the sums of the sorts, which are not needed between two steps.
 fn audits<L>(bind: &dyn Fn(&'static str, &[Instead]) -> L, sizes: &Sizes) -> Vec<Audit<L>> {
     let arrays = sizes.row_arrays();
     let audit = |array: &RowArray| {

@@ -1,5 +1,5 @@
-//! What a policy looks at in a view beside the signals: candidates for new rows while training, and
-//! auxiliary views at its events. The device lists the worst pixels of a view, of which the host takes
+//! Measures single views for a policy: candidates for new rows while training, and auxiliary views at
+//! its events. The device lists the worst pixels of a view, of which the host takes
 //! those that are spaced; of auxiliary views the host chooses them, from a copy of the image. The
 //! device then finds their surface points, and the sums over each row's pixels.
 

@@ -1,5 +1,5 @@
-//! A view's passes as commands: forward, image loss, backward, optimiser. What is encoded depends on
-//! the image's size and on the number of bands only; everything else the device counts itself.
+//! Encodes the passes of a view: forward, image loss, backward, optimiser. What is encoded depends only
+//! on the image's size and the number of bands; everything else is counted on the device.
 
 use wgpu::ComputePass;
 

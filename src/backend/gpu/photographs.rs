@@ -1,8 +1,8 @@
-//! Which photographs stay on the device. A view's is packed and uploaded when it is first seen and
-//! copied there from then on, as far as there is room; those beyond are uploaded at every step.
+//! Which photographs stay on the device: the first ones seen, as many as there is room for. The others
+//! are uploaded at every step.
 //!
-//! Which ones stay is not changed afterwards: views come in a new random order in each epoch, so that
-//! to keep the newest instead would keep none of them until its turn comes again.
+//! The choice is never changed: views come in a new random order in each epoch, so that the newest
+//! ones would be gone before they are needed again.
 
 use std::collections::HashMap;
 

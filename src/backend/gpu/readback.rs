@@ -1,4 +1,4 @@
-//! From the device to the host: through one buffer of fixed size, piece by piece.
+//! Copies from the device to the host, piece by piece through one buffer of fixed size.
 
 use wgpu::{Buffer, CommandEncoder, MapMode, PollType};
 

@@ -1,4 +1,4 @@
-//! One training step: what it needs in the uniform buffer, and which passes it takes.
+//! One training step: fills the uniform buffer and runs the passes.
 
 use std::time::Instant;
 
@@ -10,7 +10,8 @@ use crate::backend::candidates::error_weights;
 use crate::backend::{BackendError, StepInput, StepOutput};
 
 impl GpuBackend {
-    /// Who steps now and who waits, as bits of the frame, and who waits afterwards.
+    /// Which parameter groups step now and which have waited, as bits of the frame, and which wait
+    /// afterwards.
     fn cadence_bits(&self, input: &StepInput<'_>) -> (u32, Waiting) {
         let (step, cadence) = (input.step, input.cadence);
         assert!(cadence.is_within(self.cadence), "step {step}: {cadence:?} was not declared");

@@ -1,4 +1,4 @@
-//! A view's passes on their way to the device: encoded, submitted, and taken again where bands did not do.
+//! Submits a view's passes, and again with more bands where there were too few.
 
 use super::accumulation::Accumulation;
 use super::frame::{Frame, State};

@@ -1,4 +1,4 @@
-//! Between host and device: the model, photographs, rendered images, and columns of numbers.
+//! Transfers between host and device: the model, photographs, rendered images and columns of numbers.
 
 use std::ops::Range;
 

@@ -81,10 +81,14 @@ fn steps_are_those_of_the_native_backend() {
     // Half of the rows are nearer.
     let full_depth = 3.5;
     let some = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
+    let absolute = SignalSet::from([Signal::ScreenGradientAbs]);
+    let pixels = SignalSet::from([Signal::PixelCount, Signal::WeightMax, Signal::ScreenGradient]);
     let noise = NoiseTerm { strength: 5e3, sharpness: 100.0, opacity: 0.3 };
     let runs = [
         ("plain", Needs::default(), Cadence::default()),
         ("all signals", Needs { signals: all, ..Needs::default() }, Cadence::default()),
+        ("absolute gradients", Needs { signals: absolute, ..Needs::default() }, Cadence::default()),
+        ("pixels and weights", Needs { signals: pixels, ..Needs::default() }, Cadence::default()),
         (
             "near views weigh less",
             Needs { signals: all, full_depth, ..Needs::default() },

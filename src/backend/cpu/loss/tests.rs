@@ -1,5 +1,5 @@
-//! Tests of what of the loss is asked for; its values and gradients are held against the reference in
-//! `tests/it/loss.rs`.
+//! Tests of the optional parts of the loss; `tests/it/loss.rs` compares its values and gradients with
+//! the reference.
 
 use super::super::tiles::Grid;
 use super::*;

@@ -1,4 +1,4 @@
-//! Every number that can be stored, the neighbours of those that cannot, and the draws.
+//! Tests of every number that can be stored, of rounding between them, and of the random draws.
 
 #![expect(clippy::float_cmp, reason = "what can be stored comes back to the last bit")]
 

@@ -16,9 +16,12 @@ use super::super::device::Device as Opened;
 use super::super::frame::{Frame, State, folded_seed};
 use super::super::launches::Launches;
 use super::super::photographs::KeptPhotographs;
+use super::super::pipelines::Variant;
 use super::super::readback;
 use super::super::sizes::Sizes;
 use super::*;
+use crate::backend::Shortcuts;
+use crate::backend::signals::RecordLayout;
 
 /// What naga must allow, beside what WebGPU has everywhere.
 fn capabilities(accumulation: Accumulation) -> Capabilities {
@@ -87,6 +90,29 @@ fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
         assert!(shared <= 16_384, "{}: {shared} bytes of shared memory", entry.name);
         assert!(entry.workgroup_size.iter().product::<u32>() <= 256, "{}", entry.name);
     }
+}
+
+/// A shader's `override` is given its value by name, and a signal that the shader does not know would
+/// be 0 for good.
+#[test]
+fn every_override_has_a_value_and_every_signal_a_number() {
+    let variant = Variant {
+        records: RecordLayout::ALL,
+        more: true,
+        shortcuts: Shortcuts::default(),
+        accumulation: Accumulation::Slots,
+    };
+    let constants: BTreeSet<String> =
+        variant.constants().into_iter().map(|(name, _)| name).collect();
+    let mut declared = BTreeSet::new();
+    for stage in &STAGES {
+        for accumulation in Accumulation::ALL {
+            let Some(text) = stage.text(accumulation) else { continue };
+            let module = stage.parse(&text);
+            declared.extend(module.overrides.iter().filter_map(|(_, o)| o.name.clone()));
+        }
+    }
+    assert_eq!(declared, constants);
 }
 
 /// The sizes of a backend that has every buffer there is.
