@@ -119,7 +119,7 @@ fn header() -> Header {
             normalisation: Normalisation { centre: DVec3::new(0.1, 2e-300, 7.0), scale: 1.0 / 3.0 },
         },
         trainer: crate::trainer::TrainerState {
-            growth: None,
+            auto_budget: None,
             step: 17,
             initial_rows: 9,
             peak_rows: ROWS,

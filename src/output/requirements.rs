@@ -1,61 +1,59 @@
-//! `stats/requirements.json`: what a run has left out, on what evidence, and what that costs as far as
-//! it was measured.
+//! `stats/requirements.json`: what a run left out automatically, on what evidence, and at what cost.
 
 use serde::Serialize;
 
 use super::{DegreeChoice, TrainConfig};
 use crate::gaussians::MAX_SH_DEGREE;
-use crate::trainer::{Growth, PAYS};
+use crate::trainer::{AutoBudget, MIN_GAIN};
 
 /// The report of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Requirements {
-    /// Whether nothing was to be left out (`--full`).
+    /// Whether automatic reductions were disabled (`--full`).
     pub full: bool,
-    /// Highest degree of colour of the model.
+    /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,
-    /// What decided it.
+    /// What decided the degree.
     pub sh_degree_from: DegreeChoice,
-    /// Ends of rungs and attempts to do with fewer rows, where rows had to pay.
-    pub rows: Option<Growth>,
-    /// Training views that were not rendered for scores, as others are nearly the same.
+    /// Measurements of `--budget auto`.
+    pub rows: Option<AutoBudget>,
+    /// Number of training views not rendered for scores, as others are nearly the same.
     pub unscored_views: usize,
-    /// What was left out; nothing that the options themselves leave out.
+    /// What was left out automatically; not what the options leave out.
     pub left_out: Vec<LeftOut>,
 }
 
 /// Something that was left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LeftOut {
-    /// What.
+    /// What was left out.
     pub what: String,
-    /// Why it was thought to be of no use.
+    /// Why it was considered useless.
     pub evidence: String,
-    /// What it would have brought as far as that was measured, and how.
+    /// The measured loss, and how it was measured.
     pub loss: String,
 }
 
 impl Requirements {
-    /// The report of a run that has come to `rows` rows; `growth` where they had to pay, and the number
-    /// of views that were not scored.
+    /// The report of a run that ended with `rows` rows.
     #[must_use]
     pub fn of(
         train: &TrainConfig,
         rows: usize,
-        growth: Option<&Growth>,
+        auto_budget: Option<&AutoBudget>,
         unscored_views: usize,
     ) -> Self {
         let left_out = [
             degree_left_out(train),
-            growth.and_then(|growth| rows_left_out(growth, rows, train.budget)),
-            growth.and_then(shrunk),
+            auto_budget.and_then(|auto| rows_left_out(auto, rows, train.budget)),
+            auto_budget.and_then(rows_removed),
             (unscored_views > 0).then(|| unscored(unscored_views)),
         ];
         Self {
             full: train.full,
             sh_degree: train.sh_degree,
             sh_degree_from: train.sh_degree_from,
-            rows: growth.cloned(),
+            rows: auto_budget.cloned(),
             unscored_views,
             left_out: left_out.into_iter().flatten().collect(),
         }
@@ -104,41 +102,38 @@ fn degree_left_out(train: &TrainConfig) -> Option<LeftOut> {
     })
 }
 
-fn rows_left_out(growth: &Growth, rows: usize, budget: usize) -> Option<LeftOut> {
-    let last = growth.rungs.iter().find(|rung| Some(rung.step) == growth.stopped)?;
-    let gain = last.gain.filter(|_| rows < budget && growth.idle >= 2)?;
-    growth.stopped.map(|step| LeftOut {
+fn rows_left_out(auto: &AutoBudget, rows: usize, budget: usize) -> Option<LeftOut> {
+    let last = auto.intervals.iter().find(|interval| Some(interval.step) == auto.stopped)?;
+    let gain = last.gain.filter(|_| rows < budget && auto.idle >= 2)?;
+    auto.stopped.map(|step| LeftOut {
         what: format!("rows beyond {}", last.rows),
         evidence: format!(
-            "growth ended at step {step}, as rows had brought less than {PAYS:.2} dB per doubling, \
+            "growth ended at step {step}, as a doubling of rows gained less than {MIN_GAIN:.2} dB \
              twice in a row"
         ),
-        loss: format!(
-            "they had brought {gain:.2} dB per doubling on training views, training included"
-        ),
+        loss: format!("about {gain:.2} dB per doubling on training views"),
     })
 }
 
-fn shrunk(growth: &Growth) -> Option<LeftOut> {
-    let kept: Vec<_> =
-        growth.shrinks.iter().filter(|shrink| shrink.after < shrink.before).collect();
-    let change: f64 = kept.iter().map(|shrink| shrink.change).sum();
-    let gone: usize = kept.iter().map(|shrink| shrink.before - shrink.after).sum();
-    (gone > 0).then(|| LeftOut {
-        what: format!("{gone} rows"),
+fn rows_removed(auto: &AutoBudget) -> Option<LeftOut> {
+    let removals = auto.removals.iter().filter(|removal| removal.after < removal.before);
+    let removals: Vec<_> = removals.collect();
+    let change: f64 = removals.iter().map(|removal| removal.change).sum();
+    let removed: usize = removals.iter().map(|removal| removal.before - removal.after).sum();
+    (removed > 0).then(|| LeftOut {
+        what: format!("{removed} rows of low weight"),
         evidence: format!(
-            "{} times, those of least weight were hidden, and missed by less than {PAYS:.2} dB per \
-             doubling",
-            kept.len()
+            "{} times, hiding them cost less than {MIN_GAIN:.2} dB per halving",
+            removals.len()
         ),
-        loss: format!("{change:.3} dB on training views, at once, in all"),
+        loss: format!("{change:.3} dB in all on training views, measured at removal"),
     })
 }
 
 fn unscored(views: usize) -> LeftOut {
     LeftOut {
-        what: format!("{views} training views where rows are scored"),
-        evidence: "for each there is another within 1 % of the scene's extent and one degree"
+        what: format!("{views} training views from the policy's scores"),
+        evidence: "each has a near-duplicate within 1 % of the scene's extent and one degree"
             .into(),
         loss: "its loss was not measured".into(),
     }
@@ -149,7 +144,7 @@ mod tests {
     use super::*;
     use crate::output::config::tests::sample;
     use crate::spread::Spread;
-    use crate::trainer::{Rung, Shrink};
+    use crate::trainer::{Interval, Removal};
 
     fn spread() -> Spread {
         let (median, tenth, twentieth, rms) = (0.0, 0.25, 0.5, 0.125);
@@ -176,8 +171,8 @@ mod tests {
     #[test]
     fn each_decision_has_its_evidence_and_its_loss() {
         let mut train = sample().train;
-        let line = |train: &TrainConfig, growth: Option<&Growth>| {
-            Requirements::of(train, 900, growth, 0).lines().join("\n")
+        let line = |train: &TrainConfig, auto_budget: Option<&AutoBudget>| {
+            Requirements::of(train, 900, auto_budget, 0).lines().join("\n")
         };
         train.sh_degree_from = DegreeChoice::Spread(spread());
         train.sh_degree = 0;
@@ -190,22 +185,22 @@ mod tests {
         let text = line(&train, None);
         assert!(text.contains("degree 3 of") && text.contains("not measured"), "{text}");
         train.sh_degree = 3;
-        let rung = |step, rows, gain| Rung { step, rows, psnr: 30.0, settled: true, gain };
-        let growth = Growth {
+        let interval = |step, rows, gain| Interval { step, rows, psnr: 30.0, settled: true, gain };
+        let auto_budget = AutoBudget {
             limit: 900,
             stopped: Some(300),
             idle: 2,
-            rungs: vec![
-                rung(200, 700, Some(0.06)),
-                rung(300, 1000, Some(0.04)),
-                rung(400, 1000, None),
+            intervals: vec![
+                interval(200, 700, Some(0.06)),
+                interval(300, 1000, Some(0.04)),
+                interval(400, 1000, None),
             ],
-            shrinks: vec![
-                Shrink { step: 400, before: 1000, after: 900, change: -0.015 },
-                Shrink { step: 500, before: 900, after: 900, change: -0.125 },
+            removals: vec![
+                Removal { step: 400, before: 1000, after: 900, change: -0.015 },
+                Removal { step: 500, before: 900, after: 900, change: -0.125 },
             ],
         };
-        let text = line(&train, Some(&growth));
+        let text = line(&train, Some(&auto_budget));
         for words in ["rows beyond 1000", "step 300", "0.04 dB", "100 rows", "1 times", "-0.015 dB"]
         {
             assert!(text.contains(words), "{words}: {text}");

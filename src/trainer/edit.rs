@@ -1,4 +1,4 @@
-//! Where a policy is due: what it sees, its plan, and the plan's execution.
+//! The policy's edit: what the policy sees, its plan, and the plan's execution.
 
 use std::time::Instant;
 
@@ -6,33 +6,32 @@ use densify_policies::plan::{EditPlan, RowOps};
 use densify_policies::policy::{SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 
-use super::guard::asked;
+use super::policy_calls::call_policy;
 use super::{EditEvent, TrainError, Trainer};
 use crate::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Asks the policy for a plan and executes it; policies may be due at steps at which they find
-    /// nothing to do.
+    /// Lets the policy plan and executes the plan. `None` if there was nothing to do.
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
-        let needs = self.measure_fresh(step)?;
-        self.show_views(step)?;
+        let needs = self.measure_fresh_views(step)?;
+        self.show_aux_views(step)?;
         self.views_time = self.views_time.saturating_add(start.elapsed());
         let signals =
-            self.backend.take_signals(needs.signals).map_err(|e| self.stopped(step, e))?;
-        let limit = self.limit();
+            self.backend.take_signals(needs.signals).map_err(|e| self.backend_error(step, e))?;
+        let limit = self.row_limit();
         let scene = SceneInfo { budget: limit, ..self.scene.clone() };
         let candidates = self.backend.candidates();
         let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
         let mut plan = EditPlan::new(self.backend.rows(), limit);
         let rng = PolicyRng::new(self.options.seed, step);
-        let planned = asked(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
+        let planned = call_policy(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         self.backend.give_back(signals);
-        planned.map_err(|source| self.refused(step, source))?;
+        planned.map_err(|source| self.policy_error(step, source))?;
         self.execute(step, plan)
     }
 
-    /// Executes a plan. One that changes no row and was refused nothing is no event.
+    /// Executes a plan. A plan that changes no row and had nothing refused is not an event.
     pub(super) fn execute(
         &mut self,
         step: u32,
@@ -40,10 +39,12 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
-        // A limit below the budget is the trainer's own; a backend knows of one budget only.
+        // The backend checks the budget, which the trainer's own limit may be below.
         ops.budget = self.backend.budget();
-        self.backend.apply(&ops, self.options.seed, step).map_err(|e| self.stopped(step, e))?;
-        self.peak_rows = self.peak_rows.max(rows_within(&ops)).max(self.backend.rows());
+        self.backend
+            .apply(&ops, self.options.seed, step)
+            .map_err(|e| self.backend_error(step, e))?;
+        self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
             return Ok(None);
         }
@@ -55,10 +56,10 @@ impl<V: ViewSource> Trainer<V> {
         Ok(Some(event))
     }
 
-    /// A plan compiles only from accepted calls; this is the second lock on the budget, and it
-    /// turns a plan that slipped through the first into an error instead of a panic in the backend.
+    /// Checks the budget and all invariants once more, so that a broken plan is an error here and not a
+    /// panic in the backend.
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
-        let (rows, budget) = (self.backend.rows(), self.limit());
+        let (rows, budget) = (self.backend.rows(), self.row_limit());
         let reason = if ops.rows_before != rows || ops.budget != budget {
             let RowOps { rows_before, budget: planned, .. } = ops;
             Some(format!(
@@ -73,10 +74,22 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Most rows in use at any instant of an edit: children and seeds stand in their slots before the
-/// moves shorten the model.
-pub(super) fn rows_within(ops: &RowOps) -> usize {
-    let born = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
-    let highest = born.max().map_or(0, |slot| slot as usize + 1);
+/// Most rows in use at any instant of an edit: children and seeds are written before moves shorten the
+/// model.
+fn peak_rows(ops: &RowOps) -> usize {
+    let new = ops.child_slots.iter().copied().chain(ops.seeds.iter().map(|(slot, _)| *slot));
+    let highest = new.max().map_or(0, |slot| slot as usize + 1);
     highest.max(ops.rows_before).max(ops.rows_after)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slots_written_before_the_moves_count_for_the_peak() {
+        let ops =
+            RowOps { rows_before: 4, rows_after: 3, child_slots: vec![1, 5], ..RowOps::default() };
+        assert_eq!(peak_rows(&ops), 6);
+    }
 }

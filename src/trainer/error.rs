@@ -1,12 +1,12 @@
-//! Why a run stops.
+//! Errors that end a run.
 
 use densify_policies::policy::PolicyError;
 
 use crate::backend::BackendError;
 use crate::views::ViewError;
 
-/// Why training cannot go on. The model stays as it was before the step's edit and can still be
-/// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is worth nothing.
+/// Why training cannot continue. The model stays as it was before the step's edit and can still be
+/// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is worthless.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// There is nothing to train on.
@@ -22,7 +22,7 @@ pub enum TrainError {
         step: u32,
         /// The view's name.
         view: String,
-        /// What the source of the views says.
+        /// The error of the view source.
         source: ViewError,
     },
     /// The loss is not a finite number.
@@ -38,8 +38,7 @@ pub enum TrainError {
         /// The loss.
         loss: f32,
     },
-    /// Rows hold numbers that are not finite: more of them than a sound run has, or any where none is
-    /// wanted.
+    /// Rows hold non-finite values: too many of them, or any with [`OnNan::Stop`](super::OnNan::Stop).
     #[error(
         "step {step}: {count} of {rows} rows hold numbers that are not finite, first {first}; \
          lower the learning rates, and check the scene's scale and cameras"
@@ -47,11 +46,11 @@ pub enum TrainError {
     Unsound {
         /// Iteration.
         step: u32,
-        /// How many rows.
+        /// How many rows hold them.
         count: usize,
-        /// Of how many.
+        /// Rows of the model.
         rows: usize,
-        /// The first of them, and its number.
+        /// Names the first of them and its value.
         first: String,
     },
     /// The policy reported an error.
@@ -64,9 +63,9 @@ pub enum TrainError {
         /// What it reported.
         source: PolicyError,
     },
-    /// The policy's plan breaks an invariant of plans.
+    /// The policy's plan breaks an invariant.
     #[error(
-        "step {step}: the plan of policy `{policy}` does not hold: {reason}; this is a bug, please report it"
+        "step {step}: the plan of policy `{policy}` is broken: {reason}; this is a bug, please report it"
     )]
     BrokenPlan {
         /// Iteration.
@@ -76,12 +75,12 @@ pub enum TrainError {
         /// What is wrong.
         reason: String,
     },
-    /// The backend cannot go on.
+    /// The backend failed.
     #[error("step {step}: {source}")]
     Backend {
         /// Iteration.
         step: u32,
-        /// What the backend says.
+        /// The backend's error.
         source: BackendError,
     },
 }

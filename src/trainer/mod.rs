@@ -1,44 +1,44 @@
-//! The training loop. It names no policy and no device: views come from a [`ViewSource`], pixels
-//! and gradients from a [`Backend`], births and deaths from a [`DensityPolicy`].
+//! The training loop, for any policy and any device.
 //!
-//! One step (Kerbl et al. 2023, section 5): a view in the order of its epoch, forward and backward
-//! pass and optimiser, and then, where the policy is due, one edit of the rows. A policy sees the
-//! model as the optimiser left it.
+//! Views come from a [`ViewSource`], pixels and gradients from a [`Backend`], edits of the rows from a
+//! [`DensityPolicy`]. One step (Kerbl et al. 2023, section 5) takes the next view of the epoch, runs
+//! forward pass, backward pass and optimiser, and then, if the policy is due, one edit. A policy sees
+//! the model after the optimiser's step.
 
-mod check;
+mod auto_budget;
+mod distinct_views;
 mod edit;
 mod error;
-mod fresh;
-mod growth;
-mod guard;
+mod nonfinite;
 mod options;
+mod policy_calls;
+mod policy_views;
 mod probe;
-mod quarantine;
-mod scored;
+mod progress;
+mod report;
 mod state;
+mod validate;
 
 use std::time::{Duration, Instant};
 
-use densify_policies::plan::RowOps;
 use densify_policies::policy::{Cadence, DensityPolicy, Needs, PolicyError, SceneInfo};
-use serde::{Deserialize, Serialize};
 
-use crate::backend::{Backend, BackendError, StepInput, StepOutput};
+use crate::backend::{Backend, BackendError, StepInput};
 use crate::dataset::images::SharedImage;
-use crate::gaussians::Gaussians;
 use crate::schedule;
 use crate::views::ViewSource;
-use check::{check, checked_needs};
+pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth_signals};
+use distinct_views::ScoringViews;
 pub use error::TrainError;
-pub use growth::{Growth, PAYS, Rung, Shrink, signals as growth_signals};
-use guard::asked;
+use nonfinite::AUDIT_EVERY;
 pub use options::{OnNan, Required, Savings, TrainOptions};
-use quarantine::AUDIT_EVERY;
-use scored::Scored;
+use policy_calls::call_policy;
+pub use report::{EditEvent, StepReport};
 pub use state::TrainerState;
+use validate::{check_options, checked_needs};
 
-/// What a run with this policy needs of its backend: the policy's needs, and room for the cadence of
-/// [`TrainOptions::sh_every`].
+/// The needs of a run with this policy: the policy's own, with [`TrainOptions::sh_every`] in place of its
+/// cadence.
 #[must_use]
 pub fn needs(policy: &dyn DensityPolicy, scene: &SceneInfo, sh_every: Option<u32>) -> Needs {
     let mut needs = policy.needs(scene);
@@ -46,59 +46,6 @@ pub fn needs(policy: &dyn DensityPolicy, scene: &SceneInfo, sh_every: Option<u32
         needs.cadence.sh_rest = every;
     }
     needs
-}
-
-/// What one step did.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StepReport {
-    /// Iteration, 1-based.
-    pub step: u32,
-    /// The view's number.
-    pub view: usize,
-    /// The step's scalars.
-    pub output: StepOutput,
-    /// Rows after the step.
-    pub rows: usize,
-    /// The edits of this step: of rows that hold a number that is not finite, and the policy's, where it was
-    /// due and had something to do.
-    pub events: Vec<EditEvent>,
-}
-
-/// One edit of the rows.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct EditEvent {
-    /// Iteration, 1-based.
-    pub step: u32,
-    /// Rows before.
-    pub before: usize,
-    /// Rows pruned.
-    pub removed: usize,
-    /// Rows born.
-    pub added: usize,
-    /// Rows rewritten in place.
-    pub updated: usize,
-    /// Edits that the plan refused: the policy wanted more.
-    pub denied: usize,
-    /// Rows after.
-    pub after: usize,
-    /// Why, in the policy's words, if it gave any.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
-    pub cause: String,
-}
-
-impl EditEvent {
-    fn new(step: u32, ops: &RowOps) -> Self {
-        Self {
-            step,
-            before: ops.rows_before,
-            removed: ops.counts.removed,
-            added: ops.counts.added,
-            updated: ops.counts.updated,
-            denied: ops.counts.denied,
-            after: ops.rows_after,
-            cause: ops.cause.clone(),
-        }
-    }
 }
 
 /// A run in progress.
@@ -111,6 +58,7 @@ pub struct Trainer<V> {
     scene: SceneInfo,
     options: TrainOptions,
     step: u32,
+    /// The views of this epoch and of the next one, in order.
     order: Vec<usize>,
     next_order: Vec<usize>,
     peak_rows: usize,
@@ -119,18 +67,18 @@ pub struct Trainer<V> {
     views_time: Duration,
     images_time: Duration,
     events: Vec<EditEvent>,
-    /// Training views that are rendered for scores.
-    scored: Scored,
-    /// Training views that are measured along the run; none where nothing asks for it.
+    /// Training views that the policy's scores are measured in.
+    scored: ScoringViews,
+    /// Training views that `--budget auto` measures; empty without it.
     probes: Vec<usize>,
-    growth: Option<Growth>,
+    auto_budget: Option<AutoBudget>,
 }
 
 impl<V: ViewSource> Trainer<V> {
-    /// A run at its start. `backend` holds the initial model; `policy_name` is for messages only.
+    /// A new run. `backend` holds the initial model; `policy_name` is for messages only.
     ///
     /// # Errors
-    /// [`TrainError::NoViews`], and [`TrainError::BadOption`] where `scene` or `options` disagree
+    /// [`TrainError::NoViews`], and [`TrainError::BadOption`] if `scene` or `options` disagree
     /// with the views or the backend.
     pub fn new(
         views: V,
@@ -140,7 +88,7 @@ impl<V: ViewSource> Trainer<V> {
         options: TrainOptions,
     ) -> Result<Self, TrainError> {
         let count = views.count();
-        check(&scene, &options, count, backend.as_ref())?;
+        check_options(&scene, &options, count, backend.as_ref())?;
         Ok(Self {
             needs: checked_needs(policy_name, policy.as_ref(), &scene, &options)?,
             policy_name: policy_name.to_owned(),
@@ -158,47 +106,33 @@ impl<V: ViewSource> Trainer<V> {
             options,
             step: 0,
             events: Vec::new(),
-            scored: Scored::all(count),
+            scored: ScoringViews::all(count),
             probes: Vec::new(),
-            growth: None,
+            auto_budget: None,
         })
     }
 
-    /// Lets the run find out what the scene requires, before its first step. For rows the backend must
-    /// have been made with [`growth_signals`], too.
+    /// Lets the run make automatic choices; to be called before the first step. To choose the number of
+    /// rows, the backend must have been made with [`growth_signals`] too.
     #[must_use]
-    pub fn requiring(mut self, what: Required) -> Self {
-        if what.rows {
+    pub fn requiring(mut self, choices: Required) -> Self {
+        if choices.rows {
             self.probes = probe::probes(self.views.count(), self.options.seed);
         }
-        if what.scored_views {
-            self.scored = Scored::distinct(&self.views, self.scene.extent);
+        if choices.scored_views {
+            self.scored = ScoringViews::distinct(&self.views, self.scene.extent);
         }
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
-        self.growth = what.rows.then(|| Growth::new(rows, budget));
+        self.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
         self
     }
 
-    /// What more rows have brought, where [they must pay](Required::rows).
-    #[must_use]
-    pub fn growth(&self) -> Option<&Growth> {
-        self.growth.as_ref()
-    }
-
-    /// Training views that are left out where the policy scores rows or looks at auxiliary views, as
-    /// others are nearly the same; none where it does neither.
-    #[must_use]
-    pub fn unscored_views(&self) -> usize {
-        let scores = self.needs.fresh_views > 0 || self.needs.aux.is_some();
-        if scores { self.views.count() - self.scored.count() } else { 0 }
-    }
-
-    /// One iteration: a view, a gradient step, and the policy's edit where one is due.
+    /// One iteration: a view, a gradient step, and the policy's edit if it is due.
     ///
-    /// May be called beyond [`TrainOptions::iterations`]; step sizes then stay at their end.
+    /// May be called beyond [`TrainOptions::iterations`]; learning rates then keep their final values.
     ///
     /// # Errors
-    /// [`TrainError`]. After one, the run is over; the model can still be read.
+    /// [`TrainError`]. After an error the run is over; the model can still be read.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let step = self.step + 1;
         let TrainOptions { iterations, savings, .. } = self.options;
@@ -221,18 +155,19 @@ impl<V: ViewSource> Trainer<V> {
             seed,
             ssim_weight: savings.ssim_weight(step, iterations),
         };
-        let output = self.backend.train_step(&input).map_err(|e| self.stopped(step, e))?;
+        let output = self.backend.train_step(&input).map_err(|e| self.backend_error(step, e))?;
         self.step = step;
         if !output.loss.is_finite() {
             let view = self.views.name(view).to_owned();
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
-        let is_due = asked(|| self.policy.is_due(step)).map_err(|e| self.refused(step, e))?;
+        let is_due =
+            call_policy(|| self.policy.is_due(step)).map_err(|e| self.policy_error(step, e))?;
         let mut events = Vec::new();
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
-            events.extend(self.quarantine(step)?);
+            events.extend(self.remove_nonfinite(step)?);
         }
-        events.extend(self.watch_growth(step)?);
+        events.extend(self.update_auto_budget(step)?);
         let start = Instant::now();
         if is_due {
             events.extend(self.edit(step)?);
@@ -249,24 +184,25 @@ impl<V: ViewSource> Trainer<V> {
         })
     }
 
-    /// How often the optimiser steps now: as the options say, else as the policy does.
+    /// How often the optimiser steps now: by the options, else by the policy.
     fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
-        let wanted = asked(|| self.policy.cadence(step)).map_err(|e| self.refused(step, e))?;
+        let wanted =
+            call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
         let cadence =
             Cadence { sh_rest: self.options.sh_every.unwrap_or(wanted.sh_rest), ..wanted };
         let declared = self.needs.cadence;
         if cadence.is_within(declared) {
             return Ok(cadence);
         }
-        let why = format!("it wants {cadence:?}, but declared {declared:?}");
-        Err(self.refused(step, PolicyError::Other(why)))
+        let error = format!("it wants {cadence:?}, but declared {declared:?}");
+        Err(self.policy_error(step, PolicyError::Other(error)))
     }
 
-    fn refused(&self, step: u32, source: PolicyError) -> TrainError {
+    fn policy_error(&self, step: u32, source: PolicyError) -> TrainError {
         TrainError::Policy { step, policy: self.policy_name.clone(), source }
     }
 
-    /// The view of the coming step; announces those after it, and epochs to the backend.
+    /// The view of the next step. Prefetches the views after it, and tells the backend of new epochs.
     fn next_view(&mut self) -> usize {
         let count = self.views.count();
         let place = self.step as usize % count;
@@ -276,7 +212,7 @@ impl<V: ViewSource> Trainer<V> {
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
             self.backend.begin_epoch();
         }
-        // A run that is extended goes on beyond its last iteration; then nothing is known of the end.
+        // Beyond the last iteration the end of the run is unknown.
         let left = self.options.iterations.checked_sub(self.step + 1);
         let last = left.map_or(usize::MAX, |left| left as usize);
         let upcoming: Vec<usize> = self.order[place + 1..]
@@ -289,90 +225,13 @@ impl<V: ViewSource> Trainer<V> {
         self.order[place]
     }
 
-    /// The spherical-harmonic degree at which a step's view is rendered.
+    /// The spherical-harmonic degree in use at a step.
     fn sh_degree(&self, step: u32) -> u8 {
         schedule::sh_degree(step, self.options.iterations, self.options.sh_degree)
     }
 
-    fn stopped(&self, step: u32, source: BackendError) -> TrainError {
+    fn backend_error(&self, step: u32, source: BackendError) -> TrainError {
         TrainError::Backend { step, source }
-    }
-
-    /// Steps done so far.
-    #[must_use]
-    pub fn steps_done(&self) -> u32 {
-        self.step
-    }
-
-    /// Rows now.
-    #[must_use]
-    pub fn rows(&self) -> usize {
-        self.backend.rows()
-    }
-
-    /// Most rows there have been at any instant, inside edits too.
-    #[must_use]
-    pub fn peak_rows(&self) -> usize {
-        self.peak_rows
-    }
-
-    /// Training views rendered for the policy's decisions so far, beside one per step: fresh and
-    /// auxiliary ones.
-    #[must_use]
-    pub fn extra_forwards(&self) -> u64 {
-        self.extra_forwards
-    }
-
-    /// Wall time of all policy events so far: signals, plan and its execution; and, apart from these,
-    /// of the views that were rendered for them.
-    #[must_use]
-    pub fn policy_times(&self) -> (Duration, Duration) {
-        (self.policy_time.saturating_sub(self.views_time), self.views_time)
-    }
-
-    /// Wall time that steps have waited for their images so far.
-    #[must_use]
-    pub fn images_time(&self) -> Duration {
-        self.images_time
-    }
-
-    /// All edits so far.
-    #[must_use]
-    pub fn events(&self) -> &[EditEvent] {
-        &self.events
-    }
-
-    /// The scene and the run as the policy sees them.
-    #[must_use]
-    pub fn scene(&self) -> &SceneInfo {
-        &self.scene
-    }
-
-    /// The views that are trained on.
-    #[must_use]
-    pub fn views(&self) -> &V {
-        &self.views
-    }
-
-    /// A copy of the model as it is now, in the coordinates of training.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    pub fn model(&self) -> Result<Gaussians, BackendError> {
-        self.model_rows(0..self.backend.rows())
-    }
-
-    /// Some rows of the [`model`](Self::model), which must be there.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    pub fn model_rows(&self, rows: std::ops::Range<usize>) -> Result<Gaussians, BackendError> {
-        self.backend.download_rows(rows)
-    }
-
-    /// The backend, for rendering and its ledger.
-    pub fn backend(&mut self) -> &mut dyn Backend {
-        self.backend.as_mut()
     }
 }
 

@@ -1,58 +1,58 @@
-//! How a run goes.
+//! Options of a run that the trainer acts on.
 
 use crate::schedule::{Background, RateOptions};
 
-/// How a run goes, beside its scene and its policy.
+/// Options of a run, beside its scene and its policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrainOptions {
     /// Length of the run in steps, >= 1; schedules scale with it.
     pub iterations: u32,
-    /// Seed of everything that is drawn.
+    /// Seed of all random draws.
     pub seed: u64,
     /// Highest spherical-harmonic degree trained, <= the model's.
     pub sh_degree: u8,
-    /// What lies behind the Gaussians.
+    /// Colour behind the Gaussians.
     pub background: Background,
-    /// Step sizes.
+    /// Learning rates.
     pub rates: RateOptions,
-    /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, if not the
-    /// policy's choice; >= 1.
+    /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, >= 1; `None`
+    /// leaves the choice to the policy.
     pub sh_every: Option<u32>,
-    /// How many views ahead are announced to the [`ViewSource`](crate::views::ViewSource).
+    /// Number of views to prefetch from the [`ViewSource`](crate::views::ViewSource).
     pub prefetch: usize,
-    /// What becomes of rows that hold a number that is not finite.
+    /// What happens to rows with non-finite values.
     pub on_nan: OnNan,
-    /// Where less is computed than could be.
+    /// Computations that are left out to save time.
     pub savings: Savings,
 }
 
-/// Where a run computes less than it could, beside its backend
-/// ([`Shortcuts`](crate::backend::Shortcuts)). The default is nowhere.
+/// Computations that the trainer leaves out to save time; none by default. Those of the backend are its
+/// [`Shortcuts`](crate::backend::Shortcuts).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Savings {
-    /// The loss has its SSIM term in every so many-th step, with as many times its weight, so that
-    /// the gradient is the same in the mean; >= 1.
+    /// The SSIM term is part of the loss once in this many steps, with its weight multiplied by the same
+    /// number, so that the mean gradient is unchanged; >= 1.
     pub ssim_every: u32,
-    /// Share of the run that is trained on shrunk images ([`schedule::divisor`]), in `[0, 1)`.
+    /// Share of the run trained on downsampled images ([`schedule::divisor`]), in `[0, 1)`.
     ///
     /// [`schedule::divisor`]: crate::schedule::divisor
     pub coarse_until: f64,
-    /// Share of the budget up to which policies may let rows grow, in `(0, 1]`.
+    /// Share of the budget that policies may use, in `(0, 1]`.
     pub budget_share: f64,
 }
 
 impl Savings {
-    /// None.
+    /// Nothing is left out.
     pub const NONE: Self = Self { ssim_every: 1, coarse_until: 0.0, budget_share: 1.0 };
 
-    /// What of a budget may be used, at least 1 of any.
+    /// The rows of a budget that may be used, at least 1.
     #[must_use]
     pub fn rows(self, budget: usize) -> usize {
         ((budget as f64 * self.budget_share) as usize).max(1).min(budget)
     }
 
-    /// Factor of the SSIM term in a step of a run of so many iterations. The last step has it, so
-    /// that a run ends with a measurement.
+    /// Factor on the SSIM term at a step. The last step always has the term, so that a run ends with a
+    /// complete loss.
     #[must_use]
     pub fn ssim_weight(self, step: u32, iterations: u32) -> f32 {
         let every = self.ssim_every.max(1);
@@ -66,19 +66,19 @@ impl Default for Savings {
     }
 }
 
-/// What a run is to find out by itself about its scene.
+/// Choices that a run makes by itself, from measurements of its scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Required {
-    /// The number of rows, up to the budget.
+    /// The number of rows, up to the budget (`--budget auto`).
     pub rows: bool,
-    /// Which training views say something that others do not, where rows are scored.
+    /// Which training views the policy's scores are measured in: near-duplicates are left out.
     pub scored_views: bool,
 }
 
-/// What becomes of rows with a parameter or a moment that is NaN or infinite.
+/// What happens to rows with a parameter or a moment that is NaN or infinite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnNan {
-    /// They are removed; only many of them at once end the run.
+    /// They are removed; many of them at once end the run.
     #[default]
     Prune,
     /// They end the run.

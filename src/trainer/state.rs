@@ -1,15 +1,15 @@
-//! The trainer's own part of a checkpoint: where the run is, and what its policy remembers.
+//! The trainer's part of a checkpoint: counters, events and the policy's state.
 //!
-//! It is small, because everything along a run is a function of (seed, step): the order of views,
-//! the background, every draw.
+//! It is small because the order of views, the background and every random draw are functions of
+//! (seed, step).
 
 use std::time::Duration;
 
 use densify_policies::policy::{PolicyError, PolicyState};
 use serde::{Deserialize, Serialize};
 
-use super::guard::asked;
-use super::{EditEvent, Growth, Trainer};
+use super::policy_calls::call_policy;
+use super::{AutoBudget, EditEvent, Trainer};
 use crate::schedule;
 use crate::views::ViewSource;
 
@@ -19,27 +19,27 @@ use crate::views::ViewSource;
 pub struct TrainerState {
     /// Steps done.
     pub step: u32,
-    /// Rows after initialisation, as the policy has been told.
+    /// Rows after initialisation.
     pub initial_rows: usize,
     /// Most rows at any instant so far.
     pub peak_rows: usize,
-    /// Views rendered for the policy's decisions so far.
+    /// Renders so far beside the one per step.
     pub extra_forwards: u64,
     /// Wall time of all policy events so far.
     pub policy_time: Duration,
-    /// The part of it that went into rendering views.
+    /// The part of it spent on rendering views.
     pub views_time: Duration,
     /// All edits so far.
     pub events: Vec<EditEvent>,
-    /// What the policy remembers.
+    /// The policy's state.
     pub policy: PolicyState,
-    /// Ends of rungs, where rows must pay.
+    /// The row limit of `--budget auto` and its measurements.
     #[serde(default)]
-    pub growth: Option<Growth>,
+    pub auto_budget: Option<AutoBudget>,
 }
 
 impl<V: ViewSource> Trainer<V> {
-    /// What a run that goes on from here must know, beside the model and the backend's state.
+    /// What a checkpoint must hold, beside the model and the backend's state.
     ///
     /// # Errors
     /// When the policy panics.
@@ -52,19 +52,18 @@ impl<V: ViewSource> Trainer<V> {
             policy_time: self.policy_time,
             views_time: self.views_time,
             events: self.events.clone(),
-            policy: asked(|| self.policy.save())?,
-            growth: self.growth.clone(),
+            policy: call_policy(|| self.policy.save())?,
+            auto_budget: self.auto_budget.clone(),
         })
     }
 
-    /// Goes on where `state` was taken. This trainer must be new, made with the same options for
-    /// the same views, and its backend hold the model and the state of that moment.
+    /// Continues a run from `state`. This trainer must be new, with the same options and views, and its
+    /// backend must hold the model and the backend state of the same step.
     ///
     /// # Errors
-    /// [`PolicyError`] when the policy does not take its state back; the trainer must not be used
-    /// then.
+    /// [`PolicyError`] if the policy rejects its state; then the trainer must not be used.
     pub fn resume(&mut self, state: TrainerState) -> Result<(), PolicyError> {
-        asked(|| self.policy.restore(state.policy)).and_then(|done| done)?;
+        call_policy(|| self.policy.restore(state.policy)).and_then(|done| done)?;
         self.step = state.step;
         self.scene.initial_rows = state.initial_rows;
         self.peak_rows = self.peak_rows.max(state.peak_rows);
@@ -72,9 +71,9 @@ impl<V: ViewSource> Trainer<V> {
         self.policy_time = state.policy_time;
         self.views_time = state.views_time;
         self.events = state.events;
-        self.growth = state.growth;
-        // Within an epoch its order is at hand, and the next one is drawn; at the end of an epoch
-        // only the next one.
+        self.auto_budget = state.auto_budget;
+        // As after `next_view`: at the end of an epoch only the next order is drawn, within one both
+        // are.
         let count = self.views.count();
         let (epoch, place) = (state.step / count as u32, state.step as usize % count);
         let order = |epoch| schedule::view_order(count, self.options.seed, epoch);

@@ -122,8 +122,8 @@ fn bits(backend: Box<dyn Backend>, views: &Views, measures: bool) -> (Gaussians,
     }
     if measures {
         let growth = trainer.growth().expect("it measures");
-        let shrinks: Vec<_> = growth.shrinks.iter().map(|s| (s.before, s.after)).collect();
-        assert_eq!((growth.rungs.len(), &*shrinks), (2, &[(ROWS, ROWS)][..]), "{growth:?}");
+        let removals: Vec<_> = growth.removals.iter().map(|s| (s.before, s.after)).collect();
+        assert_eq!((growth.intervals.len(), &*removals), (2, &[(ROWS, ROWS)][..]), "{growth:?}");
     }
     let backend = trainer.backend();
     let names = backend.state();

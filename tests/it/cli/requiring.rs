@@ -44,22 +44,22 @@ fn what_is_found_out_survives_a_stop_and_does_not_depend_on_threads() {
     let said = "colour   degree 3 (auto): points of a reconstruction decide nothing";
     assert!(outcome.stdout.contains(said), "{}", outcome.stdout);
     assert_eq!((&found["sh_degree_from"], &found["sh_degree"]), (&"undecided".into(), &3.into()));
-    let rungs = list(&found, "/rows/rungs");
-    assert!(rungs.len() >= 2 && !list(&found, "/rows/shrinks").is_empty(), "{found}");
-    let rows = |rung: &Value| rung["rows"].as_u64().expect("rows");
+    let intervals = list(&found, "/rows/intervals");
+    assert!(intervals.len() >= 2 && !list(&found, "/rows/removals").is_empty(), "{found}");
+    let rows = |interval: &Value| interval["rows"].as_u64().expect("rows");
     let mut limit = 1_000_f64;
     let stopped = found["rows"]["stopped"].as_u64().unwrap_or(u64::MAX);
-    for rung in rungs {
-        assert!(rows(rung) as f64 <= limit.round(), "{found}");
+    for interval in intervals {
+        assert!(rows(interval) as f64 <= limit.round(), "{found}");
         // Nothing is concluded where an edit is being recovered from.
-        if rung["settled"] == true && rung["step"].as_u64() < Some(stopped) {
+        if interval["settled"] == true && interval["step"].as_u64() < Some(stopped) {
             limit = limit.round() * std::f64::consts::SQRT_2;
         }
-        assert!(rung["settled"] == true || rung["gain"].is_null(), "{found}");
+        assert!(interval["settled"] == true || interval["gain"].is_null(), "{found}");
     }
-    for shrink in list(&found, "/rows/shrinks") {
-        let rung = rungs.iter().find(|rung| rung["step"] == shrink["step"]);
-        assert!(rung.is_some_and(|rung| rung["settled"] == true), "{found}");
+    for removal in list(&found, "/rows/removals") {
+        let interval = intervals.iter().find(|interval| interval["step"] == removal["step"]);
+        assert!(interval.is_some_and(|interval| interval["settled"] == true), "{found}");
     }
 
     let threads = root.path().join("threads");

@@ -1,11 +1,12 @@
-//! Whether scene, options, views and backend agree, before the first step.
+//! Checks before the first step: that scene, options, views, backend and policy agree.
 
 use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
 
 use super::{Savings, TrainError, TrainOptions, needs};
 use crate::backend::Backend;
 
-pub(super) fn check(
+/// Checks that scene, options, views and backend agree.
+pub(super) fn check_options(
     scene: &SceneInfo,
     options: &TrainOptions,
     views: usize,
@@ -16,7 +17,7 @@ pub(super) fn check(
         return Err(TrainError::NoViews);
     }
     if u32::try_from(views) != Ok(scene.train_views) {
-        return bad(format!("{views} views, but the scene tells of {}", scene.train_views));
+        return bad(format!("{views} views, but the scene has {}", scene.train_views));
     }
     if options.iterations == 0 || options.iterations != scene.iterations {
         let (here, there) = (options.iterations, scene.iterations);
@@ -43,7 +44,7 @@ pub(super) fn check(
     Ok(())
 }
 
-/// The needs of a run, if a backend can work with them.
+/// The needs of a run, if their numbers are valid.
 pub(super) fn checked_needs(
     name: &str,
     policy: &dyn DensityPolicy,

@@ -1,0 +1,174 @@
+//! The row limit of `--budget auto`: it rises while more rows improve the images, and falls while rows
+//! can be removed without loss.
+//!
+//! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few
+//! training views (the probes) is measured. In the first half of the run the limit then rises by half
+//! a doubling, up to the budget. Policies receive the limit as their budget, and plans enforce it as
+//! such, so policies need not know about it. The gain of a doubling is the slope of the PSNR over
+//! log2(rows), fitted to the last three intervals. It includes what training alone brings in the
+//! meantime, so growth stops too late rather than too early: after the gain has been below [`MIN_GAIN`]
+//! twice in a row.
+//!
+//! Policies also do things that reduce the PSNR for a while, such as inserting rows or resetting
+//! opacities. If it is more than [`MAX_DROP`] below the best of the last [`RECENT`] intervals, nothing
+//! is concluded: the interval has no gain, the limit stays, and no row is removed.
+//!
+//! After growth, low-weight Gaussians are pruned. At the end of each later interval the rows are ordered
+//! by their largest blend weight in any view. Tenths of them are hidden one after another, and those are
+//! removed without which the PSNR falls by less than [`MIN_GAIN`] per halving. The comparison is on the
+//! same model at the same step, so it has no noise; it overestimates the loss, as the other rows adapt.
+//!
+//! Measuring leaves the model and all that its future depends on unchanged, to the bit: rows are hidden
+//! by their opacity logits only, and these are written back as they were read.
+
+mod measure;
+
+use densify_policies::policy::{Signal, SignalSet};
+use serde::{Deserialize, Serialize};
+
+use crate::schedule::scaled;
+
+/// PSNR that a doubling of rows must gain `[dB]`.
+pub const MIN_GAIN: f64 = 0.10;
+/// A PSNR this far below the recent best means that an edit is still being recovered from `[dB]`. The
+/// probes are always the same views; with views drawn at random the noise would be larger than this.
+const MAX_DROP: f64 = 0.5;
+/// Intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which
+/// is four intervals.
+const RECENT: usize = 6;
+/// Steps of an interval in a run of 30,000: ten intervals, or five doublings, until most policies stop
+/// growing.
+const INTERVAL: u32 = 1_500;
+/// Intervals are multiples of this: policies are due every 100 steps at most.
+const INTERVAL_UNIT: u32 = 100;
+/// The limit grows by this factor in each interval.
+const FACTOR: f64 = std::f64::consts::SQRT_2;
+/// The limit starts at this at least.
+const MIN_LIMIT: usize = 1_000;
+/// Intervals to which the slope is fitted.
+const FITTED: usize = 3;
+/// The share of the run after which no rows are removed, so that the others can adapt.
+const LAST_REMOVAL: f64 = 0.8;
+/// Most tenths of the rows that are removed at once.
+const MAX_TENTHS: usize = 5;
+/// The logit of an opacity of 1e-6, which no pixel shows.
+const HIDDEN_LOGIT: f32 = -13.8;
+
+/// The signals that the row limit needs from a backend, in addition to the policy's.
+#[must_use]
+pub fn signals() -> SignalSet {
+    SignalSet::from([Signal::WeightMax])
+}
+
+/// The row limit and the measurements it follows from.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AutoBudget {
+    /// Most rows now.
+    pub limit: usize,
+    /// The step at which growth was stopped, if it was.
+    pub stopped: Option<u32>,
+    /// The measured intervals so far, during growth and after it.
+    pub intervals: Vec<Interval>,
+    /// Attempts to remove rows.
+    pub removals: Vec<Removal>,
+    /// Number of intervals in a row with a gain below [`MIN_GAIN`].
+    pub idle: u32,
+}
+
+/// The measurement at the end of an interval.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Interval {
+    /// Iteration.
+    pub step: u32,
+    /// Rows, before the policy's edit.
+    pub rows: usize,
+    /// Mean PSNR of the probes `[dB]`.
+    pub psnr: f64,
+    /// Whether the PSNR is near its recent best; otherwise nothing is concluded.
+    pub settled: bool,
+    /// Gain over this settled interval and the two before, including the effect of training
+    /// `[dB per doubling]`; `None` if there are fewer, if rows did not increase, or after growth.
+    pub gain: Option<f64>,
+}
+
+/// An attempt to remove rows.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Removal {
+    /// Iteration.
+    pub step: u32,
+    /// Rows before.
+    pub before: usize,
+    /// Rows after; as before if removing a tenth would cost too much.
+    pub after: usize,
+    /// Immediate change of the probes' PSNR `[dB]`; that of removing a tenth, if none was removed.
+    pub change: f64,
+}
+
+impl AutoBudget {
+    pub(super) fn new(rows: usize, budget: usize) -> Self {
+        Self { limit: rows.max(MIN_LIMIT).min(budget), ..Self::default() }
+    }
+
+    /// Records the end of an interval. Returns whether it is settled.
+    fn record(&mut self, step: u32, rows: usize, psnr: f64) -> bool {
+        let recent = self.intervals.iter().rev().take(RECENT);
+        let best = recent.map(|interval| interval.psnr).fold(f64::NEG_INFINITY, f64::max);
+        let settled = psnr >= best - MAX_DROP;
+        self.intervals.push(Interval { step, rows, psnr, settled, gain: None });
+        settled
+    }
+
+    /// Raises the limit or stops growth, after a settled interval.
+    fn update_limit(&mut self, budget: usize) {
+        let settled = self.intervals.iter().rev().filter(|interval| interval.settled);
+        let gain = slope(&settled.take(FITTED).copied().collect::<Vec<_>>());
+        let Some(interval) = self.intervals.last_mut() else { return };
+        interval.gain = gain;
+        let Interval { step, rows, .. } = *interval;
+        // Rows far below the limit say nothing about a higher limit.
+        let is_full = rows as f64 * FACTOR.sqrt() >= self.limit as f64;
+        let is_idle = is_full && gain.is_some_and(|gain| gain < MIN_GAIN);
+        self.idle = if is_idle { self.idle + 1 } else { 0 };
+        if self.idle >= 2 {
+            self.stopped = Some(step);
+            self.limit = rows.max(1);
+        } else {
+            self.limit = ((self.limit as f64 * FACTOR).round() as usize).min(budget);
+        }
+    }
+
+    /// Whether rows may be removed at the end of an interval.
+    fn may_remove(&self, step: u32, iterations: u32) -> bool {
+        let grown = self.stopped.is_some() || step > iterations / 2;
+        grown && f64::from(step) <= LAST_REMOVAL * f64::from(iterations)
+    }
+}
+
+/// The slope of PSNR over log2(rows) `[dB per doubling]`, by least squares.
+fn slope(intervals: &[Interval]) -> Option<f64> {
+    let count = intervals.len() as f64;
+    let doublings = |interval: &Interval| (interval.rows.max(1) as f64).log2();
+    let x = intervals.iter().map(doublings).sum::<f64>() / count;
+    let y = intervals.iter().map(|interval| interval.psnr).sum::<f64>() / count;
+    let variance: f64 = intervals.iter().map(|i| (doublings(i) - x).powi(2)).sum();
+    let covariance: f64 = intervals.iter().map(|i| (doublings(i) - x) * (i.psnr - y)).sum();
+    // At least that of a quarter of a doubling from first to last.
+    let is_enough = intervals.len() == FITTED && variance > 2.0 * 0.125_f64.powi(2);
+    is_enough.then(|| covariance / variance)
+}
+
+/// PSNR that removing this many tenths of the rows may cost `[dB]`.
+fn allowed_loss(tenths: usize) -> f64 {
+    MIN_GAIN * (10.0 / (10.0 - tenths as f64)).log2()
+}
+
+/// Length of an interval `[steps]`.
+fn interval_steps(iterations: u32) -> u32 {
+    scaled(INTERVAL, iterations).next_multiple_of(INTERVAL_UNIT)
+}
+
+#[cfg(test)]
+mod tests;

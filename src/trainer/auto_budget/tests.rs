@@ -1,0 +1,109 @@
+//! Tests of the row limit on made-up measurements: where growth stops, and when rows may be removed.
+
+use super::*;
+
+const LENGTH: u32 = 100;
+const BUDGET: usize = 200_000;
+/// PSNR of a model of this many rows: each doubling gains half as much as the one before.
+fn psnr_of_rows(rows: usize) -> f64 {
+    38.0 - 1.6 * (4_000.0 / rows as f64)
+}
+
+/// Runs the limit through intervals, each of which gains `training` dB by training alone.
+fn grow(first: usize, training: f64) -> AutoBudget {
+    let mut auto = AutoBudget::new(first, BUDGET);
+    let mut rows = first;
+    for end in 1..=20_u32 {
+        let psnr = psnr_of_rows(rows) + training * f64::from(end);
+        assert!(auto.record(end * LENGTH, rows, psnr), "the PSNR only rises");
+        auto.update_limit(10 * BUDGET);
+        if auto.stopped.is_some() {
+            break;
+        }
+        rows = auto.limit;
+    }
+    auto
+}
+
+#[test]
+fn growth_stops_when_the_gain_is_too_low_twice_in_a_row() {
+    let auto = grow(1_000, 0.0);
+    let gains: Vec<Option<f64>> = auto.intervals.iter().map(|interval| interval.gain).collect();
+    assert_eq!(gains[..2], [None, None], "two points are no slope");
+    let gains: Vec<f64> = gains.into_iter().flatten().collect();
+    // Three points at equal distances: what is between the outer two, a doubling apart.
+    let [first, .., third] = [0, 1, 2].map(|i| auto.intervals[i].psnr);
+    assert!((gains[0] - (third - first)).abs() < 1e-2, "{} for {}", gains[0], third - first);
+    let (paid, idle) = gains.split_at(gains.len() - 2);
+    assert!(paid.len() > 5 && paid.iter().all(|gain| *gain >= MIN_GAIN), "{gains:?}");
+    assert!(idle.iter().all(|gain| *gain < MIN_GAIN), "it stops at the second: {gains:?}");
+    assert_eq!(auto.limit, auto.intervals.last().unwrap().rows, "no row more");
+}
+
+#[test]
+fn gains_by_training_prolong_growth() {
+    let (still, training) = (grow(1_000, 0.0), grow(1_000, 0.03));
+    assert!(still.stopped.is_some() && training.stopped > still.stopped, "{training:?}");
+    assert_eq!(grow(1_000, 0.06).stopped, None, "0.12 dB per doubling by training alone");
+}
+
+#[test]
+fn a_limit_that_is_not_reached_rises_to_the_budget_at_most() {
+    let mut auto = AutoBudget::new(100_000, BUDGET);
+    for end in 1..=6 {
+        auto.record(end * LENGTH, 20_000, 30.0);
+        auto.update_limit(BUDGET);
+    }
+    assert_eq!((auto.limit, auto.stopped), (BUDGET, None));
+    assert!(auto.intervals.iter().all(|interval| interval.gain.is_none()), "{:?}", auto.intervals);
+    // The same with rows that increase far below the limit.
+    for end in 7..=12 {
+        auto.record(end * LENGTH, 1_000 << (end - 7), 30.0);
+        auto.update_limit(BUDGET);
+    }
+    assert!(auto.intervals.last().unwrap().gain.unwrap() < MIN_GAIN);
+    assert_eq!((auto.idle, auto.stopped), (0, None));
+    assert_eq!(AutoBudget::new(10, BUDGET).limit, MIN_LIMIT);
+    assert_eq!(AutoBudget::new(10, 400).limit, 400);
+}
+
+#[test]
+fn nothing_is_concluded_until_the_psnr_has_recovered() {
+    let psnr = [30.0, 33.0, 35.0, 35.6, 35.2, 29.0, 35.0, 35.2, 36.0];
+    let mut auto = AutoBudget::new(5_000, BUDGET);
+    let settled: Vec<bool> = (1..).zip(psnr).map(|(end, psnr)| auto.record(end, 0, psnr)).collect();
+    assert_eq!(settled, [true, true, true, true, true, false, false, true, true]);
+    // A loss that does not recover counts as permanent.
+    let mut auto = AutoBudget::new(5_000, BUDGET);
+    let lost: Vec<bool> =
+        (0..8).map(|end| auto.record(end, 0, if end == 0 { 30.0 } else { 20.0 })).collect();
+    assert_eq!(lost, [true, false, false, false, false, false, false, true]);
+    // The slope is fitted to the settled intervals only.
+    let mut auto = AutoBudget::new(4_000, BUDGET);
+    for (rows, psnr) in [(4_000, 30.0), (8_000, 31.0), (12_000, 12.0), (16_000, 32.0)] {
+        if auto.record(rows as u32, rows, psnr) {
+            auto.update_limit(BUDGET);
+        }
+    }
+    let gains: Vec<Option<f64>> = auto.intervals.iter().map(|interval| interval.gain).collect();
+    assert_eq!(gains[..3], [None; 3]);
+    assert!((gains[3].unwrap() - 1.0).abs() < 1e-9, "1 dB per doubling: {gains:?}");
+    assert_eq!(auto.limit, 11_314, "it has risen in three of four intervals");
+}
+
+#[test]
+fn rows_are_removed_after_growth_and_not_at_the_end() {
+    let mut auto = AutoBudget::new(10_000, BUDGET);
+    assert!(!auto.may_remove(500, 1_000), "it grows");
+    assert!(auto.may_remove(600, 1_000), "policies have stopped");
+    auto.stopped = Some(300);
+    assert!(auto.may_remove(400, 1_000));
+    assert!(!auto.may_remove(900, 1_000), "those that stay must settle");
+}
+
+#[test]
+fn intervals_are_multiples_of_the_policies_intervals() {
+    for (iterations, steps) in [(30_000, 1_500), (2_000, 100), (5_000, 300), (100, 100)] {
+        assert_eq!(interval_steps(iterations), steps);
+    }
+}

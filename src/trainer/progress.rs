@@ -1,0 +1,103 @@
+//! Read access to a run in progress: counters, times, events, and the model.
+
+use std::ops::Range;
+use std::time::Duration;
+
+use densify_policies::policy::SceneInfo;
+
+use super::{AutoBudget, EditEvent, Trainer};
+use crate::backend::{Backend, BackendError};
+use crate::gaussians::Gaussians;
+use crate::views::ViewSource;
+
+impl<V: ViewSource> Trainer<V> {
+    /// The measurements and the limit of rows, if they are [chosen automatically](super::Required::rows).
+    #[must_use]
+    pub fn growth(&self) -> Option<&AutoBudget> {
+        self.auto_budget.as_ref()
+    }
+
+    /// Number of training views that are not rendered for the policy's scores, as others are nearly the
+    /// same; 0 if the policy renders none.
+    #[must_use]
+    pub fn unscored_views(&self) -> usize {
+        let scores = self.needs.fresh_views > 0 || self.needs.aux.is_some();
+        if scores { self.views.count() - self.scored.count() } else { 0 }
+    }
+
+    /// Steps done so far.
+    #[must_use]
+    pub fn steps_done(&self) -> u32 {
+        self.step
+    }
+
+    /// Rows now.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.backend.rows()
+    }
+
+    /// Most rows at any instant so far, also during edits.
+    #[must_use]
+    pub fn peak_rows(&self) -> usize {
+        self.peak_rows
+    }
+
+    /// Renders so far beside the one per step: views that the policy or `--budget auto` measured.
+    #[must_use]
+    pub fn extra_forwards(&self) -> u64 {
+        self.extra_forwards
+    }
+
+    /// Wall time of all policy events so far (signals, plan and its execution), and separately that of
+    /// the views rendered for them.
+    #[must_use]
+    pub fn policy_times(&self) -> (Duration, Duration) {
+        (self.policy_time.saturating_sub(self.views_time), self.views_time)
+    }
+
+    /// Wall time that steps have waited for their images so far.
+    #[must_use]
+    pub fn images_time(&self) -> Duration {
+        self.images_time
+    }
+
+    /// All edits so far.
+    #[must_use]
+    pub fn events(&self) -> &[EditEvent] {
+        &self.events
+    }
+
+    /// The scene and the run, as the policy sees them.
+    #[must_use]
+    pub fn scene(&self) -> &SceneInfo {
+        &self.scene
+    }
+
+    /// The training views.
+    #[must_use]
+    pub fn views(&self) -> &V {
+        &self.views
+    }
+
+    /// A copy of the current model, in the coordinates of training.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    pub fn model(&self) -> Result<Gaussians, BackendError> {
+        self.model_rows(0..self.backend.rows())
+    }
+
+    /// Some rows of the [`model`](Self::model), which must exist.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    pub fn model_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
+        self.backend.download_rows(rows)
+    }
+
+    /// The backend, for rendering and its ledger.
+    pub fn backend(&mut self) -> &mut dyn Backend {
+        self.backend.as_mut()
+    }
+}

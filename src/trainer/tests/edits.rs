@@ -1,0 +1,47 @@
+//! Tests of the policy's edits: reports, the budget, the peak, errors and panics.
+
+use super::*;
+
+#[test]
+fn edits_are_reported_and_the_budget_holds() {
+    let (mut trainer, ..) = trainer(&CASE);
+    let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
+    let short: Vec<_> =
+        events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
+    assert_eq!(short, [(2, 3, 3, 0, 6), (4, 6, 4, 2, 10), (6, 10, 0, 10, 10), (8, 10, 0, 10, 10)]);
+    assert_eq!((events[0].updated, events[0].removed, &*events[0].cause), (3, 0, "scripted"));
+    assert_eq!(trainer.events(), events);
+    assert_eq!((trainer.peak_rows(), trainer.rows(), trainer.steps_done()), (10, 10, 9));
+}
+
+#[test]
+fn a_plan_that_changes_nothing_is_not_an_event() {
+    let (mut trainer, log, _) = trainer(&Case { behaviour: Behaviour::Nothing, ..CASE });
+    assert!((0..9).all(|_| trainer.step().unwrap().events.is_empty()));
+    assert!(trainer.events().is_empty());
+    // It may reset statistics and is executed all the same.
+    assert!(log.lock().unwrap().contains(&"apply 2".to_owned()));
+}
+
+#[test]
+fn the_peak_outlives_a_prune() {
+    let (mut trainer, ..) = trainer(&Case { rows: 8, behaviour: Behaviour::Halve, ..CASE });
+    for _ in 0..4 {
+        trainer.step().unwrap();
+    }
+    assert_eq!((trainer.rows(), trainer.peak_rows()), (2, 8));
+}
+
+#[test]
+fn a_policy_error_stops_before_the_edit() {
+    let (message, rows, calls) = failure(&Case { behaviour: Behaviour::Fail, ..CASE });
+    assert_eq!(message, "step 2: policy `scripted`: out of ideas");
+    assert_eq!(rows, 3);
+    assert!(!calls.iter().any(|d| d.starts_with("apply")), "{calls:?}");
+    let (message, rows, calls) = failure(&Case { behaviour: Behaviour::Panic, ..CASE });
+    assert!(message.contains("`scripted`: it panicked: no row 3;"), "{message}");
+    assert_eq!(rows, 3);
+    assert!(!calls.iter().any(|d| d.starts_with("apply")), "{calls:?}");
+    let (message, ..) = failure(&Case { behaviour: Behaviour::ReadUndeclared, ..CASE });
+    assert!(message.contains("Age") && message.contains("not declared"), "{message}");
+}

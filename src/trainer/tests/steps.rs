@@ -1,0 +1,77 @@
+//! Tests of a step: the order of views, prefetching, the cadence, options, lost models and images.
+
+use super::*;
+
+#[test]
+fn every_epoch_shows_every_view_once_and_prefetches() {
+    let (mut trainer, log, prefetched) = trainer(&Case { every: 100, ..CASE });
+    let shown: Vec<usize> = (0..9).map(|_| trainer.step().unwrap().view).collect();
+    for (epoch, views) in shown.chunks(3).enumerate() {
+        assert_eq!(views, schedule::view_order(3, 7, epoch as u32));
+    }
+    let log = log.lock().unwrap();
+    let epochs: Vec<usize> = (0..log.len()).filter(|&i| log[i] == "epoch").collect();
+    assert_eq!(epochs, [0, 4, 8]);
+    // The right pixels reached the backend.
+    let steps: Vec<String> =
+        shown.iter().enumerate().map(|(i, view)| format!("step {} view {view}", i + 1)).collect();
+    assert_eq!(log.iter().filter(|d| *d != "epoch").cloned().collect::<Vec<_>>(), steps);
+    // Each announcement is behaviour comes next, and nothing beyond the end of the run.
+    for (i, said) in prefetched.lock().unwrap().iter().enumerate() {
+        assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
+    }
+}
+
+#[test]
+fn options_override_the_cadence_of_the_policy() {
+    let noted = |cadence: Cadence, sh_every: Option<u32>| {
+        let case = Case { cadence, every: 100, ..CASE };
+        let options = TrainOptions { sh_every, ..OPTIONS };
+        let (mut trainer, log, _) = build(&case, 3, scene(&case, 3), options)?;
+        for _ in 0..9 {
+            trainer.step()?;
+        }
+        let log = log.lock().unwrap().clone();
+        Ok::<_, TrainError>(
+            log.into_iter().filter(|d| d.starts_with("cadence")).collect::<Vec<_>>(),
+        )
+    };
+    let (every, fourth) = (Cadence::default(), Cadence { all: 4, sh_rest: 1 });
+    assert_eq!(noted(every, None).unwrap(), [""; 0]);
+    assert_eq!(noted(fourth, None).unwrap(), ["cadence 4 1"; 4]);
+    assert_eq!(noted(every, Some(16)).unwrap(), ["cadence 1 16"; 9]);
+    assert_eq!(
+        noted(fourth, Some(16)).unwrap()[4..],
+        ["cadence 1 16", "cadence 4 16", "cadence 4 16", "cadence 4 16", "cadence 4 16"]
+    );
+    let undeclared = noted(Cadence { all: 1, sh_rest: 9 }, None).unwrap_err().to_string();
+    assert!(undeclared.starts_with("step 6: policy `scripted`: it wants"), "{undeclared}");
+    let senseless = noted(every, Some(0)).unwrap_err().to_string();
+    assert!(senseless.contains("cadence.sh_rest is 0"), "{senseless}");
+}
+
+#[test]
+fn errors_name_the_view() {
+    let (message, _, calls) = failure(&Case { nan_loss_at: 4, every: 4, ..CASE });
+    let view = ["a.png", "b.png", "c.png"][schedule::view_order(3, 7, 1)[0]];
+    assert!(message.starts_with(&format!("step 4: the loss of view `{view}` is NaN")), "{message}");
+    assert!(!calls.contains(&"apply 4".to_owned()), "{calls:?}");
+    let (message, ..) = failure(&Case { unreadable: Some(1), ..CASE });
+    assert!(message.contains("view `b.png`: file is gone"), "{message}");
+}
+
+#[test]
+fn options_that_disagree_are_refused() {
+    let refused = |views, change: fn(&mut SceneInfo, &mut TrainOptions)| {
+        let (mut scene, mut options) = (scene(&CASE, 3), OPTIONS);
+        change(&mut scene, &mut options);
+        build(&CASE, views, scene, options).err().expect("refused").to_string()
+    };
+    assert!(refused(0, |_, _| ()).contains("no training view"));
+    assert!(refused(2, |_, _| ()).contains("2 views"));
+    assert!(refused(3, |_, o| o.iterations = 8).contains("--iterations"));
+    assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
+    assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
+    assert!(refused(3, |_, o| o.rates.quat = 0.0).contains("`quat`"));
+    assert!(build(&CASE, 3, scene(&CASE, 3), OPTIONS).is_ok());
+}
