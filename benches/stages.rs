@@ -1,9 +1,9 @@
-//! Time per training step and stage on random scenes, on one thread, on two, and on every adapter,
-//! in every way that it can add up gradients.
+//! Measures the time per training step and per stage on random scenes.
 //!
-//! `cargo bench --bench stages [-- ROWS@SIZE]`, e.g. `10000@256` for one scene only. Figures are
-//! medians of processor time, so that a loaded machine distorts them little; the stage columns are
-//! wall time. Software adapters take part in the small scenes only.
+//! Runs on one and on two threads, and on every adapter with each of its methods to add up gradients
+//! (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE]`, such as
+//! `10000@256` for one scene. Times are medians: processor time, which a loaded machine distorts little,
+//! wall time, and the wall time of each stage.
 
 #![expect(clippy::print_stdout, reason = "its output is a table")]
 
@@ -25,9 +25,9 @@ use pulp::{Arch, Simd, WithSimd};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A random cloud in front of the camera whose splats shrink as their number grows, so that the
-/// number of tile entries per row is that of a trained scene: about 3 at 10,000 rows and 256², 2.7 at
-/// 50,000 and 512².
+/// A random cloud in front of the camera. Gaussians are smaller the more there are, so that the number of
+/// tile entries per row is that of a trained scene: about 3 at 10,000 rows and 256², 2.7 at 50,000
+/// rows and 512².
 fn scene(rows: usize, sh_degree: u8) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
@@ -68,14 +68,13 @@ fn median(mut times: Vec<Duration>) -> f64 {
     times[times.len() / 2].as_secs_f64() * 1e3
 }
 
-/// Multiply-adds on twelve independent vectors: as many as two units of latency four need, and half
-/// as many again.
+/// Multiply-adds on twelve independent vectors: 1.5 times as many as two units of latency four need.
 struct MultiplyAdds {
     rounds: u32,
 }
 
 impl WithSimd for MultiplyAdds {
-    /// A sum, so that nothing is left out; and operations, two to a multiply-add.
+    /// A sum, so that no work is optimised away, and the number of operations, two per multiply-add.
     type Output = (f32, f64);
 
     #[inline(always)]
@@ -92,7 +91,7 @@ impl WithSimd for MultiplyAdds {
     }
 }
 
-/// What one thread of this machine can do at most: GFLOP/s, and GB/s read and written in place.
+/// Peak performance of one thread: GFLOP/s, and GB/s read and written in place.
 fn peak() -> (f64, f64) {
     let mut rates = (0.0_f64, 0.0_f64);
     let mut memory = vec![1.0_f32; 32 << 20];
@@ -121,7 +120,7 @@ const RATES: LearningRates = LearningRates {
     sh_rest: 1e-6,
 };
 
-/// Prints a line: medians over the steps but for the first two.
+/// Prints a line with medians over all steps but the first two.
 fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u32, on: &str) {
     let mut backend = match backend {
         Ok(backend) => backend,
@@ -178,19 +177,20 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
 
 fn main() {
     let (flops, bytes) = peak();
-    println!("one thread: at most {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
+    println!("one thread: peak of {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
     let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
     let usable = adapters().into_iter().filter(|a| a.missing.is_empty());
     let mut devices: Vec<GpuDevice> = Vec::new();
     for adapter in usable {
-        for way in adapter.accumulations {
+        for method in adapter.accumulations {
             let name = Some(adapter.name.clone());
-            devices.extend(GpuDevice::open(&AdapterChoice { name, accumulation: Some(way) }).ok());
+            devices
+                .extend(GpuDevice::open(&AdapterChoice { name, accumulation: Some(method) }).ok());
         }
     }
     for (i, device) in devices.iter().enumerate() {
-        let (adapter, way) = (device.adapter(), device.accumulation());
-        println!("adapter {i}: {}, {}, accumulation={way}", adapter.name, adapter.driver);
+        let (adapter, method) = (device.adapter(), device.accumulation());
+        println!("adapter {i}: {}, {}, accumulation={method}", adapter.name, adapter.driver);
     }
     println!("   rows  image   entries         on  CPU ms  wall ms  stages [ms]");
     for (rows, size) in [
