@@ -92,15 +92,16 @@ fn run_event(
 ) -> Result<RowOps, Failure> {
     let (rows, budget) = (model.rows, scenario.budget(model.rows));
     let fresh = policy.wants_fresh(step, rows, budget);
-    let event = model.event(scenario, step, needs, fresh);
+    let (pattern, scene) = (scenario.pattern_at(step), &scenario.scene);
+    let event = model.event(pattern, scene, step, needs, fresh);
     let aux = policy.aux_views(step, rows, budget);
     if aux > 0 && needs.aux.is_none() {
         let why = "it wants auxiliary views, but its needs do not say what to measure there";
         return Err((Check::RequestsConsistently, why.to_owned()));
     }
     let request = needs.aux.clone().unwrap_or_default();
-    let views: Vec<View> = (0..aux.min(scenario.scene.train_views).min(MAX_VIEWS))
-        .map(|view| model.view(scenario, step, view, &request))
+    let views: Vec<View> = (0..aux.min(scene.train_views).min(MAX_VIEWS))
+        .map(|view| model.view(pattern, step, view, &request))
         .collect();
     observe(policy, step, rows, &views, &request, false)?;
     let ops = plan(policy, scenario, &event, needs, false)?;

@@ -1,6 +1,5 @@
 //! Synthetic statistics: a model that is only a number of rows, with plausible and with broken values.
 
-use super::scenarios::Scenario;
 use crate::plan::RowOps;
 use crate::policy::{
     AuxColumn, AuxRequest, Candidate, Needs, SceneInfo, Signal, SignalSet, Signals,
@@ -103,19 +102,19 @@ impl Model {
     /// The statistics of an event; new candidates are collected.
     pub(super) fn event(
         &mut self,
-        scenario: &Scenario,
+        pattern: Pattern,
+        scene: &SceneInfo,
         step: u32,
         needs: &Needs,
         fresh: bool,
     ) -> Event {
         let rng = PolicyRng::new(7, step);
-        let pattern = scenario.pattern_at(step);
         let fill = |set: SignalSet| {
             let mut signals = Signals::zeros(self.rows, set);
             for signal in set.iter() {
                 for (row, number) in (0..).zip(signals.get_mut(signal).into_iter().flatten()) {
                     let bits = rng.bits(row, Purpose::Noise, signal as u32);
-                    *number = value(pattern, bits, |u| plausible(signal, u, &scenario.scene));
+                    *number = value(pattern, bits, |u| plausible(signal, u, scene));
                 }
             }
             signals
@@ -137,13 +136,12 @@ impl Model {
     /// The statistics of one auxiliary view.
     pub(super) fn view(
         &self,
-        scenario: &Scenario,
+        pattern: Pattern,
         step: u32,
         view: u32,
         request: &AuxRequest,
     ) -> View {
         let rng = PolicyRng::new(11 + u64::from(view), step);
-        let pattern = scenario.pattern_at(step);
         let number = |row: u32, part: u32, scale: f32| {
             value(pattern, rng.bits(row, Purpose::Noise, 200 + part), |u| u) * scale
         };
