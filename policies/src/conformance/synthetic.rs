@@ -69,11 +69,12 @@ fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
         Signal::MeanGradientX | Signal::MeanGradientY | Signal::MeanGradientZ => 1e-3 * (u - 0.5),
         Signal::MeanGradientNorm => 2e-3 * u,
         Signal::WeightMax | Signal::FreshWeightMax => u,
-        Signal::WeightSum | Signal::PixelCount => (1000.0 * u).floor(),
         Signal::Opacity => 0.99 * u.powi(3) + 1e-3,
         Signal::ScaleProduct => (0.15 * scene.extent * u.powi(3)).powi(3),
         Signal::ScaleMax => 0.15 * scene.extent * u.powi(3) + 1e-6,
         Signal::Age => (300.0 * u).floor(),
+        // Sums over pixels, and any signal without a range of its own here.
+        _ => (1000.0 * u).floor(),
     }
 }
 
