@@ -1,5 +1,6 @@
 //! Hand-made events for the tests of policies: signals in, pruned and grown rows out.
 
+use crate::conformance::check_policy_with;
 use crate::plan::{EditPlan, ParentFate, RowOps};
 use crate::policy::{
     AuxColumn, AuxView, Candidate, DensityPolicy, PolicyError, SceneInfo, Signal, SignalSet,
@@ -17,6 +18,15 @@ pub(crate) fn build(name: &str, set: &str, scene: &SceneInfo) -> Box<dyn Density
 pub(crate) fn due_steps(name: &str, set: &str, scene: &SceneInfo) -> Vec<u32> {
     let policy = build(name, set, scene);
     (0..=scene.iterations).filter(|&step| policy.is_due(step)).collect()
+}
+
+/// Runs the conformance suite on the policy with each of these sets of parameters.
+pub(crate) fn assert_conforms(name: &str, sets: &[&str]) {
+    for set in sets {
+        if let Err(report) = check_policy_with(find(name).unwrap(), &set.parse().unwrap()) {
+            panic!("{set}: {report}");
+        }
+    }
 }
 
 /// One event of a policy. Signals that are not given are zero.

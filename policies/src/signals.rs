@@ -4,37 +4,37 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-/// How a signal comes about, which decides where a backend keeps it and when it starts anew.
+/// How a signal is measured, which decides where a backend keeps it and when it is reset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SignalKind {
     /// Summed over the views in which the row was visible since the last
     /// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
     Sum,
-    /// The same, of whole numbers.
+    /// The same, for whole numbers.
     Count,
     /// The largest value of the previous and the current epoch.
     EpochMaximum,
-    /// The largest value in views that are rendered for the event.
+    /// The largest value in views rendered for the event.
     FreshMaximum,
-    /// Read from the row as it is now; costs no memory.
+    /// Computed from the current parameters or age of the row; needs no memory.
     Present,
 }
 
-/// What a view's backward pass must sum over the pixels of each row for a signal, beyond what training
-/// itself needs: it costs a backend memory and time for every (row, tile) pair.
+/// What the backward pass must sum over the pixels of each row for a signal, beyond what training needs;
+/// it costs memory and time for every (row, tile) pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PixelSum {
-    /// |dL/d(projected mean)|, for each axis.
+    /// |dL/d(projected mean)| per axis.
     AbsGradient,
     /// The blend weight α·T.
     Weight,
-    /// 1 where the row was blended.
+    /// 1 per pixel that the row was blended into.
     Count,
-    /// The largest blend weight α·T, rather than a sum.
+    /// The blend weight α·T; its maximum, not its sum.
     LargestWeight,
 }
 
-/// The table of signals: each is one entry of name, kind, unit and what it is summed from.
+/// Declares the table of signals, each an entry with name, kind, unit and pixel sums.
 macro_rules! signals {
     ($($(#[$doc:meta])* $name:ident: $kind:ident $unit:literal [$($sum:ident),*];)*) => {
         /// A per-row statistic that a policy may read: one `f32` per row.
@@ -50,7 +50,7 @@ macro_rules! signals {
             /// All signals, in declaration order; `Signal::ALL[s as usize] == s`.
             pub const ALL: [Self; [$(stringify!($name)),*].len()] = [$(Self::$name),*];
 
-            /// How it comes about.
+            /// How the signal is measured.
             #[must_use]
             pub const fn kind(self) -> SignalKind {
                 match self {
@@ -58,7 +58,7 @@ macro_rules! signals {
                 }
             }
 
-            /// Its unit; `1` for a number without one.
+            /// The unit; `1` for none.
             #[must_use]
             pub const fn unit(self) -> &'static str {
                 match self {
@@ -66,7 +66,7 @@ macro_rules! signals {
                 }
             }
 
-            /// What it costs in every backward pass.
+            /// What it adds to the backward pass.
             #[must_use]
             pub const fn pixel_sums(self) -> &'static [PixelSum] {
                 match self {

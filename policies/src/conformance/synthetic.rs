@@ -2,7 +2,7 @@
 
 use crate::plan::RowOps;
 use crate::policy::{
-    AuxColumn, AuxRequest, Candidate, Needs, SceneInfo, Signal, SignalSet, Signals,
+    AuxColumn, AuxRequest, Candidate, Needs, SceneInfo, Signal, SignalKind, SignalSet, Signals,
 };
 use crate::rng::{PolicyRng, Purpose};
 
@@ -65,16 +65,16 @@ fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
     match signal {
         Signal::VisibleCount => (20.0 * u).floor(),
         Signal::ScreenGradient | Signal::ScreenGradientAbs => 0.02 * u.powi(3),
-        Signal::ColourGradient => 1e-3 * u.powi(3),
         Signal::MeanGradientX | Signal::MeanGradientY | Signal::MeanGradientZ => 1e-3 * (u - 0.5),
-        Signal::MeanGradientNorm => 2e-3 * u,
-        Signal::WeightMax | Signal::FreshWeightMax => u,
         Signal::Opacity => 0.99 * u.powi(3) + 1e-3,
         Signal::ScaleProduct => (0.15 * scene.extent * u.powi(3)).powi(3),
         Signal::ScaleMax => 0.15 * scene.extent * u.powi(3) + 1e-6,
         Signal::Age => (300.0 * u).floor(),
-        // Sums over pixels, and any signal without a range of its own here.
-        _ => (1000.0 * u).floor(),
+        other => match other.kind() {
+            SignalKind::Count => (1000.0 * u).floor(),
+            SignalKind::Sum => 1e-3 * u.powi(3),
+            _ => u,
+        },
     }
 }
 

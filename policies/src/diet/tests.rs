@@ -4,7 +4,7 @@ use super::offspring::conserving_scale;
 use super::quota::rows_of_share;
 use super::*;
 use crate::adc::{clone_at, split_by, split_long_axis};
-use crate::event::{Event, Outcome, View, build, due_steps};
+use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 use crate::plan::{EditCounts, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
 
@@ -113,8 +113,8 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
         .with(Signal::ScaleMax, &[0.05, 1.01, 1.0, 1.01])
         .with(Signal::ScreenGradient, &[0.0, 0.0, 9.0, 8.0]);
     let late = Event { step: 3100, ..event.clone() };
-    let lives = run(&late, "");
-    assert_eq!((lives.pruned, lives.split), (vec![], vec![2, 3]));
+    let kept = run(&late, "");
+    assert_eq!((kept.pruned, kept.split), (vec![], vec![2, 3]));
     // With one they are pruned after step 3000, at growth only.
     let named = "max_scale = 0.1";
     let early = run(&event, named);
@@ -504,4 +504,23 @@ fn every_ingredient_can_be_switched_off() {
         let full = format!("{}\n{off}", kept.join("\n"));
         assert_ne!(outcome(event, &full), outcome(event, shares), "{off}");
     }
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "diet",
+        &[
+            "mixed_gradient = false\nshift = \"none\"\nprotect = 0",
+            "growth = \"all\"\nshift = \"paper\"\nnewborn_size = \"code\"",
+            "shift = \"code\"\nclone_opacity = \"conserve\"\nrho = 20.0\nrho_c = 9.0",
+            "rho_c = 0.0\nrho = 0.0\ntau = 0.0",
+            "compensate_from = 1\ninsert_every = 4\nrho_c = 0.3",
+            "importance = \"fresh\"",
+            "reinit_at = 100\nprune_every = 1",
+            "reinit_at = 300\nreinit_share = 1.0\nimportance = \"fresh\"",
+            "importance = \"fresh\"\ncompensate_from = 1\ninsert_every = 4\nrho_c = 0.3",
+            "importance = \"fresh\"\ngrowth = \"all\"\nrho_c = 1.0\nfresh_views = 1",
+        ],
+    );
 }

@@ -1,7 +1,7 @@
 //! Tests of the rules of `igs`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome, View, build, due_steps};
+use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("igs", set)
@@ -159,4 +159,15 @@ fn the_optimiser_steps_less_often_towards_the_end() {
     );
     let plain = build("igs", "sum = 1\nsum_more = 1", &scene);
     assert_eq!(plain.needs(&scene).cadence, Cadence::default());
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "igs",
+        &[
+            "views = 1\nfinal_from = 1\ntau = 0.0",
+            "tau = 0.0\nrecovery_share = 1.0\nresets = 99\nfirst_prune_opacity = 1.0",
+        ],
+    );
 }

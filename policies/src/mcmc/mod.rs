@@ -193,9 +193,11 @@ impl DensityPolicy for Mcmc {
     ) -> Result<(), PolicyError> {
         let opacity = now.signal(Signal::Opacity)?;
         let least = self.params.min_opacity as f32;
-        let lives = |opacity: f32| opacity.is_finite() && opacity > least;
-        let weights: Vec<f32> = opacity.iter().map(|&o| if lives(o) { o } else { 0.0 }).collect();
-        let dead: Vec<u32> = (0..).zip(opacity).filter(|(_, o)| !lives(**o)).map(|x| x.0).collect();
+        let is_alive = |opacity: f32| opacity.is_finite() && opacity > least;
+        let weights: Vec<f32> =
+            opacity.iter().map(|&o| if is_alive(o) { o } else { 0.0 }).collect();
+        let dead: Vec<u32> =
+            (0..).zip(opacity).filter(|(_, o)| !is_alive(**o)).map(|x| x.0).collect();
         if dead.len() == now.rows() {
             return Ok(());
         }

@@ -1,7 +1,7 @@
 //! Tests of the rules of `mcmc`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome, build};
+use crate::event::{Event, Outcome, assert_conforms, build};
 use crate::plan::EditCounts;
 
 fn run(event: &Event, set: &str) -> Outcome {
@@ -143,4 +143,9 @@ fn terms_and_noise_are_declared_in_the_unit_of_the_cameras() {
     }
     let off = build("mcmc", "noise = 0\nopacity_term = 0\nscale_term = 0", &scene).needs(&scene);
     assert!(off.noise.is_none() && off.loss_terms.is_none());
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms("mcmc", &["growth = 1.0\nnoise = 0.0", "min_opacity = 0.5\nmost_shares = 2"]);
 }

@@ -1,4 +1,4 @@
-//! Fates, room and refusals of a plan; any plan against a plain vector.
+//! Tests of edits, room and refusals, and of any plan against a plain vector.
 
 use super::*;
 use proptest::prelude::*;
@@ -18,7 +18,7 @@ const UPDATE: Update =
     Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(1.0), keep_moments: true };
 
 #[test]
-fn a_row_has_one_fate() {
+fn a_row_has_one_edit() {
     let mut plan = EditPlan::new(4, 8);
     plan.prune(0).unwrap();
     plan.grow(1, family(1, ParentFate::Stays)).unwrap();
@@ -134,40 +134,41 @@ fn calls() -> impl Strategy<Value = (usize, usize, Vec<Call>)> {
     })
 }
 
-/// Who sits in a slot of the naive model.
+/// What a slot of the naive model holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Who {
+enum Occupant {
     Row(u32),
-    Child { of: u32, number: u32 },
+    Child { parent: u32, number: u32 },
     Seed(usize),
 }
 
-/// Executes `ops` on a plain vector, checking every sub-step, and returns who is left.
-fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Who> {
+/// Executes `ops` on a plain vector, checking every sub-step, and returns the occupants left.
+fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Occupant> {
     let slots = ops.rows_before.max(budget);
-    let mut model: Vec<Option<Who>> =
-        (0..slots).map(|slot| (slot < ops.rows_before).then_some(Who::Row(slot as u32))).collect();
+    let mut model: Vec<Option<Occupant>> = (0..slots)
+        .map(|slot| (slot < ops.rows_before).then_some(Occupant::Row(slot as u32)))
+        .collect();
     for &row in pruned {
-        assert_eq!(model[row as usize].take(), Some(Who::Row(row)));
+        assert_eq!(model[row as usize].take(), Some(Occupant::Row(row)));
     }
     let mut live = ops.rows_before - pruned.len();
-    let mut bear = |model: &mut [Option<Who>], slot: u32, who: Who| {
+    let mut add = |model: &mut [Option<Occupant>], slot: u32, occupant: Occupant| {
         assert!((slot as usize) < budget, "slot {slot} is beyond the budget {budget}");
-        assert_eq!(model[slot as usize].replace(who), None, "slot {slot} was not free");
+        assert_eq!(model[slot as usize].replace(occupant), None, "slot {slot} was not free");
         live += 1;
         assert!(live <= budget, "{live} rows, budget {budget}");
     };
     for family in &ops.families {
-        assert_eq!(model[family.parent as usize], Some(Who::Row(family.parent)));
+        assert_eq!(model[family.parent as usize], Some(Occupant::Row(family.parent)));
         for (number, &slot) in (1..).zip(ops.children(family)) {
-            bear(&mut model, slot, Who::Child { of: family.parent, number });
+            add(&mut model, slot, Occupant::Child { parent: family.parent, number });
         }
     }
     for (row, _) in &ops.updates {
-        assert_eq!(model[*row as usize], Some(Who::Row(*row)));
+        assert_eq!(model[*row as usize], Some(Occupant::Row(*row)));
     }
     for (index, (slot, _)) in ops.seeds.iter().enumerate() {
-        bear(&mut model, *slot, Who::Seed(index));
+        add(&mut model, *slot, Occupant::Seed(index));
     }
     for &(from, to) in &ops.moves {
         let row = model[from as usize].take();
@@ -183,7 +184,7 @@ proptest! {
     fn any_plan_agrees_with_a_plain_vector((rows, budget, calls) in calls()) {
         let mut plan = EditPlan::new(rows, budget);
         let mut pruned = Vec::new();
-        let mut expected: Vec<Who> = (0..rows as u32).map(Who::Row).collect();
+        let mut expected: Vec<Occupant> = (0..rows as u32).map(Occupant::Row).collect();
         let mut denied = 0;
         let mut seeds = 0;
         for call in calls {
@@ -191,17 +192,17 @@ proptest! {
             let done = match call {
                 Call::Prune(row) => plan.prune(row).map(|()| {
                     pruned.push(row);
-                    expected.retain(|&who| who != Who::Row(row));
+                    expected.retain(|&occupant| occupant != Occupant::Row(row));
                 }),
                 Call::Grow(row, children, stays) => {
                     let parent = if stays { ParentFate::Stays } else { ParentFate::BecomesChild };
                     plan.grow(row, family(children, parent)).map(|()| {
-                        expected.extend((1..=children).map(|number| Who::Child { of: row, number }));
+                        expected.extend((1..=children).map(|number| Occupant::Child { parent: row, number }));
                     })
                 }
                 Call::Update(row) => plan.update(row, UPDATE),
                 Call::Append => plan.append(SEED).map(|()| {
-                    expected.push(Who::Seed(seeds));
+                    expected.push(Occupant::Seed(seeds));
                     seeds += 1;
                 }),
             };

@@ -1,7 +1,7 @@
 //! Tests of the rules of `taming`, each worked out by hand.
 
 use super::*;
-use crate::event::{Event, Outcome, View, build, due_steps};
+use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 use crate::plan::EditCounts;
 
 fn run(event: &Event, set: &str) -> Outcome {
@@ -200,7 +200,7 @@ fn the_published_draw_hits_few_and_others() {
     assert_eq!(run(&event, "").pruned.len(), 2);
     assert!(run(&event, "prune = \"published\"").pruned.is_empty());
     // Rows 0 and 1 are split; only place 2 has nearly no score, so that it is drawn for sure. Of the
-    // survivors 2, 3, 4, … place 2 is row 4: it dies, though the score is that of row 2.
+    // survivors 2, 3, 4, … place 2 is row 4: it is pruned, though the score is that of row 2.
     let mut scale = [0.05; 400];
     scale[..2].fill(0.5);
     let mut gradient = [0.0; 400];
@@ -249,4 +249,15 @@ fn views_are_rendered_and_bands_are_summed_as_the_parameters_say() {
     assert_eq!(needs.cadence, policy.cadence(1));
     assert_eq!(needs.rates, RateOverrides { sh_rest: Some(0.5), ..RateOverrides::default() });
     assert_eq!(needs.aux.unwrap().map, PixelMap { error: 3.0, edge: 50.0 });
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "taming",
+        &[
+            "tau = 0.0\nviews = 0\nprune_share = 1.0",
+            "prune = \"published\"\nmultiplier = 2.0\ntau = 0.0",
+        ],
+    );
 }

@@ -1,7 +1,7 @@
 //! Tests of the rules of the original, one event at a time.
 
 use super::*;
-use crate::event::{Event, Outcome, due_steps};
+use crate::event::{Event, Outcome, assert_conforms, due_steps};
 use crate::plan::{EditCounts, OpacityRule, ParentFate, Placement, ScaleRule};
 
 fn run(event: &Event, set: &str) -> Outcome {
@@ -147,4 +147,9 @@ fn an_empty_model_stays_empty() {
     let done = run(&event(600, &[], 4), "");
     assert_eq!(done.ops.rows_after, 0);
     assert!(!done.ops.edits_rows());
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms("vanilla", &["governor = true", "grow_every = 0"]);
 }
