@@ -7,7 +7,7 @@
 use std::collections::HashSet;
 use std::fs::File;
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value};
@@ -125,30 +125,37 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     if fell_back > 0 {
         notes.push(folders.fell_back_note(fell_back));
     }
-    let mut points_file = None;
-    if let Some(value) = top.text("ply_file_path")? {
-        let named = DataPath { file: &path, field: "ply_file_path", value };
-        let found = root.existing(named)?;
-        points_file = Some(found.ok_or_else(|| {
-            top.fault("ply_file_path", format!("the file {value:?} does not exist"))
-        })?);
-    } else if !held_out {
-        for value in POINT_FILES {
-            if let Some(found) =
-                root.existing(DataPath { file: &path, field: "initial points", value })?
-            {
-                notes.push(format!("initial points are taken from {value}"));
-                points_file = Some(found);
-                break;
-            }
-        }
-    }
+    let points_file = points_file(root, &top, held_out, &mut notes)?;
     let listing = path.clone();
     let mut scene = Scene { frames, notes, points_file, listing, own_split, ..Scene::default() };
     if !held_out && let Some(file) = &scene.points_file {
         scene.points = crate::import::ply::read_points(file)?;
     }
     Ok(scene)
+}
+
+/// The file of the initial points: the one that the JSON names, or one of [`POINT_FILES`].
+fn points_file(
+    root: &Root,
+    top: &Fields<'_>,
+    held_out: bool,
+    notes: &mut Vec<String>,
+) -> Result<Option<PathBuf>, DatasetError> {
+    if let Some(value) = top.text("ply_file_path")? {
+        let named = DataPath { file: top.path, field: "ply_file_path", value };
+        let missing = || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
+        return Ok(Some(root.existing(named)?.ok_or_else(missing)?));
+    }
+    if !held_out {
+        for value in POINT_FILES {
+            let named = DataPath { file: top.path, field: "initial points", value };
+            if let Some(found) = root.existing(named)? {
+                notes.push(format!("initial points are taken from {value}"));
+                return Ok(Some(found));
+            }
+        }
+    }
+    Ok(None)
 }
 
 fn parse(path: &Path) -> Result<Value, DatasetError> {

@@ -25,12 +25,11 @@ fn check(make: fn() -> Made, cases: &[Case]) {
     }
 }
 
-#[test]
-fn colmap_text() {
+const COLMAP_TEXT: &[Case] = {
     const IMAGES: &str = "sparse/0/images.txt";
     const CAMERAS: &str = "sparse/0/cameras.txt";
     const POINTS: &str = "sparse/0/points3D.txt";
-    let cases: &[Case] = &[
+    &[
         (
             "no cameras",
             |m| std::fs::remove_file(m.file(CAMERAS)).unwrap(),
@@ -155,16 +154,19 @@ fn colmap_text() {
             &["points3D.txt", "line 5", "300"],
         ),
         ("not UTF-8", |m| m.patch(POINTS, |bytes| bytes[20] = 0xff), &["points3D.txt"]),
-    ];
-    check(Made::colmap_txt, cases);
-}
+    ]
+};
 
 #[test]
-fn colmap_binary() {
+fn colmap_text() {
+    check(Made::colmap_txt, COLMAP_TEXT);
+}
+
+const COLMAP_BINARY: &[Case] = {
     const IMAGES: &str = "sparse/0/images.bin";
     const CAMERAS: &str = "sparse/0/cameras.bin";
     const POINTS: &str = "sparse/0/points3D.bin";
-    let cases: &[Case] = &[
+    &[
         (
             "model 5",
             |m| m.patch(CAMERAS, |b| b[12] = 5),
@@ -220,8 +222,12 @@ fn colmap_binary() {
         ),
         ("zero cameras", |m| m.write(CAMERAS, [0; 8]), &["a.png", "camera 1"]),
         ("zero images", |m| m.write(IMAGES, [0; 8]), &["images.bin", "no image"]),
-    ];
-    check(Made::colmap_bin, cases);
+    ]
+};
+
+#[test]
+fn colmap_binary() {
+    check(Made::colmap_bin, COLMAP_BINARY);
 }
 
 /// Whatever single byte is damaged, loading ends with a dataset or an error.
@@ -248,119 +254,113 @@ fn no_damaged_byte_makes_it_panic() {
     assert!(Dataset::load(made.path(), &LoadOptions::default()).is_ok());
 }
 
+type JsonCase = (&'static str, fn(&mut serde_json::Value), &'static [&'static str]);
+
+const TRANSFORMS: &[JsonCase] = &[
+    (
+        "test split",
+        |j| j["test_filenames"] = serde_json::json!([1]),
+        &["transforms.json", "test_filenames", "list of file names"],
+    ),
+    ("no frames", |j| j["frames"] = 3.into(), &["transforms.json", "frames"]),
+    ("frame no object", |j| j["frames"][1] = 3.into(), &["frames[1]"]),
+    ("zero frames", |j| j["frames"] = serde_json::json!([]), &["transforms.json", "no image"]),
+    (
+        "no path",
+        |j| drop(j["frames"][1].as_object_mut().unwrap().remove("file_path")),
+        &["frames[1].file_path"],
+    ),
+    (
+        "path no string",
+        |j| j["frames"][1]["file_path"] = 7.into(),
+        &["frames[1].file_path", "string"],
+    ),
+    (
+        "climbs out",
+        |j| j["frames"][1]["file_path"] = "../b.png".into(),
+        &["frames[1].file_path", "`..`"],
+    ),
+    (
+        "absolute",
+        |j| j["frames"][1]["file_path"] = "/b.png".into(),
+        &["frames[1].file_path", "absolute"],
+    ),
+    ("NUL", |j| j["frames"][1]["file_path"] = "b\0.png".into(), &["frames[1].file_path", "NUL"]),
+    (
+        "long",
+        |j| j["frames"][1]["file_path"] = "b".repeat(5000).into(),
+        &["frames[1].file_path", "4 KiB"],
+    ),
+    (
+        "mask climbs out",
+        |j| j["frames"][1]["mask_path"] = "../m.png".into(),
+        &["frames[1].mask_path", "`..`"],
+    ),
+    (
+        "mask missing",
+        |j| j["frames"][1]["mask_path"] = "m.png".into(),
+        &["frames[1].mask_path", "m.png"],
+    ),
+    ("points climb out", |j| j["ply_file_path"] = "../p.ply".into(), &["ply_file_path", "`..`"]),
+    ("points missing", |j| j["ply_file_path"] = "p.ply".into(), &["ply_file_path", "p.ply"]),
+    (
+        "no matrix",
+        |j| drop(j["frames"][1].as_object_mut().unwrap().remove("transform_matrix")),
+        &["frames[1].transform_matrix"],
+    ),
+    (
+        "matrix shape",
+        |j| {
+            j["frames"][1]["transform_matrix"] =
+                serde_json::json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        },
+        &["frames[1].transform_matrix"],
+    ),
+    (
+        "matrix null",
+        |j| j["frames"][1]["transform_matrix"][0][3] = serde_json::Value::Null,
+        &["frames[1].transform_matrix"],
+    ),
+    (
+        "scaled",
+        |j| j["frames"][0]["transform_matrix"][0][0] = 2.0.into(),
+        &["frames[0].transform_matrix", "a.png", "orthonormal"],
+    ),
+    (
+        "mirrored",
+        |j| j["frames"][0]["transform_matrix"][0][0] = (-1.0).into(),
+        &["frames[0].transform_matrix", "reflection"],
+    ),
+    (
+        "no focal length",
+        |j| drop(j.as_object_mut().unwrap().remove("fl_x")),
+        &["fl_x", "camera_angle_x"],
+    ),
+    ("fl_x = 0", |j| j["fl_x"] = 0.into(), &["intrinsics", "fx"]),
+    (
+        "angle",
+        |j| {
+            j.as_object_mut().unwrap().remove("fl_x");
+            j["camera_angle_x"] = 4.0.into();
+        },
+        &["intrinsics", "fx"],
+    ),
+    ("w", |j| j["w"] = 20.5.into(), &["w", "20.5"]),
+    ("w < 0", |j| j["w"] = (-20).into(), &["w", "-20"]),
+    (
+        "fisheye",
+        |j| j["camera_model"] = "OPENCV_FISHEYE".into(),
+        &["camera_model", "OPENCV_FISHEYE", "image_undistorter"],
+    ),
+    ("is_fisheye", |j| j["is_fisheye"] = true.into(), &["is_fisheye", "image_undistorter"]),
+    ("k3", |j| j["k3"] = 0.1.into(), &["k3", "image_undistorter"]),
+    ("fold", |j| j["k1"] = (-5.0).into(), &["distortion", "a.png", "image_undistorter"]),
+    ("k1 no number", |j| j["k1"] = "x".into(), &["k1", "number"]),
+];
+
 #[test]
 fn transforms() {
-    type Case = (&'static str, fn(&mut serde_json::Value), &'static [&'static str]);
-    let cases: &[Case] = &[
-        (
-            "test split",
-            |j| j["test_filenames"] = serde_json::json!([1]),
-            &["transforms.json", "test_filenames", "list of file names"],
-        ),
-        ("no frames", |j| j["frames"] = 3.into(), &["transforms.json", "frames"]),
-        ("frame no object", |j| j["frames"][1] = 3.into(), &["frames[1]"]),
-        ("zero frames", |j| j["frames"] = serde_json::json!([]), &["transforms.json", "no image"]),
-        (
-            "no path",
-            |j| drop(j["frames"][1].as_object_mut().unwrap().remove("file_path")),
-            &["frames[1].file_path"],
-        ),
-        (
-            "path no string",
-            |j| j["frames"][1]["file_path"] = 7.into(),
-            &["frames[1].file_path", "string"],
-        ),
-        (
-            "climbs out",
-            |j| j["frames"][1]["file_path"] = "../b.png".into(),
-            &["frames[1].file_path", "`..`"],
-        ),
-        (
-            "absolute",
-            |j| j["frames"][1]["file_path"] = "/b.png".into(),
-            &["frames[1].file_path", "absolute"],
-        ),
-        (
-            "NUL",
-            |j| j["frames"][1]["file_path"] = "b\0.png".into(),
-            &["frames[1].file_path", "NUL"],
-        ),
-        (
-            "long",
-            |j| j["frames"][1]["file_path"] = "b".repeat(5000).into(),
-            &["frames[1].file_path", "4 KiB"],
-        ),
-        (
-            "mask climbs out",
-            |j| j["frames"][1]["mask_path"] = "../m.png".into(),
-            &["frames[1].mask_path", "`..`"],
-        ),
-        (
-            "mask missing",
-            |j| j["frames"][1]["mask_path"] = "m.png".into(),
-            &["frames[1].mask_path", "m.png"],
-        ),
-        (
-            "points climb out",
-            |j| j["ply_file_path"] = "../p.ply".into(),
-            &["ply_file_path", "`..`"],
-        ),
-        ("points missing", |j| j["ply_file_path"] = "p.ply".into(), &["ply_file_path", "p.ply"]),
-        (
-            "no matrix",
-            |j| drop(j["frames"][1].as_object_mut().unwrap().remove("transform_matrix")),
-            &["frames[1].transform_matrix"],
-        ),
-        (
-            "matrix shape",
-            |j| {
-                j["frames"][1]["transform_matrix"] =
-                    serde_json::json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
-            },
-            &["frames[1].transform_matrix"],
-        ),
-        (
-            "matrix null",
-            |j| j["frames"][1]["transform_matrix"][0][3] = serde_json::Value::Null,
-            &["frames[1].transform_matrix"],
-        ),
-        (
-            "scaled",
-            |j| j["frames"][0]["transform_matrix"][0][0] = 2.0.into(),
-            &["frames[0].transform_matrix", "a.png", "orthonormal"],
-        ),
-        (
-            "mirrored",
-            |j| j["frames"][0]["transform_matrix"][0][0] = (-1.0).into(),
-            &["frames[0].transform_matrix", "reflection"],
-        ),
-        (
-            "no focal length",
-            |j| drop(j.as_object_mut().unwrap().remove("fl_x")),
-            &["fl_x", "camera_angle_x"],
-        ),
-        ("fl_x = 0", |j| j["fl_x"] = 0.into(), &["intrinsics", "fx"]),
-        (
-            "angle",
-            |j| {
-                j.as_object_mut().unwrap().remove("fl_x");
-                j["camera_angle_x"] = 4.0.into();
-            },
-            &["intrinsics", "fx"],
-        ),
-        ("w", |j| j["w"] = 20.5.into(), &["w", "20.5"]),
-        ("w < 0", |j| j["w"] = (-20).into(), &["w", "-20"]),
-        (
-            "fisheye",
-            |j| j["camera_model"] = "OPENCV_FISHEYE".into(),
-            &["camera_model", "OPENCV_FISHEYE", "image_undistorter"],
-        ),
-        ("is_fisheye", |j| j["is_fisheye"] = true.into(), &["is_fisheye", "image_undistorter"]),
-        ("k3", |j| j["k3"] = 0.1.into(), &["k3", "image_undistorter"]),
-        ("fold", |j| j["k1"] = (-5.0).into(), &["distortion", "a.png", "image_undistorter"]),
-        ("k1 no number", |j| j["k1"] = "x".into(), &["k1", "number"]),
-    ];
-    for (case, edit, words) in cases {
+    for (case, edit, words) in TRANSFORMS {
         refused(case, &Made::transforms(edit), &LoadOptions::default(), words);
     }
     let broken = Made::transforms(|_| ());
