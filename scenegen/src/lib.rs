@@ -19,7 +19,6 @@ mod camera;
 mod error;
 mod gltf;
 mod intersect;
-mod lines;
 pub mod mesh;
 mod nearest;
 mod obj;

@@ -239,7 +239,13 @@ impl Model {
 }
 
 /// Appends one value per vertex to a list that is empty until the first source has any.
-fn pad<T: Copy>(list: &mut Vec<T>, values: &[T], before: usize, count: usize, missing: T) {
+pub(crate) fn pad<T: Copy>(
+    list: &mut Vec<T>,
+    values: &[T],
+    before: usize,
+    count: usize,
+    missing: T,
+) {
     if values.is_empty() && list.is_empty() {
         return;
     }

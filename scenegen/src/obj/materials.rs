@@ -1,0 +1,242 @@
+//! Reads MTL material libraries with their textures.
+
+use std::collections::{HashMap, HashSet};
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+use glam::{Vec2, Vec3};
+
+use super::statements::{Statement, Statements, shortened, split_word};
+use crate::error::Error;
+use crate::mesh::{AlphaMode, Material, Model, Reflection};
+use crate::resource::{self, Folder};
+use crate::texture::{TextureRef, Wrap};
+
+/// Linear base colour of materials that state none, and of faces without a material.
+pub(super) const GREY: [f32; 3] = [0.6; 3];
+
+/// A library as `tobj` returns it.
+type Library = (Vec<tobj::Material>, HashMap<String, usize>);
+
+/// The materials of all libraries of an OBJ file.
+pub(super) struct Materials {
+    folder: Folder,
+    /// Materials that are defined or were noted as missing.
+    names: HashSet<String>,
+    /// Numbers of the textures, by file and whether it is sRGB.
+    textures: HashMap<(PathBuf, bool), u32>,
+    /// Has the materials, textures and notes.
+    pub(super) model: Model,
+}
+
+impl Materials {
+    pub(super) fn new(obj: &Path) -> Result<Self, Error> {
+        let (names, textures) = (HashSet::new(), HashMap::new());
+        Ok(Self { folder: Folder::of(obj)?, names, textures, model: Model::default() })
+    }
+
+    /// Notes, once, that a material is not defined.
+    pub(super) fn note_missing(&mut self, name: &str) {
+        if self.names.insert(name.to_owned()) {
+            let name = shortened(name);
+            self.model.notes.push(format!("there is no material {name}; a grey one is used"));
+        }
+    }
+
+    /// Reads the libraries that a `mtllib` statement names. Missing ones are noted.
+    pub(super) fn read_libraries(&mut self, s: Statement<'_>) -> Result<Vec<Library>, Error> {
+        let element = format!("line {}: mtllib", s.line);
+        // One name with spaces, or several names.
+        let names: Vec<&str> = match self.folder.resolve(&element, &slashed(s.text)) {
+            Ok(path) if path.is_file() => vec![s.text],
+            _ => s.words().collect(),
+        };
+        let mut libraries = Vec::new();
+        for name in names {
+            let path = self.folder.resolve(&element, &slashed(name))?;
+            if path.is_file() {
+                libraries.push(self.read(&path)?);
+            } else {
+                let name = shortened(name);
+                self.model.notes.push(format!("there is no {name}; its materials are grey"));
+            }
+        }
+        Ok(libraries)
+    }
+
+    fn read(&mut self, path: &Path) -> Result<Library, Error> {
+        let mut check = check;
+        let mut statements = Statements::open(path, &mut check)?;
+        let result = tobj::load_mtl_buf(&mut BufReader::new(&mut statements));
+        let library = statements.outcome(result)?;
+        for material in &library.0 {
+            self.add(path, material)?;
+        }
+        Ok(library)
+    }
+
+    fn add(&mut self, path: &Path, source: &tobj::Material) -> Result<(), Error> {
+        let more = &source.unknown_param;
+        let number = |key| more.get(key).and_then(|value: &String| value.parse::<f32>().ok());
+        let mut material = Material::lambert(&source.name, GREY);
+        if let Some(colour) = source.diffuse {
+            material.base = linear(colour).extend(1.0);
+        }
+        material.emissive = source.emissive.map_or(Vec3::ZERO, linear);
+        material.base.w = source.dissolve.unwrap_or(1.0) as f32;
+        if ["Pr", "Pm", "map_Pr", "map_Pm"].iter().any(|&key| more.contains_key(key)) {
+            material.reflection = Reflection::MetalRough;
+        }
+        material.roughness = number("Pr").unwrap_or(material.roughness);
+        // A map without a number beside it is the metalness itself.
+        let alone = if more.contains_key("map_Pm") { 1.0 } else { material.metallic };
+        material.metallic = number("Pm").unwrap_or(alone);
+        let mut texture = |map: Option<&String>, srgb| match map.and_then(|map| Map::read(map)) {
+            Some(map) => self.texture(path, &map, srgb).map(Some),
+            None => Ok(None),
+        };
+        material.base_texture = texture(source.diffuse_texture.as_ref(), true)?;
+        material.emissive_texture = texture(more.get("map_Ke"), true)?;
+        material.alpha_texture = texture(source.dissolve_texture.as_ref(), false)?;
+        material.normal_texture = texture(more.get("norm"), false)?;
+        material.roughness_texture = texture(more.get("map_Pr"), false)?;
+        material.metallic_texture = texture(more.get("map_Pm"), false)?;
+        if material.base.w < 1.0 || material.alpha_texture.is_some() {
+            material.alpha = AlphaMode::Blend;
+        }
+        if source.normal_texture.is_some() {
+            let name = shortened(&source.name);
+            self.model.notes.push(format!(
+                "material {name}: bump maps are not supported; store a normal map (norm) instead"
+            ));
+        }
+        self.names.insert(source.name.clone());
+        self.model.material(material);
+        Ok(())
+    }
+
+    fn texture(&mut self, path: &Path, map: &Map, srgb: bool) -> Result<TextureRef, Error> {
+        let library = path.file_name().unwrap_or_default().to_string_lossy();
+        let element = format!("{library} line {}: texture", map.line);
+        let file = self.folder.resolve(&element, &map.file)?;
+        let key = (file.clone(), srgb);
+        let number = match self.textures.get(&key) {
+            Some(&number) => number,
+            None => {
+                let bytes = self.folder.read(&element, &file)?;
+                let texture = resource::decode(&file, &element, &bytes, srgb)?;
+                let textures = &mut self.model.textures;
+                resource::check_texels(path, &element, textures, &texture)?;
+                textures.push(texture);
+                let number = textures.len() as u32 - 1;
+                self.textures.insert(key, number);
+                number
+            }
+        };
+        let mut found = TextureRef::new(number);
+        if map.clamp {
+            found.sampler.wrap_u = Wrap::Clamp;
+            found.sampler.wrap_v = Wrap::Clamp;
+        }
+        // Scale and offset are meant with v pointing up.
+        let (s, o) = (map.scale, map.offset);
+        found.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
+        Ok(found)
+    }
+}
+
+fn linear(colour: [f64; 3]) -> Vec3 {
+    Vec3::from(colour.map(|v| v as f32)).max(Vec3::ZERO)
+}
+
+/// Returns the lines that `tobj` reads in place of a statement. Texture statements get their line's
+/// number in front, for messages.
+fn check(statement: Statement<'_>) -> Result<String, Error> {
+    let (key, line) = (statement.key, statement.line);
+    let fault = |problem: &str| statement.fault(format!("{key} {problem}"));
+    let number = |word: &str| match word.parse::<f32>() {
+        Ok(value) if value.is_finite() => Ok(value),
+        _ => Err(fault("is not a finite number")),
+    };
+    // `d -halo 0.5` is rendered without the halo.
+    let words = statement.words().filter(|word| *word != "-halo").take(3);
+    let share = || -> Result<f32, Error> {
+        let word = words.clone().next().ok_or_else(|| fault("has no value"))?;
+        Ok(number(word)?.clamp(0.0, 1.0))
+    };
+    Ok(match key {
+        "newmtl" => format!("newmtl {}\n", statement.value()),
+        // `tobj` panics if there are not three numbers. Spectral files are not read.
+        "Kd" | "Ke" if !statement.text.starts_with(['s', 'x']) => {
+            let [r, g, b] = match words.clone().map(number).collect::<Result<Vec<_>, _>>()?[..] {
+                [r, g, b] => [r, g, b],
+                [grey] => [grey; 3],
+                _ => return Err(fault("needs three numbers")),
+            };
+            format!("{key} {r} {g} {b}\n")
+        }
+        "d" | "Pr" | "Pm" => format!("{key} {}\n", share()?),
+        "Tr" => format!("d {}\n", 1.0 - share()?),
+        "map_Kd" | "map_Ke" | "map_d" | "norm" | "map_Pr" | "map_Pm" | "bump" | "map_bump"
+        | "map_Bump" => format!("{key} {line} {}\n", statement.text),
+        _ => String::new(),
+    })
+}
+
+/// A texture statement.
+pub(super) struct Map {
+    pub(super) line: usize,
+    pub(super) file: String,
+    pub(super) scale: Vec2,
+    pub(super) offset: Vec2,
+    pub(super) clamp: bool,
+}
+
+impl Map {
+    /// A line's number, options, and a file name that may hold spaces; None without a name.
+    pub(super) fn read(statement: &str) -> Option<Self> {
+        let (line, mut rest) = split_word(statement);
+        let line = line.parse().ok()?;
+        let mut map =
+            Self { line, file: String::new(), scale: Vec2::ONE, offset: Vec2::ZERO, clamp: false };
+        while rest.starts_with('-') {
+            let (option, mut after) = split_word(rest);
+            // Up to three numbers for some; the second and third may be left out.
+            let most = match option {
+                "-o" | "-s" | "-t" => 3,
+                "-mm" => 2,
+                _ => 1,
+            };
+            let mut values = Vec::new();
+            while values.len() < most {
+                let (word, behind) = split_word(after);
+                let number = word.parse::<f32>().ok().filter(|v| v.is_finite());
+                if most > 1 && number.is_none() {
+                    break;
+                }
+                if option == "-clamp" {
+                    map.clamp = word == "on";
+                }
+                values.push(number.unwrap_or(0.0));
+                after = behind;
+            }
+            let pair = |default: f32| {
+                let at = |i: usize| values.get(i).copied().unwrap_or(default);
+                Vec2::new(at(0), at(1))
+            };
+            match option {
+                "-o" => map.offset = pair(0.0),
+                "-s" => map.scale = pair(1.0),
+                _ => {}
+            }
+            rest = after;
+        }
+        map.file = slashed(rest);
+        (!map.file.is_empty()).then_some(map)
+    }
+}
+
+/// Names from other systems use backslashes.
+fn slashed(name: &str) -> String {
+    name.replace('\\', "/")
+}

@@ -1,0 +1,148 @@
+//! Tests of the OBJ reader: what `tobj` alone would misread, smoothing groups, materials.
+
+#![allow(clippy::float_cmp, reason = "exact values")]
+
+use std::io::Cursor;
+
+use super::materials::Map;
+use super::*;
+use crate::mesh::Reflection;
+use crate::texture::TextureRef;
+
+/// Loads an OBJ file with files beside it.
+fn loaded(obj: &str, files: &[(&str, &[u8])]) -> Result<Model, Error> {
+    let folder = tempfile::tempdir().expect("folder");
+    for (name, bytes) in files {
+        std::fs::write(folder.path().join(name), bytes).expect("write");
+    }
+    let path = folder.path().join("test.obj");
+    std::fs::write(&path, obj).expect("write");
+    load(&path)
+}
+
+/// Two squares that meet at a right angle, along the y axis.
+const ROOF: &str = "v 0 0 0\nv 0 1 0\nv 1 0 0\nv 1 1 0\nv 0 0 -1\nv 0 1 -1\n";
+
+#[test]
+fn smoothing_groups_share_normals_and_no_group_is_flat() {
+    let normals = |text: &str| {
+        let model = loaded(&format!("{ROOF}{text}"), &[]).expect("a roof");
+        let at = |i: u32| model.normals.get(i as usize).copied().unwrap_or_default();
+        // By triangle and corner: position and normal.
+        let corners = model.triangles.iter().flatten();
+        corners.map(|&i| (model.positions[i as usize], at(i))).collect::<Vec<_>>()
+    };
+    let (z, x) = (Vec3::Z, Vec3::NEG_X);
+    let edge = (z + x).normalize();
+    for (text, at_edge, beside) in [
+        ("s 1\nf 1 3 4 2\nf 5 1 2 6\n", [edge, edge], [z, x]),
+        ("s 1\nf 1 3 4 2\ns 2\nf 5 1 2 6\n", [z, x], [z, x]),
+        ("f 1 3 4 2\nf 5 1 2 6\n", [Vec3::ZERO; 2], [Vec3::ZERO; 2]),
+        ("s 1\ns off\nf 1 3 4 2\ns 0\nf 5 1 2 6\n", [Vec3::ZERO; 2], [Vec3::ZERO; 2]),
+        // A normal of its own comes before the group's.
+        (
+            "vn 0 1 0\ns 1\nf 1//1 3//1 4//1 2//1\ns off\nf 5 1 2 6\n",
+            [Vec3::Y, Vec3::ZERO],
+            [Vec3::Y, Vec3::ZERO],
+        ),
+    ] {
+        for (i, (position, normal)) in normals(text).into_iter().enumerate() {
+            let face = i / 6;
+            let is_edge = position.x == 0.0 && position.z == 0.0;
+            let expected = if is_edge { at_edge[face] } else { beside[face] };
+            assert!(normal.distance(expected) < 1e-6, "{text}: {position} has {normal}");
+        }
+    }
+    let error = loaded(&format!("{ROOF}s five\nf 1 2 3\n"), &[]).expect_err("no group");
+    assert!(error.to_string().contains("line 7") && error.to_string().contains("five"));
+}
+
+#[test]
+fn maps_of_roughness_and_metalness_are_read() {
+    let grey = |value: u8| {
+        let mut bytes = Cursor::new(Vec::new());
+        let image = image::GrayImage::from_pixel(2, 2, image::Luma([value]));
+        image.write_to(&mut bytes, image::ImageFormat::Png).expect("PNG");
+        bytes.into_inner()
+    };
+    let (rough, metal) = (grey(51), grey(204));
+    let load = |library: &str| {
+        let obj = format!("mtllib a.mtl\n{ROOF}vt 0 0\nusemtl m\nf 1/1 3/1 4/1\n");
+        let files: [(&str, &[u8]); 3] =
+            [("a.mtl", library.as_bytes()), ("r.png", &rough), ("m.png", &metal)];
+        loaded(&obj, &files).expect("a triangle")
+    };
+    let model = load("newmtl m\nmap_Pr r.png\nmap_Pm m.png\nPr 0.5\nbump r.png\n");
+    let material = &model.materials[0];
+    assert_eq!(material.reflection, Reflection::MetalRough);
+    assert_eq!((material.roughness, material.metallic), (0.5, 1.0));
+    let value = |texture: &Option<TextureRef>| {
+        let texture = texture.as_ref().expect("a texture");
+        let image = &model.textures[texture.texture as usize];
+        image.sample(Vec2::splat(0.5), &texture.sampler, 0.0)
+    };
+    // Where shading looks: green for roughness, blue for metalness.
+    assert!((value(&material.roughness_texture).y - 0.2).abs() < 1e-6);
+    assert!((value(&material.metallic_texture).z - 0.8).abs() < 1e-6);
+    assert!(model.notes.iter().any(|note| note.contains("bump")), "{:?}", model.notes);
+    // Without the map of one of them, it is the number's, and no metal by default.
+    let model = load("newmtl m\nmap_Pr r.png\n");
+    let material = &model.materials[0];
+    assert_eq!((material.roughness, material.metallic), (1.0, 0.0));
+    assert!(material.metallic_texture.is_none() && model.notes.is_empty());
+    let model = load("newmtl m\nPm 0.25\nmap_Pm m.png\n");
+    assert_eq!(model.materials[0].metallic, 0.25);
+}
+
+#[test]
+fn texture_options_are_told_from_the_name() {
+    let map = Map::read("1 -o 0.5 0.25 -s 2 3 1 -clamp on -bm 0.3 my file.png").expect("map");
+    assert_eq!(map.file, "my file.png");
+    assert_eq!((map.offset, map.scale), (Vec2::new(0.5, 0.25), Vec2::new(2.0, 3.0)));
+    assert!(map.clamp);
+    assert!(Map::read("1 -s 1 1 1").is_none());
+    assert!(Map::read("1").is_none());
+}
+
+#[test]
+fn corners_without_coordinates_get_placeholders() {
+    let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.25 0.5\nvn 0 0 2\n\
+                f 1/1/1 2/1 3//1\nf 1 2 3\nf 3/1 2/1 1/1\n";
+    let model = loaded(text, &[]).expect("three triangles");
+    let (uv, normal) = (Vec2::new(0.25, 0.5), Vec3::Z);
+    let corners = model.triangles.iter().flatten().map(|&i| i as usize);
+    let found: Vec<_> = corners.map(|i| (model.uvs[0][i], model.normals[i])).collect();
+    let (no_uv, no_normal) = (Vec2::ZERO, Vec3::ZERO);
+    assert_eq!(found[..3], [(uv, normal), (uv, no_normal), (no_uv, normal)]);
+    assert_eq!(found[3..6], [(no_uv, no_normal); 3]);
+    assert_eq!(found[6..], [(uv, no_normal); 3]);
+}
+
+#[test]
+fn vertices_before_the_first_colour_are_white() {
+    let text = "v 0 0 0\nv 1 0 0 0.5 -1 nan\nv 0 1 0 1 0.25 -1 0\nf 3 2 1\n";
+    let model = loaded(text, &[]).expect("a triangle");
+    let colours: Vec<_> = model.triangles[0].map(|i| model.colours[i as usize]).to_vec();
+    assert_eq!(colours, [Vec4::new(0.25, 0.0, 0.0, 1.0), Vec4::ONE, Vec4::ONE]);
+}
+
+#[test]
+fn indices_outside_the_file_are_refused_with_their_line() {
+    let head = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n";
+    for (face, problem) in [
+        ("0 1 2", "vertex index 0 of 3"),
+        ("1 2 4", "vertex index 4 of 3"),
+        ("-4 1 2", "vertex index -4 of 3"),
+        ("1/0 2/1 3/1", "texture index 0 of 1"),
+        ("1/1 2/-2 3/1", "texture index -2 of 1"),
+        ("1//9223372036854775807 2//1 3//1", "normal index 9223372036854775807 of 1"),
+        ("1//-9223372036854775808 2//1 3//1", "normal index -9223372036854775808 of 1"),
+        ("1 2 x", "\"x\" is not a vertex index"),
+        ("/1 2 3", "a corner has no vertex index"),
+    ] {
+        let error = loaded(&format!("{head}f {face}\n"), &[]).expect_err("no such index");
+        let error = error.to_string();
+        assert!(error.contains("line 6") && error.contains(problem), "{error}");
+    }
+    assert!(loaded(&format!("{head}f -3/-1/-1 -2/1/1 3/1/1/7 # fine\n"), &[]).is_ok());
+}
