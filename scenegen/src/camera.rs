@@ -1,7 +1,7 @@
-//! The camera that rays start from.
+//! Defines the camera that rays start from.
 //!
-//! Derived on its own, from the camera's axes in the world, rather than by inverting a projection:
-//! that pixels and rays agree with the trainer's `Camera::project` is then a test of both.
+//! Its rays come from its axes in the world, not from an inverted projection: so comparing them with
+//! the trainer's `Camera::project` tests both.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -42,16 +42,18 @@ impl Camera {
         let right = forward.cross(up).normalize_or(forward.any_orthonormal_vector());
         let down = forward.cross(right);
         let focal = 0.5 * f64::from(width) / (0.5 * fov_x).tan();
-        Self {
-            width,
-            height,
-            fx: focal,
-            fy: focal,
-            cx: 0.5 * f64::from(width),
-            cy: 0.5 * f64::from(height),
-            world_from_camera: DMat3::from_cols(right, down, forward),
-            centre,
-        }
+        Self::centred((width, height), focal, DMat3::from_cols(right, down, forward), centre)
+    }
+
+    /// A camera whose principal point is the image's middle.
+    pub(crate) fn centred(
+        (width, height): (u32, u32),
+        focal: f64,
+        world_from_camera: DMat3,
+        centre: DVec3,
+    ) -> Self {
+        let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+        Self { width, height, fx: focal, fy: focal, cx, cy, world_from_camera, centre }
     }
 
     /// The direction through a place in the image `[px]`, in the world. Its component along the

@@ -1,4 +1,4 @@
-//! What can go wrong, and what to do about it.
+//! The errors of this crate: each names the file or option, the problem and the remedy.
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ pub enum Error {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file or folder cannot be written.
@@ -19,7 +19,7 @@ pub enum Error {
     Write {
         /// The file or folder.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file contradicts its format or itself.
@@ -27,29 +27,29 @@ pub enum Error {
     Malformed {
         /// The file.
         path: PathBuf,
-        /// Mesh, accessor, line: what in the file.
+        /// Where in the file: mesh, accessor, line.
         element: String,
-        /// What is wrong with it.
+        /// The problem.
         problem: String,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
-    /// A file needs what this program does not do.
+    /// A file needs an unsupported feature.
     #[error("{}: {feature} is not supported; {remedy}", path.display())]
     Unsupported {
         /// The file.
         path: PathBuf,
-        /// What it needs.
+        /// The feature.
         feature: String,
-        /// What to do.
+        /// The remedy.
         remedy: String,
     },
-    /// A reference to another file leads out of the mesh's folder or is no plain relative path.
+    /// A reference to another file leaves the mesh's folder or is not a relative path.
     #[error("{}: {element}: the URI {uri:?} {problem}; keep all files in the mesh's own folder", path.display())]
     Uri {
         /// The file that refers.
         path: PathBuf,
-        /// What in it refers.
+        /// Where in the file the reference is.
         element: String,
         /// The reference, shortened.
         uri: String,
@@ -67,7 +67,7 @@ pub enum Error {
     UnknownPreset {
         /// As asked for.
         name: String,
-        /// All there are.
+        /// All known names.
         known: String,
     },
     /// An option's value cannot be used.
@@ -89,6 +89,16 @@ pub enum Error {
 }
 
 impl Error {
+    pub(crate) fn malformed(
+        path: &Path,
+        element: impl Into<String>,
+        problem: impl Into<String>,
+        remedy: &'static str,
+    ) -> Self {
+        let (element, problem) = (element.into(), problem.into());
+        Self::Malformed { path: path.to_owned(), element, problem, remedy }
+    }
+
     pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
         move |source| Self::Io { path: path.to_owned(), source }
     }

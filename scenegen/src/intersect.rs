@@ -1,4 +1,4 @@
-//! Watertight ray–triangle intersection.
+//! Intersects rays and triangles without cracks.
 //!
 //! Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013): the triangle is
 //! sheared into the ray's space, where two triangles that share an edge evaluate the very same
@@ -17,9 +17,9 @@ pub(crate) struct ShearedRay {
     pub(crate) shear: Vec3,
 }
 
-/// Where a ray meets a triangle.
+/// Where a ray hits a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Meeting {
+pub(crate) struct Intersection {
     /// Ray parameter.
     pub(crate) t: f32,
     /// Weight of the second vertex.
@@ -58,9 +58,9 @@ impl ShearedRay {
         [self.kx, self.ky, self.kz]
     }
 
-    /// The meeting with a triangle, whatever its ray parameter.
+    /// The intersection with a triangle, whatever its ray parameter.
     #[inline]
-    pub(crate) fn meet(&self, triangle: &[Vec3; 3]) -> Option<Meeting> {
+    pub(crate) fn intersect(&self, triangle: &[Vec3; 3]) -> Option<Intersection> {
         let corner = |p: Vec3| {
             let p = p - self.origin;
             let z = p[self.kz];
@@ -88,8 +88,8 @@ impl ShearedRay {
         }
         let inverse = 1.0 / determinant;
         let t = (u * a.2 + v * b.2 + w * c.2) * inverse;
-        // A determinant so small that its inverse overflows makes t infinite or NaN: no meeting.
-        t.is_finite().then_some(Meeting {
+        // A determinant so small that its inverse overflows makes t infinite or NaN: no intersection.
+        t.is_finite().then_some(Intersection {
             t,
             v: v * inverse,
             w: w * inverse,

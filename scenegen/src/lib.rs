@@ -1,8 +1,8 @@
-//! Known geometry, ray-traced into posed ground-truth images.
+//! Ray-traces known geometry into posed ground-truth images.
 //!
 //! A mesh (glTF, OBJ or a built-in scene) becomes views with colour, alpha, depth and normals, and
-//! initial points as structure-from-motion would find them. The [`Surface`] that was traced stays at
-//! hand, so that a trained scene can be measured against it.
+//! initial points as structure-from-motion would find them. The [`Surface`] that was traced is kept,
+//! so that a trained scene can be measured against it.
 //!
 //! ```
 //! use densify_scenegen::{Options, Scene, Source};
@@ -14,7 +14,6 @@
 //! # Ok::<(), densify_scenegen::Error>(())
 //! ```
 
-mod bundle;
 mod camera;
 mod error;
 mod gltf;
@@ -22,6 +21,7 @@ mod intersect;
 pub mod mesh;
 mod nearest;
 mod obj;
+mod packet;
 mod panorama;
 mod points;
 mod presets;
@@ -41,6 +41,7 @@ mod write;
 
 pub use camera::Camera;
 pub use error::Error;
+pub use nearest::Nearest;
 pub use panorama::Panorama;
 pub use points::{InitPoints, PointCollector, PointOptions};
 pub use presets::{PRESETS, Preset};
@@ -48,7 +49,7 @@ pub use rig::{Rig, RigKind};
 pub use scene::{Generated, Options, Requirements, Scene, Source, Split, View, generate};
 pub use shade::Ambient;
 pub use sky::Sky;
-pub use surface::{Nearest, Surface, SurfaceHit};
+pub use surface::{Surface, SurfaceHit};
 pub use trace::Frame;
 pub use truth::{GroundTruth, Sight};
 pub use write::{Written, check_target, contact_sheet, write, write_png};

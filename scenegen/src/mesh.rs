@@ -31,11 +31,11 @@ pub struct Model {
     pub materials: Vec<Material>,
     /// Decoded images.
     pub textures: Vec<Texture>,
-    /// Lights of the source; without any, the renderer brings its own.
+    /// The source's lights; without any, the renderer adds its own.
     pub lights: Vec<Light>,
-    /// Cameras of the source.
+    /// The source's cameras.
     pub cameras: Vec<FileCamera>,
-    /// What was noticed while loading and may interest the user.
+    /// Notes for the user from loading.
     pub notes: Vec<String>,
 }
 
@@ -50,7 +50,7 @@ pub enum Reflection {
     MetalRough,
 }
 
-/// What happens to light where alpha is below one.
+/// How alpha below one is rendered.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AlphaMode {
     /// Alpha is ignored.
@@ -90,7 +90,7 @@ pub struct Material {
     pub normal_scale: f32,
     /// Multiplies what is emitted (sRGB).
     pub emissive_texture: Option<TextureRef>,
-    /// What alpha means.
+    /// How alpha is rendered.
     pub alpha: AlphaMode,
     /// Whether the back is visible too.
     pub double_sided: bool,
@@ -174,11 +174,11 @@ pub struct Light {
     pub kind: LightKind,
     /// Linear colour times intensity, in the kind's unit.
     pub intensity: Vec3,
-    /// Distance beyond which there is no light; infinite where there is no such.
+    /// Distance beyond which there is no light; may be infinite.
     pub range: f64,
 }
 
-/// A camera that a file brings.
+/// A camera defined in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FileCamera {
     /// Its name.
@@ -210,7 +210,7 @@ impl Model {
         self.triangle_materials.resize(self.triangles.len(), material);
     }
 
-    /// Adds a material; its number.
+    /// Adds a material and returns its number.
     pub fn material(&mut self, material: Material) -> u32 {
         self.materials.push(material);
         self.materials.len() as u32 - 1

@@ -1,4 +1,4 @@
-//! Shapes and painted textures that presets are made of.
+//! Makes the presets' shapes and painted textures.
 
 use std::f64::consts::{PI, TAU};
 

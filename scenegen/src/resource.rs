@@ -1,7 +1,7 @@
-//! Files that a mesh file refers to, and images: all untrusted.
+//! Reads the files that a mesh file refers to, and decodes images: all untrusted.
 //!
 //! References are plain relative paths that stay in the mesh's folder, symbolic links followed. No
-//! allocation is sized by what a header declares: readers take what is there, decoders have limits.
+//! allocation is sized by a header's declaration: readers take the bytes that exist, decoders have limits.
 
 use std::fs::File;
 use std::io::{Cursor, Read};
@@ -31,12 +31,8 @@ const MAX_NAME: usize = 4096;
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
     let file = File::open(path).map_err(Error::io(path))?;
     let known = file.metadata().map_err(Error::io(path))?;
-    let too_large = || Error::Malformed {
-        path: path.to_owned(),
-        element: "the file".into(),
-        problem: "it is larger than 16 GiB".into(),
-        remedy: "split the mesh",
-    };
+    let too_large =
+        || Error::malformed(path, "the file", "it is larger than 16 GiB", "split the mesh");
     if known.len() > MAX_FILE {
         return Err(too_large());
     }
@@ -57,7 +53,7 @@ pub(crate) struct Folder {
 }
 
 impl Folder {
-    pub(crate) fn of(file: &Path) -> Result<Self, Error> {
+    pub(crate) fn around(file: &Path) -> Result<Self, Error> {
         let folder = match file.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => parent,
             _ => Path::new("."),
@@ -66,7 +62,7 @@ impl Folder {
         Ok(Self { file: file.to_owned(), folder })
     }
 
-    /// The path a reference stands for; whether a file is there is not looked at.
+    /// The path of a reference; the file may be missing.
     pub(crate) fn resolve(&self, element: &str, reference: &str) -> Result<PathBuf, Error> {
         let refuse = |problem| {
             Err(Error::Uri {
@@ -80,21 +76,21 @@ impl Folder {
             return refuse("is empty or longer than 4 KiB");
         }
         if reference.contains('\0') {
-            return refuse("holds a NUL");
+            return refuse("contains a NUL");
         }
-        // A colon before the first slash ends a scheme or a drive.
+        // A colon before the first slash marks a scheme or a drive.
         if reference.split(['/', '\\']).next().is_some_and(|first| first.contains(':')) {
-            return refuse("is no relative path");
+            return refuse("is not a relative path");
         }
         if reference.starts_with(['/', '\\']) {
             return refuse("is an absolute path");
         }
         if reference.split(['/', '\\']).any(|part| part == "..") {
-            return refuse("leads out of the folder");
+            return refuse("leaves the folder");
         }
         let path = self.folder.join(reference);
         match path.canonicalize() {
-            Ok(real) if !real.starts_with(&self.folder) => refuse("leads out of the folder"),
+            Ok(real) if !real.starts_with(&self.folder) => refuse("leaves the folder"),
             _ => Ok(path),
         }
     }
@@ -110,7 +106,7 @@ impl Folder {
             path: self.file.clone(),
             element: element.to_owned(),
             uri: uri.chars().take(80).collect(),
-            problem: "has a % that is followed by no two hexadecimal digits of UTF-8",
+            problem: "has a % without two hexadecimal digits of UTF-8 after it",
         })?;
         self.read(element, &self.resolve(element, &decoded)?)
     }
@@ -121,12 +117,9 @@ impl Folder {
             return read(path);
         }
         let name = path.strip_prefix(&self.folder).unwrap_or(path);
-        Err(Error::Malformed {
-            path: self.file.clone(),
-            element: element.to_owned(),
-            problem: format!("there is no file {}", name.display()),
-            remedy: "put it where the mesh file says, or take its mention out",
-        })
+        let problem = format!("there is no file {}", name.display());
+        let remedy = "put it where the mesh file says, or remove the reference";
+        Err(Error::malformed(&self.file, element, problem, remedy))
     }
 }
 
@@ -146,12 +139,8 @@ pub(crate) fn check_texels(
     if total <= MAX_TEXELS {
         return Ok(());
     }
-    Err(Error::Malformed {
-        path: file.to_owned(),
-        element: element.to_owned(),
-        problem: "all textures together have more than 2^29 texels".into(),
-        remedy: "store smaller textures",
-    })
+    let problem = "all textures together have more than 2^29 texels";
+    Err(Error::malformed(file, element, problem, "store smaller textures"))
 }
 
 fn percent_decoded(text: &str) -> Option<String> {
@@ -170,7 +159,7 @@ fn percent_decoded(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-/// The bytes of a `data:` URI with base64; None if it is none.
+/// The bytes of a base64 `data:` URI; None for other URIs.
 pub(crate) fn data_uri(uri: &str) -> Option<Vec<u8>> {
     let (head, body) = uri.strip_prefix("data:")?.split_once(',')?;
     head.ends_with(";base64").then(|| base64(body)).flatten()
@@ -205,12 +194,8 @@ pub(crate) fn decode(
     bytes: &[u8],
     srgb: bool,
 ) -> Result<Texture, Error> {
-    let fault = |problem: String| Error::Malformed {
-        path: file.to_owned(),
-        element: element.to_owned(),
-        problem,
-        remedy: "store it as a PNG or JPEG of at most 16384 px a side",
-    };
+    let remedy = "store it as a PNG or JPEG of at most 16384 px a side";
+    let fault = |problem: String| Error::malformed(file, element, problem, remedy);
     let reader = |bytes| {
         let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
         if !reader.format().is_some_and(|format| FORMATS.contains(&format)) {
@@ -242,7 +227,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         let file = folder.path().join("a.gltf");
         std::fs::write(&file, "x").expect("write");
-        let here = Folder::of(&file).expect("folder");
+        let here = Folder::around(&file).expect("folder");
         for bad in [
             "../b.bin",
             "a/../../b",

@@ -1,8 +1,8 @@
-//! Where the cameras stand.
+//! Places the cameras.
 //!
 //! Training and test views follow different paths. No camera stands in a solid or closer to a
-//! surface than [`Rig::clearance`] of the geometry's diagonal: a view from inside a wall would be
-//! ground truth of nothing.
+//! surface than [`Rig::clearance`] of the geometry's diagonal: a view from inside a wall has no use as
+//! ground truth.
 
 use std::f64::consts::TAU;
 
@@ -27,11 +27,11 @@ pub enum RigKind {
     Inside,
     /// An ellipse as wide and deep as the scene, looking at the middle.
     Ellipse,
-    /// At and around the cameras that the file brings.
+    /// At and around the file's own cameras.
     File,
 }
 
-/// A rig with everything decided.
+/// An arrangement of cameras, complete.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
     /// Arrangement.
@@ -57,9 +57,9 @@ pub struct Rig {
     pub jitter: f64,
     /// Least distance from any surface, as a share of the diagonal.
     pub clearance: f64,
-    /// What the cameras look at; the middle of the bounding box where not given.
+    /// The point that the cameras look at; by default the middle of the bounding box.
     pub target: Option<[f64; 3]>,
-    /// Radius of what is to fill the image; that of the bounding sphere where not given.
+    /// Radius that fills the image; by default the bounding sphere's.
     pub focus: Option<f64>,
     /// Seed of the jitter.
     pub seed: u64,
@@ -92,14 +92,14 @@ const GOLDEN: f64 = TAU * 0.381_966_011_250_105;
 const ATTEMPTS: u64 = 200;
 
 /// A place and what it looks at.
-type Stand = (DVec3, DVec3);
+type Viewpoint = (DVec3, DVec3);
 
 impl Rig {
     /// The cameras of training and test views.
     ///
     /// # Errors
-    /// When an option is out of range, a file camera is asked for and there is none, or no place
-    /// outside the geometry is found.
+    /// When an option is out of range, the file has no camera to start from, or no place outside the
+    /// geometry is found.
     pub fn cameras(
         &self,
         surface: &Surface,
@@ -108,7 +108,7 @@ impl Rig {
         self.check()?;
         if self.kind == RigKind::File && file.is_empty() {
             let problem =
-                "the file brings no perspective camera; choose orbit, dome, ellipse or inside";
+                "the file has no perspective camera; choose orbit, dome, ellipse or inside";
             return Err(Error::option("--rig", problem));
         }
         let split = |test: bool| {
@@ -159,11 +159,11 @@ impl Rig {
         for attempt in 0..ATTEMPTS {
             if self.kind == RigKind::File && attempt == 0 && !test && (i as usize) < file.len() {
                 // The file's author chose this place.
-                return Ok(self.of_file(&file[i as usize]));
+                return Ok(self.file_camera(&file[i as usize]));
             }
             let (place, target) = self.stand(surface, file, i, test);
             let reach = (place - target).length();
-            // First by the jitter asked for, then ever farther from a place that is no good.
+            // First by the requested jitter, then farther each time.
             let spread = self.jitter.max(0.005 * attempt as f64) * reach;
             let mut shift = || DVec3::new(draws.normal(), draws.normal(), draws.normal());
             let offset = if spread > 0.0 { shift() * spread } else { DVec3::ZERO };
@@ -184,29 +184,19 @@ impl Rig {
         if self.kind != RigKind::File {
             return camera;
         }
-        let like = self.of_file(&file[i as usize % file.len()]);
+        let like = self.file_camera(&file[i as usize % file.len()]);
         let up = -like.world_from_camera.y_axis;
         let turned = Camera::looking(place, target, up, self.fov.to_radians(), self.size());
         Camera { fx: like.fx, fy: like.fy, ..turned }
     }
 
-    fn of_file(&self, file: &FileCamera) -> Camera {
-        let (width, height) = self.size();
-        let focal = 0.5 * f64::from(height) / (0.5 * file.yfov).tan();
-        Camera {
-            width,
-            height,
-            fx: focal,
-            fy: focal,
-            cx: 0.5 * f64::from(width),
-            cy: 0.5 * f64::from(height),
-            world_from_camera: file.world_from_camera,
-            centre: file.centre,
-        }
+    fn file_camera(&self, file: &FileCamera) -> Camera {
+        let focal = 0.5 * f64::from(self.height) / (0.5 * file.yfov).tan();
+        Camera::centred(self.size(), focal, file.world_from_camera, file.centre)
     }
 
     /// Where view `i` of its split stands before jitter, and what it looks at.
-    fn stand(&self, surface: &Surface, file: &[FileCamera], i: u32, test: bool) -> Stand {
+    fn stand(&self, surface: &Surface, file: &[FileCamera], i: u32, test: bool) -> Viewpoint {
         let (lo, hi) = surface.bounds();
         let middle = self.target.map_or(0.5 * (lo + hi), DVec3::from);
         let half = 0.5 * (hi - lo);
@@ -280,7 +270,7 @@ impl Rig {
     }
 }
 
-/// Whether a place is in a solid: most of what is seen from there is the back of surfaces.
+/// Whether a place is inside a solid: most surfaces seen from there show their back.
 fn is_inside(surface: &Surface, place: DVec3) -> bool {
     const RAYS: i32 = 26;
     let (mut fronts, mut backs) = (0, 0);

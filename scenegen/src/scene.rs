@@ -1,6 +1,6 @@
-//! From a source and options to a scene whose views can be rendered.
+//! Prepares a scene from a source and options, so that its views can be rendered.
 //!
-//! One piece: what is decided for a scene is decided in one order.
+//! One piece: geometry, cameras, light and exposure are chosen in this order, each from those before.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use crate::panorama::Panorama;
 use crate::points::{InitPoints, PointCollector, PointOptions};
 use crate::presets::{PRESETS, Staging, open_sky, sun};
 use crate::rig::{Rig, RigKind};
-use crate::shade::{Ambient, Lighting, Traits};
+use crate::shade::{Ambient, Lighting, TriangleFlags};
 use crate::sky::Sky;
 use crate::surface::Surface;
 use crate::trace::{Frame, Tracer, luminances};
@@ -30,7 +30,7 @@ pub enum Source {
     File(PathBuf),
 }
 
-/// How to render it. What is `None` is as the preset says, or the default.
+/// How to render it. `None` stands for the preset's value, or else the default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Options {
     /// Arrangement of the cameras.
@@ -57,7 +57,8 @@ pub struct Options {
     pub shadows: bool,
     /// Whether all materials are diffuse only.
     pub lambert: bool,
-    /// Factor on all light; None chooses where files bring their own lights or sky, and is 1 else.
+    /// Factor on all light. `None` chooses one for files with their own lights or sky, and is 1
+    /// otherwise.
     pub exposure: Option<f32>,
     /// Initial points.
     pub points: PointOptions,
@@ -107,7 +108,7 @@ pub struct View {
     pub camera: Camera,
 }
 
-/// What a scene asks of a trainer.
+/// What a trainer needs to know of a scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Requirements {
     /// Whether every surface looks the same from all sides: colours of degree 0 suffice then.
@@ -137,17 +138,17 @@ pub struct Scene {
     pub rig: Rig,
     /// Options as given.
     pub options: Options,
-    /// What was decided for [`Options::ambient`].
+    /// [`Options::ambient`], or its default for this scene.
     pub ambient: Ambient,
     /// Light from all around.
     pub sky: Sky,
-    /// What was decided for [`Options::exposure`].
+    /// [`Options::exposure`], or the one chosen.
     pub exposure: f32,
-    /// What it asks of a trainer.
+    /// What a trainer needs to know of it.
     pub requirements: Requirements,
     train_cameras: Vec<Camera>,
     lighting: Lighting,
-    traits: Vec<Traits>,
+    flags: Vec<TriangleFlags>,
 }
 
 /// A scene with all its views, in memory.
@@ -156,7 +157,7 @@ pub struct Generated {
     pub scene: Scene,
     /// Rendered views, as [`Scene::views`].
     pub frames: Vec<Frame>,
-    /// Points to start from.
+    /// Initial points.
     pub points: InitPoints,
 }
 
@@ -183,8 +184,8 @@ impl Scene {
     /// Loads or builds the geometry and places the cameras.
     ///
     /// # Errors
-    /// When the preset is unknown, the file is unreadable, malformed or needs what is not
-    /// supported, an option is out of range, or there is no place for a camera.
+    /// When the preset is unknown, the file is unreadable, malformed or needs an
+    /// unsupported feature, an option is out of range, or no camera can be placed.
     pub fn prepare(source: &Source, options: &Options) -> Result<Self, Error> {
         check(options)?;
         let (name, staging, cameras) = stage(source)?;
@@ -197,10 +198,10 @@ impl Scene {
             }
         }
         let surface = Surface::new(&model)?;
-        let rig = decided(rig, options);
+        let rig = with_options(rig, options);
         let (train, test) = rig.cameras(&surface, &cameras)?;
         let ambient = options.ambient.unwrap_or(ambient);
-        let traits = Traits::all(&surface, &model);
+        let flags = TriangleFlags::all(&surface, &model);
         let is_file = matches!(source, Source::File(_));
         let brought_lights = is_file && !model.lights.is_empty();
         if let Some(path) = &options.sky {
@@ -218,9 +219,9 @@ impl Scene {
             let is_fill = options.sky.is_none();
             if options.exposure.is_none() {
                 let only = light(if is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
-                let (surface, model, traits) = (&surface, &model, &traits);
+                let (surface, model, flags) = (&surface, &model, &flags);
                 let tracer =
-                    Tracer { surface, model, traits, lighting: &only, exposure: 1.0, seed: 0 };
+                    Tracer { surface, model, flags, lighting: &only, exposure: 1.0, seed: 0 };
                 exposure = exposure_for(&tracer, &train);
             }
             // Fill light in the units the exposure takes to the image's.
@@ -250,7 +251,7 @@ impl Scene {
             requirements,
             train_cameras: train,
             lighting,
-            traits,
+            flags,
             model,
         })
     }
@@ -290,7 +291,7 @@ impl Scene {
         Tracer {
             surface: &self.surface,
             model: &self.model,
-            traits: &self.traits,
+            flags: &self.flags,
             lighting: &self.lighting,
             exposure: self.exposure,
             seed: self.options.seed,
@@ -358,7 +359,7 @@ fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
     }
 }
 
-fn decided(rig: Rig, options: &Options) -> Rig {
+fn with_options(rig: Rig, options: &Options) -> Rig {
     let kind = options.rig.unwrap_or(rig.kind);
     let default = Rig::default();
     // Another arrangement than the preset's does not inherit what was chosen for that.
@@ -389,7 +390,7 @@ fn decided(rig: Rig, options: &Options) -> Rig {
     }
 }
 
-/// The exposure at which the brightest fiftieth of what is lit is at 0.9.
+/// The exposure at which the 98th percentile of luminance is 0.9.
 fn exposure_for(tracer: &Tracer<'_>, cameras: &[Camera]) -> f32 {
     let step = cameras.len().div_ceil(6).max(1);
     let mut all = Vec::new();

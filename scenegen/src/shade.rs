@@ -8,9 +8,9 @@ use std::sync::OnceLock;
 
 use glam::{DVec3, Vec2, Vec3, Vec4, Vec4Swizzles};
 
-use crate::bundle::{LANES, has};
-use crate::intersect::Meeting;
+use crate::intersect::Intersection;
 use crate::mesh::{AlphaMode, Light, LightKind, Material, Model, Reflection};
+use crate::packet::{LANES, has};
 use crate::random::{
     Draws, cosine_hemisphere, frame, ggx_distribution, ggx_visible_normal, stratum,
 };
@@ -32,13 +32,13 @@ const DIELECTRIC: f32 = 0.04;
 pub enum Ambient {
     /// The whole sky reaches everything; in closed form, no secondary ray.
     Open,
-    /// What of the sky is hidden is sampled, by this many rays per pixel.
+    /// Occlusion of the sky is sampled by this many rays per pixel.
     Occlusion(u32),
-    /// One bounce: what is hidden is replaced by what hides it, by this many rays per pixel.
+    /// One bounce: as occlusion, and the occluding surfaces send their own direct light.
     Bounce(u32),
 }
 
-/// All that shading needs to know of a scene.
+/// The light of a scene.
 pub(crate) struct Lighting {
     /// In local coordinates.
     lights: Vec<Light>,
@@ -63,13 +63,13 @@ pub(crate) struct Point<'a> {
     emitted: Vec3,
 }
 
-/// Random numbers of a pixel, and what its rays met.
+/// A pixel's random numbers, and triangles to try first.
 pub(crate) struct Sampling {
     pub(crate) draws: Draws,
-    /// What a ray from the camera met, by place in leaf order.
+    /// A triangle that a camera ray hit, by place in leaf order.
     pub(crate) met: Option<u32>,
-    /// What hid a light last, by place in leaf order: it is likely to hide it again, and is tried
-    /// first. No result depends on this.
+    /// The last triangle that hid a light, by place in leaf order. It is tried first; no result
+    /// depends on it.
     pub(crate) hid: Option<u32>,
 }
 
@@ -116,7 +116,7 @@ impl Lighting {
     /// light is shared.
     pub(crate) fn radiance(
         &self,
-        matter: &Matter<'_>,
+        shaded: &ShadedSurface<'_>,
         points: &[Seen<'_>],
         sampling: &mut Sampling,
     ) -> [Vec3; LANES] {
@@ -126,15 +126,17 @@ impl Lighting {
         }
         for light in &self.lights {
             let mut rays = [LocalRay::NONE; LANES];
-            // Of each ray, its point's number and the light it brings where nothing is in its way.
-            let mut brings = [(0, Vec3::ZERO); LANES];
+            // For each ray: its point's number and its light if it is not blocked.
+            let mut contributions = [(0, Vec3::ZERO); LANES];
             let mut count = 0;
             for (number, Seen { index, point, view }) in points.iter().enumerate() {
                 if point.is_unlit() {
                     continue;
                 }
                 let u = || stratum(*index, self.grid, sampling.draws.square());
-                let Some((to_light, distance, irradiance)) = arriving(light, point.place, u) else {
+                let Some((to_light, distance, irradiance)) =
+                    light_arriving_at(light, point.place, u)
+                else {
                     continue;
                 };
                 if point.geometric.dot(to_light) <= 0.0 {
@@ -142,13 +144,13 @@ impl Lighting {
                 }
                 let sent = point.reflected(*view, to_light) * irradiance;
                 if sent.max_element() > 0.0 {
-                    rays[count] = lifted_to(point, to_light, distance);
-                    brings[count] = (number, sent);
+                    rays[count] = shadow_ray(point, to_light, distance);
+                    contributions[count] = (number, sent);
                     count += 1;
                 }
             }
-            let hidden = self.shadowed(matter, &rays[..count], sampling);
-            for (lane, &(number, sent)) in brings.iter().enumerate().take(count) {
+            let hidden = self.shadowed(shaded, &rays[..count], sampling);
+            for (lane, &(number, sent)) in contributions.iter().enumerate().take(count) {
                 if !has(hidden, lane) {
                     total[number] += sent;
                 }
@@ -156,29 +158,39 @@ impl Lighting {
         }
         for (total, seen) in total.iter_mut().zip(points) {
             if !seen.point.is_unlit() {
-                *total += self.ambient(matter, seen, sampling);
+                *total += self.ambient(shaded, seen, sampling);
             }
         }
         total
     }
 
-    /// Which rays to a light do not reach it, as bits.
-    fn shadowed(&self, matter: &Matter<'_>, rays: &[LocalRay], sampling: &mut Sampling) -> u32 {
+    /// The rays that do not reach their light, as bits.
+    fn shadowed(
+        &self,
+        shaded: &ShadedSurface<'_>,
+        rays: &[LocalRay],
+        sampling: &mut Sampling,
+    ) -> u32 {
         if !self.shadows {
             return 0;
         }
-        let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
-        matter.surface.occluded_of(rays, &mut sampling.hid, solid)
+        let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
+        shaded.surface.occluded_each(rays, &mut sampling.hid, solid)
     }
 
-    fn ambient(&self, matter: &Matter<'_>, seen: &Seen<'_>, sampling: &mut Sampling) -> Vec3 {
+    fn ambient(
+        &self,
+        shaded: &ShadedSurface<'_>,
+        seen: &Seen<'_>,
+        sampling: &mut Sampling,
+    ) -> Vec3 {
         let Seen { index, ref point, view } = *seen;
         let shiny = point.material.reflection == Reflection::MetalRough;
         let diffuse_colour = point.diffuse_colour();
         let rays = match self.ambient {
             Ambient::Open => {
                 let diffuse = diffuse_colour * self.sky.irradiance(point.shading) / PI;
-                return if shiny { diffuse + self.mirrored_sky(point, view) } else { diffuse };
+                return if shiny { diffuse + self.specular_sky(point, view) } else { diffuse };
             }
             Ambient::Occlusion(rays) | Ambient::Bounce(rays) => rays,
         };
@@ -191,7 +203,7 @@ impl Lighting {
             let d = cosine_hemisphere(u);
             let direction = d.x * tangent + d.y * bitangent + d.z * point.shading;
             if point.geometric.dot(direction) > 0.0 {
-                sum += self.arriving_from(matter, point, direction, bounce, sampling);
+                sum += self.incoming(shaded, point, direction, bounce, sampling);
             }
         }
         let diffuse = diffuse_colour * sum / count as f32;
@@ -199,31 +211,31 @@ impl Lighting {
             return diffuse;
         }
         if !bounce {
-            return diffuse + self.mirrored_sky(point, view);
+            return diffuse + self.specular_sky(point, view);
         }
-        diffuse + self.mirrored(matter, seen, sampling)
+        diffuse + self.specular_bounce(shaded, seen, sampling)
     }
 
-    /// Radiance that arrives from a direction: the sky, or what hides it, as lit directly.
-    fn arriving_from(
+    /// Radiance from a direction: the sky's, or that of the directly lit surface before it.
+    fn incoming(
         &self,
-        matter: &Matter<'_>,
+        shaded: &ShadedSurface<'_>,
         point: &Point<'_>,
         direction: Vec3,
         bounce: bool,
         sampling: &mut Sampling,
     ) -> Vec3 {
-        let ray = lifted(point, direction, f32::MAX);
+        let ray = secondary_ray(point, direction, f32::MAX);
         if !bounce {
-            let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
-            let hidden = matter.surface.occluder(&ray, solid).is_some();
+            let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
+            let hidden = shaded.surface.occluder(&ray, solid).is_some();
             return if hidden { Vec3::ZERO } else { self.sky.radiance(direction) };
         }
-        let solid = |slot, at: &Meeting| matter.is_solid(slot, at);
-        let Some(hit) = matter.surface.closest(&ray, None, None, solid) else {
+        let solid = |slot, at: &Intersection| shaded.is_solid(slot, at);
+        let Some(hit) = shaded.surface.closest(&ray, None, None, solid) else {
             return self.sky.radiance(direction);
         };
-        let (there, _) = Point::read(matter, &ray, &hit, 0.0);
+        let (there, _) = Point::read(shaded, &ray, &hit, 0.0);
         if there.is_unlit() {
             return there.base;
         }
@@ -231,13 +243,14 @@ impl Lighting {
         let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
         for light in &self.lights {
             let u = || sampling.draws.square();
-            let Some((to_light, distance, irradiance)) = arriving(light, there.place, u) else {
+            let Some((to_light, distance, irradiance)) = light_arriving_at(light, there.place, u)
+            else {
                 continue;
             };
             let cos = there.shading.dot(to_light);
             if cos > 0.0
                 && there.geometric.dot(to_light) > 0.0
-                && self.shadowed(matter, &[lifted_to(&there, to_light, distance)], sampling) == 0
+                && self.shadowed(shaded, &[shadow_ray(&there, to_light, distance)], sampling) == 0
             {
                 total += there.diffuse_colour() / PI * cos * irradiance;
             }
@@ -245,9 +258,9 @@ impl Lighting {
         total
     }
 
-    /// The sky in a glossy surface, without rays: the radiance of a blurred sky times the share of it
-    /// that is reflected.
-    fn mirrored_sky(&self, point: &Point<'_>, view: Vec3) -> Vec3 {
+    /// The sky's specular reflection without rays: a blurred sky's radiance times the reflected
+    /// share.
+    fn specular_sky(&self, point: &Point<'_>, view: Vec3) -> Vec3 {
         let cos = point.shading.dot(view).max(0.0);
         let (scale, bias) = directional_albedo(cos, point.roughness);
         let albedo = point.f0() * scale + Vec3::splat(bias);
@@ -255,8 +268,13 @@ impl Lighting {
         albedo * self.sky.blurred(direction, point.roughness)
     }
 
-    /// What a glossy surface mirrors, by one sampled direction.
-    fn mirrored(&self, matter: &Matter<'_>, seen: &Seen<'_>, sampling: &mut Sampling) -> Vec3 {
+    /// The specular reflection of sky and surfaces, by one sampled direction.
+    fn specular_bounce(
+        &self,
+        shaded: &ShadedSurface<'_>,
+        seen: &Seen<'_>,
+        sampling: &mut Sampling,
+    ) -> Vec3 {
         let Seen { index, ref point, view } = *seen;
         let (tangent, bitangent) = frame(point.shading);
         let cos = view.dot(point.shading).max(1e-4);
@@ -270,7 +288,7 @@ impl Lighting {
         }
         let weight = fresnel(point.f0(), local.dot(half))
             * shadowing_after_masking(local.z, out.z, point.alpha_ggx);
-        weight * self.arriving_from(matter, point, direction, true, sampling)
+        weight * self.incoming(shaded, point, direction, true, sampling)
     }
 }
 
@@ -278,18 +296,18 @@ impl<'a> Point<'a> {
     /// Reads the material at a hit; also its alpha, 0 where a mask says there is no surface.
     /// `width` is the width of the ray's cone there, local units.
     pub(crate) fn read(
-        matter: &Matter<'a>,
+        shaded: &ShadedSurface<'a>,
         ray: &LocalRay,
         hit: &LocalHit,
         width: f32,
     ) -> (Self, f32) {
-        let (at, material) = matter.locate(hit.slot, &hit.at, width);
-        let model = matter.model;
+        let (at, material) = shaded.locate(hit.slot, &hit.at, width);
+        let model = shaded.model;
         let [a, b, c] = at.corners;
-        let Meeting { v, w, front, .. } = hit.at;
+        let Intersection { v, w, front, .. } = hit.at;
         let face = (b - a).cross(c - a);
         let side = if front { 1.0 } else { -1.0 };
-        // A triangle met edge-on or without area has no normal of its own.
+        // A triangle hit edge-on or without area has no normal of its own.
         let geometric = face.normalize_or(-ray.direction * side) * side;
         let base = at.base(material);
         let alpha = at.alpha(material, base.w);
@@ -301,7 +319,7 @@ impl<'a> Point<'a> {
         }
         if let Some(texture) = &material.normal_texture {
             let texel = at.texel(Some(texture)).xyz();
-            shading = at.bumped(shading, side, texel, texture, material.normal_scale);
+            shading = at.normal_mapped(shading, side, texel, texture, material.normal_scale);
             // A normal that turns away from the viewer's side would be lit from behind.
             if shading.dot(geometric) <= 0.0 {
                 shading = geometric;
@@ -360,27 +378,27 @@ impl<'a> Point<'a> {
     }
 }
 
-/// What rays meet: geometry with its materials.
-pub(crate) struct Matter<'a> {
+/// Geometry with its materials, as rays hit it.
+pub(crate) struct ShadedSurface<'a> {
     pub(crate) surface: &'a Surface,
     pub(crate) model: &'a Model,
     /// By place in leaf order; empty where every triangle is opaque from both sides.
-    pub(crate) traits: &'a [Traits],
+    pub(crate) flags: &'a [TriangleFlags],
 }
 
-/// What a ray must know of a triangle before it counts as met.
+/// Properties of a triangle that decide whether a ray hits it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Traits {
+pub(crate) struct TriangleFlags {
     /// Its back is invisible.
     pub(crate) one_sided: bool,
     /// Its alpha may be below one.
     pub(crate) see_through: bool,
 }
 
-impl Traits {
-    /// The traits of all triangles by place in leaf order; empty where none has any.
+impl TriangleFlags {
+    /// The flags of all triangles by place in leaf order; empty where none is set.
     pub(crate) fn all(surface: &Surface, model: &Model) -> Vec<Self> {
-        let of = |slot: usize| {
+        let flags = |slot: usize| {
             let triangle = surface.triangle_of(slot as u32) as usize;
             let material = &model.materials[model.triangle_materials[triangle] as usize];
             Self {
@@ -388,41 +406,46 @@ impl Traits {
                 see_through: material.alpha != AlphaMode::Opaque,
             }
         };
-        let all: Vec<Self> = (0..surface.len()).map(of).collect();
+        let all: Vec<Self> = (0..surface.len()).map(flags).collect();
         if all.iter().all(|&t| t == Self::default()) { Vec::new() } else { all }
     }
 }
 
-impl<'a> Matter<'a> {
+impl<'a> ShadedSurface<'a> {
     /// Whether a triangle is there at all for a ray from a camera.
     #[inline]
-    pub(crate) fn is_visible(&self, slot: u32, at: &Meeting) -> bool {
-        at.front || !self.traits.get(slot as usize).is_some_and(|t| t.one_sided)
+    pub(crate) fn is_visible(&self, slot: u32, at: &Intersection) -> bool {
+        at.front || !self.flags.get(slot as usize).is_some_and(|t| t.one_sided)
     }
 
-    /// Whether a triangle hides what is behind it: for shadows and sampled light, from both sides,
-    /// where its alpha is at least one half.
-    pub(crate) fn is_solid(&self, slot: u32, at: &Meeting) -> bool {
-        if !self.traits.get(slot as usize).is_some_and(|t| t.see_through) {
+    /// Whether a triangle is opaque here, for shadows and sampled light: from both sides, where its
+    /// alpha is at least one half.
+    pub(crate) fn is_solid(&self, slot: u32, at: &Intersection) -> bool {
+        if !self.flags.get(slot as usize).is_some_and(|t| t.see_through) {
             return true;
         }
         let (at, material) = self.locate(slot, at, 0.0);
         at.alpha(material, at.base(material).w) >= 0.5
     }
 
-    fn locate(&self, slot: u32, at: &Meeting, width: f32) -> (Located<'a>, &'a Material) {
+    fn locate(
+        &self,
+        slot: u32,
+        at: &Intersection,
+        width: f32,
+    ) -> (TrianglePoint<'a>, &'a Material) {
         let model = self.model;
         let triangle = self.surface.triangle_of(slot) as usize;
         let indices = model.triangles[triangle].map(|i| i as usize);
         let material = &model.materials[model.triangle_materials[triangle] as usize];
         let weights = [1.0 - at.v - at.w, at.v, at.w];
         let corners = self.surface.triangles[slot as usize];
-        (Located { model, indices, weights, corners, width }, material)
+        (TrianglePoint { model, indices, weights, corners, width }, material)
     }
 }
 
-/// A place on a triangle, for reading what its corners and textures say.
-struct Located<'a> {
+/// A point of a triangle, for interpolating its corners and sampling its textures.
+struct TrianglePoint<'a> {
     model: &'a Model,
     indices: [usize; 3],
     weights: [f32; 3],
@@ -430,7 +453,7 @@ struct Located<'a> {
     width: f32,
 }
 
-impl Located<'_> {
+impl TrianglePoint<'_> {
     fn base(&self, material: &Material) -> Vec4 {
         let tint = self.interpolated(&self.model.colours).unwrap_or(Vec4::ONE);
         material.base * self.texel(material.base_texture.as_ref()) * tint
@@ -476,7 +499,7 @@ impl Located<'_> {
     }
 
     /// The shading normal as a normal map turns it.
-    fn bumped(
+    fn normal_mapped(
         &self,
         normal: Vec3,
         side: f32,
@@ -519,7 +542,11 @@ impl Located<'_> {
 
 /// Direction to a light, distance, and irradiance of a surface that faces it; `u` draws the point
 /// of an area light. None where it does not shine.
-fn arriving(light: &Light, place: Vec3, u: impl FnOnce() -> Vec2) -> Option<(Vec3, f32, Vec3)> {
+fn light_arriving_at(
+    light: &Light,
+    place: Vec3,
+    u: impl FnOnce() -> Vec2,
+) -> Option<(Vec3, f32, Vec3)> {
     let from_point = |position: DVec3| {
         let way = position.as_vec3() - place;
         let distance = way.length();
@@ -532,13 +559,13 @@ fn arriving(light: &Light, place: Vec3, u: impl FnOnce() -> Vec2) -> Option<(Vec
         }
         LightKind::Point { position } => {
             let (to, distance) = from_point(position)?;
-            Some((to, distance, light.intensity * windowed(distance, light.range)))
+            Some((to, distance, light.intensity * attenuation(distance, light.range)))
         }
         LightKind::Spot { position, direction, cos_inner, cos_outer } => {
             let (to, distance) = from_point(position)?;
             let cos = -to.dot(direction.as_vec3());
             let share = ((cos - cos_outer) / (cos_inner - cos_outer).max(1e-3)).clamp(0.0, 1.0);
-            let irradiance = light.intensity * (windowed(distance, light.range) * share * share);
+            let irradiance = light.intensity * (attenuation(distance, light.range) * share * share);
             (share > 0.0).then_some((to, distance, irradiance))
         }
         LightKind::Area { corner, u: side_u, v: side_v } => {
@@ -554,7 +581,7 @@ fn arriving(light: &Light, place: Vec3, u: impl FnOnce() -> Vec2) -> Option<(Vec
 }
 
 /// 1 / distance², cut off smoothly at the range (KHR_lights_punctual, recommended form).
-fn windowed(distance: f32, range: f64) -> f32 {
+fn attenuation(distance: f32, range: f64) -> f32 {
     let inverse_square = 1.0 / (distance * distance);
     if !range.is_finite() {
         return inverse_square;
@@ -564,11 +591,11 @@ fn windowed(distance: f32, range: f64) -> f32 {
 }
 
 /// The ray from a point that ends just before a light.
-fn lifted_to(point: &Point<'_>, to_light: Vec3, distance: f32) -> LocalRay {
-    lifted(point, to_light, (distance - 2.0 * LIFT).max(0.0))
+fn shadow_ray(point: &Point<'_>, to_light: Vec3, distance: f32) -> LocalRay {
+    secondary_ray(point, to_light, (distance - 2.0 * LIFT).max(0.0))
 }
 
-fn lifted(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {
+fn secondary_ray(point: &Point<'_>, direction: Vec3, tmax: f32) -> LocalRay {
     LocalRay { origin: point.place + point.geometric * LIFT, direction, tmin: 0.0, tmax }
 }
 
@@ -635,7 +662,7 @@ fn visibility(cos_view: f32, cos_light: f32, alpha: f32) -> f32 {
     0.5 / (v + l)
 }
 
-/// G2 / G1: what is left of a sampled visible normal's light.
+/// G2 / G1: the weight of a direction sampled by a visible normal.
 pub(crate) fn shadowing_after_masking(cos_view: f32, cos_out: f32, alpha: f32) -> f32 {
     let a2 = alpha * alpha;
     let lambda = |c: f32| 0.5 * ((1.0 + a2 * (1.0 / (c * c) - 1.0).max(0.0)).sqrt() - 1.0);

@@ -11,7 +11,7 @@ use serde::{Serialize, Serializer};
 
 use crate::panorama::Panorama;
 
-/// The sky. It lights; where a ray meets no surface the image stays transparent.
+/// The sky. It only lights: where a ray hits no surface, the image stays transparent.
 #[derive(Debug, Clone, Serialize)]
 #[serde(untagged)]
 pub enum Sky {
@@ -24,11 +24,11 @@ pub enum Sky {
         /// Upward direction, unit length.
         up: [f32; 3],
     },
-    /// As an image has it.
+    /// From an image.
     Image(#[serde(serialize_with = "shared")] Arc<Panorama>),
 }
 
-/// As what is shared.
+/// Serializes a shared panorama.
 fn shared<S: Serializer>(image: &Panorama, to: S) -> Result<S::Ok, S::Error> {
     image.serialize(to)
 }

@@ -8,14 +8,14 @@ use std::sync::OnceLock;
 
 use glam::{Vec2, Vec4};
 
-/// How texture coordinates beyond the unit square are meant.
+/// What lies beyond the unit square of texture coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wrap {
-    /// The edge goes on.
+    /// The edge's texels.
     Clamp,
-    /// The image repeats.
+    /// The image repeated.
     Repeat,
-    /// The image repeats, every other time mirrored.
+    /// The image repeated, every second copy mirrored.
     Mirror,
 }
 
@@ -116,7 +116,7 @@ impl Texture {
     #[must_use]
     pub fn sample(&self, uv: Vec2, sampler: &Sampler, footprint: f32) -> Vec4 {
         let uv = Vec2::new(wrapped(uv.x, sampler.wrap_u), wrapped(uv.y, sampler.wrap_v));
-        let values = Values::of(self.srgb);
+        let values = Values::tables(self.srgb);
         let first = &self.levels[0];
         let texels = footprint * ((first.width * first.height) as f32).sqrt();
         let level = if sampler.mipmaps { texels.log2() } else { 0.0 };
@@ -167,7 +167,7 @@ impl Level {
     /// The image at half its size, averaged in linear light.
     fn halved(&self, srgb: bool) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
-        let values = Values::of(srgb);
+        let values = Values::tables(srgb);
         let mut texels = Vec::with_capacity(4 * width as usize * height as usize);
         for y in 0..height {
             for x in 0..width {
@@ -237,7 +237,7 @@ pub fn srgb_from_linear(v: f64) -> f64 {
     if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// What the bytes of a texel mean: linear light, and coverage.
+/// Tables from a texel's bytes to linear light and to coverage.
 #[derive(Debug, Clone, Copy)]
 struct Values {
     colour: &'static [f32; 256],
@@ -245,7 +245,7 @@ struct Values {
 }
 
 impl Values {
-    fn of(srgb: bool) -> Self {
+    fn tables(srgb: bool) -> Self {
         static TABLES: OnceLock<[[f32; 256]; 2]> = OnceLock::new();
         let [plain, decoded] = TABLES.get_or_init(|| {
             let decoded = |i: usize| linear_from_srgb(i as f64 / 255.0) as f32;

@@ -1,8 +1,8 @@
-//! The tree over a mesh's triangles, built in parts: the library's builder takes three times the
-//! memory of what it makes, so it is given a part of the mesh at a time.
+//! Builds the tree over a mesh's triangles in parts: the library's builder needs three times the memory
+//! of its result.
 //!
 //! Parts are halves of halves, cut at the median triangle across the widest axis. They hang from the
-//! nodes of those cuts, and the library's optimiser then moves what lies badly, across parts too.
+//! nodes of those cuts, and the library's optimiser then improves the whole tree.
 
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
@@ -13,21 +13,21 @@ use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 
 /// Most triangles of a part. The builder takes some 200 bytes for each.
 const PART: usize = 1 << 16;
-/// Share of all nodes, those with the largest boxes, that the last improvement looks at.
+/// Share of all nodes, those with the largest boxes, that the last optimisation tries to move.
 const IMPROVED: f32 = 0.1;
 
 /// The tree over `count` triangles, whose boxes `box_of` tells. Leaves hold up to eight triangles,
 /// `primitive_indices` their numbers.
 pub(crate) fn build(count: usize, box_of: impl Fn(u32) -> Aabb) -> Bvh2 {
-    grow(count, PART, &box_of)
+    build_in_parts(count, PART, &box_of)
 }
 
-fn grow(count: usize, part: usize, box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
+fn build_in_parts(count: usize, part: usize, box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
     let mut ids: Vec<u32> = (0..count as u32).collect();
     let mut tree = Bvh2::default();
     tree.nodes.push(Bvh2Node::default());
     tree.primitive_indices.reserve_exact(count);
-    hang(&mut tree, 0, &mut ids, part, box_of);
+    build_below(&mut tree, 0, &mut ids, part, box_of);
     drop(ids);
     // The optimiser's stacks are sized by it.
     tree.max_depth = tree.max_depth.max(depth(&tree));
@@ -38,7 +38,7 @@ fn grow(count: usize, part: usize, box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
 }
 
 /// Puts the tree over `ids` at a node that is there already.
-fn hang(
+fn build_below(
     tree: &mut Bvh2,
     place: usize,
     ids: &mut [u32],
@@ -61,8 +61,8 @@ fn hang(
     let (left, right) = ids.split_at_mut(half);
     let pair = tree.nodes.len();
     tree.nodes.extend([Bvh2Node::default(); 2]);
-    hang(tree, pair, left, part, box_of);
-    hang(tree, pair + 1, right, part, box_of);
+    build_below(tree, pair, left, part, box_of);
+    build_below(tree, pair + 1, right, part, box_of);
     let around = tree.nodes[pair].aabb().union(tree.nodes[pair + 1].aabb());
     tree.nodes[place] = Bvh2Node::new(around, 0, pair as u32);
 }
@@ -102,8 +102,8 @@ fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
     part
 }
 
-/// What the optimiser does by itself, but for nodes in any order: it looks for the largest boxes in
-/// the first nodes alone.
+/// The optimiser's own schedule, for nodes in any order: the optimiser looks for the largest boxes
+/// among the first nodes only.
 fn improve(tree: &mut Bvh2) {
     let mut optimiser = ReinsertionOptimizer::default();
     let mut largest: Vec<(f32, u32)> = Vec::new();
@@ -184,7 +184,7 @@ mod tests {
     fn parts_make_one_tree() {
         for count in [1, 2, 7, 8, 9, 100, 1000] {
             for part in [1, 3, 64, 1000] {
-                let tree = grow(count as usize, part, &box_of);
+                let tree = build_in_parts(count as usize, part, &box_of);
                 check(&tree, count);
                 assert_eq!(tree.primitive_indices.len(), count as usize);
             }
@@ -198,7 +198,8 @@ mod tests {
             let areas: f32 = tree.nodes.iter().map(|node| node.aabb().half_area()).sum();
             areas / tree.nodes[0].aabb().half_area()
         };
-        let (whole, parts) = (grow(5000, 5000, &box_of), grow(5000, 500, &box_of));
+        let (whole, parts) =
+            (build_in_parts(5000, 5000, &box_of), build_in_parts(5000, 500, &box_of));
         assert!(cost(&parts) < 1.05 * cost(&whole), "{} {}", cost(&parts), cost(&whole));
     }
 }

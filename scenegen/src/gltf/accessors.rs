@@ -1,4 +1,4 @@
-//! Buffers, buffer views and accessors, every offset checked.
+//! Reads buffers, buffer views and accessors; every offset is checked.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -117,7 +117,7 @@ impl<'a> Buffers<'a> {
             self.read[index] = Some(bytes);
         }
         let whole = self.read[index].as_deref().unwrap_or_default();
-        // What lies beyond the declared length is padding.
+        // Bytes beyond the declared length are padding.
         Ok(&whole[..usize::try_from(buffer.byte_length.0).unwrap_or(whole.len()).min(whole.len())])
     }
 

@@ -1,4 +1,4 @@
-//! Materials, textures and samplers.
+//! Reads glTF materials, textures and samplers.
 
 use std::collections::HashMap;
 use std::path::Path;

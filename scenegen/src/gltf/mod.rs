@@ -1,12 +1,12 @@
-//! glTF 2.0, as `.gltf` with files or data URIs and as `.glb`.
+//! Loads glTF 2.0, as `.gltf` with files or data URIs and as `.glb`.
 //!
 //! The `gltf` crate's types describe the JSON; indices, offsets and counts are checked here, as its
 //! own readers index without looking. Skins, morph targets and animations are left as they are at
 //! rest. Occlusion textures are ignored: the tracer computes occlusion when asked.
 //!
-//! What nothing here depends on is not complained of: alignments, bounds of accessors, targets of
+//! Errors that cannot change the result are ignored: alignments, bounds of accessors, targets of
 //! buffer views, names of attributes that are not read, morph targets, and objects that the scene
-//! does not use. `tests/shared.rs` lists what becomes of a validator's test files.
+//! does not use. `tests/shared.rs` lists the outcome for each of a validator's test files.
 //!
 //! One piece: a node's mesh, camera and light share its walk.
 
@@ -90,7 +90,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
             return Err(fault(path, what, "there are more than a million"));
         }
     }
-    let folder = Folder::of(path)?;
+    let folder = Folder::around(path)?;
     let mut reader = Reader {
         path,
         root: &root,
@@ -110,12 +110,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
 }
 
 pub(super) fn fault(path: &Path, element: impl Into<String>, problem: impl Into<String>) -> Error {
-    Error::Malformed {
-        path: path.to_owned(),
-        element: element.into(),
-        problem: problem.into(),
-        remedy: REMEDY,
-    }
+    Error::malformed(path, element, problem, REMEDY)
 }
 
 /// The JSON part. Whole numbers may be written as 1.0 (glTF 2.0, 2.7.1), which the crate's types

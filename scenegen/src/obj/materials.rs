@@ -32,7 +32,7 @@ pub(super) struct Materials {
 impl Materials {
     pub(super) fn new(obj: &Path) -> Result<Self, Error> {
         let (names, textures) = (HashSet::new(), HashMap::new());
-        Ok(Self { folder: Folder::of(obj)?, names, textures, model: Model::default() })
+        Ok(Self { folder: Folder::around(obj)?, names, textures, model: Model::default() })
     }
 
     /// Notes, once, that a material is not defined.

@@ -125,12 +125,8 @@ impl Read for Statements<'_> {
 }
 
 fn fault(path: &Path, line: usize, problem: impl Into<String>) -> Error {
-    Error::Malformed {
-        path: path.to_owned(),
-        element: format!("line {line}"),
-        problem: problem.into(),
-        remedy: "correct the file or export it again",
-    }
+    let remedy = "correct the file or export it again";
+    Error::malformed(path, format!("line {line}"), problem, remedy)
 }
 
 /// The first word and what follows it.

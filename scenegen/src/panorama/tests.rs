@@ -16,7 +16,7 @@ fn unit(draws: &mut Draws) -> Vec3 {
 }
 
 /// An image whose pixels are a function of their direction.
-fn of(width: usize, radiance: impl Fn(Vec3) -> Vec3) -> Panorama {
+fn panorama(width: usize, radiance: impl Fn(Vec3) -> Vec3) -> Panorama {
     let pixels = (0..width * width / 2).map(|i| radiance(direction(i, width))).collect();
     Panorama::new("test".into(), width, pixels)
 }
@@ -25,7 +25,7 @@ fn of(width: usize, radiance: impl Fn(Vec3) -> Vec3) -> Panorama {
 fn an_image_of_one_colour_is_the_uniform_sky() {
     let uniform = Sky::uniform(0.7);
     for width in [2, 64, 200] {
-        let image = Sky::Image(of(width, |_| Vec3::splat(0.7)).into());
+        let image = Sky::Image(panorama(width, |_| Vec3::splat(0.7)).into());
         let mut draws = Draws::new(5, &[]);
         for _ in 0..500 {
             let (d, roughness) = (unit(&mut draws), draws.unit());
@@ -44,7 +44,7 @@ fn an_image_of_one_colour_is_the_uniform_sky() {
 fn an_image_of_a_gradient_lights_like_the_gradient() {
     let up = [0.0, 1.0, 0.0];
     let gradient = Sky::Gradient { zenith: [1.0, 0.5, 0.2], ground: [0.1, 0.2, 0.4], up };
-    let image = Sky::Image(of(128, |d| gradient.radiance(d)).into());
+    let image = Sky::Image(panorama(128, |d| gradient.radiance(d)).into());
     let mut draws = Draws::new(6, &[]);
     for _ in 0..500 {
         let d = unit(&mut draws);

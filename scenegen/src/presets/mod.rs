@@ -1,4 +1,4 @@
-//! Built-in scenes: exact geometry from a few dozen lines each, no external data.
+//! The built-in scenes: exact geometry, no external data.
 //!
 //! A scene's file documents its geometry. Lengths are in metres; +y is up.
 
@@ -28,7 +28,7 @@ pub struct Preset {
     pub(crate) build: fn() -> Staging,
 }
 
-/// What a preset decides.
+/// A preset's geometry, light and cameras.
 pub(crate) struct Staging {
     pub(crate) model: Model,
     pub(crate) sky: Sky,

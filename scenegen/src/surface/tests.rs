@@ -3,8 +3,8 @@
 use glam::DQuat;
 
 use super::*;
-use crate::bundle::{LANES, has};
 use crate::nearest::on_triangle;
+use crate::packet::{LANES, has};
 use crate::primitives::icosphere;
 use crate::random::Draws;
 
@@ -51,7 +51,7 @@ fn soup(count: usize, seed: u64) -> Vec<[DVec3; 3]> {
 fn brute_force(surface: &Surface, ray: &LocalRay) -> Option<(f32, u32)> {
     let sheared = ShearedRay::new(ray.origin, ray.direction);
     let meet = |slot: u32| {
-        let at = sheared.meet(&surface.triangles[slot as usize])?;
+        let at = sheared.intersect(&surface.triangles[slot as usize])?;
         (at.t > ray.tmin && at.t <= ray.tmax).then_some((at.t, surface.triangle_of(slot)))
     };
     (0..surface.len() as u32)
@@ -115,7 +115,7 @@ fn meetings_behind_the_first_come_in_order_and_all() {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
         let mut expected: Vec<(f32, u32)> = (0..surface.len() as u32)
             .filter_map(|slot| {
-                let at = sheared.meet(&surface.triangles[slot as usize])?;
+                let at = sheared.intersect(&surface.triangles[slot as usize])?;
                 (at.t > ray.tmin && at.t <= ray.tmax).then_some((at.t, surface.triangle_of(slot)))
             })
             .collect();
@@ -288,9 +288,9 @@ fn bundles_find_what_their_rays_find_alone() {
             }
             // Every other triangle is not there.
             for accept in [|_: u32| true, |slot: u32| slot.is_multiple_of(2)] {
-                let found = surface.closest_of(&rays, |slot, _| accept(slot));
+                let found = surface.closest_each(&rays, |slot, _| accept(slot));
                 let mut hint = Some(0).filter(|_| round % 2 == 0);
-                let hidden = surface.occluded_of(&rays, &mut hint, |slot, _| accept(slot));
+                let hidden = surface.occluded_each(&rays, &mut hint, |slot, _| accept(slot));
                 for (lane, ray) in rays.iter().enumerate() {
                     let alone = surface.closest(ray, None, None, |slot, _| accept(slot));
                     let told = |hit: Option<LocalHit>| hit.map(|hit| (hit.slot, hit.at));
@@ -317,7 +317,7 @@ fn what_is_beside_a_pyramid_is_met_by_no_ray_in_it() {
         let (u, v) = (0.2 * point(&mut draws), 0.2 * point(&mut draws));
         let at = |x: f64, y: f64| aim - eye + x * u + y * v;
         let corners = [at(-1.01, -1.01), at(1.01, -1.01), at(-1.01, 1.01), at(1.01, 1.01)];
-        if !surface.is_beside(eye, corners) {
+        if !surface.is_missed_by(eye, corners) {
             continue;
         }
         beside += 1;

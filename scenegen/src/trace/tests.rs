@@ -16,10 +16,10 @@ use crate::{Options, Scene, Source};
 /// A rendering of a model by a camera.
 fn render(model: &Model, camera: &Camera, sky: Sky, ambient: Ambient) -> Frame {
     let surface = Surface::new(model).expect("triangles");
-    let traits = Traits::all(&surface, model);
+    let flags = TriangleFlags::all(&surface, model);
     let lighting = Lighting::new(&model.lights, &surface, sky, (ambient, true, 4));
-    let (surface, traits, lighting) = (&surface, &traits[..], &lighting);
-    Tracer { surface, model, traits, lighting, exposure: 1.0, seed: 1 }.render(camera, 0)
+    let (surface, flags, lighting) = (&surface, &flags[..], &lighting);
+    Tracer { surface, model, flags, lighting, exposure: 1.0, seed: 1 }.render(camera, 0)
 }
 
 fn above(height: f64) -> Camera {

@@ -1,4 +1,4 @@
-//! Float images as this program writes them, read back.
+//! Reads the float images that this program writes.
 
 use std::fs;
 use std::io::Cursor;
@@ -7,11 +7,11 @@ use std::path::Path;
 use exr::meta::MetaData;
 use exr::prelude::{ReadChannels, ReadLayers, SampleType, read as reader};
 
+use super::REMEDY;
 use crate::error::Error;
 
 /// Most bytes that one byte of a compressed file can stand for: zip's limit, 1032, and a margin.
 const EXPANSION: u64 = 1100;
-const REMEDY: &str = "write the scene again with densify scenegen --overwrite";
 
 /// The channels of the image, in the order named; `None` if it has another size.
 pub(super) fn read<const N: usize>(
@@ -20,12 +20,7 @@ pub(super) fn read<const N: usize>(
     (width, height): (u32, u32),
 ) -> Result<Option<[Vec<f32>; N]>, Error> {
     let bytes = fs::read(path).map_err(Error::io(path))?;
-    let bad = |element: &str, problem: String| Error::Malformed {
-        path: path.to_owned(),
-        element: element.to_owned(),
-        problem,
-        remedy: REMEDY,
-    };
+    let bad = |element: &str, problem: String| Error::malformed(path, element, problem, REMEDY);
     let meta = MetaData::read_from_buffered(Cursor::new(&bytes), false);
     let meta = meta.map_err(|error| bad("header", error.to_string()))?;
     let [header] = &meta.headers[..] else {

@@ -1,26 +1,21 @@
-//! `mesh.ply` as this program writes it: three f64 corners per triangle, and which are thin.
+//! Reads `mesh.ply` as this program writes it: three f64 corners per triangle, and which are thin.
 
 use std::fs;
 use std::path::Path;
 
 use glam::DVec3;
 
+use super::REMEDY;
 use crate::error::Error;
 
 /// Longest header accepted `[bytes]`.
 const HEADER: usize = 4096;
-const REMEDY: &str = "write the scene again with densify scenegen --overwrite";
 
 /// Corners, three per triangle, and for each triangle whether it is thin (absent in files of
 /// earlier versions: none is).
 pub(super) fn read(path: &Path) -> Result<(Vec<DVec3>, Vec<bool>), Error> {
     let bytes = fs::read(path).map_err(Error::io(path))?;
-    let bad = |element: &str, problem: String| Error::Malformed {
-        path: path.to_owned(),
-        element: element.to_owned(),
-        problem,
-        remedy: REMEDY,
-    };
+    let bad = |element: &str, problem: String| Error::malformed(path, element, problem, REMEDY);
     let start = &bytes[..bytes.len().min(HEADER)];
     const END: &[u8] = b"end_header\n";
     let end = start.windows(END.len()).position(|at| at == END);

@@ -1,4 +1,4 @@
-//! Files and scenes say the same; damaged files are refused.
+//! Tests that files and scenes agree and damaged files are refused.
 
 use std::fs;
 

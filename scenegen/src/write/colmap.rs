@@ -1,4 +1,4 @@
-//! COLMAP's text model under `sparse/0`; image names are relative to `images`.
+//! Writes COLMAP's text model under `sparse/0`; image names are relative to `images`.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -16,7 +16,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     let mut images = String::from(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
     );
-    // What each view sees, and at which place of its list.
+    // The points that each view sees, and their places in its list.
     let mut seen: Vec<Vec<usize>> = vec![Vec::new(); scene.views.len()];
     let mut tracks: Vec<Vec<(usize, usize)>> = vec![Vec::new(); points.positions.len()];
     for (point, views) in points.seen_by.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Float images: depth as channel `Z`, normals as `X`, `Y`, `Z`.
+//! Writes float images: depth as channel `Z`, normals as `X`, `Y`, `Z`.
 
 use std::io::Cursor;
 use std::path::Path;

@@ -1,7 +1,7 @@
-//! A scene as files that trainers read.
+//! Writes a scene as files that trainers read.
 //!
 //! Everything is written into a temporary folder beside the target, which is then renamed: there is
-//! a whole scene or none. Views stream: one image is held at a time.
+//! a complete scene or none. Views stream: one image is held at a time.
 
 mod colmap;
 mod exr;
@@ -21,7 +21,7 @@ use crate::trace::Frame;
 
 pub(crate) use record::NAME as SCENE_FILE;
 
-/// What was written.
+/// A summary of the files written.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Written {
     /// Number of views.

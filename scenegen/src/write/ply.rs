@@ -1,4 +1,4 @@
-//! Initial points and the traced mesh as binary PLY.
+//! Writes initial points and the traced mesh as binary PLY.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};

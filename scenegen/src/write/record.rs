@@ -1,4 +1,4 @@
-//! `scene.json`: what was rendered and how, enough to render it again.
+//! Writes `scene.json`: all that is needed to render the scene again.
 
 use std::path::Path;
 

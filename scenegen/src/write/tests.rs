@@ -1,4 +1,4 @@
-//! What is written, and that nothing is half-written.
+//! Tests that scenes are written completely or not at all.
 
 use super::*;
 use crate::{Options, PointOptions, Source};

@@ -1,4 +1,4 @@
-//! `transforms_train.json` and `transforms_test.json`: the fields of NeRF-synthetic
+//! Writes `transforms_train.json` and `transforms_test.json`: the fields of NeRF-synthetic
 //! (`camera_angle_x`, paths without ending) and those of nerfstudio (`fl_x` … `ply_file_path`).
 
 use std::path::Path;

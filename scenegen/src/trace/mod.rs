@@ -1,16 +1,16 @@
-//! From a camera to an image with alpha, depth and normals.
+//! Renders a camera's view: colour with alpha, depth and normals.
 //!
-//! Every pixel is a function of the scene and the view alone, whichever thread computes it.
+//! Pixels do not depend on the thread that computes them.
 
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::bundle::LANES;
 use crate::camera::Camera;
-use crate::intersect::Meeting;
+use crate::intersect::Intersection;
 use crate::mesh::Model;
+use crate::packet::LANES;
 use crate::random::{Draws, stratum};
-use crate::shade::{Lighting, Matter, Point, Sampling, Seen, Traits};
+use crate::shade::{Lighting, Point, Sampling, Seen, ShadedSurface, TriangleFlags};
 use crate::surface::{LocalHit, LocalRay, Surface};
 use crate::texture::encode;
 
@@ -47,7 +47,7 @@ pub struct Frame {
 pub(crate) struct Tracer<'a> {
     pub(crate) surface: &'a Surface,
     pub(crate) model: &'a Model,
-    pub(crate) traits: &'a [Traits],
+    pub(crate) flags: &'a [TriangleFlags],
     pub(crate) lighting: &'a Lighting,
     /// Factor on all radiance before it is encoded.
     pub(crate) exposure: f32,
@@ -86,9 +86,14 @@ impl Rays {
         &self.rays[..self.count]
     }
 
-    fn read<'a>(&self, matter: &Matter<'a>, lane: usize, hit: &LocalHit) -> (Point<'a>, f32) {
+    fn read<'a>(
+        &self,
+        shaded: &ShadedSurface<'a>,
+        lane: usize,
+        hit: &LocalHit,
+    ) -> (Point<'a>, f32) {
         let width = (hit.at.t + self.entry[lane]) * self.spread;
-        Point::read(matter, &self.rays[lane], hit, width)
+        Point::read(shaded, &self.rays[lane], hit, width)
     }
 
     fn seen<'a>(&self, lane: usize, point: Point<'a>) -> Seen<'a> {
@@ -111,7 +116,7 @@ impl Frame {
 }
 
 impl Tracer<'_> {
-    /// Renders view number `view`, which only seeds its random numbers.
+    /// Renders a view, whose number seeds its random numbers.
     pub(crate) fn render(&self, camera: &Camera, view: u64) -> Frame {
         let mut frame = Frame::empty(camera.width, camera.height);
         let row = camera.width as usize;
@@ -160,11 +165,11 @@ impl Tracer<'_> {
         let (right, bottom) = ((x + width) as f64 + margin, (y + height) as f64 + margin);
         let corners = [(left, top), (right, top), (left, bottom), (right, bottom)];
         let directions = corners.map(|(x, y)| camera.direction(DVec2::new(x, y)));
-        self.surface.is_beside(camera.centre, directions)
+        self.surface.is_missed_by(camera.centre, directions)
     }
 
-    fn matter(&self) -> Matter<'_> {
-        Matter { surface: self.surface, model: self.model, traits: self.traits }
+    fn shaded(&self) -> ShadedSurface<'_> {
+        ShadedSurface { surface: self.surface, model: self.model, flags: self.flags }
     }
 
     /// Colour and alpha of a pixel, whose upper left corner is at `corner`; also a triangle that one
@@ -183,7 +188,7 @@ impl Tracer<'_> {
                 let direction = camera.direction(corner + place.as_dvec2());
                 rays.add(self.surface, index, camera.centre, direction);
             }
-            let (c, a) = self.through(&rays, &mut sampling);
+            let (c, a) = self.sum_rays(&rays, &mut sampling);
             colour += c;
             alpha += a;
         }
@@ -197,24 +202,24 @@ impl Tracer<'_> {
     }
 
     /// Sums over rays: colour, weighted with alpha, and alpha.
-    fn through(&self, rays: &Rays, sampling: &mut Sampling) -> (Vec3, f32) {
-        let matter = self.matter();
-        let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
+    fn sum_rays(&self, rays: &Rays, sampling: &mut Sampling) -> (Vec3, f32) {
+        let shaded = self.shaded();
+        let visible = |slot, at: &Intersection| shaded.is_visible(slot, at);
         let (mut colours, mut alphas) = (Vec3::ZERO, 0.0);
-        // First surfaces together, as most are opaque; what is behind them, ray by ray.
-        let hits = self.surface.closest_of(rays.all(), visible);
+        // The first surfaces in one packet, as most are opaque; those behind them ray by ray.
+        let hits = self.surface.closest_each(rays.all(), visible);
         sampling.met = hits[rays.count / 2].map(|hit| hit.slot).or(sampling.met);
         let mut alphas_of = [0.0; LANES];
         let mut seen = Vec::with_capacity(LANES);
         for (lane, hit) in hits.iter().enumerate() {
             let Some(hit) = hit else { continue };
-            let (point, alpha) = rays.read(&matter, lane, hit);
+            let (point, alpha) = rays.read(&shaded, lane, hit);
             alphas_of[lane] = alpha;
             if alpha > 0.0 {
                 seen.push(rays.seen(lane, point));
             }
         }
-        let mut radiance = self.lighting.radiance(&matter, &seen, sampling).into_iter();
+        let mut radiance = self.lighting.radiance(&shaded, &seen, sampling).into_iter();
         for (lane, hit) in hits.iter().enumerate() {
             let Some(hit) = hit else { continue };
             let alpha = alphas_of[lane];
@@ -224,10 +229,10 @@ impl Tracer<'_> {
             }
             if transmittance > MIN_TRANSMITTANCE {
                 self.layers(&rays.rays[lane], *hit, |hit| {
-                    let (point, alpha) = rays.read(&matter, lane, &hit);
+                    let (point, alpha) = rays.read(&shaded, lane, &hit);
                     if alpha > 0.0 {
                         let seen = [rays.seen(lane, point)];
-                        let radiance = self.lighting.radiance(&matter, &seen, sampling)[0];
+                        let radiance = self.lighting.radiance(&shaded, &seen, sampling)[0];
                         colour += transmittance * alpha * radiance;
                         transmittance *= 1.0 - alpha;
                     }
@@ -251,9 +256,10 @@ impl Tracer<'_> {
         direction: DVec3,
         hint: Option<u32>,
     ) -> Option<(f64, DVec3, u32)> {
-        let matter = self.matter();
+        let shaded = self.shaded();
         let ray = self.surface.enter(origin, direction, f64::INFINITY)?;
-        let solid = |slot, at: &Meeting| matter.is_visible(slot, at) && matter.is_solid(slot, at);
+        let solid =
+            |slot, at: &Intersection| shaded.is_visible(slot, at) && shaded.is_solid(slot, at);
         let hit = self.surface.closest(&ray, None, hint, solid)?;
         let hit = self.surface.describe(origin, direction, hit);
         let normal = if hit.normal.dot(direction) > 0.0 { -hit.normal } else { hit.normal };
@@ -263,8 +269,8 @@ impl Tracer<'_> {
     /// Visits the visible surfaces along a ray behind its first, front to back, while `go_on` says
     /// so.
     fn layers(&self, ray: &LocalRay, first: LocalHit, mut go_on: impl FnMut(LocalHit) -> bool) {
-        let matter = self.matter();
-        let visible = |slot, at: &Meeting| matter.is_visible(slot, at);
+        let shaded = self.shaded();
+        let visible = |slot, at: &Intersection| shaded.is_visible(slot, at);
         let mut last = first;
         for _ in 1..MAX_LAYERS {
             let after = (last.at.t, self.surface.triangle_of(last.slot));
@@ -289,7 +295,7 @@ pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec
             let direction = camera.direction(corner + Vec2::splat(0.5).as_dvec2());
             let mut ray = Rays::new(0.0);
             ray.add(tracer.surface, 0, camera.centre, direction);
-            let (c, a) = tracer.through(&ray, &mut Sampling { draws, met: None, hid: None });
+            let (c, a) = tracer.sum_rays(&ray, &mut Sampling { draws, met: None, hid: None });
             if a > 0.5 {
                 all.push(c.dot(Vec3::new(0.2126, 0.7152, 0.0722)));
             }

@@ -2,7 +2,8 @@
 //!
 //! +y is up; the image's middle shows what lies towards +x, and its right half what lies towards
 //! +z, as it looks from within. Files are untrusted: sizes are checked before anything is decoded,
-//! what is no number is black, and what is infinite is as bright as a half float can say.
+//! NaN
+//! becomes black, and infinity the largest half float.
 //!
 //! Blurred copies are made once, so that a surface that asks for no occlusion needs no secondary
 //! ray: each is the image averaged with a power of the cosine as weight. Of the exponent k that is
@@ -70,12 +71,8 @@ impl Panorama {
     /// as high.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = resource::read(path)?;
-        let fault = |problem: String| Error::Malformed {
-            path: path.to_owned(),
-            element: "the sky".into(),
-            problem,
-            remedy: "give an equirectangular .hdr or .exr image, at most 11584 px wide",
-        };
+        let remedy = "give an equirectangular .hdr or .exr image, at most 11584 px wide";
+        let fault = |problem: String| Error::malformed(path, "the sky", problem, remedy);
         let reader = || {
             let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
             let mut reader = reader.map_err(|e| fault(e.to_string()))?;
@@ -129,11 +126,15 @@ impl Panorama {
     pub(crate) fn blurred(&self, direction: Vec3, roughness: f32) -> Vec3 {
         let level = roughness.clamp(0.0, 1.0) * LEVELS as f32;
         let (below, share) = (level as usize, level.fract());
-        let of = |level: usize| match level {
+        let at_level = |level: usize| match level {
             0 => self.image.at(direction),
             _ => self.blurred[(level - 1).min(LEVELS - 1)].at(direction),
         };
-        if share == 0.0 { of(below) } else { of(below).lerp(of(below + 1), share) }
+        if share == 0.0 {
+            at_level(below)
+        } else {
+            at_level(below).lerp(at_level(below + 1), share)
+        }
     }
 }
 

@@ -1,5 +1,5 @@
-//! Ground truth of a scene, to measure a trained one against: the surface, and what each view sees
-//! of it.
+//! Gives a scene's ground truth, to measure a trained scene against: the surface, and depth and normals
+//! of each view.
 //!
 //! It comes from a scene in memory, or from a folder that [`write`](crate::write) wrote. Files are
 //! untrusted: sizes are checked against the file's length before anything is allocated.
@@ -25,6 +25,8 @@ use crate::write::SCENE_FILE;
 const LONGEST_RECORD: u64 = 1 << 24;
 /// Depths agree if they differ by less than this share: depth files hold f32.
 const SAME_DEPTH: f64 = 1e-5;
+/// The remedy for damaged files.
+const REMEDY: &str = "write the scene again with densify scenegen --overwrite";
 /// Step into the surface before its thickness is measured, in diagonals.
 const STEP: f64 = 1e-7;
 
@@ -38,7 +40,7 @@ enum Kind {
     Folder { root: PathBuf, surface: Box<Surface>, thin: Vec<bool> },
 }
 
-/// What a view sees of the surface.
+/// Depth and normals of a view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sight {
     /// Image width `[px]`.
@@ -96,10 +98,9 @@ impl GroundTruth {
         }
     }
 
-    /// What `camera` sees. `view` is the view's name as a dataset has it; in a folder it says which
-    /// depth and normal files to read. Where there are none of that name, or of another size than
-    /// the camera's, the mesh is traced: the same, but for surfaces with alpha below one half, which
-    /// the mesh does not know.
+    /// Depth and normals as `camera` sees them. In a folder, `view` (the view's name in a dataset)
+    /// selects the files to read. Where these are missing or of another size, the mesh is traced:
+    /// the same, but surfaces with alpha below one half count too.
     ///
     /// # Errors
     /// When a file is there but damaged.
@@ -128,8 +129,9 @@ impl GroundTruth {
     }
 
     /// Thickness of the thin structure `[world units]` that the ray from `origin` along `direction`
-    /// meets first, at ray parameter `depth`: the shortest of the way through it against its normal
-    /// and of two ways across that through its middle; for a wire its diameter. `None` where what is met is not thin, or not there.
+    /// hits first, at ray parameter `depth`: the shortest of the way through it against its normal
+    /// and of two ways across that through its middle; for a wire its diameter. `None` where the
+    /// surface hit is not thin, or not at that depth.
     #[must_use]
     pub fn thickness(&self, origin: DVec3, direction: DVec3, depth: f64) -> Option<f64> {
         let surface = self.surface();
@@ -162,7 +164,7 @@ impl std::fmt::Debug for GroundTruth {
     }
 }
 
-/// A sight by its rays through the pixels' centres.
+/// Traces the rays through the pixels' centres.
 fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) -> Sight {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let seen: Vec<(f32, [f32; 3])> = (0..width * height)

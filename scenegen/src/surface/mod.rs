@@ -1,4 +1,4 @@
-//! The geometry as traced: one BVH over all triangles, for rays and for nearest points.
+//! Holds the geometry as traced: one BVH over all triangles, for rays and for nearest points.
 //!
 //! The tree is the library's binary one: on a CPU its traversal is a quarter faster than that of its
 //! eight-way compressed one (`benches/scenegen.rs` measures both).
@@ -8,8 +8,8 @@
 //! tolerances of the tree's builder (1e-4) lie below an ulp of the geometry.
 //!
 //! Boxes handed to the builder are wider than their triangles by [`PADDING`], so that rounding in
-//! the box tests cannot lose a triangle that the watertight intersection would meet; together they
-//! leave no cracks.
+//! the box tests cannot lose a triangle that the watertight intersection would hit: there are no
+//! cracks.
 //!
 //! One piece: both traversals share the tree, its coordinates and its rounding bounds.
 
@@ -21,9 +21,9 @@ use obvhs::faststack::{FastStack, HeapStack, StackStack};
 use obvhs::ray::{Ray, RayHit};
 
 use crate::error::Error;
-use crate::intersect::{Meeting, ShearedRay};
+use crate::intersect::{Intersection, ShearedRay};
 use crate::mesh::Model;
-use crate::{nearest, tree};
+use crate::tree;
 
 /// Largest half side of the geometry in local coordinates.
 const HALF_SIDE: f64 = 1024.0;
@@ -34,8 +34,7 @@ const PADDING: f32 = 1e-3;
 /// Deepest tree for which the traversal stack lies on the stack.
 const SHALLOW: usize = 96;
 
-/// A triangle mesh that rays and nearest-point queries can be put to. World coordinates are the
-/// source's own.
+/// A triangle mesh for ray casts and nearest-point queries. World coordinates are the source's own.
 pub struct Surface {
     pub(crate) bvh: Bvh2,
     /// In the order of the tree's leaves, local coordinates.
@@ -48,7 +47,7 @@ pub struct Surface {
     build_seconds: f64,
 }
 
-/// Where a ray meets the surface.
+/// Where a ray hits the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SurfaceHit {
     /// Ray parameter: distance in units of the direction's length.
@@ -63,39 +62,28 @@ pub struct SurfaceHit {
     pub front: bool,
 }
 
-/// The surface's point nearest to a place.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Nearest {
-    /// Distance `[world units]`.
-    pub distance: f64,
-    /// The nearest point, world coordinates.
-    pub point: DVec3,
-    /// Number of its triangle in the model.
-    pub triangle: u32,
-}
-
 /// A ray in local coordinates. The direction need not have unit length.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LocalRay {
     pub(crate) origin: Vec3,
     pub(crate) direction: Vec3,
-    /// Meetings up to and including this parameter do not count.
+    /// Intersections up to and including this parameter do not count.
     pub(crate) tmin: f32,
     /// Nor do those beyond this one.
     pub(crate) tmax: f32,
 }
 
 impl LocalRay {
-    /// Meets nothing; stands where a ray will.
+    /// A placeholder that hits nothing.
     pub(crate) const NONE: Self =
         Self { origin: Vec3::ZERO, direction: Vec3::Z, tmin: 0.0, tmax: 0.0 };
 }
 
-/// A meeting with a triangle, by its place in leaf order.
+/// An intersection with a triangle, which `slot` gives by its place in leaf order.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LocalHit {
     pub(crate) slot: u32,
-    pub(crate) at: Meeting,
+    pub(crate) at: Intersection,
 }
 
 impl Surface {
@@ -149,17 +137,6 @@ impl Surface {
         let (origin, direction) = (from + step, way - 2.0 * step);
         let ray = self.enter(origin, direction, 1.0);
         ray.is_some_and(|ray| self.occluder(&ray, |_, _| true).is_some())
-    }
-
-    /// The surface's nearest point.
-    #[must_use]
-    pub fn nearest(&self, place: DVec3) -> Nearest {
-        let (slot, point, distance) = nearest::search(self, self.to_local(place));
-        Nearest {
-            distance: distance / self.scale,
-            point: self.to_world(point),
-            triangle: self.triangle_of(slot),
-        }
     }
 
     /// Number of triangles.
@@ -253,8 +230,8 @@ impl Surface {
     ) -> Option<(LocalRay, f32)> {
         let (o, d) = (self.to_local(origin), direction * self.scale);
         let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
-        // Along an axis that the ray does not move on, these are infinite; on the box's very rim,
-        // which is not the geometry's, they are none, and then it misses.
+        // Infinite along axes on which the ray does not move, and NaN on the box's very rim, which is
+        // not the geometry's; then the ray misses.
         let inverse = d.recip();
         let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
         let near = a.min(b).max_element().max(0.0);
@@ -302,7 +279,7 @@ impl Surface {
         ray: &LocalRay,
         after: Option<(f32, u32)>,
         hint: Option<u32>,
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> Option<LocalHit> {
         if self.depth <= SHALLOW {
             let stack = StackStack::<u32, SHALLOW>::default();
@@ -320,14 +297,14 @@ impl Surface {
         mut stack: impl FastStack<u32>,
         ray: &LocalRay,
         (after, hint): (Option<(f32, u32)>, Option<u32>),
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> Option<LocalHit> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
         let mut boxes = box_ray(ray);
         let mut best: Option<LocalHit> = None;
         // Whether a meeting is nearer than the best so far.
-        let nearer = |slot: u32, tmax: f32, best: &Option<LocalHit>| -> Option<Meeting> {
-            let at = sheared.meet(&self.triangles[slot as usize])?;
+        let nearer = |slot: u32, tmax: f32, best: &Option<LocalHit>| -> Option<Intersection> {
+            let at = sheared.intersect(&self.triangles[slot as usize])?;
             if !(at.t > ray.tmin && at.t <= tmax) {
                 return None;
             }
@@ -364,10 +341,10 @@ impl Surface {
         &self,
         slot: u32,
         ray: &LocalRay,
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> bool {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
-        let met = sheared.meet(&self.triangles[slot as usize]);
+        let met = sheared.intersect(&self.triangles[slot as usize]);
         met.is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
     }
 
@@ -376,7 +353,7 @@ impl Surface {
     pub(crate) fn occluder(
         &self,
         ray: &LocalRay,
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> Option<u32> {
         if self.depth <= SHALLOW {
             self.occluder_with(StackStack::<u32, SHALLOW>::default(), ray, accept)
@@ -390,12 +367,12 @@ impl Surface {
         &self,
         mut stack: impl FastStack<u32>,
         ray: &LocalRay,
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> Option<u32> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
         let counts = |slot: u32| {
             sheared
-                .meet(&self.triangles[slot as usize])
+                .intersect(&self.triangles[slot as usize])
                 .is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
         };
         let mut found = None;

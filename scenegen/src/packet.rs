@@ -1,22 +1,22 @@
-//! Several rays at once: those of a pixel, or from what a pixel shows to a light, go nearly the same
-//! way, and one walk through the tree serves them all.
+//! Traces packets of rays: those of a pixel, or from its points to a light, run nearly parallel, so one
+//! traversal of the tree serves them all.
 //!
-//! A node is entered if any of the rays could meet what is in it. That is decided with intervals
+//! A node is entered if any of the rays could hit its box. That is decided with intervals
 //! that hold all rays (Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for
 //! Entire Ray Packets", 2006). Rounding is monotonic, so the bounds hold for rounded values too and
 //! no box is missed that a single ray would enter. A leaf's triangles are tested against all rays
-//! in vectors, and only those rays that the test leaves do the whole of [`ShearedRay::meet`]. So
+//! in vectors, and only the rays that pass do the whole of [`ShearedRay::intersect`]. So
 //! every ray finds, to the bit, what it would find alone.
 
 use glam::{BVec3A, DVec3, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
 
-use crate::intersect::{Meeting, ShearedRay};
+use crate::intersect::{Intersection, ShearedRay};
 use crate::surface::{LocalHit, LocalRay, Surface, padded};
 
-/// Most rays of a bundle: the default subsamples of a pixel.
+/// Most rays of a packet: the default subsamples of a pixel.
 pub(crate) const LANES: usize = 16;
-/// Deepest tree that is walked with a bundle.
+/// Deepest tree that is traversed with packets.
 const DEEPEST: usize = 96;
 
 /// Each lane's bit.
@@ -44,9 +44,9 @@ fn each(mut lanes: u32) -> impl Iterator<Item = usize> {
     })
 }
 
-/// Bounds of all rays of a bundle. Along an axis, a ray goes forward or backward; where some rays do
-/// the one and some the other, or nothing at all, the axis decides nothing: its bounds are infinite.
-struct Beam {
+/// Bounds of all rays of a packet. An axis along which the rays do not all run forward, or all
+/// backward, is not used: its bounds are infinite.
+struct PacketBounds {
     /// Axes along which all rays go backward.
     backward: BVec3A,
     /// The origin that comes first to the near plane of a box, and that which comes last to the far
@@ -57,7 +57,7 @@ struct Beam {
     inverse: (Vec3A, Vec3A),
 }
 
-impl Beam {
+impl PacketBounds {
     /// Around rays with these origins and directions.
     fn around(rays: impl Iterator<Item = (Vec3, Vec3)>) -> Self {
         let whole = (Vec3A::INFINITY, Vec3A::NEG_INFINITY);
@@ -96,7 +96,7 @@ impl Beam {
 }
 
 /// Rays side by side in the space that they share.
-struct Bundle<'a> {
+struct RayPacket<'a> {
     rays: &'a [LocalRay],
     sheared: [ShearedRay; LANES],
     /// Which coordinates are the first two and the third of the sheared space.
@@ -104,11 +104,11 @@ struct Bundle<'a> {
     /// Origins in these axes, and the shear.
     origin: [[f32; LANES]; 3],
     shear: [[f32; LANES]; 2],
-    beam: Beam,
+    bounds: PacketBounds,
 }
 
-impl<'a> Bundle<'a> {
-    /// None where the rays are no bundle: a single one, or not all along the same axis.
+impl<'a> RayPacket<'a> {
+    /// None for a single ray, and where the rays' largest components differ.
     fn new(rays: &'a [LocalRay]) -> Option<Self> {
         if !(2..=LANES).contains(&rays.len()) {
             return None;
@@ -128,15 +128,15 @@ impl<'a> Bundle<'a> {
             }
             (shear[0][lane], shear[1][lane]) = (ray.shear.x, ray.shear.y);
         }
-        let beam = Beam::around(rays.iter().map(|ray| (ray.origin, ray.direction)));
-        Some(Self { rays, sheared, axes, origin, shear, beam })
+        let bounds = PacketBounds::around(rays.iter().map(|ray| (ray.origin, ray.direction)));
+        Some(Self { rays, sheared, axes, origin, shear, bounds })
     }
 
     /// The rays that may meet a triangle, as bits: all but those for which the edge functions have
-    /// both signs. They are those of [`ShearedRay::meet`], operation by operation.
+    /// both signs. They are those of [`ShearedRay::intersect`], operation by operation.
     #[expect(clippy::needless_range_loop, reason = "lanes side by side become vectors")]
     #[inline(always)]
-    fn may_meet(&self, triangle: &[Vec3; 3]) -> u32 {
+    fn may_hit(&self, triangle: &[Vec3; 3]) -> u32 {
         let [x, y, z] = self.axes;
         let corner = |p: Vec3| {
             let p = [p[x], p[y], p[z]];
@@ -173,7 +173,7 @@ impl<'a> Bundle<'a> {
         let mut reach = self.rays.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
         let mut open = [(0_u32, 0.0_f32); DEEPEST];
         let mut count = 1;
-        open[0] = (0, self.beam.entry(nodes[0].aabb()));
+        open[0] = (0, self.bounds.entry(nodes[0].aabb()));
         while count > 0 {
             count -= 1;
             let (mut index, entry) = open[count];
@@ -185,10 +185,10 @@ impl<'a> Bundle<'a> {
                 if node.is_leaf() {
                     for slot in node.first_index..node.first_index + node.prim_count {
                         let triangle = &surface.triangles[slot as usize];
-                        if self.beam.entry(&padded(triangle)) >= reach {
+                        if self.bounds.entry(&padded(triangle)) >= reach {
                             continue;
                         }
-                        let lanes = self.may_meet(triangle);
+                        let lanes = self.may_hit(triangle);
                         if lanes != 0 {
                             reach = look(slot, lanes);
                         }
@@ -196,8 +196,8 @@ impl<'a> Bundle<'a> {
                     break;
                 }
                 let (mut near, mut far) = (node.first_index, node.first_index + 1);
-                let mut first = self.beam.entry(nodes[near as usize].aabb());
-                let mut second = self.beam.entry(nodes[far as usize].aabb());
+                let mut first = self.bounds.entry(nodes[near as usize].aabb());
+                let mut second = self.bounds.entry(nodes[far as usize].aabb());
                 if second < first {
                     (near, far) = (far, near);
                     (first, second) = (second, first);
@@ -219,14 +219,14 @@ impl Surface {
     /// Whether all rays from `origin` within the pyramid of these directions certainly miss it: no
     /// leaf's box is near. The pyramid must exceed the rays by more than single precision rounds,
     /// relative to distance.
-    pub(crate) fn is_beside(&self, origin: DVec3, directions: [DVec3; 4]) -> bool {
+    pub(crate) fn is_missed_by(&self, origin: DVec3, directions: [DVec3; 4]) -> bool {
         let origin = self.to_local(origin).as_vec3();
-        let beam = Beam::around(directions.into_iter().map(|d| (origin, d.as_vec3())));
+        let bounds = PacketBounds::around(directions.into_iter().map(|d| (origin, d.as_vec3())));
         let nodes = &self.bvh.nodes;
         let mut open = vec![0_u32];
         while let Some(index) = open.pop() {
             let node = &nodes[index as usize];
-            if beam.entry(node.aabb()) < f32::INFINITY {
+            if bounds.entry(node.aabb()) < f32::INFINITY {
                 if node.is_leaf() {
                     return false;
                 }
@@ -237,14 +237,14 @@ impl Surface {
     }
 
     /// [`Surface::closest`] for each of at most [`LANES`] rays.
-    pub(crate) fn closest_of(
+    pub(crate) fn closest_each(
         &self,
         rays: &[LocalRay],
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> [Option<LocalHit>; LANES] {
         let mut best = [None::<LocalHit>; LANES];
-        let bundle = if self.depth() <= DEEPEST { Bundle::new(rays) } else { None };
-        let Some(bundle) = bundle else {
+        let packet = if self.depth() <= DEEPEST { RayPacket::new(rays) } else { None };
+        let Some(packet) = packet else {
             let mut hint = None;
             for (best, ray) in best.iter_mut().zip(rays) {
                 *best = self.closest(ray, None, hint, &accept);
@@ -257,10 +257,10 @@ impl Surface {
             *tmax = ray.tmax;
         }
         let mut reach = tmax.iter().copied().fold(0.0, f32::max);
-        bundle.walk(self, |slot, lanes| {
+        packet.walk(self, |slot, lanes| {
             let mut changed = false;
             for lane in each(lanes) {
-                let met = bundle.sheared[lane].meet(&self.triangles[slot as usize]);
+                let met = packet.sheared[lane].intersect(&self.triangles[slot as usize]);
                 let Some(at) = met.filter(|at| at.t > rays[lane].tmin && at.t <= tmax[lane]) else {
                     continue;
                 };
@@ -283,14 +283,14 @@ impl Surface {
 
     /// Which of at most [`LANES`] rays have an [`Surface::occluder`], as bits. What `hint` names is
     /// tried first, and becomes what was found last.
-    pub(crate) fn occluded_of(
+    pub(crate) fn occluded_each(
         &self,
         rays: &[LocalRay],
         hint: &mut Option<u32>,
-        accept: impl Fn(u32, &Meeting) -> bool,
+        accept: impl Fn(u32, &Intersection) -> bool,
     ) -> u32 {
         let mut hidden = 0;
-        // Where the hint hides a ray already, a bundle of the others is a smaller one.
+        // Where the hint hides a ray already, a packet of the others is a smaller one.
         let mut left = [0_usize; LANES];
         let mut count = 0;
         for (lane, ray) in rays.iter().enumerate() {
@@ -310,8 +310,8 @@ impl Surface {
             *other = rays[lane];
         }
         let others = &others[..count];
-        let bundle = if self.depth() <= DEEPEST { Bundle::new(others) } else { None };
-        let Some(bundle) = bundle else {
+        let packet = if self.depth() <= DEEPEST { RayPacket::new(others) } else { None };
+        let Some(packet) = packet else {
             for (ray, lane) in others.iter().zip(left) {
                 if let Some(slot) = self.occluder(ray, &accept) {
                     hidden |= 1 << lane;
@@ -322,10 +322,10 @@ impl Surface {
         };
         let mut open = u32::MAX >> (32 - count);
         let reach = others.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
-        bundle.walk(self, |slot, lanes| {
+        packet.walk(self, |slot, lanes| {
             for lane in each(lanes & open) {
                 let ray = &others[lane];
-                let met = bundle.sheared[lane].meet(&self.triangles[slot as usize]);
+                let met = packet.sheared[lane].intersect(&self.triangles[slot as usize]);
                 if met.is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at)) {
                     open &= !(1 << lane);
                     hidden |= 1 << left[lane];

@@ -1,5 +1,5 @@
-//! Random numbers without state: every draw is a hash of what it is for, so that images do not
-//! depend on which thread traces which pixel.
+//! Draws random numbers without state: each is a hash of its purpose, so that images do not depend on
+//! which thread traces which pixel.
 
 use std::f32::consts::{PI, TAU};
 

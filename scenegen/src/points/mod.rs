@@ -1,4 +1,4 @@
-//! Initial points as structure-from-motion would find them, with errors of known size.
+//! Makes initial points as structure-from-motion would find them, with errors of known size.
 //!
 //! Candidates are pixels of training views, drawn with probability by the local gradient of
 //! luminance: where an image is flat, feature matching finds nothing. A candidate counts when at
@@ -14,7 +14,7 @@ use crate::trace::{Frame, Tracer};
 
 /// Views that must see a point.
 const MIN_VIEWS: usize = 3;
-/// Candidates per point wanted: most are seen by three views, and noise needs no more.
+/// Candidates per point wanted: most are seen by three views.
 const CANDIDATES: f64 = 2.0;
 /// Gradient every pixel counts as having: half a step of eight bits.
 const GRADIENT_FLOOR: f64 = 0.5;
@@ -28,7 +28,7 @@ const SAME_DEPTH: f64 = 1e-3;
 pub struct PointOptions {
     /// Points wanted; fewer where the views see fewer.
     pub count: usize,
-    /// Uniformly in the bounding box, instead of on surfaces.
+    /// Whether points lie uniformly in the bounding box instead of on surfaces.
     pub random: bool,
     /// Standard deviation of each coordinate, as a share of the diagonal.
     pub noise: f64,
@@ -62,7 +62,7 @@ pub struct InitPoints {
     pub colours: Vec<[u8; 3]>,
     /// Numbers of the training views that see each, ascending. Shape: `[points]`.
     pub seen_by: Vec<Vec<u32>>,
-    /// How many of them were displaced to anywhere.
+    /// Number of outliers among them.
     pub outliers: usize,
 }
 
@@ -126,7 +126,7 @@ impl<'a> PointCollector<'a> {
             let c = &frame.rgba[4 * i..4 * i + 3];
             0.299 * f64::from(c[0]) + 0.587 * f64::from(c[1]) + 0.114 * f64::from(c[2])
         };
-        // An outline against nothing is no feature of the surface.
+        // A silhouette is not a feature of the surface.
         let solid = |i: usize| frame.depth[i] > 0.0 && frame.rgba[4 * i + 3] == 255;
         let slope = |i: usize, before: Option<usize>, after: Option<usize>| {
             let before = before.filter(|&j| solid(j)).unwrap_or(i);
@@ -174,7 +174,7 @@ impl<'a> PointCollector<'a> {
         }
         self.candidates.sort_by_key(|candidate| candidate.order);
         let needed = MIN_VIEWS.min(self.cameras.len());
-        // In blocks, so that views are not asked about candidates nobody needs.
+        // In blocks: visibility is tested only until there are enough points.
         for block in self.candidates.chunks(4096) {
             let seen: Vec<Vec<u32>> = block.par_iter().map(|c| self.viewers(c.position)).collect();
             for (candidate, seen) in block.iter().zip(seen) {
