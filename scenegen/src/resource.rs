@@ -21,7 +21,7 @@ const MAX_SIDE: u32 = 16_384;
 /// Most pixels of an image.
 const MAX_PIXELS: u64 = 1 << 28;
 /// Most bytes a decoder may allocate.
-const MAX_DECODED: u64 = 1 << 30;
+pub(crate) const MAX_DECODED: u64 = 1 << 30;
 /// Most texels of all textures of a model.
 const MAX_TEXELS: u64 = 1 << 29;
 /// Longest reference `[bytes]`.
@@ -187,6 +187,24 @@ fn base64(text: &str) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
+/// A decoder with limits for one of these formats; `problem` says that it is another.
+pub(crate) fn image_reader<'a>(
+    bytes: &'a [u8],
+    formats: &[ImageFormat],
+    problem: &str,
+) -> std::io::Result<ImageReader<Cursor<&'a [u8]>>> {
+    let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
+    if !reader.format().is_some_and(|format| formats.contains(&format)) {
+        return Err(std::io::Error::other(problem));
+    }
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(MAX_SIDE);
+    limits.max_image_height = Some(MAX_SIDE);
+    limits.max_alloc = Some(MAX_DECODED);
+    reader.limits(limits);
+    Ok(reader)
+}
+
 /// Decodes a PNG, JPEG or WebP image.
 pub(crate) fn decode(
     file: &Path,
@@ -196,25 +214,13 @@ pub(crate) fn decode(
 ) -> Result<Texture, Error> {
     let remedy = "store it as a PNG or JPEG of at most 16384 px a side";
     let fault = |problem: String| Error::malformed(file, element, problem, remedy);
-    let reader = |bytes| {
-        let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
-        if !reader.format().is_some_and(|format| FORMATS.contains(&format)) {
-            return Err(std::io::Error::other("it is neither PNG, JPEG nor WebP"));
-        }
-        let mut limits = Limits::default();
-        limits.max_image_width = Some(MAX_SIDE);
-        limits.max_image_height = Some(MAX_SIDE);
-        limits.max_alloc = Some(MAX_DECODED);
-        reader.limits(limits);
-        Ok(reader)
-    };
-    let header = reader(bytes).map_err(|e| fault(e.to_string()))?;
-    let (width, height) = header.into_dimensions().map_err(|e| fault(e.to_string()))?;
+    let problem = "it is neither PNG, JPEG nor WebP";
+    let reader = || image_reader(bytes, &FORMATS, problem).map_err(|e| fault(e.to_string()));
+    let (width, height) = reader()?.into_dimensions().map_err(|e| fault(e.to_string()))?;
     if width > MAX_SIDE || height > MAX_SIDE || u64::from(width) * u64::from(height) > MAX_PIXELS {
         return Err(fault(format!("it has {width}x{height} px")));
     }
-    let image = reader(bytes).map_err(|e| fault(e.to_string()))?;
-    let image = image.decode().map_err(|e| fault(e.to_string()))?.into_rgba8();
+    let image = reader()?.decode().map_err(|e| fault(e.to_string()))?.into_rgba8();
     Ok(Texture::new(width, height, image.into_raw(), srgb))
 }
 

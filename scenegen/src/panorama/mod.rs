@@ -11,21 +11,16 @@
 //! roughest copy is irradiance / pi.
 
 use std::f32::consts::{PI, TAU};
-use std::io::Cursor;
 use std::path::Path;
 
 use glam::{DVec3, Vec3};
-use image::{ImageFormat, ImageReader, Limits};
+use image::ImageFormat;
 use rayon::prelude::*;
 use serde::{Serialize, Serializer, ser::SerializeStruct};
 
 use crate::error::Error;
-use crate::resource;
+use crate::resource::{self, MAX_DECODED};
 
-/// Largest side `[px]`.
-const MAX_SIDE: u32 = 16_384;
-/// Most bytes that a decoder may allocate; floats for 2^26 px.
-const MAX_DECODED: u64 = 1 << 30;
 /// Most bytes of an image that one byte of its file can stand for: zip's limit, 1032, and a margin.
 const EXPANSION: u64 = 1100;
 /// Largest radiance, a half float's.
@@ -73,19 +68,10 @@ impl Panorama {
         let bytes = resource::read(path)?;
         let remedy = "give an equirectangular .hdr or .exr image, at most 11584 px wide";
         let fault = |problem: String| Error::malformed(path, "the sky", problem, remedy);
-        let reader = || {
-            let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
-            let mut reader = reader.map_err(|e| fault(e.to_string()))?;
-            if !matches!(reader.format(), Some(ImageFormat::Hdr | ImageFormat::OpenExr)) {
-                return Err(fault("it is neither Radiance HDR nor OpenEXR".into()));
-            }
-            let mut limits = Limits::default();
-            limits.max_image_width = Some(MAX_SIDE);
-            limits.max_image_height = Some(MAX_SIDE);
-            limits.max_alloc = Some(MAX_DECODED);
-            reader.limits(limits);
-            Ok(reader)
-        };
+        let formats = [ImageFormat::Hdr, ImageFormat::OpenExr];
+        let problem = "it is neither Radiance HDR nor OpenEXR";
+        let reader =
+            || resource::image_reader(&bytes, &formats, problem).map_err(|e| fault(e.to_string()));
         let (width, height) = reader()?.into_dimensions().map_err(|e| fault(e.to_string()))?;
         if height == 0 || width != 2 * height {
             return Err(fault(format!("it has {width}x{height} px, and is not twice as wide")));
