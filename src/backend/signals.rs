@@ -1,8 +1,8 @@
-//! Where signals come from and where they lie: fields of gradient records and planes of accumulators,
-//! for both backends.
+//! The memory layout of signals, for both backends: fields of gradient records and planes of
+//! accumulators.
 //!
-//! What a signal is stands in its one entry in the policies' table ([`Signal`]); record layouts,
-//! strides, planes and the shaders' constants follow from it. Only what is asked for has memory.
+//! A signal is one entry in the policies' table ([`Signal`]); record layouts, strides, planes and the
+//! shaders' constants follow from it. Only requested signals have memory.
 
 use densify_policies::policy::{Needs, PixelSum, Signal, SignalKind, SignalSet};
 
@@ -117,7 +117,7 @@ impl RecordLayout {
 pub(super) struct SignalPlanes {
     /// First plane of each signal, in the order of [`Signal::ALL`].
     first: [Option<usize>; Signal::ALL.len()],
-    /// How many there are.
+    /// Number of planes.
     pub(super) count: usize,
     /// See [`Needs::full_depth`].
     pub(super) full_depth: f32,
@@ -182,7 +182,7 @@ impl SignalPlanes {
         Signal::ALL.into_iter().filter(by_epoch).filter_map(|s| self.current(s)).collect()
     }
 
-    /// What is kept between steps, by name and plane. Fresh views are not: they are measured and
+    /// The planes that checkpoints save, by name. Those of fresh views are not: they are measured and
     /// taken within one event.
     pub(super) fn kept(&self) -> Vec<(String, usize)> {
         let mut kept = Vec::new();

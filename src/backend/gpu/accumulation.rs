@@ -54,7 +54,7 @@ impl Accumulation {
         }
     }
 
-    /// What an adapter with these features lacks of it, in words.
+    /// The features that an adapter lacks for it, in words.
     pub(super) fn missing(self, there: Features) -> Vec<&'static str> {
         let lacking = self.features().difference(there);
         let names = [

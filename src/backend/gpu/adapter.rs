@@ -158,7 +158,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
 /// Which adapter to take, and how it adds up gradients.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct AdapterChoice {
-    /// Part of its name or its driver's, in any case of letters; the best there is without one.
+    /// Part of its name or its driver's, in upper or lower case; `None` takes the best.
     pub name: Option<String>,
     /// How it adds up gradients; [its own choice](AdapterSummary::accumulation) without one.
     pub accumulation: Option<Accumulation>,
@@ -168,7 +168,7 @@ impl AdapterChoice {
     /// How the adapter that was taken adds up gradients.
     ///
     /// # Errors
-    /// [`BackendError::NoAdapter`] where it cannot do what is asked for: what it lacks, and what it can.
+    /// [`BackendError::NoAdapter`] where it does not support the way: what it lacks, and what it supports.
     pub(super) fn accumulation(
         &self,
         adapter: &AdapterSummary,
@@ -200,7 +200,7 @@ impl AdapterChoice {
 /// last.
 ///
 /// # Errors
-/// [`BackendError::NoAdapter`] with what there is and what it lacks.
+/// [`BackendError::NoAdapter`] with the adapters found and what they lack.
 pub(super) fn choose(
     all: &[AdapterSummary],
     choice: &AdapterChoice,

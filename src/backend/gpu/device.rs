@@ -13,7 +13,7 @@ use crate::backend::signals::RecordLayout;
 
 /// Errors that a device reports outside of any call.
 #[derive(Debug, Default)]
-struct Told {
+struct Reported {
     lost: Option<String>,
     error: Option<String>,
 }
@@ -26,8 +26,8 @@ impl GpuDevice {
     /// Opens an adapter.
     ///
     /// # Errors
-    /// [`BackendError::NoAdapter`] with what there is and what it lacks, to work at all or to add up
-    /// gradients as is asked for.
+    /// [`BackendError::NoAdapter`] with the adapters found and what they lack, in general or for the
+    /// requested accumulation.
     pub fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
         Ok(Self(Arc::new(Device::open(choice)?)))
     }
@@ -52,8 +52,8 @@ pub(super) struct Device {
     pub(super) queue: wgpu::Queue,
     pub(super) summary: AdapterSummary,
     pub(super) accumulation: Accumulation,
-    told: Arc<Mutex<Told>>,
-    /// By what they are compiled for; there are few.
+    reported: Arc<Mutex<Reported>>,
+    /// The compiled variants; there are few.
     pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
     /// The records for which the device has passed the canary.
     proven: Mutex<Vec<RecordLayout>>,
@@ -78,8 +78,8 @@ impl Device {
         let (device, queue) = wait(adapter.request_device(&descriptor)).map_err(|e| {
             BackendError::NoAdapter(format!("{} cannot be opened: {e}", summary.name))
         })?;
-        let told = Arc::new(Mutex::new(Told::default()));
-        let (errors, losses) = (told.clone(), told.clone());
+        let reported = Arc::new(Mutex::new(Reported::default()));
+        let (errors, losses) = (reported.clone(), reported.clone());
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
             lock(&errors).error.get_or_insert(error.to_string());
         }));
@@ -91,7 +91,7 @@ impl Device {
             queue,
             summary,
             accumulation,
-            told,
+            reported,
             pipelines: Mutex::default(),
             proven: Mutex::default(),
         })
@@ -123,16 +123,16 @@ impl Device {
         Ok(())
     }
 
-    /// An error that the device has told since, if any. A lost device ignores what it is given.
+    /// An error that the device has reported, if any. A lost device ignores what it is given.
     pub(super) fn check(&self) -> Result<(), BackendError> {
         #[cfg(test)]
         faults::lose(&self.device);
-        let told = lock(&self.told);
+        let reported = lock(&self.reported);
         let device = self.summary.name.clone();
-        if let Some(why) = &told.lost {
+        if let Some(why) = &reported.lost {
             return Err(BackendError::DeviceLost { device, why: why.clone() });
         }
-        match &told.error {
+        match &reported.error {
             Some(why) => Err(BackendError::Device { device, why: why.clone() }),
             None => Ok(()),
         }
@@ -167,8 +167,8 @@ impl Device {
     }
 }
 
-fn lock(told: &Mutex<Told>) -> std::sync::MutexGuard<'_, Told> {
-    told.lock().unwrap_or_else(PoisonError::into_inner)
+fn lock(reported: &Mutex<Reported>) -> std::sync::MutexGuard<'_, Reported> {
+    reported.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

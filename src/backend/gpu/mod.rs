@@ -3,11 +3,11 @@
 //! Parameters stay on the device. A step is encoded once and submitted once; what differs between
 //! views (rows on screen, entries, bands) is counted there and drives indirect dispatches, and a few
 //! scalars come back with the loss. Where a view has more tile entries than the cap, the image is
-//! processed in bands: as many are encoded as the step before needed, and a step for which these do
-//! not do changes nothing, says so, and is taken again with enough.
+//! processed in bands. As many are encoded as the step before needed; a step that needs more changes
+//! nothing, reports it, and is repeated with enough.
 //!
-//! With [`Accumulation::Slots`] every sum has one order, so that the same device gives the same bytes
-//! twice. Elsewhere the sums of rows over tiles have any order, and all other sums still have one.
+//! With [`Accumulation::Slots`] every sum has a fixed order, so that runs on the same device are
+//! reproducible byte for byte. Otherwise the order of a row's sums over tiles varies.
 
 mod accumulation;
 mod adapter;
@@ -65,8 +65,8 @@ use frame::Frame;
 use launches::Launches;
 pub use options::GpuOptions;
 use options::MAX_SIDE;
-use photographs::Kept;
 pub use photographs::KeptPhotographs;
+use photographs::PhotographPlaces;
 use pipelines::Variant;
 use sizes::Sizes;
 
@@ -95,7 +95,7 @@ pub struct GpuBackend {
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
-    kept: Kept,
+    kept: PhotographPlaces,
     /// Bands that are encoded for the next view.
     bands: u32,
     laps: Vec<(&'static str, Duration)>,
@@ -152,7 +152,7 @@ impl GpuBackend {
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),
-            kept: Kept::default(),
+            kept: PhotographPlaces::default(),
             bands: 1,
             laps: Vec::new(),
         };
@@ -168,13 +168,13 @@ impl GpuBackend {
         &self.device.summary
     }
 
-    /// What of the ledger is on the device `[bytes]`.
+    /// Bytes of the ledger that are on the device.
     #[must_use]
     pub fn promised(&self) -> u64 {
         self.sizes.planned().iter().map(|planned| planned.bytes).sum()
     }
 
-    /// What is allocated on the device now `[bytes]`.
+    /// Bytes allocated on the device now.
     #[must_use]
     pub fn allocated(&self) -> u64 {
         self.buffers.bytes()

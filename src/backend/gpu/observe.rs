@@ -27,7 +27,7 @@ pub(super) struct Seen<'a> {
 }
 
 impl GpuBackend {
-    /// What to look for in a view of this size, if the device has room for what is found.
+    /// The search for candidates in a view of this size; `None` if the device lacks room for the result.
     pub(super) fn search(
         &self,
         request: &CandidateRequest,
@@ -75,8 +75,8 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// The pixels that a search has found, with their errors; `None` where there are more than there
-    /// was room for, as of an image with one error everywhere.
+    /// The pixels that a search has found, with their errors; `None` if there are more than fit, as in an
+    /// image with the same error everywhere.
     fn found(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
         // As many as are wanted, and a few that are as bad as the last.
         let likely = (search.wanted + 63).min(search.room);

@@ -212,7 +212,7 @@ impl Passes<'_> {
     }
 
     /// Writes the `wanted` worst pixels, and those as bad as the last of them, to the gradients of the
-    /// rows: how many there are, then bits of the error and number of each, as far as there is room.
+    /// rows: their number, then error bits and pixel number of each, as many as fit.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;

@@ -15,9 +15,9 @@ pub struct KeptPhotographs {
     pub with_masks: bool,
 }
 
-/// What stays where.
+/// Where the photographs on the device are.
 #[derive(Debug, Default)]
-pub(super) struct Kept {
+pub(super) struct PhotographPlaces {
     /// By view: place among those kept, size, and the bits that say what it has.
     pub(super) places: HashMap<usize, (u64, [u32; 2], u32)>,
 }

@@ -56,14 +56,14 @@ pub(super) struct Compiled {
     pub(super) bindings: Vec<Binding>,
 }
 
-/// The kernels of a device by name, as far as it has them.
+/// The kernels of a device, by name.
 #[derive(Debug)]
 pub(super) struct Pipelines {
     kernels: HashMap<String, Compiled>,
 }
 
 impl Pipelines {
-    /// Builds every kernel that there is for the variant.
+    /// Builds every kernel of the variant.
     pub(super) fn new(device: &Device, variant: Variant) -> Self {
         let mut kernels = HashMap::new();
         for stage in &STAGES {

@@ -39,7 +39,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Siz
     sizes
 }
 
-/// What is on the device, and what the host holds for it.
+/// Bytes on the device, and on the host for it.
 pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     let mut ledger = sizes.ledger();
     let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);

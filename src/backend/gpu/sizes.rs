@@ -11,9 +11,9 @@ use crate::backend::signals::{RecordLayout, SignalPlanes};
 use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, Section};
 
-/// Operations of an edit that are uploaded at a time `[bytes]`.
+/// Bytes of an edit's operations that are uploaded at a time.
 pub(super) const OPS_BYTES: u64 = 1 << 18;
-/// What is read back at a time `[bytes]`.
+/// Most bytes read back at a time.
 pub(super) const READ_BYTES: u64 = 1 << 20;
 /// Items per group of the sums and sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
@@ -34,15 +34,15 @@ pub(super) struct Sizes {
     pub(super) planes: usize,
     /// Of the records and their sums.
     pub(super) records: RecordLayout,
-    /// How sums come about: whether there are records at all.
+    /// How gradients are added up: only slots need records.
     pub(super) accumulation: Accumulation,
-    /// Whether the gradients of alpha and depth are given, too.
+    /// Whether gradients of alpha and depth are given as well.
     pub(super) more: bool,
     pub(super) cadence: Cadence,
     pub(super) with_error: bool,
 }
 
-/// One buffer to be.
+/// A buffer to allocate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Planned {
     pub(super) name: &'static str,
