@@ -84,7 +84,9 @@ pub fn parse_overrides(
     Ok(tables)
 }
 
-pub(crate) fn parse_value(text: &str) -> Value {
+/// A value as it is written on a command line: TOML where it is some, else text.
+#[must_use]
+pub fn parse_value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     // A text with a line break could set further keys; then it is not one value.
     let single = parsed.filter(|table| table.len() == 1);

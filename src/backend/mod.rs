@@ -5,6 +5,7 @@
 
 mod audit;
 mod candidates;
+mod choice;
 pub mod cpu;
 pub mod gpu;
 mod pixel_map;
@@ -24,6 +25,7 @@ use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
+pub use choice::{BackendChoice, BackendKind, BackendOptions, Device};
 pub use shortcuts::Shortcuts;
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};
 pub use state::{StateArray, StateError, Tensor, Values};

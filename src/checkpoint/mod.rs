@@ -36,7 +36,7 @@ use densify_policies::policy::PolicyError;
 use serde::{Deserialize, Serialize};
 
 use crate::backend::{BackendError, StateError};
-use crate::output::{OutputError, RunConfig};
+use crate::output::OutputError;
 use crate::trainer::TrainerState;
 
 /// A checkpoint without its arrays.
@@ -45,8 +45,12 @@ use crate::trainer::TrainerState;
 pub struct Header {
     /// Version of densify that wrote it.
     pub densify: String,
-    /// The configuration of the run.
-    pub config: RunConfig,
+    /// The most rows there may ever be.
+    pub budget: usize,
+    /// Spherical-harmonic degree of the model.
+    pub sh_degree: u8,
+    /// The run's configuration, as `config.toml` has it.
+    pub config: toml::Table,
     /// The dataset.
     pub dataset: Fingerprint,
     /// State of the trainer.

@@ -79,8 +79,7 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError::Invalid`] if the model contradicts its own configuration.
     pub fn blank_model(&self) -> Result<Gaussians, CheckpointError> {
-        let train = &self.header.config.train;
-        let (budget, sh_degree) = (train.budget, train.sh_degree);
+        let Header { budget, sh_degree, .. } = self.header;
         if sh_degree > MAX_SH_DEGREE {
             return Err(self.invalid(format!("sh_degree is {sh_degree}; at most {MAX_SH_DEGREE}")));
         }

@@ -7,7 +7,7 @@ use std::io::{self, IsTerminal, Write};
 use indicatif::MultiProgress;
 use tracing_subscriber::EnvFilter;
 
-use super::failure::{Failure, OTHER};
+use crate::failure::{Failure, OTHER};
 
 /// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
 const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";

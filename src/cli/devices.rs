@@ -3,11 +3,11 @@
 use clap::Args;
 
 use super::console::Console;
-use super::failure::Failure;
-use super::number::grouped;
 use crate::backend::gpu::{AdapterKind, adapters};
+use crate::failure::Failure;
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::memory::Bytes;
+use crate::number::grouped;
 
 /// Lists the adapters that can train and render, with their limits.
 ///

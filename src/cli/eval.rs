@@ -7,13 +7,13 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use super::device::DeviceArgs;
-use super::failure::Failure;
-use super::number::grouped;
 use super::run_files::{Machine, SplitArg, iteration, open_run};
 use crate::evaluate::evaluate;
+use crate::failure::Failure;
 use crate::metrics::geometry::{self, Geometry, Ground};
+use crate::number::grouped;
 use crate::output::{write_geometry, write_scores};
+use crate::run::{DeviceSpec, RunConfig};
 
 /// Measures a trained scene against its photographs: PSNR, SSIM and FLIP.
 ///
@@ -36,11 +36,8 @@ pub(super) struct EvalArgs {
     /// Folder of the dataset, where it is no longer where it was
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
-    /// Processor threads to use `[default: all]`
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
     #[command(flatten)]
-    device: DeviceArgs,
+    device: DeviceSpec,
 }
 
 const EXAMPLES: &str = "\
@@ -51,13 +48,13 @@ Examples:
 pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let run = &args.run;
     // A folder without config.toml is no run, whatever else it holds.
-    crate::output::RunConfig::read(run)?;
+    RunConfig::read(run)?;
     let iteration = iteration(run, args.iteration)?;
     let moved_to = args.scene.clone();
-    let machine = Machine { threads: args.threads, device: args.device.open_to_render(console)? };
+    let machine = Machine::open(&args.device, console)?;
     let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
     let views = opened.views(args.split)?;
-    let background = opened.scene.background.fixed();
+    let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
     console.result(format_args!("{:width$}  PSNR [dB]    SSIM    FLIP", "view"));

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::console::Console;
-use super::failure::Failure;
-use super::number::grouped;
 use super::run_files::{iteration, read_model};
 use crate::export::{Format, find, find_by_extension, formats};
+use crate::failure::Failure;
+use crate::number::grouped;
 use crate::output::{model_path, write_atomically};
 
 /// Writes a trained model in another format.

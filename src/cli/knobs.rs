@@ -3,13 +3,13 @@
 use clap::Args;
 
 use super::console::Console;
-use super::failure::Failure;
-use crate::knobs::{Class, How, KNOBS, Knob, Measured, On, PRESETS};
+use crate::backend::BackendKind;
+use crate::failure::Failure;
+use crate::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
 
 /// Lists the knobs: every setting that trades speed or memory for accuracy.
 ///
-/// Set one with `densify train --knob NAME=VALUE`. Some are options of `train` or parameters of the
-/// policy by another name; either way of setting them does. An exact knob changes no bit of the
+/// Set one with `densify train --knob NAME=VALUE`. An exact knob changes no bit of the
 /// result, a bounded one makes a numerical error only, a heuristic one changes what training arrives
 /// at.
 #[derive(Debug, Args)]
@@ -24,7 +24,7 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
         };
         console.result(format_args!("{class}: {promise}"));
         for knob in KNOBS.iter().filter(|knob| knob.class == class) {
-            console.result(format_args!("  {:<18}  {}", knob.name, knob.what));
+            console.result(format_args!("  {:<18}  {}", knob.name, knob.effect));
             console.result(format_args!("  {:<18}  {}", "", facts(knob)));
         }
     }
@@ -38,20 +38,10 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Default, domain, and how it is set.
+/// Default, domain, and which backend has it.
 fn facts(knob: &Knob) -> String {
     let unit = if knob.unit.is_empty() { String::new() } else { format!(" {}", knob.unit) };
-    let how = match knob.how {
-        How::Knob => String::new(),
-        How::Flag(flag) => format!("; the same as {flag}"),
-        How::Parameter(names) => {
-            format!("; the same as --policy-set POLICY.{}", names.join(" or "))
-        }
-    };
-    let on = match knob.on {
-        On::Both => "",
-        On::Native => "; native backend only",
-        On::Gpu => "; GPU backend only",
-    };
-    format!("{}{unit}, of {}{how}{on}", knob.default, knob.domain)
+    let on = BackendKind::only_one_with(knob.name)
+        .map_or_else(String::new, |only| format!("; {} backend only", only.name()));
+    format!("{}{unit}, of {}{on}", knob.default, knob.domain)
 }

@@ -15,18 +15,17 @@
 
 mod compare;
 mod console;
-mod device;
 mod devices;
 mod eval;
 mod export;
-mod failure;
+mod flags;
+mod interrupt;
 mod knobs;
-mod number;
+mod plan;
 mod policies;
 mod progress;
 mod render;
 mod run_files;
-mod scene;
 mod scenegen;
 mod selftest;
 mod study;
@@ -36,8 +35,9 @@ mod train;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
+use crate::failure;
 use console::Console;
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
@@ -106,9 +106,12 @@ pub fn run() -> ExitCode {
 
 /// Runs a command line, the program's name first; returns the exit code.
 fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
-    let words: Vec<OsString> = arguments.into_iter().map(Into::into).collect();
-    let arguments = match Arguments::try_parse_from(&words) {
-        Ok(arguments) => arguments,
+    let parsed = command().try_get_matches_from(arguments).and_then(|matches| {
+        let arguments = Arguments::from_arg_matches(&matches)?;
+        Ok((matches, arguments))
+    });
+    let (matches, arguments) = match parsed {
+        Ok(parsed) => parsed,
         Err(help_or_error) => {
             // A reader that has gone away is no reason to fail.
             let _ = help_or_error.print();
@@ -122,10 +125,10 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         _ => false,
     };
     let console = Console::new(quiet);
+    let (_, given) = matches.subcommand().unwrap_or(("", &matches));
     let done = match arguments.command {
-        Command::Train(train) => train::run(&after(&words, "train"), &train, &console),
-        Command::Plan(_) => train::arguments(&after(&words, "plan"))
-            .and_then(|train| train::plan::run(&train, &console)),
+        Command::Train(train) => train::run(&train, given, &console),
+        Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Export(export) => export::run(&export, &console),
         Command::Render(render) => render::run(&render, &console),
@@ -146,25 +149,26 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     }
 }
 
-/// The words after that of a subcommand.
-fn after(words: &[OsString], subcommand: &str) -> Vec<OsString> {
-    words.iter().skip(1).skip_while(|word| *word != subcommand).skip(1).cloned().collect()
+/// The command line, with the defaults of a run's options in the commands that have them.
+fn command() -> clap::Command {
+    const WITH_RUN_OPTIONS: [&str; 5] = ["train", "plan", "eval", "render", "selftest"];
+    WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
+        command.mut_subcommand(name, flags::with_defaults)
+    })
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     #[test]
     fn the_arguments_are_consistent() {
-        Arguments::command().debug_assert();
+        command().debug_assert();
     }
 
     #[test]
     fn every_option_is_explained() {
-        for command in Arguments::command().get_subcommands() {
+        for command in command().get_subcommands() {
             for argument in command.get_arguments() {
                 let (id, name) = (argument.get_id(), command.get_name());
                 assert!(argument.get_help().is_some(), "{name}: {id} has no help");

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use super::console::Console;
-use super::number::{duration, grouped};
+use crate::number::{duration, grouped};
 
 /// Share of the run between two lines where there is no terminal.
 const LINES: u32 = 20;

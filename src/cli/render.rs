@@ -9,14 +9,12 @@ use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 
 use super::console::Console;
-use super::device::DeviceArgs;
-use super::failure::Failure;
-use super::number;
 use super::run_files::{Machine, Opened, SplitArg, iteration, open, open_run};
-use super::scene::{NEAR, SceneArgs};
 use crate::backend::Rendering;
 use crate::dataset::images::Image8;
+use crate::failure::Failure;
 use crate::output::{OutputError, write_atomically, write_json};
+use crate::run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use crate::views::ViewSource;
 
 /// Renders a trained scene to PNG files.
@@ -55,15 +53,12 @@ pub(super) struct RenderArgs {
     side_by_side: bool,
     /// Nearest distance to a camera at which anything of a .ply is drawn, as a fraction of the
     /// scene's extent
-    #[arg(long, value_name = "FRACTION", help_heading = "Scene", default_value_t = NEAR, value_parser = number::fraction)]
-    near: f64,
-    /// Processor threads to use `[default: all]`
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
+    #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
+    near: Fraction,
     #[command(flatten)]
-    device: DeviceArgs,
+    device: DeviceSpec,
     #[command(flatten)]
-    data: SceneArgs,
+    data: DataSpec,
 }
 
 const EXAMPLES: &str = "\
@@ -76,7 +71,7 @@ Examples:
 pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     let mut opened = open_model(args, console)?;
     let views = opened.views(args.split)?;
-    let background = opened.scene.background.fixed();
+    let background = opened.data.background.fixed();
     let units = 1.0 / opened.dataset.normalisation.scale;
     let names: Vec<&str> = (0..views.count()).map(|view| views.name(view)).collect();
     let files = file_names(&names);
@@ -110,9 +105,9 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
 }
 
 fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
-    let machine = Machine { threads: args.threads, device: args.device.open_to_render(console)? };
+    let machine = Machine::open(&args.device, console)?;
     if !args.model.is_file() {
-        crate::output::RunConfig::read(&args.model)?;
+        RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;
         let moved_to = args.scene.clone();
         return open_run(&args.model, iteration, moved_to, machine, Needs::default(), console);
@@ -126,8 +121,8 @@ fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
     if args.iteration.is_some() {
         return Err(Failure::input("--iteration is for a run's folder; a file has only one model"));
     }
-    let config = args.data.config(scene);
-    open(&args.model, scene, config, (args.near, machine), Needs::default(), console)
+    let data = args.data.clone();
+    open(&args.model, scene, data, (args.near.0, machine), Needs::default(), console)
 }
 
 /// A file name without ending for each view. Names come from data files: no part of one may lead

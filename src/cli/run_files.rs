@@ -1,20 +1,19 @@
 //! A finished run or a bare PLY, opened for looking at it.
 
+use std::num::NonZeroU16;
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::Needs;
 
 use super::console::Console;
-use super::failure::Failure;
-use super::scene;
-use crate::backend::Backend;
-use crate::backend::cpu::{CpuBackend, CpuOptions};
-use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
+use crate::backend::{Backend, BackendOptions, Device};
 use crate::dataset::{Dataset, View};
 use crate::evaluate::Split;
+use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::import::ply::read_splats;
-use crate::output::{RunConfig, SceneConfig, model_path, saved_iterations};
+use crate::output::{model_path, saved_iterations};
+use crate::run::{DataSpec, DeviceSpec, RunConfig, use_threads};
 use crate::views::DatasetViews;
 
 /// Spelling of [`Split`] on the command line.
@@ -39,26 +38,26 @@ impl From<SplitArg> for Split {
 #[derive(Debug, Default)]
 pub(super) struct Machine {
     /// Processor threads; all without a number.
-    pub(super) threads: Option<u16>,
-    /// The device; the processor without one.
-    pub(super) device: Option<GpuDevice>,
+    threads: Option<usize>,
+    device: Device,
+}
+
+impl Machine {
+    /// Opens what the options say.
+    pub(super) fn open(spec: &DeviceSpec, console: &Console) -> Result<Self, Failure> {
+        let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
+        console.say(format_args!("device   {}", device.describe()));
+        use_threads(spec.threads.map(NonZeroU16::get));
+        Ok(Self { threads: spec.threads.map(|threads| usize::from(threads.get())), device })
+    }
 }
 
 /// A model with the dataset it belongs to, ready to render.
 pub(super) struct Opened {
     pub(super) dataset: Dataset,
-    pub(super) scene: SceneConfig,
+    pub(super) data: DataSpec,
     pub(super) sh_degree: u8,
     pub(super) backend: Box<dyn Backend>,
-}
-
-/// Limits rayon's common pool, which measuring uses, to the threads the user grants.
-pub(super) fn use_threads(threads: Option<u16>) {
-    if let Some(threads) = threads {
-        // It fails only if the pool is in use already; then its size is what it is.
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads));
-        let _ = pool.build_global();
-    }
 }
 
 /// The iteration asked for, or the last one saved.
@@ -93,8 +92,8 @@ pub(super) fn open_run(
     let was_moved = moved_to.is_some();
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
-    let near = config.train.near;
-    open(&model, &path, config.scene, (near, machine), needs, console).map_err(|failure| {
+    let near = config.spec.start.near.0;
+    open(&model, &path, config.spec.data, (near, machine), needs, console).map_err(|failure| {
         if was_moved || path.is_dir() {
             failure
         } else {
@@ -107,30 +106,31 @@ pub(super) fn open_run(
 pub(super) fn open(
     model: &Path,
     dataset: &Path,
-    config: SceneConfig,
+    data: DataSpec,
     (near, machine): (f64, Machine),
     needs: Needs,
     console: &Console,
 ) -> Result<Opened, Failure> {
-    use_threads(machine.threads);
-    let dataset = scene::load(dataset, &config, false, console)?;
+    let dataset = load(dataset, &data, console)?;
     let model = dataset.normalisation.model_from_world(read_model(model, console)?);
-    let budget = model.len().max(1);
-    let near = (near * dataset.extent()) as f32;
-    let largest_image = scene::largest_image(&dataset);
-    let backend: Box<dyn Backend> = match machine.device {
-        Some(device) => {
-            let options = GpuOptions { near, largest_image, needs, ..GpuOptions::new(budget) };
-            Box::new(GpuBackend::new(&model, &options, &device)?)
-        }
-        None => {
-            let threads = machine.threads.map(usize::from);
-            let options =
-                CpuOptions { near, threads, largest_image, needs, ..CpuOptions::new(budget) };
-            Box::new(CpuBackend::new(&model, &options)?)
-        }
+    let options = BackendOptions {
+        near: (near * dataset.extent()) as f32,
+        threads: machine.threads,
+        largest_image: dataset.largest_image(),
+        needs,
+        ..BackendOptions::new(model.len().max(1))
     };
-    Ok(Opened { sh_degree: model.sh_degree, backend, dataset, scene: config })
+    let backend = machine.device.backend(&model, &options)?;
+    Ok(Opened { sh_degree: model.sh_degree, backend, dataset, data })
+}
+
+/// Reads the dataset at `path`; says what there is to say.
+pub(super) fn load(path: &Path, data: &DataSpec, console: &Console) -> Result<Dataset, Failure> {
+    let dataset = Dataset::load(path, &data.load_options(false)?)?;
+    for note in &dataset.notes {
+        console.say(format_args!("note: {note}"));
+    }
+    Ok(dataset)
 }
 
 /// Reads a .ply of Gaussian splats by any program, in its own coordinates; says what was wrong with it.

@@ -9,9 +9,9 @@ use densify_scenegen::{
 };
 
 use super::console::Console;
-use super::failure::Failure;
-use super::number;
-use super::run_files::use_threads;
+use crate::failure::Failure;
+use crate::number;
+use crate::run::use_threads;
 
 /// Ray-traces a mesh into posed images of known geometry.
 ///

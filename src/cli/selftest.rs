@@ -5,11 +5,12 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use super::device::DeviceArgs;
-use super::failure::{Failure, OTHER};
+use crate::backend::Device;
 use crate::backend::cpu::InstructionSet;
 use crate::backend::gpu::{Accumulation, AdapterChoice, GpuDevice, adapters};
+use crate::failure::{Failure, OTHER};
 use crate::output::write_atomically;
+use crate::run::DeviceSpec;
 use crate::verify::{Case, Finding, Subject, Tested, cases, markdown, table};
 
 /// Holds this machine against a renderer in float64, where numbers are hardest.
@@ -36,11 +37,8 @@ pub(super) struct SelftestArgs {
     /// On every backend that there is: the processor, and all adapters, software drivers included
     #[arg(long, conflicts_with_all = ["backend", "gpu"])]
     all: bool,
-    /// Processor threads to use `[default: all]`
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
     #[command(flatten)]
-    device: DeviceArgs,
+    device: DeviceSpec,
 }
 
 const EXAMPLES: &str = "\
@@ -57,7 +55,7 @@ const SUMS: Option<Accumulation> = Some(Accumulation::Slots);
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {
     let chosen = chosen(&args.only)?;
     let mut tested: Vec<Tested> = Vec::new();
-    for subject in subjects(args, console)? {
+    for subject in subjects(args)? {
         console.result(format_args!(
             "densify {} on {}: {}, {}",
             env!("CARGO_PKG_VERSION"),
@@ -100,13 +98,17 @@ fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
 }
 
 /// What is to be tested.
-fn subjects(args: &SelftestArgs, console: &Console) -> Result<Vec<Subject>, Failure> {
+fn subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
     let native = Subject::Native {
         instructions: InstructionSet::default(),
-        threads: args.threads.map(usize::from),
+        threads: args.device.threads.map(|threads| usize::from(threads.get())),
     };
     if !args.all {
-        return Ok(vec![args.device.open(SUMS, console)?.map_or(native, Subject::Gpu)]);
+        let device = Device::open_to_render(args.device.backend, args.device.gpu.as_deref())?;
+        return Ok(vec![match device {
+            Device::Processor => native,
+            Device::Gpu(device) => Subject::Gpu(device),
+        }]);
     }
     let mut subjects = vec![native];
     for adapter in adapters().into_iter().filter(|adapter| adapter.missing.is_empty()) {

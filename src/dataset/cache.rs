@@ -3,7 +3,7 @@
 //! Training visits every view once per epoch, in a new order each time. The next use of a view just
 //! seen is therefore the furthest away on average, so that the most recently used image is evicted
 //! first, but never one that was announced. (Least-recently-used eviction would always miss as soon
-//! as the images do not all fit.) Over 400 lines because of its tests.
+//! as the images do not all fit.) One piece with its tests, which are half of it.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};

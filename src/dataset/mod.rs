@@ -7,6 +7,7 @@
 pub mod builtin;
 mod cache;
 mod colmap;
+mod describe;
 mod error;
 mod folders;
 pub mod images;

@@ -1,9 +1,8 @@
-//! Every setting that trades speed or memory for accuracy, in one table: what it is called, what it
-//! may be, what it costs at worst, and how it is set.
+//! The knobs: settings that trade speed or memory for accuracy, in one table with what each is called, what
+//! it may be and what it costs at worst.
 //!
-//! A *knob* is a name for a setting. Some knobs are options of `densify train` or parameters of a
-//! policy by another name ([`How`]); the others are set by `--knob` alone, and stand in `[knobs]` of
-//! `config.toml`. [`Settings`] holds these.
+//! A knob is set with `--knob NAME=VALUE`, or in the table `[knob]` of a file. [`Knobs`] holds those of a
+//! run; [`Preset`]s are knobs and options that go together.
 
 mod presets;
 mod settings;
@@ -12,7 +11,7 @@ mod table;
 use std::fmt;
 
 pub use presets::{DEFAULT_PRESET, EXACT, Measured, PRESETS, Preset, preset};
-pub use settings::Settings;
+pub use settings::Knobs;
 pub use table::KNOBS;
 
 /// A setting that trades speed or memory for accuracy.
@@ -20,22 +19,20 @@ pub use table::KNOBS;
 pub struct Knob {
     /// Its name.
     pub name: &'static str,
-    /// What it is where nobody says otherwise; words in brackets where that is not one value.
+    /// Its default value.
     pub default: &'static str,
     /// What it may be.
     pub domain: Domain,
-    /// Of its values; empty for words and plain numbers.
+    /// The unit of its values; empty for words and plain numbers.
     pub unit: &'static str,
     /// What it can do to the result, at worst.
     pub class: Class,
-    /// Which backends have it.
-    pub on: On,
-    /// How it is set.
-    pub how: How,
-    /// What it is and what it buys, in a line.
-    pub what: &'static str,
-    /// Values that `densify trade` measures.
-    pub levels: Levels,
+    /// What it does and what that gains, in a line.
+    pub effect: &'static str,
+    /// Values that `densify trade` measures, besides the default.
+    pub levels: &'static [&'static str],
+    /// Sets it to a value in the table's spelling.
+    pub(super) set: fn(&mut Knobs, &str),
 }
 
 /// What a knob may be.
@@ -50,13 +47,6 @@ pub enum Domain {
         /// The most.
         most: f64,
     },
-    /// A whole number.
-    Whole {
-        /// The least.
-        least: u64,
-        /// The most.
-        most: u64,
-    },
 }
 
 /// What a knob can do to the result, at worst.
@@ -70,40 +60,7 @@ pub enum Class {
     Heuristic,
 }
 
-/// Which backends have a knob.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum On {
-    /// Both.
-    Both,
-    /// The native backend.
-    Native,
-    /// The GPU backend.
-    Gpu,
-}
-
-/// How a knob is set.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum How {
-    /// With `--knob NAME=VALUE`.
-    Knob,
-    /// With an option of `densify train`; `--knob` is another name for it.
-    Flag(&'static str),
-    /// With the first of these parameters that the policy has; `--knob` is another name for it.
-    Parameter(&'static [&'static str]),
-}
-
-/// Values of a knob that `densify trade` measures, beside its default.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Levels {
-    /// These.
-    Values(&'static [&'static str]),
-    /// So many times the budget of the run.
-    TimesBudget(&'static [f64]),
-    /// So many times the iterations of the run.
-    TimesIterations(&'static [f64]),
-}
-
-/// Why a knob cannot be what it was to be: one message with the nearest that works.
+/// A rejected knob or value, with the nearest valid one.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct KnobError(pub(crate) String);
@@ -122,19 +79,14 @@ pub fn find(name: &str) -> Result<&'static Knob, KnobError> {
     })
 }
 
-/// Takes `NAME=VALUE` apart.
+/// The number of a knob in [`KNOBS`], and a value of it as the table spells it.
 ///
 /// # Errors
-/// When it has another form, no knob has the name, or the value is outside its domain.
-pub fn parse(setting: &str) -> Result<(&'static Knob, String), KnobError> {
-    let Some((name, value)) = setting.split_once('=') else {
-        return Err(KnobError(format!(
-            "`{setting}` is not of the form NAME=VALUE, such as alpha_min=1/128"
-        )));
-    };
-    let knob = find(name.trim())?;
-    let value = knob.canonical(value.trim())?;
-    Ok((knob, value))
+/// When there is no such knob, or the value is outside its domain.
+fn parse_setting(name: &str, value: &str) -> Result<(usize, String), KnobError> {
+    let knob = find(name)?;
+    let number = KNOBS.iter().position(|other| other.name == knob.name);
+    Ok((number.unwrap_or_default(), knob.canonical(value.trim())?))
 }
 
 impl Knob {
@@ -163,23 +115,12 @@ impl Knob {
                 Some(value) if value > most => Err(bad(self.spelled(most))),
                 _ => Err(bad(self.default.to_owned())),
             },
-            Domain::Whole { least, most } => match text.parse::<f64>() {
-                Ok(value) if value < least as f64 => Err(bad(least.to_string())),
-                Ok(value) if value > most as f64 => Err(bad(most.to_string())),
-                Ok(value) if value.fract() == 0.0 => Ok((value as u64).to_string()),
-                Ok(value) if value.is_finite() => Err(bad((value.round() as u64).to_string())),
-                _ => Err(bad(least.to_string())),
-            },
         }
     }
 
     /// A number as the default, the levels or the ends of the domain spell it, else as a decimal.
     fn spelled(&self, value: f64) -> String {
-        let levels = match self.levels {
-            Levels::Values(values) => values,
-            _ => &[],
-        };
-        let known = levels.iter().copied().chain([self.default]);
+        let known = self.levels.iter().copied().chain([self.default]);
         let same =
             |text: &&str| number(text).is_some_and(|number| number.total_cmp(&value).is_eq());
         known.into_iter().find(same).map_or_else(|| plain(value), str::to_owned)
@@ -189,26 +130,6 @@ impl Knob {
     #[must_use]
     pub fn is_default(&self, value: &str) -> bool {
         value == self.default
-    }
-
-    /// Fails where a backend would have to be what it cannot be.
-    ///
-    /// # Errors
-    /// When the value is not the default and the backend that is to train lacks the knob.
-    pub fn check_backend(&self, value: &str, gpu: bool) -> Result<(), KnobError> {
-        let (here, other) = match (self.on, gpu) {
-            (On::Native, true) => ("GPU", "cpu"),
-            (On::Gpu, false) => ("native", "gpu"),
-            (On::Both, _) | (On::Native, false) | (On::Gpu, true) => return Ok(()),
-        };
-        if self.is_default(value) {
-            return Ok(());
-        }
-        let Self { name, default, .. } = self;
-        Err(KnobError(format!(
-            "knob {name}={value}: the {here} backend does not have it; the nearest that works there \
-             is {name}={default}, or use --backend {other}"
-        )))
     }
 }
 
@@ -254,10 +175,6 @@ impl fmt::Display for Domain {
                 };
                 write!(f, "{} to {}", shown(least), shown(most))
             }
-            Self::Whole { least, most } if *most >= u64::from(u32::MAX) => {
-                write!(f, "{least} or more")
-            }
-            Self::Whole { least, most } => write!(f, "{least} to {most}"),
         }
     }
 }

@@ -1,18 +1,18 @@
-//! Presets: knobs that go together, named by what they promise. Levels are chosen from what
+//! Presets: knobs and options that go together, named by what they promise. Levels are chosen from what
 //! `densify trade` measures, and each says what that was.
 
 use std::fmt;
 
 use super::KnobError;
 
-/// Knobs that go together.
+/// Knobs and options that go together.
 #[derive(Debug)]
 pub struct Preset {
     /// Its name.
     pub name: &'static str,
     /// What it promises.
-    pub what: &'static str,
-    /// Knobs with their values, as the table of knobs spells them.
+    pub promise: &'static str,
+    /// Knobs and options by name, each with its value.
     pub levels: &'static [(&'static str, &'static str)],
     /// What that costs and buys; `None` for the one that the others are measured against.
     pub measured: Option<Measured>,
@@ -62,7 +62,7 @@ pub const DEFAULT_PRESET: &str = "balanced";
 pub static PRESETS: &[Preset] = &[
     Preset {
         name: EXACT,
-        what: "no shortcut that a knob can take",
+        promise: "no shortcut that a knob can take",
         levels: &[
             ("alpha_min", "1/255"),
             ("transmittance_stop", "1e-4"),
@@ -78,7 +78,7 @@ pub static PRESETS: &[Preset] = &[
     // docs/tradeoffs.md.
     Preset {
         name: "balanced",
-        what: "four fifths of the iterations; what the others bring cannot be seen",
+        promise: "four fifths of the iterations; what the others bring cannot be seen",
         levels: &[("iterations", "24000")],
         measured: Some(Measured {
             psnr: -0.01,
@@ -91,7 +91,7 @@ pub static PRESETS: &[Preset] = &[
     },
     Preset {
         name: "fast",
-        what: "half of the iterations",
+        promise: "half of the iterations",
         levels: &[("iterations", "15000")],
         measured: Some(Measured {
             psnr: 0.03,
@@ -104,7 +104,7 @@ pub static PRESETS: &[Preset] = &[
     },
     Preset {
         name: "tiny-memory",
-        what: "memory before time",
+        promise: "memory before time",
         // 478 bytes per row at degree 3 with `diet`; docs/memory.md has the table.
         levels: &[
             ("image_cache", "0"),
@@ -140,7 +140,7 @@ impl fmt::Display for Preset {
         let levels: Vec<String> =
             self.levels.iter().map(|(knob, value)| format!("{knob}={value}")).collect();
         let levels = if levels.is_empty() { "the defaults".to_owned() } else { levels.join(" ") };
-        write!(f, "{}: {}; {levels}; ", self.name, self.what)?;
+        write!(f, "{}: {}; {levels}; ", self.name, self.promise)?;
         match self.measured {
             None => f.write_str("what the others are measured against"),
             Some(Measured { psnr, interval: [low, high], seconds, peak, on, .. }) => write!(

@@ -1,133 +1,87 @@
-//! The knobs that are set by `--knob` alone, as a run has them.
+//! The knobs of a run, with what follows from them for backends and for the trainer.
 
-use std::collections::BTreeMap;
+use toml::{Table, Value};
 
-use serde::{Deserialize, Serialize};
-
-use super::{How, KNOBS, Knob, KnobError, find, number, parse};
+use super::{KNOBS, Knob, KnobError, parse_setting};
 use crate::backend::gpu::Accumulation;
-use crate::backend::{MomentStorage, ParameterStorage, Shortcuts, Storage};
+use crate::backend::{Shortcuts, Storage};
 use crate::trainer::Savings;
 
-/// All knobs that are set by `--knob` alone, by name, each with its value as the table spells it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct Settings(BTreeMap<String, String>);
+/// All knobs, each set.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Knobs {
+    /// Where a backend computes less than it could.
+    pub shortcuts: Shortcuts,
+    /// How parameters and moments are stored.
+    pub storage: Storage,
+    /// Where the trainer computes less than it could.
+    pub savings: Savings,
+    /// (Row, tile) pairs held per row of the budget; `None`: as `--tile-cap` and `--memory` say.
+    pub pairs_per_row: Option<usize>,
+    /// How a GPU adds up gradients; `None`: the fastest way that it has.
+    pub accumulation: Option<Accumulation>,
+    /// Each knob's value as the table spells it, in the table's order.
+    values: Vec<String>,
+}
 
-impl Default for Settings {
+impl Default for Knobs {
     fn default() -> Self {
-        let knobs = KNOBS.iter().filter(|knob| knob.how == How::Knob);
-        Self(knobs.map(|knob| (knob.name.to_owned(), knob.default.to_owned())).collect())
+        let mut knobs = Self {
+            shortcuts: Shortcuts::default(),
+            storage: Storage::default(),
+            savings: Savings::NONE,
+            pairs_per_row: None,
+            accumulation: None,
+            values: KNOBS.iter().map(|knob| knob.default.to_owned()).collect(),
+        };
+        for knob in KNOBS {
+            (knob.set)(&mut knobs, knob.default);
+        }
+        knobs
     }
 }
 
-impl Settings {
-    /// The defaults, with these `NAME=VALUE`. Knobs that are options or parameters by another name are
-    /// left out: these take effect, and are checked, where options and parameters are.
+impl Knobs {
+    /// The defaults, with these values by name.
     ///
     /// # Errors
-    /// When a knob or its value is none.
-    pub fn of(settings: &[String]) -> Result<Self, KnobError> {
-        let mut all = Self::default();
-        for setting in settings {
-            let name = setting.split('=').next().unwrap_or_default().trim();
-            if find(name).is_ok_and(|knob| knob.how != How::Knob) {
-                continue;
-            }
-            let (knob, value) = parse(setting)?;
-            all.0.insert(knob.name.to_owned(), value);
+    /// When there is no such knob, or its value is outside its domain.
+    pub fn from_table(table: &Table) -> Result<Self, KnobError> {
+        let mut knobs = Self::default();
+        for (name, value) in table {
+            let text = match value {
+                Value::String(text) => text.clone(),
+                other => other.to_string(),
+            };
+            knobs.set(name, &text)?;
         }
-        Ok(all)
+        Ok(knobs)
     }
 
-    /// The settings of a run as it had them, where it was of a version that lacked some: by default,
-    /// but for sums in slots on a GPU, which had no other.
-    #[must_use]
-    pub fn completed(&self, gpu: bool) -> Self {
-        let mut all = Self::default();
-        if gpu {
-            all.take_accumulation(Accumulation::Slots);
-        }
-        all.0.extend(self.0.clone());
-        all
-    }
-
-    /// Notes how the device that was opened adds up, so that `auto` is no longer open.
-    pub fn take_accumulation(&mut self, taken: Accumulation) {
-        self.0.insert("accumulation".to_owned(), taken.name().to_owned());
-    }
-
-    /// How a GPU is to add up gradients; `None` where that is its own choice.
-    #[must_use]
-    pub fn accumulation(&self) -> Option<Accumulation> {
-        Accumulation::of_name(self.text("accumulation"))
+    /// Sets a knob.
+    ///
+    /// # Errors
+    /// As [`from_table`](Self::from_table).
+    pub fn set(&mut self, name: &str, value: &str) -> Result<(), KnobError> {
+        let (number, value) = parse_setting(name, value)?;
+        (KNOBS[number].set)(self, &value);
+        self.values[number] = value;
+        Ok(())
     }
 
     /// Each knob with its value.
-    pub fn iter(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.0.iter().map(|(name, value)| (&**name, &**value))
+    pub fn iter(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
+        KNOBS.iter().zip(&self.values).map(|(knob, value)| (knob, &**value))
     }
 
     /// Each knob that is not as it is by default.
     pub fn changed(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
-        KNOBS.iter().filter_map(|knob| {
-            let value = self.0.get(knob.name)?;
-            (!knob.is_default(value)).then_some((knob, &**value))
-        })
+        self.iter().filter(|(knob, value)| !knob.is_default(value))
     }
 
-    /// Fails where a backend lacks a knob that is set.
-    ///
-    /// # Errors
-    /// Names the knob.
-    pub fn check_backend(&self, gpu: bool) -> Result<(), KnobError> {
-        self.changed().try_for_each(|(knob, value)| knob.check_backend(value, gpu))
-    }
-
-    /// What of it is a backend's to know.
+    /// Every knob by name, as a file has them.
     #[must_use]
-    pub fn shortcuts(&self) -> Shortcuts {
-        let default = Shortcuts::default();
-        let number = |name: &str| number(self.text(name)).map(|value| value as f32);
-        Shortcuts {
-            alpha_min: number("alpha_min").unwrap_or(default.alpha_min),
-            transmittance_min: number("transmittance_stop").unwrap_or(default.transmittance_min),
-        }
-    }
-
-    /// How parameters and moments are stored.
-    #[must_use]
-    pub fn storage(&self) -> Storage {
-        Storage {
-            parameters: match self.text("param_storage") {
-                "f16" => ParameterStorage::F16,
-                _ => ParameterStorage::F32,
-            },
-            moments: match self.text("moment_storage") {
-                "both8" => MomentStorage::Both8,
-                _ => MomentStorage::F32,
-            },
-        }
-    }
-
-    /// (Row, tile) pairs held per row of the budget; `None` where that is not set.
-    #[must_use]
-    pub fn pairs_per_row(&self) -> Option<usize> {
-        self.text("pairs_per_row").parse().ok()
-    }
-
-    /// What of it is the trainer's to know.
-    #[must_use]
-    pub fn savings(&self) -> Savings {
-        Savings {
-            ssim_every: self.text("ssim_every").parse().unwrap_or(1),
-            coarse_until: number(self.text("coarse_until")).unwrap_or(0.0),
-            budget_share: number(self.text("budget_share")).unwrap_or(1.0),
-        }
-    }
-
-    /// The value of a knob; empty for one that is not set here.
-    fn text(&self, name: &str) -> &str {
-        self.0.get(name).map_or("", String::as_str)
+    pub fn table(&self) -> Table {
+        self.iter().map(|(knob, value)| (knob.name.to_owned(), value.into())).collect()
     }
 }

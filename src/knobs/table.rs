@@ -1,48 +1,21 @@
-//! The knobs. Figures behind their classes and levels: `docs/tradeoffs.md`, which `densify trade`
-//! writes.
+//! The knobs. `densify trade` measures what they cost and gain; docs/tradeoffs.md has the figures.
 
 use super::Class::{Bounded, Exact, Heuristic};
-use super::How::{Flag, Parameter};
-use super::Levels::{TimesBudget, TimesIterations, Values};
-use super::{Domain, How, Knob, On};
-
-/// A count without an upper end of its own.
-const MANY: u64 = u32::MAX as u64;
+use super::{Domain, Knob, number};
+use crate::backend::gpu::Accumulation;
+use crate::backend::{MomentStorage, ParameterStorage};
 
 /// All knobs: exact ones, then bounded ones, then heuristic ones.
 pub static KNOBS: &[Knob] = &[
-    Knob {
-        name: "tile_cap",
-        default: "[16 per row of the budget]",
-        domain: Domain::Whole { least: 1, most: MANY },
-        unit: "pairs",
-        class: Exact,
-        on: On::Both,
-        how: Flag("--tile-cap"),
-        what: "(row, tile) pairs held at a time; fewer take less memory, and cut views into bands",
-        levels: TimesBudget(&[1.0, 4.0, 32.0]),
-    },
     Knob {
         name: "pairs_per_row",
         default: "auto",
         domain: Domain::Choice(&["auto", "4", "2", "1"]),
         unit: "pairs",
         class: Exact,
-        on: On::Native,
-        how: How::Knob,
-        what: "tile_cap per row, with gradients for 2 in 5; auto: 16, or 4 to 16 with --memory, and for all",
-        levels: Values(&["4", "2", "1"]),
-    },
-    Knob {
-        name: "image_cache",
-        default: "[1 GiB, or what --memory leaves]",
-        domain: Domain::Whole { least: 0, most: 1 << 53 },
-        unit: "bytes",
-        class: Exact,
-        on: On::Both,
-        how: Flag("--image-cache"),
-        what: "decoded photographs held at a time; those beyond it are decoded again, two at least are held",
-        levels: Values(&["0", "16777216"]),
+        effect: "tile_cap per Gaussian, with gradients for 2 in 5; auto: 16, or 4 to 16 with --memory, and for all",
+        levels: &["4", "2", "1"],
+        set: |knobs, value| knobs.pairs_per_row = value.parse().ok(),
     },
     Knob {
         name: "alpha_min",
@@ -50,10 +23,9 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Number { least: 1.0 / 1024.0, most: 1.0 / 32.0 },
         unit: "",
         class: Bounded,
-        on: On::Both,
-        how: How::Knob,
-        what: "alpha below this is not blended; a larger one shrinks splats, so that fewer pairs are left",
-        levels: Values(&["1/1024", "1/128", "1/64", "1/32"]),
+        effect: "alpha below this is not blended; a larger one shrinks splats, so that fewer pairs are left",
+        levels: &["1/1024", "1/128", "1/64", "1/32"],
+        set: |knobs, value| knobs.shortcuts.alpha_min = real(value) as f32,
     },
     Knob {
         name: "transmittance_stop",
@@ -61,10 +33,9 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Number { least: 1e-5, most: 1e-2 },
         unit: "",
         class: Bounded,
-        on: On::Both,
-        how: How::Knob,
-        what: "a pixel that lets no more light through takes no more splats; a larger one stops sooner",
-        levels: Values(&["1e-5", "1e-3", "1e-2"]),
+        effect: "a pixel stops before its transmittance falls below this; a larger one stops sooner",
+        levels: &["1e-5", "1e-3", "1e-2"],
+        set: |knobs, value| knobs.shortcuts.transmittance_min = real(value) as f32,
     },
     Knob {
         name: "accumulation",
@@ -72,21 +43,9 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Choice(&["auto", "slots", "cas", "atomics"]),
         unit: "",
         class: Bounded,
-        on: On::Gpu,
-        how: How::Knob,
-        what: "how gradients are added up: in slots, in one order, or by atomics, whose last bits are chance",
-        levels: Values(&["slots", "cas", "atomics"]),
-    },
-    Knob {
-        name: "preset",
-        default: "balanced",
-        domain: Domain::Choice(&["exact", "balanced", "fast", "tiny-memory"]),
-        unit: "",
-        class: Heuristic,
-        on: On::Both,
-        how: Flag("--preset"),
-        what: "knobs that go together, by what they promise; `densify knobs` lists them below",
-        levels: Values(&["balanced", "fast", "tiny-memory"]),
+        effect: "how gradients are added up: slots in one order; cas and atomics in any, so that runs differ slightly",
+        levels: &["slots", "cas", "atomics"],
+        set: |knobs, value| knobs.accumulation = Accumulation::of_name(value),
     },
     Knob {
         name: "ssim_every",
@@ -94,10 +53,9 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Choice(&["1", "2", "5", "10"]),
         unit: "iterations",
         class: Heuristic,
-        on: On::Native,
-        how: How::Knob,
-        what: "SSIM in every so many-th step with as many times its weight, L1 in all; saves most of the loss",
-        levels: Values(&["2", "5", "10"]),
+        effect: "SSIM in every so many-th step with as many times its weight, L1 in all; saves most of the loss",
+        levels: &["2", "5", "10"],
+        set: |knobs, value| knobs.savings.ssim_every = value.parse().unwrap_or(1),
     },
     Knob {
         name: "coarse_until",
@@ -105,10 +63,9 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Number { least: 0.0, most: 0.9 },
         unit: "of the run",
         class: Heuristic,
-        on: On::Both,
-        how: How::Knob,
-        what: "share of the run, from its start, that is trained on images of half their sides",
-        levels: Values(&["0.2", "0.4", "0.6"]),
+        effect: "share of the run, from its start, that is trained on images of half the size",
+        levels: &["0.2", "0.4", "0.6"],
+        set: |knobs, value| knobs.savings.coarse_until = real(value),
     },
     Knob {
         name: "budget_share",
@@ -116,10 +73,9 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Number { least: 0.05, most: 1.0 },
         unit: "of the budget",
         class: Heuristic,
-        on: On::Both,
-        how: How::Knob,
-        what: "rows may grow up to this share of the budget; what is left is neither touched nor computed",
-        levels: Values(&["0.25", "0.5", "0.75"]),
+        effect: "Gaussians may grow up to this share of the budget; the rest is neither touched nor computed",
+        levels: &["0.25", "0.5", "0.75"],
+        set: |knobs, value| knobs.savings.budget_share = real(value),
     },
     Knob {
         name: "param_storage",
@@ -127,10 +83,14 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Choice(&["f32", "f16"]),
         unit: "",
         class: Bounded,
-        on: On::Native,
-        how: How::Knob,
-        what: "f16: parameters but for the means in 2 bytes, rounded at random; 112 bytes less per row of 59",
-        levels: Values(&["f16"]),
+        effect: "f16: parameters other than means in 2 bytes, rounded at random; 112 bytes less per Gaussian of degree 3",
+        levels: &["f16"],
+        set: |knobs, value| {
+            knobs.storage.parameters = match value {
+                "f16" => ParameterStorage::F16,
+                _ => ParameterStorage::F32,
+            }
+        },
     },
     Knob {
         name: "moment_storage",
@@ -138,75 +98,18 @@ pub static KNOBS: &[Knob] = &[
         domain: Domain::Choice(&["f32", "both8"]),
         unit: "",
         class: Bounded,
-        on: On::Native,
-        how: How::Knob,
-        what: "both8: Adam's two moments in 1 byte each, rounded at random; 354 bytes less per row of 59",
-        levels: Values(&["both8"]),
-    },
-    Knob {
-        name: "sh_degree",
-        default: "[3, or what --memory holds]",
-        domain: Domain::Whole { least: 0, most: 3 },
-        unit: "",
-        class: Heuristic,
-        on: On::Both,
-        how: Flag("--sh-degree"),
-        what: "how colour depends on the direction of view; 14, 23, 38 or 59 numbers per row",
-        levels: Values(&["0", "1", "2"]),
-    },
-    Knob {
-        name: "sh_every",
-        default: "[the policy's]",
-        domain: Domain::Whole { least: 1, most: 1000 },
-        unit: "iterations",
-        class: Heuristic,
-        on: On::Both,
-        how: Flag("--sh-every"),
-        what: "iterations per optimiser step of view-dependent colour, the largest part of a row",
-        levels: Values(&["4", "8", "16"]),
-    },
-    Knob {
-        name: "refine_every",
-        default: "[the policy's]",
-        domain: Domain::Whole { least: 1, most: MANY },
-        unit: "iterations",
-        class: Heuristic,
-        on: On::Both,
-        how: Parameter(&["grow_every"]),
-        what: "iterations between two edits of the rows; a longer interval plans less often",
-        levels: Values(&["50", "100", "200", "400"]),
-    },
-    Knob {
-        name: "score_views",
-        default: "[the policy's]",
-        domain: Domain::Whole { least: 1, most: MANY },
-        unit: "views",
-        class: Heuristic,
-        on: On::Both,
-        how: Parameter(&["views", "fresh_views"]),
-        what: "training views rendered for one score of the rows, by policies that do; fewer take less time",
-        levels: Values(&["2", "5", "20"]),
-    },
-    Knob {
-        name: "iterations",
-        default: "[the preset's]",
-        domain: Domain::Whole { least: 1, most: MANY },
-        unit: "iterations",
-        class: Heuristic,
-        on: On::Both,
-        how: Flag("--iterations"),
-        what: "length of the run; every schedule scales with it",
-        levels: TimesIterations(&[0.25, 0.5, 2.0]),
-    },
-    Knob {
-        name: "budget",
-        default: "[200000, or what --memory holds]",
-        domain: Domain::Whole { least: 1, most: MANY },
-        unit: "rows",
-        class: Heuristic,
-        on: On::Both,
-        how: Flag("--budget"),
-        what: "most rows at any instant; memory and time follow it",
-        levels: TimesBudget(&[0.25, 0.5, 2.0]),
+        effect: "both8: both moments of the optimiser in a byte each",
+        levels: &["both8"],
+        set: |knobs, value| {
+            knobs.storage.moments = match value {
+                "both8" => MomentStorage::Both8,
+                _ => MomentStorage::F32,
+            }
+        },
     },
 ];
+
+/// The number that a value in the table's spelling is.
+fn real(value: &str) -> f64 {
+    number(value).unwrap_or_default()
+}

@@ -17,29 +17,26 @@
 
 mod atomic;
 mod cameras;
-mod config;
 pub(crate) mod disk;
 mod folder;
 mod records;
-mod requirements;
 mod tensorboard;
 
 pub use atomic::{WriteError, write_atomically, write_atomically_from};
 pub use cameras::cameras_json;
-pub use config::{
-    CONFIG_FILE, DegreeChoice, InitChoice, PolicyConfig, RunConfig, SceneConfig, TrainConfig,
-};
 pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
 pub use records::{
     RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,
 };
-pub use requirements::{LeftOut, Requirements};
 pub use tensorboard::TensorBoard;
 
 pub use crate::evaluate::Mean;
 
 use std::path::{Path, PathBuf};
+
+/// Name of the file in a run's folder that describes the run.
+pub const CONFIG_FILE: &str = "config.toml";
 
 /// Errors of writing and reading the files of a run.
 #[derive(Debug, thiserror::Error)]

@@ -1,5 +1,7 @@
 //! Options of a run that the trainer acts on.
 
+use serde::{Deserialize, Serialize};
+
 use crate::schedule::{Background, RateOptions};
 
 /// Options of a run, beside its scene and its policy.
@@ -76,11 +78,12 @@ pub struct Required {
 }
 
 /// What happens to rows with a parameter or a moment that is NaN or infinite.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
 pub enum OnNan {
-    /// They are removed; many of them at once end the run.
+    /// Stop the run, with a checkpoint
+    Stop,
+    /// Remove them; stop only if they are more than 0.1 % at once
     #[default]
     Prune,
-    /// They end the run.
-    Stop,
 }

@@ -13,7 +13,7 @@ use densify::checkpoint::Checkpoint;
 use densify::dataset::{Dataset, LoadOptions};
 use densify::gaussians::Gaussians;
 use densify::import::ply::{read_points, read_splats};
-use densify::output::RunConfig;
+use densify::run::RunConfig;
 use densify_scenegen::{Options, PointOptions, Scene, Source};
 use glam::{DMat3, DQuat, DVec3};
 
@@ -109,7 +109,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         let Ok(mut found) = Checkpoint::open(&folder.join("step.safetensors")) else {
             return false;
         };
-        let budget = found.header().config.train.budget;
+        let budget = found.header().budget;
         let Ok(model) = found.blank_model() else {
             return false;
         };

@@ -5,15 +5,16 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use toml::{Table, Value};
 
 use super::contender::Contender;
 use super::{POINTS, run_folder};
-use crate::cli::failure::Failure;
-use crate::cli::number::grouped;
-use crate::cli::study::{Call, Entry, Summary, has_geometry, in_run, last_arguments};
+use crate::cli::study::{Call, Entry, Summary, has_geometry, in_run};
+use crate::failure::Failure;
 use crate::metrics::geometry::Geometry;
+use crate::number::grouped;
 use crate::output::{Mean, geometry_of};
+use crate::run::Partial;
 
 /// What is run.
 #[derive(Debug, Clone, PartialEq)]
@@ -25,8 +26,8 @@ pub(super) struct Cell {
     pub(super) budget: usize,
     pub(super) seed: u32,
     pub(super) iterations: u32,
-    /// More options of `densify train`.
-    pub(super) train: Vec<String>,
+    /// Options that all runs share.
+    pub(super) train: Partial,
 }
 
 impl fmt::Display for Cell {
@@ -48,8 +49,8 @@ pub(super) struct Record {
     pub(super) iterations: u32,
     /// Folder of the run, in `runs`.
     pub(super) run: String,
-    /// The call, but for the output folder: a run with the same is not run again.
-    pub(super) arguments: Vec<String>,
+    /// The run's description: one with the same is not run again.
+    pub(super) spec: Table,
     /// Mean over the views held out `[dB]`.
     pub(super) psnr: f64,
     /// Mean over the views held out.
@@ -86,24 +87,25 @@ impl Entry for Record {
     type Of = Cell;
 
     fn is_of(&self, cell: &Cell) -> bool {
-        self.arguments == cell.arguments() && self.densify == env!("CARGO_PKG_VERSION")
+        self.spec == cell.spec() && self.densify == env!("CARGO_PKG_VERSION")
     }
 }
 
 impl Cell {
-    /// The call of `densify` that runs this cell, but for the output folder.
-    fn arguments(&self) -> Vec<String> {
-        let tests: Vec<String> =
-            (1..POINTS).map(|i| (self.iterations * i / POINTS).max(1).to_string()).collect();
-        let mut arguments = vec!["train".to_owned(), self.scene.to_string_lossy().into_owned()];
-        arguments.extend(Contender::new(&self.policy).options());
-        let mut set = |name: &str, value: String| arguments.extend([name.to_owned(), value]);
-        set("--budget", self.budget.to_string());
-        set("--seed", self.seed.to_string());
-        set("--iterations", self.iterations.to_string());
-        set("--test-iterations", tests.join(","));
-        arguments.extend(last_arguments(&self.train));
-        arguments
+    /// The description of the run.
+    fn spec(&self) -> Table {
+        let tests = (1..POINTS).map(|i| i64::from((self.iterations * i / POINTS).max(1)));
+        let own = [
+            ("scene", Value::from(self.scene.to_string_lossy().into_owned())),
+            ("budget", Value::from(i64::try_from(self.budget).unwrap_or(i64::MAX))),
+            ("seed", Value::from(self.seed)),
+            ("iterations", Value::from(self.iterations)),
+            ("test_iterations", Value::from(tests.collect::<Vec<_>>())),
+        ];
+        let own = own.into_iter().fold(self.train.clone(), |spec, (name, value)| {
+            Partial::option(name, value).over(spec)
+        });
+        Contender::new(&self.policy).options().over(own).into_table()
     }
 
     fn run(&self) -> String {
@@ -118,12 +120,8 @@ impl Cell {
     pub(super) fn train(&self, output: &Path) -> Result<Record, Failure> {
         let run = self.run();
         let folder = output.join("runs").join(&run);
-        let call = Call {
-            scene: &self.scene,
-            arguments: self.arguments(),
-            options: &self.train,
-            folder: &folder,
-        };
+        let spec = self.spec();
+        let call = Call { spec: &spec, folder: &folder };
         let done = call.train().and_then(|()| match has_geometry(&self.scene) {
             true => call.measure(),
             false => Ok(()),
@@ -149,7 +147,7 @@ impl Cell {
             seed: self.seed,
             iterations: self.iterations,
             run,
-            arguments: self.arguments(),
+            spec: self.spec(),
             psnr,
             ssim,
             flip,
@@ -169,8 +167,9 @@ impl Cell {
 pub(super) fn over_time(output: &Path, record: &Record, field: &str) -> Vec<(u32, f64)> {
     let path = run_folder(output, record).join("stats/train.jsonl");
     let text = fs::read_to_string(path).unwrap_or_default();
-    let steps = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
-    let point = |step: Value| {
+    let steps =
+        text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    let point = |step: serde_json::Value| {
         let iteration = u32::try_from(step["step"].as_u64()?).ok()?;
         Some((iteration, step[field].as_f64()?))
     };

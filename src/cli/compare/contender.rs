@@ -4,7 +4,10 @@ use densify_policies::parameters::parse_overrides;
 use densify_policies::policy::SceneInfo;
 use densify_policies::registry::find;
 
-use crate::cli::failure::Failure;
+use toml::Table;
+
+use crate::failure::Failure;
+use crate::run::Partial;
 
 /// A policy as it is named on the command line: `NAME`, or `NAME:PARAMETER=VALUE`, with as many
 /// parameters as wanted.
@@ -25,10 +28,11 @@ impl<'a> Contender<'a> {
         self.settings.iter().map(|setting| format!("{}.{setting}", self.name)).collect()
     }
 
-    /// Options of `densify train`.
-    pub(super) fn options(&self) -> Vec<String> {
-        let set = self.overrides().into_iter().flat_map(|set| ["--policy-set".to_owned(), set]);
-        ["--policy".to_owned(), self.name.to_owned()].into_iter().chain(set).collect()
+    /// Its options of a run.
+    pub(super) fn options(&self) -> Partial {
+        let tables = parse_overrides(&self.overrides()).unwrap_or_default();
+        let set: Table = tables.into_iter().map(|(name, set)| (name, set.into())).collect();
+        Partial::option("policy_set", set).over(Partial::option("policy", self.name))
     }
 
     /// A name for folders.
@@ -69,15 +73,11 @@ mod tests {
     #[test]
     fn parameters_follow_the_name() {
         let plain = Contender::new("diet");
-        assert_eq!(
-            (plain.options(), plain.folder()),
-            (vec!["--policy".into(), "diet".into()], "diet".into())
-        );
+        assert_eq!(plain.options().get("policy").and_then(|name| name.as_str()), Some("diet"));
+        assert_eq!(plain.folder(), "diet");
         let set = Contender::new("diet:rho=0:split=random");
-        assert_eq!(
-            set.options(),
-            ["--policy", "diet", "--policy-set", "diet.rho=0", "--policy-set", "diet.split=random"]
-        );
+        let expected: Table = toml::toml! { diet = { rho = 0, split = "random" } };
+        assert_eq!(set.options().get("policy_set"), Some(&expected.into()));
         assert_eq!(set.folder(), "diet-rho-0-split-random");
     }
 

@@ -11,10 +11,10 @@ use image::{ImageFormat, Rgb, RgbImage, imageops};
 
 use super::{Picture, Record, budgets_of, distinct, run_folder};
 use crate::cli::console::Console;
-use crate::cli::failure::Failure;
-use crate::cli::number::grouped;
 use crate::cli::run_files::{Machine, SplitArg, open_run};
 use crate::dataset::images::Image8;
+use crate::failure::Failure;
+use crate::number::grouped;
 use crate::output::write_atomically;
 use crate::views::ViewSource;
 
@@ -63,7 +63,7 @@ pub(super) fn draw(
                 let mut opened =
                     open_run(&folder, record.iterations, None, machine, needs, &quiet)?;
                 let views = opened.views(SplitArg::Test)?;
-                let background = opened.scene.background.fixed();
+                let background = opened.data.background.fixed();
                 let image = |view: usize| {
                     let image = views.image(view);
                     image.map_err(|e| Failure::input(format!("{}: {e}", views.name(view))))

@@ -14,9 +14,10 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::console::Console;
-use super::failure::Failure;
-use super::number;
-use super::study::{Records, labels};
+use super::flags;
+use super::study::{Records, common, labels};
+use crate::failure::Failure;
+use crate::number;
 use crate::output::write_atomically;
 use cell::{Cell, Record};
 use contender::Contender;
@@ -96,18 +97,8 @@ Examples:
   densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
 
 /// Options of `densify train` that are the comparison's to set.
-const OWN_OPTIONS: [&str; 10] = [
-    "--policy",
-    "-p",
-    "--budget",
-    "-b",
-    "--seed",
-    "--iterations",
-    "-i",
-    "--output",
-    "-o",
-    "--test-iterations",
-];
+const OWN_OPTIONS: [&str; 7] =
+    ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations"];
 /// Measurements along each run, for the curves.
 const POINTS: u32 = 8;
 
@@ -148,14 +139,7 @@ struct Picture {
 /// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a
 /// fair one of fewer seeds.
 fn cells(args: &CompareArgs) -> Result<Vec<Cell>, Failure> {
-    for flag in &args.train {
-        let name = flag.split('=').next().unwrap_or_default();
-        if OWN_OPTIONS.contains(&name) {
-            return Err(Failure::input(format!(
-                "{name} is set by the comparison itself; leave it out after `--`"
-            )));
-        }
-    }
+    let train = common(flags::parsed(&args.train, "densify compare ... --")?, &OWN_OPTIONS)?;
     unique(&args.policies, "--policies")?;
     unique(&args.budget, "--budget")?;
     let labels = labels(&args.scenes)?;
@@ -176,7 +160,7 @@ fn cells(args: &CompareArgs) -> Result<Vec<Cell>, Failure> {
                         budget,
                         seed,
                         iterations: args.iterations,
-                        train: args.train.clone(),
+                        train: train.clone(),
                     });
                 }
             }

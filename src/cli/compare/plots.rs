@@ -8,8 +8,8 @@ use plotters::prelude::*;
 
 use super::cell::over_time;
 use super::{Picture, Record, budgets_of, distinct};
-use crate::cli::failure::{Failure, OTHER};
-use crate::cli::number::grouped;
+use crate::failure::{Failure, OTHER};
+use crate::number::grouped;
 use crate::output::write_atomically;
 
 /// Size of a panel `[px]`.

@@ -4,8 +4,8 @@ use std::fmt::Write;
 
 use super::difference::between;
 use super::{Record, budgets_of, distinct};
-use crate::cli::number::grouped;
 use crate::metrics::geometry::Geometry;
+use crate::number::grouped;
 
 /// Mean over records; `None` where one has no value.
 fn mean(records: &[&Record], of: impl Fn(&Record) -> Option<f64>) -> Option<f64> {
@@ -184,7 +184,7 @@ mod tests {
             seed,
             iterations: 7000,
             run: String::new(),
-            arguments: Vec::new(),
+            spec: toml::Table::new(),
             psnr,
             ssim: psnr / 100.0,
             flip: 1.0 - psnr / 100.0,

@@ -1,5 +1,5 @@
-//! Calls of `densify` from `densify`: each run in a process of its own, whose memory is then the run's
-//! and nobody else's.
+//! Runs of `densify` from `densify`: each in a process of its own, whose memory is then the run's and nobody
+//! else's. A child is given a file that describes its run.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -9,18 +9,16 @@ use std::process::{Command, Stdio};
 
 use densify_scenegen::GroundTruth;
 use serde_json::Value;
+use toml::Table;
 
-use crate::cli::failure::{Failure, OTHER};
 use crate::dataset::builtin;
-use crate::output::Mean;
+use crate::failure::{Failure, OTHER};
+use crate::output::{Mean, write_atomically};
+use crate::run::{Partial, RunSpec};
 
-/// A run of `densify train`.
+/// A run of a study, by its description.
 pub(in crate::cli) struct Call<'a> {
-    pub(in crate::cli) scene: &'a Path,
-    /// All of the call, `train` first, but for the output folder.
-    pub(in crate::cli) arguments: Vec<String>,
-    /// Those of the arguments that the user gave.
-    pub(in crate::cli) options: &'a [String],
+    pub(in crate::cli) spec: &'a Table,
     pub(in crate::cli) folder: &'a Path,
 }
 
@@ -30,33 +28,55 @@ impl Call<'_> {
     /// # Errors
     /// With the trainer's message and exit code when it fails.
     pub(in crate::cli) fn train(&self) -> Result<(), Failure> {
+        // Appended, as a name may hold a dot.
+        let mut file = self.folder.as_os_str().to_owned();
+        file.push(".toml");
+        let text = toml::to_string(self.spec).map_err(Failure::input)?;
+        write_atomically(Path::new(&file), |out| out.write_all(text.as_bytes()))?;
         let mut call = Command::new(program()?);
-        call.args(&self.arguments).arg("--overwrite").arg("--output").arg(self.folder);
-        if !self.options.iter().any(|flag| flag.starts_with("--checkpoint-every")) {
-            // A run of a study that is interrupted runs again, so that its times are whole.
-            call.args(["--checkpoint-every", "0"]);
-        }
-        wait_for(&mut call)
+        call.arg("train").arg("--config").arg(file).args(["--overwrite", "--quiet", "--output"]);
+        wait_for(call.arg(self.folder))
     }
 
-    /// Measures what was trained, with `densify eval`.
+    /// Measures what was trained, with `densify eval`, on the device that trained it.
     ///
     /// # Errors
     /// With its message and exit code when it fails.
     pub(in crate::cli) fn measure(&self) -> Result<(), Failure> {
+        let RunSpec { start, device, .. } =
+            Partial::new(self.spec.clone(), "the study's run")?.describe()?;
         let mut call = Command::new(program()?);
-        call.arg("eval").arg(self.folder).arg("--scene").arg(self.scene);
-        call.args(shared_with_eval(self.options));
+        call.arg("eval").arg(self.folder);
+        call.arg("--scene").arg(start.scene.unwrap_or_default());
+        call.args(["--backend", device.backend.word()]);
+        if let Some(name) = device.gpu {
+            call.args(["--gpu", &name]);
+        }
+        if let Some(threads) = device.threads {
+            call.args(["--threads", &threads.to_string()]);
+        }
         wait_for(&mut call)
     }
 }
 
-/// How the call of a study's run ends: views are held out, and then come the options that the user
-/// gave.
-pub(in crate::cli) fn last_arguments(options: &[String]) -> Vec<String> {
-    let holds_out = |flag: &String| flag == "--eval" || flag.starts_with("--test-every");
-    let own = if options.iter().any(holds_out) { &["--quiet"][..] } else { &["--quiet", "--eval"] };
-    own.iter().map(|&flag| flag.to_owned()).chain(options.iter().cloned()).collect()
+/// The description that all runs of a study share: the options that the user gave, but views are held
+/// out, and no checkpoints are written, as a run that is interrupted runs again so that its times are
+/// whole.
+///
+/// # Errors
+/// When an option is the study's own.
+pub(in crate::cli) fn common(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
+    if let Some((name, _)) = given.iter().find(|(name, _)| own.contains(name)) {
+        return Err(Failure::input(format!(
+            "--{} is set by the study itself; leave it out after `--`",
+            name.replace('_', "-")
+        )));
+    }
+    let mut least = Partial::option("checkpoint_every", 0);
+    if given.get("test_every").is_none() {
+        least = Partial::option("eval", true).over(least);
+    }
+    Ok(given.over(least))
 }
 
 /// A failure within a run of a study.
@@ -127,43 +147,7 @@ fn fault(path: &Path, problem: &str) -> Failure {
     Failure { code: OTHER, message: format!("{}: {problem}", path.display()) }
 }
 
-/// Options of `densify train` that `densify eval` has too, and that say where and on what to compute.
-const SHARED: [&str; 3] = ["--threads", "--backend", "--gpu"];
-
-/// Those of the options of a run that its measurement takes as well.
-fn shared_with_eval(train: &[String]) -> Vec<&String> {
-    let mut shared = Vec::new();
-    let mut words = train.iter();
-    while let Some(word) = words.next() {
-        let (flag, with_value) = word.split_once('=').map_or((&**word, false), |(f, _)| (f, true));
-        if SHARED.contains(&flag) {
-            shared.push(word);
-            shared.extend((!with_value).then(|| words.next()).flatten());
-        }
-    }
-    shared
-}
-
 /// Whether the surface of a scene is known.
 pub(in crate::cli) fn has_geometry(scene: &Path) -> bool {
     builtin::name(scene).is_some() || GroundTruth::is_in(scene)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn runs_and_their_measurements_use_the_same_device() {
-        let words =
-            |text: &str| -> Vec<String> { text.split_whitespace().map(str::to_owned).collect() };
-        for (train, shared) in [
-            ("", ""),
-            ("--threads 1 -r 4 --backend gpu", "--threads 1 --backend gpu"),
-            ("--near=0.1 --gpu=lavapipe --threads=2", "--gpu=lavapipe --threads=2"),
-            ("--sh-degree 2 --backend", "--backend"),
-        ] {
-            assert_eq!(shared_with_eval(&words(train)), words(shared).iter().collect::<Vec<_>>());
-        }
-    }
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::cli::failure::Failure;
+use crate::failure::Failure;
 use crate::output::{OutputError, write_atomically};
 
 /// A record of something that was done.

@@ -7,12 +7,12 @@ mod journal;
 
 use std::path::PathBuf;
 
-pub(super) use call::{Call, Summary, has_geometry, in_run, last_arguments};
+pub(super) use call::{Call, Summary, common, has_geometry, in_run};
 pub(super) use difference::Difference;
 pub(super) use journal::{Entry, Records};
 
-use super::failure::Failure;
 use crate::dataset::builtin;
+use crate::failure::Failure;
 
 /// A short name for each scene: its folder's, or that of the built-in scene.
 pub(super) fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {

@@ -6,12 +6,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
 
-use crate::cli::failure::{Failure, OTHER};
-use crate::cli::study::{Call, Entry, Summary, in_run, last_arguments};
+use crate::cli::study::{Call, Entry, Summary, in_run};
+use crate::failure::{Failure, OTHER};
 use crate::knobs::{EXACT, preset};
 use crate::metrics::geometry::Geometry;
 use crate::output::{Mean, geometry_of, model_path, scores_of};
+use crate::run::Partial;
 use crate::schedule::REFERENCE_ITERATIONS;
 
 /// The knob of a run in which none is changed, which is one with the preset `exact`, and that of a run
@@ -33,8 +35,8 @@ pub(super) struct Cell {
     pub(super) seed: u32,
     pub(super) iterations: u32,
     pub(super) budget: usize,
-    /// More options of `densify train`.
-    pub(super) train: Vec<String>,
+    /// Options that all runs share.
+    pub(super) train: Partial,
 }
 
 impl fmt::Display for Cell {
@@ -76,8 +78,8 @@ pub(super) struct Outcome {
     pub(super) seed: u32,
     /// Folder of the run, in `runs`.
     pub(super) run: String,
-    /// The call, but for the output folder: a run with the same is not run again.
-    pub(super) arguments: Vec<String>,
+    /// The run's description: one with the same is not run again.
+    pub(super) spec: Table,
     /// Checksum of the model's file: equal models have equal ones.
     pub(super) model: u32,
     /// Mean over the views held out, rendered without any shortcut `[dB]`.
@@ -109,8 +111,8 @@ pub(super) struct Numerical {
     pub(super) scene: String,
     pub(super) knob: String,
     pub(super) level: String,
-    /// The call that made the model.
-    pub(super) arguments: Vec<String>,
+    /// The description of the run that made the model.
+    pub(super) spec: Table,
     /// Against the float64 renderer with the standard rules: alpha from 1/255, transmittance to 1e-4
     /// `[dB]`.
     pub(super) standard: f64,
@@ -126,12 +128,10 @@ impl Entry for Record {
     fn is_of(&self, what: &What) -> bool {
         let version = env!("CARGO_PKG_VERSION");
         match (self, what) {
-            (Self::Run(run), What::Run(cell)) => {
-                run.arguments == cell.arguments() && run.densify == version
-            }
+            (Self::Run(run), What::Run(cell)) => run.spec == cell.spec() && run.densify == version,
             (Self::Image(image), What::Image(cell, knob, level)) => {
                 (&image.knob, &image.level) == (knob, level)
-                    && image.arguments == cell.arguments()
+                    && image.spec == cell.spec()
                     && image.densify == version
             }
             _ => false,
@@ -156,33 +156,22 @@ pub(super) fn settings(knob: &str, level: &str, iterations: u32) -> Vec<String> 
 }
 
 impl Cell {
-    /// The call of `densify` that runs this cell, but for the output folder.
-    pub(super) fn arguments(&self) -> Vec<String> {
-        let mut arguments = vec!["train".to_owned(), self.scene.to_string_lossy().into_owned()];
-        let mut set = |name: &str, value: String| arguments.extend([name.to_owned(), value]);
-        if !self.is_set("budget") {
-            set("--budget", self.budget.to_string());
-        }
-        if !self.is_set("iterations") {
-            set("--iterations", self.iterations.to_string());
-        }
-        set("--seed", self.seed.to_string());
-        for setting in self.exact().iter().chain(&self.settings) {
-            set("--knob", setting.clone());
-        }
-        arguments.extend(last_arguments(&self.train));
-        arguments
-    }
-
-    fn is_set(&self, knob: &str) -> bool {
-        self.settings.iter().any(|setting| setting.split('=').next() == Some(knob))
-    }
-
-    /// The levels of `exact`, but for knobs that are changed. The preset itself would not let them be.
-    fn exact(&self) -> Vec<String> {
-        let levels = preset(EXACT).map_or(&[][..], |exact| exact.levels);
-        let kept = levels.iter().filter(|(knob, _)| !self.is_set(knob));
-        kept.map(|(knob, level)| format!("{knob}={level}")).collect()
+    /// The description of the run: that of `exact` with what is changed.
+    pub(super) fn spec(&self) -> Table {
+        let own = [
+            ("scene", Value::from(self.scene.to_string_lossy().into_owned())),
+            ("budget", Value::from(i64::try_from(self.budget).unwrap_or(i64::MAX))),
+            ("seed", Value::from(self.seed)),
+            ("iterations", Value::from(self.iterations)),
+            ("preset", Value::from(EXACT)),
+        ];
+        let own = own.into_iter().fold(self.train.clone(), |spec, (name, value)| {
+            Partial::option(name, value).over(spec)
+        });
+        let changed = self.settings.iter().filter_map(|setting| setting.split_once('='));
+        let spec =
+            changed.fold(own, |spec, (name, value)| Partial::setting(name, value).over(spec));
+        spec.into_table()
     }
 
     /// Name of the run's folder.
@@ -205,12 +194,8 @@ impl Cell {
     /// With the trainer's message and exit code when it fails.
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
         let folder = self.folder(output);
-        let call = Call {
-            scene: &self.scene,
-            arguments: self.arguments(),
-            options: &self.train,
-            folder: &folder,
-        };
+        let spec = self.spec();
+        let call = Call { spec: &spec, folder: &folder };
         call.train().and_then(|()| call.measure()).map_err(|failure| in_run(self, failure))?;
         let summary = Summary::read(&folder)?;
         let iterations = summary.number("iterations")? as u32;
@@ -231,7 +216,7 @@ impl Cell {
             level: self.level.clone(),
             seed: self.seed,
             run: self.run(),
-            arguments: self.arguments(),
+            spec: self.spec(),
             model: crc32c::crc32c(&model),
             psnr,
             ssim,

@@ -1,99 +1,131 @@
-//! Which knobs are measured, at which levels.
-
-use std::ffi::OsString;
+//! What a study varies, and at which levels.
 
 use super::TradeArgs;
+use crate::backend::{BackendChoice, BackendKind};
 use crate::cli::console::Console;
-use crate::cli::failure::Failure;
-use crate::cli::train;
-use crate::knobs::{KNOBS, Knob, Levels, On, find};
+use crate::failure::Failure;
+use crate::knobs::{Class, KNOBS, find};
+use crate::run::{Partial, RunOption, RunSpec};
 
-/// A knob that is measured.
+/// A knob or an option of a run that a study varies.
 #[derive(Debug, Clone)]
-pub(super) struct Chosen {
-    pub(super) knob: &'static Knob,
-    /// Its levels beside that of `exact`, as the table spells them.
+pub(super) struct Factor {
+    pub(super) name: String,
+    pub(super) class: Class,
+    /// Whether it says how large a run is: its levels follow the run's size.
+    pub(super) is_size: bool,
+    /// Its levels besides that of `exact`.
     pub(super) levels: Vec<String>,
 }
 
-/// Options of `densify train` that are the study's to set.
-const OWN_OPTIONS: [&str; 9] =
-    ["--budget", "-b", "--seed", "--iterations", "-i", "--output", "-o", "--knob", "--preset"];
+/// Levels of an option that is no knob.
+enum Levels {
+    These(&'static [&'static str]),
+    TimesBudget(&'static [f64]),
+    TimesIterations(&'static [f64]),
+}
 
-/// The knobs that are asked for, or all that can be set.
+/// Options that are varied unless knobs are named.
+const OPTIONS: [(&str, Class, Levels); 7] = [
+    ("tile_cap", Class::Exact, Levels::TimesBudget(&[1.0, 4.0, 32.0])),
+    ("image_cache", Class::Exact, Levels::These(&["0", "16777216"])),
+    ("preset", Class::Heuristic, Levels::These(&["balanced", "fast", "tiny-memory"])),
+    ("sh_degree", Class::Heuristic, Levels::These(&["0", "1", "2"])),
+    ("sh_every", Class::Heuristic, Levels::These(&["4", "8", "16"])),
+    ("iterations", Class::Heuristic, Levels::TimesIterations(&[0.25, 0.5, 2.0])),
+    ("budget", Class::Heuristic, Levels::TimesBudget(&[0.25, 0.5, 2.0])),
+];
+
+/// The factors that are asked for, or all that these runs have.
 ///
 /// # Errors
-/// When a knob or a level is none, or cannot be set in these runs, or an option of the runs is the
-/// study's own.
-pub(super) fn chosen(args: &TradeArgs, console: &Console) -> Result<Vec<Chosen>, Failure> {
-    for flag in &args.train {
-        let name = flag.split('=').next().unwrap_or_default();
-        if OWN_OPTIONS.contains(&name) {
-            return Err(Failure::input(format!(
-                "{name} is set by the study itself; leave it out after `--`"
-            )));
-        }
-    }
+/// When there is no such knob or option, or a level is outside its domain.
+pub(super) fn factors(
+    args: &TradeArgs,
+    train: &Partial,
+    console: &Console,
+) -> Result<Vec<Factor>, Failure> {
+    let spec = train.clone().describe()?;
+    let kind = match spec.device.backend {
+        BackendChoice::Gpu => BackendKind::Gpu,
+        _ if spec.device.gpu.is_some() => BackendKind::Gpu,
+        _ => BackendKind::Cpu,
+    };
     if args.knobs.is_empty() {
+        let here = |name: &str| BackendKind::only_one_with(name).is_none_or(|only| only == kind);
+        let knobs = KNOBS.iter().map(|knob| knob.name).filter(|name| here(name));
+        let names = knobs.chain(OPTIONS.iter().map(|(name, ..)| *name));
         let mut all = Vec::new();
-        let is_there = |knob: &&Knob| knob.on != On::Gpu || is_on_gpu(&args.train);
-        for knob in KNOBS.iter().filter(is_there) {
-            let one = Chosen { knob, levels: levels(knob, args) };
-            match check(args, &one) {
-                Ok(()) => all.push(one),
+        for name in names {
+            match factor(args, name, &[]).and_then(|one| check(train, &one).map(|()| one)) {
+                Ok(one) => all.push(one),
                 Err(failure) => {
-                    console
-                        .say(format_args!("note: {} is left out: {}", knob.name, failure.message));
+                    console.say(format_args!("note: {name} is left out: {}", failure.message));
                 }
             }
         }
         return Ok(all);
     }
-    let mut all: Vec<Chosen> = Vec::new();
+    let mut all: Vec<Factor> = Vec::new();
     for text in &args.knobs {
-        let mut parts = text.split(':');
-        let fail = |error| Failure::input(format!("--knobs {text}: {error}"));
-        let knob = find(parts.next().unwrap_or_default().trim()).map_err(fail)?;
-        if all.iter().any(|one| one.knob.name == knob.name) {
-            return Err(Failure::input(format!("--knobs names {} twice", knob.name)));
+        let mut parts = text.split(':').map(str::trim);
+        let name = parts.next().unwrap_or_default();
+        let levels: Vec<&str> = parts.collect();
+        if all.iter().any(|one| one.name == name) {
+            return Err(Failure::input(format!("--knobs names {name} twice")));
         }
-        let own: Result<Vec<String>, _> = parts.map(|level| knob.canonical(level.trim())).collect();
-        let own = own.map_err(fail)?;
-        let levels = if own.is_empty() { levels(knob, args) } else { own };
-        let one = Chosen { knob, levels };
-        check(args, &one)?;
-        all.push(one);
+        let one = factor(args, name, &levels);
+        let one = one.and_then(|one| check(train, &one).map(|()| one));
+        all.push(one.map_err(|failure| failure.within(&format!("--knobs {text}")))?);
     }
     Ok(all)
 }
 
-/// Whether these options of `train` ask for a GPU.
-fn is_on_gpu(train: &[String]) -> bool {
-    let names_one = |word: &String| word == "--gpu" || word.starts_with("--gpu=");
-    let backend = train.windows(2).any(|words| words[0] == "--backend" && words[1] == "gpu");
-    backend || train.iter().any(|word| names_one(word) || word == "--backend=gpu")
+/// A knob or an option by name, at these levels, or at its own where there are none.
+fn factor(args: &TradeArgs, name: &str, levels: &[&str]) -> Result<Factor, Failure> {
+    let given = levels.iter().map(|level| (*level).to_owned()).collect::<Vec<_>>();
+    let of_option = OPTIONS.iter().find(|(option, ..)| *option == name);
+    let (class, is_size, own) = match (of_option, RunOption::find(name), find(name)) {
+        (Some((_, class, levels)), ..) => {
+            let (is_size, own) = sized(args, levels);
+            (*class, is_size, own)
+        }
+        (None, Some(_), _) if given.is_empty() => {
+            return Err(Failure::input(format!("say at which levels, as {name}:VALUE:VALUE")));
+        }
+        (None, Some(_), _) => (Class::Heuristic, false, Vec::new()),
+        (None, None, Ok(knob)) => {
+            let canonical = |level: &String| knob.canonical(level).map_err(Failure::input);
+            let given = given.iter().map(canonical).collect::<Result<Vec<_>, _>>()?;
+            let own = knob.levels.iter().map(|level| (*level).to_owned()).collect();
+            let levels = if given.is_empty() { own } else { given };
+            return Ok(Factor { name: name.to_owned(), class: knob.class, is_size: false, levels });
+        }
+        (None, None, Err(error)) => return Err(Failure::input(error)),
+    };
+    let levels = if given.is_empty() { own } else { given };
+    Ok(Factor { name: name.to_owned(), class, is_size, levels })
 }
 
-/// The levels of a knob in runs of this size.
-fn levels(knob: &Knob, args: &TradeArgs) -> Vec<String> {
+/// Whether the levels follow the size of the runs, and the levels for runs of this size.
+fn sized(args: &TradeArgs, levels: &Levels) -> (bool, Vec<String>) {
     let times = |factors: &[f64], base: f64| {
         let level = |factor: &f64| ((base * factor).round().max(1.0) as u64).to_string();
         factors.iter().map(level).collect()
     };
-    match knob.levels {
-        Levels::Values(values) => values.iter().map(|v| (*v).to_owned()).collect(),
-        Levels::TimesBudget(factors) => times(factors, args.budget as f64),
-        Levels::TimesIterations(factors) => times(factors, f64::from(args.iterations)),
+    match levels {
+        Levels::These(values) => (false, values.iter().map(|v| (*v).to_owned()).collect()),
+        Levels::TimesBudget(factors) => (true, times(factors, args.budget as f64)),
+        Levels::TimesIterations(factors) => (true, times(factors, f64::from(args.iterations))),
     }
 }
 
-/// Fails where a run with the knob would be refused for it.
-fn check(args: &TradeArgs, one: &Chosen) -> Result<(), Failure> {
+/// Fails where a run with the factor at one of its levels would be refused for it.
+fn check(train: &Partial, one: &Factor) -> Result<(), Failure> {
     for level in &one.levels {
-        let setting = format!("{}={level}", one.knob.name);
-        let words = ["scene".to_owned(), "--knob".to_owned(), setting];
-        let words = words.iter().chain(&args.train).map(OsString::from);
-        train::arguments(&words.collect::<Vec<_>>())?;
+        let setting = Partial::setting(&one.name, level).into_table();
+        let spec = Partial::new(setting, &one.name)?.over(train.clone()).describe()?;
+        let _: RunSpec = spec;
     }
     Ok(())
 }

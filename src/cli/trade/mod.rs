@@ -13,14 +13,15 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use super::failure::Failure;
-use super::number;
-use super::study::{Records, labels};
-use super::train::DEFAULT_BUDGET;
+use super::flags;
+use super::study::{Records, common, labels};
+use crate::failure::Failure;
 use crate::knobs::Class;
+use crate::number;
 use crate::output::write_atomically;
+use crate::run::{DEFAULT_BUDGET, Partial};
 use cell::{BASE, Cell, FACTORIAL, Outcome, Record, What, settings};
-use levels::{Chosen, chosen};
+use levels::{Factor, factors};
 use numerical::Subject;
 use report::Report;
 
@@ -71,9 +72,14 @@ Examples:
   densify trade data/garden --knobs alpha_min,ssim_every,sh_every --seeds 5 -- -r 4
   densify trade scene:spheres --knobs coarse_until:0.3:0.5 -i 1000 -b 5k -- --policy taming";
 
+/// Options of `densify train` that are the study's to set.
+const OWN_OPTIONS: [&str; 7] =
+    ["scene", "budget", "seed", "iterations", "output", "knob", "preset"];
+
 pub(super) fn run(args: &TradeArgs, console: &Console) -> Result<(), Failure> {
-    let chosen = chosen(args, console)?;
-    let cells = cells(args, &chosen)?;
+    let train = common(flags::parsed(&args.train, "densify trade ... --")?, &OWN_OPTIONS)?;
+    let chosen = factors(args, &train, console)?;
+    let cells = cells(args, &chosen, &train)?;
     let mut study =
         Study { args, console, records: Records::open(&args.output.join("trade.jsonl"))? };
     study.train(&cells)?;
@@ -123,12 +129,13 @@ impl Study<'_> {
     }
 
     /// Looks at the models of the first seed with every knob that changes images.
-    fn look(&mut self, cells: &[Cell], chosen: &[Chosen]) -> Result<(), Failure> {
+    fn look(&mut self, cells: &[Cell], chosen: &[Factor]) -> Result<(), Failure> {
         for cell in cells.iter().filter(|cell| cell.knob == BASE && cell.seed == 0) {
             let base = std::iter::once((String::new(), String::new()));
-            let levels = chosen.iter().filter(|one| is_in_images(one)).flat_map(|one| {
-                one.levels.iter().map(|level| (one.knob.name.to_owned(), level.clone()))
-            });
+            let levels = chosen
+                .iter()
+                .filter(|one| is_in_images(one))
+                .flat_map(|one| one.levels.iter().map(|level| (one.name.clone(), level.clone())));
             let todo: Vec<(String, String)> = base
                 .chain(levels)
                 .filter(|(knob, level)| {
@@ -161,13 +168,13 @@ impl Study<'_> {
         cells.iter().filter_map(of).collect()
     }
 
-    fn report(&self, cells: &[Cell], chosen: &[Chosen]) -> Result<Report, Failure> {
+    fn report(&self, cells: &[Cell], chosen: &[Factor]) -> Result<Report, Failure> {
         let mut images = Vec::new();
         for cell in cells.iter().filter(|cell| cell.knob == BASE && cell.seed == 0) {
             let base = std::iter::once((String::new(), String::new()));
-            let levels = chosen.iter().flat_map(|one| {
-                one.levels.iter().map(|level| (one.knob.name.to_owned(), level.clone()))
-            });
+            let levels = chosen
+                .iter()
+                .flat_map(|one| one.levels.iter().map(|level| (one.name.clone(), level.clone())));
             images.extend(base.chain(levels).filter_map(|(knob, level)| {
                 match self.records.of(&What::Image(cell.clone(), knob, level)) {
                     Some(Record::Image(image)) => Some(image.clone()),
@@ -180,13 +187,13 @@ impl Study<'_> {
 }
 
 /// Whether a knob can change the images of a model.
-fn is_in_images(one: &Chosen) -> bool {
-    one.knob.class != Class::Heuristic
+fn is_in_images(one: &Factor) -> bool {
+    one.class != Class::Heuristic
 }
 
 /// All runs in which at most one knob is changed, in the order in which they run: seed after seed, so
 /// that an interrupted study is a fair one of fewer seeds.
-fn cells(args: &TradeArgs, chosen: &[Chosen]) -> Result<Vec<Cell>, Failure> {
+fn cells(args: &TradeArgs, chosen: &[Factor], train: &Partial) -> Result<Vec<Cell>, Failure> {
     let labels = labels(&args.scenes)?;
     let mut cells = Vec::new();
     for seed in 0..args.seeds {
@@ -200,14 +207,14 @@ fn cells(args: &TradeArgs, chosen: &[Chosen]) -> Result<Vec<Cell>, Failure> {
                 seed,
                 iterations: args.iterations,
                 budget: args.budget,
-                train: args.train.clone(),
+                train: train.clone(),
             };
             cells.push(base.clone());
             for one in chosen {
                 cells.extend(one.levels.iter().map(|level| Cell {
-                    knob: one.knob.name.to_owned(),
+                    knob: one.name.clone(),
                     level: level.clone(),
-                    settings: settings(one.knob.name, level, args.iterations),
+                    settings: settings(&one.name, level, args.iterations),
                     ..base.clone()
                 }));
             }

@@ -12,12 +12,12 @@ use crate::backend::Backend;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::camera::Camera;
 use crate::cli::console::Console;
-use crate::cli::failure::{Failure, OTHER};
-use crate::cli::run_files::{iteration, read_model};
-use crate::cli::scene;
+use crate::cli::run_files::{self, iteration, read_model};
+use crate::failure::{Failure, OTHER};
 use crate::gaussians::Gaussians;
-use crate::knobs::{How, Settings, find};
-use crate::output::{RunConfig, model_path};
+use crate::knobs::{Knobs, find};
+use crate::output::model_path;
+use crate::run::RunConfig;
 use crate::verify::reference::{Model, Rules, View, pixels};
 
 /// Views looked at, evenly spread over those held out.
@@ -48,11 +48,11 @@ impl Subject {
     /// When it cannot be read.
     pub(super) fn of(folder: &Path, console: &Console) -> Result<Self, Failure> {
         let config = RunConfig::read(folder)?;
-        let dataset = scene::load(&config.scene_path(), &config.scene, false, console)?;
+        let dataset = run_files::load(&config.scene_path(), &config.spec.data, console)?;
         let path = model_path(folder, iteration(folder, None)?);
         let model = dataset.normalisation.model_from_world(read_model(&path, console)?);
-        let near = (config.train.near * dataset.extent()) as f32;
-        let background = config.scene.background.fixed();
+        let near = (config.spec.start.near.0 * dataset.extent()) as f32;
+        let background = config.spec.data.background.fixed();
         let count = dataset.test.len();
         let chosen = (0..VIEWS.min(count)).map(|i| i * count / VIEWS.min(count));
         let views = chosen.map(|i| Looked::at(&model, dataset.test[i].camera, near, background, i));
@@ -69,17 +69,16 @@ impl Subject {
         knob: &str,
         level: &str,
     ) -> Result<Numerical, Failure> {
-        let input = |error| Failure::input(format!("--knob: {error}"));
-        let setting = if knob.is_empty() { Vec::new() } else { vec![format!("{knob}={level}")] };
-        let settings = Settings::of(&setting).map_err(input)?;
+        let mut knobs = Knobs::default();
+        if find(knob).is_ok() {
+            knobs.set(knob, level).map_err(|error| Failure::input(format!("--knobs: {error}")))?;
+        }
         let mut options = CpuOptions::new(self.model.len().max(1));
         options.near = self.near;
-        options.shortcuts = settings.shortcuts();
-        options.storage = settings.storage();
-        if let (Ok(knob), Ok(value)) = (find(knob), level.parse())
-            && knob.how == How::Flag("--tile-cap")
-        {
-            options.tile_cap = value;
+        options.shortcuts = knobs.shortcuts;
+        options.storage = knobs.storage;
+        if let ("tile_cap", Ok(cap)) = (knob, level.parse()) {
+            options.tile_cap = cap;
         }
         let mut backend = CpuBackend::new(&self.model, &options)?;
         let (mut squares, mut worst, mut count) = ([0.0; 2], 0.0_f64, 0.0);
@@ -107,7 +106,7 @@ impl Subject {
             scene: cell.label.clone(),
             knob: knob.to_owned(),
             level: level.to_owned(),
-            arguments: cell.arguments(),
+            spec: cell.spec(),
             standard: psnr(squares[0]),
             everything: psnr(squares[1]),
             worst,

@@ -5,7 +5,7 @@ use std::path::Path;
 use plotters::prelude::*;
 
 use super::report::{PSNR, Report, SECONDS};
-use crate::cli::failure::{Failure, OTHER};
+use crate::failure::{Failure, OTHER};
 use crate::output::write_atomically;
 
 /// Size of a plot `[px]`.
@@ -49,7 +49,7 @@ pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<(String, String
 
 fn points(report: &Report, scene: &str) -> Vec<Point> {
     let Some(base) = report.mean(scene, "", "", PSNR) else { return Vec::new() };
-    let levels = report.effects.iter().map(|e| (e.knob.name, &*e.level));
+    let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
     let point = |(knob, level): (&str, &str)| {
         let name = if knob.is_empty() { "exact".to_owned() } else { format!("{knob}={level}") };
         Some(Point {

@@ -5,9 +5,9 @@ use super::cell::{BASE, Numerical, Outcome};
 use super::effects::{
     FACTORS, Price, RUNS, dominated_by, error_of_effects, is_free, main_effects, stands_out,
 };
-use super::levels::Chosen;
+use super::levels::Factor;
 use crate::cli::study::Difference;
-use crate::knobs::{Class, Knob, Levels};
+use crate::knobs::Class;
 
 /// A study's results.
 pub(super) struct Report {
@@ -25,7 +25,7 @@ pub(super) struct Report {
 
 /// What a knob does at a level, against `exact`.
 pub(super) struct Effect {
-    pub(super) knob: &'static Knob,
+    pub(super) factor: Factor,
     pub(super) level: String,
     pub(super) psnr: Difference,
     pub(super) ssim: Difference,
@@ -79,7 +79,7 @@ fn positive(value: f64) -> Option<f64> {
 impl Report {
     pub(super) fn new(
         args: &TradeArgs,
-        chosen: &[Chosen],
+        chosen: &[Factor],
         outcomes: Vec<Outcome>,
         images: Vec<Numerical>,
     ) -> Self {
@@ -102,7 +102,7 @@ impl Report {
         };
         for one in chosen {
             for level in &one.levels {
-                report.effects.extend(report.effect(one.knob, level));
+                report.effects.extend(report.effect(one, level));
             }
         }
         report.rank();
@@ -128,8 +128,8 @@ impl Report {
         self.pairs(knob, level).into_iter().filter_map(difference).collect()
     }
 
-    fn effect(&self, knob: &'static Knob, level: &str) -> Option<Effect> {
-        let name = knob.name;
+    fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
+        let name = &*factor.name;
         let of = |measure: Measure| Difference::of(&self.differences(name, level, measure));
         let (psnr, ssim, depth) = (of(PSNR)?, of(SSIM)?, of(DEPTH));
         let pairs = self.pairs(name, level);
@@ -138,7 +138,7 @@ impl Report {
         let free = is_free(&psnr, &ssim, depth.as_ref(), numerical);
         let stand_out = [PSNR, SECONDS].map(|of| stands_out(&self.differences(name, level, of)));
         Some(Effect {
-            knob,
+            factor: factor.clone(),
             level: level.to_owned(),
             free,
             psnr,
@@ -173,7 +173,7 @@ impl Report {
         let prices: Vec<Price> =
             std::iter::once(exact).chain(self.effects.iter().map(price)).collect();
         let names: Vec<String> = std::iter::once("exact".to_owned())
-            .chain(self.effects.iter().map(|e| format!("{}={}", e.knob.name, e.level)))
+            .chain(self.effects.iter().map(|e| format!("{}={}", e.factor.name, e.level)))
             .collect();
         for (i, effect) in self.effects.iter_mut().enumerate() {
             effect.dominated = dominated_by(&prices, i + 1).map(|by| names[by].clone());
@@ -185,12 +185,12 @@ impl Report {
     pub(super) fn that_stand_out(&self) -> Vec<(String, String)> {
         let mut found: Vec<&Effect> = Vec::new();
         for effect in &self.effects {
-            let sized = !matches!(effect.knob.levels, Levels::Values(_));
-            let several = effect.knob.name == "preset";
-            if !effect.stands_out || sized || several || effect.knob.class == Class::Exact {
+            let sized = effect.factor.is_size;
+            let several = effect.factor.name == "preset";
+            if !effect.stands_out || sized || several || effect.factor.class == Class::Exact {
                 continue;
             }
-            match found.iter_mut().find(|other| other.knob.name == effect.knob.name) {
+            match found.iter_mut().find(|other| other.factor.name == effect.factor.name) {
                 Some(other) if effect.seconds.mean < other.seconds.mean => *other = effect,
                 Some(_) => {}
                 None => found.push(effect),
@@ -198,7 +198,7 @@ impl Report {
         }
         found.sort_by(|a, b| a.seconds.mean.total_cmp(&b.seconds.mean));
         found.truncate(FACTORS);
-        found.iter().map(|e| (e.knob.name.to_owned(), e.level.clone())).collect()
+        found.iter().map(|e| (e.factor.name.clone(), e.level.clone())).collect()
     }
 
     /// Adds the runs in which several knobs were changed.
@@ -227,7 +227,7 @@ impl Report {
         let idle = |all: &[f64; FACTORS]| error_of_effects(&all[knobs.len()..]);
         let errors = idle(&psnr).zip(idle(&seconds)).map(|(a, b)| [a, b]);
         let alone = |knob: &str, level: &str| {
-            let effect = self.effects.iter().find(|e| e.knob.name == knob && e.level == level);
+            let effect = self.effects.iter().find(|e| e.factor.name == knob && e.level == level);
             effect.map_or([f64::NAN; 2], |e| [e.psnr.mean, e.seconds.mean])
         };
         let together = knobs.iter().enumerate().map(|(k, (knob, level))| Together {
@@ -265,7 +265,7 @@ pub(super) fn sample() -> Report {
         level: level.into(),
         seed,
         run: String::new(),
-        arguments: Vec::new(),
+        spec: toml::Table::new(),
         model: (psnr * 1e3) as u32,
         psnr,
         ssim: psnr / 100.0,
@@ -292,7 +292,7 @@ pub(super) fn sample() -> Report {
         scene: "room".into(),
         knob: knob.into(),
         level: level.into(),
-        arguments: Vec::new(),
+        spec: toml::Table::new(),
         standard,
         everything: standard - 1.0,
         worst: 0.01,
@@ -307,11 +307,13 @@ pub(super) fn sample() -> Report {
         output: "x".into(),
         train: vec!["--policy=diet".into()],
     };
-    let find = |name: &str| crate::knobs::find(name).expect("a knob");
-    let chosen = [
-        Chosen { knob: find("alpha_min"), levels: vec!["1/64".into(), "1/32".into()] },
-        Chosen { knob: find("ssim_every"), levels: vec!["5".into()] },
-    ];
+    let factor = |name: &str, levels: &[&str]| Factor {
+        name: name.to_owned(),
+        class: crate::knobs::find(name).expect("a knob").class,
+        is_size: false,
+        levels: levels.iter().map(|level| (*level).to_owned()).collect(),
+    };
+    let chosen = [factor("alpha_min", &["1/64", "1/32"]), factor("ssim_every", &["5"])];
     let images = vec![
         image("", "", 120.0),
         image("alpha_min", "1/64", 61.0),

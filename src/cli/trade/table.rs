@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use super::report::{Effect, PSNR, Report, SECONDS};
-use crate::cli::number::grouped;
 use crate::cli::study::Difference;
 use crate::knobs::Class;
+use crate::number::grouped;
 
 /// The whole study.
 pub(super) fn markdown(report: &Report) -> String {
@@ -104,16 +104,16 @@ fn row(effect: &Effect) -> Vec<String> {
     if effect.free {
         verdict.push("free".into());
     }
-    if effect.knob.class == Class::Exact && effect.same < effect.psnr.pairs {
+    if effect.factor.class == Class::Exact && effect.same < effect.psnr.pairs {
         verdict.push("**not the same bits**".into());
     }
     if let Some(by) = &effect.dominated {
         verdict.push(format!("dominated by {by}"));
     }
     vec![
-        effect.knob.name.to_owned(),
+        effect.factor.name.clone(),
         effect.level.clone(),
-        effect.knob.class.to_string(),
+        effect.factor.class.to_string(),
         effect.psnr.show(2),
         effect.ssim.show(4),
         effect.flip.show(4),
@@ -182,7 +182,7 @@ fn stages(report: &Report) -> String {
     let titles: Vec<String> = names.iter().map(|name| format!(" {name} |")).collect();
     let _ = writeln!(text, "| knob | level |{}", titles.concat());
     let _ = writeln!(text, "|---|---|{}", "---|".repeat(names.len()));
-    let levels = report.effects.iter().map(|e| (e.knob.name, &*e.level));
+    let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
     for (knob, level) in std::iter::once(("", "")).chain(levels) {
         let seconds = mean(knob, level);
         let cells: Vec<String> = names
@@ -203,7 +203,7 @@ fn shown(value: Option<f64>, digits: usize) -> String {
 pub(super) fn summary(report: &Report) -> String {
     let mut text = format!("{:<28}  dPSNR [dB]  time x  peak x", "knob");
     for effect in &report.effects {
-        let name = format!("{}={}", effect.knob.name, effect.level);
+        let name = format!("{}={}", effect.factor.name, effect.level);
         let free = if effect.free { "  free" } else { "" };
         let _ = write!(
             text,

@@ -3,13 +3,13 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use clap::{Args, Command, FromArgMatches};
+use clap::FromArgMatches;
 use tempfile::TempDir;
 
 use super::*;
 use crate::backend::gpu::{AdapterKind, adapters, with_device_lost_after};
-use crate::cli::failure::{DEVICE, INPUT, OTHER};
 use crate::dataset::tests::write::Made;
+use crate::failure::{DEVICE, INPUT, OTHER};
 use crate::output::disk::{Fault, Operation, with_fault};
 use crate::output::model_path;
 
@@ -34,16 +34,16 @@ impl Case {
 
     /// Trains for 12 steps with checkpoints after 4, 8 and 12, and with models after 5 and 12.
     fn train(&self, flags: &str) -> Result<(), Failure> {
-        let words = [self.scene.path().to_str().unwrap(), "-o", self.run().to_str().unwrap()]
+        let run_folder = self.run();
+        let words = ["densify", "train"]
             .into_iter()
+            .chain([self.scene.path().to_str().unwrap(), "-o", run_folder.to_str().unwrap()])
             .chain(["--iterations", "12", "--budget", "250", "--sh-degree", "0", "--quiet"])
             .chain(["--save-iterations", "5", "--checkpoint-every", "4", "--test-every", "3"])
-            .chain(flags.split_whitespace())
-            .map(OsString::from)
-            .collect::<Vec<_>>();
-        let command = TrainArgs::augment_args(Command::new("train").no_binary_name(true));
-        let matches = command.try_get_matches_from(&words).unwrap();
-        run(&words, &TrainArgs::from_arg_matches(&matches).unwrap(), &Console::new(true))
+            .chain(flags.split_whitespace());
+        let matches = crate::cli::command().try_get_matches_from(words).unwrap();
+        let matches = matches.subcommand_matches("train").unwrap();
+        run(&TrainArgs::from_arg_matches(matches).unwrap(), matches, &Console::new(true))
     }
 
     /// Trains with a fault; what came of it. Fails if the fault was never met.

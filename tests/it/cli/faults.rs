@@ -40,7 +40,7 @@ fn flags_out_of_range_are_refused() {
         ("background", leave, "--background mauve", &["--background", "mauve", "#808080"]),
         ("learning rate", leave, "--lr opacity=x", &["--lr", "NAME=RATE"]),
         ("rate's name", leave, "--lr colour=1", &["--lr", "colour"]),
-        ("steps of colour", leave, "--sh-every 0", &["--sh-every", "1..=1000"]),
+        ("steps of colour", leave, "--sh-every 0", &["--sh-every", "from 1 to 1000"]),
         ("save beyond the end", leave, "--save-iterations 21", &["--save-iterations", "1 to 20"]),
         ("nothing to test", leave, "--test-iterations 5", &["--test-iterations", "--eval"]),
         ("images elsewhere", leave, "--images photos", &["photos"]),

@@ -63,7 +63,7 @@ fn plan_says_what_train_promises_and_writes_nothing() {
         let summary = json(&run.join("stats/summary.json"));
         let rows = format!("budget   {}", grouped(count(&summary, "budget")));
         assert!(budget(&planned).starts_with(&rows), "{flags}: {}", budget(&planned));
-        for said in ["rows that --memory", "-r 1 (48x40)", "-r 4 (12x10)", "degree 3"] {
+        for said in ["Gaussians that --memory", "-r 1 (48x40)", "-r 4 (12x10)", "degree 3"] {
             assert!(planned.stdout.contains(said), "{flags}: {said:?} in {}", planned.stdout);
         }
     }
@@ -226,11 +226,11 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
     let before = files(&run);
     let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
     let config: toml::Table = config.parse().expect("config.toml is TOML");
-    let chosen = |table: &str, key: &str| config[table][key].as_integer();
-    assert_eq!(chosen("train", "memory"), Some(48 << 20));
-    let rows = chosen("train", "budget").expect("a budget");
-    assert_eq!(chosen("train", "tile_cap"), Some(4 * rows));
-    assert!(chosen("scene", "image_cache").is_some());
+    let chosen = |key: &str| config[key].as_integer();
+    assert_eq!(chosen("memory"), Some(48 << 20));
+    let rows = chosen("budget").expect("a budget");
+    assert_eq!(chosen("tile_cap"), Some(4 * rows));
+    assert!(chosen("image_cache").is_some());
     for (flags, words) in [
         ("--memory 49MiB", ["--memory: 51380224 now", "50331648 in the checkpoint"]),
         ("--budget 300", ["--budget: 300 now", "in the checkpoint"]),

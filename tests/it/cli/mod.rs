@@ -2,6 +2,7 @@
 
 mod accumulation;
 mod comparing;
+mod configuring;
 mod exporting;
 mod faults;
 mod generated;

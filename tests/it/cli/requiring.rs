@@ -136,7 +136,7 @@ fn contradictions_name_both_sides() {
     }
     train(scene.path(), &run, "--sh-degree 1 --budget 500").ok();
     let again = train(scene.path(), &run, "--resume --sh-degree auto");
-    again.refused("--resume", &["--resume", "--sh-degree auto", "degree 1"]);
+    again.refused("--resume", &["--resume", "--sh-degree auto", "given 1"]);
     let again = train(scene.path(), &run, "--resume --full");
     again.refused("--resume", &["--resume", "--full"]);
 }

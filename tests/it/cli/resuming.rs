@@ -216,7 +216,7 @@ fn a_damaged_checkpoint_is_named_and_the_one_before_is_taken() {
         ("a bit of the header", flipped(find("rho")), "damaged"),
         ("newer", newer, "version 2"),
         ("foreign", foreign, "not a checkpoint of densify"),
-        ("a picture", read(&scene.path().join("images/view_00.png")), "no safetensors"),
+        ("a picture", read(&scene.path().join("images/view_00.png")), "not a safetensors file"),
     ];
     for (what, bytes, words) in &faults {
         let here = root.path().join("here");

@@ -43,13 +43,13 @@ fn every_level_is_measured_once_and_in_the_table() {
     }
     assert_ne!(find("", "", 0)["model"], find("", "", 1)["model"], "the seeds do nothing");
     // All but the knob are as with the preset `exact`.
-    let is_spelled = |knob: &str, level: &str, setting: &str| {
-        let run = find(knob, level, 0);
-        run["arguments"].as_array().is_some_and(|words| words.iter().any(|word| word == setting))
-    };
-    assert!(is_spelled("", "", "alpha_min=1/255") && is_spelled("", "", "ssim_every=1"));
-    assert!(is_spelled("alpha_min", "1/32", "ssim_every=1"));
-    assert!(!is_spelled("alpha_min", "1/32", "alpha_min=1/255"));
+    let spec = |knob: &str, level: &str| find(knob, level, 0)["spec"].clone();
+    assert_eq!(spec("", "")["preset"], "exact");
+    let changed = spec("alpha_min", "1/32");
+    assert_eq!(
+        (&changed["preset"], &changed["knob"]["alpha_min"]),
+        (&"exact".into(), &"1/32".into())
+    );
     let images = of("image");
     let psnr = |knob: &str, level: &str| {
         let image = images.iter().find(|r| is(r, knob, level));
@@ -85,8 +85,8 @@ fn bad_studies_are_refused_before_anything_runs() {
         (&["--knobs", "alpha_mim"], &["alpha_mim", "alpha_min"]),
         (&["--knobs", "alpha_min:1/2"], &["alpha_min", "1/2", "1/32"]),
         (&["--knobs", "alpha_min,alpha_min"], &["alpha_min", "twice"]),
-        (&["--knobs", "score_views", "--", "--policy", "vanilla"], &["score_views", "vanilla"]),
-        (&["--knobs", "sh_degree", "--", "--sh-degree", "1"], &["sh_degree", "--sh-degree 1"]),
+        (&["--knobs", "near"], &["near", "VALUE"]),
+        (&["--knobs", "near:2"], &["near", "less than 1"]),
         (&["--", "--knob", "alpha_min=1/64"], &["--knob", "study"]),
         (&["--", "--seed", "3"], &["--seed", "study"]),
     ];

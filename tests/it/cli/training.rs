@@ -43,7 +43,7 @@ fn check_tree(run: &Path) {
     assert_eq!(cameras.as_array().map(Vec::len), Some(VIEWS));
     let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
     let config: toml::Table = config.parse().expect("config.toml is TOML");
-    assert_eq!(config["train"]["budget"].as_integer(), Some(BUDGET as i64));
+    assert_eq!(config["budget"].as_integer(), Some(BUDGET as i64));
 }
 
 /// Fails unless rows stay within the budget in every event, and follow from one to the next.
@@ -146,9 +146,9 @@ fn more_points_than_the_budget_are_subsampled_and_it_is_said() {
     let scene = Photographs::colmap_binary();
     let (_root, run) = scratch();
     let outcome = train(scene.path(), &run, 3, "--budget 100").ok();
-    let told = format!("{} points left out: beyond the budget", POINTS - 100);
+    let told = format!("{} points beyond the budget", POINTS - 100);
     assert!(outcome.stdout.contains(&told), "{}", outcome.stdout);
-    assert!(outcome.stdout.contains("100 rows from 300 points"), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("100 Gaussians from 300 points"), "{}", outcome.stdout);
     let summary = json(&run.join("stats/summary.json"));
     assert_eq!(count(&summary, "peak_rows"), 100);
 }
@@ -190,7 +190,7 @@ fn view_dependent_colour_steps_as_often_as_is_said() {
         let outcome = train(scene.path(), &run, 20, &format!("--budget 330 {flags}")).ok();
         let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
         let config: toml::Table = config.parse().expect("config.toml is TOML");
-        let sh_every = config["train"].get("sh_every").and_then(toml::Value::as_integer);
+        let sh_every = config.get("sh_every").and_then(toml::Value::as_integer);
         (model(&run, 20), sh_every, outcome.stdout.contains("gradients summed between steps"))
     };
     let [plain, every, fourth] = ["", "--sh-every 1", "--sh-every 4"].map(trained);

@@ -1,4 +1,4 @@
-//! Errors as the command line ends with them: a message and an exit code.
+//! Errors as they reach a user: one message with the remedy, and the exit code that it stands for.
 
 use densify_policies::policy::PolicyError;
 
@@ -13,28 +13,39 @@ use crate::output::OutputError;
 use crate::trainer::TrainError;
 
 /// Exit code of anything that has no code of its own.
-pub(super) const OTHER: u8 = 1;
+pub const OTHER: u8 = 1;
 /// Exit code of bad input and usage.
-pub(super) const INPUT: u8 = 2;
+pub const INPUT: u8 = 2;
 /// Exit code where device or memory do not suffice.
-pub(super) const DEVICE: u8 = 3;
+pub const DEVICE: u8 = 3;
 
-/// Why a command failed.
-#[derive(Debug)]
-pub(super) struct Failure {
+/// Why a run or a command failed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct Failure {
     /// Exit code.
-    pub(super) code: u8,
+    pub code: u8,
     /// One message, with the remedy.
-    pub(super) message: String,
+    pub message: String,
 }
 
 impl Failure {
-    pub(super) fn input(message: impl ToString) -> Self {
+    /// Bad input: a file, a flag, a field.
+    #[must_use]
+    #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
+    pub fn input(message: impl ToString) -> Self {
         Self { code: INPUT, message: message.to_string() }
     }
 
+    /// The same failure, said of `origin`: a file, or an option.
+    #[must_use]
+    pub fn within(self, origin: &str) -> Self {
+        Self { message: format!("{origin}: {}", self.message), ..self }
+    }
+
     /// The same failure with more to say.
-    pub(super) fn and(self, more: &str) -> Self {
+    #[must_use]
+    pub fn and(self, more: &str) -> Self {
         Self { message: format!("{}\n{more}", self.message), ..self }
     }
 }

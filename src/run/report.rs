@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::{DegreeChoice, TrainConfig};
+use super::config::{DegreeSource, RunConfig};
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::trainer::{AutoBudget, MIN_GAIN};
 
@@ -14,7 +14,7 @@ pub struct Requirements {
     /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,
     /// What decided the degree.
-    pub sh_degree_from: DegreeChoice,
+    pub sh_degree_from: DegreeSource,
     /// Measurements of `--budget auto`.
     pub rows: Option<AutoBudget>,
     /// Number of training views not rendered for scores, as others are nearly the same.
@@ -37,22 +37,22 @@ pub struct LeftOut {
 impl Requirements {
     /// The report of a run that ended with `rows` rows.
     #[must_use]
-    pub fn of(
-        train: &TrainConfig,
+    pub fn new(
+        config: &RunConfig,
         rows: usize,
         auto_budget: Option<&AutoBudget>,
         unscored_views: usize,
     ) -> Self {
         let left_out = [
-            degree_left_out(train),
-            auto_budget.and_then(|auto| rows_left_out(auto, rows, train.budget)),
+            degree_left_out(config),
+            auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget())),
             auto_budget.and_then(rows_removed),
             (unscored_views > 0).then(|| unscored(unscored_views)),
         ];
         Self {
-            full: train.full,
-            sh_degree: train.sh_degree,
-            sh_degree_from: train.sh_degree_from,
+            full: config.spec.size.full,
+            sh_degree: config.sh_degree(),
+            sh_degree_from: config.resolved.sh_degree_from,
             rows: auto_budget.cloned(),
             unscored_views,
             left_out: left_out.into_iter().flatten().collect(),
@@ -72,14 +72,14 @@ impl Requirements {
     }
 }
 
-fn degree_left_out(train: &TrainConfig) -> Option<LeftOut> {
-    let degree = train.sh_degree;
+fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
+    let degree = config.sh_degree();
     let what = match MAX_SH_DEGREE.checked_sub(degree)? {
         0 => return None,
         1 => format!("degree {MAX_SH_DEGREE} of colour"),
         _ => format!("degrees {} to {MAX_SH_DEGREE} of colour", degree + 1),
     };
-    if train.sh_degree_lowered {
+    if config.resolved.sh_degree_lowered {
         return Some(LeftOut {
             what,
             evidence: "--memory holds fewer rows at it than the scene starts with".to_owned(),
@@ -87,7 +87,7 @@ fn degree_left_out(train: &TrainConfig) -> Option<LeftOut> {
         });
     }
     // Any other degree below the highest is what the options say.
-    let DegreeChoice::Spread(found) = train.sh_degree_from else { return None };
+    let DegreeSource::Spread(found) = config.resolved.sh_degree_from else { return None };
     Some(LeftOut {
         what,
         evidence: format!(
@@ -142,7 +142,8 @@ fn unscored(views: usize) -> LeftOut {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::output::config::tests::sample;
+    use crate::run::ShDegree;
+    use crate::run::config::tests::sample;
     use crate::spread::Spread;
     use crate::trainer::{Interval, Removal};
 
@@ -153,38 +154,38 @@ mod tests {
 
     #[test]
     fn what_the_options_say_is_not_left_out() {
-        let mut train = sample().train;
-        let lines = |train: &TrainConfig, unscored| {
-            Requirements::of(train, 500, None, unscored).lines().join("\n")
+        let mut config = sample();
+        let lines = |config: &RunConfig, unscored| {
+            Requirements::new(config, 500, None, unscored).lines().join("\n")
         };
-        train.sh_degree_from = DegreeChoice::Given;
-        train.sh_degree = 0;
-        assert_eq!(lines(&train, 0), "left out nothing");
-        train.sh_degree_from = DegreeChoice::Undecided;
-        train.sh_degree = MAX_SH_DEGREE;
-        assert_eq!(lines(&train, 0), "left out nothing");
-        assert!(lines(&train, 4).starts_with("left out 4 training views"));
-        train.full = true;
-        assert_eq!(lines(&train, 0), "left out nothing (--full)");
+        config.resolved.sh_degree_from = DegreeSource::Given;
+        config.spec.size.sh_degree = Some(ShDegree::Fixed(0));
+        assert_eq!(lines(&config, 0), "left out nothing");
+        config.resolved.sh_degree_from = DegreeSource::Undecided;
+        config.spec.size.sh_degree = Some(ShDegree::Fixed(MAX_SH_DEGREE));
+        assert_eq!(lines(&config, 0), "left out nothing");
+        assert!(lines(&config, 4).starts_with("left out 4 training views"));
+        config.spec.size.full = true;
+        assert_eq!(lines(&config, 0), "left out nothing (--full)");
     }
 
     #[test]
     fn each_decision_has_its_evidence_and_its_loss() {
-        let mut train = sample().train;
-        let line = |train: &TrainConfig, auto_budget: Option<&AutoBudget>| {
-            Requirements::of(train, 900, auto_budget, 0).lines().join("\n")
+        let mut config = sample();
+        let line = |config: &RunConfig, auto_budget: Option<&AutoBudget>| {
+            Requirements::new(config, 900, auto_budget, 0).lines().join("\n")
         };
-        train.sh_degree_from = DegreeChoice::Spread(spread());
-        train.sh_degree = 0;
-        let text = line(&train, None);
+        config.resolved.sh_degree_from = DegreeSource::Spread(spread());
+        config.spec.size.sh_degree = Some(ShDegree::Fixed(0));
+        let text = line(&config, None);
         for words in ["degrees 1 to 3", "4000 points", "0.50/255", "0.12/255"] {
             assert!(text.contains(words), "{words}: {text}");
         }
-        train.sh_degree_lowered = true;
-        train.sh_degree = 2;
-        let text = line(&train, None);
+        config.resolved.sh_degree_lowered = true;
+        config.spec.size.sh_degree = Some(ShDegree::Fixed(2));
+        let text = line(&config, None);
         assert!(text.contains("degree 3 of") && text.contains("not measured"), "{text}");
-        train.sh_degree = 3;
+        config.spec.size.sh_degree = Some(ShDegree::Fixed(3));
         let interval = |step, rows, gain| Interval { step, rows, psnr: 30.0, settled: true, gain };
         let auto_budget = AutoBudget {
             limit: 900,
@@ -200,7 +201,7 @@ mod tests {
                 Removal { step: 500, before: 900, after: 900, change: -0.125 },
             ],
         };
-        let text = line(&train, Some(&auto_budget));
+        let text = line(&config, Some(&auto_budget));
         for words in ["rows beyond 1000", "step 300", "0.04 dB", "100 rows", "1 times", "-0.015 dB"]
         {
             assert!(text.contains(words), "{words}: {text}");

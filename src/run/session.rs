@@ -7,21 +7,16 @@ use std::time::Instant;
 
 use cpu_time::ProcessTime;
 
-use super::TrainArgs;
-use super::export::export;
-use super::interrupt::{Interrupt, Interrupts};
-use super::setup::Prepared;
-use super::tally::{Logs, Tally};
+use super::Run;
+use super::observer::{Interrupt, Observer};
+use super::records::{Logs, Totals};
 use crate::checkpoint::{CheckpointError, Header, checkpoint_path, tidy, write};
-use crate::cli::console::Console;
-use crate::cli::failure::{Failure, INPUT};
-use crate::cli::number::{duration, grouped};
-use crate::cli::progress::Progress;
 use crate::evaluate::{EvaluateError, Split, evaluate};
-use crate::memory::Bytes;
+use crate::export::{PLY, Shape};
+use crate::failure::{Failure, INPUT};
 use crate::output::{
-    CHECKPOINTS, Mean, OutputError, Requirements, RunFolder, Summary, cameras_json, model_path,
-    saved_iterations, write_atomically, write_json, write_scores,
+    CHECKPOINTS, Mean, OutputError, RunFolder, cameras_json, model_path, saved_iterations,
+    write_atomically, write_scores,
 };
 use crate::trainer::{StepReport, TrainError};
 use crate::views::ViewSource;
@@ -30,14 +25,15 @@ use crate::views::ViewSource;
 const RECORD_EVERY: u32 = 10;
 
 /// A run in progress.
-struct Session<'a> {
-    run: Prepared,
-    console: &'a Console,
+pub(super) struct Session<'a> {
+    pub(super) run: Run,
+    /// What checkpoints say of its configuration.
+    config: toml::Table,
+    pub(super) observer: &'a dyn Observer,
     /// Where files go now.
-    folder: PathBuf,
+    pub(super) folder: PathBuf,
     logs: Logs,
-    tally: Tally,
-    interrupts: Interrupts,
+    pub(super) totals: Totals,
     /// Step of the last checkpoint that this process has written, or gone on from.
     checkpoint: Option<u32>,
 }
@@ -50,28 +46,45 @@ struct Duties {
     last: u32,
 }
 
-pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Result<(), Failure> {
-    let interrupts = Interrupts::listen();
+/// What happens to a run that is in the output folder already.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Occupied {
+    /// It stays, and the new run is refused.
+    Refuse,
+    /// The new run replaces it, once that is complete.
+    Replace,
+    /// It goes on.
+    Resume,
+}
+
+/// Trains to the end, and writes everything that a run leaves; returns the folder.
+pub(super) fn train(
+    run: Run,
+    occupied: Occupied,
+    observer: &dyn Observer,
+) -> Result<PathBuf, Failure> {
     let last = run.last;
-    let folder = match args.resume {
-        true => RunFolder::resume(&run.output, run.kept.is_none())?,
-        false => RunFolder::create(&run.output, args.overwrite)?,
+    let resumes = run.session.is_some();
+    let folder = match occupied {
+        Occupied::Resume => RunFolder::resume(&run.output, !resumes)?,
+        Occupied::Refuse => RunFolder::create(&run.output, false)?,
+        Occupied::Replace => RunFolder::create(&run.output, true)?,
     };
-    let goes_on = run.kept.is_some();
-    let mut session = match Session::start(run, folder.path(), interrupts, console) {
+    let output = run.config.spec.output.clone();
+    let duties = Duties {
+        saves: output.save_iterations.iter().copied().chain([last]).collect(),
+        tests: output.test_iterations.iter().copied().chain([last]).collect(),
+        checkpoint_every: output.checkpoint_every,
+        last,
+    };
+    let mut session = match Session::start(run, folder.path(), observer) {
         Ok(session) => session,
         // Where nothing can be written nothing has been learned.
-        Err(error) if goes_on => return Err(error.into()),
+        Err(error) if resumes => return Err(error),
         Err(error) => {
             folder.discard();
-            return Err(error.into());
+            return Err(error);
         }
-    };
-    let duties = Duties {
-        saves: args.save_iterations.iter().copied().chain([last]).collect(),
-        tests: args.test_iterations.iter().copied().chain([last]).collect(),
-        checkpoint_every: args.checkpoint_every,
-        last,
     };
     let done = session.go(&duties);
     let finished = done.and_then(|()| session.write_summary(true).map_err(Failure::from));
@@ -79,7 +92,7 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
         Ok(()) => {
             let path = folder.finish()?;
             session.report(&path);
-            Ok(())
+            Ok(path)
         }
         // Such as a photograph that cannot be decoded: nothing was learned that is worth keeping.
         Err(failure) if failure.code == INPUT && has_nothing(folder.path()) => {
@@ -90,7 +103,8 @@ pub(super) fn train(args: &TrainArgs, run: Prepared, console: &Console) -> Resul
         // What led here is told first; what cannot be written besides is no news.
         Err(failure) => {
             let _ = session.write_summary(false);
-            let (scene, kept) = (session.run.config.scene.path.clone(), session.checkpoint);
+            let scene = session.run.config.spec.start.scene.clone().unwrap_or_default();
+            let kept = session.checkpoint;
             drop(session);
             let path = folder.abandon();
             let kept = kept.map_or_else(String::new, |step| {
@@ -113,16 +127,12 @@ fn has_nothing(folder: &Path) -> bool {
 }
 
 impl<'a> Session<'a> {
-    fn start(
-        mut run: Prepared,
-        folder: &Path,
-        interrupts: Interrupts,
-        console: &'a Console,
-    ) -> Result<Self, OutputError> {
+    fn start(mut run: Run, folder: &Path, observer: &'a dyn Observer) -> Result<Self, Failure> {
         run.config.write(folder)?;
+        let config = run.config.table()?;
         let to_world = &run.dataset.normalisation;
         if let Some(warning) = to_world.f32_warning() {
-            console.say(format_args!("note: {warning}"));
+            observer.say(format_args!("note: {warning}"));
         }
         let views = run.dataset.test.iter().chain(&run.dataset.train);
         let cameras = views.map(|view| (&*view.name, to_world.denormalise_camera(&view.camera)));
@@ -130,39 +140,39 @@ impl<'a> Session<'a> {
             out.write_all(cameras_json(cameras)?.as_bytes())
         })?;
         let mut checkpoint = None;
-        let (logs, tally) = match run.kept.take() {
-            None => (Logs::create(folder)?, Tally::new()),
-            Some(kept) => {
+        let (logs, totals) = match run.session.take() {
+            None => (Logs::create(folder)?, Totals::new()),
+            Some(saved) => {
                 checkpoint = Some(run.trainer.steps_done());
-                let (logs, tally, lost) = Logs::resume(folder, kept)?;
+                let (logs, totals, lost) = Logs::resume(folder, saved)?;
                 for name in lost {
-                    console.say(format_args!("note: {name} has lost records; they stay missing"));
+                    observer.say(format_args!("note: {name} has lost records; they stay missing"));
                 }
-                (logs, tally)
+                (logs, totals)
             }
         };
         let folder = folder.to_owned();
-        Ok(Self { run, console, folder, logs, tally, interrupts, checkpoint })
+        Ok(Self { run, config, observer, folder, logs, totals, checkpoint })
     }
 
     /// All steps that are left.
     fn go(&mut self, duties: &Duties) -> Result<(), Failure> {
         let done = self.run.trainer.steps_done();
-        let (last, budget) = (duties.last, self.run.config.train.budget);
+        let (last, budget) = (duties.last, self.run.config.budget());
         if done > 0 {
             // A run that was stopped may not have come to what follows its last step.
             self.after(done, duties, true)?;
         }
-        let mut progress = Progress::new(self.console, done, last, budget);
+        self.observer.begin(done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
-            if let Some(interrupt) = self.interrupts.received() {
+            if let Some(interrupt) = self.observer.interrupt() {
                 return Err(self.interrupted(interrupt));
             }
             let report = self.step()?;
-            progress.step(step, report.output.loss, report.rows);
+            self.observer.step(step, report.output.loss, report.rows);
             self.after(step, duties, false)
         });
-        progress.finish();
+        self.observer.end();
         stepped
     }
 
@@ -173,7 +183,7 @@ impl<'a> Session<'a> {
         if duties.saves.contains(&step) && !there(model_path(&self.folder, step)) {
             self.save(step)?;
         }
-        if duties.tests.contains(&step) && !(resumed && self.tally.tested.contains_key(&step)) {
+        if duties.tests.contains(&step) && !(resumed && self.totals.tested.contains_key(&step)) {
             self.test(step, step == duties.last)?;
         }
         let every = duties.checkpoint_every;
@@ -199,10 +209,12 @@ impl<'a> Session<'a> {
         let trainer = self.run.trainer.state();
         let header = Header {
             densify: self.run.config.densify.clone(),
-            config: self.run.config.clone(),
+            budget: self.run.config.budget(),
+            sh_degree: self.run.config.sh_degree(),
+            config: self.config.clone(),
             dataset: self.run.fingerprint.clone(),
             trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
-            session: self.logs.keep(&self.tally)?,
+            session: self.logs.keep(&self.totals)?,
         };
         write(&checkpoint_path(&self.folder, step), &header, self.run.trainer.backend())?;
         tidy(&self.folder, step);
@@ -230,9 +242,9 @@ impl<'a> Session<'a> {
     fn step(&mut self) -> Result<StepReport, Failure> {
         let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
         let stepped = self.run.trainer.step();
-        self.tally.time(wall, cpu);
+        self.totals.time(wall, cpu);
         for &(stage, time) in self.run.trainer.backend().stage_times() {
-            self.tally.stage(stage, time);
+            self.totals.stage(stage, time);
         }
         match stepped {
             Ok(report) => {
@@ -255,16 +267,16 @@ impl<'a> Session<'a> {
     }
 
     fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
-        let Self { logs, tally, run, .. } = self;
+        let Self { logs, totals, run, .. } = self;
         for event in &report.events {
             logs.events.append(event)?;
         }
-        tally.step(&report.output);
+        totals.step(&report.output);
         let step = report.step;
         // The end of a run is a record even where it is extended, so that records do not depend on it.
-        let ends = [run.config.train.iterations, run.last].contains(&step);
+        let ends = [run.config.spec.schedule.iterations.0, run.last].contains(&step);
         if step.is_multiple_of(RECORD_EVERY) || ends {
-            let record = tally.record(step, report.rows);
+            let record = totals.record(step, report.rows);
             logs.steps.append(&record)?;
             logs.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
         }
@@ -274,22 +286,27 @@ impl<'a> Session<'a> {
     /// Writes the model; returns where.
     fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
         let path = model_path(&self.folder, step);
-        export(&mut self.run.trainer, &self.run.dataset.normalisation, &path)?;
+        let (trainer, to_world) = (&mut self.run.trainer, &self.run.dataset.normalisation);
+        let sh_degree = trainer.model_rows(0..0)?.sh_degree;
+        let shape = Shape { rows: trainer.backend().rows(), sh_degree };
+        PLY.write_file(&path, shape, |piece| {
+            Ok::<_, Failure>(to_world.model_to_world(trainer.model_rows(piece)?))
+        })?;
         Ok(path)
     }
 
     /// Measures the views held out, if there are any.
     fn test(&mut self, step: u32, is_last: bool) -> Result<(), Failure> {
-        let Prepared { trainer, test, config, .. } = &mut self.run;
+        let Run { trainer, test, config, .. } = &mut self.run;
         if test.count() == 0 {
             return Ok(());
         }
-        let (background, degree) = (config.scene.background.fixed(), config.train.sh_degree);
-        let interrupts = self.interrupts;
+        let (background, degree) = (config.spec.data.background.fixed(), config.sh_degree());
+        let observer = self.observer;
         let scores = evaluate(trainer.backend(), test, background, degree, |_| {
-            interrupts.received().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
+            observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
         });
-        let scores = match (scores, self.interrupts.received()) {
+        let scores = match (scores, self.observer.interrupt()) {
             (Err(EvaluateError::Stopped), Some(interrupt)) => {
                 return Err(self.interrupted(interrupt));
             }
@@ -300,83 +317,12 @@ impl<'a> Session<'a> {
         let Mean { psnr, ssim, flip } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
         self.logs.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
-        self.tally.tested.insert(step, mean);
+        self.totals.tested.insert(step, mean);
         if !is_last {
-            self.console.say(format_args!(
+            self.observer.say(format_args!(
                 "step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}"
             ));
         }
         Ok(())
-    }
-
-    fn write_summary(&self, finished: bool) -> Result<(), OutputError> {
-        let Prepared { config, trainer, test, ledger, .. } = &self.run;
-        let (events, views) = trainer.policy_times();
-        let images = trainer.images_time();
-        let more = [("policy events", events), ("policy views", views), ("images", images)];
-        let more = more.map(|(stage, time)| (stage.to_owned(), time));
-        let stages = self.tally.stages.clone().into_iter().chain(more);
-        let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
-        let summary = Summary {
-            densify: config.densify.clone(),
-            policy: config.policy.name.clone(),
-            finished,
-            iterations: trainer.steps_done(),
-            rows: trainer.rows(),
-            peak_rows: trainer.peak_rows(),
-            budget: config.train.budget,
-            extra_forwards: trainer.extra_forwards(),
-            peak_bytes: self.tally.peak_bytes(),
-            memory: config.train.memory,
-            ledger_bytes: ledger.total(),
-            ledger: ledger.clone(),
-            seconds: self.tally.wall.as_secs_f64(),
-            stage_seconds,
-            cpu_seconds: self.tally.cpu.map(|cpu| cpu.as_secs_f64()),
-            train_views: trainer.views().count(),
-            test_views: test.count(),
-            test: self.tally.tested.clone(),
-        };
-        write_json(&self.folder.join("stats/requirements.json"), &self.requirements())?;
-        write_json(&self.folder.join("stats/summary.json"), &summary)
-    }
-
-    /// What was left out.
-    fn requirements(&self) -> Requirements {
-        let Prepared { config, trainer, .. } = &self.run;
-        let (growth, unscored) = (trainer.growth(), trainer.unscored_views());
-        Requirements::of(&config.train, trainer.rows(), growth, unscored)
-    }
-
-    /// What came of it, in a few lines.
-    fn report(&self, path: &Path) {
-        let Prepared { config, trainer, test, ledger, .. } = &self.run;
-        let steps = trainer.steps_done();
-        if let Some(Mean { psnr, ssim, flip }) = self.tally.tested.get(&steps) {
-            let views = test.count();
-            self.console.say(format_args!(
-                "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
-            ));
-        }
-        self.console.say(format_args!(
-            "rows     {}, at most {} of {}",
-            grouped(trainer.rows()),
-            grouped(trainer.peak_rows()),
-            grouped(config.train.budget)
-        ));
-        let promised = Bytes(ledger.total());
-        if let Some(peak) = self.tally.peak_bytes() {
-            let peak = Bytes(peak);
-            self.console.say(format_args!("memory   {peak} at its peak, {promised} promised"));
-        }
-        let cpu = self.tally.cpu.map_or_else(String::new, |cpu| {
-            format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
-        });
-        self.console.say(format_args!("time     {}{cpu}", duration(self.tally.wall)));
-        for line in self.requirements().lines() {
-            self.console.say(line);
-        }
-        self.console.say(format_args!("model    {}", model_path(path, steps).display()));
-        self.console.say(format_args!("numbers  {}", path.join("stats").display()));
     }
 }

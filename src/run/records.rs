@@ -1,5 +1,5 @@
-//! The numbers of a run so far: what its logs and its summary say beside what the trainer knows. They
-//! go into checkpoints, so that the records of a run that was interrupted have no seam.
+//! The logs of a run and its totals so far. Both go into checkpoints, so that the records of an interrupted
+//! run have no gap.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -15,7 +15,7 @@ use crate::output::{Mean, OutputError, RecordLog, StepRecord, TensorBoard};
 /// Sums and scores so far.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Tally {
+pub(super) struct Totals {
     window: Window,
     /// Wall time of all steps.
     pub(super) wall: Duration,
@@ -45,7 +45,7 @@ struct Window {
     last_ssim: f32,
 }
 
-impl Tally {
+impl Totals {
     pub(super) fn new() -> Self {
         Self { cpu: Some(Duration::ZERO), ..Self::default() }
     }
@@ -128,8 +128,8 @@ struct Lengths {
 /// What a checkpoint holds of the session.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Kept {
-    tally: Tally,
+pub(super) struct SavedSession {
+    totals: Totals,
     logs: Lengths,
 }
 
@@ -146,29 +146,29 @@ impl Logs {
     }
 
     /// The session as it is now, as JSON; all that the logs hold is on disk then.
-    pub(super) fn keep(&self, tally: &Tally) -> Result<serde_json::Value, OutputError> {
+    pub(super) fn keep(&self, totals: &Totals) -> Result<serde_json::Value, OutputError> {
         let lengths = Lengths {
             steps: self.steps.synced()?,
             events: self.events.synced()?,
             board: self.board.synced()?,
         };
-        let peak = tally.peak_bytes();
-        let mut tally = serde_json::to_value(tally).unwrap_or_default();
-        tally["peak_before"] = peak.into();
-        Ok(serde_json::json!({ "tally": tally, "logs": lengths }))
+        let peak = totals.peak_bytes();
+        let mut totals = serde_json::to_value(totals).unwrap_or_default();
+        totals["peak_before"] = peak.into();
+        Ok(serde_json::json!({ "totals": totals, "logs": lengths }))
     }
 
     /// Goes on with the logs as they were; names those that have lost something meanwhile.
     pub(super) fn resume(
         folder: &Path,
-        kept: Kept,
-    ) -> Result<(Self, Tally, Vec<&'static str>), OutputError> {
-        let Kept { tally, logs } = kept;
+        kept: SavedSession,
+    ) -> Result<(Self, Totals, Vec<&'static str>), OutputError> {
+        let SavedSession { totals, logs } = kept;
         let (steps, steps_whole) = RecordLog::resume(&folder.join(STEPS), logs.steps)?;
         let (events, events_whole) = RecordLog::resume(&folder.join(EVENTS), logs.events)?;
         let board = TensorBoard::resume(folder, &logs.board.0, logs.board.1)?;
         let lost = [(STEPS, steps_whole), (EVENTS, events_whole)];
         let lost = lost.into_iter().filter(|(_, whole)| !whole).map(|(name, _)| name).collect();
-        Ok((Self { steps, events, board }, tally, lost))
+        Ok((Self { steps, events, board }, totals, lost))
     }
 }

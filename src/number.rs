@@ -6,7 +6,7 @@ use std::time::Duration;
 const MOST_ROWS: f64 = u32::MAX as f64;
 
 /// Parses a number of rows: `200000`, `28k`, `1.5M`.
-pub(super) fn rows(text: &str) -> Result<usize, String> {
+pub(crate) fn rows(text: &str) -> Result<usize, String> {
     let wrong = || format!("`{text}` is no number of rows; write it as 200000, 200k or 1.5M");
     let (number, factor) = match text.char_indices().last() {
         Some((at, 'k' | 'K')) => (&text[..at], 1e3),
@@ -30,7 +30,7 @@ pub(super) fn rows(text: &str) -> Result<usize, String> {
 }
 
 /// Parses a number of bytes: `1GiB`, `512MiB`, `800MB`, `1000000`.
-pub(super) fn bytes(text: &str) -> Result<u64, String> {
+pub(crate) fn bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, f64); 10] = [
         ("KiB", 1024.0),
         ("MiB", 1024.0 * 1024.0),
@@ -60,8 +60,8 @@ pub(super) fn bytes(text: &str) -> Result<u64, String> {
 }
 
 /// Parses a fraction above 0 and below 1.
-pub(super) fn fraction(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| format!("`{text}` is no number"))?;
+pub(crate) fn fraction(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("`{text}` is not a number"))?;
     if value > 0.0 && value < 1.0 {
         Ok(value)
     } else {
@@ -70,7 +70,7 @@ pub(super) fn fraction(text: &str) -> Result<f64, String> {
 }
 
 /// 1234567 as 1,234,567.
-pub(super) fn grouped(number: usize) -> String {
+pub(crate) fn grouped(number: usize) -> String {
     let digits = number.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);
     for (i, digit) in digits.chars().enumerate() {
@@ -83,7 +83,7 @@ pub(super) fn grouped(number: usize) -> String {
 }
 
 /// A duration to the second: 45 s, 2 min 5 s, 3 h 0 min.
-pub(super) fn duration(time: Duration) -> String {
+pub(crate) fn duration(time: Duration) -> String {
     let seconds = time.as_secs_f64().round() as u64;
     match (seconds / 3600, seconds / 60 % 60, seconds % 60) {
         (0, 0, _) if time.as_secs_f64() < 9.95 => format!("{:.1} s", time.as_secs_f64()),

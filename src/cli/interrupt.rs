@@ -7,15 +7,10 @@ use std::sync::{Arc, OnceLock};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
+use crate::run::Interrupt;
+
 /// What the shell adds to a signal's number for the exit code of a process that it has ended.
 const BY_SIGNAL: i32 = 128;
-
-/// A signal that asks the run to end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Interrupt {
-    pub(super) name: &'static str,
-    pub(super) exit_code: u8,
-}
 
 /// What the process has been told so far; there is one for all runs of a process.
 #[derive(Debug, Clone, Copy)]

@@ -1,0 +1,161 @@
+//! The options of a run as flags: their defaults in the help, and which of them a call gives.
+
+use std::ffi::OsString;
+use std::path::Path;
+
+use clap::parser::ValueSource;
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
+use toml::{Table, Value};
+
+use crate::failure::Failure;
+use crate::run::{Partial, RunSpec};
+
+/// Gives every option of a run in `command` the default that [`RunSpec`] has for it.
+pub(super) fn with_defaults(command: Command) -> Command {
+    let defaults = RunSpec::default().table().unwrap_or_default();
+    command.mut_args(|arg| {
+        let default = defaults.get(arg.get_id().as_str());
+        match default.filter(|_| arg.get_default_values().is_empty()) {
+            None | Some(Value::Array(_) | Value::Table(_)) => arg,
+            Some(Value::Boolean(_)) => shown(arg, "false").hide_default_value(true),
+            Some(Value::String(text)) => shown(arg, text),
+            Some(other) => shown(arg, &other.to_string()),
+        }
+    })
+}
+
+fn shown(arg: Arg, default: &str) -> Arg {
+    arg.required(false).default_value(default.to_owned())
+}
+
+/// The options of a run that a call gives: those that clap found on the command line.
+pub(super) fn given(matches: &ArgMatches, spec: &RunSpec) -> Result<Partial, Failure> {
+    Partial::given(spec, |name| matches.value_source(name) == Some(ValueSource::CommandLine))
+}
+
+/// The options of a run in words like those after `densify train`, but for the scene.
+pub(super) fn parsed(words: &[String], of: &'static str) -> Result<Partial, Failure> {
+    let command = Command::new(of).no_binary_name(true).disable_help_flag(true);
+    let command = with_defaults(RunSpec::augment_args(command));
+    let usage =
+        |error: clap::Error| Failure::input(error.to_string().trim().trim_start_matches("error: "));
+    let words = words.iter().map(OsString::from);
+    let matches = command.try_get_matches_from(words).map_err(usage)?;
+    let spec = RunSpec::from_arg_matches(&matches).map_err(usage)?;
+    given(&matches, &spec)
+}
+
+/// The parameters of policies in a file with a table for each: `--policy-config`.
+pub(super) fn policy_config(path: &Path) -> Result<Partial, Failure> {
+    let origin = format!("--policy-config {}", path.display());
+    let fail = |problem: String| Failure::input(format!("{origin}: {}", problem.trim()));
+    let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
+    let table: Table = text.parse().map_err(|error: toml::de::Error| fail(error.to_string()))?;
+    for (policy, parameters) in &table {
+        densify_policies::registry::find(policy).map_err(|error| fail(error.to_string()))?;
+        if !parameters.is_table() {
+            return Err(fail(format!("`{policy}` must be a table: [{policy}]")));
+        }
+    }
+    Partial::new([("policy_set".to_owned(), table.into())].into_iter().collect(), &origin)
+}
+
+/// Fails where `--policy-set` among these flags names another policy than that of the run.
+pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failure> {
+    let policy = &spec.density.policy;
+    let set = flags.get("policy_set").and_then(Value::as_table);
+    match set.into_iter().flat_map(Table::keys).find(|name| *name != policy) {
+        None => Ok(()),
+        Some(other) => Err(Failure::input(format!(
+            "--policy-set sets a parameter of `{other}`, but the policy of this run is `{policy}`; \
+             choose it with --policy {other}"
+        ))),
+    }
+}
+
+/// The table of docs/options.md: every option of a run, as the help has it.
+#[cfg(test)]
+pub(super) fn markdown() -> String {
+    use std::fmt::Write as _;
+
+    use crate::run::{OPTIONS, OnResume};
+
+    let command = with_defaults(RunSpec::augment_args(Command::new("train")));
+    let mut text = String::from(
+        "# Options of `densify train`\n\nThis table is generated from the description of a run \
+         (`src/run/spec.rs`); `cargo test options_table` says how to renew it. In a file for `--config` an \
+         option has the name of its flag, with `_` for `-`: `tile_cap = 100000`.\n",
+    );
+    let mut heading = "";
+    for option in OPTIONS {
+        let Some(arg) = command.get_arguments().find(|arg| arg.get_id() == option.name) else {
+            continue;
+        };
+        let own = arg.get_help_heading().unwrap_or_default();
+        if own != heading {
+            heading = own;
+            let _ = write!(
+                text,
+                "\n## {heading}\n\n| option | default | what it is | with --resume |\n|---|---|---|---|\n"
+            );
+        }
+        let default: Vec<String> = arg
+            .get_default_values()
+            .iter()
+            .map(|value| value.to_string_lossy().into_owned())
+            .collect();
+        let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+        let on_resume = match option.on_resume {
+            OnResume::Fixed => "stays",
+            OnResume::Free => "may change",
+            OnResume::Longer => "may grow",
+        };
+        let _ = writeln!(
+            text,
+            "| `{}` | {} | {} | {on_resume} |",
+            option.flag(),
+            default.join(" "),
+            help.replace('|', "\\|").replace('\n', " ")
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_options_table_is_current() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/options.md");
+        if std::env::var_os("DENSIFY_WRITE_DOCS").is_some() {
+            std::fs::write(&path, markdown()).unwrap();
+        }
+        let there = std::fs::read_to_string(&path).unwrap_or_default();
+        assert!(
+            there == markdown(),
+            "docs/options.md is out of date: DENSIFY_WRITE_DOCS=1 cargo test options_table"
+        );
+    }
+
+    #[test]
+    fn only_what_is_given_is_given() {
+        let words = ["--near", "0.04", "--eval", "--knob", "alpha_min=1/64", "--lr=opacity=0.05"];
+        let found = parsed(&words.map(str::to_owned), "train").unwrap();
+        let names: Vec<&str> = found.iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["eval", "knob", "lr", "near"]);
+        let spec = found.describe().unwrap();
+        assert!(spec.data.eval && spec.schedule.iterations.0 == 24_000);
+        for (bad, part) in [
+            ("--knob=alpha_mim=1/64", "alpha_min"),
+            ("--lr=opacty=1", "opacity"),
+            ("--budget=0", "out of range"),
+            ("--sh-degree=4", "auto"),
+            ("--policy-set=dite.rho=1", "diet"),
+            ("--sh-every=1001", "1000"),
+        ] {
+            let message = parsed(&[bad.to_owned()], "train").unwrap_err().message;
+            assert!(message.contains(part), "{bad}: {message}");
+        }
+    }
+}

@@ -1,0 +1,29 @@
+//! `densify plan`: what a run would take, without the run.
+
+use clap::ArgMatches;
+
+use super::console::Console;
+use super::train::{Follower, TrainArgs};
+use crate::failure::Failure;
+use crate::run::plan;
+
+/// Prints the ledger of a run, and what else its memory could hold. Writes nothing.
+pub(super) fn run(
+    args: &TrainArgs,
+    matches: &ArgMatches,
+    console: &Console,
+) -> Result<(), Failure> {
+    if args.resume {
+        return Err(Failure::input(
+            "--resume: a resumed run has the size that it began with (config.toml); leave it out \
+             to plan a new one",
+        ));
+    }
+    let plan = plan(&args.describe(matches)?, &Follower::new(console))?;
+    for line in &plan.lines {
+        console.result(line);
+    }
+    console.result(format_args!("memory promised\n{}", plan.ledger));
+    console.result(plan.alternatives);
+    Ok(())
+}

@@ -1,0 +1,234 @@
+//! From a description to a trainer. Everything that can fail for reasons of the user's making fails here,
+//! before anything is written.
+
+use std::path::PathBuf;
+
+use densify_policies::policy::DensityPolicy;
+
+use super::Run;
+use super::config::{Resolved, RunConfig};
+use super::observer::Observer;
+use super::records::SavedSession;
+use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS, ignored, random_count};
+use super::resume::{self, Resumed};
+use super::spec::RunSpec;
+use super::values::{Assignment, ByteCount, InitChoice, Rows, ShDegree, assignments};
+use crate::checkpoint::Fingerprint;
+use crate::failure::Failure;
+use crate::gaussians::Gaussians;
+use crate::init::{initialise, random_points, restart};
+use crate::memory::Setting;
+use crate::number::grouped;
+use crate::schedule::RateOptions;
+use crate::trainer::{TrainOptions, Trainer, needs};
+use crate::views::DatasetViews;
+
+/// Views announced ahead: enough that each decoder has one at work and one waiting.
+const AHEAD: usize = 2 * DECODERS;
+
+/// Prepares a run: a new one, or one that goes on from a checkpoint.
+pub(super) fn build(
+    spec: &RunSpec,
+    resumed: Option<Resumed>,
+    observer: &dyn Observer,
+) -> Result<Run, Failure> {
+    let last = resumed.as_ref().map_or(spec.schedule.iterations.0, |resumed| resumed.last);
+    spec.check_iterations(last)?;
+    let output = spec.output_folder()?;
+    let saved = resumed.as_ref().map(|resumed| &resumed.config);
+    let inputs = Inputs::load(spec, saved, observer)?;
+    if !spec.output.test_iterations.is_empty() && inputs.dataset.test.is_empty() {
+        return Err(Failure::input(
+            "--test-iterations: no view is held out to measure; add --eval or --test-every K",
+        ));
+    }
+    let size = match &resumed {
+        // Solved when the run began; its configuration has the result.
+        Some(_) => Size::as_given(&inputs)?,
+        None => Size::choose(&inputs)?,
+    };
+    let setting = size.setting;
+    let threads = inputs.threads();
+    resolve::check_grant(&inputs, &inputs.ledger(&setting, &inputs.needs(setting.rows)?, threads))?;
+    let (mut model, init, init_points) = match &resumed {
+        None => first_model(&inputs, &setting, observer)?,
+        Some(resumed) => {
+            let start = &spec.start;
+            let init = start.init.unwrap_or_else(|| inputs.init());
+            (resumed.checkpoint.blank_model()?, init, start.init_points.map(|points| points.0))
+        }
+    };
+    let initial_rows = (resumed.as_ref())
+        .map_or(model.len(), |resumed| resumed.checkpoint.header().trainer.initial_rows);
+    let scene = inputs.info(setting.rows, initial_rows)?;
+    let policy = inputs.entry.build(&inputs.parameters, &scene)?;
+    let declared = policy.needs(&scene);
+    if resumed.is_none() {
+        restart(&mut model, &declared.start);
+    }
+    let rates = spec.learning_rates(&declared.rates)?;
+    let parameters = inputs.entry.effective(&inputs.parameters, &scene)?;
+    let decided = Decided { setting, init, init_points, rates, parameters };
+    let mut config = decided.config(&inputs)?;
+    config.resolved.sh_degree_lowered = match saved {
+        Some(saved) => saved.resolved.sh_degree_lowered,
+        None => size.is_lowered(&inputs),
+    };
+    config.resolved.extended_to = (last > spec.schedule.iterations.0).then_some(last);
+    let fingerprint = Fingerprint::of(&inputs.dataset);
+    if let Some(resumed) = &resumed {
+        resume::check(&config, resumed, &fingerprint)?;
+    }
+    for line in inputs.degree.line().into_iter().chain(size.lines(&inputs)) {
+        observer.say(format_args!("{line}"));
+    }
+    announce(&config, &output, inputs.entry.summary, observer);
+    let needs = inputs.backend_needs(needs(policy.as_ref(), &scene, inputs.sh_every()));
+    let ledger = inputs.ledger(&setting, &needs, threads);
+    resolve::check(&inputs, &ledger)?;
+    observer.say(format_args!("memory promised\n{ledger}"));
+    let backend = inputs.device.backend(&model, &inputs.backend_options(&setting, needs))?;
+    let options = TrainOptions {
+        iterations: spec.schedule.iterations.0,
+        seed: spec.schedule.seed,
+        sh_degree: setting.sh_degree,
+        background: spec.data.background,
+        rates,
+        sh_every: inputs.sh_every(),
+        prefetch: AHEAD,
+        on_nan: spec.schedule.on_nan,
+        savings: inputs.knobs.savings,
+    };
+    let (name, required) = (inputs.entry.name, inputs.required);
+    let mut dataset = inputs.dataset;
+    let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
+    let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
+    dataset.points = crate::dataset::PointCloud::default();
+    let policy: Box<dyn DensityPolicy> = policy;
+    let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
+    let mut trainer = trainer.requiring(required);
+    let session: Option<SavedSession> =
+        resumed.map(|resumed| resume::restore(resumed, &mut trainer, observer)).transpose()?;
+    Ok(Run { config, output, trainer, test, dataset, ledger, fingerprint, last, session })
+}
+
+/// Everything that was open in the description of a run.
+struct Decided {
+    setting: Setting,
+    init: InitChoice,
+    init_points: Option<usize>,
+    rates: RateOptions,
+    parameters: toml::Table,
+}
+
+impl Decided {
+    /// The run with nothing open.
+    fn config(self, inputs: &Inputs<'_>) -> Result<RunConfig, Failure> {
+        let Self { setting, init, init_points, rates, parameters } = self;
+        let mut spec = inputs.spec.clone();
+        // It is where the file is.
+        spec.output.output = None;
+        let name = inputs.entry.name;
+        let budget = spec.size.budget.unwrap_or(super::Budget::Rows(setting.rows));
+        spec.size.budget = Some(budget.limited_to(setting.rows));
+        spec.size.sh_degree = Some(match spec.size.sh_degree {
+            Some(ShDegree::Auto(_)) => ShDegree::Auto(Some(setting.sh_degree)),
+            _ => ShDegree::Fixed(setting.sh_degree),
+        });
+        // The knob says it otherwise.
+        spec.size.tile_cap = inputs.knobs.pairs_per_row.is_none().then_some(Rows(setting.tile_cap));
+        spec.size.image_cache = Some(ByteCount(setting.image_cache));
+        spec.device.backend = inputs.device.kind().choice();
+        spec.device.gpu = inputs.device.adapter().map(str::to_owned);
+        spec.start.init = Some(init);
+        spec.start.init_points = init_points.map(Rows);
+        spec.schedule.lr =
+            assignments(&as_written(toml::Table::try_from(rates).map_err(Failure::input)?));
+        spec.schedule.knob = assignments(&inputs.knobs.table());
+        // Those of other policies stay, as one file may serve several.
+        spec.density.policy_set.retain(|setting| setting.path.first().is_none_or(|it| it != name));
+        spec.density.policy_set.extend(assignments(&parameters).into_iter().map(|setting| {
+            let path = std::iter::once(name.to_owned()).chain(setting.path).collect();
+            Assignment { path, value: setting.value }
+        }));
+        let scene = spec.start.scene.as_ref();
+        let resolved = Resolved {
+            working_directory: std::env::current_dir()
+                .ok()
+                .filter(|_| scene.is_some_and(|scene| scene.is_relative())),
+            adapter: inputs.device.adapter().map(str::to_owned),
+            accumulation: inputs.device.accumulation().map(|way| way.name().to_owned()),
+            sh_degree_from: inputs.degree.source,
+            ..Resolved::default()
+        };
+        Ok(RunConfig { densify: env!("CARGO_PKG_VERSION").to_owned(), spec, resolved })
+    }
+}
+
+/// Numbers that are an `f32` as people write them: 0.005 rather than 0.004999999888241291.
+fn as_written(mut table: toml::Table) -> toml::Table {
+    for value in table.iter_mut().map(|(_, value)| value) {
+        if let toml::Value::Float(number) = value
+            && f64::from(*number as f32).total_cmp(number).is_eq()
+        {
+            *number = (*number as f32).to_string().parse().unwrap_or(*number);
+        }
+    }
+    table
+}
+
+/// The initial model in the coordinates of training, and how it was made.
+fn first_model(
+    inputs: &Inputs<'_>,
+    setting: &Setting,
+    observer: &dyn Observer,
+) -> Result<(Gaussians, InitChoice, Option<usize>), Failure> {
+    let (choice, given) = (inputs.init(), inputs.spec.start.init_points);
+    let (dataset, seed) = (&inputs.dataset, inputs.spec.schedule.seed);
+    let random;
+    let (points, count) = match choice {
+        InitChoice::Points if given.is_some() => {
+            return Err(Failure::input(
+                "--init-points is for a random start; leave it out, or use --init random",
+            ));
+        }
+        InitChoice::Points => (&dataset.points, None),
+        InitChoice::Random => {
+            let count = given.map_or_else(|| random_count(setting.rows), |points| points.0);
+            let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
+            let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
+            random = random_points(count, &cameras, opaque, seed);
+            (&random, Some(count))
+        }
+    };
+    let (model, report) = initialise(points, setting.rows, setting.sh_degree, seed)?;
+    for (number, reason) in [
+        (report.unusable, "non-finite points ignored"),
+        (report.duplicates, "duplicate points ignored"),
+        (report.over_budget, "points beyond the budget left out, drawn by the seed"),
+    ] {
+        if number > 0 {
+            observer.say(format_args!("{}", ignored(number, reason)));
+        }
+    }
+    let source = if count.is_some() { "random points" } else { "points of the scene" };
+    observer.say(format_args!(
+        "start    {} Gaussians from {} {source}",
+        grouped(model.len()),
+        grouped(report.points)
+    ));
+    Ok((model, choice, count))
+}
+
+fn announce(config: &RunConfig, output: &PathBuf, summary: &str, observer: &dyn Observer) {
+    let RunSpec { density, schedule, data, .. } = &config.spec;
+    observer.say(format_args!("policy   {}: {summary}", density.policy));
+    observer.say(format_args!(
+        "run      {} iterations, seed {}, degree {}, background {}",
+        grouped(schedule.iterations.0 as usize),
+        schedule.seed,
+        config.sh_degree(),
+        data.background
+    ));
+    observer.say(format_args!("output   {}", output.display()));
+}

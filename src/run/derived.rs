@@ -1,0 +1,204 @@
+//! What follows from the options of a run alone: the dataset's split, the knobs, the learning rates, the
+//! policy's parameters, the output folder.
+
+use std::path::{Path, PathBuf};
+
+use densify_policies::policy::RateOverrides;
+use densify_policies::registry::{PolicyEntry, find};
+use toml::{Table, Value};
+
+use super::spec::{DataSpec, RunSpec};
+use super::values;
+use crate::dataset::{LoadOptions, Resolution, Split, builtin};
+use crate::failure::Failure;
+use crate::knobs::Knobs;
+use crate::schedule::RateOptions;
+
+impl DataSpec {
+    /// How the dataset is to be read, with tracks if they are wanted.
+    ///
+    /// # Errors
+    /// When the resolution is out of range.
+    pub fn load_options(&self, tracks: bool) -> Result<LoadOptions, Failure> {
+        let resolution = self.resolution.map(|size| size.0.to_string().parse::<Resolution>());
+        Ok(LoadOptions {
+            images: self.images.clone(),
+            resolution: resolution.transpose().map_err(Failure::input)?,
+            split: match self.test_every {
+                Some(every) => Split::Every(every),
+                None if self.eval => Split::Eval,
+                None => Split::None,
+            },
+            tracks,
+        })
+    }
+}
+
+impl RunSpec {
+    /// The options as the table of a file. Those that are `None` are not in it.
+    ///
+    /// # Errors
+    /// When an option that may be repeated contradicts itself.
+    pub fn table(&self) -> Result<Table, Failure> {
+        Table::try_from(self).map_err(|error| Failure::input(error.to_string().trim()))
+    }
+
+    /// The dataset.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn scene(&self) -> Result<&Path, Failure> {
+        self.start.scene.as_deref().ok_or_else(|| {
+            Failure::input(
+                "no scene is given; name a dataset's folder, or a built-in scene such as scene:spheres \
+                 (in a file: scene = \"...\")",
+            )
+        })
+    }
+
+    /// The folder to write to: `output/SCENE-POLICY` unless another is given, SCENE being the name of
+    /// the dataset's folder.
+    ///
+    /// # Errors
+    /// When neither scene nor folder is given.
+    pub fn output_folder(&self) -> Result<PathBuf, Failure> {
+        if let Some(folder) = &self.output.output {
+            return Ok(folder.clone());
+        }
+        let (scene, policy) = (self.scene()?, &self.density.policy);
+        if let Some(name) = builtin::name(scene) {
+            return Ok(Path::new("output").join(format!("{name}-{policy}")));
+        }
+        let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
+        let name = full.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+        Ok(Path::new("output").join(format!("{name}-{policy}")))
+    }
+
+    /// The knobs.
+    ///
+    /// # Errors
+    /// When there is no such knob, or its value is outside its domain.
+    pub fn knobs(&self) -> Result<Knobs, Failure> {
+        let table = values::table(&self.schedule.knob)
+            .map_err(|error| Failure::input(format!("--knob {error}")))?;
+        Knobs::from_table(&table).map_err(|error| Failure::input(format!("--knob: {error}")))
+    }
+
+    /// The default learning rates for a run of this length, overlaid with the policy's, and these with
+    /// `--lr`, which are taken as given.
+    ///
+    /// # Errors
+    /// When there is no such rate, or it is not a positive number.
+    pub fn learning_rates(&self, of_policy: &RateOverrides) -> Result<RateOptions, Failure> {
+        let fail = |problem: &str| Failure::input(format!("--lr: {}", problem.trim()));
+        let iterations = self.schedule.iterations.0;
+        let defaults = Table::try_from(RateOptions::for_run(iterations).with(of_policy));
+        let mut table = defaults.map_err(|error| fail(&error.to_string()))?;
+        let given = values::table(&self.schedule.lr).map_err(|error| fail(&error))?;
+        for (name, rate) in given {
+            let number = match rate {
+                Value::Integer(number) => number as f64,
+                Value::Float(number) => number,
+                other => {
+                    return Err(fail(&format!(
+                        "{name}={other} is not of the form NAME=RATE, such as opacity=0.05"
+                    )));
+                }
+            };
+            table.insert(name, number.into());
+        }
+        let rates: RateOptions = table.try_into().map_err(|error| fail(&format!("{error}")))?;
+        match rates.invalid() {
+            Some(name) => Err(fail(&format!("{name} must be a positive number"))),
+            None => Ok(rates),
+        }
+    }
+
+    /// The policy, and its parameters as they are set.
+    ///
+    /// # Errors
+    /// When there is no such policy, or a parameter is set twice.
+    pub fn policy(&self) -> Result<(&'static PolicyEntry, Table), Failure> {
+        let entry = find(&self.density.policy)?;
+        let fail = |error| Failure::input(format!("--policy-set {error}"));
+        let mut tables = values::table(&self.density.policy_set).map_err(fail)?;
+        let own = tables.remove(entry.name);
+        Ok((entry, own.and_then(|own| own.as_table().cloned()).unwrap_or_default()))
+    }
+
+    /// Fails where an iteration after which something is to be done is not one of the run.
+    ///
+    /// # Errors
+    /// Names the flag.
+    pub(super) fn check_iterations(&self, last: u32) -> Result<(), Failure> {
+        for (flag, chosen) in [
+            ("--save-iterations", &self.output.save_iterations),
+            ("--test-iterations", &self.output.test_iterations),
+        ] {
+            if let Some(step) = chosen.iter().find(|&&step| step == 0 || step > last) {
+                return Err(Failure::input(format!(
+                    "{flag} {step} is out of range: the run has iterations 1 to {last}"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::Partial;
+
+    fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
+        let file: Table = format!("{option} = {value}").parse().unwrap();
+        Partial::new(file, "file.toml")?.describe()
+    }
+
+    #[test]
+    fn learning_rates_by_name() {
+        let rates = |lr: &str, of_policy: &RateOverrides| {
+            let mut spec = spec("lr", lr).unwrap();
+            spec.schedule.iterations.0 = 30_000;
+            spec.learning_rates(of_policy).unwrap()
+        };
+        let given = rates("{ opacity = 0.05, mean_end = 1e-5 }", &RateOverrides::default());
+        let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
+        assert_eq!(given, expected);
+        let of_policy =
+            RateOverrides { mean_end: Some(3e-6), sh_rest: Some(2e-4), ..RateOverrides::default() };
+        let both = rates("{ mean_end = 1e-5 }", &of_policy);
+        let expected = RateOptions { mean_end: 1e-5, sh_rest: 2e-4, ..RateOptions::default() };
+        assert_eq!(both, expected);
+        for (bad, part) in [
+            ("{ opacity = \"x\" }", "NAME=RATE"),
+            ("{ colour = 1 }", "colour"),
+            ("{ quat = 0 }", "quat"),
+            ("{ quat = inf }", "quat"),
+        ] {
+            let message = spec("lr", bad).unwrap_err().message;
+            assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
+        }
+    }
+
+    #[test]
+    fn iterations_outside_the_run_name_the_flag() {
+        let spec = spec("save_iterations", "[1, 30]").unwrap();
+        assert!(spec.check_iterations(30).is_ok());
+        let failure = spec.check_iterations(29).unwrap_err();
+        assert!(failure.message.starts_with("--save-iterations 30 "), "{}", failure.message);
+    }
+
+    #[test]
+    fn the_output_is_named_after_the_scene_and_the_policy() {
+        let root = tempfile::tempdir().unwrap();
+        let scene = root.path().join("garden");
+        std::fs::create_dir(&scene).unwrap();
+        for spelling in [scene.clone(), scene.join(""), scene.join("."), scene.join("../garden")] {
+            let mut spec = RunSpec::default();
+            spec.start.scene = Some(spelling);
+            assert_eq!(spec.output_folder().unwrap(), Path::new("output/garden-diet"));
+        }
+        assert!(RunSpec::default().output_folder().unwrap_err().message.contains("no scene"));
+    }
+}

@@ -1,0 +1,141 @@
+//! A run as data, and how it becomes one: a description is resolved to sizes, built into a trainer, and
+//! trained to the end. Knows no subcommand and prints nothing; an [`Observer`] hears what there is to say.
+
+mod build;
+mod config;
+mod derived;
+mod observer;
+mod overlay;
+mod records;
+mod report;
+mod resolve;
+mod resume;
+mod session;
+mod spec;
+mod summary;
+mod values;
+
+use std::path::{Path, PathBuf};
+
+pub use config::{DegreeSource, Resolved, RunConfig};
+pub use observer::{Interrupt, Observer, Silent};
+pub use overlay::Partial;
+pub use report::{LeftOut, Requirements};
+pub(crate) use resolve::use_threads;
+pub use resolve::{Alternatives, DEFAULT_BUDGET, Plan, plan};
+pub use resume::{Resumed, Start, start};
+pub use session::Occupied;
+pub use spec::{
+    DataSpec, DeviceSpec, OPTIONS, OnResume, OutputSpec, PolicySpec, RunOption, RunSpec,
+    ScheduleSpec, SizeSpec, StartSpec,
+};
+pub use values::{
+    Assignment, Budget, ByteCount, Fraction, ImageSize, InitChoice, Rows, ShDegree, Whole,
+};
+
+use crate::checkpoint::Fingerprint;
+use crate::dataset::Dataset;
+use crate::failure::Failure;
+use crate::memory::Ledger;
+use crate::trainer::Trainer;
+use crate::views::DatasetViews;
+
+/// A run, ready to train.
+pub struct Run {
+    config: RunConfig,
+    output: PathBuf,
+    trainer: Trainer<DatasetViews>,
+    /// The test views.
+    test: DatasetViews,
+    /// Everything of the dataset but its points.
+    dataset: Dataset,
+    ledger: Ledger,
+    /// What the dataset is, for checkpoints.
+    fingerprint: Fingerprint,
+    /// The step at which the run ends.
+    last: u32,
+    /// What the logs were, for a run that goes on.
+    session: Option<records::SavedSession>,
+}
+
+impl Run {
+    /// Prepares a new run: opens scene and device, decides its size, and makes the trainer. Nothing is
+    /// written.
+    ///
+    /// # Errors
+    /// Everything that can be wrong with the description, its files and the device.
+    pub fn prepare(spec: &RunSpec) -> Result<Self, Failure> {
+        Self::prepare_observed(spec, &Silent)
+    }
+
+    /// The same, and says what there is to say.
+    ///
+    /// # Errors
+    /// As [`prepare`](Self::prepare).
+    pub fn prepare_observed(spec: &RunSpec, observer: &dyn Observer) -> Result<Self, Failure> {
+        build::build(spec, None, observer)
+    }
+
+    /// Prepares a run that goes on from a checkpoint; see [`start`].
+    ///
+    /// # Errors
+    /// As [`prepare`](Self::prepare), and when the description would give another result than that of
+    /// the checkpoint.
+    pub fn resume(
+        spec: &RunSpec,
+        resumed: Resumed,
+        observer: &dyn Observer,
+    ) -> Result<Self, Failure> {
+        build::build(spec, Some(resumed), observer)
+    }
+
+    /// The run, with everything decided.
+    #[must_use]
+    pub fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
+    /// Bytes per buffer, as promised.
+    #[must_use]
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    /// The folder that [`train`](Self::train) writes to.
+    #[must_use]
+    pub fn output(&self) -> &Path {
+        &self.output
+    }
+
+    /// The dataset, without its points.
+    #[must_use]
+    pub fn dataset(&self) -> &Dataset {
+        &self.dataset
+    }
+
+    /// The trainer.
+    pub fn trainer(&mut self) -> &mut Trainer<DatasetViews> {
+        &mut self.trainer
+    }
+
+    /// Trains to the end and writes everything that a run leaves; returns its folder.
+    ///
+    /// # Errors
+    /// When a view cannot be read, the device or the disk fails, or the policy does. What was written
+    /// until then stays, and is named.
+    pub fn train(self, occupied: Occupied) -> Result<PathBuf, Failure> {
+        self.train_observed(occupied, &Silent)
+    }
+
+    /// The same, and says what there is to say.
+    ///
+    /// # Errors
+    /// As [`train`](Self::train).
+    pub fn train_observed(
+        self,
+        occupied: Occupied,
+        observer: &dyn Observer,
+    ) -> Result<PathBuf, Failure> {
+        session::train(self, occupied, observer)
+    }
+}

@@ -1,0 +1,80 @@
+//! `--sh-degree`: how colours may depend on the direction of view, and who decides it.
+
+use std::ops::RangeInclusive;
+
+use crate::dataset::Dataset;
+use crate::failure::Failure;
+use crate::gaussians::MAX_SH_DEGREE;
+use crate::number::grouped;
+use crate::run::config::{DegreeSource, RunConfig};
+use crate::run::spec::RunSpec;
+use crate::run::values::ShDegree;
+use crate::spread::{self, MIN_TRACKS};
+
+/// The degree of a run, before its memory is known.
+#[derive(Debug, Clone)]
+pub(in crate::run) struct Degree {
+    /// The highest wanted, and how far memory may lower it.
+    pub(in crate::run) range: RangeInclusive<u8>,
+    /// Who decided it.
+    pub(in crate::run) source: DegreeSource,
+    /// Bytes that deciding it took beside an image.
+    pub(in crate::run) bytes: u64,
+}
+
+impl Degree {
+    pub(in crate::run) fn highest(&self) -> u8 {
+        *self.range.end()
+    }
+
+    /// Decides it: from the configuration of a run that goes on, else as the options say, else from
+    /// the tracks of the dataset where it has enough.
+    pub(in crate::run) fn decide(
+        spec: &RunSpec,
+        saved: Option<&RunConfig>,
+        dataset: &Dataset,
+    ) -> Result<Self, Failure> {
+        let given = |range| Self { range, source: DegreeSource::Given, bytes: 0 };
+        match spec.size.sh_degree {
+            // As a resumed run had it, or decided before.
+            Some(ShDegree::Fixed(degree) | ShDegree::Auto(Some(degree))) => {
+                let source = saved.map_or(DegreeSource::Given, |run| run.resolved.sh_degree_from);
+                Ok(Self { range: degree..=degree, source, bytes: 0 })
+            }
+            None if spec.size.full => Ok(given(MAX_SH_DEGREE..=MAX_SH_DEGREE)),
+            None => Ok(given(0..=MAX_SH_DEGREE)),
+            Some(ShDegree::Auto(None)) => {
+                let bytes = dataset.tracks.bytes() + spread::bytes(&dataset.tracks);
+                let found = match dataset.tracks.len() {
+                    ..MIN_TRACKS => None,
+                    _ => Some(spread::measure(&dataset.tracks, &dataset.train)?),
+                };
+                let decided = found.and_then(|found| Some((found.degree()?, found)));
+                let (degree, source) = match decided {
+                    Some((degree, spread)) => (degree, DegreeSource::Spread(spread)),
+                    None => (MAX_SH_DEGREE, DegreeSource::Undecided),
+                };
+                Ok(Self { range: 0..=degree, source, bytes })
+            }
+        }
+    }
+
+    /// What there is to say about it, if anything.
+    pub(in crate::run) fn line(&self) -> Option<String> {
+        match self.source {
+            DegreeSource::Given => None,
+            DegreeSource::Spread(found) => Some(format!(
+                "colour   degree {} (auto): between their views a twentieth of {} points differ by {:.1}/255 or \
+                 more",
+                self.highest(),
+                grouped(found.tracks),
+                found.twentieth,
+            )),
+            DegreeSource::Undecided => Some(format!(
+                "colour   degree {} (auto): points of a reconstruction decide nothing, as fewer than \
+                 {MIN_TRACKS} are known in enough views, or fewer than half of them lie on surfaces",
+                self.highest()
+            )),
+        }
+    }
+}

@@ -1,0 +1,161 @@
+//! What a run takes, buffer by buffer, for any size of it, before anything of it is allocated. A run, the
+//! solver for `--memory` and `densify plan` read this ledger, so they cannot disagree.
+
+use densify_policies::plan::BYTES_PER_ROW;
+use densify_policies::policy::Needs;
+use glam::DVec3;
+
+use super::{DECODERS, Inputs};
+use crate::backend::gpu::KeptPhotographs;
+use crate::backend::{BackendOptions, ROWS_AT_A_TIME};
+use crate::dataset::{Dataset, View};
+use crate::export::{PLY, Shape};
+use crate::gaussians::sh_coefficients;
+use crate::memory::{IMAGES, Ledger, Section, Setting};
+use crate::metrics::scratch_bytes;
+use crate::trainer::Required;
+
+/// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
+/// Measured at 10 to 13 MiB.
+const PROGRAM: u64 = 14 << 20;
+/// A program that takes more, such as one with a driver in it, is taken at what it has, in these
+/// steps: what is promised should not change from call to call.
+const PROGRAM_STEP: u64 = 8 << 20;
+/// What the system's allocator keeps between two uses of a piece. Measured at up to 5 MiB.
+const KEPT: u64 = 6 << 20;
+/// What a policy makes of its signals for each row before it plans: means, orders, sums of weights
+/// and draws. Those that make more of auxiliary views' columns have these counted twice.
+const PLANNING: u64 = 20;
+/// A point with its colour.
+const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
+
+impl Inputs<'_> {
+    /// How the backend is made for a size.
+    pub(in crate::run) fn backend_options(
+        &self,
+        setting: &Setting,
+        needs: Needs,
+    ) -> BackendOptions {
+        BackendOptions {
+            near: (self.spec.start.near.0 * self.dataset.extent()) as f32,
+            tile_cap: Some(setting.tile_cap),
+            record_cap: self.record_cap(setting),
+            threads: self.spec.device.threads.map(|threads| usize::from(threads.get())),
+            largest_image: self.dataset.largest_image(),
+            photographs: self.kept_photographs(setting),
+            storage: self.knobs.storage,
+            shortcuts: self.knobs.shortcuts,
+            needs,
+            ..BackendOptions::new(setting.rows)
+        }
+    }
+
+    /// Gradient records for two pairs in five, where pairs are counted; else for all.
+    fn record_cap(&self, setting: &Setting) -> usize {
+        match self.knobs.pairs_per_row {
+            Some(_) => (setting.tile_cap / 5 * 2).max(1),
+            None => usize::MAX,
+        }
+    }
+
+    /// What of the training images stays on a GPU: as much as decoded images may take on the host, and
+    /// no more than their share of the device's memory.
+    fn kept_photographs(&self, setting: &Setting) -> KeptPhotographs {
+        let train = &self.dataset.train;
+        let with_masks = train.iter().any(|view| view.source.mask.is_some());
+        let one = KeptPhotographs::bytes(self.dataset.largest_image(), with_masks);
+        let room = self.spec.size.memory.map_or(u64::MAX, |memory| memory.0 / IMAGES);
+        let room = room.min(setting.image_cache);
+        let count = usize::try_from(room / one.iter().sum::<u64>().max(1)).unwrap_or(usize::MAX);
+        KeptPhotographs { count: count.min(train.len()), with_masks }
+    }
+
+    /// Everything that a run takes with these needs, on so many threads.
+    pub(in crate::run) fn ledger(
+        &self,
+        setting: &Setting,
+        needs: &Needs,
+        threads: usize,
+    ) -> Ledger {
+        let degree = setting.sh_degree;
+        let options = self.backend_options(setting, needs.clone());
+        let mut ledger = self.device.promise(degree, &options, threads);
+        let [train, test] = self.images;
+        let held = train.held(setting.image_cache);
+        ledger.add_to(Section::Images, "decoded training views", held);
+        ledger.add_to(Section::Images, "decoding", train.decoding(DECODERS));
+        let budget = setting.rows as u64;
+        let float = size_of::<f32>() as u64;
+        let row = float * (11 + 3 * sh_coefficients(degree) as u64);
+        if self.degree.bytes > 0 {
+            let bytes = self.degree.bytes + train.held(0) + train.decoding(1);
+            ledger.add_to(Section::Before, "colours of tracks", bytes);
+        }
+        let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
+        // Points, their order, neighbours in f64, and the rows before the backend has them.
+        let first = self.initial_rows(setting.rows) as u64;
+        let points =
+            self.spec.start.init_points.map_or(self.dataset.points.len(), |points| points.0) as u64;
+        pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
+        pass("a policy's event", self.event_bytes(setting, needs));
+        // So many rows, as much again because allocators keep some freed arrays for a while, and what the
+        // writer holds.
+        let piece = budget.min(ROWS_AT_A_TIME as u64);
+        let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
+        pass("export of the model, checkpoint", 2 * piece * row + held);
+        let measures_test = !self.dataset.test.is_empty();
+        if measures_test || self.required != Required::default() {
+            let (width, height) = self.dataset.largest_image();
+            let rendering = u64::from(width) * u64::from(height) * 5 * float;
+            let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
+            // While it is asked which rows are missed: their order, and their opacities twice or, when
+            // that is done, a plan.
+            let row = float + (2 * float).max(BYTES_PER_ROW as u64);
+            let asked = if self.required.rows { budget * row } else { 0 };
+            pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
+        }
+        let process = self.process_bytes();
+        if let Some(beyond) = self.peak.and_then(|peak| peak.checked_sub(process)) {
+            ledger.add_to(Section::Before, "loading the scene", beyond);
+        }
+        ledger.add_to(Section::Process, "program and dataset", process);
+        ledger
+    }
+
+    /// Signals on the host, the plan, and what the policy makes of the former.
+    fn event_bytes(&self, setting: &Setting, needs: &Needs) -> u64 {
+        let float = size_of::<f32>() as u64;
+        let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
+        let seed = size_of::<densify_policies::plan::Seed>() as u64;
+        // The native backend has room for them.
+        let signals = self.device.columns_on_host(needs.signals.count()) as u64;
+        // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
+        let aux = needs.aux.as_ref();
+        let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
+        let points = aux.map_or(0, |request| u64::from(request.points));
+        // A point is kept by the policy, becomes a seed, and is compiled.
+        setting.rows as u64 * ((signals + columns) * float + BYTES_PER_ROW as u64 + PLANNING)
+            + points * self.dataset.train.len() as u64 * (candidate + 3 * seed)
+    }
+
+    /// The program and the dataset, but for what the ledger has besides. A number that does not
+    /// depend on what else the process has done, where it takes no more than expected.
+    fn process_bytes(&self) -> u64 {
+        let Dataset { train, test, points, .. } = &self.dataset;
+        let views = train.iter().chain(test);
+        let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
+        // A view's name and path; it is there once more for its images.
+        let view = |view: &View| (3 * size_of::<View>() + 512) as u64 + rendered(view);
+        let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT;
+        let program = match self.resident {
+            Some(resident) if resident > expected => resident.next_multiple_of(PROGRAM_STEP),
+            _ => expected,
+        };
+        program + KEPT
+    }
+
+    /// Bytes of all training images decoded.
+    pub(super) fn all_images(&self) -> u64 {
+        self.images[0].all
+    }
+}

@@ -1,0 +1,276 @@
+//! From a description to sizes: the scene and the device are opened, and rows, degree, tile lists and image
+//! cache follow, with the ledger of what they take. Nothing is written.
+
+mod degree;
+mod ledger;
+mod plan;
+mod size;
+
+use densify_policies::policy::{Needs, SceneInfo, SignalSet};
+use densify_policies::registry::PolicyEntry;
+use toml::Table;
+
+pub use plan::{Alternatives, Plan, plan};
+pub use size::DEFAULT_BUDGET;
+pub(super) use size::{Size, check, check_grant};
+
+use super::config::RunConfig;
+use super::observer::Observer;
+use super::spec::{DataSpec, RunSpec};
+use super::values::{Budget, InitChoice, ShDegree};
+use crate::backend::gpu::Accumulation;
+use crate::backend::{BackendKind, Device};
+use crate::dataset::images::ImageDemand;
+use crate::dataset::{Dataset, Tracks, View};
+use crate::failure::Failure;
+use crate::init::usable_points;
+use crate::knobs::Knobs;
+use crate::memory::{peak_resident, resident};
+use crate::number::grouped;
+use crate::schedule::Background;
+use crate::trainer::{Required, growth_signals, needs};
+use degree::Degree;
+
+/// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
+const RANDOM_POINTS: usize = 100_000;
+/// Threads that decode training views ahead of the trainer.
+pub(super) const DECODERS: usize = 2;
+/// Threads that decode test views.
+pub(super) const TEST_DECODERS: usize = 1;
+
+/// What a run starts from, before its size is known.
+pub(super) struct Inputs<'a> {
+    pub(super) spec: &'a RunSpec,
+    pub(super) entry: &'static PolicyEntry,
+    /// The policy's parameters as set.
+    pub(super) parameters: Table,
+    pub(super) knobs: Knobs,
+    pub(super) device: Device,
+    /// How the dataset was read.
+    pub(super) data: DataSpec,
+    pub(super) dataset: Dataset,
+    pub(super) degree: Degree,
+    /// What the run is to find out by itself.
+    pub(super) required: Required,
+    /// What training and test images take.
+    images: [ImageDemand; 2],
+    /// Rows that a start on the dataset's points would have, were there no limit.
+    usable: usize,
+    /// Resident memory when the dataset was loaded, and the most until then.
+    resident: Option<u64>,
+    peak: Option<u64>,
+}
+
+impl<'a> Inputs<'a> {
+    /// Opens the device and loads the dataset. `saved` is the configuration of a run that is resumed.
+    pub(super) fn load(
+        spec: &'a RunSpec,
+        saved: Option<&RunConfig>,
+        observer: &dyn Observer,
+    ) -> Result<Self, Failure> {
+        let (entry, parameters) = spec.policy()?;
+        let mut knobs = spec.knobs()?;
+        check_full(spec)?;
+        let device = open(spec, &mut knobs, observer)?;
+        use_threads(spec.device.threads.map(std::num::NonZeroU16::get));
+        let scene = spec.scene()?;
+        let with_tracks = saved.is_none() && spec.size.sh_degree == Some(ShDegree::Auto(None));
+        let mut dataset = Dataset::load(scene, &spec.data.load_options(with_tracks)?)?;
+        for note in &dataset.notes {
+            observer.say(format_args!("note: {note}"));
+        }
+        observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
+        let usable = usable_points(&dataset.points);
+        let images = images(&dataset);
+        let (resident, peak) = (resident(), peak_resident());
+        let degree = Degree::decide(spec, saved, &dataset)?;
+        dataset.tracks = Tracks::default();
+        let required = Required {
+            rows: spec.size.budget.is_some_and(Budget::is_auto),
+            scored_views: !spec.size.full,
+        };
+        let data = spec.data.clone();
+        Ok(Self {
+            spec,
+            entry,
+            parameters,
+            knobs,
+            device,
+            data,
+            dataset,
+            degree,
+            required,
+            images,
+            usable,
+            resident,
+            peak,
+        })
+    }
+
+    /// The same with images of another size; `None` where there are none of it.
+    fn at_resolution(&self, resolution: u32) -> Option<Self> {
+        let resolution = Some(super::values::ImageSize(resolution));
+        let data = DataSpec { resolution, ..self.data.clone() };
+        let dataset =
+            Dataset::load(self.spec.scene().ok()?, &data.load_options(false).ok()?).ok()?;
+        let (parameters, knobs) = (self.parameters.clone(), self.knobs.clone());
+        let (device, degree, images) = (self.device.clone(), self.degree.clone(), images(&dataset));
+        Some(Self { dataset, images, data, parameters, knobs, device, degree, ..*self })
+    }
+
+    /// How the first rows are placed.
+    pub(super) fn init(&self) -> InitChoice {
+        let start = &self.spec.start;
+        match start.init {
+            Some(init) => init,
+            None if self.dataset.points.is_empty() || start.init_points.is_some() => {
+                InitChoice::Random
+            }
+            None => InitChoice::Points,
+        }
+    }
+
+    /// Rows that the scene starts with, were there no limit; `None` where the limit decides.
+    fn start(&self) -> Option<usize> {
+        match self.init() {
+            InitChoice::Points => Some(self.usable),
+            InitChoice::Random => self.spec.start.init_points.map(|points| points.0),
+        }
+    }
+
+    fn initial_rows(&self, budget: usize) -> usize {
+        self.start().unwrap_or_else(|| random_count(budget)).min(budget)
+    }
+
+    /// The scene as policies see it.
+    pub(super) fn info(&self, budget: usize, initial_rows: usize) -> Result<SceneInfo, Failure> {
+        Ok(SceneInfo {
+            extent: self.dataset.extent() as f32,
+            train_views: u32::try_from(self.dataset.train.len())
+                .map_err(|_| Failure::input("the scene has more than 4 billion views"))?,
+            budget,
+            initial_rows,
+            iterations: self.spec.schedule.iterations.0,
+            white_background: self.data.background == Background::White,
+        })
+    }
+
+    /// What a run with so many rows needs of its backend.
+    pub(super) fn needs(&self, rows: usize) -> Result<Needs, Failure> {
+        let scene = self.info(rows, self.initial_rows(rows))?;
+        let policy = self.entry.build(&self.parameters, &scene)?;
+        Ok(self.backend_needs(needs(policy.as_ref(), &scene, self.sh_every())))
+    }
+
+    /// The needs of a policy, and what the trainer needs beside them.
+    pub(super) fn backend_needs(&self, needs: Needs) -> Needs {
+        let signals = match self.required.rows {
+            true => growth_signals().iter().fold(needs.signals, SignalSet::with),
+            false => needs.signals,
+        };
+        Needs { signals, ..needs }
+    }
+
+    /// Iterations per optimiser step of view-dependent colour, where the options say.
+    pub(super) fn sh_every(&self) -> Option<u32> {
+        self.spec.schedule.sh_every.map(|every| every.0)
+    }
+
+    /// Threads that train and measure.
+    pub(super) fn threads(&self) -> usize {
+        self.spec
+            .device
+            .threads
+            .map_or_else(rayon::current_num_threads, |threads| usize::from(threads.get()))
+    }
+}
+
+/// Rows of a random start within a budget, where no number is given.
+pub(super) fn random_count(budget: usize) -> usize {
+    (budget / 2).clamp(1, RANDOM_POINTS)
+}
+
+/// Limits rayon's common pool, which measuring uses, to the threads the user grants.
+pub(crate) fn use_threads(threads: Option<u16>) {
+    if let Some(threads) = threads {
+        // It fails only if the pool is in use already; then its size is what it is.
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads));
+        let _ = pool.build_global();
+    }
+}
+
+/// Opens the device, and checks that it has the knobs that are set.
+fn open(spec: &RunSpec, knobs: &mut Knobs, observer: &dyn Observer) -> Result<Device, Failure> {
+    let accumulation = match (spec.schedule.deterministic, knobs.accumulation) {
+        (true, Some(given)) if !given.is_deterministic() => {
+            return Err(Failure::input(format!(
+                "--deterministic, which takes accumulation={}, and --knob accumulation={given} \
+                 contradict each other; give one of them",
+                Accumulation::Slots
+            )));
+        }
+        (true, _) => Some(Accumulation::Slots),
+        (false, given) => given,
+    };
+    let device = Device::open(spec.device.backend, spec.device.gpu.as_deref(), accumulation)?;
+    observer.say(format_args!("device   {}", device.describe()));
+    check_knobs(knobs, device.kind())?;
+    if let Some(taken) = device.accumulation() {
+        knobs
+            .set("accumulation", taken.name())
+            .map_err(|error| Failure::input(format!("--knob: {error}")))?;
+        let note = match taken.is_deterministic() {
+            true => "runs are reproducible byte for byte",
+            false => "results vary slightly between runs; --deterministic makes them reproducible",
+        };
+        observer.say(format_args!("sums     accumulation={taken}: {note}"));
+    }
+    Ok(device)
+}
+
+/// Fails where a knob is set that this backend does not have.
+fn check_knobs(knobs: &Knobs, kind: BackendKind) -> Result<(), Failure> {
+    for (knob, value) in knobs.changed() {
+        if let Some(other) = BackendKind::only_one_with(knob.name).filter(|only| *only != kind) {
+            return Err(Failure::input(format!(
+                "--knob: knob {name}={value}: the {} backend does not have it; the nearest that works \
+                 there is {name}={}, or use --backend {}",
+                kind.name(),
+                knob.default,
+                other.choice().word(),
+                name = knob.name,
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Fails where `--full` and an automatic reduction are both given.
+fn check_full(spec: &RunSpec) -> Result<(), Failure> {
+    if !spec.size.full {
+        return Ok(());
+    }
+    if spec.size.budget.is_some_and(Budget::is_auto) {
+        return Err(Failure::input(
+            "--full disables automatic reductions, and --budget auto is one; give one of the two, or --full \
+             with a number of Gaussians",
+        ));
+    }
+    if matches!(spec.size.sh_degree, Some(ShDegree::Auto(_))) {
+        return Err(Failure::input(
+            "--full disables automatic reductions, and --sh-degree auto is one; give one of the two, or \
+             --full with --sh-degree 3",
+        ));
+    }
+    Ok(())
+}
+
+fn images(dataset: &Dataset) -> [ImageDemand; 2] {
+    let demand = |views: &[View]| ImageDemand::of(views.iter().map(|view| &view.source));
+    [demand(&dataset.train), demand(&dataset.test)]
+}
+
+/// What the log says of points that were not used, by number.
+pub(super) fn ignored(number: usize, reason: &str) -> String {
+    format!("note: {} {reason}", grouped(number))
+}

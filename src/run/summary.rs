@@ -1,0 +1,84 @@
+//! What a run says at its end: `stats/summary.json`, what was left out, and a few lines.
+
+use std::path::Path;
+
+use super::Run;
+use super::report::Requirements;
+use super::session::Session;
+use crate::memory::Bytes;
+use crate::number::{duration, grouped};
+use crate::output::{Mean, OutputError, Summary, model_path, write_json};
+use crate::views::ViewSource;
+
+impl Session<'_> {
+    pub(super) fn write_summary(&self, finished: bool) -> Result<(), OutputError> {
+        let Run { config, trainer, test, ledger, .. } = &self.run;
+        let (events, views) = trainer.policy_times();
+        let images = trainer.images_time();
+        let more = [("policy events", events), ("policy views", views), ("images", images)];
+        let more = more.map(|(stage, time)| (stage.to_owned(), time));
+        let stages = self.totals.stages.clone().into_iter().chain(more);
+        let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
+        let summary = Summary {
+            densify: config.densify.clone(),
+            policy: config.spec.density.policy.clone(),
+            finished,
+            iterations: trainer.steps_done(),
+            rows: trainer.rows(),
+            peak_rows: trainer.peak_rows(),
+            budget: config.budget(),
+            extra_forwards: trainer.extra_forwards(),
+            peak_bytes: self.totals.peak_bytes(),
+            memory: config.spec.size.memory.map(|bytes| bytes.0),
+            ledger_bytes: ledger.total(),
+            ledger: ledger.clone(),
+            seconds: self.totals.wall.as_secs_f64(),
+            stage_seconds,
+            cpu_seconds: self.totals.cpu.map(|cpu| cpu.as_secs_f64()),
+            train_views: trainer.views().count(),
+            test_views: test.count(),
+            test: self.totals.tested.clone(),
+        };
+        write_json(&self.folder.join("stats/requirements.json"), &self.requirements())?;
+        write_json(&self.folder.join("stats/summary.json"), &summary)
+    }
+
+    /// What was left out.
+    fn requirements(&self) -> Requirements {
+        let Run { config, trainer, .. } = &self.run;
+        let (growth, unscored) = (trainer.growth(), trainer.unscored_views());
+        Requirements::new(config, trainer.rows(), growth, unscored)
+    }
+
+    /// What came of it, in a few lines.
+    pub(super) fn report(&self, path: &Path) {
+        let Run { config, trainer, test, ledger, .. } = &self.run;
+        let steps = trainer.steps_done();
+        if let Some(Mean { psnr, ssim, flip }) = self.totals.tested.get(&steps) {
+            let views = test.count();
+            self.observer.say(format_args!(
+                "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
+            ));
+        }
+        self.observer.say(format_args!(
+            "rows     {}, at most {} of {}",
+            grouped(trainer.rows()),
+            grouped(trainer.peak_rows()),
+            grouped(config.budget())
+        ));
+        let promised = Bytes(ledger.total());
+        if let Some(peak) = self.totals.peak_bytes() {
+            let peak = Bytes(peak);
+            self.observer.say(format_args!("memory   {peak} at its peak, {promised} promised"));
+        }
+        let cpu = self.totals.cpu.map_or_else(String::new, |cpu| {
+            format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
+        });
+        self.observer.say(format_args!("time     {}{cpu}", duration(self.totals.wall)));
+        for line in self.requirements().lines() {
+            self.observer.say(format_args!("{line}"));
+        }
+        self.observer.say(format_args!("model    {}", model_path(path, steps).display()));
+        self.observer.say(format_args!("numbers  {}", path.join("stats").display()));
+    }
+}

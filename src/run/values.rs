@@ -1,0 +1,385 @@
+//! Types of options that need more than a number or a word: how they are written on the command line
+//! and in a file, and what is out of range.
+
+use std::fmt;
+use std::str::FromStr;
+
+use clap::ValueEnum;
+use serde::de::Visitor;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use toml::{Table, Value};
+
+use crate::gaussians::MAX_SH_DEGREE;
+use crate::number;
+
+/// A number of rows: `200000`, `28k`, `1.5M`; in a file also a plain number. At least 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Rows(pub usize);
+
+/// A number of bytes: `512MiB`, `800MB`, `1000000`; in a file also a plain number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct ByteCount(pub u64);
+
+/// A number greater than 0 and less than 1.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+pub struct Fraction(pub f64);
+
+/// A whole number from `LEAST` to `MOST`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Whole<const LEAST: u32, const MOST: u32>(pub u32);
+
+/// `--resolution`: 1, 2, 4 or 8 to divide the images' sides by, or a width `[px]` above 8.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSize(pub u32);
+
+/// `--budget`: the most Gaussians there may ever be, or `auto`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Budget {
+    /// At most so many.
+    Rows(usize),
+    /// As many as improve the model, and at most so many (`auto:50k`; `auto` alone: the default, or what
+    /// `--memory` holds).
+    Auto(Option<usize>),
+}
+
+impl Budget {
+    /// The upper limit, where there is a number.
+    #[must_use]
+    pub fn most(self) -> Option<usize> {
+        match self {
+            Self::Rows(rows) => Some(rows),
+            Self::Auto(rows) => rows,
+        }
+    }
+
+    /// Whether Gaussians must improve the model to stay.
+    #[must_use]
+    pub fn is_auto(self) -> bool {
+        matches!(self, Self::Auto(_))
+    }
+
+    /// The same with this limit.
+    #[must_use]
+    pub fn limited_to(self, rows: usize) -> Self {
+        match self {
+            Self::Rows(_) => Self::Rows(rows),
+            Self::Auto(_) => Self::Auto(Some(rows)),
+        }
+    }
+}
+
+/// `--sh-degree`: a spherical-harmonic degree, or `auto`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ShDegree {
+    /// This one, 0 to 3.
+    Fixed(u8),
+    /// As the scene requires; with the degree once that is decided (`auto:2`).
+    Auto(Option<u8>),
+}
+
+/// How the first Gaussians are placed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitChoice {
+    /// On the points of the dataset's reconstruction
+    Points,
+    /// At random, where the cameras look
+    Random,
+}
+
+/// A word before an optional number: `auto`, `auto:50k`.
+const AUTO: &str = "auto";
+
+/// What follows `auto`, if `text` begins with it: nothing, or what stands after a colon.
+fn after_auto(text: &str) -> Option<Option<&str>> {
+    match text.strip_prefix(AUTO)? {
+        "" => Some(None),
+        rest => Some(Some(rest.strip_prefix(':')?)),
+    }
+}
+
+impl FromStr for Rows {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        number::rows(text).map(Self)
+    }
+}
+
+impl FromStr for ByteCount {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        number::bytes(text).map(Self)
+    }
+}
+
+impl FromStr for Fraction {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        number::fraction(text).map(Self)
+    }
+}
+
+impl<const LEAST: u32, const MOST: u32> FromStr for Whole<LEAST, MOST> {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.parse() {
+            Ok(number) if (LEAST..=MOST).contains(&number) => Ok(Self(number)),
+            _ if MOST == u32::MAX => Err(format!("`{text}` must be a whole number from {LEAST}")),
+            _ => Err(format!("`{text}` must be a whole number from {LEAST} to {MOST}")),
+        }
+    }
+}
+
+impl FromStr for ImageSize {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        text.parse::<crate::dataset::Resolution>().map_err(|error| error.to_string())?;
+        text.parse().map(Self).map_err(|_| format!("`{text}` is not a whole number"))
+    }
+}
+
+impl FromStr for Budget {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let rows = |text| number::rows(text).map_err(|error| format!("{error}, or auto"));
+        match after_auto(text) {
+            Some(None) => Ok(Self::Auto(None)),
+            Some(Some(most)) => Ok(Self::Auto(Some(rows(most)?))),
+            None => rows(text).map(Self::Rows),
+        }
+    }
+}
+
+impl FromStr for ShDegree {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let degree = |text: &str| text.parse().ok().filter(|degree| *degree <= MAX_SH_DEGREE);
+        let wrong = || format!("`{text}` is not a degree; give 0, 1, 2, 3, or auto");
+        match after_auto(text) {
+            Some(None) => Ok(Self::Auto(None)),
+            Some(Some(decided)) => degree(decided).map(|it| Self::Auto(Some(it))).ok_or_else(wrong),
+            None => degree(text).map(Self::Fixed).ok_or_else(wrong),
+        }
+    }
+}
+
+/// How a value is written to a file.
+trait InFile: FromStr<Err = String> + Copy {
+    /// What the message says was expected.
+    const EXPECTED: &'static str;
+
+    fn to_value(self) -> Value;
+}
+
+fn integer(number: impl TryInto<i64>) -> Value {
+    Value::Integer(number.try_into().unwrap_or(i64::MAX))
+}
+
+impl InFile for Rows {
+    const EXPECTED: &'static str = "a number of Gaussians such as 200000 or \"200k\"";
+
+    fn to_value(self) -> Value {
+        integer(self.0)
+    }
+}
+
+impl InFile for ByteCount {
+    const EXPECTED: &'static str = "a number of bytes such as 1000000 or \"512MiB\"";
+
+    fn to_value(self) -> Value {
+        integer(self.0)
+    }
+}
+
+impl InFile for Fraction {
+    const EXPECTED: &'static str = "a number greater than 0 and less than 1";
+
+    fn to_value(self) -> Value {
+        Value::Float(self.0)
+    }
+}
+
+impl<const LEAST: u32, const MOST: u32> InFile for Whole<LEAST, MOST> {
+    const EXPECTED: &'static str = "a whole number";
+
+    fn to_value(self) -> Value {
+        integer(self.0)
+    }
+}
+
+impl InFile for ImageSize {
+    const EXPECTED: &'static str = "1, 2, 4, 8, or a width in pixels";
+
+    fn to_value(self) -> Value {
+        integer(self.0)
+    }
+}
+
+impl InFile for Budget {
+    const EXPECTED: &'static str = "a number of Gaussians such as 200000 or \"200k\", or \"auto\"";
+
+    fn to_value(self) -> Value {
+        match self {
+            Self::Rows(rows) => integer(rows),
+            Self::Auto(None) => AUTO.into(),
+            Self::Auto(Some(rows)) => format!("{AUTO}:{rows}").into(),
+        }
+    }
+}
+
+impl InFile for ShDegree {
+    const EXPECTED: &'static str = "0, 1, 2, 3, or \"auto\"";
+
+    fn to_value(self) -> Value {
+        match self {
+            Self::Fixed(degree) => integer(degree),
+            Self::Auto(None) => AUTO.into(),
+            Self::Auto(Some(degree)) => format!("{AUTO}:{degree}").into(),
+        }
+    }
+}
+
+/// Reads a value that is a number or a text in a file.
+struct NumberOrText<T>(std::marker::PhantomData<T>);
+
+impl<T: InFile> Visitor<'_> for NumberOrText<T> {
+    type Value = T;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(T::EXPECTED)
+    }
+
+    fn visit_i64<E: serde::de::Error>(self, number: i64) -> Result<T, E> {
+        number.to_string().parse().map_err(E::custom)
+    }
+
+    fn visit_u64<E: serde::de::Error>(self, number: u64) -> Result<T, E> {
+        number.to_string().parse().map_err(E::custom)
+    }
+
+    fn visit_f64<E: serde::de::Error>(self, number: f64) -> Result<T, E> {
+        number.to_string().parse().map_err(E::custom)
+    }
+
+    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<T, E> {
+        text.parse().map_err(E::custom)
+    }
+}
+
+macro_rules! in_files {
+    ($([$($parameters:tt)*] $type:ty;)*) => {$(
+        impl<$($parameters)*> Serialize for $type {
+            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                self.to_value().serialize(serializer)
+            }
+        }
+
+        impl<'de, $($parameters)*> Deserialize<'de> for $type {
+            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                deserializer.deserialize_any(NumberOrText(std::marker::PhantomData))
+            }
+        }
+    )*};
+}
+
+in_files! {
+    [] Rows;
+    [] ByteCount;
+    [] Fraction;
+    [const LEAST: u32, const MOST: u32] Whole<LEAST, MOST>;
+    [] ImageSize;
+    [] Budget;
+    [] ShDegree;
+}
+
+/// One `NAME=VALUE` of an option that may be repeated; NAME may have parts, separated by a dot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Assignment {
+    /// The parts of the name.
+    pub path: Vec<String>,
+    /// The value: TOML where it is some, else text.
+    pub value: Value,
+}
+
+impl FromStr for Assignment {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (name, value) = text.split_once('=').unwrap_or((text, ""));
+        let path: Vec<String> = name.split('.').map(|part| part.trim().to_owned()).collect();
+        if value.trim().is_empty() || path.iter().any(String::is_empty) {
+            return Err(format!("`{text}` is not of the form NAME=VALUE"));
+        }
+        Ok(Self { path, value: densify_policies::parameters::parse_value(value.trim()) })
+    }
+}
+
+/// Assignments as a table, which is what they are in a file.
+///
+/// # Errors
+/// When a name is assigned two values, or is a value and a table at once.
+pub(super) fn table(assignments: &[Assignment]) -> Result<Table, String> {
+    let mut all = Table::new();
+    for Assignment { path, value } in assignments {
+        let name = path.join(".");
+        let twice = |other: &Value| {
+            format!("{name}={value} and {name}={other} contradict each other; give one of them")
+        };
+        let Some((last, parents)) = path.split_last() else { continue };
+        let mut inner = &mut all;
+        for parent in parents {
+            let entry = inner.entry(parent).or_insert_with(|| Table::new().into());
+            inner = entry.as_table_mut().ok_or_else(|| format!("{name} is not a table"))?;
+        }
+        match inner.get(last) {
+            Some(other) if other != value => return Err(twice(other)),
+            _ => _ = inner.insert(last.clone(), value.clone()),
+        }
+    }
+    Ok(all)
+}
+
+/// The assignments of a table.
+#[must_use]
+pub(super) fn assignments(table: &Table) -> Vec<Assignment> {
+    let mut all = Vec::new();
+    for (name, value) in table {
+        match value {
+            Value::Table(inner) => all.extend(assignments(inner).into_iter().map(|mut one| {
+                one.path.insert(0, name.clone());
+                one
+            })),
+            value => all.push(Assignment { path: vec![name.clone()], value: value.clone() }),
+        }
+    }
+    all
+}
+
+/// For `#[serde(with)]`: assignments as a table.
+pub(super) mod as_table {
+    use super::{Assignment, Deserialize, Deserializer, Serialize, Serializer};
+    use serde::de::Error as _;
+
+    pub(in crate::run) fn serialize<S: Serializer>(
+        all: &[Assignment],
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        super::table(all).map_err(serde::ser::Error::custom)?.serialize(serializer)
+    }
+
+    pub(in crate::run) fn deserialize<'de, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<Vec<Assignment>, D::Error> {
+        match toml::Value::deserialize(deserializer)? {
+            toml::Value::Table(table) => Ok(super::assignments(&table)),
+            other => Err(D::Error::custom(format!("{other} is not a table of NAME = VALUE"))),
+        }
+    }
+}

@@ -1,0 +1,98 @@
+//! Runs described by a file: what it may say, what wins over it, and what is refused.
+
+use densify::run::{OPTIONS, Occupied, Partial, Run};
+
+use super::{densify, files, model, read, scratch, text};
+use crate::photographs::Photographs;
+
+const ITERATIONS: u32 = 12;
+
+fn write(folder: &std::path::Path, text: &str) -> String {
+    let path = folder.join("run.toml");
+    std::fs::write(&path, text).expect("it is written");
+    path.to_str().expect("temporary paths are UTF-8").to_owned()
+}
+
+#[test]
+fn a_file_describes_a_run_and_flags_win_over_it() {
+    let scene = Photographs::colmap_text();
+    let (root, by_flags) = scratch();
+    let words = ["train", text(scene.path()), "-o", text(&by_flags), "-i", "12", "--budget", "250"];
+    let more = ["--sh-degree", "1", "--seed", "5", "--knob", "alpha_min=1/64", "--eval"];
+    densify(&[&words[..], &more, &["--policy-set", "diet.rho=0.2"]].concat()).ok();
+    // The same from a file, but for the seed, which a flag gives.
+    let file = write(
+        root.path(),
+        &format!(
+            "scene = {:?}\niterations = 12\nbudget = \"0.25k\"\nsh_degree = 1\neval = true\nseed = 9\n\
+             [knob]\nalpha_min = 0.015625\n[policy_set.diet]\nrho = 0.2\n",
+            scene.path()
+        ),
+    );
+    let by_file = root.path().join("file");
+    densify(&["train", "--config", &file, "--seed", "5", "-o", text(&by_file)]).ok();
+    assert!(model(&by_flags, ITERATIONS) == model(&by_file, ITERATIONS));
+    assert!(read(&by_flags.join("config.toml")) == read(&by_file.join("config.toml")));
+    // A run's own file repeats it.
+    let config = by_flags.join("config.toml");
+    let again = root.path().join("again");
+    densify(&["train", "--config", text(&config), "-o", text(&again)]).ok();
+    assert!(model(&by_flags, ITERATIONS) == model(&again, ITERATIONS));
+    assert!(read(&by_flags.join("config.toml")) == read(&again.join("config.toml")));
+    // So does a program without the command line.
+    let library = root.path().join("library");
+    let mut spec = Partial::read(&config).and_then(Partial::describe).expect("it is sound");
+    spec.output.output = Some(library.clone());
+    let run = Run::prepare(&spec).expect("it was prepared before");
+    assert_eq!(run.train(Occupied::Refuse).expect("it trains"), library);
+    assert!(model(&by_flags, ITERATIONS) == model(&library, ITERATIONS));
+}
+
+#[test]
+fn a_run_has_every_option_in_its_file() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    densify(&["train", text(scene.path()), "-o", text(&run), "-i", "2", "--budget", "250"]).ok();
+    let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
+    let config: toml::Table = config.parse().expect("TOML");
+    // What is not set is what there is nothing to set to.
+    let unset =
+        ["test_every", "images", "resolution", "init_points", "memory", "sh_every", "preset"];
+    let elsewhere = ["gpu", "threads", "output"];
+    for option in OPTIONS {
+        let is_unset = unset.contains(&option.name) || elsewhere.contains(&option.name);
+        assert_eq!(config.contains_key(option.name), !is_unset, "{}", option.name);
+    }
+}
+
+#[test]
+fn files_that_say_what_cannot_be_are_refused_by_key() {
+    let scene = Photographs::colmap_text();
+    let cases: [(&str, &[&str]); 12] = [
+        ("budgte = 3", &["budgte", "budget"]),
+        ("budget = true", &["budget", "200000", "auto"]),
+        ("budget = 0", &["budget", "out of range"]),
+        ("near = 1.5", &["near", "less than 1"]),
+        ("near = \"x\"", &["near", "not a number"]),
+        ("sh_degree = 4", &["sh_degree", "0, 1, 2, 3"]),
+        ("backend = \"cuda\"", &["backend", "cpu"]),
+        ("iterations = 0", &["iterations", "from 1"]),
+        ("eval = \"yes\"", &["eval", "boolean"]),
+        ("[knob]\nalpha_mim = 1", &["alpha_mim", "alpha_min"]),
+        ("[policy_set.dite]\nrho = 1", &["dite", "diet"]),
+        ("[lr]\nopacty = 1", &["opacty", "opacity"]),
+    ];
+    for (line, words) in cases {
+        let (root, output) = scratch();
+        let file = write(root.path(), line);
+        let call = ["train", text(scene.path()), "--config", &file, "-o", text(&output)];
+        let words: Vec<&str> = words.iter().copied().chain(["run.toml"]).collect();
+        densify(&call).refused(line, &words);
+        assert_eq!(files(root.path()).len(), 1, "{line}: something was written");
+        assert!(!output.exists());
+    }
+    let (root, output) = scratch();
+    let nowhere = root.path().join("no.toml");
+    densify(&["train", "--config", text(&nowhere)]).refused("no file", &["no.toml"]);
+    densify(&["train", "-o", text(&output)]).refused("no scene", &["no scene", "scene:spheres"]);
+}
