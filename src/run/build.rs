@@ -1,7 +1,7 @@
 //! From a description to a trainer. Everything that can fail for reasons of the user's making fails here,
 //! before anything is written.
 
-use std::path::PathBuf;
+use std::path::Path;
 
 use densify_policies::policy::DensityPolicy;
 
@@ -220,7 +220,7 @@ fn first_model(
     Ok((model, choice, count))
 }
 
-fn announce(config: &RunConfig, output: &PathBuf, summary: &str, observer: &dyn Observer) {
+fn announce(config: &RunConfig, output: &Path, summary: &str, observer: &dyn Observer) {
     let RunSpec { density, schedule, data, .. } = &config.spec;
     observer.say(format_args!("policy   {}: {summary}", density.policy));
     observer.say(format_args!(

@@ -98,7 +98,7 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
         let is_auto = |value: &Value| value.as_str().is_some_and(|text| text.starts_with("auto"));
         match (given.get(name).and_then(Value::as_str), lower.get(name)) {
             (Some("auto"), Some(saved)) if is_auto(saved) => given.remove(name),
-            (Some(auto), Some(saved)) if auto == "auto" => {
+            (Some("auto"), Some(saved)) => {
                 let flag = RunOption::find(name).map_or_else(String::new, RunOption::flag);
                 return Err(Failure::input(format!(
                     "--resume: {flag} auto contradicts {origin}, which was given {saved}; leave it out, \

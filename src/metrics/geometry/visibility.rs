@@ -67,7 +67,7 @@ impl Visibility {
             let sight = ground.sight(name, &ray_camera)?;
             let places = visibility.empty.par_iter_mut().zip(&rows.centres);
             places.for_each(|(empty, &place)| {
-                *empty += u32::from(sees_through(&world, &sight, place))
+                *empty += u32::from(sees_through(&world, &sight, place));
             });
             let surface = ground.truth.surface();
             samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS).for_each(
