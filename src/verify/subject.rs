@@ -32,8 +32,12 @@ pub enum Subject {
 pub struct Setup {
     /// Most rows; the model's, if these are more.
     pub budget: usize,
+    /// Near plane `[scene units]`; 0.01 without one.
+    pub near: Option<f32>,
     /// Most (row, tile) entries held at a time.
     pub tile_cap: Option<usize>,
+    /// Most gradient records held at a time; only the native backend has this limit.
+    pub record_cap: Option<usize>,
     /// Largest image that its ledger shall cover `[px]`.
     pub largest_image: (u32, u32),
     /// Signals to collect.
@@ -150,12 +154,14 @@ impl Subject {
         model: &Gaussians,
         setup: Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
-        let Setup { budget, tile_cap, largest_image, needs, shortcuts } = setup;
+        let Setup { budget, near, tile_cap, record_cap, largest_image, needs, shortcuts } = setup;
         let budget = budget.max(model.len()).max(1);
         let native = |instructions, threads, needs| {
             let mut options = CpuOptions::new(budget);
             (options.instructions, options.threads) = (instructions, threads);
+            options.near = near.unwrap_or(options.near);
             options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
+            options.record_cap = record_cap.unwrap_or(options.record_cap);
             (options.largest_image, options.needs) = (largest_image, needs);
             options.shortcuts = shortcuts;
             CpuBackend::new(model, &options)
@@ -170,13 +176,14 @@ impl Subject {
                 Ok(Box::new(super::sabotage::Saboteur::new(inner, *how)))
             }
             Self::Gpu(device) => {
-                let options = GpuOptions {
+                let mut options = GpuOptions {
                     tile_cap,
                     largest_image,
                     needs,
                     shortcuts,
                     ..GpuOptions::new(budget)
                 };
+                options.near = near.unwrap_or(options.near);
                 Ok(Box::new(GpuBackend::new(model, &options, device)?))
             }
         }

@@ -2,14 +2,11 @@
 
 #![expect(clippy::float_cmp, reason = "colours are carried to the last bit")]
 
-use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::{AuxInput, AuxOutput, Backend, LearningRates, StepInput};
+use densify::backend::{AuxInput, AuxOutput, Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::policy::{
-    AuxColumn, AuxRequest, Cadence, Needs, PixelMap, Signal, SignalSet,
-};
+use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap, Signal, SignalSet};
 use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -19,7 +16,9 @@ use densify::verify::reference::blend::each_blended;
 use densify::verify::reference::loss::loss;
 use densify::verify::reference::project::{by_depth, project};
 use densify::verify::reference::{Image, Model, Rules, View, render};
-use densify::verify::scenes;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
+
+use crate::subject::{all, make_with, on_each, repeatable, step_input};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 /// That of sums over pixels in `signals`; a pixel at the step of alpha may be gained or lost.
@@ -55,21 +54,28 @@ fn request(map: PixelMap) -> AuxRequest {
 }
 
 /// `cap` bounds the tile lists, and half of it the records.
-fn backend(scene: &Scene, request: &AuxRequest, cap: usize, threads: usize) -> CpuBackend {
-    let mut options = CpuOptions::new(scene.model.len() + 3);
-    options.threads = Some(threads);
-    options.tile_cap = cap;
-    options.record_cap = cap.div_ceil(2);
-    options.needs = Needs {
+fn backend(
+    subject: &Subject,
+    scene: &Scene,
+    request: &AuxRequest,
+    cap: usize,
+) -> Box<dyn Differentiable> {
+    let needs = Needs {
         signals: SignalSet::from([Signal::ScreenGradient, Signal::WeightSum, Signal::WeightMax]),
         aux: Some(request.clone()),
         ..Needs::default()
     };
-    CpuBackend::new(&scene.model, &options).expect("a small model fits")
+    let (tile_cap, record_cap) = (Some(cap), Some(cap.div_ceil(2)));
+    let budget = scene.model.len() + 3;
+    make_with(
+        subject,
+        &scene.model,
+        Setup { budget, tile_cap, record_cap, needs, ..Setup::default() },
+    )
 }
 
 fn observe(
-    backend: &mut CpuBackend,
+    backend: &mut dyn Backend,
     scene: &Scene,
     request: &AuxRequest,
     view: usize,
@@ -85,6 +91,11 @@ fn observe(
         request,
     };
     backend.observe(&input).expect("a small image is rendered")
+}
+
+/// The first view of a new backend.
+fn observe_on(subject: &Subject, scene: &Scene, request: &AuxRequest, cap: usize) -> AuxOutput {
+    observe(&mut *backend(subject, scene, request, cap), scene, request, 0)
 }
 
 fn weight(scene: &Scene, pixel: usize) -> f64 {
@@ -134,7 +145,6 @@ fn every_column_is_that_of_the_reference() {
     let image = render(&model, view, &Rules::STANDARD);
     let splats = project(&model, view, &Rules::STANDARD);
     let order = by_depth(&splats);
-    let mut table = Table::new("auxiliary views");
     let maps = [(50.0, 50.0), (1.0, 0.0), (0.0, 1.0)].map(|(error, edge)| PixelMap { error, edge });
     // The smaller cap takes several bands.
     for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
@@ -145,41 +155,43 @@ fn every_column_is_that_of_the_reference() {
                 *sum += x;
             }
         });
-        let request = request(weights);
-        let found = observe(&mut backend(&scene, &request, cap, 2), &scene, &request, 0);
-        assert_eq!(found.columns.len(), 6);
-        for (column, values) in &found.columns {
-            let is_shown = |row: usize| sums[row][1] > 0.0;
-            let expected: Vec<f64> = (0..values.len())
-                .map(|row| match column {
-                    AuxColumn::MapSum => sums[row][0],
-                    AuxColumn::PixelCount => sums[row][1],
-                    AuxColumn::WeightSum => sums[row][2],
-                    AuxColumn::DistanceSum => sums[row][3],
-                    AuxColumn::Depth => splats[row].depth,
-                    AuxColumn::Radius => {
-                        let [a, b, c] = splats[row].covariance;
-                        let mid = 0.5 * (a + c);
-                        (3.0 * (mid + (mid * mid - (a * c - b * b)).sqrt()).sqrt()).ceil()
-                    }
-                })
-                .collect();
-            // A row may be on screen without being blended anywhere.
-            let shown: Vec<usize> = (0..values.len()).filter(|&row| is_shown(row)).collect();
-            assert!(shown.len() > 20 && !is_shown(0), "{}", shown.len());
-            assert!(values[..3].iter().all(|x| x.to_bits() == 0), "{column:?} of rows not seen");
-            let measured: Vec<f32> = shown.iter().map(|&row| values[row]).collect();
-            let expected: Vec<f64> = shown.iter().map(|&row| expected[row]).collect();
-            let error = relative_error(&measured, &expected);
-            table.check(
-                &format!("{weights:?}, cap {cap}"),
-                &format!("{column:?}"),
-                error,
-                TOLERANCE,
-            );
+        // A row may be on screen without being blended anywhere.
+        let shown: Vec<usize> = (0..sums.len()).filter(|&row| sums[row][1] > 0.0).collect();
+        assert!(shown.len() > 20 && shown[0] > 0, "{}", shown.len());
+        let expected = |column: AuxColumn, row: usize| match column {
+            AuxColumn::MapSum => sums[row][0],
+            AuxColumn::PixelCount => sums[row][1],
+            AuxColumn::WeightSum => sums[row][2],
+            AuxColumn::DistanceSum => sums[row][3],
+            AuxColumn::Depth => splats[row].depth,
+            AuxColumn::Radius => {
+                let [a, b, c] = splats[row].covariance;
+                let mid = 0.5 * (a + c);
+                (3.0 * (mid + (mid * mid - (a * c - b * b)).sqrt()).sqrt()).ceil()
+            }
+        };
+        for subject in all() {
+            let mut table = Table::new(&format!("auxiliary views, {}", subject.name()));
+            let found = observe_on(&subject, &scene, &request(weights), cap);
+            assert_eq!(found.columns.len(), AuxColumn::ALL.len());
+            for (column, values) in &found.columns {
+                assert!(
+                    values[..3].iter().all(|x| x.to_bits() == 0),
+                    "{column:?} of rows not seen"
+                );
+                let measured: Vec<f32> = shown.iter().map(|&row| values[row]).collect();
+                let expected: Vec<f64> = shown.iter().map(|&row| expected(*column, row)).collect();
+                let error = relative_error(&measured, &expected);
+                table.check(
+                    &format!("{weights:?}, cap {cap}"),
+                    &format!("{column:?}"),
+                    error,
+                    TOLERANCE,
+                );
+            }
+            table.finish();
         }
     }
-    table.finish();
 }
 
 #[test]
@@ -187,84 +199,76 @@ fn the_loss_is_that_of_training() {
     let mut scene = scene();
     scene.target.mask = None;
     let request = request(PixelMap::default());
-    let found = observe(&mut backend(&scene, &request, 10_000, 1), &scene, &request, 0).loss;
     let view = View { camera: &scene.camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
     let image = render(&Model::of(&scene.model), view, &Rules::STANDARD);
     let truth: Vec<f64> = scene.target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
     let (width, height) = (scene.camera.width as usize, scene.camera.height as usize);
     let expected = loss(&image.rgb, &truth, width, height).loss;
-    assert!((f64::from(found) - expected).abs() < 1e-5, "{found} {expected}");
+    for subject in all() {
+        let found = observe_on(&subject, &scene, &request, 10_000).loss;
+        assert!((f64::from(found) - expected).abs() < 1e-5, "{found} {expected}");
+    }
 }
 
 #[test]
 fn neither_threads_nor_bands_change_a_bit() {
     let scene = scene();
     let points = AuxRequest { points: 50, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
-    let run =
-        |cap, threads| observe(&mut backend(&scene, &points, cap, threads), &scene, &points, 0);
-    let expected = run(10_000, 1);
-    assert_eq!(run(10_000, 3), expected);
-    assert_eq!(run(1, 2), expected);
-    assert_eq!(run(60, 2), expected);
+    for subject in repeatable() {
+        let run = |cap| observe_on(&subject, &scene, &points, cap);
+        let expected = run(10_000);
+        assert!(run(1) == expected && run(60) == expected, "{}", subject.name());
+        let Subject::Native { instructions, .. } = subject else { continue };
+        for threads in [1, 3].map(Some) {
+            let subject = Subject::Native { instructions, threads };
+            assert!(observe_on(&subject, &scene, &points, 10_000) == expected, "{threads:?}");
+        }
+    }
 }
 
 #[test]
 fn training_goes_on_as_if_nothing_had_been_observed() {
     let scene = scene();
     let request = AuxRequest { points: 9, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
-    let run = |observes: bool| {
-        let mut backend = backend(&scene, &request, 10_000, 2);
+    let run = |subject: &Subject, observes: bool| {
+        let mut backend = backend(subject, &scene, &request, 10_000);
         for step in 1..=4 {
-            let rate = 1e-3;
-            let rates = LearningRates {
-                mean: rate,
-                log_scale: rate,
-                quat: rate,
-                opacity: rate,
-                sh_dc: rate,
-                sh_rest: rate,
-            };
             let input = StepInput {
-                step,
-                view: 0,
-                camera: &scene.camera,
-                target: &scene.target,
                 background: BACKGROUND,
-                sh_degree: 2,
-                rates,
-                cadence: Cadence::default(),
-                seed: 1,
-                ssim_weight: 1.0,
+                ..step_input(step, &scene.camera, &scene.target, 2)
             };
             backend.train_step(&input).expect("a small image is rendered");
             if observes {
-                observe(&mut backend, &scene, &request, 0);
+                observe(&mut *backend, &scene, &request, 0);
             }
         }
         let signals = SignalSet::from([Signal::ScreenGradient, Signal::WeightSum]);
-        let needs = Needs { signals, ..Needs::default() };
-        let signals = backend.take_signals(needs.signals).expect("signals can be taken");
+        let signals = backend.take_signals(signals).expect("signals can be taken");
         let of = |signal| signals.get(signal).expect("a requested signal").to_vec();
         (backend.download().expect("a model"), of(Signal::ScreenGradient), of(Signal::WeightSum))
     };
-    assert!(run(false) == run(true));
+    for subject in repeatable() {
+        assert!(run(&subject, false) == run(&subject, true), "{}", subject.name());
+    }
 }
 
-#[test]
-fn points_lie_on_surfaces_and_follow_alpha() {
-    // One opaque Gaussian in the left of the image: all points are on it.
+/// One opaque Gaussian in the left of the image.
+fn opaque_on_the_left() -> Scene {
     let camera = scenes::camera(60, 40, 95);
-    let mut scene = scene();
-    scene.camera = camera;
     let local = [(15.0 - camera.cx) / camera.fx * 3.0, (20.0 - camera.cy) / camera.fy * 3.0, 3.0];
-    scene.model = scenes::one_at(&camera, local, [0.2; 3]);
-    scene.model.sh_degree = 1;
+    let model = scenes::one_at(&camera, local, [0.2; 3]);
     let n = 3 * (camera.width * camera.height) as usize;
     let rgb = (0..n).map(|i| (i % 251) as u8).collect();
-    scene.target = Image8 { width: 60, height: 40, rgb, alpha: None, mask: None };
+    Scene { camera, model, target: Image8 { width: 60, height: 40, rgb, alpha: None, mask: None } }
+}
+
+fn points_lie_on_surfaces_and_follow_alpha_on(subject: &Subject) {
+    let scene = opaque_on_the_left();
+    let camera = scene.camera;
     let request = AuxRequest { points: 40, ..AuxRequest::default() };
-    let mut backend = backend(&scene, &request, 10_000, 1);
-    let first = observe(&mut backend, &scene, &request, 0);
+    let mut backend = backend(subject, &scene, &request, 10_000);
+    let mut look = |request, view| observe(&mut *backend, &scene, request, view);
+    let first = look(&request, 0);
     assert!(first.columns.is_empty() && first.points.len() == 40, "{}", first.points.len());
     let centre = DVec3::from(scene.model.means[0].map(f64::from));
     let mut places: Vec<[u32; 3]> = Vec::new();
@@ -291,10 +295,15 @@ fn points_lie_on_surfaces_and_follow_alpha() {
     // Opaque pixels are drawn more often: of the blended ones the mean alpha is lower.
     let mean = first.points.iter().map(|p| p.error).sum::<f32>() / 40.0;
     let all = AuxRequest { points: u32::MAX, ..request.clone() };
-    let every = observe(&mut backend, &scene, &all, 0).points;
+    let every = look(&all, 0).points;
     let of_all = every.iter().map(|p| p.error).sum::<f32>() / every.len() as f32;
     assert!(every.len() > 80 && mean > 1.1 * of_all, "{} {mean} {of_all}", every.len());
     // Each view draws anew.
-    assert!(observe(&mut backend, &scene, &request, 1).points != first.points);
-    assert!(observe(&mut backend, &scene, &request, 0) == first);
+    assert!(look(&request, 1).points != first.points);
+    assert!(look(&request, 0) == first);
+}
+
+#[test]
+fn points_lie_on_surfaces_and_follow_alpha() {
+    on_each(all(), points_lie_on_surfaces_and_follow_alpha_on);
 }

@@ -4,23 +4,19 @@
 
 #![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, ModelGradient};
+use densify::backend::cpu::{ImageGradient, ModelGradient};
 use densify::backend::{Backend, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 use glam::{DMat3, DVec3};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 
-use crate::subject::{self, RATES};
-use densify::verify::scenes;
+use crate::subject::{RATES, class, make, make_with, on_each, repeatable, step_input};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
-const STILL: LearningRates =
-    LearningRates { mean: 0.0, log_scale: 0.0, quat: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
 const EVERY: Cadence = Cadence { all: 1, sh_rest: 1 };
 
 fn view(number: u32) -> Camera {
@@ -38,10 +34,7 @@ fn away() -> Camera {
 }
 
 fn target(camera: &Camera, seed: u64) -> Image8 {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let n = 3 * (camera.width * camera.height) as usize;
-    let rgb = (0..n).map(|_| rng.random()).collect();
-    Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: None }
+    scenes::noisy((camera.width, camera.height), 0.0, seed).1
 }
 
 fn model(rows: usize) -> Gaussians {
@@ -54,60 +47,56 @@ fn model(rows: usize) -> Gaussians {
     model
 }
 
-fn backend(model: &Gaussians, needs: Needs, threads: usize) -> CpuBackend {
-    let mut options = CpuOptions::new(model.len());
-    options.needs = needs;
-    options.threads = Some(threads);
-    CpuBackend::new(model, &options).expect("a small model fits")
+fn backend(subject: &Subject, model: &Gaussians, needs: Needs) -> Box<dyn Differentiable> {
+    make_with(subject, model, Setup { needs, ..Setup::default() })
 }
 
 fn step(
-    backend: &mut CpuBackend,
+    backend: &mut dyn Backend,
     camera: &Camera,
     step: u32,
     rates: LearningRates,
     cadence: Cadence,
 ) {
     let target = target(camera, step.into());
+    let sh_degree = backend.sh_degree();
     let input = StepInput {
-        step,
-        view: 0,
-        camera,
-        target: &target,
         background: BACKGROUND,
-        sh_degree: 1,
         rates,
         cadence,
         seed: 5,
-        ssim_weight: 1.0,
+        ..step_input(step, camera, &target, sh_degree)
     };
     backend.train_step(&input).expect("a small image is rendered");
 }
 
 #[test]
 fn terms_of_the_loss_pull_at_rows_that_no_view_shows() {
-    let model = model(30);
-    let camera = away();
-    for (opacity, scale) in [(0.01, 0.0), (0.0, 0.02), (0.01, 0.02), (0.0, 0.0)] {
-        let needs = Needs { loss_terms: LossTerms { opacity, scale }, ..Needs::default() };
-        let mut backend = backend(&model, needs, 2);
-        step(&mut backend, &camera, 1, RATES, EVERY);
-        let after = backend.download().expect("a model");
-        // The first step of Adam is one learning rate long, whatever the gradient.
-        let moved = |on: f32, before: f32, after: f32, rate: f32| {
-            let expected = if on > 0.0 { rate } else { 0.0 };
-            assert!((before - after - expected).abs() < 1e-3 * rate, "{opacity} {scale}");
-        };
-        for row in 0..30 {
-            let logits = (model.opacity_logits[row], after.opacity_logits[row]);
-            moved(opacity, logits.0, logits.1, RATES.opacity);
-            for axis in 0..3 {
-                let (before, after) = (model.log_scales[row][axis], after.log_scales[row][axis]);
-                moved(scale, before, after, RATES.log_scale);
+    on_each(repeatable(), |subject| {
+        let model = model(30);
+        let camera = away();
+        for (opacity, scale) in [(0.01, 0.0), (0.0, 0.02), (0.01, 0.02), (0.0, 0.0)] {
+            let needs = Needs { loss_terms: LossTerms { opacity, scale }, ..Needs::default() };
+            let mut backend = backend(subject, &model, needs);
+            step(&mut *backend, &camera, 1, RATES, EVERY);
+            let after = backend.download().expect("a model");
+            // The first step of Adam is one learning rate long, whatever the gradient.
+            let moved = |on: f32, before: f32, after: f32, rate: f32| {
+                let expected = if on > 0.0 { rate } else { 0.0 };
+                assert!((before - after - expected).abs() < 1e-3 * rate, "{opacity} {scale}");
+            };
+            for row in 0..30 {
+                let logits = (model.opacity_logits[row], after.opacity_logits[row]);
+                moved(opacity, logits.0, logits.1, RATES.opacity);
+                for axis in 0..3 {
+                    let (before, after) =
+                        (model.log_scales[row][axis], after.log_scales[row][axis]);
+                    moved(scale, before, after, RATES.log_scale);
+                }
             }
+            assert_eq!((after.means, after.sh), (model.means.clone(), model.sh.clone()));
         }
-        assert_eq!((after.means, after.sh), (model.means.clone(), model.sh.clone()));
-    }
+    });
 }
 
 /// Rows in pairs of one shape, every second one turned by a quarter.
@@ -123,71 +112,88 @@ fn alike(rows: usize) -> Gaussians {
 
 #[test]
 fn noise_has_the_declared_covariance() {
-    let rows = 20_000;
-    let model = alike(rows);
-    let noise = NoiseTerm { strength: 7.0, sharpness: 100.0, opacity: 0.005 };
-    let run = |threads: usize, at: u32| {
-        let needs = Needs { noise: Some(noise), ..Needs::default() };
-        let mut backend = backend(&model, needs, threads);
-        step(&mut backend, &away(), at, RATES, EVERY);
-        backend.download().expect("a model")
-    };
-    let moved = run(1, 3);
-    assert_eq!(moved, run(3, 3), "it depends on the threads");
-    assert!(moved.means != run(1, 4).means, "it does not depend on the step");
-    assert_eq!((&moved.log_scales, &moved.sh), (&model.log_scales, &model.sh));
-    // σ(−4) = 0.017986; its share is σ(−100·0.012986).
-    let opacity = 1.0 / (1.0 + 4.0_f64.exp());
-    let share = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
-    let factor = 7.0 * f64::from(RATES.mean) * share;
-    // Deviations Σ·factor: variances of the axes, x and y swapped in turned rows.
-    for (parity, variances) in [(0, [0.01, 0.04, 0.16]), (1, [0.04, 0.01, 0.16])] {
-        let of_parity = moved.means.iter().skip(parity).step_by(2);
-        let deltas: Vec<[f64; 3]> =
-            of_parity.map(|mean| mean.map(|x| f64::from(x) - 0.5)).collect();
-        let n = deltas.len() as f64;
-        for i in 0..3 {
-            for j in 0..3 {
-                let deviation = |k: usize| factor * variances[k];
-                let found = deltas.iter().map(|d| d[i] * d[j]).sum::<f64>() / n;
-                let expected = if i == j { deviation(i).powi(2) } else { 0.0 };
-                // Five standard errors.
-                let error = if i == j { 2.0_f64 } else { 1.0 };
-                let bound = 5.0 * (error / n).sqrt() * deviation(i) * deviation(j);
-                assert!((found - expected).abs() < bound, "{parity} {i} {j}: {found} {expected}");
-            }
-            let mean = deltas.iter().map(|d| d[i]).sum::<f64>() / n;
-            assert!(mean.abs() < 5.0 * factor * variances[i] / n.sqrt(), "{i}: {mean}");
+    on_each(repeatable(), |subject| {
+        let rows = 20_000;
+        let model = alike(rows);
+        let noise = NoiseTerm { strength: 7.0, sharpness: 100.0, opacity: 0.005 };
+        let run = |subject: &Subject, at: u32| {
+            let needs = Needs { noise: Some(noise), ..Needs::default() };
+            let mut backend = backend(subject, &model, needs);
+            step(&mut *backend, &away(), at, RATES, EVERY);
+            backend.download().expect("a model")
+        };
+        let moved = run(subject, 3);
+        if let Subject::Native { instructions, .. } = *subject {
+            let alone = Subject::Native { instructions, threads: Some(1) };
+            assert!(moved == run(&alone, 3), "it depends on the threads");
         }
-    }
+        assert!(moved.means != run(subject, 4).means, "it does not depend on the step");
+        assert_eq!((&moved.log_scales, &moved.sh), (&model.log_scales, &model.sh));
+        // σ(−4) = 0.017986; its share is σ(−100·0.012986).
+        let opacity = 1.0 / (1.0 + 4.0_f64.exp());
+        let share = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
+        let factor = 7.0 * f64::from(RATES.mean) * share;
+        // Deviations Σ·factor: variances of the axes, x and y swapped in turned rows.
+        for (parity, variances) in [(0, [0.01, 0.04, 0.16]), (1, [0.04, 0.01, 0.16])] {
+            let of_parity = moved.means.iter().skip(parity).step_by(2);
+            let deltas: Vec<[f64; 3]> =
+                of_parity.map(|mean| mean.map(|x| f64::from(x) - 0.5)).collect();
+            let n = deltas.len() as f64;
+            for i in 0..3 {
+                for j in 0..3 {
+                    let deviation = |k: usize| factor * variances[k];
+                    let found = deltas.iter().map(|d| d[i] * d[j]).sum::<f64>() / n;
+                    let expected = if i == j { deviation(i).powi(2) } else { 0.0 };
+                    // Five standard errors.
+                    let error = if i == j { 2.0_f64 } else { 1.0 };
+                    let bound = 5.0 * (error / n).sqrt() * deviation(i) * deviation(j);
+                    assert!(
+                        (found - expected).abs() < bound,
+                        "{parity} {i} {j}: {found} {expected}"
+                    );
+                }
+                let mean = deltas.iter().map(|d| d[i]).sum::<f64>() / n;
+                assert!(mean.abs() < 5.0 * factor * variances[i] / n.sqrt(), "{i}: {mean}");
+            }
+        }
+    });
 }
 
 #[test]
 fn rows_opaque_enough_are_not_disturbed() {
-    let mut model = alike(64);
-    // Opacities 0.16 and 0.18: shares of 1.9e-7 and 2.5e-8, on either side of 6e-8.
-    for (row, logit) in model.opacity_logits.iter_mut().enumerate() {
-        *logit = if row < 32 { -1.658_23 } else { -1.516_35 };
-    }
-    let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
-    let mut backend = backend(&model, Needs { noise: Some(noise), ..Needs::default() }, 1);
-    step(&mut backend, &away(), 1, RATES, EVERY);
-    let moved: Vec<bool> =
-        backend.download().expect("a model").means.iter().map(|mean| *mean != [0.5; 3]).collect();
-    assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
+    on_each(repeatable(), |subject| {
+        let mut model = alike(64);
+        // Opacities 0.16 and 0.18: shares of 1.9e-7 and 2.5e-8, on either side of 6e-8.
+        for (row, logit) in model.opacity_logits.iter_mut().enumerate() {
+            *logit = if row < 32 { -1.658_23 } else { -1.516_35 };
+        }
+        let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
+        let mut backend =
+            backend(subject, &model, Needs { noise: Some(noise), ..Needs::default() });
+        step(&mut *backend, &away(), 1, RATES, EVERY);
+        let moved: Vec<bool> = backend
+            .download()
+            .expect("a model")
+            .means
+            .iter()
+            .map(|mean| *mean != [0.5; 3])
+            .collect();
+        assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
+    });
 }
 
 /// The gradient of the image's loss, without a step.
-fn gradient(model: &Gaussians, camera: &Camera, seed: u64) -> ModelGradient {
-    let mut backend = backend(model, Needs::default(), 1);
+fn gradient(subject: &Subject, model: &Gaussians, camera: &Camera, seed: u64) -> ModelGradient {
+    let mut backend = make(subject, model);
     let rendering = backend.render(camera, BACKGROUND, 1).expect("a small image is rendered");
-    let (_, rgb) = backend.loss(&rendering, &target(camera, seed), BACKGROUND);
+    let outcome = backend.loss(&rendering, &target(camera, seed), BACKGROUND);
+    let (_, rgb) = outcome.expect("a loss");
     let zeros = vec![0.0; rendering.alpha.len()];
     let upstream = ImageGradient { rgb, alpha: zeros.clone(), depth: zeros };
     backend.differentiate(camera, BACKGROUND, 1, &upstream).expect("a small image is rendered").1
 }
 
-/// Values of a model by class, in the order of [`subject::class`].
+/// Values of a model by class, in the order of [`class`].
 fn values<'a>(model: &'a Gaussians, class: &str) -> &'a [f32] {
     match class {
         "means" => model.means.as_flattened(),
@@ -231,7 +237,7 @@ impl Adam {
         due: bool,
     ) -> f64 {
         let (before, after) = (values(before, self.class), values(after, self.class));
-        for (sum, g) in self.sums.iter_mut().zip(subject::class(gradient, self.class)) {
+        for (sum, g) in self.sums.iter_mut().zip(class(gradient, self.class)) {
             *sum += f64::from(*g);
         }
         let mine: Vec<usize> =
@@ -267,137 +273,147 @@ impl Adam {
 
 #[test]
 fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
-    const ROWS: usize = 40;
-    let longest = [(2, 1), (1, 3), (2, 4), (20, 16)].map(|(all, sh_rest)| Cadence { all, sh_rest });
-    for longest in longest {
-        // The last of them: shorter than declared, and changing on the way.
-        let cadence_at = |step: u32| match longest.all {
-            20 if step < 5 => Cadence { all: 1, sh_rest: 2 },
-            20 => Cadence { all: 2, sh_rest: 3 },
-            _ => longest,
-        };
-        let needs = Needs { cadence: longest, ..Needs::default() };
-        let mut backend = backend(&model(ROWS), needs, 2);
-        let mut classes = [
-            Adam::new("means", RATES.mean, 0..3, 3, ROWS),
-            Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
-            Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
-            Adam::new("sh", RATES.sh_dc, 0..3, 12, ROWS),
-            Adam::new("sh", RATES.sh_rest, 3..12, 12, ROWS),
-        ];
-        for number in 1..=8 {
-            let camera = view(number % 3);
-            let before = backend.download().expect("a model");
-            let gradient = gradient(&before, &camera, number.into());
-            step(&mut backend, &camera, number, RATES, cadence_at(number));
-            let after = backend.download().expect("a model");
-            let [main, rest] = cadence_at(number).steps_at(number);
-            for (i, class) in classes.iter_mut().enumerate() {
-                let due = if i == 4 { rest } else { main };
-                let error = class.check(&before, &after, &gradient, due);
-                let what = format!("{longest:?}, step {number}, {}", class.class);
-                assert!(error < 0.01, "{what}: {error} learning rates");
+    on_each(repeatable(), |subject| {
+        const ROWS: usize = 40;
+        let longest =
+            [(2, 1), (1, 3), (2, 4), (20, 16)].map(|(all, sh_rest)| Cadence { all, sh_rest });
+        for longest in longest {
+            // The last of them: shorter than declared, and changing on the way.
+            let cadence_at = |step: u32| match longest.all {
+                20 if step < 5 => Cadence { all: 1, sh_rest: 2 },
+                20 => Cadence { all: 2, sh_rest: 3 },
+                _ => longest,
+            };
+            let needs = Needs { cadence: longest, ..Needs::default() };
+            let mut backend = backend(subject, &model(ROWS), needs);
+            let mut classes = [
+                Adam::new("means", RATES.mean, 0..3, 3, ROWS),
+                Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
+                Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
+                Adam::new("sh", RATES.sh_dc, 0..3, 12, ROWS),
+                Adam::new("sh", RATES.sh_rest, 3..12, 12, ROWS),
+            ];
+            for number in 1..=8 {
+                let camera = view(number % 3);
+                let before = backend.download().expect("a model");
+                let gradient = gradient(subject, &before, &camera, number.into());
+                step(&mut *backend, &camera, number, RATES, cadence_at(number));
+                let after = backend.download().expect("a model");
+                let [main, rest] = cadence_at(number).steps_at(number);
+                for (i, class) in classes.iter_mut().enumerate() {
+                    let due = if i == 4 { rest } else { main };
+                    let error = class.check(&before, &after, &gradient, due);
+                    let what = format!("{longest:?}, step {number}, {}", class.class);
+                    assert!(error < 0.01, "{what}: {error} learning rates");
+                }
             }
         }
-    }
+    });
 }
 
 #[test]
 fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
-    const ROWS: usize = 40;
-    let terms = LossTerms { opacity: 0.01, scale: 0.02 };
-    let mut backend = backend(&model(ROWS), Needs { loss_terms: terms, ..Needs::default() }, 2);
-    let mut classes = [
-        Adam::new("means", RATES.mean, 0..3, 3, ROWS),
-        Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
-        Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
-    ];
-    for number in 1..=8 {
-        let camera = if number % 2 == 0 { away() } else { view(number % 3) };
-        let before = backend.download().expect("a model");
-        let mut gradient = gradient(&before, &camera, number.into());
-        for row in 0..ROWS {
-            let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
-            gradient.opacity_logits[row] += 0.01 / ROWS as f32 * opacity * (1.0 - opacity);
-            for axis in 0..3 {
-                let scale = before.log_scales[row][axis].exp();
-                gradient.log_scales[row][axis] += 0.02 / (3 * ROWS) as f32 * scale;
+    on_each(repeatable(), |subject| {
+        const ROWS: usize = 40;
+        let terms = LossTerms { opacity: 0.01, scale: 0.02 };
+        let mut backend =
+            backend(subject, &model(ROWS), Needs { loss_terms: terms, ..Needs::default() });
+        let mut classes = [
+            Adam::new("means", RATES.mean, 0..3, 3, ROWS),
+            Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
+            Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
+        ];
+        for number in 1..=8 {
+            let camera = if number % 2 == 0 { away() } else { view(number % 3) };
+            let before = backend.download().expect("a model");
+            let mut gradient = gradient(subject, &before, &camera, number.into());
+            for row in 0..ROWS {
+                let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
+                gradient.opacity_logits[row] += 0.01 / ROWS as f32 * opacity * (1.0 - opacity);
+                for axis in 0..3 {
+                    let scale = before.log_scales[row][axis].exp();
+                    gradient.log_scales[row][axis] += 0.02 / (3 * ROWS) as f32 * scale;
+                }
+            }
+            step(&mut *backend, &camera, number, RATES, EVERY);
+            let after = backend.download().expect("a model");
+            for class in &mut classes {
+                let error = class.check(&before, &after, &gradient, true);
+                assert!(error < 0.01, "step {number}, {}: {error} learning rates", class.class);
             }
         }
-        step(&mut backend, &camera, number, RATES, EVERY);
-        let after = backend.download().expect("a model");
-        for class in &mut classes {
-            let error = class.check(&before, &after, &gradient, true);
-            assert!(error < 0.01, "step {number}, {}: {error} learning rates", class.class);
-        }
-    }
+    });
 }
 
 #[test]
 fn sums_move_with_their_rows_and_end_with_them() {
-    let cadence = Cadence { all: 2, sh_rest: 2 };
-    let model = model(20);
-    let run = |edit: bool| {
-        let needs = Needs { cadence, ..Needs::default() };
-        let mut backend = backend(&model, needs, 1);
-        step(&mut backend, &view(0), 1, RATES, cadence);
-        if edit {
-            // Row 19 takes the place of row 4.
-            let mut plan = EditPlan::new(20, 20);
-            plan.prune(4).expect("the row is free");
-            backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-        }
-        // Nothing is seen: only what waits is left.
-        step(&mut backend, &away(), 2, RATES, cadence);
-        backend.download().expect("a model")
-    };
-    let (plain, edited) = (run(false), run(true));
-    assert!(plain.means[19] != model.means[19] && plain.sh_of(19) != model.sh_of(19));
-    assert_eq!((plain.means[19], plain.sh_of(19)), (edited.means[4], edited.sh_of(4)));
-    assert_eq!(plain.means[..4], edited.means[..4]);
+    on_each(repeatable(), |subject| {
+        let cadence = Cadence { all: 2, sh_rest: 2 };
+        let model = model(20);
+        let run = |edit: bool| {
+            let needs = Needs { cadence, ..Needs::default() };
+            let mut backend = backend(subject, &model, needs);
+            step(&mut *backend, &view(0), 1, RATES, cadence);
+            if edit {
+                // Row 19 takes the place of row 4.
+                let mut plan = EditPlan::new(20, 20);
+                plan.prune(4).expect("the row is free");
+                backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
+            }
+            // Nothing is seen: only what waits is left.
+            step(&mut *backend, &away(), 2, RATES, cadence);
+            backend.download().expect("a model")
+        };
+        let (plain, edited) = (run(false), run(true));
+        assert!(plain.means[19] != model.means[19] && plain.sh_of(19) != model.sh_of(19));
+        assert_eq!((plain.means[19], plain.sh_of(19)), (edited.means[4], edited.sh_of(4)));
+        assert_eq!(plain.means[..4], edited.means[..4]);
 
-    // Bounding opacities forgets what waits for them, as it forgets their moments.
-    let needs = Needs { cadence, ..Needs::default() };
-    let mut backend = backend(&model, needs, 1);
-    step(&mut backend, &view(0), 1, RATES, cadence);
-    let mut plan = EditPlan::new(20, 20);
-    plan.clamp_opacity(0.999).expect("the bound is sound");
-    backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-    step(&mut backend, &away(), 2, RATES, cadence);
-    let after = backend.download().expect("a model");
-    assert_eq!(after.opacity_logits, model.opacity_logits);
-    assert_eq!(after.means, plain.means);
+        // Bounding opacities forgets what waits for them, as it forgets their moments.
+        let needs = Needs { cadence, ..Needs::default() };
+        let mut backend = backend(subject, &model, needs);
+        step(&mut *backend, &view(0), 1, RATES, cadence);
+        let mut plan = EditPlan::new(20, 20);
+        plan.clamp_opacity(0.999).expect("the bound is sound");
+        backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
+        step(&mut *backend, &away(), 2, RATES, cadence);
+        let after = backend.download().expect("a model");
+        assert_eq!(after.opacity_logits, model.opacity_logits);
+        assert_eq!(after.means, plain.means);
+    });
 }
 
 #[test]
 fn a_row_that_starts_anew_steps_as_a_newborn() {
-    let cadence = Cadence { all: 1, sh_rest: 2 };
-    let mut backend = backend(&model(20), Needs { cadence, ..Needs::default() }, 1);
-    for number in 1..=6 {
-        step(&mut backend, &view(number % 3), number, RATES, cadence);
-    }
-    let mut plan = EditPlan::new(20, 20);
-    let opacity = OpacityRule::Same;
-    let update = Update { opacity, scale: ScaleRule::Uniform(1.0), keep_moments: false };
-    plan.update(11, update).expect("the row is free");
-    backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
-    let before = backend.download().expect("a model");
-    step(&mut backend, &view(0), 7, RATES, cadence);
-    step(&mut backend, &view(1), 8, RATES, cadence);
-    let after = backend.download().expect("a model");
-    // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
-    let moved = |row: usize| -> Vec<f32> {
-        let pairs = after.sh_of(row).iter().zip(before.sh_of(row));
-        pairs.skip(3).map(|(a, b)| (a - b).abs() / RATES.sh_rest).collect()
-    };
-    assert!(moved(11).iter().all(|rates| (rates - 1.0).abs() < 1e-2), "{:?}", moved(11));
-    assert!(moved(12).iter().any(|rates| (rates - 1.0).abs() > 0.1), "{:?}", moved(12));
+    on_each(repeatable(), |subject| {
+        let cadence = Cadence { all: 1, sh_rest: 2 };
+        let mut backend = backend(subject, &model(20), Needs { cadence, ..Needs::default() });
+        for number in 1..=6 {
+            step(&mut *backend, &view(number % 3), number, RATES, cadence);
+        }
+        let mut plan = EditPlan::new(20, 20);
+        let opacity = OpacityRule::Same;
+        let update = Update { opacity, scale: ScaleRule::Uniform(1.0), keep_moments: false };
+        plan.update(11, update).expect("the row is free");
+        backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
+        let before = backend.download().expect("a model");
+        step(&mut *backend, &view(0), 7, RATES, cadence);
+        step(&mut *backend, &view(1), 8, RATES, cadence);
+        let after = backend.download().expect("a model");
+        // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
+        let moved = |row: usize| -> Vec<f32> {
+            let pairs = after.sh_of(row).iter().zip(before.sh_of(row));
+            pairs.skip(3).map(|(a, b)| (a - b).abs() / RATES.sh_rest).collect()
+        };
+        assert!(moved(11).iter().all(|rates| (rates - 1.0).abs() < 1e-2), "{:?}", moved(11));
+        assert!(moved(12).iter().any(|rates| (rates - 1.0).abs() > 0.1), "{:?}", moved(12));
+    });
 }
 
 #[test]
 fn what_is_declared_is_in_the_ledger() {
     let model = model(20);
-    let bytes = |needs: Needs| backend(&model, needs, 1).ledger().total();
+    let bytes = |needs: Needs| backend(&Subject::NATIVE, &model, needs).ledger().total();
     let plain = bytes(Needs::default());
     let with = |all, sh_rest| Needs { cadence: Cadence { all, sh_rest }, ..Needs::default() };
     // 32 padded rows of 11 + 12 numbers; of 9; and two bytes each to count steps.
@@ -406,31 +422,29 @@ fn what_is_declared_is_in_the_ledger() {
     assert_eq!(bytes(with(5, 16)) - plain, 32 * (23 * 4 + 2));
     let still = Needs { loss_terms: LossTerms { opacity: 1.0, scale: 1.0 }, ..Needs::default() };
     assert_eq!(bytes(still), plain);
-    // A step of length zero, so that `STILL` is used as everywhere.
-    let mut backend = backend(&model, with(5, 1), 1);
-    step(&mut backend, &view(0), 5, STILL, Cadence { all: 5, sh_rest: 1 });
-    assert_eq!(backend.download().expect("a model").means, model.means);
 }
 
 #[test]
 fn present_values_are_those_of_the_model() {
-    let model = model(20);
-    let wanted = [Signal::Opacity, Signal::ScaleMax, Signal::ScaleProduct];
-    let needs = Needs { signals: SignalSet::from(wanted), ..Needs::default() };
-    let mut backend = backend(&model, needs.clone(), 1);
-    let signals = backend.take_signals(needs.signals).expect("signals can be taken");
-    let of = |signal| signals.get(signal).expect("a requested signal");
-    for row in 0..20 {
-        let scales = model.log_scales[row].map(|x| f64::from(x).exp());
-        let largest = scales.into_iter().fold(0.0, f64::max);
-        let expected = [
-            1.0 / (1.0 + (-f64::from(model.opacity_logits[row])).exp()),
-            largest,
-            scales.into_iter().product(),
-        ];
-        for (signal, expected) in wanted.into_iter().zip(expected) {
-            let found = f64::from(of(signal)[row]);
-            assert!((found / expected - 1.0).abs() < 1e-5, "{signal:?}: {found} {expected}");
+    on_each(repeatable(), |subject| {
+        let model = model(20);
+        let wanted = [Signal::Opacity, Signal::ScaleMax, Signal::ScaleProduct];
+        let needs = Needs { signals: SignalSet::from(wanted), ..Needs::default() };
+        let mut backend = backend(subject, &model, needs.clone());
+        let signals = backend.take_signals(needs.signals).expect("signals can be taken");
+        let of = |signal| signals.get(signal).expect("a requested signal");
+        for row in 0..20 {
+            let scales = model.log_scales[row].map(|x| f64::from(x).exp());
+            let largest = scales.into_iter().fold(0.0, f64::max);
+            let expected = [
+                1.0 / (1.0 + (-f64::from(model.opacity_logits[row])).exp()),
+                largest,
+                scales.into_iter().product(),
+            ];
+            for (signal, expected) in wanted.into_iter().zip(expected) {
+                let found = f64::from(of(signal)[row]);
+                assert!((found / expected - 1.0).abs() < 1e-5, "{signal:?}: {found} {expected}");
+            }
         }
-    }
+    });
 }

@@ -1,5 +1,5 @@
-//! Where numbers are hardest: the cases of the [selftest](densify::verify) on the native backend
-//! (`gpu/extremes.rs` runs them on every adapter), and where each extreme is tested.
+//! Where numbers are hardest: the cases of the [selftest](densify::verify) on every backend, and where each
+//! extreme is tested.
 //!
 //! A backend is compared with the float64 reference, which `central.rs` checks by central differences;
 //! how near to it is said with each figure (`docs/numerics.md` has them all). Where a decision of the
@@ -8,17 +8,17 @@
 //!
 //! | extreme | tested in |
 //! |---|---|
-//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/vanilla/tests.rs: an_empty_model_stays_empty` |
+//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/import/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/vanilla/tests.rs: an_empty_model_stays_empty` |
 //! | 2 one row | selftest; `src/init/tests.rs: few_points` |
 //! | 3 duplicates | selftest; `src/init/tests.rs: duplicates_are_merged_and_counted_and_break_nothing` |
 //! | 4 a budget below the points | `src/init/tests.rs: the_budget_is_kept_by_a_seeded_subsample`; `tests/it/cli/training.rs: more_points_than_the_budget_are_subsampled_and_it_is_said`; `tests/it/cli/training.rs: a_budget_of_one_row_trains`; `tests/it/edits/mod.rs: budget_one_row_is_kept`; `tests/it/cli/faults.rs: flags_out_of_range_are_refused` |
-//! | 5 log-scales | selftest; `src/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
-//! | 6 quaternions | selftest; `src/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
+//! | 5 log-scales | selftest; `src/import/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
+//! | 6 quaternions | selftest; `src/import/ply/tests.rs: damaged_rows_are_dropped_up_to_one_percent` |
 //! | 7 needles | selftest |
 //! | 8 the near plane | selftest |
 //! | 9 a camera inside of a row | selftest |
 //! | 10 beside the frustum | selftest |
-//! | 11 rows as large as the image | selftest, in full with `--long`; `tests/it/sameness.rs: bands_change_nothing`; `tests/it/gpu/twins.rs: bands_and_sizes_leave_nothing_behind` |
+//! | 11 rows as large as the image | selftest, in full with `--long`; `tests/it/sameness.rs: bands_change_nothing`; `tests/it/sameness.rs: running_twice_changes_nothing` |
 //! | 12 opacities at the steps | selftest |
 //! | 13 layers | selftest |
 //! | 14 behind an opaque row | selftest; opacity is capped at 0.99 always |
@@ -32,8 +32,8 @@
 //! | 22 lenses | selftest; `src/dataset/pose.rs: fields_of_view_that_no_pinhole_has_are_refused` |
 //! | 23 plain photographs | selftest; `src/dataset/images.rs: every_colour_type_packs_to_eight_bits`; `policies/src/taming/score.rs: terms_are_relative_to_the_median_of_the_positive`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
 //! | 24 similarity | selftest; `src/metrics/ssim.rs: flat_images_a_hair_apart_stay_below_one`; `src/metrics/ssim.rs: noise_of_a_thousandth_on_a_flat_image` |
-//! | 25 the optimiser | selftest; `src/backend/cpu/adam.rs: a_thousand_steps_of_any_size`; `tests/it/gpu/training.rs: steps_are_those_of_the_native_backend` |
-//! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: the_native_backend_finds_every_number_that_is_none`; `src/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
+//! | 25 the optimiser | selftest; `src/backend/cpu/adam.rs: a_thousand_steps_of_any_size`; `tests/it/agreement.rs: steps_are_those_of_the_native_backend` |
+//! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_number_that_is_none_is_found`; `src/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
 //! | 27 all faint, all prunable | selftest; `policies/src/vanilla/tests.rs: the_last_row_lives`; `policies/src/diet/tests.rs: the_last_row_lives`; `policies/src/taming/tests.rs: one_row_is_left`; `policies/src/mcmc/tests.rs: without_the_living_nothing_is_done` |
 //! | 28 half precision | `src/backend/cpu/narrow/tests.rs: halves_are_what_the_standard_says`; `src/backend/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `src/backend/cpu/narrow/tests.rs: small_steps_are_not_lost`; `tests/it/storage.rs: an_audit_sees_what_is_no_number` |
 //! | 29 whole numbers | `src/backend/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/backend/cpu/budget.rs: huge_budgets_are_refused_and_do_not_wrap`; `src/backend/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/checkpoint/tests.rs: headers_that_promise_too_much_are_refused_without_allocation` |
@@ -43,8 +43,14 @@ use std::path::Path;
 
 use densify::verify::{Subject, cases, table};
 
+use crate::subject::others;
+
+/// Cases that take software drivers, and a processor without its vectors, a minute or more each;
+/// `densify selftest --gpu NAME 11 21 30` runs them.
+const SLOW: [u8; 3] = [11, 21, 30];
+
 /// Fails with the lines of all cases that do not hold; those numbered in `but` are not tried.
-pub(crate) fn check(subject: &Subject, but: &[u8]) {
+fn check(subject: &Subject, but: &[u8]) {
     let mut failed = Vec::new();
     for case in cases().iter().filter(|case| !but.contains(&case.number)) {
         let findings = case.run(subject, false);
@@ -58,6 +64,15 @@ pub(crate) fn check(subject: &Subject, but: &[u8]) {
 #[test]
 fn every_case_holds_on_the_native_backend() {
     check(&Subject::NATIVE, &[]);
+}
+
+/// With sums in slots: some cases want the same bits of two runs, which sums by atomics do not have;
+/// `agreement` and `oracle` hold those to the native backend and to the reference.
+#[test]
+fn every_case_holds_with_other_instructions_and_on_every_device() {
+    for subject in others().iter().filter(|subject| subject.is_deterministic()) {
+        check(subject, &SLOW);
+    }
 }
 
 /// The rows of the table at the head of a file: number of the extreme, and where it is tested.

@@ -14,7 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 use tempfile::TempDir;
 
-use crate::subject::{self, Resources};
+use crate::subject::native;
 use densify::verify::scenes;
 
 /// Views taken.
@@ -97,7 +97,7 @@ fn camera(view: usize) -> Camera {
 fn shots() -> &'static [Shot] {
     static SHOTS: OnceLock<Vec<Shot>> = OnceLock::new();
     SHOTS.get_or_init(|| {
-        let mut backend = subject::backend(&blobs(), Resources::default());
+        let mut backend = native(&blobs());
         let shoot = |view: usize| {
             let camera = camera(view);
             let seen = backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");

@@ -21,7 +21,7 @@ use densify_policies::policy::{
 use densify_policies::rng::PolicyRng;
 use glam::DVec3;
 
-use crate::gpu::subjects;
+use crate::subject::devices;
 
 const ROWS: usize = 60;
 /// The probes are measured at step 100, and at step 200 also without the rows of least weight.
@@ -153,7 +153,7 @@ fn measuring_changes_no_bit() {
             });
         }
     }
-    if let Some(device) = subjects().first() {
+    if let Some(device) = devices().first() {
         compare(&device.adapter().name, &|| {
             let options = GpuOptions { needs: needs.clone(), ..GpuOptions::new(ROWS) };
             Box::new(GpuBackend::new(&model, &options, device).expect("a small model fits"))

@@ -1,15 +1,13 @@
 //! Rows that hold a number that is not finite: every one is found, none is lost sight of, and no other row
-//! notices. The same for every backend.
+//! notices.
 
-use densify::backend::{Attribute, Backend, Kept, StepInput, Unsound, Values};
+use densify::backend::{Attribute, Backend, Kept, Unsound, Values};
 use densify::camera::Camera;
-use densify::gaussians::Gaussians;
 use densify::verify::values::{POISON, SLOTS, remove, slot_of};
 use densify_policies::plan::EditPlan;
-use densify_policies::policy::Cadence;
 
-use crate::subject::{self, RATES, Resources};
-use densify::verify::scenes;
+use crate::subject::{make, on_each, repeatable, step_input};
+use densify::verify::{Subject, scenes};
 
 /// The row that is poisoned where it is one.
 const POISONED: usize = 11;
@@ -23,13 +21,6 @@ const CLASSES: [(usize, Attribute); 6] = [
     (40, Attribute::Sh),
 ];
 
-/// How a test makes its backend.
-pub(crate) type Make<'a> = &'a dyn Fn(&Gaussians) -> Box<dyn Backend>;
-
-fn native(model: &Gaussians) -> Box<dyn Backend> {
-    Box::new(subject::backend(model, Resources::default()))
-}
-
 fn audit(backend: &mut dyn Backend) -> Vec<Unsound> {
     backend.audit().expect("an audit")
 }
@@ -37,28 +28,17 @@ fn audit(backend: &mut dyn Backend) -> Vec<Unsound> {
 fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) {
     let target = scenes::target(camera);
     for step in 1..=steps {
-        let input = StepInput {
-            step,
-            view: 0,
-            camera,
-            target: &target,
-            background: [0.2, 0.1, 0.4],
-            sh_degree: 3,
-            rates: RATES,
-            cadence: Cadence::default(),
-            seed: 3,
-            ssim_weight: 1.0,
-        };
+        let input = step_input(step, camera, &target, 3);
         let output = backend.train_step(&input).expect("a small image is rendered");
         assert!(output.loss.is_finite(), "step {step}");
     }
 }
 
 /// Row i has its number i poisoned; then the same with moments.
-pub(crate) fn every_number_that_is_none_is_found(make: Make<'_>) {
+fn every_number_that_is_none_is_found_on(subject: &Subject) {
     let camera = scenes::camera(33, 30, 71);
     let model = scenes::cloud(SLOTS + 3, 3, &camera, 72);
-    let mut clean = make(&model);
+    let mut clean = make(subject, &model);
     assert!(audit(&mut *clean).is_empty());
     for value in POISON {
         let mut poisoned = model.clone();
@@ -77,7 +57,7 @@ pub(crate) fn every_number_that_is_none_is_found(make: Make<'_>) {
                 Unsound { row: slot as u32, attribute, kept: Kept::Parameter }
             })
             .collect();
-        assert_eq!(audit(&mut *make(&poisoned)), expected, "{value}");
+        assert_eq!(audit(&mut *make(subject, &poisoned)), expected, "{value}");
     }
     let names = clean.state();
     let names = names.iter().map(|array| &array.name);
@@ -105,16 +85,16 @@ pub(crate) fn every_number_that_is_none_is_found(make: Make<'_>) {
 
 /// A poisoned parameter stays so in training, the other rows train as if there were no such row, and
 /// the model is sound when it is gone.
-pub(crate) fn the_others_train_as_if_it_were_not_there(make: Make<'_>) {
+fn the_others_train_as_if_it_were_not_there_on(subject: &Subject) {
     let camera = scenes::camera(33, 30, 73);
     let model = scenes::cloud(24, 3, &camera, 74);
-    let mut without = make(&remove(&model, POISONED));
+    let mut without = make(subject, &remove(&model, POISONED));
     train(&mut *without, &camera, 3);
     let without = without.download().expect("a model");
     for (slot, attribute) in CLASSES {
         let mut poisoned = model.clone();
         *slot_of(&mut poisoned, POISONED, slot) = f32::NAN;
-        let mut backend = make(&poisoned);
+        let mut backend = make(subject, &poisoned);
         train(&mut *backend, &camera, 3);
         let expected = Unsound { row: POISONED as u32, attribute, kept: Kept::Parameter };
         assert_eq!(audit(&mut *backend), [expected]);
@@ -131,11 +111,11 @@ pub(crate) fn the_others_train_as_if_it_were_not_there(make: Make<'_>) {
 
 /// A gradient that is none shows in a moment, and after the next step in its parameter: nothing that
 /// brings parameters back to where they are safe makes a number of it.
-pub(crate) fn a_poisoned_moment_poisons_its_parameter(make: Make<'_>) {
+fn a_poisoned_moment_poisons_its_parameter_on(subject: &Subject) {
     let camera = scenes::camera(33, 30, 75);
     let model = scenes::cloud(24, 3, &camera, 76);
     for (slot, attribute) in CLASSES {
-        let mut backend = make(&model);
+        let mut backend = make(subject, &model);
         let names = backend.state();
         // Classes may share an array or not; the numbers of a row have the same order everywhere.
         let mut place = slot;
@@ -162,16 +142,16 @@ pub(crate) fn a_poisoned_moment_poisons_its_parameter(make: Make<'_>) {
 }
 
 #[test]
-fn the_native_backend_finds_every_number_that_is_none() {
-    every_number_that_is_none_is_found(&native);
+fn every_number_that_is_none_is_found() {
+    on_each(repeatable(), every_number_that_is_none_is_found_on);
 }
 
 #[test]
-fn on_the_native_backend_the_others_train_as_if_it_were_not_there() {
-    the_others_train_as_if_it_were_not_there(&native);
+fn the_others_train_as_if_it_were_not_there() {
+    on_each(repeatable(), the_others_train_as_if_it_were_not_there_on);
 }
 
 #[test]
-fn on_the_native_backend_a_poisoned_moment_poisons_its_parameter() {
-    a_poisoned_moment_poisons_its_parameter(&native);
+fn a_poisoned_moment_poisons_its_parameter() {
+    on_each(repeatable(), a_poisoned_moment_poisons_its_parameter_on);
 }

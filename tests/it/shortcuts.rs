@@ -2,18 +2,14 @@
 //! limits, forward and backward.
 
 use densify::backend::Shortcuts;
-use densify::backend::cpu::CpuBackend;
-use densify::backend::gpu::{GpuBackend, GpuOptions};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 
-use crate::gpu::subjects;
-use crate::subject::{self, Resources};
+use crate::subject::{GREY, all, make_with};
 use densify::verify::compare::{Limits, Table, class, compare_images, relative_error};
 use densify::verify::reference::{CLASSES, Image, Model, Rules, View, blend, project};
-use densify::verify::scenes;
+use densify::verify::{Setup, scenes};
 
-const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 /// Gradients, as elsewhere, against the largest of their class.
 const GRADIENT: f64 = 1e-4;
 
@@ -25,12 +21,6 @@ fn scene() -> (Gaussians, Camera) {
         *logit += 1.5;
     }
     (model, camera)
-}
-
-fn native(model: &Gaussians, shortcuts: Shortcuts) -> CpuBackend {
-    let mut options = subject::options(model.len(), Resources::default());
-    options.shortcuts = shortcuts;
-    CpuBackend::new(model, &options).expect("a small model fits")
 }
 
 /// What the reference renders with these rules, and what it differentiates.
@@ -67,18 +57,11 @@ fn other_limits_of_blending_are_those_of_forward_and_backward_pass() {
         let is_standard = shortcuts == Shortcuts::default();
         assert_eq!(image.rgb == standard.rgb, is_standard, "the limits do nothing here");
         let upstream = scenes::narrowed(&upstream);
-        let mut found = vec![(
-            "native".to_owned(),
-            native(&model, shortcuts).differentiate(&camera, GREY, 1, &upstream),
-        )];
-        for device in subjects() {
-            let options = GpuOptions { shortcuts, ..GpuOptions::new(model.len()) };
-            let mut backend = GpuBackend::new(&model, &options, device).expect("it fits");
+        for subject in all() {
+            let mut backend = make_with(&subject, &model, Setup { shortcuts, ..Setup::default() });
             let outcome = backend.differentiate(&camera, GREY, 1, &upstream);
-            found.push((device.adapter().name.clone(), outcome));
-        }
-        for (name, outcome) in found {
             let (rendering, measured) = outcome.expect("a small image is rendered");
+            let name = subject.name();
             let case = format!("{name}, {alpha_min:.4}, {transmittance_min:e}");
             // A decision that is taken otherwise may be worth the faintest splat.
             let step = 1.5 * f64::from(alpha_min.max(transmittance_min).max(1.0 / 255.0));

@@ -1,24 +1,28 @@
 //! The signals that training accumulates, against the reference's loss gradient.
 
-use densify::backend::cpu::CpuBackend;
-use densify::backend::{Backend, LearningRates, StepInput};
+use densify::backend::{LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::policy::{Cadence, Needs, Signal, SignalKind, SignalSet};
+use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet};
 use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::subject::{self, Resources};
+use crate::subject::{all, make_with, repeatable, step_input};
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::reference::loss::loss;
 use densify::verify::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
-use densify::verify::scenes;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
 
 /// A quarter of the loss's gradient jumps with the sign of render − target, and a few pixels are
 /// near a step, so this is the tolerance of gradients, doubled.
 const TOLERANCE: f64 = 2e-4;
+/// The tolerance of a backend: a GPU's functions are less accurate.
+fn tolerance(subject: &Subject) -> f64 {
+    if matches!(subject, Subject::Gpu(_)) { 5.0 * TOLERANCE } else { TOLERANCE }
+}
+
 /// The share of its pixels that a row may gain or lose at the step of alpha.
 const FLIPPED: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
@@ -95,29 +99,27 @@ fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64
 }
 
 /// Runs one step per view and takes the signals.
-fn collect(views: &Views, wanted: &[Signal]) -> (CpuBackend, Vec<Vec<f32>>) {
-    collect_from(views, wanted, 0.0)
+fn collect(
+    subject: &Subject,
+    views: &Views,
+    wanted: &[Signal],
+) -> (Box<dyn Differentiable>, Vec<Vec<f32>>) {
+    collect_from(subject, views, wanted, 0.0)
 }
 
 /// The same, where views count in full from this depth on.
-fn collect_from(views: &Views, wanted: &[Signal], full_depth: f32) -> (CpuBackend, Vec<Vec<f32>>) {
+fn collect_from(
+    subject: &Subject,
+    views: &Views,
+    wanted: &[Signal],
+    full_depth: f32,
+) -> (Box<dyn Differentiable>, Vec<Vec<f32>>) {
     let needs = Needs { signals: wanted.iter().copied().collect(), full_depth, ..Needs::default() };
-    let mut options = subject::options(views.model.len(), Resources::default());
-    options.needs = needs.clone();
-    let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
+    let setup = Setup { needs: needs.clone(), ..Setup::default() };
+    let mut backend = make_with(subject, &views.model, setup);
     for (v, (camera, target)) in views.cameras.iter().zip(&views.targets).enumerate() {
-        let input = StepInput {
-            step: v as u32 + 1,
-            view: 0,
-            camera,
-            target,
-            background: BACKGROUND,
-            sh_degree: 2,
-            rates: STILL,
-            cadence: Cadence::default(),
-            seed: 1,
-            ssim_weight: 1.0,
-        };
+        let step = step_input(v as u32 + 1, camera, target, 2);
+        let input = StepInput { background: BACKGROUND, rates: STILL, ..step };
         backend.train_step(&input).expect("a small image is rendered");
     }
     let signals = backend.take_signals(needs.signals).expect("signals can be taken");
@@ -145,25 +147,27 @@ fn every_signal_whatever_else_is_asked_for() {
         }
     }
 
-    let mut table = Table::new("signals");
-    for request in requests {
-        let (_, columns) = collect(&views, &request);
-        for (&signal, column) in request.iter().zip(columns) {
-            let mut expected = vec![0.0; views.model.len()];
-            for (gradient, camera) in gradients.iter().zip(&views.cameras) {
-                let parts = contribution(signal, gradient, camera);
-                for (sum, part) in expected.iter_mut().zip(parts) {
-                    let is_maximum = signal.kind() == SignalKind::EpochMaximum;
-                    *sum = if is_maximum { part.max(*sum) } else { *sum + part };
+    for subject in all() {
+        let mut table = Table::new(&format!("signals, {}", subject.name()));
+        for request in &requests {
+            let (_, columns) = collect(&subject, &views, request);
+            for (&signal, column) in request.iter().zip(columns) {
+                let mut expected = vec![0.0; views.model.len()];
+                for (gradient, camera) in gradients.iter().zip(&views.cameras) {
+                    let parts = contribution(signal, gradient, camera);
+                    for (sum, part) in expected.iter_mut().zip(parts) {
+                        let is_maximum = signal.kind() == SignalKind::EpochMaximum;
+                        *sum = if is_maximum { part.max(*sum) } else { *sum + part };
+                    }
                 }
+                let what = format!("{} signals", request.len());
+                let error = relative_error(&column, &expected);
+                let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
+                table.check(&what, &format!("{signal:?}"), error, tolerance(&subject) + flips);
             }
-            let what = format!("{} signals", request.len());
-            let error = relative_error(&column, &expected);
-            let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
-            table.check(&what, &format!("{signal:?}"), error, TOLERANCE + flips);
         }
+        table.finish();
     }
-    table.finish();
 }
 
 /// Gradients on screen and by colour; nothing else.
@@ -183,37 +187,43 @@ fn near_views_weigh_less_where_asked_for() {
     let others = [Signal::VisibleCount, Signal::MeanGradientNorm, Signal::WeightSum];
     let wanted = [weighed, others].concat();
 
-    let mut table = Table::new("signals of near views");
-    let (_, columns) = collect_from(&views, &wanted, full_depth);
-    for (signal, column) in wanted.into_iter().zip(columns) {
-        let mut expected = vec![0.0; rows.len()];
-        for (gradient, camera) in gradients.iter().zip(&views.cameras) {
-            let parts = contribution(signal, gradient, camera);
-            for (row, part) in parts.into_iter().enumerate() {
-                let near = (depth(camera, row) / f64::from(full_depth)).min(1.0);
-                expected[row] += if weighed.contains(&signal) { near * near * part } else { part };
+    for subject in all() {
+        let mut table = Table::new(&format!("signals of near views, {}", subject.name()));
+        let (_, columns) = collect_from(&subject, &views, &wanted, full_depth);
+        for (&signal, column) in wanted.iter().zip(columns) {
+            let mut expected = vec![0.0; rows.len()];
+            for (gradient, camera) in gradients.iter().zip(&views.cameras) {
+                let parts = contribution(signal, gradient, camera);
+                for (row, part) in parts.into_iter().enumerate() {
+                    let near = (depth(camera, row) / f64::from(full_depth)).min(1.0);
+                    let share = if weighed.contains(&signal) { near * near } else { 1.0 };
+                    expected[row] += share * part;
+                }
             }
+            let error = relative_error(&column, &expected);
+            table.check("near", &format!("{signal:?}"), error, tolerance(&subject));
         }
-        let error = relative_error(&column, &expected);
-        table.check("from the median depth on", &format!("{signal:?}"), error, TOLERANCE);
+        table.finish();
     }
-    table.finish();
 }
 
 #[test]
 fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let views = views();
-    let (mut backend, columns) = collect(&views, &[Signal::WeightMax]);
-    let needs = Needs { signals: SignalSet::from([Signal::WeightMax]), ..Needs::default() };
-    let now = |backend: &mut CpuBackend| {
-        let signals = backend.take_signals(needs.signals).expect("signals can be taken");
-        signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
-    };
-    assert!(columns[0].iter().any(|&w| w > 0.1));
-    backend.begin_epoch();
-    assert!(now(&mut backend) == columns[0], "the previous epoch counts");
-    backend.begin_epoch();
-    assert!(now(&mut backend).iter().all(|&w| w.to_bits() == 0), "the one before does not");
+    for subject in all() {
+        let (mut backend, columns) = collect(&subject, &views, &[Signal::WeightMax]);
+        let mut now = |begins_epoch: bool| {
+            if begins_epoch {
+                backend.begin_epoch();
+            }
+            let signals = backend.take_signals(SignalSet::from([Signal::WeightMax]));
+            let signals = signals.expect("signals can be taken");
+            signals.get(Signal::WeightMax).expect("a requested signal").to_vec()
+        };
+        assert!(columns[0].iter().any(|&w| w > 0.1));
+        assert!(now(true) == columns[0], "the previous epoch counts");
+        assert!(now(true).iter().all(|&w| w.to_bits() == 0), "the one before does not");
+    }
 }
 
 /// Signals lie where a step sums gradients: whether they are given back or not, and however many they
@@ -225,25 +235,14 @@ fn what_is_lent_for_signals_changes_nothing() {
     let present = declared.with(Signal::Age).with(Signal::ScaleMax);
     // More columns than a step has sums.
     let many = SignalSet::from(Signal::ALL);
-    let run = |read: Option<SignalSet>, gives_back: bool| {
-        let mut options = subject::options(views.model.len(), Resources::default());
-        options.needs = Needs { signals: declared, ..Needs::default() };
-        let mut backend = CpuBackend::new(&views.model, &options).expect("a small model fits");
+    let run = |subject: &Subject, read: Option<SignalSet>, gives_back: bool| {
+        let needs = Needs { signals: declared, ..Needs::default() };
+        let setup = Setup { needs, ..Setup::default() };
+        let mut backend = make_with(subject, &views.model, setup);
         let mut image = None;
         for step in 1..=4 {
             let (camera, target) = (&views.cameras[0], &views.targets[0]);
-            let input = StepInput {
-                step,
-                view: 0,
-                camera,
-                target,
-                background: BACKGROUND,
-                sh_degree: 2,
-                rates: subject::RATES,
-                cadence: Cadence::default(),
-                seed: 1,
-                ssim_weight: 1.0,
-            };
+            let input = StepInput { background: BACKGROUND, ..step_input(step, camera, target, 2) };
             backend.train_step(&input).expect("a small image is rendered");
             let taken = read.map(|wanted| backend.take_signals(wanted).expect("signals"));
             image = Some(backend.render(camera, BACKGROUND, 2).expect("a small image"));
@@ -256,11 +255,14 @@ fn what_is_lent_for_signals_changes_nothing() {
         let columns = [of(Signal::ScreenGradient), of(Signal::WeightMax)];
         (backend.download().expect("a model"), image.expect("four").rgb, columns)
     };
-    let expected = run(None, false);
-    assert!(expected.2.iter().all(|column| column.iter().any(|&x| x > 0.0)));
-    for wanted in [declared, present, many] {
-        for gives_back in [false, true] {
-            assert!(run(Some(wanted), gives_back) == expected, "{wanted:?}, {gives_back}");
+    for subject in repeatable() {
+        let expected = run(&subject, None, false);
+        assert!(expected.2.iter().all(|column| column.iter().any(|&x| x > 0.0)));
+        for wanted in [declared, present, many] {
+            for gives_back in [false, true] {
+                let found = run(&subject, Some(wanted), gives_back);
+                assert!(found == expected, "{}: {wanted:?}, {gives_back}", subject.name());
+            }
         }
     }
 }

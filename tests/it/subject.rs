@@ -1,66 +1,180 @@
-//! The backend under test, behind one door: tests name what they vary, and nothing else.
+//! The backends under test: the native one with every instruction set of the machine, and every adapter in
+//! every way that it adds up gradients.
+//!
+//! Where there is no adapter, not even a software driver, this is said and only the native backend is
+//! tested, unless `DENSIFY_REQUIRE_GPU` is set. `VK_DRIVER_FILES` chooses drivers, several if need be.
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, ModelGradient};
-use densify::backend::{Rendering, StepOutput};
+use std::sync::OnceLock;
+
+use densify::backend::cpu::{CpuBackend, CpuOptions, InstructionSet};
+use densify::backend::gpu::{
+    Accumulation, AdapterChoice, AdapterSummary, GpuBackend, GpuDevice, GpuOptions, adapters,
+};
+use densify::backend::{Rendering, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
+use densify::verify::{Differentiable, Setup, Subject};
+use densify_policies::policy::Cadence;
+use proptest::prelude::ProptestConfig;
 
 pub(crate) use densify::verify::compare::class;
-use densify::verify::reference::Upstream;
-use densify::verify::scenes;
 pub(crate) use densify::verify::values::RATES;
 
-/// What must not change the outcome.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Resources {
-    /// Most (row, tile) entries at a time; `None` is the default.
-    pub(crate) tile_cap: Option<usize>,
-    /// Most gradient records at a time; `None` is the default.
-    pub(crate) record_cap: Option<usize>,
-    /// Worker threads; `None` takes all cores.
-    pub(crate) threads: Option<usize>,
+/// The background of most tests.
+pub(crate) const GREY: [f32; 3] = [0.3, 0.4, 0.6];
+
+/// The native backend with every instruction set of this machine.
+pub(crate) fn natives() -> Vec<Subject> {
+    let all = InstructionSet::available().into_iter();
+    all.map(|instructions| Subject::Native { instructions, threads: None }).collect()
 }
 
-pub(crate) fn options(rows: usize, resources: Resources) -> CpuOptions {
-    let mut options = CpuOptions::new(rows.max(1));
-    options.near = 0.01;
-    options.threads = resources.threads;
-    if let Some(cap) = resources.tile_cap {
-        options.tile_cap = cap;
+/// The adapters, opened once, with sums in slots.
+pub(crate) fn devices() -> &'static [GpuDevice] {
+    static DEVICES: OnceLock<Vec<GpuDevice>> = OnceLock::new();
+    DEVICES.get_or_init(|| usable().iter().filter_map(|a| open(a, Accumulation::Slots)).collect())
+}
+
+/// The adapters with sums in any order, in each way that they have; ways that they lack are said.
+pub(crate) fn atomics() -> &'static [GpuDevice] {
+    static DEVICES: OnceLock<Vec<GpuDevice>> = OnceLock::new();
+    DEVICES.get_or_init(|| {
+        let ways = [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics];
+        let all = usable();
+        all.iter().flat_map(|a| ways.into_iter().filter_map(|way| open(a, way))).collect()
+    })
+}
+
+/// The adapters in every way that they add up gradients.
+pub(crate) fn ways() -> impl Iterator<Item = &'static GpuDevice> {
+    devices().iter().chain(atomics())
+}
+
+/// The backends whose runs give the same bits twice.
+pub(crate) fn repeatable() -> Vec<Subject> {
+    let mut all = natives();
+    all.extend(devices().iter().cloned().map(Subject::Gpu));
+    all
+}
+
+/// All backends.
+pub(crate) fn all() -> Vec<Subject> {
+    let mut all = repeatable();
+    all.extend(atomics().iter().cloned().map(Subject::Gpu));
+    all
+}
+
+/// All backends but the native one as it is by default, with which they are compared.
+pub(crate) fn others() -> Vec<Subject> {
+    let is_default =
+        |s: &Subject| matches!(s, Subject::Native { instructions: InstructionSet::Best, .. });
+    all().into_iter().filter(|subject| !is_default(subject)).collect()
+}
+
+#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
+fn usable() -> Vec<AdapterSummary> {
+    let mut usable: Vec<_> = adapters().into_iter().filter(|a| a.missing.is_empty()).collect();
+    // Fast ones first: SwiftShader is slow.
+    usable.sort_by_key(|adapter| adapter.name.contains("SwiftShader"));
+    if usable.is_empty() {
+        let needed = std::env::var_os("DENSIFY_REQUIRE_GPU").is_some();
+        assert!(!needed, "DENSIFY_REQUIRE_GPU is set, but there is no usable adapter");
+        eprintln!("skipped: there is no usable GPU adapter, not even a software driver");
     }
-    if let Some(cap) = resources.record_cap {
-        options.record_cap = cap;
+    usable
+}
+
+/// Opens an adapter. What it does not have is refused, and skipped; llvmpipe has everything.
+#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
+fn open(adapter: &AdapterSummary, accumulation: Accumulation) -> Option<GpuDevice> {
+    let name = Some(adapter.name.clone());
+    let opened = GpuDevice::open(&AdapterChoice { name, accumulation: Some(accumulation) });
+    if adapter.accumulations.contains(&accumulation) {
+        let device = opened.expect("a usable adapter opens");
+        assert_eq!(device.accumulation(), accumulation);
+        return Some(device);
     }
-    options
+    let refusal = opened.expect_err("it lacks what is asked for");
+    assert!(!adapter.name.contains("llvmpipe"), "{refusal}");
+    eprintln!("skipped: {refusal}");
+    None
 }
 
-pub(crate) fn backend(model: &Gaussians, resources: Resources) -> CpuBackend {
-    CpuBackend::new(model, &options(model.len(), resources)).expect("a small model fits")
+/// Calls a check with each of the backends, and says which is next, which shows where a check fails.
+#[expect(clippy::print_stderr, reason = "shown only where a test fails")]
+pub(crate) fn on_each(subjects: Vec<Subject>, mut check: impl FnMut(&Subject)) {
+    for subject in subjects {
+        eprintln!("on {}:", subject.name());
+        check(&subject);
+    }
 }
 
-/// Renders a view and differentiates Σ image · upstream.
-pub(crate) fn differentiate(
-    backend: &mut CpuBackend,
-    camera: &Camera,
-    background: [f32; 3],
+/// A backend for a model.
+pub(crate) fn make(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
+    make_with(subject, model, Setup::default())
+}
+
+/// A backend with room for more, or that collects something.
+pub(crate) fn make_with(
+    subject: &Subject,
+    model: &Gaussians,
+    setup: Setup,
+) -> Box<dyn Differentiable> {
+    subject.with(model, setup).expect("a small model fits")
+}
+
+/// The native backend as it is by default.
+pub(crate) fn native(model: &Gaussians) -> CpuBackend {
+    CpuBackend::new(model, &CpuOptions::new(model.len().max(1))).expect("a small model fits")
+}
+
+/// A GPU backend, for tests of what only it has.
+pub(crate) fn gpu(
+    device: &GpuDevice,
+    model: &Gaussians,
+    change: impl FnOnce(&mut GpuOptions),
+) -> GpuBackend {
+    let mut options = GpuOptions::new(model.len().max(1));
+    change(&mut options);
+    GpuBackend::new(model, &options, device).expect("a small model fits")
+}
+
+/// How proptest is set up: as many cases as `PROPTEST_CASES` says, or so many.
+pub(crate) fn cases(default: u32) -> ProptestConfig {
+    let base = ProptestConfig { failure_persistence: None, ..ProptestConfig::default() };
+    let is_set = std::env::var_os("PROPTEST_CASES").is_some();
+    ProptestConfig { cases: if is_set { base.cases } else { default }, ..base }
+}
+
+/// A training step towards an image, at the degree of the model.
+pub(crate) fn step_input<'a>(
+    step: u32,
+    camera: &'a Camera,
+    target: &'a Image8,
     sh_degree: u8,
-    upstream: &Upstream,
-) -> (Rendering, ModelGradient) {
-    let outcome = backend.differentiate(camera, background, sh_degree, &scenes::narrowed(upstream));
-    outcome.expect("a small image is rendered")
+) -> StepInput<'a> {
+    StepInput {
+        step,
+        view: 0,
+        camera,
+        target,
+        background: GREY,
+        sh_degree,
+        rates: RATES,
+        cadence: Cadence::default(),
+        seed: 1,
+        ssim_weight: 1.0,
+    }
 }
 
-/// The training loss of an image of the target's size, and its gradient.
-pub(crate) fn loss(
-    rendered: &[f32],
-    target: &Image8,
-    background: [f32; 3],
-) -> (StepOutput, Vec<f32>) {
-    let empty = Gaussians::default();
-    backend(&empty, Resources::default()).loss(
-        &scenes::opaque(rendered, target),
-        target,
-        background,
-    )
+/// The bits of an image.
+pub(crate) fn bits(image: &Rendering) -> Vec<u32> {
+    let all = image.rgb.iter().chain(&image.alpha).chain(&image.depth);
+    all.map(|v| v.to_bits()).collect()
+}
+
+/// Numbers in `f64`.
+pub(crate) fn wide(values: &[f32]) -> Vec<f64> {
+    values.iter().copied().map(f64::from).collect()
 }

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::{Outcome, densify, files, model, read, scratch, text};
-use crate::gpu::{subjects, ways};
 use crate::photographs::Photographs;
+use crate::subject::{devices, ways};
 
 const ITERATIONS: u32 = 8;
 
@@ -65,7 +65,7 @@ fn a_run_adds_up_as_it_is_told_and_keeps_to_it() {
 #[test]
 fn what_is_deterministic_repeats_on_every_device() {
     let scene = Photographs::colmap_text();
-    for device in subjects() {
+    for device in devices() {
         let (root, first) = scratch();
         let second = root.path().join("second");
         let flags = ["--gpu", &device.adapter().name, "--deterministic"];
@@ -93,7 +93,7 @@ fn contradictions_and_what_a_device_lacks_are_refused_by_name() {
             .refused(way, &[&given[7..], "native backend", "accumulation=auto", "--backend gpu"]);
     }
     try_with("--knob accumulation=fast").refused("no such way", &["auto|slots|cas|atomics"]);
-    for device in subjects() {
+    for device in devices() {
         let adapter = device.adapter();
         for (way, feature) in [("cas", "SUBGROUP"), ("atomics", "SHADER_FLOAT32_ATOMIC")] {
             if adapter.accumulations.iter().all(|there| there.name() != way) {
@@ -123,7 +123,7 @@ fn devices_say_how_they_add_up() {
     let listed = densify(&["devices"]).ok().stdout;
     let lines = listed.lines().filter_map(|line| line.strip_prefix("  accumulation    "));
     let found: Vec<&str> = lines.collect();
-    for device in subjects() {
+    for device in devices() {
         let adapter = device.adapter();
         let place = listed.lines().filter(|line| !line.starts_with(' '));
         let place = place.take_while(|line| *line != adapter.name).count();

@@ -135,7 +135,7 @@ fn a_row_takes_no_more_than_480_bytes_in_tiny_memory() {
 fn on_a_gpu_it_bounds_what_is_on_the_device() {
     let scene = Photographs::colmap_text();
     let mut rows: Vec<(&str, u64)> = Vec::new();
-    for device in crate::gpu::ways() {
+    for device in crate::subject::ways() {
         let (root, run) = scratch();
         let name = &device.adapter().name;
         let knob = format!("accumulation={}", device.accumulation());
@@ -308,7 +308,7 @@ fn a_system_that_grants_too_little_is_named_and_nothing_is_written() {
 #[cfg(target_os = "linux")]
 fn a_device_that_runs_out_of_memory_is_named_and_nothing_is_written() {
     let is_llvmpipe = |name: &&str| name.contains("llvmpipe");
-    let mut names = crate::gpu::subjects().iter().map(|device| &device.adapter().name[..]);
+    let mut names = crate::subject::devices().iter().map(|device| &device.adapter().name[..]);
     let Some(name) = names.find(is_llvmpipe) else { return };
     let flags = format!("--budget 1500k --tile-cap 100k --gpu '{name}'");
     let mut refused = 0;

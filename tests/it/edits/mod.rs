@@ -10,21 +10,19 @@
 mod calls;
 mod plain;
 
-use std::sync::OnceLock;
-
-use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::{Backend, StepInput};
+use densify::backend::Backend;
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::{EditPlan, OpacityRule, RowOps, ScaleRule, Seed, Update};
-use densify_policies::policy::{Cadence, Needs, Signal, SignalSet};
+use densify_policies::policy::{Needs, Signal, SignalSet};
 use densify_policies::rng::PolicyRng;
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
 
-use crate::subject::RATES;
+use crate::subject::{cases, make, make_with, repeatable, step_input};
 use calls::{Call, call, enter};
-use densify::verify::scenes;
 use plain::{Row, execute};
 
 const ROWS: usize = 37;
@@ -51,41 +49,29 @@ fn needs() -> Needs {
     Needs { signals, ..Needs::default() }
 }
 
-fn step(backend: &mut CpuBackend, camera: &Camera, step: u32) -> usize {
-    let input = StepInput {
-        step,
-        view: 0,
-        camera,
-        target: &scenes::target(camera),
-        background: [0.2; 3],
-        sh_degree: 1,
-        rates: RATES,
-        cadence: Cadence::default(),
-        seed: 1,
-        ssim_weight: 1.0,
-    };
+fn step(backend: &mut dyn Backend, camera: &Camera, step: u32) -> usize {
+    let target = scenes::target(camera);
+    let input = step_input(step, camera, &target, 1);
     backend.train_step(&input).expect("a small image is rendered").visible
 }
 
 /// A backend with a past: moments, signals, and rows of different ages.
-fn trained(budget: usize) -> CpuBackend {
+fn trained(subject: &Subject, budget: usize) -> Box<dyn Differentiable> {
     let model = scenes::cloud(ROWS, 1, &view(), 72);
-    let mut options = CpuOptions::new(budget);
-    options.threads = Some(1);
-    options.needs = needs();
-    let mut backend = CpuBackend::new(&model, &options).expect("a small model fits");
-    step(&mut backend, &view(), 1);
-    step(&mut backend, &view(), 2);
+    let setup = Setup { budget, needs: needs(), ..Setup::default() };
+    let mut backend = make_with(subject, &model, setup);
+    step(&mut *backend, &view(), 1);
+    step(&mut *backend, &view(), 2);
     let mut plan = EditPlan::new(ROWS, budget);
     for row in (0..ROWS as u32).step_by(3) {
         plan.update(row, SAME).expect("the row is free");
     }
     backend.apply(&plan.compile(), SEED, 2).expect("a plan is applied");
-    step(&mut backend, &view(), 3);
+    step(&mut *backend, &view(), 3);
     backend
 }
 
-fn rows(backend: &mut CpuBackend) -> Vec<Row> {
+fn rows(backend: &mut dyn Backend) -> Vec<Row> {
     let model = backend.download().expect("a model");
     let signals = backend.take_signals(needs().signals).expect("signals are there");
     let of = |signal, row: usize| signals.get(signal).expect("it was asked for")[row];
@@ -102,15 +88,12 @@ fn rows(backend: &mut CpuBackend) -> Vec<Row> {
     (0..model.len()).map(row).collect()
 }
 
-/// The twin before and after a step that sees nothing.
-fn twin() -> &'static [Vec<Row>; 2] {
-    static TWIN: OnceLock<[Vec<Row>; 2]> = OnceLock::new();
-    TWIN.get_or_init(|| {
-        let mut backend = trained(ROWS);
-        let before = rows(&mut backend);
-        assert_eq!(step(&mut backend, &away(), 4), 0, "the camera sees something");
-        [before, rows(&mut backend)]
-    })
+/// What is not edited, before and after a step that sees nothing.
+fn twin(subject: &Subject) -> [Vec<Row>; 2] {
+    let mut backend = trained(subject, ROWS);
+    let before = rows(&mut *backend);
+    assert_eq!(step(&mut *backend, &away(), 4), 0, "the camera sees something");
+    [before, rows(&mut *backend)]
 }
 
 // --- The comparison -----------------------------------------------------------------------------
@@ -136,8 +119,8 @@ fn check_rows(found: &[Row], expected: &[Row]) {
 
 /// Fails unless a step that sees nothing moves each row as it moves the row of the twin that has
 /// the same moments and age, and no other row at all.
-fn check_movement(before: &[Row], after: &[Row], expected: &[Row]) {
-    let [twin_before, twin_after] = twin();
+fn check_movement(twin: &[Vec<Row>; 2], before: &[Row], after: &[Row], expected: &[Row]) {
+    let [twin_before, twin_after] = twin;
     for (i, expected) in expected.iter().enumerate() {
         let (from, to) = (&before[i], &after[i]);
         assert_eq!(to.signals[2], from.signals[2] + 1.0, "age of row {i}");
@@ -158,38 +141,41 @@ fn check_movement(before: &[Row], after: &[Row], expected: &[Row]) {
     }
 }
 
-proptest! {
-    #![proptest_config(ProptestConfig { cases: 96, failure_persistence: None, ..Default::default() })]
+fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[Vec<Call>]) {
+    let budget = ROWS + spare;
+    let mut backend = trained(subject, budget);
+    let mut expected = rows(&mut *backend);
+    for (event, calls) in (4..).zip(plans) {
+        let mut plan = EditPlan::new(backend.rows(), budget);
+        let taken: Vec<Call> =
+            calls.iter().filter(|call| enter(&mut plan, call)).cloned().collect();
+        backend.apply(&plan.compile(), SEED, event).expect("a plan is applied");
+        assert!(backend.rows() <= backend.budget());
+        expected = execute(expected, &taken, budget, &PolicyRng::new(SEED, event));
+        check_rows(&rows(&mut *backend), &expected);
+    }
+    let before = rows(&mut *backend);
+    assert_eq!(step(&mut *backend, &away(), 9), 0);
+    check_movement(twin, &before, &rows(&mut *backend), &expected);
+}
 
-    #[test]
-    fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector(
-        spare in 0..14_usize,
-        plans in prop::collection::vec(prop::collection::vec(call(), 0..40), 1..4),
-    ) {
-        let budget = ROWS + spare;
-        let mut backend = trained(budget);
-        let mut expected = rows(&mut backend);
-        for (number, calls) in plans.iter().enumerate() {
-            let event = 4 + number as u32;
-            let mut plan = EditPlan::new(backend.rows(), budget);
-            let taken: Vec<Call> =
-                calls.iter().filter(|call| enter(&mut plan, call)).cloned().collect();
-            let ops = plan.compile();
-            backend.apply(&ops, SEED, event).expect("a plan is applied");
-            prop_assert!(backend.rows() <= backend.budget());
-            expected = execute(expected, &taken, budget, &PolicyRng::new(SEED, event));
-            check_rows(&rows(&mut backend), &expected);
-        }
-        let before = rows(&mut backend);
-        prop_assert_eq!(step(&mut backend, &away(), 9), 0);
-        check_movement(&before, &rows(&mut backend), &expected);
+#[test]
+fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector() {
+    for subject in repeatable() {
+        let twin = twin(&subject);
+        let plans = prop::collection::vec(prop::collection::vec(call(), 0..40), 1..4);
+        let outcome = TestRunner::new(cases(32)).run(&(0..14_usize, plans), |(spare, plans)| {
+            check_plans(&subject, &twin, spare, &plans);
+            Ok(())
+        });
+        outcome.unwrap_or_else(|error| panic!("{}: {error}", subject.name()));
     }
 }
 
 // --- Plans that must not be applied -------------------------------------------------------------
 
 fn apply_corrupted(corrupt: impl FnOnce(&mut RowOps)) {
-    let mut backend = trained(ROWS + 2);
+    let mut backend = trained(&Subject::NATIVE, ROWS + 2);
     let mut plan = EditPlan::new(ROWS, ROWS + 2);
     plan.append(Seed { position: [0.0; 3], colour: [0.5; 3], scale: 0.1, opacity: 0.1 })
         .expect("there is room");
@@ -225,12 +211,15 @@ fn a_plan_that_writes_a_live_row_stops_the_run() {
 #[test]
 fn budget_one_row_is_kept() {
     let model = Gaussians { sh_degree: 1, ..scenes::cloud(1, 1, &view(), 73) };
-    let mut backend = CpuBackend::new(&model, &CpuOptions::new(1)).expect("one row fits");
-    let mut plan = EditPlan::new(1, 1);
-    let seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 0.1, opacity: 0.1 };
-    assert!(plan.append(seed).is_err());
-    plan.prune(0).expect("the row is free");
-    plan.append(seed).expect("its slot is free now");
-    backend.apply(&plan.compile(), SEED, 1).expect("a plan is applied");
-    assert_eq!((backend.rows(), backend.download().expect("a model").means[0]), (1, [0.0; 3]));
+    for subject in repeatable() {
+        let mut backend = make(&subject, &model);
+        let mut plan = EditPlan::new(1, 1);
+        let seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 0.1, opacity: 0.1 };
+        assert!(plan.append(seed).is_err());
+        plan.prune(0).expect("the row is free");
+        plan.append(seed).expect("its slot is free now");
+        backend.apply(&plan.compile(), SEED, 1).expect("a plan is applied");
+        let means = backend.download().expect("a model").means;
+        assert_eq!((backend.rows(), means[0]), (1, [0.0; 3]), "{}", subject.name());
+    }
 }

@@ -1,14 +1,11 @@
 //! Policies on scenes whose geometry is known exactly: small views of built-in scenes, short runs,
 //! fixed seeds.
 
-mod candidates;
 mod policies;
 
 use std::ops::ControlFlow;
 use std::path::Path;
 
-use densify::backend::Backend;
-use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::dataset::{Dataset, LoadOptions, Split, builtin};
 use densify::evaluate::evaluate;
 use densify::gaussians::Gaussians;
@@ -16,11 +13,14 @@ use densify::init::{initialise, restart};
 use densify::metrics::geometry::{self, Geometry, Ground};
 use densify::schedule::{Background, RateOptions};
 use densify::trainer::{OnNan, Savings, TrainOptions, Trainer, needs};
+use densify::verify::{Setup, Subject};
 use densify::views::DatasetViews;
-use densify_policies::policy::{Needs, SceneInfo};
+use densify_policies::policy::SceneInfo;
 use densify_policies::registry::find;
 use densify_scenegen::{Generated, GroundTruth, Options, PointOptions, Source, generate};
 use toml::Table;
+
+use crate::subject::make_with;
 
 /// A built-in scene, small, with its ground truth.
 pub(crate) struct Known {
@@ -39,9 +39,6 @@ pub(crate) struct Run<'a> {
     pub(crate) iterations: u32,
     pub(crate) seed: u64,
 }
-
-/// Makes a backend: model, budget, near plane, needs.
-pub(crate) type Make<'a> = &'a dyn Fn(&Gaussians, usize, f32, Needs) -> Box<dyn Backend>;
 
 /// What came of it.
 pub(crate) struct Outcome {
@@ -72,18 +69,15 @@ impl Known {
 
     /// Trains and measures on the native backend.
     pub(crate) fn train(&self, run: Run<'_>) -> Outcome {
-        self.train_on(run, &|model, budget, near, needs| {
-            let options = CpuOptions { near, needs, ..CpuOptions::new(budget) };
-            Box::new(CpuBackend::new(model, &options).expect("a small model fits"))
-        })
+        self.train_on(&Subject::NATIVE, run)
     }
 
-    /// Trains and measures on backends that `make` makes. The budget is held at every step.
+    /// Trains and measures on this backend. The budget is held at every step.
     #[expect(
         clippy::print_stderr,
         reason = "the numbers, where a test fails or is asked to show them"
     )]
-    pub(crate) fn train_on(&self, run: Run<'_>, make: Make<'_>) -> Outcome {
+    pub(crate) fn train_on(&self, subject: &Subject, run: Run<'_>) -> Outcome {
         let Self { dataset, truth, .. } = self;
         let entry = find(run.policy).expect("a policy");
         let (mut model, _) =
@@ -111,9 +105,12 @@ impl Known {
             on_nan: OnNan::Prune,
             savings: Savings::NONE,
         };
-        let near = (0.04 * dataset.extent()) as f32;
+        let near = Some((0.04 * dataset.extent()) as f32);
+        let make = |model: &Gaussians, budget, needs| {
+            make_with(subject, model, Setup { budget, near, needs, ..Setup::default() })
+        };
         let needs = needs(policy.as_ref(), &scene, options.sh_every);
-        let first = make(&model, run.budget, near, needs);
+        let first = make(&model, run.budget, needs);
         let views =
             |views: &[densify::dataset::View]| DatasetViews::new(views.to_vec(), 1 << 30, 1);
         let (train, test) = (views(&dataset.train), views(&dataset.test));
@@ -125,7 +122,7 @@ impl Known {
             assert!(report.rows <= run.budget, "{run:?}: {} rows", report.rows);
         }
         let model = trainer.model().expect("a model");
-        let mut last = make(&model, model.len().max(1), near, geometry::needs());
+        let mut last = make(&model, model.len().max(1), geometry::needs());
         let ground = Ground {
             truth,
             normalisation: &dataset.normalisation,

@@ -1,14 +1,12 @@
 //! Photographs that stay on the device.
 
-use densify::backend::gpu::{GpuBackend, GpuOptions, KeptPhotographs};
+use densify::backend::gpu::{GpuBackend, GpuDevice, KeptPhotographs};
 use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
-use densify_policies::policy::Cadence;
 
-use super::{options, subjects};
-use crate::subject::RATES;
+use crate::subject::{devices, gpu, step_input};
 use densify::verify::scenes;
 
 /// A view of this size, with a random image.
@@ -16,24 +14,15 @@ fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {
     (scenes::camera(size.0, size.1, 60), scenes::noisy(size, 0.0, seed).1)
 }
 
-fn options_for(model: &Gaussians, count: usize, with_masks: bool) -> GpuOptions {
-    let photographs = KeptPhotographs { count, with_masks };
-    GpuOptions { photographs, largest_image: (41, 30), ..options(model) }
+fn backend(device: &GpuDevice, model: &Gaussians, count: usize, with_masks: bool) -> GpuBackend {
+    gpu(device, model, |options| {
+        options.photographs = KeptPhotographs { count, with_masks };
+        options.largest_image = (41, 30);
+    })
 }
 
 fn step(backend: &mut GpuBackend, step: u32, view: usize, (camera, target): &(Camera, Image8)) {
-    let input = StepInput {
-        step,
-        view,
-        camera,
-        target,
-        background: [0.3, 0.4, 0.6],
-        sh_degree: 0,
-        rates: RATES,
-        ssim_weight: 1.0,
-        cadence: Cadence::default(),
-        seed: 3,
-    };
+    let input = StepInput { view, ..step_input(step, camera, target, 0) };
     backend.train_step(&input).expect("a small image is rendered");
 }
 
@@ -47,10 +36,9 @@ fn to_keep_photographs_changes_nothing_but_memory() {
     views[3].1.mask = Some(plane(7, (17, 5)));
     let coarse = [view((20, 13), 9), view((15, 15), 10), view((20, 15), 11), view((8, 2), 12)];
     let model = scenes::cloud(60, 0, &views[0].0, 8);
-    for device in subjects() {
+    for device in devices() {
         let run = |count, with_masks| {
-            let options = options_for(&model, count, with_masks);
-            let mut backend = GpuBackend::new(&model, &options, device).expect("it fits");
+            let mut backend = backend(device, &model, count, with_masks);
             for number in 0..12 {
                 let view = number * 7 % 4;
                 // As in a run that goes from coarse to fine.
@@ -81,10 +69,9 @@ fn what_is_kept_is_not_uploaded_again() {
     let (_, second) = view((41, 30), 2);
     let model = scenes::cloud(40, 0, &camera, 9);
     let (first, second) = ((camera, first), (camera, second));
-    for device in subjects() {
+    for device in devices() {
         let run = |count, order: [&(Camera, Image8); 3]| {
-            let options = options_for(&model, count, false);
-            let mut backend = GpuBackend::new(&model, &options, device).expect("it fits");
+            let mut backend = backend(device, &model, count, false);
             for (number, view) in (1..).zip(order) {
                 // The third step is of a view for which there is no room.
                 step(&mut backend, number, usize::from(number == 3), view);

@@ -1,18 +1,16 @@
-//! Tiles of so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
+//! Tiles with so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
 //! invocation after 65,535 rounds together, without a word. What comes then must be an error, not a model.
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient};
-use densify::backend::gpu::{Accumulation, GpuBackend, GpuDevice, GpuOptions};
-use densify::backend::{Backend, BackendError, Shortcuts};
+use densify::backend::cpu::ImageGradient;
+use densify::backend::gpu::{Accumulation, GpuDevice};
+use densify::backend::{BackendError, Shortcuts};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 
-use super::{name, options, ways};
-use crate::subject;
+use crate::subject::{GREY, class, make_with, ways};
 use densify::verify::compare::{Table, relative_error};
-use densify::verify::scenes;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
 
-const GREY: [f32; 3] = [0.3, 0.4, 0.6];
 /// Rows one behind the other, each of which all pixels of one tile take; what is behind all is still seen.
 fn pile(rows: usize, camera: &Camera) -> Gaussians {
     let mut model = Gaussians::default();
@@ -26,18 +24,18 @@ fn pile(rows: usize, camera: &Camera) -> Gaussians {
     model
 }
 
-fn faint() -> Shortcuts {
-    Shortcuts { alpha_min: 1e-6, ..Shortcuts::default() }
+fn name(device: &GpuDevice) -> String {
+    format!("{}, {}", device.adapter().name, device.accumulation())
 }
 
-fn backend(model: &Gaussians, device: &GpuDevice) -> GpuBackend {
-    let options = GpuOptions { shortcuts: faint(), ..options(model) };
-    GpuBackend::new(model, &options, device).expect("a small model fits")
+/// A backend that blends faint rows too.
+fn faint(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
+    let shortcuts = Shortcuts { alpha_min: 1e-6, ..Shortcuts::default() };
+    make_with(subject, model, Setup { shortcuts, ..Setup::default() })
 }
 
-fn native(model: &Gaussians) -> CpuBackend {
-    let options = CpuOptions { shortcuts: faint(), ..CpuOptions::new(model.len()) };
-    CpuBackend::new(model, &options).expect("a small model fits")
+fn backend(model: &Gaussians, device: &GpuDevice) -> Box<dyn Differentiable> {
+    faint(&Subject::Gpu(device.clone()), model)
 }
 
 /// Holds that a driver that breaks off is found out, and that llvmpipe, which does, is.
@@ -59,7 +57,7 @@ fn is_broken_off<T>(result: &Result<T, BackendError>, device: &GpuDevice, more: 
 fn a_list_too_long_to_be_drawn_is_an_error() {
     let camera = scenes::camera(16, 16, 71);
     let model = pile(300_000, &camera);
-    let expected = native(&model).render(&camera, GREY, 0).expect("a small image");
+    let expected = faint(&Subject::NATIVE, &model).render(&camera, GREY, 0).expect("a small image");
     for device in ways() {
         let found = backend(&model, device).render(&camera, GREY, 0);
         let more = device.accumulation() != Accumulation::Slots;
@@ -82,8 +80,9 @@ fn a_list_too_long_to_be_differentiated_is_an_error() {
         alpha: vec![0.5; 256],
         depth: vec![-0.25; 256],
     };
-    let (_, expected) =
-        native(&model).differentiate(&camera, GREY, 0, &upstream).expect("a small image");
+    let (_, expected) = faint(&Subject::NATIVE, &model)
+        .differentiate(&camera, GREY, 0, &upstream)
+        .expect("a small image");
     for device in ways() {
         let found = backend(&model, device).differentiate(&camera, GREY, 0, &upstream);
         if device.accumulation() != Accumulation::Slots && is_broken_off(&found, device, true) {
@@ -91,11 +90,11 @@ fn a_list_too_long_to_be_differentiated_is_an_error() {
         }
         let mut table = Table::new(&format!("30,000 rows in a tile, {}", name(device)));
         let (_, found) = found.expect("slots go through so many");
-        for class in ["means", "opacity_logits", "sh"] {
-            let expected = subject::class(&expected, class).iter().copied().map(f64::from);
+        for name in ["means", "opacity_logits", "sh"] {
+            let expected = class(&expected, name).iter().copied().map(f64::from);
             let expected: Vec<f64> = expected.collect();
-            let error = relative_error(subject::class(&found, class), &expected);
-            table.check("gradient", class, error, 1e-3);
+            let error = relative_error(class(&found, name), &expected);
+            table.check("gradient", name, error, 1e-3);
         }
         table.finish();
     }

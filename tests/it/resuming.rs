@@ -1,13 +1,14 @@
-//! What a checkpoint holds of a GPU backend is all that its future depends on.
+//! What a checkpoint holds of a backend is all that its future depends on.
 
-use densify::backend::{Backend, StateArray, Tensor, Values};
+use densify::backend::{Backend, StateArray, StepInput, Tensor, Values};
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, Signal, SignalSet,
 };
 
-use super::training::step;
-use super::{backend_for, subjects};
-use densify::verify::scenes;
+use crate::subject::{make, make_with, repeatable, step_input};
+use densify::camera::Camera;
+use densify::gaussians::Gaussians;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
 
 const CADENCE: Cadence = Cadence { all: 2, sh_rest: 3 };
 /// Steps before the state is taken: no optimiser step is due, and all have sums that wait.
@@ -33,6 +34,17 @@ fn needs() -> Needs {
     }
 }
 
+fn backend(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
+    make_with(subject, model, Setup { needs: needs(), ..Setup::default() })
+}
+
+fn step(backend: &mut dyn Backend, camera: &Camera, number: u32) {
+    let target = scenes::target(camera);
+    let degree = (number / 2).min(3) as u8;
+    let input = StepInput { cadence: CADENCE, ..step_input(number, camera, &target, degree) };
+    backend.train_step(&input).expect("a small image is rendered");
+}
+
 /// Four more steps, with a new epoch among them, and everything that can be seen of the backend.
 fn future(backend: &mut dyn Backend) -> impl PartialEq + std::fmt::Debug + use<> {
     let camera = scenes::camera(48, 40, 51);
@@ -40,7 +52,7 @@ fn future(backend: &mut dyn Backend) -> impl PartialEq + std::fmt::Debug + use<>
         if i == BEFORE + 3 {
             backend.begin_epoch();
         }
-        step(backend, &camera, i, CADENCE);
+        step(backend, &camera, i);
     }
     let signals = backend.take_signals(needs().signals).expect("signals");
     let candidates = backend.candidates().to_vec();
@@ -63,35 +75,38 @@ fn is_zero(tensor: &Tensor) -> bool {
 fn a_backend_that_took_back_its_state_has_the_same_future() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
-    for device in subjects() {
-        let mut whole = backend_for(&model, device, &needs());
+    for subject in repeatable() {
+        let mut whole = backend(&subject, &model);
         whole.begin_epoch();
         for i in 1..=BEFORE {
-            step(&mut whole, &camera, i, CADENCE);
+            step(&mut *whole, &camera, i);
         }
         let saved = |array: StateArray| whole.save(&array.name).expect("an array of the state");
         let state: Vec<Tensor> = whole.state().into_iter().map(saved).collect();
         let model = whole.download().expect("the model");
-        let expected = future(&mut whole);
+        let expected = future(&mut *whole);
 
         let without = |left_out: &str| {
-            let mut backend = backend_for(&model, device, &needs());
+            let mut backend = backend(&subject, &model);
             for tensor in state.iter().filter(|t| t.name != left_out) {
                 backend.restore(tensor.clone()).expect("it is this backend's");
             }
-            future(&mut backend)
+            future(&mut *backend)
         };
-        let name = &device.adapter().name;
+        let name = subject.name();
         assert!(without("") == expected, "{name}");
         // None of it is idle.
         let told: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();
-        assert!(told.len() > 15, "{name}: only {} arrays say anything", told.len());
+        assert!(told.len() > 8, "{name}: only {} arrays say anything", told.len());
         for tensor in told {
             assert!(without(&tensor.name) != expected, "{name}: {}", tensor.name);
         }
 
-        let mut other = backend_for(&model, device, &Needs::default());
-        let waiting = state.iter().find(|t| t.name.contains("waiting")).expect("sums that wait");
+        let mut other = make(&subject, &model);
+        let waiting = state
+            .iter()
+            .find(|t| t.name.contains("waiting") || t.name.contains("summed"))
+            .expect("sums that wait");
         assert!(other.restore(waiting.clone()).is_err(), "a run without sums took them");
     }
 }

@@ -1,0 +1,325 @@
+//! Candidates: on a plane, where they are found, by which error mode, and where never; in any scene, the
+//! same on every backend.
+
+use densify::backend::{Backend, Rendering, StepInput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::gaussians::{Gaussians, logit, rgb_to_dc};
+use densify::verify::compare::Table;
+use densify::verify::{Differentiable, Setup, Subject, scenes};
+use densify_policies::policy::{
+    Candidate, CandidateRequest, DepthMode, ErrorMode, Needs, SceneInfo,
+};
+use densify_policies::registry::find;
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::subject::{devices, make_with, others, repeatable, step_input};
+
+const SIDE: u32 = 96;
+const GREY: [f32; 3] = [0.2; 3];
+/// Left, top, right and bottom of the patch whose colour is off [px].
+const PATCH: [f64; 4] = [50.0, 50.0, 80.0, 80.0];
+/// Left of this column, fine structure is missing [px].
+const FINE: usize = 30;
+/// Half the width of SSIM's window, and a pixel.
+const WINDOW: f64 = 6.0;
+const MODES: [ErrorMode; 3] = [ErrorMode::Gradient, ErrorMode::L1, ErrorMode::L1Dssim];
+
+fn camera() -> Camera {
+    let side = f64::from(SIDE);
+    Camera {
+        width: SIDE,
+        height: SIDE,
+        fx: side,
+        fy: side,
+        cx: 0.5 * side,
+        cy: 0.5 * side,
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::ZERO,
+    }
+}
+
+/// Flat rows on the plane z = 2 for x < `until`, softly mottled.
+fn plane(until: f64) -> Gaussians {
+    let mut model = Gaussians::default();
+    for i in 0..64 * 64 {
+        let at = |i: i32| -1.26 + 0.04 * f64::from(i);
+        let (x, y) = (at(i % 64), at(i / 64));
+        if x < until {
+            let colour = 0.45 + 0.1 * ((3.0 * x).sin() * (4.0 * y).cos()) as f32;
+            let quat = [1.0, 0.0, 0.0, 0.0];
+            let place = scenes::world(&camera(), [x, y, 2.0]);
+            let scale = [0.024, 0.024, 1e-3];
+            scenes::push(&mut model, place, scale, quat, logit(0.9), |_| rgb_to_dc(colour));
+        }
+    }
+    model
+}
+
+fn request(error: ErrorMode, min_alpha: f32) -> CandidateRequest {
+    CandidateRequest {
+        from: 0,
+        until: 10,
+        rows_per_candidate: 64,
+        capacity: 1000,
+        error,
+        depth: DepthMode::MaxWeight,
+        min_alpha,
+        spaced: true,
+    }
+}
+
+fn backend(
+    subject: &Subject,
+    model: &Gaussians,
+    candidates: Option<CandidateRequest>,
+) -> Box<dyn Differentiable> {
+    let needs = Needs { candidates, ..Needs::default() };
+    make_with(subject, model, Setup { needs, ..Setup::default() })
+}
+
+fn rendered(model: &Gaussians) -> Rendering {
+    let mut native = backend(&Subject::NATIVE, model, None);
+    native.render(&camera(), GREY, 0).expect("a small image is rendered")
+}
+
+/// The candidates of one step with this target.
+fn candidates(
+    subject: &Subject,
+    model: &Gaussians,
+    target: &Image8,
+    request: CandidateRequest,
+) -> Vec<Candidate> {
+    let mut backend = backend(subject, model, Some(request));
+    let camera = camera();
+    let input = StepInput { background: GREY, ..step_input(1, &camera, target, 0) };
+    backend.train_step(&input).expect("a step");
+    backend.candidates().to_vec()
+}
+
+fn image(colour: impl Fn(usize) -> f32) -> Image8 {
+    let values = 3 * (SIDE * SIDE) as usize;
+    let rgb = (0..values).map(|i| (colour(i).clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    Image8 { width: SIDE, height: SIDE, rgb, alpha: None, mask: None }
+}
+
+fn pixel(candidate: &Candidate) -> DVec2 {
+    camera().project(DVec3::from(candidate.position.map(f64::from))).0
+}
+
+#[test]
+fn a_constant_offset_is_an_error_but_no_structure() {
+    // The picture is the model's own, but for a patch that is brighter by 0.25 throughout, and a
+    // strip with a weave of ±0.03 that the model lacks.
+    let model = plane(2.0);
+    let own = rendered(&model);
+    let side = SIDE as usize;
+    let target = image(|i| {
+        let (x, y) = (i / 3 % side, i / 3 / side);
+        let [left, top, right, bottom] = PATCH;
+        let (fx, fy) = (x as f64 + 0.5, y as f64 + 0.5);
+        let in_patch = (left..right).contains(&fx) && (top..bottom).contains(&fy);
+        let weave = if x >= FINE {
+            0.0
+        } else if (x / 2 + y / 2) % 2 == 0 {
+            0.03
+        } else {
+            -0.03
+        };
+        own.rgb[i] + weave + if in_patch { 0.25 } else { 0.0 }
+    });
+    let share = |subject: &Subject, mode: ErrorMode| {
+        let found = candidates(subject, &model, &target, request(mode, 0.5));
+        assert!(found.len() >= 20, "{mode:?}: {} candidates", found.len());
+        let [left, top, right, bottom] = PATCH;
+        // Well within: at the patch's border there is structure.
+        let within = |c: &&Candidate| {
+            let p = pixel(c);
+            (left + WINDOW..right - WINDOW).contains(&p.x)
+                && (top + WINDOW..bottom - WINDOW).contains(&p.y)
+        };
+        for candidate in &found {
+            let [.., z] = candidate.position;
+            assert!((z - 2.0).abs() < 0.01, "{mode:?}: a candidate at depth {z}");
+        }
+        found.iter().filter(within).count() as f64 / found.len() as f64
+    };
+    for subject in repeatable() {
+        let [gradient, l1, l1_dssim] = MODES.map(|mode| share(&subject, mode));
+        assert!(l1 > 0.25, "l1: {l1}");
+        assert!(l1_dssim > 0.25, "l1-dssim: {l1_dssim}");
+        assert!(gradient < 0.02, "grad: {gradient}");
+    }
+}
+
+#[test]
+fn nothing_comes_from_where_nothing_was_hit() {
+    // Right of the middle rows are a veil, before a picture that is white there: the worst is there.
+    let mut model = plane(2.0);
+    for (mean, value) in model.means.iter().zip(&mut model.opacity_logits) {
+        if mean[0] > 0.1 {
+            *value = logit(0.1);
+        }
+    }
+    let own = rendered(&model);
+    let side = SIDE as usize;
+    let white = image(|i| if i / 3 % side > 52 { 1.0 } else { 0.6 });
+    for (subject, mode) in repeatable().iter().flat_map(|s| MODES.map(|mode| (s, mode))) {
+        // How many there are, and how many of them where alpha is low.
+        let taken = |min_alpha| {
+            let request = CandidateRequest { spaced: false, ..request(mode, min_alpha) };
+            let found = candidates(subject, &model, &white, request);
+            let alpha = |c: &Candidate| {
+                let p = pixel(c);
+                own.alpha[p.y as usize * SIDE as usize + p.x as usize]
+            };
+            (found.len(), found.iter().filter(|c| alpha(c) < 0.5).count())
+        };
+        let (all, faint) = taken(0.5);
+        assert!(all > 0, "{mode:?}: no candidate");
+        assert_eq!(faint, 0, "{mode:?}: {faint} of {all} where alpha is below 0.5");
+        let (all, faint) = taken(0.0);
+        assert!(mode == ErrorMode::Gradient || faint > all / 2, "{mode:?}: nothing to keep away");
+    }
+}
+
+#[test]
+fn diet_asks_for_that_guard() {
+    let scene = SceneInfo {
+        extent: 1.1,
+        train_views: 24,
+        budget: 1000,
+        initial_rows: 300,
+        iterations: 30_000,
+        white_background: false,
+    };
+    let policy = find("diet").expect("diet").build(&toml::Table::new(), &scene).expect("defaults");
+    let request = policy.needs(&scene).candidates.expect("it compensates");
+    assert!(request.min_alpha >= 0.5 && request.error != ErrorMode::Gradient, "{request:?}");
+}
+
+// --- The same on every backend ------------------------------------------------------------------
+
+/// A cloud, of which some rows end the light of their pixels.
+fn cloud() -> (Gaussians, Camera) {
+    let camera = scenes::camera(53, 41, 91);
+    let mut model = scenes::cloud(120, 2, &camera, 92);
+    for logit in model.opacity_logits.iter_mut().skip(3).step_by(2) {
+        *logit = 6.0;
+    }
+    model.means[..3].fill(scenes::world(&camera, [0.1, 0.2, -3.0]));
+    (model, camera)
+}
+
+/// Trains for some steps; the candidates after each of them.
+fn train(backend: &mut dyn Backend, camera: &Camera, steps: u32) -> Vec<Vec<Candidate>> {
+    let target = scenes::target(camera);
+    let step = |number: u32| {
+        let degree = (number / 2).min(2) as u8;
+        backend.train_step(&step_input(number, camera, &target, degree)).expect("a small image");
+        backend.candidates().to_vec()
+    };
+    (1..=steps).map(step).collect()
+}
+
+/// Places and colours, flattened.
+fn places(points: &[Candidate]) -> Vec<f32> {
+    let of = |c: &Candidate| c.position.into_iter().chain(c.colour).chain([c.pixel_size, c.error]);
+    points.iter().flat_map(of).collect()
+}
+
+/// Most of the points are the same; which pixels are taken may differ where two are nearly equal.
+fn compare_points(table: &mut Table, what: &str, found: &[Candidate], expected: &[Candidate]) {
+    if found.is_empty() || found.len().abs_diff(expected.len()) > 1 + expected.len() / 50 {
+        table.fail(format!("{what}: {} points, not {}", found.len(), expected.len()));
+        return;
+    }
+    let near = |a: &Candidate, b: &Candidate| {
+        places(&[*a]).iter().zip(places(&[*b])).all(|(a, b)| (a - b).abs() < 2e-3 * (1.0 + b.abs()))
+    };
+    let missing = found.iter().filter(|a| !expected.iter().any(|b| near(a, b))).count();
+    table.check(what, "points", missing as f64 / found.len() as f64, 0.04);
+}
+
+#[test]
+fn candidates_are_those_of_the_native_backend() {
+    let (model, camera) = cloud();
+    let ways = [
+        (ErrorMode::Gradient, DepthMode::MaxWeight, false, 3),
+        (ErrorMode::L1, DepthMode::Median, true, 3),
+        (ErrorMode::L1Dssim, DepthMode::MaxWeight, true, 3),
+        (ErrorMode::L1Dssim, DepthMode::Median, true, 50),
+        // More than a device has room to list.
+        (ErrorMode::Gradient, DepthMode::Median, true, 1),
+    ];
+    for subject in others().iter().filter(|subject| subject.is_deterministic()) {
+        let mut table = Table::new(&format!("candidates, {} against native", subject.name()));
+        for (error, depth, spaced, rows_per_candidate) in ways {
+            let capacity = 200;
+            let request = CandidateRequest {
+                rows_per_candidate,
+                capacity,
+                depth,
+                spaced,
+                ..request(error, 0.3)
+            };
+            let [expected, found] = [&Subject::NATIVE, subject]
+                .map(|subject| train(&mut *backend(subject, &model, Some(request)), &camera, 2));
+            for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
+                let what = format!("{request:?}, {step}");
+                compare_points(&mut table, &what, found, expected);
+            }
+        }
+        table.finish();
+    }
+}
+
+/// What a device lists is what the host finds in all errors: with a larger budget there is room for
+/// the list.
+#[test]
+fn the_device_finds_the_pixels_that_the_host_would() {
+    let (model, camera) = cloud();
+    for device in devices() {
+        for error in MODES {
+            let request =
+                CandidateRequest { rows_per_candidate: 1, capacity: 500, ..request(error, 0.3) };
+            let needs = Needs { candidates: Some(request), ..Needs::default() };
+            let [by_host, by_device] = [1, 2].map(|times| {
+                let setup =
+                    Setup { budget: times * model.len(), needs: needs.clone(), ..Setup::default() };
+                let mut backend = make_with(&Subject::Gpu(device.clone()), &model, setup);
+                places(train(&mut *backend, &camera, 3).last().expect("three steps"))
+            });
+            assert!(by_host.len() > 8 * 30, "{error:?}: {} numbers", by_host.len());
+            assert_eq!(by_device, by_host, "{error:?}");
+        }
+    }
+}
+
+/// One row before everything, so that all pixels are equally wrong: more than a device can list.
+#[test]
+fn where_all_pixels_are_equally_wrong_the_first_is_taken() {
+    let (width, height) = (24, 20);
+    let camera = Camera {
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::ZERO,
+        ..scenes::camera(width, height, 3)
+    };
+    let mut model = Gaussians::default();
+    scenes::push(&mut model, [0.0, 0.0, 2.0], [1e6; 3], [1.0, 0.0, 0.0, 0.0], 0.0, |_| 0.3);
+    let black = Image8 { rgb: vec![0; 3 * (width * height) as usize], ..scenes::target(&camera) };
+    let request = CandidateRequest {
+        rows_per_candidate: 1,
+        capacity: 4,
+        spaced: false,
+        ..request(ErrorMode::L1, 0.3)
+    };
+    for subject in repeatable() {
+        let mut backend = backend(&subject, &model, Some(request));
+        let input = StepInput { background: [0.0; 3], ..step_input(1, &camera, &black, 0) };
+        backend.train_step(&input).expect("a small image is rendered");
+        let [first] = backend.candidates() else { panic!("{}: not one", subject.name()) };
+        let (pixel, _) = camera.project(DVec3::from(first.position.map(f64::from)));
+        assert!((pixel - DVec2::splat(0.5)).length() < 1e-2, "{}: {pixel}", subject.name());
+    }
+}
