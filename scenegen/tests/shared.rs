@@ -48,7 +48,7 @@ fn prepare(path: &Path) -> Result<Scene, Error> {
 
 #[test]
 #[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
-fn every_mesh_renders() {
+fn every_shared_mesh_renders() {
     for folder in ["gltf", "obj"] {
         let all = files(&shared(folder));
         assert!(all.len() > 10);
@@ -64,7 +64,7 @@ fn every_mesh_renders() {
 
 #[test]
 #[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
-fn what_needs_other_software_is_refused_by_name() {
+fn shared_meshes_that_need_other_software_are_refused_by_name() {
     let all = files(&shared("refuse"));
     assert!(all.len() >= 7);
     for path in &all {
@@ -477,7 +477,7 @@ fn judge(
 
 #[test]
 #[ignore = "needs the shared meshes: set DENSIFY_SHARED"]
-fn every_malformed_file_does_what_the_table_says() {
+fn every_malformed_shared_file_does_what_the_table_says() {
     let root = shared("malformed");
     let folder = tempfile::tempdir().expect("folder");
     let mut complaints = Vec::new();

@@ -195,7 +195,7 @@ fn shared(folder: &str) -> Vec<PathBuf> {
 
 #[test]
 #[ignore = "needs files of other programs: set DENSIFY_SHARED"]
-fn clouds_of_other_programs_load() {
+fn shared_clouds_of_other_programs_load() {
     for path in shared("points") {
         let points = read_points(&path).unwrap_or_else(|e| panic!("{e}"));
         assert!([8, 24].contains(&points.len()), "{}: {}", path.display(), points.len());
@@ -206,7 +206,7 @@ fn clouds_of_other_programs_load() {
 
 #[test]
 #[ignore = "needs files of other programs: set DENSIFY_SHARED"]
-fn splats_of_other_programs_load_or_are_refused_by_name() {
+fn shared_splats_of_other_programs_load_or_are_refused_by_name() {
     for path in shared("splats") {
         match read_splats(&path) {
             Err(PlyError::Compressed { .. }) => {
@@ -228,7 +228,7 @@ fn splats_of_other_programs_load_or_are_refused_by_name() {
 
 #[test]
 #[ignore = "needs files of other programs: set DENSIFY_SHARED"]
-fn malformed_files_do_not_panic() {
+fn malformed_shared_files_do_not_panic() {
     for path in shared("meshes/malformed") {
         let _ = (read_points(&path), read_splats(&path));
     }

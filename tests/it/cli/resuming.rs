@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use super::{Outcome, densify, files, json, model, often, read, records, scratch, text, train};
 use crate::photographs::Photographs;
+use crate::subject::devices;
 
 const ITERATIONS: u32 = 202;
 /// Half of it: in the midst of an epoch of 12 views, and of any interval of `often`.
@@ -98,14 +99,28 @@ fn late(policy: &PolicyEntry) -> String {
     ends.map(|(name, _)| format!("--policy-set {}.{name}=190 ", policy.name)).collect()
 }
 
-#[test]
-fn every_policy_goes_on_as_if_nothing_had_been() {
+/// Stops and resumes a run of every registered policy, with these flags.
+fn every_policy_goes_on(device: &str) {
     let scene = Photographs::colmap_text();
     for entry in policies().expect("the registry is sound") {
         let (policy, often) = (entry.name, often(entry));
         let late = late(entry);
-        let flags = format!("--budget 2k --policy {policy} {often} {late} --eval");
+        let flags = format!("--budget 2k --policy {policy} {often} {late} --eval {device}");
         compare(scene.path(), &flags, policy);
+    }
+}
+
+#[test]
+fn every_policy_goes_on_as_if_nothing_had_been() {
+    every_policy_goes_on("");
+}
+
+#[test]
+#[ignore = "takes minutes: run by .ci/run"]
+fn every_policy_goes_on_a_device_as_if_nothing_had_been() {
+    if let Some(device) = devices().first() {
+        let name = device.adapter().name.split(' ').next().expect("a name");
+        every_policy_goes_on(&format!("--backend gpu --gpu {name} --deterministic"));
     }
 }
 
