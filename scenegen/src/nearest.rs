@@ -19,10 +19,10 @@ impl Surface {
     /// The surface's nearest point.
     #[must_use]
     pub fn nearest(&self, place: DVec3) -> Nearest {
-        let (slot, point, distance) = self.nearest_local(self.to_local(place));
+        let (slot, point, distance) = self.nearest_local(self.local_from_world(place));
         Nearest {
             distance: distance / self.scale(),
-            point: self.to_world(point),
+            point: self.world_from_local(point),
             triangle: self.triangle_of(slot),
         }
     }

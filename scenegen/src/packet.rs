@@ -220,7 +220,7 @@ impl Surface {
     /// leaf's box is near. The pyramid must exceed the rays by more than single precision rounds,
     /// relative to distance.
     pub(crate) fn is_missed_by(&self, origin: DVec3, directions: [DVec3; 4]) -> bool {
-        let origin = self.to_local(origin).as_vec3();
+        let origin = self.local_from_world(origin).as_vec3();
         let bounds = PacketBounds::around(directions.into_iter().map(|d| (origin, d.as_vec3())));
         let nodes = &self.bvh.nodes;
         let mut open = vec![0_u32];

@@ -89,7 +89,7 @@ impl Lighting {
         sky: Sky,
         (ambient, shadows, grid): (Ambient, bool, u32),
     ) -> Self {
-        let place = |p: DVec3| surface.to_local(p);
+        let place = |p: DVec3| surface.local_from_world(p);
         let scale = surface.scale();
         let lights = lights.iter().map(|light| {
             // Falls with the square of distance: in local units distances are larger.

@@ -1,5 +1,5 @@
-//! The tree is built in little more memory than it takes. A program of its own, as the peak is the
-//! process's.
+//! Tests that building the tree needs little more memory than the tree. A program of its own, because
+//! the peak is the process's.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 mod process;

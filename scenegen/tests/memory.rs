@@ -1,5 +1,5 @@
-//! Views stream to disk: how many there are makes no difference to memory. A program of its own,
-//! as the peak is the process's.
+//! Tests that views stream to disk: their number does not change the memory. A program of its own,
+//! because the peak is the process's.
 #![allow(clippy::print_stderr, reason = "tests say why they skip")]
 
 mod process;

@@ -1,14 +1,13 @@
-//! Meshes of the shared data: what other programs wrote renders, what is to be refused is refused by
-//! name, and each malformed file does what the table here says.
+//! Tests the meshes of the shared data: sound files render, files that need unsupported extensions are
+//! refused by name, and each malformed file has the outcome in the table here.
 //!
-//! Files with a validator's report mostly hold no scene. So each is read twice: as it is, and with
-//! a scene of all its meshes (or, where it has none, of its accessors or buffer views as positions
-//! and indices) before a buffer of zeros. What the validator calls an error and is read all the same
-//! is harmless: metadata that nothing here looks at, alignments that cost other readers and not this
-//! one, and morph targets, which are not rendered. What it accepts loads, or has no triangle to
-//! render; of a type that only an extension could explain, positions are no positions.
+//! Most files with a validator's report have no scene. So each is read twice: as it is, and with a
+//! scene of all its meshes (or, without any, of its accessors or buffer views as positions and
+//! indices) and a buffer of zeros. Some files that the validator rejects load all the same: their
+//! errors are in metadata that is not read, in alignments that this reader does not need, or in morph
+//! targets, which are not rendered. Files that it accepts load, or have no triangle to render.
 //!
-//! One piece: the tables are rows, one a file.
+//! One piece: the tables have one row per file.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -95,7 +95,7 @@ fn maps_of_roughness_and_metalness_are_read() {
 }
 
 #[test]
-fn texture_options_are_told_from_the_name() {
+fn texture_options_are_separated_from_the_name() {
     let map = Map::read("1 -o 0.5 0.25 -s 2 3 1 -clamp on -bm 0.3 my file.png").expect("map");
     assert_eq!(map.file, "my file.png");
     assert_eq!((map.offset, map.scale), (Vec2::new(0.5, 0.25), Vec2::new(2.0, 3.0)));

@@ -182,21 +182,21 @@ impl Surface {
         let mut all = vec![[DVec3::ZERO; 3]; self.triangles.len()];
         for (slot, triangle) in self.triangles.iter().enumerate() {
             all[self.triangle_of(slot as u32) as usize] =
-                triangle.map(|p| self.to_world(p.as_dvec3()));
+                triangle.map(|p| self.world_from_local(p.as_dvec3()));
         }
         all
     }
 
     /// A corner of the model as it is traced: rounded in local coordinates.
     pub(crate) fn traced(&self, corner: DVec3) -> DVec3 {
-        self.to_world(self.to_local(corner).as_vec3().as_dvec3())
+        self.world_from_local(self.local_from_world(corner).as_vec3().as_dvec3())
     }
 
-    pub(crate) fn to_local(&self, world: DVec3) -> DVec3 {
+    pub(crate) fn local_from_world(&self, world: DVec3) -> DVec3 {
         (world - self.centre) * self.scale
     }
 
-    pub(crate) fn to_world(&self, local: DVec3) -> DVec3 {
+    pub(crate) fn world_from_local(&self, local: DVec3) -> DVec3 {
         local / self.scale + self.centre
     }
 
@@ -228,7 +228,7 @@ impl Surface {
         direction: DVec3,
         range: f64,
     ) -> Option<(LocalRay, f32)> {
-        let (o, d) = (self.to_local(origin), direction * self.scale);
+        let (o, d) = (self.local_from_world(origin), direction * self.scale);
         let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
         // Infinite along axes on which the ray does not move, and NaN on the box's very rim, which is
         // not the geometry's; then the ray misses.
@@ -252,7 +252,7 @@ impl Surface {
     /// belongs to the world ray.
     pub(crate) fn describe(&self, origin: DVec3, direction: DVec3, hit: LocalHit) -> SurfaceHit {
         let [a, b, c] = self.triangles[hit.slot as usize].map(Vec3::as_dvec3);
-        let (o, d) = (self.to_local(origin), direction * self.scale);
+        let (o, d) = (self.local_from_world(origin), direction * self.scale);
         let normal = (b - a).cross(c - a);
         let along = normal.dot(d);
         let by_weights = a + f64::from(hit.at.v) * (b - a) + f64::from(hit.at.w) * (c - a);

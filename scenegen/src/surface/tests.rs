@@ -69,7 +69,7 @@ fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
             // At a corner, where several triangles may meet.
             1 => {
                 let at = (draws.bits() % surface.len() as u64) as usize;
-                surface.to_world(surface.triangles[at][0].as_dvec3()) - origin
+                surface.world_from_local(surface.triangles[at][0].as_dvec3()) - origin
             }
             // Along axes, with zeros of both signs.
             2 => {
@@ -105,11 +105,11 @@ fn the_closest_hit_is_that_of_trying_every_triangle() {
             hits += usize::from(expected.is_some());
         }
     }
-    assert!(hits > 3000, "only {hits} rays met anything");
+    assert!(hits > 3000, "only {hits} rays hit anything");
 }
 
 #[test]
-fn meetings_behind_the_first_come_in_order_and_all() {
+fn intersections_behind_the_first_come_in_order_and_all() {
     let surface = Surface::new(&model(&soup(300, 8))).expect("triangles");
     for ray in rays(&surface, 500, 9) {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
@@ -164,7 +164,7 @@ fn no_ray_leaks_through_a_sphere() {
 }
 
 #[test]
-fn trees_of_any_depth_are_walked() {
+fn trees_of_any_depth_are_traversed() {
     // Sizes fall by half: every level of the tree splits off one triangle.
     let chain: Vec<[DVec3; 3]> = (0..900)
         .map(|i| {
@@ -256,7 +256,7 @@ fn size_and_place_of_a_mesh_do_not_matter() {
 }
 
 #[test]
-fn what_lies_between_two_places_blocks() {
+fn surfaces_between_two_places_block() {
     let wall = [DVec3::new(0., -9., -9.), DVec3::new(0., 9., -9.), DVec3::new(0., 0., 9.)];
     let surface = Surface::new(&model(&[wall])).expect("triangles");
     assert!(surface.blocked(DVec3::NEG_X, DVec3::X));
@@ -266,7 +266,7 @@ fn what_lies_between_two_places_blocks() {
 }
 
 #[test]
-fn bundles_find_what_their_rays_find_alone() {
+fn packets_find_the_same_as_single_rays() {
     let (mut met, mut hidden_of_all) = (0, 0);
     for (count, seed) in [(1, 11), (7, 12), (60, 13), (1500, 14)] {
         let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
@@ -304,11 +304,11 @@ fn bundles_find_what_their_rays_find_alone() {
             }
         }
     }
-    assert!(met > hidden_of_all, "{met} rays of {hidden_of_all} bundles met anything");
+    assert!(met > hidden_of_all, "{met} rays of {hidden_of_all} packets hit anything");
 }
 
 #[test]
-fn what_is_beside_a_pyramid_is_met_by_no_ray_in_it() {
+fn no_ray_of_a_pyramid_hits_a_mesh_that_the_pyramid_misses() {
     let surface = Surface::new(&model(&soup(40, 21))).expect("triangles");
     let mut draws = Draws::new(22, &[]);
     let (mut beside, mut wrong) = (0, Vec::new());
@@ -327,5 +327,5 @@ fn what_is_beside_a_pyramid_is_met_by_no_ray_in_it() {
         }
     }
     assert!(beside > 200, "only {beside} pyramids miss everything");
-    assert!(wrong.is_empty(), "{} rays met something", wrong.len());
+    assert!(wrong.is_empty(), "{} rays hit something", wrong.len());
 }

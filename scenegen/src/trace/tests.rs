@@ -190,7 +190,7 @@ fn the_white_furnace_is_white() {
 }
 
 #[test]
-fn light_is_hidden_by_what_is_in_its_way_and_by_that_only() {
+fn only_occluders_cast_shadows() {
     let mut model = floor(Material::lambert("white", [1.0; 3]));
     model.lights.push(sun(DVec3::Y, PI));
     let camera = Camera::looking(DVec3::new(3.0, 0.5, 0.0), DVec3::ZERO, DVec3::Y, 0.02, (8, 8));

@@ -17,7 +17,7 @@ fn scene(name: &str) -> Scene {
 }
 
 #[test]
-fn folders_say_what_the_scene_says() {
+fn folders_agree_with_their_scene() {
     let root = tempfile::tempdir().expect("folder");
     let target = root.path().join("thin");
     let scene = scene("thin");
@@ -63,7 +63,7 @@ fn folders_say_what_the_scene_says() {
 }
 
 #[test]
-fn wires_are_as_thick_as_they_are() {
+fn wires_have_their_true_thickness() {
     let truth = GroundTruth::of_scene(scene("thin"));
     // The first upright wire, radius 6 mm at x = −1.05, from the front; then the wall beside it.
     let from = DVec3::new(-1.05, 0.7, 2.0);

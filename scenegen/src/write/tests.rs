@@ -73,7 +73,7 @@ fn everything_is_written_and_nothing_else_stays() {
 }
 
 #[test]
-fn what_is_there_already_stays_unless_it_is_a_scene_to_replace() {
+fn existing_files_stay_unless_they_are_a_scene_to_replace() {
     let scene = small();
     let root = tempfile::tempdir().expect("folder");
     let target = root.path().join("scene");
