@@ -72,9 +72,10 @@ pub fn dataset(
     let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
-        view.camera = normalisation.camera(&view.camera);
+        view.camera = normalisation.scene_from_world_camera(&view.camera);
     }
-    let positions = points.positions.iter().map(|&point| normalisation.point(point)).collect();
+    let positions =
+        points.positions.iter().map(|&point| normalisation.scene_from_world(point)).collect();
     let mut sampler = TrackSampler::new();
     let found = points.positions.iter().zip(&points.colours);
     for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {

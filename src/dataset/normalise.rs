@@ -68,40 +68,40 @@ impl Normalisation {
 
     /// A point from world to scene coordinates.
     #[must_use]
-    pub fn point(&self, world: DVec3) -> DVec3 {
+    pub fn scene_from_world(&self, world: DVec3) -> DVec3 {
         (world - self.centre) * self.scale
     }
 
     /// A point from scene to world coordinates.
     #[must_use]
-    pub fn denormalise_point(&self, scene: DVec3) -> DVec3 {
+    pub fn world_from_scene(&self, scene: DVec3) -> DVec3 {
         scene / self.scale + self.centre
     }
 
     /// A camera from world to scene coordinates.
     #[must_use]
-    pub fn camera(&self, world: &Camera) -> Camera {
+    pub fn scene_from_world_camera(&self, world: &Camera) -> Camera {
         let translation = (world.rotation * self.centre + world.translation) * self.scale;
         Camera { translation, ..*world }
     }
 
     /// A camera from scene to world coordinates.
     #[must_use]
-    pub fn denormalise_camera(&self, scene: &Camera) -> Camera {
+    pub fn world_from_scene_camera(&self, scene: &Camera) -> Camera {
         let translation = scene.translation / self.scale - scene.rotation * self.centre;
         Camera { translation, ..*scene }
     }
 
     /// A model from scene to world coordinates, computed in f64.
     #[must_use]
-    pub fn model_to_world(&self, scene: Gaussians) -> Gaussians {
-        self.mapped(scene, -self.scale.ln(), |mean| self.denormalise_point(mean))
+    pub fn world_from_model(&self, scene: Gaussians) -> Gaussians {
+        self.mapped(scene, -self.scale.ln(), |mean| self.world_from_scene(mean))
     }
 
     /// A model from world to scene coordinates, computed in f64.
     #[must_use]
     pub fn model_from_world(&self, world: Gaussians) -> Gaussians {
-        self.mapped(world, self.scale.ln(), |mean| self.point(mean))
+        self.mapped(world, self.scale.ln(), |mean| self.scene_from_world(mean))
     }
 
     /// In place: the model may be most of the memory.
@@ -164,7 +164,7 @@ mod tests {
         let offset = DVec3::new(4e6, -5e6, 300.0);
         let centres = [DVec3::X * 3.0, DVec3::Y * 5.0, DVec3::Z * -2.0].map(|c| c + offset);
         let n = Normalisation::fit(&centres, &[]);
-        let scene = centres.map(|c| n.camera(&camera(c)).centre());
+        let scene = centres.map(|c| n.scene_from_world_camera(&camera(c)).centre());
         assert!((extent(&scene) - EXTENT).abs() < 1e-8);
         assert!((scene.iter().sum::<DVec3>()).length() < 1e-8);
         assert!(n.f32_warning().is_some());
@@ -176,11 +176,14 @@ mod tests {
         let n = Normalisation { centre: DVec3::new(10.0, 20.0, -30.0), scale: 0.25 };
         let world = camera(DVec3::new(9.0, 18.0, -33.0));
         let point = DVec3::new(10.0, 21.0, -29.0);
-        let ((a, za), (b, zb)) = (world.project(point), n.camera(&world).project(n.point(point)));
+        let ((a, za), (b, zb)) = (
+            world.project(point),
+            n.scene_from_world_camera(&world).project(n.scene_from_world(point)),
+        );
         assert!((a - b).length() < 1e-9 && (za * 0.25 - zb).abs() < 1e-12);
-        let back = n.denormalise_camera(&n.camera(&world));
+        let back = n.world_from_scene_camera(&n.scene_from_world_camera(&world));
         assert!((back.translation - world.translation).length() < 1e-12);
-        assert!((n.denormalise_point(n.point(point)) - point).length() < 1e-12);
+        assert!((n.world_from_scene(n.scene_from_world(point)) - point).length() < 1e-12);
     }
 
     #[test]
@@ -200,7 +203,10 @@ mod tests {
         let scene = |k: i32| {
             let by = 2f64.powi(k);
             let n = Normalisation::fit(&centres.map(|c| c * by), &[]);
-            (n.point(points[0] * by), n.camera(&camera(centres[1] * by)).translation)
+            (
+                n.scene_from_world(points[0] * by),
+                n.scene_from_world_camera(&camera(centres[1] * by)).translation,
+            )
         };
         for k in [-20, -3, 5, 20] {
             assert_eq!(scene(k), scene(0));
@@ -218,13 +224,13 @@ mod tests {
             sh_degree: 0,
         };
         let n = Normalisation { centre: DVec3::new(100.0, 200.0, 300.0), scale: 0.125 };
-        let world = n.model_to_world(model.clone());
+        let world = n.world_from_model(model.clone());
         assert_eq!(world.means, [[104.0, 198.0, 308.0]]);
         assert!((world.log_scales[0][0] - (-3.0 + 8f32.ln())).abs() < 1e-6);
         let back = n.model_from_world(world);
         assert_eq!(back.means, model.means);
         assert!((back.log_scales[0][2] - 0.5).abs() < 1e-6);
         assert_eq!((back.quats, back.sh), (model.quats.clone(), model.sh.clone()));
-        assert_eq!(Normalisation::IDENTITY.model_to_world(model.clone()), model);
+        assert_eq!(Normalisation::IDENTITY.world_from_model(model.clone()), model);
     }
 }

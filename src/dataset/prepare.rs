@@ -45,7 +45,7 @@ pub(super) fn prepare(
     let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
-        view.camera = normalisation.camera(&view.camera);
+        view.camera = normalisation.scene_from_world_camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
             let problem = "the camera is too far from the others";
             return Err(DatasetError::malformed(
@@ -57,7 +57,7 @@ pub(super) fn prepare(
         }
     }
     for position in &mut points.positions {
-        *position = normalisation.point(*position);
+        *position = normalisation.scene_from_world(*position);
     }
     drop_bad(points_path, &mut points, &mut notes, "within reach of f32", |p| {
         p.as_vec3().is_finite()

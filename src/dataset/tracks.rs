@@ -57,7 +57,7 @@ impl Tracks {
         let mut kept = Self::default();
         let points = self.positions.into_iter().zip(self.colours);
         for ((position, colour), views) in points.zip(self.views) {
-            let position = normalisation.point(position);
+            let position = normalisation.scene_from_world(position);
             let mut views: Vec<u32> = views.into_iter().filter_map(&view_of).collect();
             views.sort_unstable();
             views.dedup();

@@ -11,7 +11,7 @@ use std::fmt;
 use serde::Serialize;
 
 pub(crate) use fit::IMAGES;
-pub use fit::{Fit, PAIRS, Setting, Wishes, fit, least_memory};
+pub use fit::{Fit, PAIRS, Setting, SizeRequest, fit, min_memory};
 pub use grant::{Grant, grant};
 
 /// All buffers of a run.

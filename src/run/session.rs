@@ -135,7 +135,8 @@ impl<'a> Session<'a> {
             observer.say(format_args!("note: {warning}"));
         }
         let views = run.dataset.test.iter().chain(&run.dataset.train);
-        let cameras = views.map(|view| (&*view.name, to_world.denormalise_camera(&view.camera)));
+        let cameras =
+            views.map(|view| (&*view.name, to_world.world_from_scene_camera(&view.camera)));
         write_atomically(&folder.join("cameras.json"), |out| {
             out.write_all(cameras_json(cameras)?.as_bytes())
         })?;
@@ -290,7 +291,7 @@ impl<'a> Session<'a> {
         let sh_degree = trainer.model_rows(0..0)?.sh_degree;
         let shape = Shape { rows: trainer.backend().rows(), sh_degree };
         PLY.write_file(&path, shape, |piece| {
-            Ok::<_, Failure>(to_world.model_to_world(trainer.model_rows(piece)?))
+            Ok::<_, Failure>(to_world.world_from_model(trainer.model_rows(piece)?))
         })?;
         Ok(path)
     }

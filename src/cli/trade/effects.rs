@@ -44,7 +44,7 @@ pub(super) fn dominated_by(prices: &[Price], of: usize) -> Option<usize> {
     prices.iter().position(|p| *p != own && no_worse(p))
 }
 
-/// Whether a level costs nothing, by the rule of `reference/tradeoffs.md`: nowhere in their 95 %
+/// Whether a level costs nothing, by the rule of docs/tradeoffs.md: nowhere in their 95 %
 /// intervals do PSNR and SSIM fall by 0.05 dB and 0.001 or depth errors grow to 1.02 of what they
 /// were, and the same model looks the same to 60 dB. What has no interval is not known to be free.
 pub(super) fn is_free(

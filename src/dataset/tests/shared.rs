@@ -146,7 +146,7 @@ fn random_points_lie_where_the_cameras_look() {
         let cameras: Vec<_> = data.train.iter().map(|view| view.camera).collect();
         let points = random_points(2000, &cameras, background, 1);
         let world: Vec<DVec3> =
-            points.positions.iter().map(|&p| data.normalisation.denormalise_point(p)).collect();
+            points.positions.iter().map(|&p| data.normalisation.world_from_scene(p)).collect();
         if name == "chair" {
             // The original's cube of ±1.3.
             let reach = world.iter().map(|p| p.abs().max_element()).fold(0.0, f64::max);

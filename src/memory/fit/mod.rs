@@ -21,7 +21,7 @@ pub struct Setting {
 
 /// The limit, the wanted size, and what may be chosen.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Wishes {
+pub struct SizeRequest {
     /// The limit `[bytes]`.
     pub memory: u64,
     /// Fewest rows of a useful model, >= 1.
@@ -62,7 +62,7 @@ pub const PAIRS: [usize; 3] = [4, 8, 16];
 /// Decoded images may take one part in so many of the memory.
 pub(crate) const IMAGES: u64 = 8;
 
-impl Wishes {
+impl SizeRequest {
     /// A setting with so many pairs per row, and at most [`IMAGES`] of the memory for images.
     fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> Setting {
         let most = self.most_pairs.max(rows);
@@ -83,17 +83,17 @@ impl Wishes {
 /// # Errors
 /// Those of `bytes`.
 pub fn fit<E>(
-    wishes: &Wishes,
+    request: &SizeRequest,
     mut bytes: impl FnMut(&Setting) -> Result<u64, E>,
 ) -> Result<Option<Fit>, E> {
-    let most = wishes.most_rows.max(1);
-    let least = wishes.least_rows.clamp(1, most);
-    let enough = wishes.enough_rows.clamp(least, most);
+    let most = request.most_rows.max(1);
+    let least = request.least_rows.clamp(1, most);
+    let enough = request.enough_rows.clamp(least, most);
     let mut at_wanted_degree = None;
     let mut found = None;
-    for degree in wishes.sh_degree.clone().rev() {
-        let setting = |rows| wishes.setting(rows, degree, wishes.pairs[0]);
-        let rows = most_within(least, most, |rows| Ok(bytes(&setting(rows))? <= wishes.memory))?;
+    for degree in request.sh_degree.clone().rev() {
+        let setting = |rows| request.setting(rows, degree, request.pairs[0]);
+        let rows = most_within(least, most, |rows| Ok(bytes(&setting(rows))? <= request.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
         found = rows.map(|rows| (rows, degree));
         if rows.is_some_and(|rows| rows >= enough) {
@@ -101,21 +101,21 @@ pub fn fit<E>(
         }
     }
     let Some((rows, degree)) = found else { return Ok(None) };
-    let mut setting = wishes.setting(rows, degree, wishes.pairs[0]);
+    let mut setting = request.setting(rows, degree, request.pairs[0]);
     if rows == most {
-        for pairs in wishes.pairs.into_iter().skip(1) {
-            let larger = wishes.setting(rows, degree, pairs);
-            if bytes(&larger)? <= wishes.memory {
+        for pairs in request.pairs.into_iter().skip(1) {
+            let larger = request.setting(rows, degree, pairs);
+            if bytes(&larger)? <= request.memory {
                 setting = larger;
             }
         }
-        if wishes.image_cache.is_none() {
-            let all = Setting { image_cache: wishes.all_images, ..setting };
-            let left = wishes.memory.saturating_sub(bytes(&setting)?);
+        if request.image_cache.is_none() {
+            let all = Setting { image_cache: request.all_images, ..setting };
+            let left = request.memory.saturating_sub(bytes(&setting)?);
             // Images in use are counted even if the cache is smaller.
-            setting.image_cache = match bytes(&all)? <= wishes.memory {
-                true => wishes.all_images,
-                false => setting.image_cache.saturating_add(left).min(wishes.all_images),
+            setting.image_cache = match bytes(&all)? <= request.memory {
+                true => request.all_images,
+                false => setting.image_cache.saturating_add(left).min(request.all_images),
             };
         }
     }
@@ -127,19 +127,19 @@ pub fn fit<E>(
 ///
 /// # Errors
 /// Those of `bytes`.
-pub fn least_memory<E>(
-    wishes: &Wishes,
+pub fn min_memory<E>(
+    request: &SizeRequest,
     step: u64,
     mut bytes: impl FnMut(&Setting) -> Result<u64, E>,
 ) -> Result<Option<u64>, E> {
     let fits = |steps: usize, bytes: &mut dyn FnMut(&Setting) -> Result<u64, E>| {
-        let wishes = Wishes { memory: steps as u64 * step, ..wishes.clone() };
-        fit(&wishes, bytes).map(|fit| fit.is_some())
+        let request = SizeRequest { memory: steps as u64 * step, ..request.clone() };
+        fit(&request, bytes).map(|fit| fit.is_some())
     };
     // The smallest model with all of its images.
-    let all = Wishes { memory: u64::MAX, ..wishes.clone() };
-    let least = wishes.least_rows.clamp(1, wishes.most_rows.max(1));
-    let most = bytes(&all.setting(least, *wishes.sh_degree.start(), wishes.pairs[0]))?;
+    let all = SizeRequest { memory: u64::MAX, ..request.clone() };
+    let least = request.least_rows.clamp(1, request.most_rows.max(1));
+    let most = bytes(&all.setting(least, *request.sh_degree.start(), request.pairs[0]))?;
     let Ok(most) = usize::try_from(most.div_ceil(step)) else { return Ok(None) };
     let too_little = most_within(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
     Ok(Some(too_little.map_or(0, |steps| steps as u64 + 1) * step))

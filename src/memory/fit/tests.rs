@@ -29,9 +29,9 @@ impl Model {
             + held.min(self.all_images)
     }
 
-    fn fit(&self, wishes: &Wishes) -> Option<Fit> {
+    fn fit(&self, request: &SizeRequest) -> Option<Fit> {
         let bytes = |setting: &Setting| Ok::<_, Infallible>(self.bytes(setting));
-        fit(wishes, bytes).unwrap_or_else(|never| match never {})
+        fit(request, bytes).unwrap_or_else(|never| match never {})
     }
 }
 
@@ -44,8 +44,8 @@ fn models() -> impl Strategy<Value = Model> {
     })
 }
 
-fn wishes(model: &Model, memory: u64) -> Wishes {
-    Wishes {
+fn request(model: &Model, memory: u64) -> SizeRequest {
+    SizeRequest {
         memory,
         least_rows: 1_000,
         enough_rows: 20_000,
@@ -89,16 +89,16 @@ fn given() -> impl Strategy<Value = Given> {
 /// What is found fits, keeps what was given, and could not be larger.
 fn check_fit(model: &Model, memory: u64, given: &Given) -> Result<(), TestCaseError> {
     let Given { most_rows: most, tile_cap, image_cache, lowest_degree: lowest, pairs } = *given;
-    let wishes = Wishes {
+    let request = SizeRequest {
         most_rows: most,
         tile_cap,
         pairs,
         image_cache,
         sh_degree: lowest..=3,
-        ..wishes(model, memory)
+        ..request(model, memory)
     };
-    let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(&wishes) else {
-        let least = wishes.setting(1_000.min(most), lowest, pairs[0]);
+    let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(&request) else {
+        let least = request.setting(1_000.min(most), lowest, pairs[0]);
         prop_assert!(model.bytes(&least) > memory);
         return Ok(());
     };
@@ -110,10 +110,10 @@ fn check_fit(model: &Model, memory: u64, given: &Given) -> Result<(), TestCaseEr
     prop_assert!(tile_cap.is_none_or(|cap| setting.tile_cap == cap.max(setting.rows)));
     prop_assert!(image_cache.is_none_or(|cache| setting.image_cache == cache));
     if by_memory {
-        let more = wishes.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
+        let more = request.setting(setting.rows + 1, setting.sh_degree, pairs[0]);
         prop_assert!(model.bytes(&more) > memory);
     } else {
-        let more = wishes.setting(setting.rows, setting.sh_degree, pairs[2]);
+        let more = request.setting(setting.rows, setting.sh_degree, pairs[2]);
         prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
         let images = Setting { image_cache: model.all_images, ..setting };
         prop_assert!(
@@ -126,7 +126,7 @@ fn check_fit(model: &Model, memory: u64, given: &Given) -> Result<(), TestCaseEr
     let enough = 20_000.min(most);
     prop_assert!(setting.sh_degree == 3 || at_wanted_degree < enough);
     if setting.sh_degree < 3 {
-        let higher = wishes.setting(enough, setting.sh_degree + 1, pairs[0]);
+        let higher = request.setting(enough, setting.sh_degree + 1, pairs[0]);
         prop_assert!(model.bytes(&higher) > memory);
     }
     Ok(())
@@ -166,7 +166,7 @@ proptest! {
         more in 0..200_000_000_u64,
     ) {
         let size = |memory| {
-            let fit = model.fit(&wishes(&model, memory));
+            let fit = model.fit(&request(&model, memory));
             fit.map(|fit| (fit.setting.sh_degree, fit.setting.rows))
         };
         prop_assert!(size(memory) <= size(memory + more));
@@ -174,12 +174,12 @@ proptest! {
 
     #[test]
     fn the_least_memory_is_the_least(model in models(), step in 1..2_000_000_u64) {
-        let wishes = wishes(&model, 0);
+        let request = request(&model, 0);
         let bytes = |setting: &Setting| Ok::<_, Infallible>(model.bytes(setting));
-        let least = least_memory(&wishes, step, bytes).unwrap_or_else(|never| match never {});
+        let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
         let least = least.expect("a number");
         prop_assert!(least.is_multiple_of(step));
-        let fits = |memory| model.fit(&Wishes { memory, ..wishes.clone() }).is_some();
+        let fits = |memory| model.fit(&SizeRequest { memory, ..request.clone() }).is_some();
         prop_assert!(fits(least));
         prop_assert!(least < step || !fits(least - step));
     }
@@ -203,15 +203,15 @@ fn a_degree_is_lowered_only_for_the_rows_that_the_scene_starts_with() {
         (19_999 * 136, 0, 19_984),
         (1_008 * 136, 0, 1_008),
     ] {
-        let found = model.fit(&wishes(&model, memory)).expect("it fits").setting;
+        let found = model.fit(&request(&model, memory)).expect("it fits").setting;
         assert_eq!((found.sh_degree, found.rows), (degree, rows), "{memory}");
     }
-    assert_eq!(model.fit(&wishes(&model, 1_008 * 136 - 1)), None);
+    assert_eq!(model.fit(&request(&model, 1_008 * 136 - 1)), None);
 }
 
 #[test]
 fn errors_are_passed_on() {
-    let wishes = wishes(
+    let request = request(
         &Model {
             fixed: 0,
             per_row: 1,
@@ -222,6 +222,6 @@ fn errors_are_passed_on() {
         },
         100,
     );
-    assert_eq!(fit(&wishes, |_| Err::<u64, _>("no")), Err("no"));
-    assert_eq!(least_memory(&wishes, 1, |_| Err::<u64, _>("no")), Err("no"));
+    assert_eq!(fit(&request, |_| Err::<u64, _>("no")), Err("no"));
+    assert_eq!(min_memory(&request, 1, |_| Err::<u64, _>("no")), Err("no"));
 }

@@ -218,7 +218,7 @@ impl Ground<'_> {
 
     /// A view's camera in world coordinates, for projecting and for casting rays.
     fn cameras(&self, scene: &Camera) -> (Camera, densify_scenegen::Camera) {
-        let world = self.normalisation.denormalise_camera(scene);
+        let world = self.normalisation.world_from_scene_camera(scene);
         let caster = densify_scenegen::Camera {
             width: world.width,
             height: world.height,

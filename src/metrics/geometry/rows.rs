@@ -33,7 +33,7 @@ impl Rows {
         let surface = ground.truth.surface();
         let vector = |v: &[f32; 3]| DVec3::from(v.map(f64::from));
         let centres: Vec<DVec3> =
-            model.means.iter().map(|mean| to_world.denormalise_point(vector(mean))).collect();
+            model.means.iter().map(|mean| to_world.world_from_scene(vector(mean))).collect();
         let scales = model.log_scales.iter().map(|log| vector(log).exp() / to_world.scale);
         let axes = model.quats.iter().map(|&[w, x, y, z]| {
             let quat = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());

@@ -35,7 +35,7 @@ impl Pair {
         };
         let rgb = vec![128; 3 * 64 * 64];
         let image = Image8 { width: 64, height: 64, rgb, alpha: None, mask: None };
-        let cameras = [-0.4, 0.4].map(|x| WORLD.camera(&camera(x))).to_vec();
+        let cameras = [-0.4, 0.4].map(|x| WORLD.scene_from_world_camera(&camera(x))).to_vec();
         Self { cameras, image: Arc::new(image) }
     }
 }

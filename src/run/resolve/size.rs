@@ -4,7 +4,7 @@ use super::{DECODERS, Inputs, TEST_DECODERS};
 use crate::backend::BackendKind;
 use crate::failure::{DEVICE, Failure};
 use crate::memory::{
-    Bytes, Fit, Grant, Ledger, PAIRS, Setting, Wishes, fit, grant, least_memory, resident,
+    Bytes, Fit, Grant, Ledger, PAIRS, Setting, SizeRequest, fit, grant, min_memory, resident,
 };
 use crate::number::grouped;
 use crate::run::values::Budget;
@@ -62,10 +62,10 @@ impl Size {
         let Some(memory) = inputs.memory() else {
             return Self::as_given(inputs);
         };
-        let wishes = wishes(inputs, memory)?;
-        match fit(&wishes, |setting| bytes(inputs, setting))? {
+        let request = request(inputs, memory)?;
+        match fit(&request, |setting| bytes(inputs, setting))? {
             Some(fit) => Ok(Self { setting: fit.setting, solved: Some((memory, fit)) }),
-            None => Err(too_little(inputs, &wishes)?),
+            None => Err(too_little(inputs, &request)?),
         }
     }
 
@@ -185,12 +185,12 @@ pub(super) fn rows_at(
     memory: u64,
     sh_degree: u8,
 ) -> Result<Option<usize>, Failure> {
-    let wishes = Wishes {
+    let request = SizeRequest {
         sh_degree: sh_degree..=sh_degree,
         most_rows: inputs.device.largest_budget(sh_degree),
-        ..wishes(inputs, memory)?
+        ..request(inputs, memory)?
     };
-    let fit = fit(&wishes, |setting| bytes(inputs, setting))?;
+    let fit = fit(&request, |setting| bytes(inputs, setting))?;
     Ok(fit.map(|fit| fit.setting.rows))
 }
 
@@ -200,10 +200,10 @@ fn bytes(inputs: &Inputs<'_>, setting: &Setting) -> Result<u64, Failure> {
     Ok(inputs.device.limited_bytes(&inputs.ledger(setting, &needs, threads)))
 }
 
-fn wishes(inputs: &Inputs<'_>, memory: u64) -> Result<Wishes, Failure> {
+fn request(inputs: &Inputs<'_>, memory: u64) -> Result<SizeRequest, Failure> {
     let degrees = inputs.degree.range.clone();
     let possible = inputs.device.largest_budget(*degrees.end());
-    Ok(Wishes {
+    Ok(SizeRequest {
         memory,
         least_rows: LEAST_ROWS,
         enough_rows: inputs.start().unwrap_or(LEAST_ROWS),
@@ -227,14 +227,14 @@ fn most_pairs(inputs: &Inputs<'_>, rows: usize) -> Result<usize, Failure> {
 }
 
 /// What to say where not even the least model fits: what it would take, and what would help.
-fn too_little(inputs: &Inputs<'_>, wishes: &Wishes) -> Result<Failure, Failure> {
-    let least_of = |inputs: &Inputs<'_>, wishes: &Wishes| {
-        least_memory(wishes, MIB, |setting| bytes(inputs, setting))
+fn too_little(inputs: &Inputs<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
+    let least_of = |inputs: &Inputs<'_>, request: &SizeRequest| {
+        min_memory(request, MIB, |setting| bytes(inputs, setting))
     };
-    let rows = LEAST_ROWS.min(wishes.most_rows);
-    let degree = *wishes.sh_degree.start();
-    let given = Bytes(wishes.memory);
-    let Some(least) = least_of(inputs, wishes)? else {
+    let rows = LEAST_ROWS.min(request.most_rows);
+    let degree = *request.sh_degree.start();
+    let given = Bytes(request.memory);
+    let Some(least) = least_of(inputs, request)? else {
         return Ok(Failure::input(format!("--memory {given}: no size of a run can be computed")));
     };
     let mut message = format!(
@@ -251,7 +251,7 @@ fn too_little(inputs: &Inputs<'_>, wishes: &Wishes) -> Result<Failure, Failure> 
         (degree > 0, "--sh-degree"),
     ];
     let free =
-        Wishes { tile_cap: None, image_cache: None, sh_degree: 0..=degree, ..wishes.clone() };
+        SizeRequest { tile_cap: None, image_cache: None, sh_degree: 0..=degree, ..request.clone() };
     let free_least = least_of(inputs, &free)?.unwrap_or(least);
     if free_least < least {
         let names: Vec<&str> = fixed.iter().filter(|(is, _)| *is).map(|(_, name)| *name).collect();
@@ -259,11 +259,11 @@ fn too_little(inputs: &Inputs<'_>, wishes: &Wishes) -> Result<Failure, Failure> 
     }
     let smaller = RESOLUTIONS.iter().filter_map(|&divisor| {
         let smaller = inputs.at_resolution(divisor)?;
-        let wishes = super::size::wishes(&smaller, wishes.memory).ok()?;
-        Some((divisor, least_of(&smaller, &wishes).ok()??))
+        let request = super::size::request(&smaller, request.memory).ok()?;
+        Some((divisor, least_of(&smaller, &request).ok()??))
     });
     let smaller: Vec<(u32, u64)> = smaller.filter(|&(_, bytes)| bytes < least).collect();
-    let fits = smaller.iter().find(|(_, bytes)| *bytes <= wishes.memory);
+    let fits = smaller.iter().find(|(_, bytes)| *bytes <= request.memory);
     if let Some((divisor, bytes)) = fits.or(smaller.last()) {
         message += &format!(", or {}MiB with images shrunk by -r {divisor}", bytes / MIB);
     }

@@ -40,7 +40,7 @@ fn written_scenes_load_as_the_built_in_ones_through_both_formats() {
     // Its unit is that of all forty cameras.
     let find = |name: &str| colmap.train.iter().find(|v| v.name.ends_with(name)).expect(name);
     let world = |set: &Dataset, view: &densify::dataset::View| {
-        set.normalisation.denormalise_camera(&view.camera).centre()
+        set.normalisation.world_from_scene_camera(&view.camera).centre()
     };
     for view in &written.train {
         let name = format!("{}.png", view.name.rsplit('/').next().expect("a name"));
