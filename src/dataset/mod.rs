@@ -14,6 +14,7 @@ pub mod images;
 pub mod normalise;
 mod options;
 mod paths;
+mod pixels;
 mod pose;
 mod prepare;
 mod resample;

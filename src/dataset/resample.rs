@@ -1,6 +1,6 @@
 //! Coverage-aware means of pixels, and the area filter that shrinks images.
 
-use super::images::Image8;
+use super::pixels::Image8;
 
 /// A weighted mean of pixels. Colours are also weighted by coverage: the colour of a transparent
 /// pixel must not bleed into its neighbours.

@@ -5,7 +5,7 @@
 
 use glam::{DMat2, DVec2};
 
-use super::images::Image8;
+use super::pixels::Image8;
 use super::resample::PixelMean;
 
 /// A pinhole with lens distortion. The upper left corner of the image is (0, 0); pixel centres are at

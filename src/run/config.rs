@@ -5,15 +5,12 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use super::overlay::Partial;
+use super::overlay::{FOUND_OUT, Partial};
 use super::spec::RunSpec;
 use super::values::ShDegree;
 use crate::failure::Failure;
 use crate::output::{CONFIG_FILE, OutputError, write_atomically};
 use crate::spread::Spread;
-
-/// Keys of `config.toml` that are not options: the version, and [`Resolved`].
-pub(super) const FOUND_OUT: [&str; 2] = ["densify", "resolved"];
 
 /// A prepared run: its options, where all that was open is decided, and what decided it.
 #[derive(Debug, Clone, PartialEq)]

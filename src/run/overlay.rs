@@ -11,6 +11,9 @@ use crate::knobs::{self, DEFAULT_PRESET};
 use densify_policies::parameters::{nearest, parse_value};
 use densify_policies::policy::RateOverrides;
 
+/// Keys of a run's `config.toml` that are not options: the version, and what was found out.
+pub(super) const FOUND_OUT: [&str; 2] = ["densify", "resolved"];
+
 /// Some options of a run, by name, each with a value that is sound by itself.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Partial(Table);
@@ -53,7 +56,7 @@ impl Partial {
         let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
         let mut table: Table =
             text.parse().map_err(|error: toml::de::Error| fail(error.to_string()))?;
-        table.retain(|key, _| !super::config::FOUND_OUT.contains(&key));
+        table.retain(|key, _| !FOUND_OUT.contains(&key));
         Self::new(table, &origin)
     }
 
