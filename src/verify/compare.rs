@@ -39,7 +39,7 @@ const FLIPS_WITH_DIRECTION: usize = 30;
 
 /// What is wrong with `measured`, or `Ok` with the largest difference away from boundaries.
 ///
-/// Shapes: `measured` and `expected` [pixels, channels], `boundary` [pixels].
+/// Shapes: `measured` and `expected` `[pixels, channels]`, `boundary` `[pixels]`.
 ///
 /// # Errors
 /// The first pixel that differs by more than is allowed, or too many that do.

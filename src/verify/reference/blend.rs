@@ -6,7 +6,7 @@ use super::{Image, Rules, ScreenGradient, Upstream, View};
 /// A row blended into a pixel.
 struct Contribution {
     row: usize,
-    /// Pixel centre minus projected mean [px].
+    /// Pixel centre minus projected mean `[px]`.
     offset: [f64; 2],
     /// exp(−½ dᵀQd).
     falloff: f64,
@@ -136,7 +136,7 @@ pub fn render(splats: &[Splat], order: &[usize], view: View<'_>, rules: &Rules) 
     }
 }
 
-/// Calls `f(pixel, row, weight, distance of the pixel's centre to the projected mean [px])` for every
+/// Calls `f(pixel, row, weight, distance of the pixel's centre to the projected mean, in px)` for every
 /// row blended into a pixel.
 pub fn each_blended(
     splats: &[Splat],
@@ -156,7 +156,7 @@ pub fn each_blended(
     }
 }
 
-/// Gradients of Σ image · upstream with respect to the splats. Shape: [rows].
+/// Gradients of Σ image · upstream with respect to the splats. Shape: `[rows]`.
 #[must_use]
 pub fn backward(
     splats: &[Splat],

@@ -1,6 +1,6 @@
 //! The training loss, 0.8 · L1 + 0.2 · (1 − SSIM), from its definition, and its derivative.
 
-/// Reach of the 11×11 window [px].
+/// Reach of the 11×11 window `[px]`.
 const REACH: i64 = 5;
 const C1: f64 = 0.0001;
 const C2: f64 = 0.0009;

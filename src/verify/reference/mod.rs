@@ -27,7 +27,7 @@ pub struct Rules {
     pub transmittance_min: f64,
 }
 
-/// Added to the diagonal of the projected covariance [px²].
+/// Added to the diagonal of the projected covariance `[px²]`.
 const BLUR: f64 = 0.3;
 /// Centres further out than the image widened by this factor about its middle are clamped in
 /// the projection's Jacobian.
@@ -48,13 +48,13 @@ impl Rules {
 pub struct Model {
     /// Coefficients of spherical harmonics per row and channel.
     pub coefficients: usize,
-    /// Shape: [rows].
+    /// Shape: `[rows]`.
     pub means: Vec<[f64; 3]>,
-    /// Shape: [rows].
+    /// Shape: `[rows]`.
     pub log_scales: Vec<[f64; 3]>,
-    /// (w, x, y, z) of any length. Shape: [rows].
+    /// (w, x, y, z) of any length. Shape: `[rows]`.
     pub quats: Vec<[f64; 4]>,
-    /// Shape: [rows].
+    /// Shape: `[rows]`.
     pub opacity_logits: Vec<f64>,
     /// Shape: [rows, coefficients, 3].
     pub sh: Vec<f64>,
@@ -205,7 +205,7 @@ impl Image {
 pub struct Gradient {
     /// Of the parameters.
     pub model: Model,
-    /// Of the projected rows. Shape: [rows].
+    /// Of the projected rows. Shape: `[rows]`.
     pub screen: Vec<ScreenGradient>,
 }
 

@@ -9,11 +9,11 @@ use super::{BLUR, FRUSTUM_MARGIN, Model, Rules, ScreenGradient, View};
 pub struct Splat {
     /// Whether it lies beyond the near plane; else all other fields are meaningless.
     pub in_front: bool,
-    /// Projected mean [px].
+    /// Projected mean `[px]`.
     pub mean: [f64; 2],
     /// Camera z [scene units].
     pub depth: f64,
-    /// Projected covariance (xx, xy, yy) [px²], blur included.
+    /// Projected covariance (xx, xy, yy) `[px²]`, blur included.
     pub covariance: [f64; 3],
     /// Its inverse (A, B, C) [1/px²].
     pub conic: [f64; 3],
