@@ -127,14 +127,15 @@ fn measure(
     }
 }
 
-// Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal.
+// Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal,
+// now.b: the number of rows, as no view need have been rendered yet.
 @compute @workgroup_size(256)
 fn present(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= frame.model.x {
+    if row >= now.b {
         return;
     }
     let s = vec3(rows[12u * row + 3u], rows[12u * row + 4u], rows[12u * row + 5u]);

@@ -4,7 +4,7 @@ use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
 /// Version of the format, for writing and reading.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 // Keys of the metadata.
 pub(super) const VERSION_KEY: &str = "densify.version";
 pub(super) const HEADER_KEY: &str = "densify.header";

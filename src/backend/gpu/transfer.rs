@@ -199,7 +199,8 @@ impl GpuBackend {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
         let mut to = Recorder { pass };
-        to.run(&self.launches.present, [signal as u32, 0, 0, 0], (self.rows as u32).div_ceil(256));
+        let rows = self.rows as u32;
+        to.run(&self.launches.present, [signal as u32, rows, 0, 0], rows.div_ceil(256));
         drop(to);
         self.device.queue.submit([encoder.finish()]);
         self.read("sums", 0, 4 * self.rows as u64)

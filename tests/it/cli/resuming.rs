@@ -217,9 +217,9 @@ fn a_damaged_checkpoint_is_named_and_the_one_before_is_taken() {
         let found = sound.windows(words.len()).position(|bytes| bytes == words.as_bytes());
         found.unwrap_or_else(|| panic!("{words} is not in the header"))
     };
-    let version = find("\"densify.version\":\"1\"") + 19;
+    let version = find("\"densify.version\":\"2\"") + 19;
     let mut newer = sound.clone();
-    newer[version] = b'2';
+    newer[version] = b'3';
     let foreign = {
         let header = br#"{"a":{"dtype":"U8","shape":[3],"data_offsets":[0,3]}}   "#;
         [&(header.len() as u64).to_le_bytes()[..], header, b"abc"].concat()
@@ -229,7 +229,7 @@ fn a_damaged_checkpoint_is_named_and_the_one_before_is_taken() {
         ("empty", Vec::new(), "cut short"),
         ("a bit of a tensor", flipped(sound.len() - 3), "damaged"),
         ("a bit of the header", flipped(find("rho")), "damaged"),
-        ("newer", newer, "version 2"),
+        ("newer", newer, "version 3"),
         ("foreign", foreign, "not a checkpoint of densify"),
         ("a picture", read(&scene.path().join("images/view_00.png")), "not a safetensors file"),
     ];
