@@ -44,6 +44,7 @@ pub mod run;
 pub mod schedule;
 pub mod sh;
 pub mod spread;
+pub mod study;
 pub mod trainer;
 pub mod verify;
 pub mod views;

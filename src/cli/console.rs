@@ -8,6 +8,7 @@ use indicatif::MultiProgress;
 use tracing_subscriber::EnvFilter;
 
 use crate::failure::{Failure, OTHER};
+use crate::run::Observer;
 
 /// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
 const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
@@ -101,6 +102,12 @@ impl Console {
         self.bars.suspend(|| {
             let _ = writeln!(io::stderr().lock(), "error: {message}");
         });
+    }
+}
+
+impl Observer for Console {
+    fn say(&self, line: fmt::Arguments<'_>) {
+        self.say(line);
     }
 }
 

@@ -7,12 +7,13 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use super::run_files::{Machine, SplitArg, iteration, open_run};
-use crate::evaluate::evaluate;
+use super::flags::SplitArg;
+use crate::evaluate::{Split, evaluate};
 use crate::failure::Failure;
 use crate::metrics::geometry::{self, Geometry, Ground};
 use crate::number::grouped;
 use crate::output::{write_geometry, write_scores};
+use crate::run::finished::{Machine, iteration, open_run};
 use crate::run::{DeviceSpec, RunConfig};
 
 /// Measures a trained scene against its photographs: PSNR, SSIM and FLIP.
@@ -53,7 +54,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let moved_to = args.scene.clone();
     let machine = Machine::open(&args.device, console)?;
     let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
-    let views = opened.views(args.split)?;
+    let views = opened.views(args.split.into())?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
@@ -69,7 +70,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     line("mean", mean.psnr, mean.ssim, mean.flip);
     write_scores(run, args.split.into(), iteration, &scores)?;
     if let Some(truth) = opened.dataset.ground_truth()? {
-        let train = opened.views(SplitArg::Train)?;
+        let train = opened.views(Split::Train)?;
         let ground = Ground {
             truth: &truth,
             normalisation: &opened.dataset.normalisation,

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::console::Console;
-use super::run_files::{iteration, read_model};
 use crate::export::{Format, find, find_by_extension, formats};
 use crate::failure::Failure;
 use crate::number::grouped;
 use crate::output::{model_path, write_atomically};
+use crate::run::finished::{iteration, read_model};
 
 /// Writes a trained model in another format.
 ///

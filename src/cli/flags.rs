@@ -7,8 +7,27 @@ use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use toml::{Table, Value};
 
+use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::run::{Partial, RunSpec};
+
+/// Spelling of [`Split`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum SplitArg {
+    /// The views held out
+    Test,
+    /// The views trained on
+    Train,
+}
+
+impl From<SplitArg> for Split {
+    fn from(split: SplitArg) -> Self {
+        match split {
+            SplitArg::Test => Self::Test,
+            SplitArg::Train => Self::Train,
+        }
+    }
+}
 
 /// Gives every option of a run in `command` the default that [`RunSpec`] has for it.
 pub(super) fn with_defaults(command: Command) -> Command {

@@ -25,10 +25,8 @@ mod plan;
 mod policies;
 mod progress;
 mod render;
-mod run_files;
 mod scenegen;
 mod selftest;
-mod study;
 mod trade;
 mod train;
 

@@ -9,11 +9,12 @@ use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 
 use super::console::Console;
-use super::run_files::{Machine, Opened, SplitArg, iteration, open, open_run};
+use super::flags::SplitArg;
 use crate::backend::Rendering;
 use crate::dataset::images::Image8;
 use crate::failure::Failure;
 use crate::output::{OutputError, write_atomically, write_json};
+use crate::run::finished::{Machine, Opened, iteration, open, open_run};
 use crate::run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use crate::views::ViewSource;
 
@@ -70,7 +71,7 @@ Examples:
 
 pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     let mut opened = open_model(args, console)?;
-    let views = opened.views(args.split)?;
+    let views = opened.views(args.split.into())?;
     let background = opened.data.background.fixed();
     let units = 1.0 / opened.dataset.normalisation.scale;
     let names: Vec<&str> = (0..views.count()).map(|view| views.name(view)).collect();

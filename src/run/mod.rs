@@ -4,6 +4,7 @@
 mod build;
 mod config;
 mod derived;
+pub(crate) mod finished;
 mod observer;
 mod overlay;
 mod records;

@@ -130,6 +130,12 @@ impl Partial {
         self.0.iter().map(|(name, value)| (&**name, value))
     }
 
+    /// Whether a file with this table says the same.
+    #[must_use]
+    pub fn is_table(&self, table: &Table) -> bool {
+        self.0 == *table
+    }
+
     /// The table of a file that says this.
     #[must_use]
     pub fn into_table(self) -> Table {

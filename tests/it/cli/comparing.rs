@@ -72,7 +72,7 @@ fn a_policy_competes_with_itself_by_its_parameters() {
     let more = ["--policies", &policies, "--budget", "320", "--iterations", "400"];
     densify(&[&call[..], &more].concat()).ok();
     let all = records(&output.join("compare.jsonl"));
-    assert_eq!([&all[0]["policy"], &all[1]["policy"]], ["diet", variant]);
+    assert_eq!([&all[0]["factor"], &all[1]["factor"]], ["diet", variant]);
     assert_ne!(all[0]["psnr"], all[1]["psnr"], "the parameters do nothing");
     let run = all[1]["run"].as_str().expect("a name");
     assert!(

@@ -23,7 +23,9 @@ fn every_level_is_measured_once_and_in_the_table() {
     assert!(said.contains("[16/16]") && said.contains("alpha_min=1/32"), "{said}");
     let all = records(&output.join("trade.jsonl"));
     let of = |kind: &str| -> Vec<&Value> { all.iter().filter(|r| r["kind"] == kind).collect() };
-    let is = |r: &Value, knob: &str, level: &str| r["knob"] == knob && r["level"] == level;
+    let is = |r: &Value, knob: &str, level: &str| {
+        (r["knob"] == knob || r["factor"] == knob) && r["level"] == level
+    };
     let runs = of("run");
     let find = |knob: &str, level: &str, seed: u64| {
         let is_it = |r: &&&Value| is(r, knob, level) && r["seed"] == seed;

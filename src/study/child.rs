@@ -1,5 +1,5 @@
-//! Runs of `densify` from `densify`: each in a process of its own, whose memory is then the run's and nobody
-//! else's. A child is given a file that describes its run.
+//! Runs of `densify` in processes of their own, whose memory is then the run's alone; each is given a file
+//! that describes it.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -9,53 +9,51 @@ use std::process::{Command, Stdio};
 
 use densify_scenegen::GroundTruth;
 use serde_json::Value;
-use toml::Table;
 
 use crate::dataset::builtin;
 use crate::failure::{Failure, OTHER};
 use crate::output::{Mean, write_atomically};
 use crate::run::{Partial, RunSpec};
 
-/// A run of a study, by its description.
-pub(in crate::cli) struct Call<'a> {
-    pub(in crate::cli) spec: &'a Table,
-    pub(in crate::cli) folder: &'a Path,
+/// A run of a study, by its description, and the folder that it writes.
+pub(super) struct Child<'a> {
+    pub(super) spec: &'a Partial,
+    pub(super) folder: &'a Path,
 }
 
-impl Call<'_> {
+impl Child<'_> {
     /// Trains.
     ///
     /// # Errors
     /// With the trainer's message and exit code when it fails.
-    pub(in crate::cli) fn train(&self) -> Result<(), Failure> {
+    pub(super) fn train(&self) -> Result<(), Failure> {
         // Appended, as a name may hold a dot.
         let mut file = self.folder.as_os_str().to_owned();
         file.push(".toml");
-        let text = toml::to_string(self.spec).map_err(Failure::input)?;
+        let text = toml::to_string(&self.spec.clone().into_table()).map_err(Failure::input)?;
         write_atomically(Path::new(&file), |out| out.write_all(text.as_bytes()))?;
-        let mut call = Command::new(program()?);
-        call.arg("train").arg("--config").arg(file).args(["--overwrite", "--quiet", "--output"]);
-        wait_for(call.arg(self.folder))
+        let mut command = Command::new(program()?);
+        command.arg("train").arg("--config").arg(file).args(["--overwrite", "--quiet", "--output"]);
+        wait_for(command.arg(self.folder))
     }
 
     /// Measures what was trained, with `densify eval`, on the device that trained it.
     ///
     /// # Errors
     /// With its message and exit code when it fails.
-    pub(in crate::cli) fn measure(&self) -> Result<(), Failure> {
-        let RunSpec { start, device, .. } =
-            Partial::new(self.spec.clone(), "the study's run")?.describe()?;
-        let mut call = Command::new(program()?);
-        call.arg("eval").arg(self.folder);
-        call.arg("--scene").arg(start.scene.unwrap_or_default());
-        call.args(["--backend", device.backend.word()]);
+    pub(super) fn measure(&self) -> Result<(), Failure> {
+        let RunSpec { start, device, .. } = self.spec.clone().describe()?;
+        let mut command = Command::new(program()?);
+        command.arg("eval").arg(self.folder);
+        command.arg("--scene").arg(start.scene.unwrap_or_default());
+        command.args(["--backend", device.backend.word()]);
         if let Some(name) = device.gpu {
-            call.args(["--gpu", &name]);
+            command.args(["--gpu", &name]);
         }
         if let Some(threads) = device.threads {
-            call.args(["--threads", &threads.to_string()]);
+            command.args(["--threads", &threads.to_string()]);
         }
-        wait_for(&mut call)
+        wait_for(&mut command)
     }
 }
 
@@ -65,7 +63,7 @@ impl Call<'_> {
 ///
 /// # Errors
 /// When an option is the study's own.
-pub(in crate::cli) fn common(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
+pub(super) fn shared_options(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
     if let Some((name, _)) = given.iter().find(|(name, _)| own.contains(name)) {
         return Err(Failure::input(format!(
             "--{} is set by the study itself; leave it out after `--`",
@@ -80,7 +78,7 @@ pub(in crate::cli) fn common(given: Partial, own: &[&str]) -> Result<Partial, Fa
 }
 
 /// A failure within a run of a study.
-pub(in crate::cli) fn in_run(run: &impl Display, failure: Failure) -> Failure {
+pub(super) fn in_run(run: &impl Display, failure: Failure) -> Failure {
     failure.and(&format!("this was the run {run}; the same command goes on from here"))
 }
 
@@ -91,8 +89,8 @@ fn program() -> Result<PathBuf, Failure> {
     })
 }
 
-fn wait_for(call: &mut Command) -> Result<(), Failure> {
-    let child = call
+fn wait_for(command: &mut Command) -> Result<(), Failure> {
+    let child = command
         .stdin(Stdio::null())
         .stdout(Stdio::null())
         .output()
@@ -107,17 +105,17 @@ fn wait_for(call: &mut Command) -> Result<(), Failure> {
 }
 
 /// `stats/summary.json` of a run.
-pub(in crate::cli) struct Summary {
+pub(super) struct Summary {
     path: PathBuf,
     all: Value,
     /// Scores of the views held out, by iteration.
-    pub(in crate::cli) tests: BTreeMap<u32, Mean>,
+    pub(super) tests: BTreeMap<u32, Mean>,
 }
 
 impl Summary {
     /// # Errors
     /// When it cannot be read, or lacks the scores.
-    pub(in crate::cli) fn read(run: &Path) -> Result<Self, Failure> {
+    pub(super) fn read(run: &Path) -> Result<Self, Failure> {
         let path = run.join("stats/summary.json");
         let bad = |problem: String| fault(&path, &problem);
         let text = fs::read(&path).map_err(|e| bad(e.to_string()))?;
@@ -127,17 +125,17 @@ impl Summary {
         Ok(Self { path, all, tests })
     }
 
-    pub(in crate::cli) fn get(&self, field: &str) -> &Value {
+    pub(super) fn get(&self, field: &str) -> &Value {
         &self.all[field]
     }
 
-    pub(in crate::cli) fn text(&self, field: &str) -> String {
+    pub(super) fn text(&self, field: &str) -> String {
         self.all[field].as_str().unwrap_or_default().to_owned()
     }
 
     /// # Errors
     /// When there is no such number.
-    pub(in crate::cli) fn number(&self, field: &str) -> Result<f64, Failure> {
+    pub(super) fn number(&self, field: &str) -> Result<f64, Failure> {
         let number = self.all[field].as_f64();
         number.ok_or_else(|| fault(&self.path, &format!("`{field}` is missing")))
     }
@@ -148,6 +146,6 @@ fn fault(path: &Path, problem: &str) -> Failure {
 }
 
 /// Whether the surface of a scene is known.
-pub(in crate::cli) fn has_geometry(scene: &Path) -> bool {
+pub(super) fn has_geometry(scene: &Path) -> bool {
     builtin::name(scene).is_some() || GroundTruth::is_in(scene)
 }

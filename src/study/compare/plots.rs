@@ -6,11 +6,13 @@ use std::path::Path;
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::prelude::*;
 
-use super::cell::over_time;
-use super::{Picture, Record, budgets_of, distinct};
-use crate::failure::{Failure, OTHER};
+use super::{Outcome, at, scenes_and_budgets};
+use crate::failure::Failure;
 use crate::number::grouped;
-use crate::output::write_atomically;
+use crate::study::Picture;
+use crate::study::difference::mean;
+use crate::study::distinct;
+use crate::study::plot::{self, Area, range};
 
 /// Size of a panel `[px]`.
 const PANEL: (u32, u32) = (720, 300);
@@ -41,87 +43,95 @@ struct Panel {
 /// When a file cannot be written.
 pub(super) fn draw(
     output: &Path,
-    records: &[&Record],
+    outcomes: &[Outcome],
     policies: &[String],
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
-    let mut put = |file: String, caption: String, panels: &[Panel]| -> Result<(), Failure> {
-        let text = svg(panels).map_err(|message| Failure { code: OTHER, message })?;
-        write_atomically(&output.join(&file), |out| out.write_all(text.as_bytes()))?;
-        pictures.push(Picture { file, caption });
-        Ok(())
-    };
-    for scene in distinct(records, |r| &r.scene) {
-        let budgets = budgets_of(records, scene);
+    let all = scenes_and_budgets(outcomes);
+    for scene in distinct(all.iter().map(|(scene, _)| *scene)) {
+        let budgets: Vec<usize> =
+            all.iter().filter(|(other, _)| *other == scene).map(|(_, budget)| *budget).collect();
         if budgets.len() > 1 {
-            let panel = |y: &'static str, score: fn(&Record) -> f64| Panel {
-                title: format!("{scene}: {y} against budget"),
-                x: "budget (rows)",
-                y,
-                log_x: true,
-                curves: by_policy(policies, |policy| {
-                    let point = |&budget: &usize| {
-                        let runs = of(records, scene, budget, policy);
-                        let score = mean(runs.filter(|r| r.is_bounded()).map(score))?;
-                        Some(((budget as f64).ln(), score))
-                    };
-                    budgets.iter().filter_map(point).collect()
-                }),
-            };
-            let panels = [
-                panel("PSNR (dB)", |r| r.psnr),
-                panel("SSIM", |r| r.ssim),
-                panel("FLIP", |r| r.flip),
-            ];
             let caption = format!("{scene}: quality against budget, means over seeds");
-            put(format!("quality-{scene}.svg"), caption, &panels)?;
+            let plot = svg(&quality(outcomes, policies, scene, &budgets))?;
+            pictures.push(plot::write(output, format!("quality-{scene}.svg"), caption, &plot)?);
         }
-        for &budget in &budgets {
-            let panel = |y: &'static str, curve: &dyn Fn(&Record) -> Vec<(u32, f64)>| Panel {
-                title: format!("{scene}, {} rows: {y} over iterations", grouped(budget)),
-                x: "iteration",
-                y,
-                log_x: false,
-                curves: by_policy(policies, |policy| {
-                    let first = of(records, scene, budget, policy).min_by_key(|r| r.seed);
-                    let points = first.map(curve).unwrap_or_default();
-                    points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
-                }),
-            };
-            let memory = |r: &Record| {
-                let bytes = over_time(output, r, "resident_bytes").into_iter();
-                bytes.map(|(step, bytes)| (step, bytes / f64::from(1 << 20))).collect()
-            };
-            let mut panels = vec![
-                panel("rows", &|r| over_time(output, r, "rows")),
-                panel("PSNR (dB)", &|r| r.curve.clone()),
-                panel("resident memory (MiB)", &memory),
-            ];
-            // Not every system says.
-            panels.retain(|panel| bounds(panel).is_some());
+        for budget in budgets {
             let caption = format!(
                 "{scene}, {} rows: rows, PSNR and memory over iterations, first seed",
                 grouped(budget)
             );
-            put(format!("growth-{scene}-{budget}.svg"), caption, &panels)?;
+            let plot = svg(&growth(output, &at(outcomes, scene, budget), policies))?;
+            let file = format!("growth-{scene}-{budget}.svg");
+            pictures.push(plot::write(output, file, caption, &plot)?);
         }
     }
     Ok(pictures)
 }
 
-fn of<'a, 'b>(
-    records: &'b [&'a Record],
-    scene: &'b str,
-    budget: usize,
-    policy: &'b str,
-) -> impl Iterator<Item = &'a Record> + use<'a, 'b> {
-    let here = move |r: &&Record| r.scene == scene && r.budget == budget && r.policy == policy;
-    records.iter().copied().filter(here)
+/// Scores against budget.
+fn quality(
+    outcomes: &[Outcome],
+    policies: &[String],
+    scene: &str,
+    budgets: &[usize],
+) -> [Panel; 3] {
+    let panel = |y: &'static str, score: fn(&Outcome) -> f64| Panel {
+        title: format!("{scene}: {y} against budget"),
+        x: "budget (rows)",
+        y,
+        log_x: true,
+        curves: by_policy(policies, |policy| {
+            let point = |&budget: &usize| {
+                let runs = at(outcomes, scene, budget).into_iter();
+                let runs = runs.filter(|r| r.factor == policy && r.kept_its_budget());
+                Some(((budget as f64).ln(), mean(runs.map(score))?))
+            };
+            budgets.iter().filter_map(point).collect()
+        }),
+    };
+    [panel("PSNR (dB)", |r| r.psnr), panel("SSIM", |r| r.ssim), panel("FLIP", |r| r.flip)]
 }
 
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (sum, count) = values.fold((0.0, 0_u32), |(sum, count), value| (sum + value, count + 1));
-    (count > 0).then(|| sum / f64::from(count))
+/// Rows, PSNR and memory along the runs at the first seed.
+fn growth(output: &Path, runs: &[&Outcome], policies: &[String]) -> Vec<Panel> {
+    let (scene, budget) = runs.first().map_or(("", 0), |run| (&*run.scene, run.budget));
+    let panel = |y: &'static str, curve: &dyn Fn(&Outcome) -> Vec<(u32, f64)>| Panel {
+        title: format!("{scene}, {} rows: {y} over iterations", grouped(budget)),
+        x: "iteration",
+        y,
+        log_x: false,
+        curves: by_policy(policies, |policy| {
+            let first = runs.iter().filter(|r| r.factor == policy).min_by_key(|r| r.seed);
+            let points = first.map(|run| curve(run)).unwrap_or_default();
+            points.into_iter().map(|(x, y)| (f64::from(x), y)).collect()
+        }),
+    };
+    let memory = |r: &Outcome| {
+        let bytes = over_time(output, r, "resident_bytes").into_iter();
+        bytes.map(|(step, bytes)| (step, bytes / f64::from(1 << 20))).collect()
+    };
+    let mut panels = vec![
+        panel("rows", &|r| over_time(output, r, "rows")),
+        panel("PSNR (dB)", &|r| r.curve.clone()),
+        panel("resident memory (MiB)", &memory),
+    ];
+    // Not every system says.
+    panels.retain(|panel| bounds(panel).is_some());
+    panels
+}
+
+/// (iteration, value) of a field of the run's log; nothing where it has none.
+fn over_time(output: &Path, run: &Outcome, field: &str) -> Vec<(u32, f64)> {
+    let path = output.join("runs").join(&run.run).join("stats/train.jsonl");
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let steps =
+        text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    let point = |step: serde_json::Value| {
+        let iteration = u32::try_from(step["step"].as_u64()?).ok()?;
+        Some((iteration, step[field].as_f64()?))
+    };
+    steps.filter_map(point).collect()
 }
 
 fn by_policy(
@@ -132,38 +142,27 @@ fn by_policy(
 }
 
 /// The panels, one above the other.
-fn svg(panels: &[Panel]) -> Result<String, String> {
-    let mut text = String::new();
-    {
-        let size = (PANEL.0, PANEL.1 * panels.len() as u32);
-        let area = SVGBackend::with_string(&mut text, size).into_drawing_area();
-        area.fill(&WHITE).map_err(|e| e.to_string())?;
+fn svg(panels: &[Panel]) -> Result<String, Failure> {
+    plot::svg((PANEL.0, PANEL.1 * panels.len() as u32), |area| {
         for (panel, area) in panels.iter().zip(area.split_evenly((panels.len(), 1))) {
             // An empty panel has no axes.
             if let Some(bounds) = bounds(panel) {
-                draw_panel(panel, bounds, &area).map_err(|e| e.to_string())?;
+                draw_panel(panel, bounds, &area)?;
             }
         }
-        area.present().map_err(|e| e.to_string())?;
-    }
-    Ok(text)
+        Ok(())
+    })
 }
 
 /// What the axes must show, with a margin: `[[x least, x most], [y least, y most]]`.
 fn bounds(panel: &Panel) -> Option<[[f64; 2]; 2]> {
     let points = || panel.curves.iter().flat_map(|(_, points)| points);
-    let range = |of: fn(&(f64, f64)) -> f64| {
-        let least = points().map(of).reduce(f64::min)?;
-        let most = points().map(of).reduce(f64::max)?;
-        Some([least, most])
-    };
-    let ([x0, x1], [y0, y1]) = (range(|p| p.0)?, range(|p| p.1)?);
+    let [x0, x1] = range(points().map(|p| p.0))?;
+    let [y0, y1] = range(points().map(|p| p.1))?;
     let margin = if y1 > y0 { 0.08 * (y1 - y0) } else { 0.5 };
     let x = if panel.log_x { [x0 - 0.1, x1 + 0.1] } else { [0.0, x1.max(1.0)] };
     Some([x, [y0 - margin, y1 + margin]])
 }
-
-type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 
 fn draw_panel(
     panel: &Panel,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use densify_policies::policy::Needs;
 
-use super::console::Console;
+use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
 use crate::backend::{Backend, BackendOptions, Device};
 use crate::dataset::{Dataset, View};
 use crate::evaluate::Split;
@@ -13,30 +13,11 @@ use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::import::ply::read_splats;
 use crate::output::{model_path, saved_iterations};
-use crate::run::{DataSpec, DeviceSpec, RunConfig, use_threads};
 use crate::views::DatasetViews;
-
-/// Spelling of [`Split`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum SplitArg {
-    /// The views held out
-    Test,
-    /// The views trained on
-    Train,
-}
-
-impl From<SplitArg> for Split {
-    fn from(split: SplitArg) -> Self {
-        match split {
-            SplitArg::Test => Self::Test,
-            SplitArg::Train => Self::Train,
-        }
-    }
-}
 
 /// What a model is rendered on.
 #[derive(Debug, Default)]
-pub(super) struct Machine {
+pub(crate) struct Machine {
     /// Processor threads; all without a number.
     threads: Option<usize>,
     device: Device,
@@ -44,24 +25,24 @@ pub(super) struct Machine {
 
 impl Machine {
     /// Opens what the options say.
-    pub(super) fn open(spec: &DeviceSpec, console: &Console) -> Result<Self, Failure> {
+    pub(crate) fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
-        console.say(format_args!("device   {}", device.describe()));
+        observer.say(format_args!("device   {}", device.describe()));
         use_threads(spec.threads.map(NonZeroU16::get));
         Ok(Self { threads: spec.threads.map(|threads| usize::from(threads.get())), device })
     }
 }
 
 /// A model with the dataset it belongs to, ready to render.
-pub(super) struct Opened {
-    pub(super) dataset: Dataset,
-    pub(super) data: DataSpec,
-    pub(super) sh_degree: u8,
-    pub(super) backend: Box<dyn Backend>,
+pub(crate) struct Opened {
+    pub(crate) dataset: Dataset,
+    pub(crate) data: DataSpec,
+    pub(crate) sh_degree: u8,
+    pub(crate) backend: Box<dyn Backend>,
 }
 
 /// The iteration asked for, or the last one saved.
-pub(super) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
+pub(crate) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     let saved = saved_iterations(run)?;
     let last = saved[saved.len() - 1];
     match asked {
@@ -80,20 +61,20 @@ pub(super) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> 
 
 /// Opens the model of a run with its dataset, or with that dataset at `moved_to`, in a backend for
 /// `needs`.
-pub(super) fn open_run(
+pub(crate) fn open_run(
     run: &Path,
     iteration: u32,
     moved_to: Option<PathBuf>,
     machine: Machine,
     needs: Needs,
-    console: &Console,
+    observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
     let config = RunConfig::read(run)?;
     let was_moved = moved_to.is_some();
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
     let near = config.spec.start.near.0;
-    open(&model, &path, config.spec.data, (near, machine), needs, console).map_err(|failure| {
+    open(&model, &path, config.spec.data, (near, machine), needs, observer).map_err(|failure| {
         if was_moved || path.is_dir() {
             failure
         } else {
@@ -103,16 +84,16 @@ pub(super) fn open_run(
 }
 
 /// Opens a model, by whatever program, with a dataset. The near plane is a fraction of the extent.
-pub(super) fn open(
+pub(crate) fn open(
     model: &Path,
     dataset: &Path,
     data: DataSpec,
     (near, machine): (f64, Machine),
     needs: Needs,
-    console: &Console,
+    observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
-    let dataset = load(dataset, &data, console)?;
-    let model = dataset.normalisation.model_from_world(read_model(model, console)?);
+    let dataset = load(dataset, &data, observer)?;
+    let model = dataset.normalisation.model_from_world(read_model(model, observer)?);
     let options = BackendOptions {
         near: (near * dataset.extent()) as f32,
         threads: machine.threads,
@@ -125,23 +106,27 @@ pub(super) fn open(
 }
 
 /// Reads the dataset at `path`; says what there is to say.
-pub(super) fn load(path: &Path, data: &DataSpec, console: &Console) -> Result<Dataset, Failure> {
+pub(crate) fn load(
+    path: &Path,
+    data: &DataSpec,
+    observer: &dyn Observer,
+) -> Result<Dataset, Failure> {
     let dataset = Dataset::load(path, &data.load_options(false)?)?;
     for note in &dataset.notes {
-        console.say(format_args!("note: {note}"));
+        observer.say(format_args!("note: {note}"));
     }
     Ok(dataset)
 }
 
 /// Reads a .ply of Gaussian splats by any program, in its own coordinates; says what was wrong with it.
-pub(super) fn read_model(path: &Path, console: &Console) -> Result<Gaussians, Failure> {
+pub(crate) fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
     let file = read_splats(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
         (file.repaired, "with a zero quaternion, read as unrotated"),
     ] {
         if number > 0 {
-            console.say(format_args!("note: {}: {number} rows {what}", path.display()));
+            observer.say(format_args!("note: {}: {number} rows {what}", path.display()));
         }
     }
     Ok(file.gaussians)
@@ -152,10 +137,10 @@ impl Opened {
     ///
     /// # Errors
     /// When there is none.
-    pub(super) fn views(&self, split: SplitArg) -> Result<DatasetViews, Failure> {
+    pub(crate) fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
         let views: &[View] = match split {
-            SplitArg::Train => &self.dataset.train,
-            SplitArg::Test => &self.dataset.test,
+            Split::Train => &self.dataset.train,
+            Split::Test => &self.dataset.test,
         };
         if views.is_empty() {
             return Err(Failure::input(

@@ -1,13 +1,13 @@
 //! What the records of a study say, level by level.
 
-use super::TradeArgs;
-use super::cell::{BASE, Numerical, Outcome};
 use super::effects::{
     FACTORS, Price, RUNS, dominated_by, error_of_effects, is_free, main_effects, stands_out,
 };
 use super::levels::Factor;
-use crate::cli::study::Difference;
+use super::{BASE, ImageError, Outcome, Trade};
 use crate::knobs::Class;
+use crate::study::difference::{Difference, mean};
+use crate::study::distinct;
 
 /// A study's results.
 pub(super) struct Report {
@@ -16,9 +16,9 @@ pub(super) struct Report {
     pub(super) seeds: u32,
     pub(super) scenes: Vec<String>,
     /// More options of every run.
-    pub(super) train: Vec<String>,
+    pub(super) train: String,
     pub(super) outcomes: Vec<Outcome>,
-    pub(super) images: Vec<Numerical>,
+    pub(super) images: Vec<ImageError>,
     pub(super) effects: Vec<Effect>,
     pub(super) together: Vec<Together>,
 }
@@ -78,23 +78,18 @@ fn positive(value: f64) -> Option<f64> {
 
 impl Report {
     pub(super) fn new(
-        args: &TradeArgs,
+        study: &Trade,
         chosen: &[Factor],
         outcomes: Vec<Outcome>,
-        images: Vec<Numerical>,
+        images: Vec<ImageError>,
     ) -> Self {
-        let mut scenes: Vec<String> = Vec::new();
-        for outcome in &outcomes {
-            if !scenes.contains(&outcome.scene) {
-                scenes.push(outcome.scene.clone());
-            }
-        }
+        let scenes = distinct(outcomes.iter().map(|outcome| outcome.scene.clone()));
         let mut report = Self {
-            iterations: args.iterations,
-            budget: args.budget,
-            seeds: args.seeds,
+            iterations: study.iterations,
+            budget: study.budget,
+            seeds: study.seeds,
             scenes,
-            train: args.train.clone(),
+            train: study.train_words.clone(),
             outcomes,
             images,
             effects: Vec::new(),
@@ -111,7 +106,7 @@ impl Report {
 
     /// The runs with a knob at a level.
     pub(super) fn runs(&self, knob: &str, level: &str) -> impl Iterator<Item = &Outcome> {
-        let is_it = move |run: &&Outcome| run.knob == knob && run.level == level;
+        let is_it = move |run: &&Outcome| run.factor == knob && run.level == level;
         self.outcomes.iter().filter(is_it)
     }
 
@@ -130,7 +125,7 @@ impl Report {
 
     fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
         let name = &*factor.name;
-        let of = |measure: Measure| Difference::of(&self.differences(name, level, measure));
+        let of = |measure: Measure| Difference::new(&self.differences(name, level, measure));
         let (psnr, ssim, depth) = (of(PSNR)?, of(SSIM)?, of(DEPTH));
         let pairs = self.pairs(name, level);
         let same = pairs.iter().filter(|(run, base)| run.model == base.model).count();
@@ -182,7 +177,7 @@ impl Report {
 
     /// The knobs that stand out, each at the fastest of its levels that does; as many as there is room
     /// for. Those that only say how large a run is are left out, and those that are several knobs.
-    pub(super) fn that_stand_out(&self) -> Vec<(String, String)> {
+    pub(super) fn knobs_that_stand_out(&self) -> Vec<(String, String)> {
         let mut found: Vec<&Effect> = Vec::new();
         for effect in &self.effects {
             let sized = effect.factor.is_size;
@@ -245,8 +240,7 @@ impl Report {
     pub(super) fn mean(&self, scene: &str, knob: &str, level: &str, of: Measure) -> Option<f64> {
         let values: Option<Vec<f64>> =
             self.runs(knob, level).filter(|run| run.scene == scene).map(of).collect();
-        let values = values.filter(|values| !values.is_empty())?;
-        Some(values.iter().sum::<f64>() / values.len() as f64)
+        mean(values?)
     }
 
     /// Peak memory of the runs with a knob at a level in a scene `[MiB]`.
@@ -259,24 +253,10 @@ impl Report {
 #[cfg(test)]
 pub(super) fn sample() -> Report {
     let outcome = |knob: &str, level: &str, seed, psnr: f64, seconds: f64| Outcome {
-        densify: "1".into(),
-        scene: "room".into(),
-        knob: knob.into(),
-        level: level.into(),
-        seed,
-        run: String::new(),
-        spec: toml::Table::new(),
-        model: (psnr * 1e3) as u32,
-        psnr,
-        ssim: psnr / 100.0,
-        flip: 0.1,
-        rows: 9,
         peak_bytes: Some(64 << 20),
-        ledger_bytes: 1,
         seconds,
-        cpu_seconds: None,
         stage_seconds: [("rasterize".to_owned(), 0.5 * seconds)].into(),
-        geometry: None,
+        ..crate::study::record::sample(knob, level, seed, psnr)
     };
     let outcomes = (0..3).flat_map(|seed| {
         let by = f64::from(seed);
@@ -287,7 +267,7 @@ pub(super) fn sample() -> Report {
             outcome("ssim_every", "5", seed, 30.2 + by, 50.0),
         ]
     });
-    let image = |knob: &str, level: &str, standard| Numerical {
+    let image = |knob: &str, level: &str, standard| ImageError {
         densify: "1".into(),
         scene: "room".into(),
         knob: knob.into(),
@@ -297,15 +277,16 @@ pub(super) fn sample() -> Report {
         everything: standard - 1.0,
         worst: 0.01,
     };
-    let args = TradeArgs {
+    let study = Trade {
         scenes: vec!["scene:room".into()],
         knobs: Vec::new(),
         seeds: 3,
         iterations: 100,
         budget: 1000,
-        no_factorial: false,
+        factorial: true,
         output: "x".into(),
-        train: vec!["--policy=diet".into()],
+        train: crate::run::Partial::default(),
+        train_words: "--policy=diet".into(),
     };
     let factor = |name: &str, levels: &[&str]| Factor {
         name: name.to_owned(),
@@ -320,7 +301,7 @@ pub(super) fn sample() -> Report {
         image("alpha_min", "1/32", 42.0),
     ];
 
-    Report::new(&args, &chosen, outcomes.collect(), images)
+    Report::new(&study, &chosen, outcomes.collect(), images)
 }
 
 #[cfg(test)]
@@ -343,7 +324,7 @@ mod tests {
         let best = of("5");
         assert!(best.free && best.dominated.is_none() && best.numerical.is_none());
         assert_eq!(free.dominated.as_deref(), Some("ssim_every=5"));
-        let together = report.that_stand_out();
+        let together = report.knobs_that_stand_out();
         assert_eq!(together[0], ("ssim_every".to_owned(), "5".to_owned()));
         assert_eq!(together[1], ("alpha_min".to_owned(), "1/64".to_owned()));
     }
@@ -351,9 +332,9 @@ mod tests {
     #[test]
     fn effects_among_others_come_from_the_factorial() {
         let mut report = sample();
-        let knobs = report.that_stand_out();
+        let knobs = report.knobs_that_stand_out();
         let runs = plackett_burman().into_iter().enumerate().map(|(i, run)| Outcome {
-            knob: "factorial".into(),
+            factor: "factorial".into(),
             level: (i + 1).to_string(),
             psnr: 30.0 + if run[0] { 0.5 } else { 0.0 } - if run[1] { 0.25 } else { 0.0 },
             seconds: 100.0 * if run[0] { 0.5 } else { 1.0 },

@@ -1,11 +1,10 @@
 //! What a study varies, and at which levels.
 
-use super::TradeArgs;
+use super::Trade;
 use crate::backend::{BackendChoice, BackendKind};
-use crate::cli::console::Console;
 use crate::failure::Failure;
 use crate::knobs::{Class, KNOBS, find};
-use crate::run::{Partial, RunOption, RunSpec};
+use crate::run::{Observer, Partial, RunOption, RunSpec};
 
 /// A knob or an option of a run that a study varies.
 #[derive(Debug, Clone)]
@@ -41,9 +40,9 @@ const OPTIONS: [(&str, Class, Levels); 7] = [
 /// # Errors
 /// When there is no such knob or option, or a level is outside its domain.
 pub(super) fn factors(
-    args: &TradeArgs,
+    study: &Trade,
     train: &Partial,
-    console: &Console,
+    observer: &dyn Observer,
 ) -> Result<Vec<Factor>, Failure> {
     let spec = train.clone().describe()?;
     let kind = match spec.device.backend {
@@ -51,30 +50,30 @@ pub(super) fn factors(
         _ if spec.device.gpu.is_some() => BackendKind::Gpu,
         _ => BackendKind::Cpu,
     };
-    if args.knobs.is_empty() {
+    if study.knobs.is_empty() {
         let here = |name: &str| BackendKind::only_one_with(name).is_none_or(|only| only == kind);
         let knobs = KNOBS.iter().map(|knob| knob.name).filter(|name| here(name));
         let names = knobs.chain(OPTIONS.iter().map(|(name, ..)| *name));
         let mut all = Vec::new();
         for name in names {
-            match factor(args, name, &[]).and_then(|one| check(train, &one).map(|()| one)) {
+            match factor(study, name, &[]).and_then(|one| check(train, &one).map(|()| one)) {
                 Ok(one) => all.push(one),
                 Err(failure) => {
-                    console.say(format_args!("note: {name} is left out: {}", failure.message));
+                    observer.say(format_args!("note: {name} is left out: {}", failure.message));
                 }
             }
         }
         return Ok(all);
     }
     let mut all: Vec<Factor> = Vec::new();
-    for text in &args.knobs {
+    for text in &study.knobs {
         let mut parts = text.split(':').map(str::trim);
         let name = parts.next().unwrap_or_default();
         let levels: Vec<&str> = parts.collect();
         if all.iter().any(|one| one.name == name) {
             return Err(Failure::input(format!("--knobs names {name} twice")));
         }
-        let one = factor(args, name, &levels);
+        let one = factor(study, name, &levels);
         let one = one.and_then(|one| check(train, &one).map(|()| one));
         all.push(one.map_err(|failure| failure.within(&format!("--knobs {text}")))?);
     }
@@ -82,12 +81,12 @@ pub(super) fn factors(
 }
 
 /// A knob or an option by name, at these levels, or at its own where there are none.
-fn factor(args: &TradeArgs, name: &str, levels: &[&str]) -> Result<Factor, Failure> {
+fn factor(study: &Trade, name: &str, levels: &[&str]) -> Result<Factor, Failure> {
     let given = levels.iter().map(|level| (*level).to_owned()).collect::<Vec<_>>();
     let of_option = OPTIONS.iter().find(|(option, ..)| *option == name);
     let (class, is_size, own) = match (of_option, RunOption::find(name), find(name)) {
         (Some((_, class, levels)), ..) => {
-            let (is_size, own) = sized(args, levels);
+            let (is_size, own) = sized(study, levels);
             (*class, is_size, own)
         }
         (None, Some(_), _) if given.is_empty() => {
@@ -108,15 +107,15 @@ fn factor(args: &TradeArgs, name: &str, levels: &[&str]) -> Result<Factor, Failu
 }
 
 /// Whether the levels follow the size of the runs, and the levels for runs of this size.
-fn sized(args: &TradeArgs, levels: &Levels) -> (bool, Vec<String>) {
+fn sized(study: &Trade, levels: &Levels) -> (bool, Vec<String>) {
     let times = |factors: &[f64], base: f64| {
         let level = |factor: &f64| ((base * factor).round().max(1.0) as u64).to_string();
         factors.iter().map(level).collect()
     };
     match levels {
         Levels::These(values) => (false, values.iter().map(|v| (*v).to_owned()).collect()),
-        Levels::TimesBudget(factors) => (true, times(factors, args.budget as f64)),
-        Levels::TimesIterations(factors) => (true, times(factors, f64::from(args.iterations))),
+        Levels::TimesBudget(factors) => (true, times(factors, study.budget as f64)),
+        Levels::TimesIterations(factors) => (true, times(factors, f64::from(study.iterations))),
     }
 }
 

@@ -1,23 +1,22 @@
-//! A study as text: Markdown for the file, a few lines for the terminal. Markdown has no grey: rows
-//! that others dominate are set in italics, and say by what.
+//! The study as text: Markdown for the file, a few lines for the terminal.
+//!
+//! Markdown has no grey: rows that others dominate are set in italics, and say by what.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use super::report::{Effect, PSNR, Report, SECONDS};
-use crate::cli::study::Difference;
 use crate::knobs::Class;
 use crate::number::grouped;
+use crate::study::difference::Difference;
+use crate::study::markdown::{MarkdownTable, number_or_dash};
 
 /// The whole study.
 pub(super) fn markdown(report: &Report) -> String {
     let mut text = String::from("# What each knob costs and buys\n\n");
     let Report { iterations, budget, seeds, scenes, train, .. } = report;
-    let options = if train.is_empty() {
-        String::new()
-    } else {
-        format!(" Options of every run: `{}`.", train.join(" "))
-    };
+    let options =
+        if train.is_empty() { String::new() } else { format!(" Options of every run: `{train}`.") };
     let _ = writeln!(
         text,
         "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
@@ -40,55 +39,77 @@ pub(super) fn markdown(report: &Report) -> String {
 
 /// What the differences are from.
 fn exact(report: &Report) -> String {
-    let mut text =
-        "\n## exact\n\n| scene | PSNR [dB] | time [s] | peak [MiB] |\n|---|---|---|---|\n"
-            .to_owned();
+    let mut table = MarkdownTable::new(&["scene", "PSNR [dB]", "time [s]", "peak [MiB]"]);
     for scene in &report.scenes {
-        let psnr = shown(report.mean(scene, "", "", PSNR), 2);
-        let seconds = shown(report.mean(scene, "", "", SECONDS).map(f64::exp), 1);
-        let peak = shown(report.peak_mib(scene, "", ""), 0);
-        let _ = writeln!(text, "| {scene} | {psnr} | {seconds} | {peak} |");
+        let psnr = number_or_dash(report.mean(scene, "", "", PSNR), 2);
+        let seconds = number_or_dash(report.mean(scene, "", "", SECONDS).map(f64::exp), 1);
+        let peak = number_or_dash(report.peak_mib(scene, "", ""), 0);
+        table.row(&[scene.clone(), psnr, seconds, peak]);
     }
-    text
+    format!("\n## exact\n\n{table}")
 }
 
 fn numerical(report: &Report) -> String {
-    let mut text = String::from(
+    let mut table = MarkdownTable::new(&[
+        "knob",
+        "level",
+        "scene",
+        "standard rules [dB]",
+        "everything blended [dB]",
+        "largest error",
+    ]);
+    for image in &report.images {
+        table.row(&[
+            knob_or_exact(&image.knob).to_owned(),
+            image.level.clone(),
+            image.scene.clone(),
+            format!("{:.1}", image.standard),
+            format!("{:.1}", image.everything),
+            format!("{:.1e}", image.worst),
+        ]);
+    }
+    format!(
         "\n## Numerical error\n\nThe same model, rendered with the knob at the level, against a \
          renderer in float64: by the standard rules (alpha from 1/255, transmittance down to 1e-4), \
-         and one that blends everything.\n\n\
-         | knob | level | scene | standard rules [dB] | everything blended [dB] | largest error |\n\
-         |---|---|---|---|---|---|\n",
-    );
-    for image in &report.images {
-        let knob = if image.knob.is_empty() { "(exact)" } else { &image.knob };
-        let _ = writeln!(
-            text,
-            "| {knob} | {} | {} | {:.1} | {:.1} | {:.1e} |",
-            image.level, image.scene, image.standard, image.everything, image.worst
-        );
-    }
-    text
+         and one that blends everything.\n\n{table}"
+    )
+}
+
+fn knob_or_exact(knob: &str) -> &str {
+    if knob.is_empty() { "(exact)" } else { knob }
 }
 
 fn outcomes(report: &Report) -> String {
-    let mut text = String::from(
+    let mut table = MarkdownTable::new(&[
+        "knob",
+        "level",
+        "class",
+        "ΔPSNR [dB]",
+        "ΔSSIM",
+        "ΔFLIP",
+        "depth error ×",
+        "Chamfer ×",
+        "time ×",
+        "processor time ×",
+        "peak ×",
+        "images [dB]",
+        "same bits",
+        "verdict",
+    ]);
+    for effect in &report.effects {
+        let mut cells = row(effect);
+        if effect.dominated.is_some() {
+            for cell in cells.iter_mut().filter(|cell| !cell.is_empty()) {
+                *cell = format!("*{cell}*");
+            }
+        }
+        table.row(&cells);
+    }
+    format!(
         "\n## Outcome of training\n\nItalics: dominated, another level is nowhere worse and somewhere \
          better in PSNR, time and memory. Free: the interval of PSNR lies above −0.05 dB, that of SSIM \
-         above −0.001, that of depth error below 1.02, and numerical PSNR is at least 60 dB.\n\n\
-         | knob | level | class | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | processor time × | peak × | images [dB] | same bits | verdict |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
-    );
-    for effect in &report.effects {
-        let cells = row(effect);
-        let grey = effect.dominated.is_some();
-        let cell = |cell: &String| {
-            if grey && !cell.is_empty() { format!("*{cell}*") } else { cell.clone() }
-        };
-        let cells: Vec<String> = cells.iter().map(cell).collect();
-        let _ = writeln!(text, "| {} |", cells.join(" | "));
-    }
-    text
+         above −0.001, that of depth error below 1.02, and numerical PSNR is at least 60 dB.\n\n{table}"
+    )
 }
 
 fn row(effect: &Effect) -> Vec<String> {
@@ -122,7 +143,7 @@ fn row(effect: &Effect) -> Vec<String> {
         ratio(&effect.seconds),
         maybe(&effect.cpu),
         ratio(&effect.peak),
-        shown(effect.numerical, 1),
+        number_or_dash(effect.numerical, 1),
         format!("{} of {}", effect.same, effect.psnr.pairs),
         verdict.join(", "),
     ]
@@ -132,14 +153,15 @@ fn together(report: &Report) -> String {
     if report.together.is_empty() {
         return String::new();
     }
-    let mut text = String::from(
-        "\n## Knobs together\n\nThose whose effect on PSNR or time is more than two standard errors, \
-         each at the fastest such level, in twelve runs after Plackett and Burman (1946) with the \
-         first seed. Where an effect among others differs from the one alone by more than two \
-         standard errors, knobs interact.\n\n\
-         | knob | level | ΔPSNR alone [dB] | among others [dB] | time × alone | among others | interacts |\n\
-         |---|---|---|---|---|---|---|\n",
-    );
+    let mut table = MarkdownTable::new(&[
+        "knob",
+        "level",
+        "ΔPSNR alone [dB]",
+        "among others [dB]",
+        "time × alone",
+        "among others",
+        "interacts",
+    ]);
     for one in &report.together {
         let [psnr, seconds] = one.alone;
         let differs =
@@ -152,17 +174,22 @@ fn together(report: &Report) -> String {
             _ => "no",
         };
         let error = one.errors.map_or_else(String::new, |e| format!(" ± {:.2}", e[0]));
-        let _ = writeln!(
-            text,
-            "| {} | {} | {psnr:+.2} | {:+.2}{error} | {:.3} | {:.3} | {interacts} |",
-            one.knob,
-            one.level,
-            one.among[0],
-            seconds.exp(),
-            one.among[1].exp(),
-        );
+        table.row(&[
+            one.knob.clone(),
+            one.level.clone(),
+            format!("{psnr:+.2}"),
+            format!("{:+.2}{error}", one.among[0]),
+            format!("{:.3}", seconds.exp()),
+            format!("{:.3}", one.among[1].exp()),
+            interacts.to_owned(),
+        ]);
     }
-    text
+    format!(
+        "\n## Knobs together\n\nThose whose effect on PSNR or time is more than two standard errors, \
+         each at the fastest such level, in twelve runs after Plackett and Burman (1946) with the \
+         first seed. Where an effect among others differs from the one alone by more than two \
+         standard errors, knobs interact.\n\n{table}"
+    )
 }
 
 /// Seconds by stage of `exact` and of every level, as a mean over all runs.
@@ -177,26 +204,16 @@ fn stages(report: &Report) -> String {
     };
     let base = mean("", "");
     let names: Vec<&String> = base.keys().collect();
-    let mut text =
-        String::from("\n## Time by stage\n\nSeconds, means over all scenes and seeds.\n\n");
-    let titles: Vec<String> = names.iter().map(|name| format!(" {name} |")).collect();
-    let _ = writeln!(text, "| knob | level |{}", titles.concat());
-    let _ = writeln!(text, "|---|---|{}", "---|".repeat(names.len()));
+    let titles = ["knob", "level"].into_iter().chain(names.iter().map(|name| &***name));
+    let mut table = MarkdownTable::new(&titles.collect::<Vec<_>>());
     let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
     for (knob, level) in std::iter::once(("", "")).chain(levels) {
         let seconds = mean(knob, level);
-        let cells: Vec<String> = names
-            .iter()
-            .map(|name| format!(" {} |", shown(seconds.get(*name).copied(), 2)))
-            .collect();
-        let knob = if knob.is_empty() { "(exact)" } else { knob };
-        let _ = writeln!(text, "| {knob} | {level} |{}", cells.concat());
+        let cell = |name: &&String| number_or_dash(seconds.get(*name).copied(), 2);
+        let first = [knob_or_exact(knob).to_owned(), level.to_owned()];
+        table.row(&first.into_iter().chain(names.iter().map(cell)).collect::<Vec<_>>());
     }
-    text
-}
-
-fn shown(value: Option<f64>, digits: usize) -> String {
-    value.map_or_else(|| "–".to_owned(), |value| format!("{value:.digits$}"))
+    format!("\n## Time by stage\n\nSeconds, means over all scenes and seeds.\n\n{table}")
 }
 
 /// A line per level.

@@ -9,14 +9,16 @@ use std::path::Path;
 use densify_policies::policy::Needs;
 use image::{ImageFormat, Rgb, RgbImage, imageops};
 
-use super::{Picture, Record, budgets_of, distinct, run_folder};
-use crate::cli::console::Console;
-use crate::cli::run_files::{Machine, SplitArg, open_run};
+use super::{Outcome, at, scenes_and_budgets};
 use crate::dataset::images::Image8;
+use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::number::grouped;
-use crate::output::write_atomically;
-use crate::views::ViewSource;
+use crate::output::{model_path, write_atomically};
+use crate::run::finished::{Machine, Opened, open_run};
+use crate::run::{Observer, Silent};
+use crate::study::Picture;
+use crate::views::{DatasetViews, ViewSource};
 
 /// Width of a crop in the picture `[px]`; small ones are enlarged by whole numbers.
 const SHOWN: u32 = 240;
@@ -39,77 +41,94 @@ struct Window {
 /// When a model cannot be rendered or a file cannot be written.
 pub(super) fn draw(
     output: &Path,
-    records: &[&Record],
-    console: &Console,
+    outcomes: &[Outcome],
+    observer: &dyn Observer,
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
-    for scene in distinct(records, |r| &r.scene) {
-        for budget in budgets_of(records, scene) {
-            let here = records.iter().filter(|r| r.scene == *scene && r.budget == budget);
-            let here: Vec<&Record> = here.copied().collect();
-            let Some(seed) = here.iter().map(|r| r.seed).min() else { continue };
-            let mut crops = Vec::new();
-            let mut shown = vec!["photograph".to_owned()];
-            let mut place = None;
-            for record in here.into_iter().filter(|r| r.seed == seed) {
-                let folder = run_folder(output, record);
-                if !crate::output::model_path(&folder, record.iterations).is_file() {
-                    console.say(format_args!("note: {} is gone; no crop of it", folder.display()));
-                    continue;
-                }
-                let quiet = Console::new(true);
-                let needs = Needs::default();
-                let machine = Machine::default();
-                let mut opened =
-                    open_run(&folder, record.iterations, None, machine, needs, &quiet)?;
-                let views = opened.views(SplitArg::Test)?;
-                let background = opened.data.background.fixed();
-                let image = |view: usize| {
-                    let image = views.image(view);
-                    image.map_err(|e| Failure::input(format!("{}: {e}", views.name(view))))
-                };
-                let (view, window) = match place {
-                    Some(place) => place,
-                    None => {
-                        let mut best: Option<(u64, usize, Window)> = None;
-                        for view in 0..views.count() {
-                            let (edges, window) = most_edges(&*image(view)?, background);
-                            if best.is_none_or(|(most, ..)| edges > most) {
-                                best = Some((edges, view, window));
-                            }
-                        }
-                        let Some((_, view, window)) = best else { continue };
-                        crops.push(cut(&photograph(&*image(view)?, background), window));
-                        *place.insert((view, window))
-                    }
-                };
-                let rendering =
-                    opened.backend.render(views.camera(view), background, opened.sh_degree)?;
-                let at = |x: u32, y: u32| {
-                    let first = 3 * (y as usize * rendering.width as usize + x as usize);
-                    let rgb = &rendering.rgb[first..first + 3];
-                    Rgb([0, 1, 2].map(|c| (rgb[c].clamp(0.0, 1.0) * 255.0).round() as u8))
-                };
-                let rendered = RgbImage::from_fn(rendering.width, rendering.height, at);
-                crops.push(cut(&rendered, window));
-                shown.push(record.policy.clone());
-            }
-            if crops.is_empty() {
-                continue;
-            }
-            let file = format!("crops-{scene}-{budget}.png");
-            let mut encoded = Cursor::new(Vec::new());
-            let picture = side_by_side(&crops);
-            write_atomically(&output.join(&file), |out| {
-                picture.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
-                out.write_all(encoded.get_ref())
-            })?;
-            let order = shown.join(", ");
-            let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
-            pictures.push(Picture { file, caption });
+    for (scene, budget) in scenes_and_budgets(outcomes) {
+        let (crops, shown) = crops(output, &at(outcomes, scene, budget), observer)?;
+        if crops.is_empty() {
+            continue;
         }
+        let file = format!("crops-{scene}-{budget}.png");
+        let mut encoded = Cursor::new(Vec::new());
+        let picture = side_by_side(&crops);
+        write_atomically(&output.join(&file), |out| {
+            picture.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
+            out.write_all(encoded.get_ref())
+        })?;
+        let order = shown.join(", ");
+        let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
+        pictures.push(Picture { file, caption });
     }
     Ok(pictures)
+}
+
+/// The crops of the runs at the first seed after that of the photograph, and what each shows.
+fn crops(
+    output: &Path,
+    runs: &[&Outcome],
+    observer: &dyn Observer,
+) -> Result<(Vec<RgbImage>, Vec<String>), Failure> {
+    let (mut crops, mut shown) = (Vec::new(), vec!["photograph".to_owned()]);
+    let mut place = None;
+    let first = runs.iter().map(|r| r.seed).min();
+    for run in runs.iter().filter(|r| Some(r.seed) == first) {
+        let folder = output.join("runs").join(&run.run);
+        if !model_path(&folder, run.iterations).is_file() {
+            observer.say(format_args!("note: {} is gone; no crop of it", folder.display()));
+            continue;
+        }
+        let machine = Machine::default();
+        let needs = Needs::default();
+        let mut opened = open_run(&folder, run.iterations, None, machine, needs, &Silent)?;
+        let views = opened.views(Split::Test)?;
+        let background = opened.data.background.fixed();
+        let (view, window) = match place {
+            Some(place) => place,
+            None => {
+                let Some((view, window)) = richest_window(&views, background)? else { continue };
+                crops.push(cut(&photograph(&*image(&views, view)?, background), window));
+                *place.insert((view, window))
+            }
+        };
+        crops.push(cut(&rendering(&mut opened, &views, view)?, window));
+        shown.push(run.factor.clone());
+    }
+    Ok((crops, shown))
+}
+
+fn image(
+    views: &DatasetViews,
+    view: usize,
+) -> Result<impl std::ops::Deref<Target = Image8>, Failure> {
+    views.image(view).map_err(|e| Failure::input(format!("{}: {e}", views.name(view))))
+}
+
+/// The window with the most edges of all views.
+fn richest_window(
+    views: &DatasetViews,
+    background: [f32; 3],
+) -> Result<Option<(usize, Window)>, Failure> {
+    let mut best: Option<(u64, usize, Window)> = None;
+    for view in 0..views.count() {
+        let (edges, window) = most_edges(&*image(views, view)?, background);
+        if best.is_none_or(|(most, ..)| edges > most) {
+            best = Some((edges, view, window));
+        }
+    }
+    Ok(best.map(|(_, view, window)| (view, window)))
+}
+
+fn rendering(opened: &mut Opened, views: &DatasetViews, view: usize) -> Result<RgbImage, Failure> {
+    let background = opened.data.background.fixed();
+    let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
+    let at = |x: u32, y: u32| {
+        let first = 3 * (y as usize * rendering.width as usize + x as usize);
+        let rgb = &rendering.rgb[first..first + 3];
+        Rgb([0, 1, 2].map(|c| (rgb[c].clamp(0.0, 1.0) * 255.0).round() as u8))
+    };
+    Ok(RgbImage::from_fn(rendering.width, rendering.height, at))
 }
 
 fn photograph(image: &Image8, background: [f32; 3]) -> RgbImage {

@@ -5,8 +5,9 @@ use std::path::Path;
 use plotters::prelude::*;
 
 use super::report::{PSNR, Report, SECONDS};
-use crate::failure::{Failure, OTHER};
-use crate::output::write_atomically;
+use crate::failure::Failure;
+use crate::study::Picture;
+use crate::study::plot::{self, Area, range};
 
 /// Size of a plot `[px]`.
 const SIZE: (u32, u32) = (900, 560);
@@ -26,11 +27,11 @@ struct Point {
     front: bool,
 }
 
-/// Draws a plot per scene into the folder `output`; returns file names and captions.
+/// Draws a plot per scene into the folder `output`.
 ///
 /// # Errors
 /// When a file cannot be written.
-pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<(String, String)>, Failure> {
+pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<Picture>, Failure> {
     let mut drawn = Vec::new();
     for scene in &report.scenes {
         let points = points(report, scene);
@@ -38,11 +39,8 @@ pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<(String, String
             continue;
         }
         let title = format!("{scene}: PSNR against time, coloured by peak memory");
-        let text = svg(&title, &points)
-            .map_err(|error| Failure { code: OTHER, message: error.to_string() })?;
-        let file = format!("pareto-{scene}.svg");
-        write_atomically(&output.join(&file), |out| out.write_all(text.as_bytes()))?;
-        drawn.push((file, title));
+        let svg = plot::svg(SIZE, |area| draw_points(&title, &points, area))?;
+        drawn.push(plot::write(output, format!("pareto-{scene}.svg"), title, &svg)?);
     }
     Ok(drawn)
 }
@@ -82,59 +80,46 @@ fn colour(peak: f64, [least, most]: [f64; 2]) -> RGBColor {
     RGBColor(mix(from.0, to.0), mix(from.1, to.1), mix(from.2, to.2))
 }
 
-fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
-    values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], v| [low.min(v), high.max(v)])
-}
-
-fn svg(title: &str, points: &[Point]) -> Result<String, Box<dyn std::error::Error>> {
-    let mut text = String::new();
-    {
-        let area = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
-        area.fill(&WHITE)?;
-        let [fast, slow] = range(points.iter().map(|p| p.seconds));
-        let [low, high] = range(points.iter().map(|p| p.psnr));
-        let peaks = range(points.iter().map(|p| p.peak));
-        let margin = 0.08 * (high - low).max(0.1);
-        let mut chart = ChartBuilder::on(&area)
-            .caption(title, ("sans-serif", 17))
-            .margin(8)
-            .margin_right(130)
-            .x_label_area_size(42)
-            .y_label_area_size(60)
-            .build_cartesian_2d(
-                (0.93 * fast..1.07 * slow).log_scale(),
-                low - margin..high + margin,
-            )?;
-        chart
-            .configure_mesh()
-            .light_line_style(WHITE)
-            .x_desc("time of training [s], logarithmic")
-            .y_desc("PSNR against exact [dB]")
-            .x_label_formatter(&|x| if *x < 10.0 { format!("{x:.2}") } else { format!("{x:.0}") })
-            .y_label_formatter(&|y| format!("{y:+.2}"))
-            .draw()?;
-        for point in points {
-            let at = (point.seconds, point.psnr);
-            let filled = colour(point.peak, peaks).filled();
-            let radius = if point.front { 6 } else { 4 };
-            let ink = if point.front { BLACK.to_rgba() } else { RGBColor(120, 120, 120).to_rgba() };
-            let label =
-                Text::new(point.name.clone(), (9, -5), ("sans-serif", 11).into_font().color(&ink));
-            chart.draw_series(std::iter::once(
-                EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label,
-            ))?;
-        }
-        scale(&area, peaks)?;
-        area.present()?;
+fn draw_points(
+    title: &str,
+    points: &[Point],
+    area: &Area<'_>,
+) -> Result<(), Box<dyn std::error::Error>> {
+    let [fast, slow] = range(points.iter().map(|p| p.seconds)).unwrap_or([1.0; 2]);
+    let [low, high] = range(points.iter().map(|p| p.psnr)).unwrap_or_default();
+    let peaks = range(points.iter().map(|p| p.peak)).unwrap_or_default();
+    let margin = 0.08 * (high - low).max(0.1);
+    let mut chart = ChartBuilder::on(area)
+        .caption(title, ("sans-serif", 17))
+        .margin(8)
+        .margin_right(130)
+        .x_label_area_size(42)
+        .y_label_area_size(60)
+        .build_cartesian_2d((0.93 * fast..1.07 * slow).log_scale(), low - margin..high + margin)?;
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .x_desc("time of training [s], logarithmic")
+        .y_desc("PSNR against exact [dB]")
+        .x_label_formatter(&|x| if *x < 10.0 { format!("{x:.2}") } else { format!("{x:.0}") })
+        .y_label_formatter(&|y| format!("{y:+.2}"))
+        .draw()?;
+    for point in points {
+        let at = (point.seconds, point.psnr);
+        let filled = colour(point.peak, peaks).filled();
+        let radius = if point.front { 6 } else { 4 };
+        let ink = if point.front { BLACK.to_rgba() } else { RGBColor(120, 120, 120).to_rgba() };
+        let label =
+            Text::new(point.name.clone(), (9, -5), ("sans-serif", 11).into_font().color(&ink));
+        chart.draw_series(std::iter::once(
+            EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label,
+        ))?;
     }
-    Ok(text)
+    scale(area, peaks)
 }
 
 /// The colour scale, right of the plot.
-fn scale(
-    area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
-    [least, most]: [f64; 2],
-) -> Result<(), Box<dyn std::error::Error>> {
+fn scale(area: &Area<'_>, [least, most]: [f64; 2]) -> Result<(), Box<dyn std::error::Error>> {
     const STEPS: i32 = 40;
     let (x, bottom) = (SIZE.0 as i32 - 108, 400);
     for step in 0..=STEPS {
@@ -168,7 +153,7 @@ mod tests {
             ("ssim_every=5", true),
         ];
         assert_eq!(front, expected);
-        let text = svg("title", &points).unwrap();
+        let text = plot::svg(SIZE, |area| draw_points("title", &points, area)).unwrap();
         for words in ["title", "alpha_min=1/64", "ssim_every=5", "peak memory", "logarithmic"] {
             assert!(text.contains(words), "{words} is not in {text}");
         }

@@ -1,8 +1,7 @@
-//! What is learned from the runs: differences that are paired by scene and seed, which of them stand
-//! out, which levels others dominate, which are free, and what knobs do among each other. Pure
-//! functions of numbers.
+//! What is learned from the runs, as pure functions of numbers: which effects stand out, which levels others
+//! dominate, which are free, and what knobs do among each other.
 
-use crate::cli::study::Difference;
+use crate::study::difference::Difference;
 
 /// Runs of a factorial.
 pub(super) const RUNS: usize = 12;

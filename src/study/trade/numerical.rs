@@ -1,4 +1,4 @@
-//! Numerical error: one model, rendered with a knob at a level and by the float64 renderer, pixel by
+//! ImageError error: one model, rendered with a knob at a level and by the float64 renderer, pixel by
 //! pixel.
 
 use std::path::Path;
@@ -7,17 +7,17 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::cell::{Cell, Numerical};
 use crate::backend::Backend;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::camera::Camera;
-use crate::cli::console::Console;
-use crate::cli::run_files::{self, iteration, read_model};
 use crate::failure::{Failure, OTHER};
 use crate::gaussians::Gaussians;
 use crate::knobs::{Knobs, find};
 use crate::output::model_path;
-use crate::run::RunConfig;
+use crate::run::finished::{iteration, load, read_model};
+use crate::run::{Observer, RunConfig};
+use crate::study::cell::Cell;
+use crate::study::record::ImageError;
 use crate::verify::reference::{Model, Rules, View, pixels};
 
 /// Views looked at, evenly spread over those held out.
@@ -30,11 +30,11 @@ pub(super) struct Subject {
     model: Gaussians,
     near: f32,
     background: [f32; 3],
-    views: Vec<Looked>,
+    views: Vec<SampledView>,
 }
 
 /// A view with some pixels.
-struct Looked {
+struct SampledView {
     camera: Camera,
     pixels: Vec<[u32; 2]>,
     /// By the standard rules, and with everything blended.
@@ -46,16 +46,17 @@ impl Subject {
     ///
     /// # Errors
     /// When it cannot be read.
-    pub(super) fn of(folder: &Path, console: &Console) -> Result<Self, Failure> {
+    pub(super) fn read(folder: &Path, observer: &dyn Observer) -> Result<Self, Failure> {
         let config = RunConfig::read(folder)?;
-        let dataset = run_files::load(&config.scene_path(), &config.spec.data, console)?;
+        let dataset = load(&config.scene_path(), &config.spec.data, observer)?;
         let path = model_path(folder, iteration(folder, None)?);
-        let model = dataset.normalisation.model_from_world(read_model(&path, console)?);
+        let model = dataset.normalisation.model_from_world(read_model(&path, observer)?);
         let near = (config.spec.start.near.0 * dataset.extent()) as f32;
         let background = config.spec.data.background.fixed();
         let count = dataset.test.len();
         let chosen = (0..VIEWS.min(count)).map(|i| i * count / VIEWS.min(count));
-        let views = chosen.map(|i| Looked::at(&model, dataset.test[i].camera, near, background, i));
+        let views =
+            chosen.map(|i| SampledView::new(&model, dataset.test[i].camera, near, background, i));
         Ok(Self { views: views.collect(), model, near, background })
     }
 
@@ -68,7 +69,7 @@ impl Subject {
         cell: &Cell,
         knob: &str,
         level: &str,
-    ) -> Result<Numerical, Failure> {
+    ) -> Result<ImageError, Failure> {
         let mut knobs = Knobs::default();
         if find(knob).is_ok() {
             knobs.set(knob, level).map_err(|error| Failure::input(format!("--knobs: {error}")))?;
@@ -101,12 +102,12 @@ impl Subject {
         }
         // Beyond this is nothing that eight or sixteen bits could show.
         let psnr = |squares: f64| (-10.0 * (squares / count).log10()).min(200.0);
-        Ok(Numerical {
+        Ok(ImageError {
             densify: env!("CARGO_PKG_VERSION").to_owned(),
             scene: cell.label.clone(),
             knob: knob.to_owned(),
             level: level.to_owned(),
-            spec: cell.spec(),
+            spec: cell.spec.clone().into_table(),
             standard: psnr(squares[0]),
             everything: psnr(squares[1]),
             worst,
@@ -114,8 +115,8 @@ impl Subject {
     }
 }
 
-impl Looked {
-    fn at(
+impl SampledView {
+    fn new(
         model: &Gaussians,
         camera: Camera,
         near: f32,
@@ -125,15 +126,15 @@ impl Looked {
         // The same pixels at every call.
         let mut draws = ChaCha8Rng::seed_from_u64(number as u64);
         let place = |_| [camera.width, camera.height].map(|side| draws.random_range(0..side));
-        let looked_at: Vec<[u32; 2]> = (0..PIXELS).map(place).collect();
+        let sampled: Vec<[u32; 2]> = (0..PIXELS).map(place).collect();
         let exact = Model::of(model);
         let sh_degree = model.sh_degree;
         let view = View { camera: &camera, background: background.map(f64::from), sh_degree };
         let truth = [Rules::STANDARD, Rules::SMOOTH].map(|rules| {
             let rules = Rules { near: f64::from(near), ..rules };
-            let parts = looked_at.par_chunks(64).map(|some| pixels(&exact, view, &rules, some));
+            let parts = sampled.par_chunks(64).map(|some| pixels(&exact, view, &rules, some));
             parts.collect::<Vec<_>>().concat()
         });
-        Self { camera, pixels: looked_at, truth }
+        Self { camera, pixels: sampled, truth }
     }
 }

@@ -1,0 +1,127 @@
+//! One run of a study: how it is called, described and made, and the record of its outcome.
+
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use toml::Value;
+
+use super::child::{Child, Summary, has_geometry, in_run};
+use super::record::Outcome;
+use crate::failure::{Failure, OTHER};
+use crate::output::{geometry_of, model_path, scores_of};
+use crate::run::Partial;
+
+/// A run of a study.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Cell {
+    pub(super) scene: PathBuf,
+    /// The scene's short name.
+    pub(super) label: String,
+    /// What is varied, and at which level.
+    pub(super) factor: String,
+    pub(super) level: String,
+    pub(super) budget: usize,
+    pub(super) seed: u32,
+    pub(super) iterations: u32,
+    /// What factor and level are called to the user, such as `vanilla, 9 rows`.
+    pub(super) title: String,
+    /// The same for names of folders.
+    pub(super) folder: String,
+    /// The description of the run.
+    pub(super) spec: Partial,
+    /// Whether scores are of the model as any viewer would show it, without shortcuts; else they are
+    /// those that the run measured itself.
+    pub(super) scores_without_shortcuts: bool,
+}
+
+impl fmt::Display for Cell {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}, {}, seed {}", self.label, self.title, self.seed)
+    }
+}
+
+/// What every run of a study sets, over the options that all of its runs share.
+pub(super) fn run_options(
+    shared: &Partial,
+    scene: &Path,
+    budget: usize,
+    seed: u32,
+    iterations: u32,
+) -> Partial {
+    let own = [
+        ("scene", Value::from(scene.to_string_lossy().into_owned())),
+        ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
+        ("seed", Value::from(seed)),
+        ("iterations", Value::from(iterations)),
+    ];
+    let lay = |spec: Partial, (name, value)| Partial::option(name, value).over(spec);
+    own.into_iter().fold(shared.clone(), lay)
+}
+
+impl Cell {
+    /// Name of the run's folder.
+    fn run(&self) -> String {
+        format!("{}-{}-seed{}", self.label, self.folder, self.seed)
+    }
+
+    /// Where the run is, in the folder of the study.
+    pub(super) fn path(&self, output: &Path) -> PathBuf {
+        output.join("runs").join(self.run())
+    }
+
+    /// Trains, measures what was trained, and returns the record.
+    ///
+    /// # Errors
+    /// With the trainer's message and exit code when it fails.
+    pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
+        let folder = self.path(output);
+        let child = Child { spec: &self.spec, folder: &folder };
+        let measured = self.scores_without_shortcuts || has_geometry(&self.scene);
+        let done = child.train().and_then(|()| if measured { child.measure() } else { Ok(()) });
+        done.map_err(|failure| in_run(self, failure))?;
+        self.record(&folder)
+    }
+
+    fn record(&self, folder: &Path) -> Result<Outcome, Failure> {
+        let summary = Summary::read(folder)?;
+        let iterations = summary.number("iterations")? as u32;
+        let scores = match self.scores_without_shortcuts {
+            true => scores_of(folder, iterations)?,
+            false => summary.tests.values().next_back().copied(),
+        };
+        let Some(scores) = scores else {
+            let scene = self.scene.display();
+            return Err(Failure::input(format!("{scene}: no view is held out to measure")));
+        };
+        let path = model_path(folder, iterations);
+        let model = fs::read(&path)
+            .map_err(|e| Failure { code: OTHER, message: format!("{}: {e}", path.display()) })?;
+        let stages = summary.get("stage_seconds").clone();
+        Ok(Outcome {
+            densify: summary.text("densify"),
+            scene: self.label.clone(),
+            factor: self.factor.clone(),
+            level: self.level.clone(),
+            budget: self.budget,
+            seed: self.seed,
+            iterations,
+            run: self.run(),
+            spec: self.spec.clone().into_table(),
+            model: crc32c::crc32c(&model),
+            psnr: scores.psnr,
+            ssim: scores.ssim,
+            flip: scores.flip,
+            rows: summary.number("rows")? as usize,
+            peak_rows: summary.number("peak_rows")? as usize,
+            peak_bytes: summary.get("peak_bytes").as_u64(),
+            ledger_bytes: summary.number("ledger_bytes")? as u64,
+            seconds: summary.number("seconds")?,
+            cpu_seconds: summary.get("cpu_seconds").as_f64(),
+            stage_seconds: serde_json::from_value(stages).unwrap_or_default(),
+            extra_forwards: summary.number("extra_forwards")? as u64,
+            curve: summary.tests.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
+            geometry: geometry_of(folder, iterations)?,
+        })
+    }
+}

@@ -1,0 +1,240 @@
+//! The comparison as text: Markdown for the file, a few lines for the terminal.
+
+use std::fmt::Write;
+
+use super::{Outcome, at, difference, scenes_and_budgets};
+use crate::metrics::geometry::Geometry;
+use crate::number::grouped;
+use crate::study::difference::mean;
+use crate::study::distinct;
+use crate::study::markdown::{MarkdownTable, number_or_dash};
+
+/// Mean over runs; `None` where one has no value.
+fn mean_of(runs: &[&Outcome], value: impl Fn(&Outcome) -> Option<f64>) -> Option<f64> {
+    mean(runs.iter().map(|run| value(run)).collect::<Option<Vec<f64>>>()?)
+}
+
+/// The whole comparison.
+pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
+    let mut text = String::from("# Comparison of density-control policies\n");
+    let (Some((first, others)), Some(run)) = (policies.split_first(), outcomes.first()) else {
+        return text;
+    };
+    let seeds = distinct(outcomes.iter().map(|r| r.seed)).len();
+    let _ = write!(
+        text,
+        "\n{} iterations, {seeds} {}. Means over seeds; differences from `{first}` are paired by \
+         scene, budget and seed, with 95 % bootstrap intervals.\n",
+        grouped(run.iterations as usize),
+        if seeds == 1 { "seed" } else { "seeds" },
+    );
+    if !others.is_empty() {
+        let _ = write!(
+            text,
+            "\n## Over all scenes and budgets\n\n{}",
+            ranking(outcomes, first, others)
+        );
+    }
+    for (scene, budget) in scenes_and_budgets(outcomes) {
+        let here = at(outcomes, scene, budget);
+        let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
+        let mut table = MarkdownTable::new(&[
+            "policy",
+            "PSNR",
+            "SSIM",
+            "FLIP",
+            "rows",
+            "true peak",
+            "peak memory [MiB]",
+            "time [s]",
+            "processor time [s]",
+            "extra passes",
+        ]);
+        for policy in policies {
+            if here.iter().any(|run| run.factor == *policy) {
+                table.row(&row(policy, first, &here, budget));
+            }
+        }
+        text += &table.to_string();
+        text += &geometry(&here, policies);
+    }
+    text
+}
+
+/// Every policy against the first.
+fn ranking(outcomes: &[Outcome], first: &str, others: &[String]) -> MarkdownTable {
+    let mut table = MarkdownTable::new(&[
+        "policy",
+        "PSNR",
+        "better in",
+        "SSIM",
+        "better in",
+        "FLIP",
+        "better in",
+    ]);
+    for policy in others {
+        let versus = |score: fn(&Outcome) -> f64| difference(outcomes.iter(), policy, first, score);
+        let all = (versus(|r| r.psnr), versus(|r| r.ssim), versus(|r| r.flip));
+        let (Some(psnr), Some(ssim), Some(flip)) = all else {
+            let mut cells = vec![String::new(); 7];
+            cells[0].clone_from(policy);
+            cells[1] = "not ranked: no run kept its budget".into();
+            table.row(&cells);
+            continue;
+        };
+        table.row(&[
+            policy.clone(),
+            format!("{} dB", psnr.show(2)),
+            format!("{} of {}", psnr.above, psnr.pairs),
+            ssim.show(4),
+            format!("{} of {}", ssim.above, ssim.pairs),
+            flip.show(4),
+            // An error: less is better.
+            format!("{} of {}", flip.below, flip.pairs),
+        ]);
+    }
+    table
+}
+
+/// A policy's results among those of a scene and budget.
+fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<String> {
+    let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == policy).copied().collect();
+    let score = |score: fn(&Outcome) -> f64, digits| {
+        let mean = number_or_dash(mean_of(&runs, |r| Some(score(r))), digits);
+        let difference = difference(here.iter().copied(), policy, first, score);
+        match difference.filter(|_| policy != first) {
+            Some(difference) => format!("{mean} ({})", difference.show(digits)),
+            None => mean,
+        }
+    };
+    let peak = runs.iter().map(|r| r.peak_rows).max().unwrap_or(0);
+    let marked = if peak > budget { " **over the budget: not ranked**" } else { "" };
+    let mib = |r: &Outcome| r.peak_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20));
+    let rows = mean_of(&runs, |r| Some(r.rows as f64)).unwrap_or(0.0);
+    vec![
+        policy.to_owned(),
+        score(|r| r.psnr, 2),
+        score(|r| r.ssim, 4),
+        score(|r| r.flip, 4),
+        grouped(rows.round() as usize),
+        format!("{}{marked}", grouped(peak)),
+        number_or_dash(mean_of(&runs, mib), 0),
+        number_or_dash(mean_of(&runs, |r| Some(r.seconds)), 1),
+        number_or_dash(mean_of(&runs, |r| r.cpu_seconds), 1),
+        number_or_dash(mean_of(&runs, |r| Some(r.extra_forwards as f64)), 0),
+    ]
+}
+
+/// A number of those measured against the known surface.
+type Measure = fn(&Geometry) -> f64;
+
+/// The table of what was measured against the known surface; nothing where none is known.
+fn geometry(here: &[&Outcome], policies: &[String]) -> String {
+    if here.iter().all(|r| r.geometry.is_none()) {
+        return String::new();
+    }
+    let columns: [(Measure, usize); 4] = [
+        (|g| g.depth.rmse, 3),
+        (|g| g.centres.chamfer, 3),
+        (|g| g.centres.f_score_one_percent, 1),
+        (|g| g.floaters.of_rows, 2),
+    ];
+    let mut table = MarkdownTable::new(&[
+        "policy",
+        "depth RMSE [%]",
+        "Chamfer [%]",
+        "F-score at 1 % [%]",
+        "floaters [% of rows]",
+    ]);
+    for policy in policies {
+        let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == *policy).copied().collect();
+        if runs.is_empty() {
+            continue;
+        }
+        let cell = |(value, digits): (Measure, usize)| {
+            let percent = |r: &Outcome| {
+                let value = r.geometry.as_ref().map(value);
+                value.filter(|value| value.is_finite()).map(|value| 100.0 * value)
+            };
+            number_or_dash(mean_of(&runs, percent), digits)
+        };
+        let cells = std::iter::once(policy.clone()).chain(columns.map(cell));
+        table.row(&cells.collect::<Vec<_>>());
+    }
+    format!("\nGeometry, lengths as % of the diagonal of the scene:\n\n{table}")
+}
+
+/// A line per policy: means over everything.
+pub(super) fn summary(outcomes: &[Outcome], policies: &[String]) -> String {
+    let width = policies.iter().map(String::len).max().unwrap_or(0).max(6);
+    let mut text = format!("{:width$}  PSNR [dB]    SSIM    FLIP  runs", "policy");
+    for policy in policies {
+        let (runs, over): (Vec<&Outcome>, Vec<&Outcome>) =
+            outcomes.iter().filter(|r| r.factor == *policy).partition(|r| r.kept_its_budget());
+        let psnr = number_or_dash(mean_of(&runs, |r| Some(r.psnr)), 3);
+        let ssim = number_or_dash(mean_of(&runs, |r| Some(r.ssim)), 4);
+        let flip = number_or_dash(mean_of(&runs, |r| Some(r.flip)), 4);
+        let _ =
+            write!(text, "\n{policy:width$}  {psnr:>9}  {ssim:>6}  {flip:>6}  {:>4}", runs.len());
+        if !over.is_empty() {
+            let _ = write!(text, "  ({} more over the budget, not counted)", over.len());
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::study::record::sample;
+
+    fn record(policy: &str, seed: u32, psnr: f64, peak_rows: usize) -> Outcome {
+        Outcome { peak_rows, cpu_seconds: Some(2.5), ..sample(policy, "1000", seed, psnr) }
+    }
+
+    #[test]
+    fn differences_are_paired_and_broken_budgets_marked() {
+        let all = [
+            record("a", 0, 30.0, 1000),
+            record("a", 1, 32.0, 1000),
+            record("b", 0, 30.5, 1000),
+            record("b", 1, 32.5, 999),
+            record("c", 0, 40.0, 1001),
+            record("c", 1, 40.0, 1001),
+        ];
+        let policies = ["a", "b", "c"].map(String::from);
+        let text = markdown(&all, &policies);
+        assert!(text.contains("| b | +0.50 [+0.50, +0.50] dB | 2 of 2 | +0.0050 [+0.0050, +0.0050] | 2 of 2 | -0.0050 [-0.0050, -0.0050] | 2 of 2 |"), "{text}");
+        assert!(text.contains("| c | not ranked"), "{text}");
+        assert!(text.contains("| a | 31.00 | 0.3100 | 0.6900 | 900 | 1,000 | – |"), "{text}");
+        assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
+        assert!(!text.contains("Geometry"), "{text}");
+        let said = summary(&all, &policies);
+        assert!(said.contains("c               –       –       –     0  (2 more over"), "{said}");
+    }
+
+    #[test]
+    fn geometry_is_shown_where_it_is_known() {
+        let measured = |rmse: f64| -> Geometry {
+            let text = format!(
+                r#"{{"depth": {{"rmse": {rmse}, "abs_rel": null, "coverage": 1.0}}, "normal_error": 3.0,
+                "centres": {{"accuracy": 0.01, "accuracy_p95": 0.02, "completeness": 0.005,
+                "chamfer": 0.015, "f_score_half_percent": 0.5, "f_score_one_percent": 0.75}},
+                "floaters": {{"count": 9, "of_rows": 0.01, "of_weight": null}}, "thin": [],
+                "redundancy": {{"blended_per_pixel": 9.0, "below_one_percent": 0.25}}}}"#
+            );
+            serde_json::from_str(&text).expect("geometry")
+        };
+        let with =
+            |policy: &str, seed, geometry| Outcome { geometry, ..record(policy, seed, 30.0, 1000) };
+        let all = [
+            with("a", 0, Some(measured(0.02))),
+            with("a", 1, Some(measured(0.03))),
+            with("b", 0, Some(measured(0.5))),
+            with("b", 1, None),
+        ];
+        let text = markdown(&all, &["a", "b"].map(String::from));
+        assert!(text.contains("| a | 2.500 | 1.500 | 75.0 | 1.00 |"), "{text}");
+        assert!(text.contains("| b | – | – | – | – |"), "{text}");
+    }
+}

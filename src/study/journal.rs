@@ -1,0 +1,82 @@
+//! The file of records of a study: a line for everything that is finished, so that it is not done again.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::record::{ImageError, Outcome, Record};
+use crate::failure::Failure;
+use crate::output::{OutputError, write_atomically};
+use crate::run::Partial;
+
+/// The records in a file.
+pub(super) struct Journal {
+    path: PathBuf,
+    records: Vec<Record>,
+}
+
+impl Journal {
+    /// Reads what is there. A last line that was cut off is not: its run runs again.
+    ///
+    /// # Errors
+    /// When a line is no record.
+    pub(super) fn open(path: &Path) -> Result<Self, Failure> {
+        let text = match fs::read_to_string(path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
+            Err(e) => return Err(Failure::input(format!("{}: {e}", path.display()))),
+        };
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        let mut records = Vec::new();
+        for (i, line) in whole.lines().enumerate() {
+            records.push(serde_json::from_str(line).map_err(|e| {
+                Failure::input(format!(
+                    "{}, line {}: {e}; delete the line, and its run runs again",
+                    path.display(),
+                    i + 1
+                ))
+            })?);
+        }
+        Ok(Self { path: path.to_owned(), records })
+    }
+
+    /// The outcome of the run with this description, by this version of densify.
+    pub(super) fn outcome(&self, spec: &Partial) -> Option<&Outcome> {
+        self.records.iter().rev().find_map(|record| match record {
+            Record::Run(run) if spec.is_table(&run.spec) && is_ours(&run.densify) => Some(&**run),
+            _ => None,
+        })
+    }
+
+    /// The image errors of that run's model with a knob at a level.
+    pub(super) fn image(&self, spec: &Partial, knob: &str, level: &str) -> Option<&ImageError> {
+        self.records.iter().rev().find_map(|record| match record {
+            Record::Image(image)
+                if (&*image.knob, &*image.level) == (knob, level)
+                    && spec.is_table(&image.spec)
+                    && is_ours(&image.densify) =>
+            {
+                Some(image)
+            }
+            _ => None,
+        })
+    }
+
+    /// Adds a record and writes them all.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(super) fn add(&mut self, record: Record) -> Result<(), OutputError> {
+        self.records.push(record);
+        let lines = self.records.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));
+        write_atomically(&self.path, |out| {
+            for line in lines {
+                out.write_all(line.map_err(std::io::Error::other)?.as_bytes())?;
+            }
+            Ok(())
+        })
+    }
+}
+
+fn is_ours(version: &str) -> bool {
+    version == env!("CARGO_PKG_VERSION")
+}

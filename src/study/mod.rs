@@ -1,0 +1,142 @@
+//! Studies: many runs of `densify train` in processes of their own, a journal that lets an interrupted
+//! study go on, paired statistics, tables and plots.
+//!
+//! A study is a list of descriptions of runs, and a report over their outcomes. [`Comparison`] varies
+//! policy and budget, [`Trade`] knobs and their levels. Nothing is printed; an [`Observer`] hears what
+//! there is to say.
+
+mod cell;
+mod child;
+mod compare;
+mod difference;
+mod journal;
+mod markdown;
+mod plot;
+mod record;
+mod trade;
+
+use std::path::{Path, PathBuf};
+
+pub use compare::{Comparison, SceneBudget};
+pub use trade::Trade;
+
+use crate::dataset::builtin;
+use crate::failure::Failure;
+use crate::output::write_atomically;
+use crate::run::Observer;
+use cell::Cell;
+use journal::Journal;
+use record::{Outcome, Record};
+
+/// What a finished study leaves.
+#[derive(Debug)]
+pub struct Finished {
+    /// A few lines for the terminal.
+    pub summary: String,
+    /// The file with tables and pictures.
+    pub report: PathBuf,
+}
+
+/// A file in the output folder, and what it shows.
+struct Picture {
+    file: String,
+    caption: String,
+}
+
+/// A study in progress.
+struct Study<'a> {
+    output: &'a Path,
+    observer: &'a dyn Observer,
+    journal: Journal,
+}
+
+impl<'a> Study<'a> {
+    /// Begins or goes on, with the journal `name`.jsonl in the folder `output`.
+    fn open(output: &'a Path, name: &str, observer: &'a dyn Observer) -> Result<Self, Failure> {
+        let journal = Journal::open(&output.join(name).with_extension("jsonl"))?;
+        Ok(Self { output, observer, journal })
+    }
+
+    /// Makes the runs that are not done yet, one after another; returns the outcomes of all. Where
+    /// several cells describe the same run, it is made once: the seed decides everything.
+    fn run(&mut self, cells: &[Cell]) -> Result<Vec<Outcome>, Failure> {
+        let count = cells.len();
+        let mut outcomes = Vec::new();
+        for (i, cell) in cells.iter().enumerate() {
+            let number = i + 1;
+            let before = self.journal.outcome(&cell.spec).cloned();
+            let done = if before.is_some() { ": done before" } else { "" };
+            self.observer.say(format_args!("[{number}/{count}] {cell}{done}"));
+            let outcome = match before {
+                Some(outcome) => outcome,
+                None => {
+                    let outcome = cell.train(self.output)?;
+                    self.journal.add(Record::Run(Box::new(outcome.clone())))?;
+                    outcome
+                }
+            };
+            let (factor, level) = (cell.factor.clone(), cell.level.clone());
+            outcomes.push(Outcome { factor, level, ..outcome });
+        }
+        Ok(outcomes)
+    }
+
+    /// Writes the report `name`.md.
+    fn finish(&self, name: &str, text: &str, summary: String) -> Result<Finished, Failure> {
+        let report = self.output.join(name).with_extension("md");
+        write_atomically(&report, |out| out.write_all(text.as_bytes()))?;
+        Ok(Finished { summary, report })
+    }
+}
+
+/// Distinct values, in the order of their appearance.
+fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
+    let mut all = Vec::new();
+    for value in values {
+        if !all.contains(&value) {
+            all.push(value);
+        }
+    }
+    all
+}
+
+/// A short name for each scene: its folder's, or that of the built-in scene.
+fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
+    let mut labels = Vec::new();
+    for scene in scenes {
+        if let Some(name) = builtin::name(scene) {
+            labels.push(unless_taken(&labels, name.to_owned())?);
+            continue;
+        }
+        let whole = std::fs::canonicalize(scene).map_err(|e| {
+            Failure::input(format!("{}: {e}; name the scene's folder", scene.display()))
+        })?;
+        let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '.', "-");
+        labels.push(unless_taken(&labels, name)?);
+    }
+    Ok(labels)
+}
+
+/// The name, if it is none of those that are taken.
+fn unless_taken(taken: &[String], name: String) -> Result<String, Failure> {
+    if taken.contains(&name) {
+        return Err(Failure::input(format!(
+            "two scenes are called {name}; take them in two calls, or rename one folder"
+        )));
+    }
+    Ok(name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn built_in_scenes_go_by_their_names() {
+        let paths = ["scene:table", "scene:thin"].map(PathBuf::from);
+        assert_eq!(labels(&paths).ok(), Some(vec!["table".to_owned(), "thin".to_owned()]));
+        let twice = ["scene:table", "scene:table"].map(PathBuf::from);
+        assert!(labels(&twice).is_err_and(|failure| failure.message.contains("table")));
+    }
+}
