@@ -32,6 +32,7 @@ pub mod dataset;
 pub mod evaluate;
 pub mod export;
 pub mod failure;
+mod foreign;
 pub mod gaussians;
 pub mod import;
 pub mod init;

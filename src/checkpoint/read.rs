@@ -34,7 +34,7 @@ impl Checkpoint {
     pub fn open(path: &Path) -> Result<Self, CheckpointError> {
         let invalid = |problem: String| CheckpointError::invalid(path, problem);
         let failed = |source| CheckpointError::Read { path: path.to_owned(), source };
-        let mut file = File::open(path).map_err(failed)?;
+        let mut file = crate::foreign::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
         let mut length = [0; LENGTH as usize];
         let short = || invalid(format!("it is cut short: {size} bytes"));

@@ -8,6 +8,7 @@ use indicatif::MultiProgress;
 use tracing_subscriber::EnvFilter;
 
 use crate::failure::{Failure, OTHER};
+use crate::foreign;
 use crate::run::Observer;
 
 /// Shown unless `RUST_LOG` says otherwise: what densify and its policies log.
@@ -64,7 +65,7 @@ impl Console {
     pub(super) fn result(&self, line: impl fmt::Display) {
         let written = self.bars.suspend(|| {
             let mut out = io::stdout().lock();
-            writeln!(out, "{line}").and_then(|()| out.flush())
+            writeln!(out, "{}", foreign::lines(&line.to_string())).and_then(|()| out.flush())
         });
         match written {
             // A reader that has gone away wants no more; that is no failure.
@@ -98,7 +99,7 @@ impl Console {
 
     /// What goes wrong, on standard error.
     pub(super) fn error(&self, failure: &Failure) {
-        let Failure { message, .. } = failure;
+        let message = foreign::lines(&failure.message);
         self.bars.suspend(|| {
             let _ = writeln!(io::stderr().lock(), "error: {message}");
         });

@@ -68,7 +68,8 @@ pub(super) fn parsed(words: &[String], of: &'static str) -> Result<Partial, Fail
 pub(super) fn policy_config(path: &Path) -> Result<Partial, Failure> {
     let origin = format!("--policy-config {}", path.display());
     let fail = |problem: String| Failure::input(format!("{origin}: {}", problem.trim()));
-    let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
+    let text = crate::foreign::read_text(path, crate::foreign::MAX_OPTIONS)
+        .map_err(|error| fail(error.to_string()))?;
     let table: Table = text.parse().map_err(|error: toml::de::Error| fail(error.to_string()))?;
     for (policy, parameters) in &table {
         densify_policies::registry::find(policy).map_err(|error| fail(error.to_string()))?;

@@ -9,8 +9,8 @@ use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 use super::console::Console;
 use crate::number::{duration, grouped};
 
-/// Share of the run between two lines where there is no terminal.
-const LINES: u32 = 20;
+/// Time between two lines where there is no terminal.
+const LINE: Duration = Duration::from_secs(30);
 /// Time between two redraws of the bar's text.
 const REDRAW: Duration = Duration::from_millis(100);
 /// Weight of the newest step in the loss shown: views differ, so single steps jump.
@@ -62,7 +62,8 @@ impl<'a> Progress<'a> {
                 bar.set_position(u64::from(step));
                 self.drawn = Instant::now();
             }
-        } else if is_milestone(step, self.iterations) {
+        } else if self.drawn.elapsed() >= LINE || step == self.iterations {
+            self.drawn = Instant::now();
             let elapsed = self.started.elapsed().as_secs_f64().max(1e-9);
             let speed = f64::from(step - self.done) / elapsed;
             let left = f64::from(self.iterations - step) / speed;
@@ -80,26 +81,6 @@ impl<'a> Progress<'a> {
     pub(super) fn finish(self) {
         if let Some(bar) = self.bar {
             bar.finish_and_clear();
-        }
-    }
-}
-
-/// Whether `step` is the first of the run's next twentieth: 20 lines, or one a step if shorter.
-fn is_milestone(step: u32, iterations: u32) -> bool {
-    let part = |step: u32| u64::from(step) * u64::from(LINES) / u64::from(iterations);
-    step == iterations || part(step) > part(step.saturating_sub(1))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn twenty_lines_or_one_a_step() {
-        for (iterations, lines) in [(1, 1), (7, 7), (20, 20), (21, 20), (30_000, 20)] {
-            let seen = (1..=iterations).filter(|&step| is_milestone(step, iterations)).count();
-            assert_eq!(seen, lines, "{iterations}");
-            assert!(is_milestone(iterations, iterations));
         }
     }
 }

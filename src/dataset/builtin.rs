@@ -8,7 +8,7 @@ use densify_scenegen::{
     Frame, Generated, GroundTruth, InitPoints, Options, Scene, Source, generate,
 };
 
-use super::images::{Image8, ImageHeader, ImageSource};
+use super::images::{Image8, ImageHeader, ImageSource, SourceFile};
 use super::normalise::Normalisation;
 use super::prepare::{Views, split, target_size};
 use super::tracks::TrackSampler;
@@ -138,7 +138,7 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
         name: format!("{name}.png"),
         camera: camera.resized(width, height),
         source: ImageSource {
-            path: PathBuf::from(format!("{PREFIX}{name}")),
+            file: SourceFile::rendered(PathBuf::from(format!("{PREFIX}{name}"))),
             mask: None,
             width,
             height,

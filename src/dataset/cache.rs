@@ -290,13 +290,16 @@ impl ImageDemand {
 /// Loads an image; a panic of the decoder becomes an error.
 fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
     catch_unwind(AssertUnwindSafe(|| source.load())).unwrap_or_else(|_| {
-        Err(DatasetError::Image { path: source.path.clone(), problem: "the decoder failed".into() })
+        Err(DatasetError::Image {
+            path: source.file.path.clone(),
+            problem: "the decoder failed".into(),
+        })
     })
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::images::probe;
+    use super::super::images::{SourceFile, probe};
     use super::*;
 
     /// `count` images of 16x16 px, told apart by their colour; 768 bytes each.
@@ -307,7 +310,7 @@ mod tests {
                 image::RgbImage::from_pixel(16, 16, [i, 0, 0].into()).save(&path).unwrap();
                 let header = probe(&path).unwrap();
                 ImageSource {
-                    path,
+                    file: SourceFile::found(path).unwrap(),
                     mask: None,
                     width: 16,
                     height: 16,
@@ -381,8 +384,8 @@ mod tests {
     fn a_background_error_surfaces_at_get_with_the_name() {
         let folder = tempfile::tempdir().unwrap();
         let sources = sources(folder.path(), 3);
-        let bytes = std::fs::read(&sources[1].path).unwrap();
-        std::fs::write(&sources[1].path, &bytes[..bytes.len() / 2]).unwrap();
+        let bytes = std::fs::read(&sources[1].file.path).unwrap();
+        std::fs::write(&sources[1].file.path, &bytes[..bytes.len() / 2]).unwrap();
         let cache = ImageCache::new(sources, 1 << 20, 1);
         cache.prefetch(&[1, 2]);
         let _ = cache.get(2);

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::foreign::one_line;
+
 /// Why a dataset, or one of its images, cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -106,10 +108,17 @@ pub enum DatasetError {
         image: PathBuf,
     },
     /// No image has a pose.
-    #[error("{path} lists no image that exists; check the file and the images beside it")]
+    #[error(
+        "{path} lists no image that exists{}; put the images there, or name their folder with --images",
+        looked_for.as_ref().map_or_else(String::new, |path| format!(
+            "; the first one looked for is {}", path.display()
+        ))
+    )]
     NoImages {
         /// The file that should list them.
         path: PathBuf,
+        /// Where the first of them was looked for, if it lists any.
+        looked_for: Option<PathBuf>,
     },
     /// The test split takes every view.
     #[error(
@@ -138,7 +147,13 @@ pub enum DatasetError {
 
 impl DatasetError {
     pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
-        move |source| Self::Io { path: path.to_owned(), source }
+        move |source| match source.raw_os_error() {
+            // Said by this program, not by the system.
+            None if source.kind() == std::io::ErrorKind::Other => {
+                Self::malformed(path, "the file", source.to_string(), "put the right file there")
+            }
+            _ => Self::Io { path: path.to_owned(), source },
+        }
     }
 
     pub(super) fn malformed(
@@ -149,8 +164,8 @@ impl DatasetError {
     ) -> Self {
         Self::Malformed {
             path: path.to_owned(),
-            field: field.into(),
-            problem: problem.into(),
+            field: one_line(&field.into()),
+            problem: one_line(&problem.into()),
             remedy,
         }
     }

@@ -101,17 +101,27 @@ impl Folders {
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {
-        let folder = self.chosen.as_ref().unwrap_or(&self.root);
-        let within = if self.chosen.is_some() {
-            self.inside_images(named.value)
-        } else {
-            self.below_root(named.value)
-        };
         DatasetError::MissingImage {
             path: named.file.to_owned(),
             field: named.field.to_owned(),
-            image: folder.path().join(within),
+            image: self.place(named),
         }
+    }
+
+    /// Where an image is looked for first.
+    pub(super) fn place(&self, named: DataPath<'_>) -> PathBuf {
+        match &self.chosen {
+            Some(folder) => folder.path().join(self.inside_images(named.value)),
+            None => self.root.path().join(self.below_root(named.value)),
+        }
+    }
+
+    /// How many files lie directly in the folder of the images.
+    pub(super) fn count(&self) -> usize {
+        let images = || self.root.path().join("images");
+        let folder = self.chosen.as_ref().map_or_else(images, |folder| folder.path().to_owned());
+        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+        entries.filter(|entry| entry.file_type().is_ok_and(|kind| !kind.is_dir())).count()
     }
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {

@@ -11,9 +11,11 @@ use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
 pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
+use super::jpeg;
 pub use super::pixels::{Image8, SharedImage};
 use super::resample;
 use super::undistort::Undistortion;
+use crate::foreign;
 
 /// Longest side accepted `[px]`.
 pub const MAX_SIDE: u32 = 16_384;
@@ -21,18 +23,56 @@ pub const MAX_SIDE: u32 = 16_384;
 pub const MAX_PIXELS: u64 = 1 << 28;
 /// Most bytes of one image as decoded.
 const MAX_DECODED_BYTES: u64 = 1 << 30;
+/// Most bytes of an image file that are read: no JPEG of [`MAX_PIXELS`] has more.
+const MAX_FILE_BYTES: u64 = MAX_DECODED_BYTES;
 /// Supported formats.
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::WebP];
 /// Almost always enough of a file to hold the header.
 const HEADER_BYTES: u64 = 256 << 10;
 
+/// An image file that was found within the folder it may not leave.
+#[derive(Debug, Clone)]
+pub struct SourceFile {
+    /// Where it is, as messages show it.
+    pub path: PathBuf,
+    /// Where links led when it was checked.
+    real: PathBuf,
+}
+
+impl SourceFile {
+    /// The file at this path, which has been checked.
+    ///
+    /// # Errors
+    /// When it is no longer there.
+    pub fn found(path: PathBuf) -> Result<Self, DatasetError> {
+        let real = path.canonicalize().map_err(DatasetError::io(&path))?;
+        Ok(Self { path, real })
+    }
+
+    /// Stands for pixels that no file holds.
+    #[must_use]
+    pub fn rendered(path: PathBuf) -> Self {
+        Self { path, real: PathBuf::new() }
+    }
+
+    /// Opens it, unless links lead elsewhere by now.
+    fn open(&self) -> Result<File, DatasetError> {
+        let real = self.path.canonicalize().map_err(DatasetError::io(&self.path))?;
+        if real != self.real {
+            let problem = "it has become a link to another file since the run began";
+            return Err(DatasetError::malformed(&self.path, "the file", problem, "restore it"));
+        }
+        foreign::open(&real).map_err(DatasetError::io(&self.path))
+    }
+}
+
 /// Where the pixels of a view come from, and how they are processed on load.
 #[derive(Debug, Clone)]
 pub struct ImageSource {
     /// The image file.
-    pub path: PathBuf,
+    pub file: SourceFile,
     /// A greyscale image of the weights of pixels in the loss (black: ignored), if there is one.
-    pub mask: Option<PathBuf>,
+    pub mask: Option<SourceFile>,
     /// Width after loading `[px]`.
     pub width: u32,
     /// Height after loading `[px]`.
@@ -99,10 +139,10 @@ impl ImageSource {
                 Image8::clone(image)
             });
         }
-        let decoded = decode(&self.path)?;
+        let decoded = decode(&self.file)?;
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
             return Err(DatasetError::ImageSize {
-                path: self.path.clone(),
+                path: self.file.path.clone(),
                 width: decoded.width(),
                 height: decoded.height(),
                 camera_width: header.width,
@@ -110,8 +150,13 @@ impl ImageSource {
             });
         }
         let mut image = pack(decoded);
-        if let Some(path) = &self.mask {
-            let mask = decode(path)?.into_luma8();
+        if let Some(file) = &self.mask {
+            let mask = decode(file)?.into_luma8();
+            if mask.iter().all(|&weight| weight == 0) {
+                let problem = "the mask hides every pixel";
+                let remedy = "repair it, or remove the photograph and its pose";
+                return Err(DatasetError::malformed(&file.path, "the mask", problem, remedy));
+            }
             image.mask = Some(if mask.dimensions() == (header.width, header.height) {
                 mask.into_raw()
             } else {
@@ -167,15 +212,18 @@ fn fault(path: &Path, problem: impl std::fmt::Display) -> DatasetError {
 
 /// Reads the header of an image file, without decoding it, and checks it against the limits.
 pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
-    let mut file = File::open(path).map_err(DatasetError::io(path))?;
+    let mut file = foreign::open(path).map_err(DatasetError::io(path))?;
     let file_bytes = file.metadata().map_err(DatasetError::io(path))?.len();
     let mut start = Vec::new();
     file.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(DatasetError::io(path))?;
+    if let Some(problem) = foreign::mistaken(&start) {
+        return Err(DatasetError::malformed(path, "the image", problem, "put the image there"));
+    }
     let header = read_header(ImageReader::new(Cursor::new(&start)), file_bytes);
     let header = match header {
         // The header may follow a long preview or colour profile.
         Err(_) if file_bytes > HEADER_BYTES => {
-            let file = File::open(path).map_err(DatasetError::io(path))?;
+            let file = foreign::open(path).map_err(DatasetError::io(path))?;
             read_header(ImageReader::new(BufReader::new(file)), file_bytes)
         }
         header => header,
@@ -211,11 +259,17 @@ fn read_header<R: std::io::BufRead + std::io::Seek>(
     Ok(ImageHeader { width, height, has_alpha, decoded_bytes: decoder.total_bytes(), file_bytes })
 }
 
-fn decode(path: &Path) -> Result<DynamicImage, DatasetError> {
-    let file = File::open(path).map_err(DatasetError::io(path))?;
-    let mut reader = ImageReader::new(BufReader::new(file))
+fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
+    let path = &source.path;
+    let mut reader = ImageReader::new(BufReader::new(source.open()?))
         .with_guessed_format()
         .map_err(DatasetError::io(path))?;
+    if reader.format() == Some(ImageFormat::Jpeg) {
+        let mut bytes = Vec::new();
+        let mut input = reader.into_inner().take(MAX_FILE_BYTES);
+        input.read_to_end(&mut bytes).map_err(DatasetError::io(path))?;
+        return jpeg::decode(&bytes).map_err(|problem| fault(path, problem));
+    }
     reader.limits(limits());
     reader.decode().map_err(|problem| fault(path, problem))
 }
@@ -227,7 +281,7 @@ mod tests {
     fn source(path: PathBuf) -> ImageSource {
         let header = probe(&path).unwrap();
         ImageSource {
-            path,
+            file: SourceFile::found(path).unwrap(),
             mask: None,
             width: header.width,
             height: header.height,
@@ -299,12 +353,39 @@ mod tests {
         image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
             .save(&mask)
             .unwrap();
-        let source = ImageSource { mask: Some(mask), width: 2, height: 2, ..source(path) };
+        let mask = Some(SourceFile::found(mask).unwrap());
+        let source = ImageSource { mask, width: 2, height: 2, ..source(path) };
         let loaded = source.load().unwrap();
         assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
         assert_eq!(loaded.rgb, [10, 20, 30].repeat(4));
         assert_eq!(loaded.bytes(), source.loaded_bytes());
         assert!(source.working_bytes() >= 4 * 4 * 4 + loaded.bytes());
+    }
+
+    #[test]
+    fn a_mask_that_hides_everything_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, mask] = ["a.png", "m.png"].map(|name| folder.path().join(name));
+        image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        image::GrayImage::new(4, 4).save(&mask).unwrap();
+        let mask = Some(SourceFile::found(mask).unwrap());
+        let message = ImageSource { mask, ..source(path) }.load().unwrap_err().to_string();
+        assert!(message.contains("m.png") && message.contains("hides every pixel"), "{message}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_photograph_that_becomes_a_link_is_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, other] = ["a.png", "b.png"].map(|name| folder.path().join(name));
+        image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        std::fs::copy(&path, &other).unwrap();
+        let source = source(path.clone());
+        source.load().unwrap();
+        std::fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink(&other, &path).unwrap();
+        let message = source.load().unwrap_err().to_string();
+        assert!(message.contains("a.png") && message.contains("link"), "{message}");
     }
 
     #[test]

@@ -11,6 +11,7 @@ mod describe;
 mod error;
 mod folders;
 pub mod images;
+mod jpeg;
 pub mod normalise;
 mod options;
 mod paths;
@@ -40,7 +41,7 @@ pub use crate::import::PointCloud;
 pub use error::DatasetError;
 use folders::Folders;
 use normalise::Normalisation;
-pub use options::{LoadOptions, ParseResolutionError, Resolution, Split};
+pub use options::{FarCameras, LoadOptions, ParseResolutionError, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
 use undistort::Lens;
@@ -81,6 +82,8 @@ struct Scene {
     /// The file that lists the frames.
     listing: PathBuf,
     frames: Vec<Frame>,
+    /// Where the first image that does not exist was looked for.
+    first_missing: Option<PathBuf>,
     points: PointCloud,
     points_file: Option<PathBuf>,
     /// Tracks; they name views by [`Frame::id`].
@@ -123,7 +126,10 @@ impl Dataset {
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {
-            return Err(DatasetError::NoImages { path: scene.listing });
+            return Err(DatasetError::NoImages {
+                path: scene.listing,
+                looked_for: scene.first_missing,
+            });
         }
         prepare::prepare(path, scene, options)
     }

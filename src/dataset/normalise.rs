@@ -21,6 +21,12 @@ const SAME_PLACE: f64 = 1e-12;
 /// about half a pixel at a focal length of 1,500 px and distance 10.
 const F32_OFFSET: f64 = 1e4;
 
+/// A camera is far if its distance from the median of the cameras is more than this many times the median
+/// of these distances. Drone flights and walks around an object stay below 5.
+const FAR: f64 = 10.0;
+/// Far cameras are a part of the scene if there are more than this share of all.
+const MOST_FAR: f64 = 0.05;
+
 /// scene = (world − centre) · scale.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Normalisation {
@@ -40,6 +46,34 @@ pub fn extent(centres: &[DVec3]) -> f64 {
 fn rig(centres: &[DVec3]) -> (DVec3, f64) {
     let centre = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
     (centre, centres.iter().map(|c| c.distance(centre)).fold(0.0, f64::max))
+}
+
+/// Fewer cameras than this do not show what is usual.
+const FEW: usize = 10;
+
+/// Which cameras are so far from the others, and so few, that their poses are hardly right.
+#[must_use]
+pub(super) fn far(centres: &[DVec3]) -> Vec<bool> {
+    let median = |mut values: Vec<f64>| {
+        let middle = values.len() / 2;
+        if values.is_empty() {
+            0.0
+        } else {
+            *values.select_nth_unstable_by(middle, f64::total_cmp).1
+        }
+    };
+    let along = |axis: usize| median(centres.iter().map(|centre| centre[axis]).collect());
+    let middle = DVec3::new(along(0), along(1), along(2));
+    let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
+    let unit = median(distances.clone());
+    let is_one_place = unit <= SAME_PLACE * middle.length();
+    if is_one_place || centres.len() < FEW {
+        return vec![false; centres.len()];
+    }
+    let far: Vec<bool> = distances.iter().map(|&distance| distance > FAR * unit).collect();
+    let count = far.iter().filter(|&&far| far).count();
+    let most = ((MOST_FAR * centres.len() as f64) as usize).max(1);
+    if count > most { vec![false; centres.len()] } else { far }
 }
 
 impl Normalisation {
@@ -143,6 +177,27 @@ mod tests {
     use glam::DMat3;
 
     use super::*;
+
+    #[test]
+    fn a_few_cameras_far_from_all_others_are_told() {
+        let ring = |count: usize, radius: f64| -> Vec<DVec3> {
+            let angle = |number: usize| number as f64 / count as f64 * std::f64::consts::TAU;
+            (0..count).map(|n| DVec3::new(angle(n).cos(), angle(n).sin(), 0.2) * radius).collect()
+        };
+        let far_of = |near: usize, lonely: &[f64]| -> Vec<usize> {
+            let mut centres = ring(near, 3.0);
+            centres.extend(lonely.iter().map(|&x| DVec3::new(x, 0.0, 0.0)));
+            let far = far(&centres).into_iter().enumerate().filter(|(_, far)| *far);
+            far.map(|(number, _)| number).collect()
+        };
+        assert_eq!(far_of(39, &[500.0]), [39]);
+        assert_eq!(far_of(39, &[40.0, -1e30]), [39, 40]);
+        assert_eq!(far_of(39, &[25.0]), [0; 0]);
+        // More than a few are a part of the scene, and a handful of cameras says nothing.
+        assert_eq!(far_of(38, &[500.0, 510.0, 520.0]), [0; 0]);
+        assert_eq!(far_of(8, &[500.0]), [0; 0]);
+        assert_eq!(far(&vec![DVec3::ONE; 30]), [false; 30]);
+    }
 
     fn camera(centre: DVec3) -> Camera {
         let rotation = DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(0.9);

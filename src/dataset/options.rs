@@ -4,6 +4,8 @@ use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use serde::{Deserialize, Serialize};
+
 /// How to load a dataset.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LoadOptions {
@@ -14,6 +16,8 @@ pub struct LoadOptions {
     pub resolution: Option<Resolution>,
     /// Which views are held out.
     pub split: Split,
+    /// What happens to views whose camera is far from all others.
+    pub far_cameras: FarCameras,
     /// Whether to read which views show which points ([`Tracks`](super::Tracks)).
     pub tracks: bool,
 }
@@ -26,6 +30,18 @@ pub enum Resolution {
     Divisor(u32),
     /// Width `[px]`, above 8.
     Width(u32),
+}
+
+/// What happens to views whose camera is far from all others, as structure from motion places some by
+/// mistake. In neither case do they count for the extent of the scene.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum FarCameras {
+    /// They are left out.
+    #[default]
+    LeaveOut,
+    /// They are kept.
+    Keep,
 }
 
 /// Which views are held out for tests.

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::error::DatasetError;
+use crate::foreign::one_line;
 
 /// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
@@ -64,7 +65,7 @@ impl DataPath<'_> {
     fn fault(self, problem: &'static str) -> DatasetError {
         DatasetError::UnsafePath {
             path: self.file.to_owned(),
-            field: self.field.to_owned(),
+            field: one_line(self.field),
             value: self.value.chars().take(200).collect(),
             problem,
         }
@@ -83,8 +84,8 @@ fn lexical_fault(value: &str) -> Option<&'static str> {
         Some("is empty")
     } else if value.len() > MAX_NAME {
         Some("is longer than 4 KiB")
-    } else if value.contains('\0') {
-        Some("contains a NUL character")
+    } else if value.contains(char::is_control) {
+        Some("contains a control character")
     } else if value.starts_with(['/', '\\'])
         || value.as_bytes().get(1) == Some(&b':')
         || value.starts_with("file:")
@@ -121,6 +122,8 @@ mod tests {
             "\\\\host\\a",
             "file:///a",
             "a\0b",
+            "a\x1b[2Jb",
+            "a\nb",
             &long,
         ] {
             assert!(

@@ -1,15 +1,15 @@
 //! Turns the frames of any format into views: checks sizes and lenses, splits, normalises.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::error::DatasetError;
-use super::images::{self, ImageHeader, ImageSource};
-use super::normalise::Normalisation;
-use super::{Dataset, Frame, LoadOptions, PointCloud, Resolution, Scene, Split, View};
+use super::images::{self, ImageHeader, ImageSource, SourceFile};
+use super::normalise::{self, Normalisation};
+use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Resolution, Scene, Split, View};
 use crate::camera::Camera;
 
 /// Fraction of the points that may be unusable.
@@ -28,7 +28,7 @@ pub(super) fn prepare(
     refuse_duplicates(&listing, &frames)?;
     // All views first, then the first error: the message does not depend on the threads.
     let views: Vec<Result<View, DatasetError>> =
-        frames.par_iter().map(|frame| view(frame, options.resolution)).collect();
+        frames.par_iter().map(|frame| view(&listing, frame, options.resolution)).collect();
     let views: Vec<View> = views.into_iter().collect::<Result<_, _>>()?;
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, views.first())
         && views.iter().any(|view| view.source.header.width < width)
@@ -36,13 +36,25 @@ pub(super) fn prepare(
         notes.push(format!("images narrower than {width} px are not enlarged ({})", first.name));
     }
 
+    let centres: Vec<_> = views.iter().map(|view| view.camera.centre()).collect();
+    let far = normalise::far(&centres);
+    notes.extend(far_note(&views, &far, options.far_cameras));
+    let leave_out = options.far_cameras == FarCameras::LeaveOut;
+    let far_names: HashSet<String> = views
+        .iter()
+        .zip(&far)
+        .filter(|(_, far)| **far)
+        .map(|(view, _)| view.name.clone())
+        .collect();
     let candidates = views.into_iter().zip(&frames);
+    let candidates = candidates.filter(|(view, _)| !(leave_out && far_names.contains(&view.name)));
     let candidates = candidates.map(|(view, frame)| (view, frame.held_out, frame.id));
     let Views { mut train, mut test, number_of } = split(candidates, options.split, own_split)?;
 
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
-    let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
+    let near = train.iter().filter(|view| !far_names.contains(&view.name));
+    let centres: Vec<_> = near.map(|view| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.scene_from_world_camera(&view.camera);
@@ -64,6 +76,23 @@ pub(super) fn prepare(
     })?;
     let tracks = tracks.in_training_views(&normalisation, |id| number_of.get(&id).copied());
     Ok(Dataset { root: path.to_owned(), train, test, points, tracks, normalisation, notes })
+}
+
+/// Names the views whose camera is far from all others.
+fn far_note(views: &[View], far: &[bool], what: FarCameras) -> Option<String> {
+    const SHOWN: usize = 5;
+    let names: Vec<&str> =
+        views.iter().zip(far).filter(|(_, far)| **far).map(|(view, _)| &*view.name).collect();
+    let more = names.len().saturating_sub(SHOWN);
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    let shown = names.get(..SHOWN).unwrap_or(&names).join(", ");
+    let fate = match what {
+        FarCameras::LeaveOut => "left out (--far-cameras keep keeps them)",
+        FarCameras::Keep => "kept, but do not count for the extent of the scene",
+    };
+    let many = if names.len() == 1 { "view whose camera is" } else { "views whose cameras are" };
+    (!names.is_empty())
+        .then(|| format!("{} {many} far from all others: {fate}: {shown}{more}", names.len()))
 }
 
 /// Views after the split.
@@ -138,7 +167,11 @@ fn drop_bad(
 }
 
 /// Checks an image's header against its camera and plans how it will be loaded.
-fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetError> {
+fn view(
+    listing: &Path,
+    frame: &Frame,
+    resolution: Option<Resolution>,
+) -> Result<View, DatasetError> {
     let header = images::probe(&frame.image)?;
     let lens = &frame.lens;
     let size_fault =
@@ -172,6 +205,17 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
         }
     }
     let lens = lens.resized(header.width, header.height);
+    // Cut-outs of a photograph have it outside, but hardly by more than their own size.
+    let size = DVec2::new(f64::from(header.width), f64::from(header.height));
+    if !(lens.principal.cmpge(-size) & lens.principal.cmple(2.0 * size)).all() {
+        let DVec2 { x, y } = lens.principal;
+        return Err(DatasetError::malformed(
+            listing,
+            &frame.name,
+            format!("the principal point ({x}, {y}) px is far outside the image"),
+            "repair the camera or remove the frame",
+        ));
+    }
     let undistortion = if lens.is_distorted() {
         Some(lens.undistortion().map_err(|problem| DatasetError::Lens {
             path: frame.image.clone(),
@@ -197,8 +241,8 @@ fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetEr
         name: frame.name.clone(),
         camera: camera.resized(width, height),
         source: ImageSource {
-            path: frame.image.clone(),
-            mask: frame.mask.clone(),
+            file: SourceFile::found(frame.image.clone())?,
+            mask: frame.mask.clone().map(SourceFile::found).transpose()?,
             width,
             height,
             undistortion,

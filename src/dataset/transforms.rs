@@ -5,8 +5,6 @@
 //! at the top level or in the frame; those in the frame take precedence.
 
 use std::collections::HashSet;
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec2, DVec3};
@@ -70,6 +68,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
         None => top.names("val_filenames")?,
     };
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
+    let mut first_missing = None;
     for (index, entry) in list.iter().enumerate() {
         let place = format!("frames[{index}].");
         let Value::Object(entry) = entry else {
@@ -82,6 +81,7 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
         let field = fields.full("file_path");
         let named = DataPath { file: &path, field: &field, value: file };
         let Some(found) = folders.image(named)? else {
+            first_missing.get_or_insert_with(|| folders.place(named));
             missing.push(file.to_owned());
             continue;
         };
@@ -127,7 +127,8 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     }
     let points_file = points_file(root, &top, held_out, &mut notes)?;
     let listing = path.clone();
-    let mut scene = Scene { frames, notes, points_file, listing, own_split, ..Scene::default() };
+    let mut scene =
+        Scene { frames, first_missing, notes, points_file, listing, own_split, ..Scene::default() };
     if !held_out && let Some(file) = &scene.points_file {
         scene.points = crate::import::ply::read_points(file)?;
     }
@@ -159,14 +160,9 @@ fn points_file(
 }
 
 fn parse(path: &Path) -> Result<Value, DatasetError> {
-    let file = File::open(path).map_err(DatasetError::io(path))?;
-    let mut text = Vec::new();
-    file.take(MAX_JSON + 1).read_to_end(&mut text).map_err(DatasetError::io(path))?;
-    if text.len() as u64 > MAX_JSON {
-        return Err(DatasetError::malformed(path, "the file", "it is larger than 64 MiB", REMEDY));
-    }
+    let text = crate::foreign::read_text(path, MAX_JSON).map_err(DatasetError::io(path))?;
     // The message of serde_json has line and column.
-    serde_json::from_slice(&text)
+    serde_json::from_str(&text)
         .map_err(|e| DatasetError::malformed(path, "JSON", e.to_string(), REMEDY))
 }
 

@@ -4,17 +4,16 @@ use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use tempfile::TempDir;
-
-use super::OutputError;
-use super::atomic::{RUN_FOLDER_DEPTH, TEMPORARY, is_temporary, remove_incomplete};
+use super::atomic::{RUN_FOLDER_DEPTH, remove_incomplete};
 use super::disk::{Operation, attempt};
+use super::lock::FolderLock;
 use super::tensorboard::PREFIX as EVENTS_PREFIX;
+use super::{CONFIG_FILE, OutputError};
 
 /// Files and folders of a run. Everything else in its folder belongs to the user and is left alone.
 const OWNED: [&str; 11] = [
     CHECKPOINTS,
-    "config.toml",
+    CONFIG_FILE,
     "cameras.json",
     MODELS,
     "stats",
@@ -53,7 +52,15 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
     Ok(saved)
 }
 
-/// The folder that a run writes to.
+/// Hidden folder of a run that is to replace another, with a suffix of its own.
+const NEW: &str = ".densify-new-";
+/// Hidden folder to which the old run goes out of the way; of the same suffix. While it is there, the old
+/// run is the one that counts.
+const OLD: &str = ".densify-old-";
+/// What [`OLD`] is called once all of the old run is in it: from then on the new run counts.
+const REPLACED: &str = ".densify-replaced-";
+
+/// The folder that a run writes to, locked against other processes for as long as this value lives.
 ///
 /// A new run writes in place. A run that replaces another writes to a hidden folder inside and takes
 /// its place in [`finish`](Self::finish); until then the old run is unchanged.
@@ -62,15 +69,17 @@ pub struct RunFolder {
     target: PathBuf,
     /// Whether this run created the folder.
     is_new: bool,
-    staging: Option<TempDir>,
+    /// Suffix of the hidden folder that is written to.
+    staged: Option<String>,
+    lock: FolderLock,
 }
 
 impl RunFolder {
     /// Checks, without writing anything, that a run may go to `target`.
     ///
     /// # Errors
-    /// [`OutputError::Occupied`] when it holds another run and `overwrite` is not set;
-    /// [`OutputError::NotAFolder`]; [`OutputError::Io`].
+    /// [`OutputError::InUse`] while a process trains there; [`OutputError::Occupied`] when it holds
+    /// another run and `overwrite` is not set; [`OutputError::NotAFolder`]; [`OutputError::Io`].
     pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
         if !target.is_dir() {
             // A dangling link is in the way, too.
@@ -79,6 +88,7 @@ impl RunFolder {
                 Err(_) => Ok(()),
             };
         }
+        FolderLock::check(target)?;
         if !overwrite && !owned_entries(target)?.is_empty() {
             return Err(OutputError::Occupied { path: target.to_owned() });
         }
@@ -91,61 +101,86 @@ impl RunFolder {
     /// As [`check`](Self::check).
     pub fn create(target: &Path, overwrite: bool) -> Result<Self, OutputError> {
         Self::check(target, overwrite)?;
-        let is_new = !target.exists();
-        let fail = |e| OutputError::io("create the folder", target)(e);
-        attempt(Operation::Create, target).map_err(fail)?;
-        fs::create_dir_all(target).map_err(fail)?;
+        let mut folder = Self::lock(target)?;
+        // Another process may have trained there since.
         let occupied = !owned_entries(target)?.is_empty();
-        let staging = occupied
-            .then(|| tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(target))
-            .transpose()
-            .map_err(OutputError::io("create a folder in", target))?;
-        Ok(Self { target: target.to_owned(), is_new, staging })
+        if occupied && !overwrite {
+            return Err(OutputError::Occupied { path: target.to_owned() });
+        }
+        if occupied {
+            let staging = tempfile::Builder::new().prefix(NEW).tempdir_in(target);
+            let staging = staging.map_err(OutputError::io("create a folder in", target))?.keep();
+            folder.staged = suffix(&staging, NEW);
+        }
+        Ok(folder)
     }
 
     /// The folder of a run that continues, or that starts again (`anew`) because it has no checkpoint;
     /// then its files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`OutputError::NotAFolder`], [`OutputError::Io`].
+    /// [`OutputError::InUse`], [`OutputError::NotAFolder`], [`OutputError::Io`].
     pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
         Self::check(target, true)?;
+        let folder = Self::lock(target)?;
         if anew {
-            remove_owned(target);
+            // Its description stays until it is replaced: a kill must not lose it.
+            remove_owned(target, |name| name != CONFIG_FILE);
         }
         remove_incomplete(target, RUN_FOLDER_DEPTH);
-        let is_new = !target.exists();
-        fs::create_dir_all(target).map_err(OutputError::io("create the folder", target))?;
-        Ok(Self { target: target.to_owned(), is_new, staging: None })
+        Ok(folder)
     }
 
-    /// Hidden folders in `target` of runs that are to replace the one there, or were.
+    /// Creates and locks a folder, and ends a replacement in it that was interrupted.
+    fn lock(target: &Path) -> Result<Self, OutputError> {
+        let is_new = !target.exists();
+        let fail = |e| OutputError::io("create the folder", target)(e);
+        attempt(Operation::Create, target).map_err(fail)?;
+        fs::create_dir_all(target).map_err(fail)?;
+        let lock = FolderLock::take(target)?;
+        recover(target)?;
+        let is_worthless =
+            |path: &PathBuf| !path.join(CHECKPOINTS).exists() && saved_iterations(path).is_err();
+        remove_all(Self::staged(target).into_iter().filter(is_worthless));
+        Ok(Self { target: target.to_owned(), is_new, staged: None, lock })
+    }
+
+    /// Hidden folders in `target` of runs that were to replace the one there and were interrupted.
     #[must_use]
     pub fn staged(target: &Path) -> Vec<PathBuf> {
-        let entries = fs::read_dir(target).into_iter().flatten().flatten();
-        let hidden = entries.filter(|entry| is_temporary(&entry.file_name()));
-        hidden.map(|entry| entry.path()).filter(|path| path.is_dir()).collect()
+        let mut staged = hidden(target, NEW);
+        staged.retain(|path| FolderLock::check(path).is_ok());
+        staged
     }
 
     /// The folder to write to.
     #[must_use]
-    pub fn path(&self) -> &Path {
-        self.staging.as_ref().map_or(&self.target, |staging| staging.path())
+    pub fn path(&self) -> PathBuf {
+        let staged = |suffix: &String| self.target.join(format!("{NEW}{suffix}"));
+        self.staged.as_ref().map_or_else(|| self.target.clone(), staged)
     }
 
-    /// Replaces the existing run, if there is one; returns the folder.
+    /// Replaces the existing run, if there is one, and removes earlier ones that were to replace it and
+    /// were interrupted; returns the folder.
     ///
     /// # Errors
     /// [`OutputError::NotReplaced`] with the hidden folder of the new run; the old run stays.
     pub fn finish(self) -> Result<PathBuf, OutputError> {
-        let Self { target, staging, .. } = self;
-        let Some(staging) = staging else {
-            return Ok(target);
+        let Some(suffix) = &self.staged else {
+            return Ok(self.target.clone());
         };
-        let staging = staging.keep();
-        match replace(&target, &staging) {
-            Ok(()) => Ok(target),
-            Err(source) => Err(OutputError::NotReplaced { staging, source: Box::new(source) }),
+        let replaced = match self.lock.holds() {
+            true => replace(&self.target, suffix),
+            false => Err(OutputError::InUse { path: self.target.clone(), process: None }),
+        };
+        match replaced {
+            Ok(()) => {
+                remove_all(Self::staged(&self.target));
+                Ok(self.target.clone())
+            }
+            Err(source) => {
+                Err(OutputError::NotReplaced { staging: self.path(), source: Box::new(source) })
+            }
         }
     }
 
@@ -153,40 +188,81 @@ impl RunFolder {
     /// returned folder.
     #[must_use]
     pub fn abandon(self) -> PathBuf {
-        self.staging.map_or(self.target, TempDir::keep)
+        self.path()
     }
 
     /// Ends a run without results: removes its files. An existing run and other files stay.
     pub fn discard(self) {
-        // Dropping the staging folder removes it.
-        if self.staging.is_none() {
-            remove_owned(&self.target);
-            if self.is_new {
-                // It stays if the user has put something there.
-                let _ = fs::remove_dir(&self.target);
-            }
+        let Self { target, is_new, staged, lock } = self;
+        match staged {
+            Some(suffix) => remove_all([target.join(format!("{NEW}{suffix}"))]),
+            None => remove_owned(&target, |_| true),
+        }
+        drop(lock);
+        if is_new {
+            // It stays if the user has put something there.
+            let _ = fs::remove_dir(&target);
         }
     }
 }
 
-/// Replaces the run in `target` by that in `staging`, or leaves both unchanged.
-fn replace(target: &Path, staging: &Path) -> Result<(), OutputError> {
-    let aside = tempfile::Builder::new()
-        .prefix(".densify-old-")
-        .tempdir_in(target)
-        .map_err(OutputError::io("create a folder in", target))?;
-    let moved = move_run(target, aside.path())
-        .map_err(|error| (error, false))
-        .and_then(|()| move_run(staging, target).map_err(|error| (error, true)));
-    let Err((error, half)) = moved else {
-        return fs::remove_dir_all(staging).map_err(OutputError::io("remove", staging));
-    };
-    let back = if half { move_run(target, staging) } else { Ok(()) };
-    if back.and_then(|()| move_run(aside.path(), target)).is_err() {
-        // Files that cannot be moved back must not be removed with the folder.
-        let _ = aside.keep();
+/// Replaces the run in `target` by that in the hidden folder of this suffix, or leaves both unchanged.
+/// Killed within, it is ended by [`recover`].
+fn replace(target: &Path, suffix: &str) -> Result<(), OutputError> {
+    let [new, old, replaced] =
+        [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
+    fs::create_dir(&old).map_err(OutputError::io("create the folder", &old))?;
+    let out_of_the_way = move_run(target, &old)
+        .and_then(|()| fs::rename(&old, &replaced).map_err(OutputError::io("rename", &old)));
+    if let Err(error) = out_of_the_way {
+        // What cannot be moved back stays where it is, for `recover`.
+        let _ = move_run(&old, target).map(|()| fs::remove_dir(&old));
+        return Err(error);
     }
-    Err(error)
+    if let Err(error) = move_run(&new, target) {
+        let _ = move_run(target, &new)
+            .and_then(|()| move_run(&replaced, target))
+            .map(|()| fs::remove_dir(&replaced));
+        return Err(error);
+    }
+    remove_all([new, replaced]);
+    Ok(())
+}
+
+/// Ends replacements that a kill has interrupted: one whose old run was still moving out is undone,
+/// one whose new run was moving in is completed.
+fn recover(target: &Path) -> Result<(), OutputError> {
+    for old in hidden(target, OLD) {
+        move_run(&old, target)?;
+        remove_all([old]);
+    }
+    for replaced in hidden(target, REPLACED) {
+        let suffix = suffix(&replaced, REPLACED).unwrap_or_default();
+        let new = target.join(format!("{NEW}{suffix}"));
+        if new.exists() {
+            move_run(&new, target)?;
+        }
+        remove_all([new, replaced]);
+    }
+    Ok(())
+}
+
+/// Folders in `target` whose names begin so.
+fn hidden(target: &Path, prefix: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(target).into_iter().flatten().flatten().map(|entry| entry.path());
+    entries.filter(|path| suffix(path, prefix).is_some() && path.is_dir()).collect()
+}
+
+/// What follows the prefix in the name of a folder.
+fn suffix(path: &Path, prefix: &str) -> Option<String> {
+    Some(path.file_name()?.to_str()?.strip_prefix(prefix)?.to_owned())
+}
+
+/// Removes folders, as far as possible.
+fn remove_all(folders: impl IntoIterator<Item = PathBuf>) {
+    for folder in folders {
+        let _ = fs::remove_dir_all(folder);
+    }
 }
 
 /// Moves the files of a run to another folder.
@@ -200,9 +276,10 @@ fn move_run(from: &Path, to: &Path) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// Removes the files of a run, as far as possible.
-fn remove_owned(folder: &Path) {
-    for name in owned_entries(folder).unwrap_or_default() {
+/// Removes those files of a run that are meant, as far as possible.
+fn remove_owned(folder: &Path, is_meant: impl Fn(&OsStr) -> bool) {
+    let names = owned_entries(folder).unwrap_or_default();
+    for name in names.into_iter().filter(|name| is_meant(name)) {
         let path = folder.join(name);
         let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
     }
@@ -229,6 +306,7 @@ fn is_owned(name: &OsStr) -> bool {
 mod tests {
     use super::*;
     use crate::output::disk::{Fault, with_fault};
+    use crate::output::lock::LOCK;
 
     fn write(path: &Path, text: &str) {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -268,8 +346,8 @@ mod tests {
         write(&run.path().join("config.toml"), "new");
         write(&run.path().join("point_cloud/iteration_1/point_cloud.ply"), "new");
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
-        drop(run);
-        assert_eq!(tree(root.path()), before, "a run that is dropped leaves nothing");
+        run.discard();
+        assert_eq!(tree(root.path()), before, "a run that is discarded leaves nothing");
 
         let run = RunFolder::create(root.path(), true).unwrap();
         write(&run.path().join("config.toml"), "new");
@@ -318,14 +396,71 @@ mod tests {
         for name in [".densify-1", "stats/.densify-2", "point_cloud/iteration_1/.densify-3"] {
             write(&root.path().join(name), "half");
         }
-        write(&root.path().join(".densify-x/checkpoints/a"), "another run, waiting");
-        RunFolder::resume(root.path(), false).unwrap();
-        assert_eq!(tree(root.path()), [".densify-x", "config.toml", "point_cloud", "stats"]);
+        write(&root.path().join(".densify-new-x/checkpoints/a"), "another run, waiting");
+        write(&root.path().join(".densify-new-y/config.toml"), "killed before it had anything");
+        drop(RunFolder::resume(root.path(), false).unwrap());
+        assert_eq!(tree(root.path()), [".densify-new-x", "config.toml", "point_cloud", "stats"]);
         assert_eq!(tree(&root.path().join("stats")), ["train.jsonl"]);
         assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
-        assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-x")]);
-        RunFolder::resume(root.path(), true).unwrap();
-        assert_eq!(tree(root.path()), [".densify-x"]);
+        assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-new-x")]);
+        drop(RunFolder::resume(root.path(), true).unwrap());
+        assert_eq!(tree(root.path()), [".densify-new-x", "config.toml"]);
+        let run = RunFolder::create(root.path(), true).unwrap();
+        write(&run.path().join("config.toml"), "new");
+        run.finish().unwrap();
+        assert_eq!(tree(root.path()), ["config.toml"]);
+    }
+
+    #[test]
+    fn a_replacement_that_is_killed_is_ended_by_the_next_run() {
+        const OLD_RUN: [&str; 2] = ["cameras.json", "config.toml"];
+        const NEW_RUN: [&str; 2] = ["config.toml", "results.json"];
+        // What has moved when the kill comes: of the old run, then of the new one.
+        for (out, moved_in) in
+            [(0, None), (1, None), (2, None), (2, Some(0)), (2, Some(1)), (2, Some(2))]
+        {
+            let root = tempfile::tempdir().unwrap();
+            let aside = if moved_in.is_some() { REPLACED } else { OLD };
+            for (number, name) in OLD_RUN.iter().enumerate() {
+                let folder = if number < out { format!("{aside}x/") } else { String::new() };
+                write(&root.path().join(folder + name), "old");
+            }
+            for (number, name) in NEW_RUN.iter().enumerate() {
+                let is_in = moved_in.is_some_and(|count| number < count);
+                let folder = if is_in { String::new() } else { format!("{NEW}x/") };
+                write(&root.path().join(folder + name), "new");
+            }
+            drop(RunFolder::resume(root.path(), false).unwrap());
+            let (names, text) = match moved_in {
+                None => (OLD_RUN, "old"),
+                Some(_) => (NEW_RUN, "new"),
+            };
+            assert_eq!(tree(root.path()), names, "{out} out, {moved_in:?} in");
+            assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), text);
+        }
+    }
+
+    #[test]
+    fn a_folder_in_use_is_neither_replaced_nor_resumed() {
+        let root = tempfile::tempdir().unwrap();
+        let run = RunFolder::create(root.path(), false).unwrap();
+        write(&run.path().join("config.toml"), "a");
+        let refused = [
+            RunFolder::check(root.path(), true),
+            RunFolder::create(root.path(), true).map(drop),
+            RunFolder::resume(root.path(), false).map(drop),
+        ];
+        for refused in refused {
+            assert!(matches!(refused, Err(OutputError::InUse { .. })), "{refused:?}");
+        }
+        run.finish().unwrap();
+        let replacing = RunFolder::create(root.path(), true).unwrap();
+        write(&replacing.path().join("config.toml"), "b");
+        assert!(RunFolder::check(root.path(), true).is_err());
+        // The lock is tested again at the end.
+        fs::remove_file(root.path().join(LOCK)).unwrap();
+        assert!(matches!(replacing.finish(), Err(OutputError::NotReplaced { .. })));
+        assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"a");
     }
 
     #[test]

@@ -19,6 +19,7 @@ mod atomic;
 mod cameras;
 pub(crate) mod disk;
 mod folder;
+mod lock;
 mod records;
 mod tensorboard;
 
@@ -48,6 +49,17 @@ pub enum OutputError {
     Occupied {
         /// The folder.
         path: PathBuf,
+    },
+    /// A process is training in the folder.
+    #[error(
+        "{path} is in use: {} is training there; wait for it, stop it, or choose another folder with -o",
+        process.map_or_else(|| "another process".to_owned(), |number| format!("process {number}"))
+    )]
+    InUse {
+        /// The folder.
+        path: PathBuf,
+        /// Number of the process, if known.
+        process: Option<u32>,
     },
     /// The path is not a folder.
     #[error("{path} is not a folder; choose another one with -o")]

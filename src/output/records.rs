@@ -1,7 +1,7 @@
 //! Writes the numbers of a run: logs, the summary, test scores.
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
@@ -35,17 +35,7 @@ impl RecordLog {
         let file = attempt(Operation::Create, path)
             .and_then(|()| options.create(true).write(true).truncate(true).open(path));
         let file = file.map_err(OutputError::io("create", path))?;
-        mark_as_in_use(&file);
         Ok(Self { file, path: path.to_owned() })
-    }
-
-    /// Whether a process is writing to the log now, if known.
-    #[must_use]
-    pub fn is_in_use(path: &Path) -> bool {
-        // On other systems the lock would also block readers.
-        cfg!(unix)
-            && File::open(path)
-                .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
     }
 
     /// Continues a log, cut to the `bytes` that it had at the checkpoint. Also returns whether it still
@@ -57,7 +47,6 @@ impl RecordLog {
         let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else {
             return Ok((Self::create(path)?, bytes == 0));
         };
-        mark_as_in_use(&file);
         let mut cut = || {
             let there = file.metadata()?.len();
             if there < bytes {
@@ -97,13 +86,6 @@ impl RecordLog {
         let Self { file, path } = self;
         line.and_then(|line| WatchedFile { file, path }.write_all((line + "\n").as_bytes()))
             .map_err(OutputError::io("write", path))
-    }
-}
-
-/// Locks the file until it is closed, even by a kill. Not every file system supports it.
-fn mark_as_in_use(file: &File) {
-    if cfg!(unix) {
-        let _ = file.try_lock();
     }
 }
 

@@ -8,7 +8,6 @@ use densify_policies::policy::DensityPolicy;
 use super::Run;
 use super::config::{Resolved, RunConfig};
 use super::observer::Observer;
-use super::records::SavedSession;
 use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS, ignored, random_count};
 use super::resume::{self, Resumed};
 use super::spec::RunSpec;
@@ -26,7 +25,7 @@ use crate::views::DatasetViews;
 /// Views announced ahead: enough that each decoder has one at work and one waiting.
 const AHEAD: usize = 2 * DECODERS;
 
-/// Prepares a run: a new one, or one that goes on from a checkpoint.
+/// Prepares a run: a new one, or one that goes on.
 pub(super) fn build(
     spec: &RunSpec,
     resumed: Option<Resumed>,
@@ -50,20 +49,21 @@ pub(super) fn build(
     let setting = size.setting;
     let threads = inputs.threads();
     resolve::check_grant(&inputs, &inputs.ledger(&setting, &inputs.needs(setting.rows)?, threads))?;
-    let (mut model, init, init_points) = match &resumed {
+    let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
+    let (mut model, init, init_points) = match checkpoint {
         None => first_model(&inputs, &setting, observer)?,
-        Some(resumed) => {
+        Some(checkpoint) => {
             let start = &spec.start;
             let init = start.init.unwrap_or_else(|| inputs.init());
-            (resumed.checkpoint.blank_model()?, init, start.init_points.map(|points| points.0))
+            (checkpoint.blank_model()?, init, start.init_points.map(|points| points.0))
         }
     };
-    let initial_rows = (resumed.as_ref())
-        .map_or(model.len(), |resumed| resumed.checkpoint.header().trainer.initial_rows);
+    let initial_rows =
+        checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
     let scene = inputs.info(setting.rows, initial_rows)?;
     let policy = inputs.entry.build(&inputs.parameters, &scene)?;
     let declared = policy.needs(&scene);
-    if resumed.is_none() {
+    if checkpoint.is_none() {
         restart(&mut model, &declared.start);
     }
     let rates = spec.learning_rates(&declared.rates)?;
@@ -77,7 +77,7 @@ pub(super) fn build(
     config.resolved.extended_to = (last > spec.schedule.iterations.0).then_some(last);
     let fingerprint = Fingerprint::of(&inputs.dataset);
     if let Some(resumed) = &resumed {
-        resume::check(&config, resumed, &fingerprint)?;
+        resume::check(&config, resumed, &fingerprint, &output)?;
     }
     for line in inputs.degree.line().into_iter().chain(size.lines(&inputs)) {
         observer.say(format_args!("{line}"));
@@ -107,8 +107,10 @@ pub(super) fn build(
     let policy: Box<dyn DensityPolicy> = policy;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
     let mut trainer = trainer.requiring(required);
-    let session: Option<SavedSession> =
-        resumed.map(|resumed| resume::restore(resumed, &mut trainer, observer)).transpose()?;
+    let session = match resumed {
+        Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
+        None => None,
+    };
     Ok(Run { config, output, trainer, test, dataset, ledger, fingerprint, last, session })
 }
 

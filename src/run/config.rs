@@ -106,12 +106,15 @@ impl RunConfig {
     /// When there is none, or it does not say what it should.
     pub fn read(run: &Path) -> Result<Self, Failure> {
         let path = run.join(CONFIG_FILE);
-        let text = std::fs::read_to_string(&path).map_err(|error| match error.kind() {
-            std::io::ErrorKind::NotFound => {
-                OutputError::NoRun { path: run.to_owned(), missing: CONFIG_FILE }.into()
-            }
-            _ => Failure::input(format!("cannot read {}: {error}", path.display())),
-        })?;
+        let text =
+            crate::foreign::read_text(&path, crate::foreign::MAX_OPTIONS).map_err(|error| {
+                match error.kind() {
+                    std::io::ErrorKind::NotFound => {
+                        OutputError::NoRun { path: run.to_owned(), missing: CONFIG_FILE }.into()
+                    }
+                    _ => Failure::input(format!("cannot read {}: {error}", path.display())),
+                }
+            })?;
         let malformed =
             |problem: String| Failure::from(OutputError::Malformed { path: path.clone(), problem });
         let table: Table = text

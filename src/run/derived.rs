@@ -29,6 +29,7 @@ impl DataSpec {
                 None if self.eval => Split::Eval,
                 None => Split::None,
             },
+            far_cameras: self.far_cameras,
             tracks,
         })
     }

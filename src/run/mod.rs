@@ -77,11 +77,11 @@ impl Run {
         build::build(spec, None, observer)
     }
 
-    /// Prepares a run that goes on from a checkpoint; see [`start`].
+    /// Prepares a run that goes on; see [`start`].
     ///
     /// # Errors
-    /// As [`prepare`](Self::prepare), and when the description would give another result than that of
-    /// the checkpoint.
+    /// As [`prepare`](Self::prepare), and when the description would give another result than the saved
+    /// one.
     pub fn resume(
         spec: &RunSpec,
         resumed: Resumed,

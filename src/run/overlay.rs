@@ -53,7 +53,8 @@ impl Partial {
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let origin = format!("--config {}", path.display());
         let fail = |problem: String| Failure::input(format!("{origin}: {}", problem.trim()));
-        let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
+        let text = crate::foreign::read_text(path, crate::foreign::MAX_OPTIONS)
+            .map_err(|error| fail(error.to_string()))?;
         let mut table: Table =
             text.parse().map_err(|error: toml::de::Error| fail(error.to_string()))?;
         table.retain(|key, _| !FOUND_OUT.contains(&key));

@@ -104,11 +104,6 @@ impl Totals {
     }
 }
 
-/// Whether a process is training in the folder of a run.
-pub(super) fn is_in_use(folder: &Path) -> bool {
-    RecordLog::is_in_use(&folder.join(STEPS))
-}
-
 /// The files that grow along a run.
 pub(super) struct Logs {
     pub(super) steps: RecordLog,

@@ -1,27 +1,28 @@
-//! `--resume`: which checkpoint a run goes on from, and with which options.
+//! `--resume`: what a run goes on from, and with which options.
 //!
 //! The saved description is overlaid with what this call gives. What would give another result than the
 //! saved one is refused by name.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
 use super::Partial;
 use super::config::RunConfig;
 use super::observer::Observer;
-use super::records::{SavedSession, is_in_use};
+use super::records::SavedSession;
 use super::spec::{OnResume, RunOption, RunSpec};
 use crate::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest};
 use crate::failure::Failure;
-use crate::output::{RunFolder, saved_iterations};
+use crate::output::{CONFIG_FILE, RunFolder, saved_iterations};
 use crate::trainer::Trainer;
 use crate::views::DatasetViews;
 
 /// A run that goes on.
 pub struct Resumed {
-    pub(super) checkpoint: Checkpoint,
+    /// `None`: the run was stopped before its first checkpoint, and begins again.
+    pub(super) checkpoint: Option<Checkpoint>,
     /// The run as it was.
     pub(super) config: RunConfig,
     /// The step at which it ends: its length, or what it is extended to.
@@ -32,22 +33,37 @@ pub struct Resumed {
 pub enum Start {
     /// There is nothing yet to go on from, and nothing to lose.
     Anew(RunSpec),
-    /// From a checkpoint, with all options.
+    /// From where the run in the folder is, with its options.
     From(RunSpec, Box<Resumed>),
+}
+
+impl Resumed {
+    /// The file that says how the run began.
+    fn origin(&self, output: &Path) -> PathBuf {
+        let config = || output.join(CONFIG_FILE);
+        self.checkpoint.as_ref().map_or_else(config, |checkpoint| checkpoint.path().to_owned())
+    }
+
+    /// Steps done.
+    pub(super) fn step(&self) -> u32 {
+        self.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.header().trainer.step)
+    }
 }
 
 /// Options within the table of knobs that change no byte of the result, or are compared as what came of
 /// them.
 const FREE_KNOBS: [&str; 2] = ["knob.pairs_per_row", "knob.accumulation"];
 
-/// Looks for the newest sound checkpoint in the output folder that `given` describes, and lays `given`
-/// over the options that were saved with it.
+/// Looks in the output folder that `given` describes for the newest sound checkpoint, or else for the
+/// description of a run that has none yet, and lays `given` over the options that were saved with it.
 ///
 /// # Errors
-/// When the folder is in use, holds a run without a checkpoint, or the checkpoint cannot be used.
+/// When a process is training there, the folder holds a run that can no longer go on, or what is there
+/// cannot be used.
 pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> {
     let described = given.clone().describe()?;
     let output = described.output_folder()?;
+    RunFolder::check(&output, true)?;
     if let Some(staged) = RunFolder::staged(&output).iter().find(|path| newest(path).0.is_some()) {
         return Err(Failure::input(format!(
             "--resume: {} holds a run that was to replace the one there and was interrupted: {}; \
@@ -56,38 +72,42 @@ pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> 
             staged.display()
         )));
     }
-    if is_in_use(&output) {
-        return Err(Failure::input(format!(
-            "--resume: another process is training in {}; wait for it, or stop it",
-            output.display()
-        )));
-    }
     let (checkpoint, rejected) = newest(&output);
-    let Some(checkpoint) = checkpoint else {
-        nothing(&output, &rejected, observer)?;
-        return Ok(Start::Anew(described));
+    let config = match &checkpoint {
+        Some(checkpoint) => {
+            for error in &rejected {
+                observer.say(format_args!("note: a newer checkpoint cannot be used: {error}"));
+            }
+            let origin = format!("{}: its configuration", checkpoint.path().display());
+            RunConfig::from_table(checkpoint.header().config.clone(), &origin)?
+        }
+        None => {
+            nothing(&output, &rejected, observer)?;
+            if !output.join(CONFIG_FILE).exists() {
+                return Ok(Start::Anew(described));
+            }
+            RunConfig::read(&output)?
+        }
     };
-    for error in &rejected {
-        observer.say(format_args!("note: a newer checkpoint cannot be used: {error}"));
+    let mut resumed = Resumed { checkpoint, last: config.last(), config };
+    let origin = resumed.origin(&output).display().to_string();
+    let length = resumed.config.spec.schedule.iterations.0;
+    if let Some(asked) = given.get("iterations").and_then(Value::as_integer) {
+        resumed.last = u32::try_from(asked).unwrap_or(resumed.last);
     }
-    let origin = format!("{}: its configuration", checkpoint.path().display());
-    let config = RunConfig::from_table(checkpoint.header().config.clone(), &origin)?;
-    let step = checkpoint.header().trainer.step;
-    let length = config.spec.schedule.iterations.0;
-    let asked = given.get("iterations").and_then(Value::as_integer);
-    let last = asked.and_then(|it| u32::try_from(it).ok()).unwrap_or_else(|| config.last());
-    if last < length.max(step) {
+    if resumed.last < length.max(resumed.step()) {
         return Err(Failure::input(format!(
-            "--iterations {last} contradicts {}: that run has {length} iterations, of which {step} \
+            "--iterations {} contradicts {origin}: that run has {length} iterations, of which {} \
              are done; it can be extended, not shortened",
-            checkpoint.path().display()
+            resumed.last,
+            resumed.step(),
         )));
     }
-    let mut spec = overlay(given, &config, &checkpoint.path().display().to_string())?;
+    let mut spec = overlay(given, &resumed.config, &origin)?;
     spec.schedule.iterations.0 = length;
     // It is this folder that goes on, wherever it was when the run began.
     spec.output.output = Some(output);
-    Ok(Start::From(spec, Box::new(Resumed { checkpoint, config, last })))
+    Ok(Start::From(spec, Box::new(resumed)))
 }
 
 /// The saved options under those that are given.
@@ -166,8 +186,10 @@ pub(super) fn check(
     now: &RunConfig,
     resumed: &Resumed,
     dataset: &Fingerprint,
+    output: &Path,
 ) -> Result<(), Failure> {
-    let path = resumed.checkpoint.path().display();
+    let path = resumed.origin(output);
+    let path = path.display();
     let (ours, theirs) = (fixed(now)?, fixed(&resumed.config)?);
     let same_policy = now.spec.density.policy == resumed.config.spec.density.policy;
     let mut keys: Vec<&String> = ours.keys().chain(theirs.keys()).collect();
@@ -181,7 +203,7 @@ pub(super) fn check(
         .filter(|(_, ours, theirs)| ours != theirs)
         .map(|(key, ours, theirs)| {
             let (ours, theirs) = (shown(ours), shown(theirs));
-            format!("\n  {}: {ours} now, {theirs} in the checkpoint", flag(key))
+            format!("\n  {}: {ours} now, {theirs} in that run", flag(key))
         })
         .collect();
     if !problems.is_empty() {
@@ -191,7 +213,8 @@ pub(super) fn check(
             problems.concat()
         )));
     }
-    match resumed.checkpoint.header().dataset.difference(dataset) {
+    let saved = resumed.checkpoint.as_ref().map(|checkpoint| &checkpoint.header().dataset);
+    match saved.and_then(|saved| saved.difference(dataset)) {
         None => Ok(()),
         Some(difference) => Err(Failure::input(format!(
             "--resume: this is not the dataset of {path}: {difference}; give the dataset of that run, \
@@ -239,24 +262,19 @@ fn fixed(config: &RunConfig) -> Result<BTreeMap<String, String>, Failure> {
     Ok(found)
 }
 
-/// Gives the trainer, which holds as many rows as the checkpoint, everything that is in it.
+/// Gives the trainer, which holds as many rows as the checkpoint, everything that is in it; the session
+/// is `None` where there is no checkpoint.
 pub(super) fn restore(
     resumed: Resumed,
     trainer: &mut Trainer<DatasetViews>,
     observer: &dyn Observer,
-) -> Result<SavedSession, Failure> {
-    let Resumed { mut checkpoint, config, last } = resumed;
-    checkpoint.restore(trainer.backend())?;
-    let header = checkpoint.header();
-    let fail =
-        |problem: String| Failure::input(format!("{}: {problem}", checkpoint.path().display()));
-    let state = header.trainer.clone();
-    let step = state.step;
-    trainer.resume(state).map_err(|error| fail(error.to_string()))?;
-    let session = serde_json::from_value(header.session.clone());
-    let session = session.map_err(|error| fail(format!("its session: {error}")))?;
-    let length = config.spec.schedule.iterations.0;
-    observer.say(format_args!("resume   from step {step}, {}", checkpoint.path().display()));
+) -> Result<Option<SavedSession>, Failure> {
+    let (step, last) = (resumed.step(), resumed.last);
+    let length = resumed.config.spec.schedule.iterations.0;
+    let session = match resumed.checkpoint {
+        Some(checkpoint) => Some(restore_from(checkpoint, trainer, observer)?),
+        None => None,
+    };
     if last > length {
         observer.say(format_args!(
             "note: extended from {length} to {last} iterations; all schedules stay those of {length}, \
@@ -268,6 +286,24 @@ pub(super) fn restore(
             "note: all {last} iterations are done; --iterations with a larger number extends the run"
         ));
     }
+    Ok(session)
+}
+
+fn restore_from(
+    mut checkpoint: Checkpoint,
+    trainer: &mut Trainer<DatasetViews>,
+    observer: &dyn Observer,
+) -> Result<SavedSession, Failure> {
+    checkpoint.restore(trainer.backend())?;
+    let header = checkpoint.header();
+    let fail =
+        |problem: String| Failure::input(format!("{}: {problem}", checkpoint.path().display()));
+    let state = header.trainer.clone();
+    let step = state.step;
+    trainer.resume(state).map_err(|error| fail(error.to_string()))?;
+    let session = serde_json::from_value(header.session.clone());
+    let session = session.map_err(|error| fail(format!("its session: {error}")))?;
+    observer.say(format_args!("resume   from step {step}, {}", checkpoint.path().display()));
     let version = env!("CARGO_PKG_VERSION");
     if header.densify != version {
         observer.say(format_args!(

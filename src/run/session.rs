@@ -1,6 +1,6 @@
 //! The loop around the trainer: progress, logs, saves, measurements, and the end, good or bad.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -13,10 +13,10 @@ use super::records::{Logs, Totals};
 use crate::checkpoint::{CheckpointError, Header, checkpoint_path, tidy, write};
 use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::export::{PLY, Shape};
-use crate::failure::{Failure, INPUT};
+use crate::failure::{Failure, INPUT, OTHER};
 use crate::output::{
-    CHECKPOINTS, Mean, OutputError, RunFolder, cameras_json, model_path, saved_iterations,
-    write_atomically, write_scores,
+    CHECKPOINTS, CONFIG_FILE, Mean, OutputError, RunFolder, cameras_json, model_path,
+    saved_iterations, write_atomically, write_scores,
 };
 use crate::trainer::{StepReport, TrainError};
 use crate::views::ViewSource;
@@ -34,6 +34,8 @@ pub(super) struct Session<'a> {
     pub(super) folder: PathBuf,
     logs: Logs,
     pub(super) totals: Totals,
+    /// Whether anything was drawn in each of the last steps, one for each training view.
+    drawn: VecDeque<bool>,
     /// Step of the last checkpoint that this process has written, or gone on from.
     checkpoint: Option<u32>,
 }
@@ -64,9 +66,10 @@ pub(super) fn train(
     observer: &dyn Observer,
 ) -> Result<PathBuf, Failure> {
     let last = run.last;
-    let resumes = run.session.is_some();
+    // Of a run that goes on nothing is removed, were it only its description.
+    let resumes = occupied == Occupied::Resume && run.output.join(CONFIG_FILE).exists();
     let folder = match occupied {
-        Occupied::Resume => RunFolder::resume(&run.output, !resumes)?,
+        Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
         Occupied::Refuse => RunFolder::create(&run.output, false)?,
         Occupied::Replace => RunFolder::create(&run.output, true)?,
     };
@@ -77,7 +80,7 @@ pub(super) fn train(
         checkpoint_every: output.checkpoint_every,
         last,
     };
-    let mut session = match Session::start(run, folder.path(), observer) {
+    let mut session = match Session::start(run, &folder.path(), observer) {
         Ok(session) => session,
         // Where nothing can be written nothing has been learned.
         Err(error) if resumes => return Err(error),
@@ -95,7 +98,7 @@ pub(super) fn train(
             Ok(path)
         }
         // Such as a photograph that cannot be decoded: nothing was learned that is worth keeping.
-        Err(failure) if failure.code == INPUT && has_nothing(folder.path()) => {
+        Err(failure) if failure.code == INPUT && !resumes && has_nothing(&folder.path()) => {
             drop(session);
             folder.discard();
             Err(failure)
@@ -153,7 +156,8 @@ impl<'a> Session<'a> {
             }
         };
         let folder = folder.to_owned();
-        Ok(Self { run, config, observer, folder, logs, totals, checkpoint })
+        let drawn = VecDeque::with_capacity(run.dataset.train.len());
+        Ok(Self { run, config, observer, folder, logs, totals, drawn, checkpoint })
     }
 
     /// All steps that are left.
@@ -174,7 +178,22 @@ impl<'a> Session<'a> {
             self.after(step, duties, false)
         });
         self.observer.end();
-        stepped
+        stepped.and_then(|()| self.check_drawn())
+    }
+
+    /// Fails where the model draws nothing in most of the last views: that is no result.
+    fn check_drawn(&self) -> Result<(), Failure> {
+        let (all, empty) = (self.drawn.len(), self.drawn.iter().filter(|drawn| !**drawn).count());
+        if 2 * empty <= all {
+            return Ok(());
+        }
+        Err(Failure {
+            code: OTHER,
+            message: format!(
+                "the model draws nothing in {empty} of the last {all} views; check the poses of the \
+                 cameras, and that they and the points have the same coordinates, or lower --near"
+            ),
+        })
     }
 
     /// What follows a step: the model is saved, measured, and the run kept. Where the run is
@@ -268,11 +287,15 @@ impl<'a> Session<'a> {
     }
 
     fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
-        let Self { logs, totals, run, .. } = self;
+        let Self { logs, totals, run, drawn, .. } = self;
         for event in &report.events {
             logs.events.append(event)?;
         }
         totals.step(&report.output);
+        if drawn.len() == run.dataset.train.len() {
+            drawn.pop_front();
+        }
+        drawn.push_back(report.output.entries > 0);
         let step = report.step;
         // The end of a run is a record even where it is extended, so that records do not depend on it.
         let ends = [run.config.spec.schedule.iterations.0, run.last].contains(&step);

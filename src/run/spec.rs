@@ -15,6 +15,7 @@ use super::values::{
     Assignment, Budget, ByteCount, Fraction, ImageSize, InitChoice, Rows, ShDegree, Whole, as_table,
 };
 use crate::backend::BackendChoice;
+use crate::dataset::FarCameras;
 use crate::schedule::{Background, REFERENCE_ITERATIONS};
 use crate::trainer::OnNan;
 
@@ -111,6 +112,11 @@ run_spec! {
         #[arg(long, value_name = "DIR")]
         images: Option<PathBuf> = None, Free;
 
+        /// What happens to views whose camera is more than 10 times as far from the others as usual, if
+        /// they are no more than one in 20: structure from motion places some by mistake
+        #[arg(long, value_name = "WHAT")]
+        far_cameras: FarCameras = FarCameras::LeaveOut, Fixed;
+
         /// 1, 2, 4 or 8: photographs that many times smaller (uses images_2, images_4, images_8 where
         /// they exist); any larger number: their width in pixels
         #[arg(short, long, value_name = "N")]
@@ -185,7 +191,8 @@ run_spec! {
         #[arg(long, value_name = "DEGREE")]
         sh_degree: Option<ShDegree> = None, Fixed;
 
-        /// Disable automatic reductions: degree 3, and all views scored
+        /// Disable automatic reductions: degree 3 unless --sh-degree says otherwise, and all views
+        /// scored
         #[arg(
             long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
             require_equals = true, default_missing_value = "true", hide_possible_values = true

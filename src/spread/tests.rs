@@ -1,6 +1,6 @@
 //! Colours of tracks in made-up views: what makes them disagree, and what must not.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use super::*;
 use crate::camera::Camera;
 use crate::dataset::builtin::PREFIX;
-use crate::dataset::images::{ImageHeader, ImageSource};
+use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
 use crate::dataset::{Dataset, LoadOptions};
 
 const SIZE: u32 = 60;
@@ -55,9 +55,9 @@ fn posed(image: Image8) -> View {
         decoded_bytes: image.bytes(),
         file_bytes: 0,
     };
-    let (path, rendered) = (PathBuf::from("made"), Some(Arc::new(image)));
+    let (file, rendered) = (SourceFile::rendered("made".into()), Some(Arc::new(image)));
     let source =
-        ImageSource { path, mask: None, width, height, undistortion: None, header, rendered };
+        ImageSource { file, mask: None, width, height, undistortion: None, header, rendered };
     View { name: "made".into(), camera, source }
 }
 

@@ -16,6 +16,7 @@ use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, checked_size};
+use crate::foreign;
 
 /// A file and the number of bytes left.
 struct Reader<'a> {
@@ -27,7 +28,7 @@ struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     fn open(path: &'a Path) -> Result<Self, DatasetError> {
-        let file = File::open(path).map_err(DatasetError::io(path))?;
+        let file = foreign::open(path).map_err(DatasetError::io(path))?;
         let length = file.metadata().map_err(DatasetError::io(path))?.len();
         Ok(Self { path, input: BufReader::with_capacity(1 << 16, file), length, left: length })
     }
@@ -109,7 +110,9 @@ impl<'a> Reader<'a> {
                 _ => return Err(self.fault(field, "the name is longer than 4 KiB")),
             }
         }
-        String::from_utf8(name).map_err(|_| self.fault(field, "the name is not UTF-8"))
+        String::from_utf8(name).map_err(|_| {
+            self.fault(field, "the name is not UTF-8; rename the image, and make the model again")
+        })
     }
 
     fn end(&self, what: &str, count: u64) -> Result<(), DatasetError> {

@@ -108,12 +108,19 @@ pub(super) fn read(
         });
     }
     let mut notes = Vec::new();
+    let (posed, there) = (frames.len(), folders.count());
+    if posed < there {
+        notes.push(format!(
+            "COLMAP has found the poses of {posed} of {there} images; the others are not used"
+        ));
+    }
     if reduced_missing > 0 {
         notes.push(folders.fell_back_note(reduced_missing));
     }
     Ok(Scene {
         listing: images,
         frames,
+        first_missing: None,
         points: model.points,
         points_file: Some(points),
         tracks: model.tracks,

@@ -15,6 +15,7 @@ use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, checked_size};
+use crate::foreign;
 
 /// Longest line accepted: the observations of one image, about 40 bytes each.
 const MAX_LINE: u64 = 64 << 20;
@@ -28,7 +29,7 @@ struct Lines<'a> {
 
 impl<'a> Lines<'a> {
     fn open(path: &'a Path) -> Result<Self, DatasetError> {
-        let file = File::open(path).map_err(DatasetError::io(path))?;
+        let file = foreign::open(path).map_err(DatasetError::io(path))?;
         Ok(Self { path, input: BufReader::new(file), number: 0, line: Vec::new() })
     }
 
@@ -47,6 +48,14 @@ impl<'a> Lines<'a> {
         self.number += 1;
         let read = (&mut self.input).take(MAX_LINE).read_until(b'\n', &mut self.line);
         let read = read.map_err(DatasetError::io(self.path))?;
+        if self.number == 1 {
+            if let Some(problem) = foreign::mistaken(&self.line) {
+                return Err(self.fault("the file", problem));
+            }
+            if self.line.starts_with("\u{feff}".as_bytes()) {
+                self.line.drain(..3);
+            }
+        }
         if read as u64 == MAX_LINE {
             return Err(self.fault("the line", "it is longer than 64 MiB"));
         }

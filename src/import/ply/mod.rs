@@ -10,6 +10,8 @@ mod splats;
 
 use std::path::{Path, PathBuf};
 
+use crate::foreign::one_line;
+
 pub use points::read_points;
 pub(crate) use splats::splat_properties;
 pub use splats::{SplatFile, read_splats};
@@ -75,7 +77,8 @@ impl PlyError {
     }
 
     fn malformed(path: &Path, field: impl Into<String>, problem: impl Into<String>) -> Self {
-        Self::Malformed { path: path.to_owned(), field: field.into(), problem: problem.into() }
+        let (field, problem) = (one_line(&field.into()), one_line(&problem.into()));
+        Self::Malformed { path: path.to_owned(), field, problem }
     }
 }
 

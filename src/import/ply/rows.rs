@@ -6,6 +6,7 @@ use std::path::Path;
 
 use super::PlyError;
 use super::header::{Element, Encoding, Header, Scalar};
+use crate::foreign;
 
 /// Longest number accepted in an ascii file `[bytes]`.
 const MAX_WORD: usize = 128;
@@ -21,7 +22,7 @@ pub(super) struct Ply<'a> {
 
 impl<'a> Ply<'a> {
     pub(super) fn open(path: &'a Path) -> Result<Self, PlyError> {
-        let file = File::open(path).map_err(PlyError::io(path))?;
+        let file = foreign::open(path).map_err(PlyError::io(path))?;
         let length = file.metadata().map_err(PlyError::io(path))?.len();
         let mut input = BufReader::with_capacity(1 << 16, file);
         let header = Header::read(path, &mut input)?;

@@ -194,15 +194,34 @@ fn a_signal_ends_the_run_in_order_and_it_goes_on() {
 
 #[cfg(unix)]
 #[test]
-fn a_run_that_goes_on_is_not_resumed() {
+fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let mut child = spawn(&arguments(scene.path(), &run, "100000", "--budget 360"));
     assert!(Moment::Records(3).wait(&mut child, &run), "it has ended by itself");
-    let resume = || densify(&["train", text(scene.path()), "-o", text(&run), "--resume"]);
-    resume().refused("twice", &["another process is training"]);
+    let process = format!("is in use: process {} is training there", child.id());
+    for flags in ["", "--overwrite --policy mcmc", "--resume"] {
+        train(scene.path(), &run, 5, flags).refused(flags, &[&process]);
+    }
     child.kill().expect("it can be killed");
     child.wait().expect("it ends");
+    // One that is killed while it replaces another leaves nothing once a run has ended there.
+    let mut child = spawn(&arguments(scene.path(), &run, "100000", "--budget 360 --overwrite"));
+    let staged = || {
+        let staged = densify::output::RunFolder::staged(&run);
+        staged.iter().any(|path| path.join("stats/train.jsonl").exists())
+    };
+    while !staged() {
+        assert!(child.try_wait().expect("a child").is_none(), "it has ended by itself");
+    }
+    train(scene.path(), &run, 5, "--overwrite").refused("replacing", &["is in use: process"]);
+    child.kill().expect("it can be killed");
+    child.wait().expect("it ends");
+    train(scene.path(), &run, 5, "--budget 360 --overwrite").ok();
+    let left = files(&run);
+    let hidden = left.keys().find(|name| name.contains(".densify") || name.contains("lock"));
+    assert_eq!(hidden, None);
+    assert_eq!(records(&run.join("stats/train.jsonl")).len(), 1);
 }
 
 #[cfg(unix)]

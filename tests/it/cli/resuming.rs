@@ -262,8 +262,8 @@ fn options_that_contradict_the_checkpoint_are_refused_by_name() {
         resume(&scene, &run, flags).refused(flags, words);
         assert!(files(&run) == before, "{flags}: something was written");
     };
-    refused("--budget 400", &["--budget: 400 now, 330 in the checkpoint", "iteration_40"]);
-    refused("--policy vanilla", &["--policy: \"vanilla\" now, \"diet\" in the checkpoint"]);
+    refused("--budget 400", &["--budget: 400 now, 330 in that run", "iteration_40"]);
+    refused("--policy vanilla", &["--policy: \"vanilla\" now, \"diet\" in that run"]);
     refused("--policy-set diet.rho=0.5", &["--policy-set diet.rho: 0.5 now, 0.25 in"]);
     refused("--lr opacity=0.5", &["--lr opacity: 0.5 now"]);
     refused("--seed 3 --sh-degree 2", &["--seed: 3 now, 0 in", "--sh-degree: 2 now, 1 in"]);
@@ -334,7 +334,10 @@ fn nothing_yet_to_go_on_from_is_a_start() {
     // As after a kill before the first checkpoint.
     std::fs::remove_dir_all(run.join("checkpoints")).expect("checkpoints");
     std::fs::remove_dir_all(run.join("point_cloud")).expect("models");
-    train(scene.path(), &run, 20, flags).ok();
-    assert!(model(&run, 20) == expected);
+    resume(&scene, &run, "--budget 400 --seed 9")
+        .refused("other options", &["--budget: 400 now, 330 in that run", "--seed", "config.toml"]);
+    let outcome = resume(&scene, &run, "").ok();
+    assert!(outcome.stdout.contains("begins at its start"), "{}", outcome.stdout);
+    assert!(model(&run, 20) == expected, "the options of config.toml");
     assert_eq!(records(&run.join("stats/train.jsonl")).len(), 2);
 }

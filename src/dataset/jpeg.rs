@@ -1,0 +1,95 @@
+//! Decodes JPEG files, and refuses those that are not whole: browsers, and the crate `image`, fill what is
+//! missing with grey, which would be trained on.
+
+use image::{DynamicImage, GrayImage, RgbImage};
+use zune_core::bytestream::ZCursor;
+use zune_core::colorspace::ColorSpace;
+use zune_core::options::DecoderOptions;
+use zune_jpeg::JpegDecoder;
+
+/// Decodes a file whose header is within the limits.
+///
+/// # Errors
+/// When it is damaged, or its end is missing.
+pub(super) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
+    let lenient = DecoderOptions::default()
+        .set_strict_mode(false)
+        .set_max_width(usize::MAX)
+        .set_max_height(usize::MAX);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), lenient);
+    // Cameras write headers of many kinds; only the pixels must be whole.
+    decoder.decode_headers().map_err(|error| error.to_string())?;
+    let grey = decoder.input_colorspace() == Some(ColorSpace::Luma);
+    let colours = if grey { ColorSpace::Luma } else { ColorSpace::RGB };
+    decoder.set_options(lenient.set_strict_mode(true).jpeg_set_out_colorspace(colours));
+    if !has_end(bytes) {
+        return Err("the end of the file is missing; copy it again".to_owned());
+    }
+    let pixels = decoder.decode().map_err(|error| format!("{error}; the file is damaged"))?;
+    let (width, height) = decoder.dimensions().unwrap_or_default();
+    let (width, height) = (width as u32, height as u32);
+    let image = if grey {
+        GrayImage::from_raw(width, height, pixels).map(DynamicImage::from)
+    } else {
+        RgbImage::from_raw(width, height, pixels).map(DynamicImage::from)
+    };
+    image.ok_or_else(|| "the decoder returned another number of pixels".to_owned())
+}
+
+/// Whether a marker for the end follows the first scan. Segments before that are passed over by their
+/// lengths, since a preview in them has an end of its own; compressed pixels cannot hold the marker.
+fn has_end(bytes: &[u8]) -> bool {
+    const SCAN: u8 = 0xda;
+    const END: [u8; 2] = [0xff, 0xd9];
+    let mut at = 2;
+    while let Some(&[a, b, high, low]) = bytes.get(at..at + 4) {
+        match (a, b) {
+            (0xff, SCAN) => return bytes[at..].windows(2).any(|pair| pair == END),
+            // Fill bytes, or something between segments.
+            (0xff, 0xff) => at += 1,
+            (0xff, _) => at += 2 + usize::from(u16::from_be_bytes([high, low])),
+            _ => at += 1,
+        }
+    }
+    false
+}
+
+#[cfg(test)]
+mod tests {
+    use image::codecs::jpeg::JpegEncoder;
+
+    use super::*;
+
+    fn sample() -> Vec<u8> {
+        let image =
+            RgbImage::from_fn(64, 48, |x, y| image::Rgb([(x * 4) as u8, (y * 5) as u8, 90]));
+        let mut bytes = Vec::new();
+        JpegEncoder::new_with_quality(&mut bytes, 90).encode_image(&image).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn whole_files_decode_as_the_crate_image_does_it() {
+        let bytes = sample();
+        let expected = image::load_from_memory(&bytes).unwrap();
+        assert_eq!(decode(&bytes).unwrap(), expected);
+        // What cameras append is no damage.
+        assert_eq!(decode(&[&bytes[..], b"appended"].concat()).unwrap(), expected);
+        let mut grey = Vec::new();
+        let image = GrayImage::from_fn(20, 9, |x, y| image::Luma([(x * y) as u8]));
+        JpegEncoder::new(&mut grey).encode_image(&image).unwrap();
+        assert_eq!(decode(&grey).unwrap(), image::load_from_memory(&grey).unwrap());
+    }
+
+    #[test]
+    fn a_file_cut_anywhere_is_refused() {
+        let bytes = sample();
+        for length in 0..bytes.len() {
+            assert!(decode(&bytes[..length]).is_err(), "{length} of {} bytes", bytes.len());
+            // The marker alone does not make it whole.
+            let ended = [&bytes[..length], &[0xff, 0xd9]].concat();
+            let missing = bytes.len() - 2 - length.min(bytes.len() - 2);
+            assert!(missing < 2 || decode(&ended).is_err(), "{length} bytes, then an end");
+        }
+    }
+}

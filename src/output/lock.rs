@@ -1,0 +1,142 @@
+//! The lock on the folder of a run: at most one process trains in it, from its first file to its last.
+
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{Read, Seek, Write};
+use std::path::{Path, PathBuf};
+
+use super::OutputError;
+
+/// Name of the locked file. It holds the number of the process that trains.
+pub(super) const LOCK: &str = "densify.lock";
+
+/// The lock of a process on a folder; it ends with the process, even by a kill.
+///
+/// Only Unix has locks that readers of the file need not mind; elsewhere, and on a file system without
+/// locks, folders are not guarded.
+#[derive(Debug)]
+pub(super) struct FolderLock {
+    path: PathBuf,
+    file: Option<File>,
+}
+
+impl FolderLock {
+    /// Locks a folder.
+    ///
+    /// # Errors
+    /// [`OutputError::InUse`] while another process has the lock; [`OutputError::Io`].
+    pub(super) fn take(folder: &Path) -> Result<Self, OutputError> {
+        let path = folder.join(LOCK);
+        if !cfg!(unix) {
+            return Ok(Self { path, file: None });
+        }
+        let fail = || OutputError::io("lock the folder with", &path);
+        loop {
+            let mut options = OpenOptions::new();
+            let options = options.read(true).write(true).create(true).truncate(false);
+            let mut file = options.open(&path).map_err(fail())?;
+            match file.try_lock() {
+                Ok(()) => {}
+                Err(TryLockError::WouldBlock) => return Err(in_use(folder, file)),
+                Err(TryLockError::Error(_)) => {
+                    remove(&path);
+                    return Ok(Self { path, file: None });
+                }
+            }
+            // The process that had it may have removed the file just before.
+            if is_at(&file, &path) {
+                let number = std::process::id().to_string();
+                let written = file.set_len(0).and_then(|()| file.write_all(number.as_bytes()));
+                written.map_err(fail())?;
+                return Ok(Self { path, file: Some(file) });
+            }
+        }
+    }
+
+    /// Fails while a process has the lock on a folder. Writes nothing.
+    ///
+    /// # Errors
+    /// [`OutputError::InUse`].
+    pub(super) fn check(folder: &Path) -> Result<(), OutputError> {
+        if cfg!(unix)
+            && let Ok(file) = File::open(folder.join(LOCK))
+            && matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
+        {
+            return Err(in_use(folder, file));
+        }
+        Ok(())
+    }
+
+    /// Whether this process still has the lock on the folder at this path: the folder, or the file in
+    /// it, may have been replaced meanwhile.
+    pub(super) fn holds(&self) -> bool {
+        self.file.as_ref().is_none_or(|file| is_at(file, &self.path))
+    }
+}
+
+impl Drop for FolderLock {
+    fn drop(&mut self) {
+        if self.file.as_ref().is_some_and(|file| is_at(file, &self.path)) {
+            remove(&self.path);
+        }
+    }
+}
+
+fn remove(path: &Path) {
+    let _ = std::fs::remove_file(path);
+}
+
+fn in_use(folder: &Path, mut file: File) -> OutputError {
+    let mut number = String::new();
+    let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut number));
+    let process = read.ok().and_then(|_| number.parse().ok());
+    OutputError::InUse { path: folder.to_owned(), process }
+}
+
+/// Whether an open file is the one at a path.
+#[cfg(unix)]
+fn is_at(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let same =
+        |a: std::fs::Metadata, b: std::fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
+    file.metadata().is_ok_and(|open| path.metadata().is_ok_and(|there| same(open, there)))
+}
+
+#[cfg(not(unix))]
+fn is_at(_: &File, _: &Path) -> bool {
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn one_holder_at_a_time_who_is_named_and_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path();
+        FolderLock::check(path).unwrap();
+        let held = FolderLock::take(path).unwrap();
+        assert!(held.holds());
+        let own = std::process::id();
+        for refused in [FolderLock::check(path), FolderLock::take(path).map(drop)] {
+            let error = refused.unwrap_err();
+            assert!(
+                matches!(error, OutputError::InUse { process: Some(number), .. } if number == own)
+            );
+            assert!(error.to_string().contains(&format!("process {own}")), "{error}");
+        }
+        drop(held);
+        assert_eq!(std::fs::read_dir(path).unwrap().count(), 0);
+        // What a killed process leaves does not lock.
+        std::fs::write(path.join(LOCK), "1").unwrap();
+        FolderLock::check(path).unwrap();
+        let held = FolderLock::take(path).unwrap();
+        // Whoever replaces the file has the folder.
+        std::fs::remove_file(path.join(LOCK)).unwrap();
+        let other = FolderLock::take(path).unwrap();
+        assert!(!held.holds() && other.holds());
+        drop(held);
+        assert!(other.holds());
+    }
+}

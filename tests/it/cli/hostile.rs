@@ -1,0 +1,180 @@
+//! Input that is damaged, mistaken, or meant to harm: one message that says what is wrong with what, and
+//! nothing that is half done.
+
+use std::path::Path;
+
+use super::{Outcome, densify, scratch, text, train};
+use crate::photographs::{Photographs, VIEWS, name};
+
+/// The message of a refusal, which is one line without control characters.
+fn refusal(outcome: &Outcome) -> &str {
+    outcome.refused("", &[]);
+    let line = outcome.stderr.strip_suffix('\n').expect("a line");
+    assert!(!line.contains(char::is_control), "{line:?}");
+    line
+}
+
+/// A scene whose photographs are JPEGs.
+fn jpegs() -> Photographs {
+    let scene = Photographs::colmap_text();
+    for view in 0..VIEWS {
+        let path = scene.file(&format!("images/{}", name(view)));
+        let image = image::open(&path).expect("a photograph");
+        image.save(path.with_extension("jpg")).expect("a JPEG");
+        scene.replace("sparse/0/images.txt", ".png", ".jpg");
+    }
+    scene
+}
+
+#[test]
+fn a_photograph_whose_end_is_missing_is_damage() {
+    let scene = jpegs();
+    let (_root, run) = scratch();
+    train(scene.path(), &run, 3, "--budget 300").ok();
+    let photograph = "images/view_03.jpg";
+    let whole = std::fs::read(scene.file(photograph)).expect("a photograph");
+    for percent in [10, 50, 90, 99] {
+        scene.write(photograph, &whole[..whole.len() * percent / 100]);
+        let (_root, run) = scratch();
+        let outcome = train(scene.path(), &run, 20, "--budget 300 --init random");
+        let message = refusal(&outcome);
+        assert!(message.contains("view_03.jpg"), "{percent} %: {message}");
+        assert!(!run.exists(), "{percent} %");
+    }
+}
+
+#[test]
+fn a_camera_far_from_all_others_is_left_out_and_named() {
+    let scene = Photographs::colmap_text();
+    let trained = |flags: &str| {
+        let (_root, run) = scratch();
+        let outcome = train(scene.path(), &run, 60, &format!("--budget 300 --eval {flags}")).ok();
+        let scores = super::json(&run.join("results.json"));
+        let psnr = scores["ours_60"]["PSNR"].as_f64().expect("a number");
+        (outcome.stdout, psnr)
+    };
+    let (said, usual) = trained("");
+    assert!(!said.contains("far"), "{said}");
+    // The last number of a pose is the distance along the optical axis.
+    let images = std::fs::read_to_string(scene.file("sparse/0/images.txt")).expect("a text");
+    let line = images.lines().find(|line| line.ends_with("view_05.png")).expect("its line");
+    let mut words: Vec<&str> = line.split(' ').collect();
+    words[7] = "2000";
+    scene.replace("sparse/0/images.txt", line, &words.join(" "));
+    let (said, psnr) = trained("");
+    assert!(said.contains("1 view whose camera is far") && said.contains("view_05.png"), "{said}");
+    assert!((psnr - usual).abs() < 2.0, "{psnr} dB, {usual} dB without the camera");
+    let (said, psnr) = trained("--far-cameras keep");
+    assert!(said.contains("view_05.png") && said.contains("kept"), "{said}");
+    assert!((psnr - usual).abs() < 3.0, "{psnr} dB, {usual} dB without the camera");
+}
+
+#[test]
+fn a_model_that_draws_nothing_is_no_result() {
+    let scene = Photographs::colmap_text();
+    let points = std::fs::read_to_string(scene.file("sparse/0/points3D.txt")).expect("a text");
+    let moved: String = points
+        .lines()
+        .map(|line| {
+            let mut words: Vec<&str> = line.split(' ').collect();
+            words[2] = "900";
+            words.join(" ") + "\n"
+        })
+        .collect();
+    scene.write("sparse/0/points3D.txt", moved);
+    let (_root, run) = scratch();
+    let outcome = train(scene.path(), &run, 30, "--budget 300");
+    assert_eq!(outcome.code, Some(1), "{outcome:?}");
+    assert!(outcome.stderr.contains("draws nothing in 14 of the last 14 views"), "{outcome:?}");
+}
+
+#[test]
+fn names_from_files_cannot_command_a_terminal() {
+    const NAME: &str = "view\u{1b}[2J\n\u{7}.png";
+    let escaped = "view\\u{1b}[2J\\n\\u{7}.png";
+    let (_root, run) = scratch();
+    let binary = Photographs::colmap_binary();
+    let images = std::fs::read(binary.file("sparse/0/images.bin")).expect("a model");
+    let old = name(0).into_bytes();
+    let at = images.windows(old.len()).position(|bytes| bytes == old).expect("its name");
+    let changed = [&images[..at], NAME.as_bytes(), &images[at + old.len()..]].concat();
+    binary.write("sparse/0/images.bin", changed);
+    let json = Photographs::transforms();
+    json.replace("transforms_train.json", "./train/r_1", "./train/r\\u001b[2J\\n\\u0007");
+    for (scene, shown) in [(&binary, escaped), (&json, "r\\u{1b}[2J\\n\\u{7}")] {
+        let outcome = train(scene.path(), &run, 3, "--budget 300");
+        let message = refusal(&outcome);
+        assert!(message.contains(shown) && message.contains("control character"), "{message}");
+    }
+}
+
+#[test]
+fn what_is_mistaken_for_data_is_called_what_it_is() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n";
+    for file in ["images/view_02.png", "sparse/0/images.txt"] {
+        let whole = std::fs::read(scene.file(file)).expect("a file");
+        scene.write(file, pointer);
+        let outcome = train(scene.path(), &run, 3, "--budget 300");
+        let message = refusal(&outcome);
+        let name = Path::new(file).file_name().and_then(|name| name.to_str()).expect("a name");
+        assert!(message.contains("git lfs pull") && message.contains(name), "{message}");
+        scene.write(file, whole);
+    }
+    let whole = std::fs::read_to_string(scene.file("sparse/0/images.txt")).expect("a file");
+    let utf16: Vec<u8> = "\u{feff}1 0\n".encode_utf16().flat_map(u16::to_le_bytes).collect();
+    scene.write("sparse/0/images.txt", utf16);
+    let outcome = train(scene.path(), &run, 3, "--budget 300");
+    assert!(refusal(&outcome).contains("UTF-16"), "{outcome:?}");
+    // Editors put a byte-order mark before a text; it is no part of it.
+    scene.write("sparse/0/images.txt", format!("\u{feff}{whole}"));
+    train(scene.path(), &run, 3, "--budget 300").ok();
+}
+
+#[test]
+fn what_cannot_be_trained_on_is_refused_with_its_place() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    scene.replace("sparse/0/cameras.txt", " 24 20", " 240 20");
+    let outcome = train(scene.path(), &run, 3, "--budget 300");
+    let message = refusal(&outcome);
+    assert!(message.contains("the principal point (240, 20) px is far outside"), "{message}");
+    let scene = Photographs::transforms();
+    let frames = scene.file("train");
+    std::fs::rename(&frames, scene.file("elsewhere")).expect("a folder");
+    std::fs::rename(scene.file("test"), scene.file("away")).expect("a folder");
+    let outcome = train(scene.path(), &run, 3, "--budget 300");
+    let message = refusal(&outcome);
+    let first = text(&frames).to_owned() + "/r_1";
+    assert!(message.contains(&first) && message.contains("--images"), "{message}");
+}
+
+#[test]
+fn how_many_images_have_poses_is_said() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    std::fs::copy(scene.file("images/view_01.png"), scene.file("images/extra.png"))
+        .expect("a copy");
+    let outcome = train(scene.path(), &run, 3, "--budget 300").ok();
+    assert!(outcome.stdout.contains("poses of 14 of 15 images"), "{}", outcome.stdout);
+}
+
+#[cfg(unix)]
+#[test]
+fn nothing_is_waited_for_that_is_no_file() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let outcome = train(scene.path(), &run, 3, "--policy-config /dev/zero");
+    assert!(refusal(&outcome).contains("/dev/zero: it is a pipe"), "{outcome:?}");
+    let outcome = train(scene.path(), &run, 3, "--config /dev/zero");
+    assert!(refusal(&outcome).contains("/dev/zero: it is a pipe"), "{outcome:?}");
+    let pipe = scene.file("images/view_02.png");
+    std::fs::remove_file(&pipe).expect("a photograph");
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo");
+    assert!(made.success());
+    let outcome = train(scene.path(), &run, 3, "--budget 300");
+    assert!(refusal(&outcome).contains("view_02.png"), "{outcome:?}");
+    let outcome = densify(&["export", text(&pipe), "-o", text(&run)]);
+    assert!(refusal(&outcome).contains("view_02.png"), "{outcome:?}");
+}
