@@ -207,7 +207,8 @@ fn limits() -> Limits {
 }
 
 fn fault(path: &Path, problem: impl std::fmt::Display) -> DatasetError {
-    DatasetError::Image { path: path.to_owned(), problem: problem.to_string() }
+    let problem = foreign::one_line(problem.to_string().trim());
+    DatasetError::Image { path: path.to_owned(), problem }
 }
 
 /// Reads the header of an image file, without decoding it, and checks it against the limits.

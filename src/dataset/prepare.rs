@@ -21,8 +21,9 @@ pub(super) fn prepare(
     scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let Scene { listing, mut frames, mut points, points_file, tracks, own_split, mut notes } =
-        scene;
+    let Scene {
+        listing, mut frames, mut points, points_file, tracks, own_split, mut notes, ..
+    } = scene;
     // Bytewise, as other trainers sort names for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
     refuse_duplicates(&listing, &frames)?;

@@ -175,6 +175,6 @@ fn nothing_is_waited_for_that_is_no_file() {
     assert!(made.success());
     let outcome = train(scene.path(), &run, 3, "--budget 300");
     assert!(refusal(&outcome).contains("view_02.png"), "{outcome:?}");
-    let outcome = densify(&["export", text(&pipe), "-o", text(&run)]);
+    let outcome = densify(&["export", text(&pipe), "-o", text(&run.with_extension("ply"))]);
     assert!(refusal(&outcome).contains("view_02.png"), "{outcome:?}");
 }

@@ -219,7 +219,7 @@ fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     child.wait().expect("it ends");
     train(scene.path(), &run, 5, "--budget 360 --overwrite").ok();
     let left = files(&run);
-    let hidden = left.keys().find(|name| name.contains(".densify") || name.contains("lock"));
+    let hidden = left.keys().find(|name| name.starts_with('.') || name.ends_with(".lock"));
     assert_eq!(hidden, None);
     assert_eq!(records(&run.join("stats/train.jsonl")).len(), 1);
 }
