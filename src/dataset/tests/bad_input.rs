@@ -285,7 +285,11 @@ const TRANSFORMS: &[JsonCase] = &[
         |j| j["frames"][1]["file_path"] = "/b.png".into(),
         &["frames[1].file_path", "absolute"],
     ),
-    ("NUL", |j| j["frames"][1]["file_path"] = "b\0.png".into(), &["frames[1].file_path", "NUL"]),
+    (
+        "NUL",
+        |j| j["frames"][1]["file_path"] = "b\0.png".into(),
+        &["frames[1].file_path", "control character"],
+    ),
     (
         "long",
         |j| j["frames"][1]["file_path"] = "b".repeat(5000).into(),
