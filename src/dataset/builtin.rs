@@ -1,16 +1,16 @@
-//! Built-in scenes as datasets: `scene:spheres` is rendered in memory, without reading or writing
-//! files. The images are those that `densify scenegen --preset NAME` writes by default.
+//! Built-in scenes as datasets: `scene:spheres` is rendered in memory, or taken from the cache. The images are those that `densify scenegen --preset NAME` writes by default.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use densify_scenegen::{
-    Frame, Generated, GroundTruth, InitPoints, Options, Scene, Source, generate,
+    Frame, Generated, GroundTruth, InitPoints, Options, PRESETS, Scene, Source, generate,
 };
 
 use super::images::{Image8, ImageHeader, ImageSource, SourceFile};
 use super::normalise::Normalisation;
 use super::prepare::{Views, split, target_size};
+use super::scene_cache::Entry;
 use super::tracks::TrackSampler;
 use super::{Dataset, DatasetError, LoadOptions, PointCloud, View};
 use crate::camera::Camera;
@@ -24,7 +24,7 @@ pub fn name(path: &Path) -> Option<&str> {
     path.to_str()?.strip_prefix(PREFIX)
 }
 
-/// Renders a built-in scene.
+/// Renders a built-in scene, or takes it from the cache.
 ///
 /// # Errors
 /// When there is no such scene, or the options leave no view to train on.
@@ -33,8 +33,21 @@ pub(super) fn load(
     name: &str,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let generated = generate(&Source::Preset(name.to_owned()), &Options::default())?;
-    let Generated { scene, frames, points } = generated;
+    let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
+    let is_known = PRESETS.iter().any(|preset| preset.name == name);
+    let entry = options.cache.as_deref().filter(|_| is_known);
+    let entry = entry.and_then(|folder| Entry::of(folder, name, &parameters));
+    if let Some((frames, points)) = entry.as_ref().and_then(Entry::read) {
+        let scene = Scene::prepare(&source, &parameters)?;
+        // A scene has as many images as views, unless somebody else has made the entry.
+        if frames.len() == scene.views.len() {
+            return dataset(path, &scene, frames, points, options);
+        }
+    }
+    let Generated { scene, frames, points } = generate(&source, &parameters)?;
+    if let Some(entry) = entry {
+        entry.write(&frames, &points);
+    }
     dataset(path, &scene, frames, points, options)
 }
 

@@ -19,6 +19,7 @@ mod pixels;
 mod pose;
 mod prepare;
 mod resample;
+pub(crate) mod scene_cache;
 mod tracks;
 mod transforms;
 pub mod undistort;

@@ -18,6 +18,8 @@ pub struct LoadOptions {
     pub split: Split,
     /// What happens to views whose camera is far from all others.
     pub far_cameras: FarCameras,
+    /// Folder that keeps built-in scenes as they were rendered; `None`: they are rendered.
+    pub cache: Option<PathBuf>,
     /// Whether to read which views show which points ([`Tracks`](super::Tracks)).
     pub tracks: bool,
 }

@@ -9,7 +9,7 @@ use toml::{Table, Value};
 
 use super::spec::{DataSpec, RunSpec};
 use super::values;
-use crate::dataset::{LoadOptions, Resolution, Split, builtin};
+use crate::dataset::{LoadOptions, Resolution, Split, builtin, scene_cache};
 use crate::failure::Failure;
 use crate::knobs::Knobs;
 use crate::schedule::RateOptions;
@@ -30,6 +30,7 @@ impl DataSpec {
                 None => Split::None,
             },
             far_cameras: self.far_cameras,
+            cache: scene_cache::folder().filter(|_| !self.no_cache),
             tracks,
         })
     }

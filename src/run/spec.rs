@@ -117,6 +117,13 @@ run_spec! {
         #[arg(long, value_name = "WHAT")]
         far_cameras: FarCameras = FarCameras::LeaveOut, Fixed;
 
+        /// Render a built-in scene anew, and do not keep it in the user's cache folder
+        #[arg(
+            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
+            require_equals = true, default_missing_value = "true", hide_possible_values = true
+        )]
+        no_cache: bool = false, Free;
+
         /// 1, 2, 4 or 8: photographs that many times smaller (uses images_2, images_4, images_8 where
         /// they exist); any larger number: their width in pixels
         #[arg(short, long, value_name = "N")]

@@ -1,6 +1,7 @@
 //! The program as its users meet it: arguments in, exit code, messages and files out.
 
 mod accumulation;
+mod caching;
 mod comparing;
 mod configuring;
 mod exporting;
@@ -60,6 +61,8 @@ fn densify(arguments: &[&str]) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
     // A layer of Mesa's Vulkan complains about the environment on stderr, but for this variable.
     command.args(arguments).env_remove("RUST_LOG").env("NODEVICE_SELECT", "1");
+    // The user's cache is left alone; built-in scenes are rendered once for all tests.
+    command.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
     let output = command.output().expect("it starts");
     let text = |bytes| String::from_utf8(bytes).expect("messages are UTF-8");
     Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
