@@ -5,7 +5,7 @@ use densify_policies::policy::Needs;
 use super::compare::Limits;
 use crate::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, InstructionSet, ModelGradient};
 use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
-use crate::backend::{Backend, BackendError, Rendering, Shortcuts, StepOutput};
+use crate::backend::{Backend, BackendError, Rendering, Shortcuts, StepOutput, Storage};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
@@ -40,6 +40,8 @@ pub struct Setup {
     pub record_cap: Option<usize>,
     /// Largest image that its ledger shall cover `[px]`.
     pub largest_image: (u32, u32),
+    /// How parameters and moments are stored; only the native backend has the choice.
+    pub storage: Storage,
     /// Signals to collect.
     pub needs: Needs,
     /// Where to compute less than could be.
@@ -154,7 +156,8 @@ impl Subject {
         model: &Gaussians,
         setup: Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
-        let Setup { budget, near, tile_cap, record_cap, largest_image, needs, shortcuts } = setup;
+        let Setup { budget, near, tile_cap, record_cap, largest_image, storage, needs, shortcuts } =
+            setup;
         let budget = budget.max(model.len()).max(1);
         let native = |instructions, threads, needs| {
             let mut options = CpuOptions::new(budget);
@@ -163,7 +166,7 @@ impl Subject {
             options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
             options.record_cap = record_cap.unwrap_or(options.record_cap);
             (options.largest_image, options.needs) = (largest_image, needs);
-            options.shortcuts = shortcuts;
+            (options.storage, options.shortcuts) = (storage, shortcuts);
             CpuBackend::new(model, &options)
         };
         match self {

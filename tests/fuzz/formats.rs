@@ -20,7 +20,7 @@ use glam::{DMat3, DQuat, DVec3};
 /// A format and what reads it.
 pub type Format = (&'static str, fn(&[u8]) -> bool);
 
-/// All of them. The names are those of the fuzz targets and of the corpora's folders.
+/// All of them. The names are those of the fuzz targets in `Cargo.toml` and of the corpora's folders.
 pub const FORMATS: [Format; 11] = [
     ("colmap_bin", colmap_bin),
     ("colmap_txt", colmap_txt),
@@ -35,19 +35,28 @@ pub const FORMATS: [Format; 11] = [
     ("scene", scene),
 ];
 
+/// Reads bytes as a file of a format.
+///
+/// # Panics
+/// When there is no such format, or the bytes do to it what they must not.
+pub fn read(format: &str, bytes: &[u8]) -> bool {
+    let known = FORMATS.iter().find(|(name, _)| *name == format);
+    known.expect("a format").1(bytes)
+}
+
 /// What stands between the files of a format that has several.
-pub const BETWEEN: &[u8] = b"\n=====\n";
+const BETWEEN: &[u8] = b"\n=====\n";
 
 /// The photographs of datasets whose other files are looked at.
 const PHOTOGRAPH: &[u8] = include_bytes!("corpus/image/photograph.png");
 
 /// `cameras.bin`, `images.bin` and `points3D.bin`.
-pub fn colmap_bin(bytes: &[u8]) -> bool {
+fn colmap_bin(bytes: &[u8]) -> bool {
     colmap(bytes, ["cameras.bin", "images.bin", "points3D.bin"])
 }
 
 /// `cameras.txt`, `images.txt` and `points3D.txt`.
-pub fn colmap_txt(bytes: &[u8]) -> bool {
+fn colmap_txt(bytes: &[u8]) -> bool {
     colmap(bytes, ["cameras.txt", "images.txt", "points3D.txt"])
 }
 
@@ -58,12 +67,12 @@ fn colmap(bytes: &[u8], names: [&str; 3]) -> bool {
 }
 
 /// `transforms.json`.
-pub fn transforms(bytes: &[u8]) -> bool {
+fn transforms(bytes: &[u8]) -> bool {
     dataset(&[("transforms.json", bytes)])
 }
 
 /// A photograph: its header when the dataset is loaded, its pixels after that.
-pub fn image(bytes: &[u8]) -> bool {
+fn image(bytes: &[u8]) -> bool {
     let listing = br#"{"camera_angle_x": 0.8, "frames": [
         {"file_path": "images/0.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]},
         {"file_path": "images/1.png", "transform_matrix": [[1,0,0,1],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}]}"#;
@@ -71,7 +80,7 @@ pub fn image(bytes: &[u8]) -> bool {
 }
 
 /// A PLY file, as a model and as a cloud of points.
-pub fn ply(bytes: &[u8]) -> bool {
+fn ply(bytes: &[u8]) -> bool {
     within(&[("model.ply", bytes)], |folder| {
         let path = folder.join("model.ply");
         let model = read_splats(&path);
@@ -87,24 +96,24 @@ pub fn ply(bytes: &[u8]) -> bool {
 }
 
 /// A glTF file with everything inside.
-pub fn gltf(bytes: &[u8]) -> bool {
+fn gltf(bytes: &[u8]) -> bool {
     mesh(&[("mesh.gltf", bytes)])
 }
 
 /// A binary glTF file.
-pub fn glb(bytes: &[u8]) -> bool {
+fn glb(bytes: &[u8]) -> bool {
     mesh(&[("mesh.glb", bytes)])
 }
 
 /// An OBJ file and its `mesh.mtl`.
-pub fn obj(bytes: &[u8]) -> bool {
+fn obj(bytes: &[u8]) -> bool {
     let mut files = split(bytes);
     let (mesh_file, library) = (files.next().unwrap_or(&[]), files.next().unwrap_or(&[]));
     mesh(&[("mesh.obj", mesh_file), ("mesh.mtl", library), ("texture.png", PHOTOGRAPH)])
 }
 
 /// A checkpoint: its header, its model, and what a backend keeps beside it.
-pub fn checkpoint(bytes: &[u8]) -> bool {
+fn checkpoint(bytes: &[u8]) -> bool {
     within(&[("step.safetensors", bytes)], |folder| {
         let Ok(mut found) = Checkpoint::open(&folder.join("step.safetensors")) else {
             return false;
@@ -123,7 +132,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
 }
 
 /// `config.toml` of a run.
-pub fn config(bytes: &[u8]) -> bool {
+fn config(bytes: &[u8]) -> bool {
     within(&[("config.toml", bytes)], |folder| {
         let config = RunConfig::read(folder);
         config.is_ok_and(|config| !config.scene_path().as_os_str().is_empty())
@@ -136,7 +145,7 @@ const LARGEST_LOG_SCALE: f32 = 20.0;
 /// Any finite Gaussians, rendered and differentiated: all pixels must be finite, and all gradients of
 /// rows that can come up in training.
 /// 52 bytes are a camera, each 92 after them a row.
-pub fn scene(bytes: &[u8]) -> bool {
+fn scene(bytes: &[u8]) -> bool {
     let mut numbers = Numbers { bytes };
     let camera = camera(&mut numbers);
     let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };

@@ -1,6 +1,5 @@
 //! What policies declare beside signals: terms of the loss, noise on the means, and the optimiser's
-//! cadence. Each is held to its formula, worked out here in f64. One piece, as all train the same
-//! small model in the same way.
+//! cadence. Each is held to its formula, worked out here in f64.
 
 #![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
 
@@ -12,9 +11,11 @@ use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 
-use crate::subject::{RATES, class, make, make_with, on_each, repeatable, step_input};
+use crate::subject::{
+    RATES, class, make, make_with, normalised, on_each, repeatable, step_input, turned_away,
+};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 const EVERY: Cadence = Cadence { all: 1, sh_rest: 1 };
@@ -25,26 +26,12 @@ fn view(number: u32) -> Camera {
     scenes::rounded(&Camera { translation: first.translation + shift, ..first })
 }
 
-/// A camera turned around and far off: it sees nothing.
-fn away() -> Camera {
-    let turn = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
-    let view = view(0);
-    let translation = turn * view.translation - DVec3::new(0.0, 0.0, 1000.0);
-    Camera { rotation: turn * view.rotation, translation, ..view }
-}
-
 fn target(camera: &Camera, seed: u64) -> Image8 {
     scenes::noisy((camera.width, camera.height), 0.0, seed).1
 }
 
 fn model(rows: usize) -> Gaussians {
-    let mut model = scenes::cloud(rows, 1, &view(0), 82);
-    // As training leaves them.
-    for quat in &mut model.quats {
-        let norm = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
-        *quat = quat.map(|v| v / norm);
-    }
-    model
+    normalised(scenes::cloud(rows, 1, &view(0), 82))
 }
 
 fn backend(subject: &Subject, model: &Gaussians, needs: Needs) -> Box<dyn Differentiable> {
@@ -70,35 +57,6 @@ fn step(
     backend.train_step(&input).expect("a small image is rendered");
 }
 
-#[test]
-fn terms_of_the_loss_pull_at_rows_that_no_view_shows() {
-    on_each(repeatable(), |subject| {
-        let model = model(30);
-        let camera = away();
-        for (opacity, scale) in [(0.01, 0.0), (0.0, 0.02), (0.01, 0.02), (0.0, 0.0)] {
-            let needs = Needs { loss_terms: LossTerms { opacity, scale }, ..Needs::default() };
-            let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &camera, 1, RATES, EVERY);
-            let after = backend.download().expect("a model");
-            // The first step of Adam is one learning rate long, whatever the gradient.
-            let moved = |on: f32, before: f32, after: f32, rate: f32| {
-                let expected = if on > 0.0 { rate } else { 0.0 };
-                assert!((before - after - expected).abs() < 1e-3 * rate, "{opacity} {scale}");
-            };
-            for row in 0..30 {
-                let logits = (model.opacity_logits[row], after.opacity_logits[row]);
-                moved(opacity, logits.0, logits.1, RATES.opacity);
-                for axis in 0..3 {
-                    let (before, after) =
-                        (model.log_scales[row][axis], after.log_scales[row][axis]);
-                    moved(scale, before, after, RATES.log_scale);
-                }
-            }
-            assert_eq!((after.means, after.sh), (model.means.clone(), model.sh.clone()));
-        }
-    });
-}
-
 /// Rows in pairs of one shape, every second one turned by a quarter.
 fn alike(rows: usize) -> Gaussians {
     let mut model = Gaussians { sh_degree: 0, ..Gaussians::default() };
@@ -119,7 +77,7 @@ fn noise_has_the_declared_covariance() {
         let run = |subject: &Subject, at: u32| {
             let needs = Needs { noise: Some(noise), ..Needs::default() };
             let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &away(), at, RATES, EVERY);
+            step(&mut *backend, &turned_away(&view(0)), at, RATES, EVERY);
             backend.download().expect("a model")
         };
         let moved = run(subject, 3);
@@ -156,29 +114,6 @@ fn noise_has_the_declared_covariance() {
                 assert!(mean.abs() < 5.0 * factor * variances[i] / n.sqrt(), "{i}: {mean}");
             }
         }
-    });
-}
-
-#[test]
-fn rows_opaque_enough_are_not_disturbed() {
-    on_each(repeatable(), |subject| {
-        let mut model = alike(64);
-        // Opacities 0.16 and 0.18: shares of 1.9e-7 and 2.5e-8, on either side of 6e-8.
-        for (row, logit) in model.opacity_logits.iter_mut().enumerate() {
-            *logit = if row < 32 { -1.658_23 } else { -1.516_35 };
-        }
-        let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
-        let mut backend =
-            backend(subject, &model, Needs { noise: Some(noise), ..Needs::default() });
-        step(&mut *backend, &away(), 1, RATES, EVERY);
-        let moved: Vec<bool> = backend
-            .download()
-            .expect("a model")
-            .means
-            .iter()
-            .map(|mean| *mean != [0.5; 3])
-            .collect();
-        assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
     });
 }
 
@@ -324,7 +259,7 @@ fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
             Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
         ];
         for number in 1..=8 {
-            let camera = if number % 2 == 0 { away() } else { view(number % 3) };
+            let camera = if number % 2 == 0 { turned_away(&view(0)) } else { view(number % 3) };
             let before = backend.download().expect("a model");
             let mut gradient = gradient(subject, &before, &camera, number.into());
             for row in 0..ROWS {
@@ -361,7 +296,7 @@ fn sums_move_with_their_rows_and_end_with_them() {
                 backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
             }
             // Nothing is seen: only what waits is left.
-            step(&mut *backend, &away(), 2, RATES, cadence);
+            step(&mut *backend, &turned_away(&view(0)), 2, RATES, cadence);
             backend.download().expect("a model")
         };
         let (plain, edited) = (run(false), run(true));
@@ -376,7 +311,7 @@ fn sums_move_with_their_rows_and_end_with_them() {
         let mut plan = EditPlan::new(20, 20);
         plan.clamp_opacity(0.999).expect("the bound is sound");
         backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-        step(&mut *backend, &away(), 2, RATES, cadence);
+        step(&mut *backend, &turned_away(&view(0)), 2, RATES, cadence);
         let after = backend.download().expect("a model");
         assert_eq!(after.opacity_logits, model.opacity_logits);
         assert_eq!(after.means, plain.means);
@@ -408,20 +343,6 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         assert!(moved(11).iter().all(|rates| (rates - 1.0).abs() < 1e-2), "{:?}", moved(11));
         assert!(moved(12).iter().any(|rates| (rates - 1.0).abs() > 0.1), "{:?}", moved(12));
     });
-}
-
-#[test]
-fn what_is_declared_is_in_the_ledger() {
-    let model = model(20);
-    let bytes = |needs: Needs| backend(&Subject::NATIVE, &model, needs).ledger().total();
-    let plain = bytes(Needs::default());
-    let with = |all, sh_rest| Needs { cadence: Cadence { all, sh_rest }, ..Needs::default() };
-    // 32 padded rows of 11 + 12 numbers; of 9; and two bytes each to count steps.
-    assert_eq!(bytes(with(5, 1)) - plain, 32 * 23 * 4);
-    assert_eq!(bytes(with(1, 16)) - plain, 32 * (9 * 4 + 2));
-    assert_eq!(bytes(with(5, 16)) - plain, 32 * (23 * 4 + 2));
-    let still = Needs { loss_terms: LossTerms { opacity: 1.0, scale: 1.0 }, ..Needs::default() };
-    assert_eq!(bytes(still), plain);
 }
 
 #[test]

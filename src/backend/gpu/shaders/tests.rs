@@ -1,4 +1,4 @@
-//! Shaders and their kernels, offline; and what shaders draw, on a device.
+//! Shaders and their kernels, offline. What they compute is compared in `tests/it`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::mem::offset_of;
@@ -9,15 +9,11 @@ use wgpu::naga::{AddressSpace, Module, StructMember, TypeInner};
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet,
 };
-use densify_policies::rng::{PolicyRng, Purpose};
 
-use super::super::adapter::AdapterChoice;
-use super::super::device::Device as Opened;
-use super::super::frame::{Frame, State, folded_seed};
+use super::super::frame::{Frame, State};
 use super::super::launches::Launches;
 use super::super::photographs::KeptPhotographs;
 use super::super::pipelines::Variant;
-use super::super::readback;
 use super::super::sizes::Sizes;
 use super::*;
 use crate::backend::Shortcuts;
@@ -201,81 +197,4 @@ fn structs_lie_as_the_shaders_read_them() {
         broken_off l1 ssim spare_f);
     assert_eq!(state["cuts"] as usize, size_of::<State>());
     assert_eq!(fields + 1, state.len());
-}
-
-const DRAWS: &str = "
-    @group(0) @binding(1) var<storage, read_write> drawn: array<vec4<u32>>;
-    @compute @workgroup_size(64)
-    fn draws(@builtin(global_invocation_id) id: vec3<u32>) {
-        let i = id.x;
-        drawn[2u * i] = draw_bits(i * 7919u, now.b, now.a, PURPOSE_PLACE, i % 5u);
-        let normal = normal3(i * 7919u, now.b, now.a, PURPOSE_PLACE, i % 5u);
-        drawn[2u * i + 1u] = bitcast<vec4<u32>>(vec4(normal, 0.0));
-    }";
-
-/// What the shader draws. Shape: `[rows, 2 × 4]`, bits and normals.
-fn drawn(device: &Opened, rows: u32, now: [u32; 4]) -> Vec<[u32; 8]> {
-    let (gpu, text) = (&device.device, [VIEW, RANDOM, DRAWS].concat());
-    let module = gpu.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: None,
-        source: wgpu::ShaderSource::Wgsl((&text).into()),
-    });
-    let pipeline = gpu.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-        label: None,
-        layout: None,
-        module: &module,
-        entry_point: Some("draws"),
-        compilation_options: wgpu::PipelineCompilationOptions::default(),
-        cache: None,
-    });
-    let size = 32 * u64::from(rows);
-    let buffer = |usage| {
-        let descriptor =
-            wgpu::BufferDescriptor { label: None, size, usage, mapped_at_creation: false };
-        gpu.create_buffer(&descriptor)
-    };
-    let found = buffer(wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
-    let staging = buffer(wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
-    let bindings = gpu.create_bind_group(&wgpu::BindGroupDescriptor {
-        label: None,
-        layout: &pipeline.get_bind_group_layout(0),
-        entries: &[wgpu::BindGroupEntry { binding: 1, resource: found.as_entire_binding() }],
-    });
-    let mut encoder = gpu.create_command_encoder(&Default::default());
-    {
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        pass.set_pipeline(&pipeline);
-        pass.set_bind_group(0, &bindings, &[]);
-        pass.set_immediates(0, bytemuck::bytes_of(&now));
-        pass.dispatch_workgroups(rows / 64, 1, 1);
-    }
-    encoder.copy_buffer_to_buffer(&found, 0, &staging, 0, size);
-    let bytes = readback::finish(device, &staging, encoder, size);
-    bytemuck::pod_collect_to_vec(&bytes.expect("the draws are read"))
-}
-
-#[test]
-#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
-fn draws_are_those_of_the_policies() {
-    let device = match Opened::open(&AdapterChoice::default()) {
-        Ok(device) => device,
-        Err(error) => {
-            assert!(std::env::var_os("DENSIFY_REQUIRE_GPU").is_none(), "{error}");
-            eprintln!("skipped: {error}");
-            return;
-        }
-    };
-    for (seed, step) in [(42, 600), (0, 0), (u64::MAX - 7, 30_000)] {
-        let rng = PolicyRng::new(seed, step);
-        let now = [folded_seed(seed), step, 0, 0];
-        for (i, found) in (0..1024_u32).zip(drawn(&device, 1024, now)) {
-            let row = i.wrapping_mul(7919);
-            assert_eq!(found[..4], rng.bits(row, Purpose::Place, i % 5), "row {row}");
-            let normal = rng.normal3(row, Purpose::Place, i % 5);
-            for (found, expected) in found[4..].iter().zip(normal) {
-                let found = f32::from_bits(*found);
-                assert!((found - expected).abs() < 2e-6, "row {row}: {found} {expected}");
-            }
-        }
-    }
 }
