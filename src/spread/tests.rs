@@ -113,6 +113,7 @@ fn points_that_are_not_on_a_surface_decide_nothing() {
 }
 
 #[test]
+#[ignore = "takes minutes: run by .ci/run"]
 fn built_in_scenes_ask_for_what_their_materials_need() {
     for (name, degrees) in [("spheres", 0..=0), ("room", 0..=0), ("glossy", 2..=3)] {
         let options = LoadOptions { tracks: true, ..LoadOptions::default() };

@@ -7,6 +7,7 @@
 
 use std::path::Path;
 
+use densify::backend::Differentiable;
 use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient};
 use densify::camera::Camera;
 use densify::checkpoint::Checkpoint;

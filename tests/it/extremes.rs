@@ -69,6 +69,7 @@ fn every_case_holds_on_the_native_backend() {
 /// With sums in slots: some cases want the same bits of two runs, which sums by atomics do not have;
 /// `agreement` and `oracle` hold those to the native backend and to the reference.
 #[test]
+#[ignore = "takes minutes: run by .ci/run"]
 fn every_case_holds_with_other_instructions_and_on_every_device() {
     for subject in others().iter().filter(|subject| subject.is_deterministic()) {
         check(subject, &SLOW);

@@ -4,24 +4,20 @@
 
 use std::sync::Arc;
 
-use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::gpu::{GpuBackend, GpuOptions};
-use densify::backend::{Backend, MomentStorage, ParameterStorage, Storage, Tensor};
+use densify::backend::{Backend, Storage, Tensor};
 use densify::camera::Camera;
-use densify::dataset::images::{Image8, SharedImage};
+use densify::dataset::images::SharedImage;
 use densify::gaussians::Gaussians;
 use densify::schedule::{Background, RateOptions};
 use densify::trainer::{OnNan, Required, Savings, TrainOptions, Trainer, growth_signals};
-use densify::verify::scenes;
+use densify::verify::{Setup, Subject, scenes};
 use densify::views::{ViewError, ViewSource};
 use densify_policies::plan::EditPlan;
-use densify_policies::policy::{
-    DensityPolicy, Needs, PolicyError, PolicyState, SceneInfo, Snapshot,
-};
+use densify_policies::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 use glam::DVec3;
 
-use crate::subject::devices;
+use crate::subject::{devices, make_with, native, photograph, saved, storages};
 
 const ROWS: usize = 60;
 /// The probes are measured at step 100, and at step 200 also without the rows of least weight.
@@ -33,25 +29,18 @@ struct Idle;
 
 impl DensityPolicy for Idle {
     fn needs(&self, _: &SceneInfo) -> Needs {
-        Needs { signals: growth_signals(), ..Needs::default() }
+        needs()
     }
     fn is_due(&self, _: u32) -> bool {
         false
     }
-    fn plan(
-        &mut self,
-        _: &Snapshot<'_>,
-        _: &PolicyRng,
-        _: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, _: &Snapshot, _: &PolicyRng, _: &mut EditPlan) -> Result<(), PolicyError> {
         Ok(())
     }
-    fn save(&self) -> PolicyState {
-        PolicyState::Null
-    }
-    fn restore(&mut self, _: PolicyState) -> Result<(), PolicyError> {
-        Ok(())
-    }
+}
+
+fn needs() -> Needs {
+    Needs { signals: growth_signals(), ..Needs::default() }
 }
 
 #[derive(Clone)]
@@ -77,17 +66,14 @@ impl ViewSource for Views {
 fn scene() -> (Gaussians, Views) {
     let camera = scenes::camera(40, 32, 11);
     let truth = scenes::cloud(ROWS, 1, &camera, 12);
-    let mut native = CpuBackend::new(&truth, &CpuOptions::new(ROWS)).expect("a small model fits");
-    let photograph = |view: u32| {
+    let mut native = native(&truth);
+    let photographed = |view: u32| {
         let aside = DVec3::new(0.02 * f64::from(view), 0.0, 0.0);
         let camera = scenes::rounded(&Camera { translation: camera.translation + aside, ..camera });
         let rendering = native.render(&camera, [0.0; 3], 1).expect("a small image");
-        let byte = |x: &f32| (x.clamp(0.0, 1.0) * 255.0).round() as u8;
-        let rgb = rendering.rgb.iter().map(byte).collect();
-        let (width, height) = (camera.width, camera.height);
-        (camera, Arc::new(Image8 { width, height, rgb, alpha: None, mask: None }))
+        (camera, Arc::new(photograph(&rendering)))
     };
-    let views = Views((0..8).map(photograph).collect());
+    let views = Views((0..8).map(photographed).collect());
     let mut model = truth;
     model.sh.iter_mut().enumerate().for_each(|(i, x)| *x += 0.2 * (i as f32 * 1.7).sin());
     (model, views)
@@ -125,38 +111,19 @@ fn bits(backend: Box<dyn Backend>, views: &Views, measures: bool) -> (Gaussians,
         let removals: Vec<_> = growth.removals.iter().map(|s| (s.before, s.after)).collect();
         assert_eq!((growth.intervals.len(), &*removals), (2, &[(ROWS, ROWS)][..]), "{growth:?}");
     }
-    let backend = trainer.backend();
-    let names = backend.state();
-    let saved = names.iter().map(|array| backend.save(&array.name).expect("an array"));
-    (backend.download().expect("a model"), saved.collect())
+    saved(trainer.backend())
 }
 
 #[test]
 fn measuring_changes_no_bit() {
     let (model, views) = scene();
-    let needs = Needs { signals: growth_signals(), ..Needs::default() };
-    let compare = |name: &str, backend: &dyn Fn() -> Box<dyn Backend>| {
-        let [without, with] = [false, true].map(|measures| bits(backend(), &views, measures));
-        assert!(with.0 == without.0, "{name}: another model");
-        for (with, without) in with.1.iter().zip(&without.1) {
-            assert!(with == without, "{name}: {} differs", with.name);
-        }
-        assert_eq!(with.1.len(), without.1.len());
-    };
-    for parameters in [ParameterStorage::F32, ParameterStorage::F16] {
-        for moments in [MomentStorage::F32, MomentStorage::Both8] {
-            let storage = Storage { parameters, moments };
-            compare(&format!("{storage:?}"), &|| {
-                let needs = needs.clone();
-                let options = CpuOptions { storage, needs, ..CpuOptions::new(ROWS) };
-                Box::new(CpuBackend::new(&model, &options).expect("a small model fits"))
-            });
-        }
-    }
-    if let Some(device) = devices().first() {
-        compare(&device.adapter().name, &|| {
-            let options = GpuOptions { needs: needs.clone(), ..GpuOptions::new(ROWS) };
-            Box::new(GpuBackend::new(&model, &options, device).expect("a small model fits"))
+    let stored = storages().map(|storage| (Subject::NATIVE, storage));
+    let device = devices().first().map(|device| (Subject::Gpu(device.clone()), Storage::default()));
+    for (subject, storage) in stored.into_iter().chain(device) {
+        let [without, with] = [false, true].map(|measures| {
+            let setup = Setup { storage, needs: needs(), ..Setup::default() };
+            bits(make_with(&subject, &model, setup), &views, measures)
         });
+        assert!(with == without, "{}, {storage:?}", subject.name());
     }
 }

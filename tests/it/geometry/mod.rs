@@ -41,6 +41,7 @@ pub(crate) struct Run<'a> {
 }
 
 /// What came of it.
+#[derive(Debug)]
 pub(crate) struct Outcome {
     pub(crate) geometry: Geometry,
     pub(crate) psnr: f64,
@@ -139,34 +140,7 @@ impl Known {
             rows: model.len(),
             peak: trainer.peak_rows(),
         };
-        eprintln!("{:8} {:8} seed {}: {outcome}", self.name, run.policy, run.seed);
+        eprintln!("{} {} seed {}: {outcome:?}", self.name, run.policy, run.seed);
         outcome
-    }
-}
-
-impl std::fmt::Display for Outcome {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { geometry: g, psnr, ssim, rows, peak } = self;
-        write!(
-            f,
-            "PSNR {psnr:.2}, SSIM {ssim:.4}, rows {rows}, peak {peak}, depth RMSE {:.2} %, AbsRel \
-             {:.2} %, coverage {:.1} %, normals {:.1}°, Chamfer {:.2} %, F 1 % {:.1} %, floaters {} \
-             ({:.2} % of rows, {:.2} % of weight), {:.1} per pixel, idle {:.1} %, thin",
-            100.0 * g.depth.rmse,
-            100.0 * g.depth.abs_rel,
-            100.0 * g.depth.coverage,
-            g.normal_error,
-            100.0 * g.centres.chamfer,
-            100.0 * g.centres.f_score_one_percent,
-            g.floaters.count,
-            100.0 * g.floaters.of_rows,
-            100.0 * g.floaters.of_weight,
-            g.redundancy.blended_per_pixel,
-            100.0 * g.redundancy.below_one_percent,
-        )?;
-        for thin in &g.thin {
-            write!(f, " {} px: {:.0} % of {}", thin.width, 100.0 * thin.recall, thin.pixels)?;
-        }
-        Ok(())
     }
 }

@@ -56,6 +56,7 @@ fn diet_beats_the_hard_stop_on(known: &Known) {
 }
 
 #[test]
+#[ignore = "takes minutes: run by .ci/run"]
 fn spheres() {
     let known = Known::new("spheres", 64, POINTS);
     every_policy(&known, |policy, outcome| check(policy, outcome, 0.032, 0.005));
@@ -111,7 +112,7 @@ fn every_policy_trains_on_a_device_as_it_does_natively() {
         let policy = entry.name;
         let run = Run { policy, set: "", budget: 900, iterations: 300, seed: 0 };
         let (expected, found) = (known.train(run), known.train_on(&subject, run));
-        let told = format!("{policy} on {}: {found}\nnatively: {expected}", subject.name());
+        let told = format!("{policy} on {}: {found:?}\nnatively: {expected:?}", subject.name());
         assert!((found.psnr - expected.psnr).abs() < 0.1, "{told}");
         assert!(found.rows.abs_diff(expected.rows) * 50 <= expected.rows, "{told}");
     }
