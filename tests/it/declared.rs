@@ -3,8 +3,10 @@
 
 #![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
 
+use std::ops::Range;
+
 use densify::backend::cpu::{ImageGradient, ModelGradient};
-use densify::backend::{Backend, LearningRates, StepInput};
+use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
@@ -38,18 +40,11 @@ fn backend(subject: &Subject, model: &Gaussians, needs: Needs) -> Box<dyn Differ
     make_with(subject, model, Setup { needs, ..Setup::default() })
 }
 
-fn step(
-    backend: &mut dyn Backend,
-    camera: &Camera,
-    step: u32,
-    rates: LearningRates,
-    cadence: Cadence,
-) {
+fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, cadence: Cadence) {
     let target = target(camera, step.into());
     let sh_degree = backend.sh_degree();
     let input = StepInput {
         background: BACKGROUND,
-        rates,
         cadence,
         seed: 5,
         ..step_input(step, camera, &target, sh_degree)
@@ -77,7 +72,7 @@ fn noise_has_the_declared_covariance() {
         let run = |subject: &Subject, at: u32| {
             let needs = Needs { noise: Some(noise), ..Needs::default() };
             let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &turned_away(&view(0)), at, RATES, EVERY);
+            step(&mut *backend, &turned_away(&view(0)), at, EVERY);
             backend.download().expect("a model")
         };
         let moved = run(subject, 3);
@@ -143,7 +138,7 @@ struct Adam {
     class: &'static str,
     rate: f64,
     /// Which of the values of a row belong to it, of how many.
-    values: std::ops::Range<usize>,
+    values: Range<usize>,
     of: usize,
     steps: i32,
     sums: Vec<f64>,
@@ -151,13 +146,7 @@ struct Adam {
 }
 
 impl Adam {
-    fn new(
-        class: &'static str,
-        rate: f32,
-        values: std::ops::Range<usize>,
-        of: usize,
-        rows: usize,
-    ) -> Self {
+    fn new(class: &'static str, rate: f32, values: Range<usize>, of: usize, rows: usize) -> Self {
         let zeros = vec![0.0; of * rows];
         let moments = [zeros.clone(), zeros.clone()];
         Self { class, rate: rate.into(), values, of, steps: 0, sums: zeros, moments }
@@ -178,11 +167,8 @@ impl Adam {
         let mine: Vec<usize> =
             (0..before.len()).filter(|i| self.values.contains(&(i % self.of))).collect();
         if !due {
-            assert!(
-                mine.iter().all(|&i| before[i].to_bits() == after[i].to_bits()),
-                "{}",
-                self.class
-            );
+            let rests = mine.iter().all(|&i| before[i].to_bits() == after[i].to_bits());
+            assert!(rests, "{}", self.class);
             return 0.0;
         }
         self.steps += 1;
@@ -206,20 +192,23 @@ impl Adam {
     }
 }
 
+/// And of the terms of the loss, which pull at rows that no view shows, too.
 #[test]
 fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
+    const ROWS: usize = 40;
+    let none = LossTerms::default();
+    let pulling = LossTerms { opacity: 0.01, scale: 0.02 };
+    let cases = [(2, 1, none), (1, 3, none), (2, 4, none), (20, 16, none), (1, 1, pulling)];
     on_each(repeatable(), |subject| {
-        const ROWS: usize = 40;
-        let longest =
-            [(2, 1), (1, 3), (2, 4), (20, 16)].map(|(all, sh_rest)| Cadence { all, sh_rest });
-        for longest in longest {
-            // The last of them: shorter than declared, and changing on the way.
-            let cadence_at = |step: u32| match longest.all {
+        for (all, sh_rest, loss_terms) in cases {
+            let longest = Cadence { all, sh_rest };
+            // One of them: shorter than declared, and changing on the way.
+            let cadence_at = |step: u32| match all {
                 20 if step < 5 => Cadence { all: 1, sh_rest: 2 },
                 20 => Cadence { all: 2, sh_rest: 3 },
                 _ => longest,
             };
-            let needs = Needs { cadence: longest, ..Needs::default() };
+            let needs = Needs { cadence: longest, loss_terms, ..Needs::default() };
             let mut backend = backend(subject, &model(ROWS), needs);
             let mut classes = [
                 Adam::new("means", RATES.mean, 0..3, 3, ROWS),
@@ -228,11 +217,23 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                 Adam::new("sh", RATES.sh_dc, 0..3, 12, ROWS),
                 Adam::new("sh", RATES.sh_rest, 3..12, 12, ROWS),
             ];
-            for number in 1..=8 {
-                let camera = view(number % 3);
+            let steps = if loss_terms == none { 8 } else { 30 };
+            for number in 1..=steps {
+                let is_away = loss_terms != none && number % 2 == 0;
+                let camera = if is_away { turned_away(&view(0)) } else { view(number % 3) };
                 let before = backend.download().expect("a model");
-                let gradient = gradient(subject, &before, &camera, number.into());
-                step(&mut *backend, &camera, number, RATES, cadence_at(number));
+                let mut gradient = gradient(subject, &before, &camera, number.into());
+                for row in 0..ROWS {
+                    let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
+                    gradient.opacity_logits[row] +=
+                        loss_terms.opacity / ROWS as f32 * opacity * (1.0 - opacity);
+                    for (g, scale) in
+                        gradient.log_scales[row].iter_mut().zip(before.log_scales[row])
+                    {
+                        *g += loss_terms.scale / (3 * ROWS) as f32 * scale.exp();
+                    }
+                }
+                step(&mut *backend, &camera, number, cadence_at(number));
                 let after = backend.download().expect("a model");
                 let [main, rest] = cadence_at(number).steps_at(number);
                 for (i, class) in classes.iter_mut().enumerate() {
@@ -247,74 +248,30 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
 }
 
 #[test]
-fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
-    on_each(repeatable(), |subject| {
-        const ROWS: usize = 40;
-        let terms = LossTerms { opacity: 0.01, scale: 0.02 };
-        let mut backend =
-            backend(subject, &model(ROWS), Needs { loss_terms: terms, ..Needs::default() });
-        let mut classes = [
-            Adam::new("means", RATES.mean, 0..3, 3, ROWS),
-            Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
-            Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
-        ];
-        for number in 1..=8 {
-            let camera = if number % 2 == 0 { turned_away(&view(0)) } else { view(number % 3) };
-            let before = backend.download().expect("a model");
-            let mut gradient = gradient(subject, &before, &camera, number.into());
-            for row in 0..ROWS {
-                let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
-                gradient.opacity_logits[row] += 0.01 / ROWS as f32 * opacity * (1.0 - opacity);
-                for axis in 0..3 {
-                    let scale = before.log_scales[row][axis].exp();
-                    gradient.log_scales[row][axis] += 0.02 / (3 * ROWS) as f32 * scale;
-                }
-            }
-            step(&mut *backend, &camera, number, RATES, EVERY);
-            let after = backend.download().expect("a model");
-            for class in &mut classes {
-                let error = class.check(&before, &after, &gradient, true);
-                assert!(error < 0.01, "step {number}, {}: {error} learning rates", class.class);
-            }
-        }
-    });
-}
-
-#[test]
 fn sums_move_with_their_rows_and_end_with_them() {
     on_each(repeatable(), |subject| {
         let cadence = Cadence { all: 2, sh_rest: 2 };
         let model = model(20);
-        let run = |edit: bool| {
+        let run = |edit: fn(&mut EditPlan)| {
             let needs = Needs { cadence, ..Needs::default() };
             let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &view(0), 1, RATES, cadence);
-            if edit {
-                // Row 19 takes the place of row 4.
-                let mut plan = EditPlan::new(20, 20);
-                plan.prune(4).expect("the row is free");
-                backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-            }
+            step(&mut *backend, &view(0), 1, cadence);
+            let mut plan = EditPlan::new(20, 20);
+            edit(&mut plan);
+            backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
             // Nothing is seen: only what waits is left.
-            step(&mut *backend, &turned_away(&view(0)), 2, RATES, cadence);
+            step(&mut *backend, &turned_away(&view(0)), 2, cadence);
             backend.download().expect("a model")
         };
-        let (plain, edited) = (run(false), run(true));
+        // Row 19 takes the place of row 4.
+        let (plain, edited) = (run(|_| {}), run(|plan| plan.prune(4).expect("the row is free")));
         assert!(plain.means[19] != model.means[19] && plain.sh_of(19) != model.sh_of(19));
         assert_eq!((plain.means[19], plain.sh_of(19)), (edited.means[4], edited.sh_of(4)));
         assert_eq!(plain.means[..4], edited.means[..4]);
-
         // Bounding opacities forgets what waits for them, as it forgets their moments.
-        let needs = Needs { cadence, ..Needs::default() };
-        let mut backend = backend(subject, &model, needs);
-        step(&mut *backend, &view(0), 1, RATES, cadence);
-        let mut plan = EditPlan::new(20, 20);
-        plan.clamp_opacity(0.999).expect("the bound is sound");
-        backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-        step(&mut *backend, &turned_away(&view(0)), 2, RATES, cadence);
-        let after = backend.download().expect("a model");
-        assert_eq!(after.opacity_logits, model.opacity_logits);
-        assert_eq!(after.means, plain.means);
+        let bounded = run(|plan| plan.clamp_opacity(0.999).expect("the bound is sound"));
+        assert_eq!(bounded.opacity_logits, model.opacity_logits);
+        assert_eq!(bounded.means, plain.means);
     });
 }
 
@@ -324,7 +281,7 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         let cadence = Cadence { all: 1, sh_rest: 2 };
         let mut backend = backend(subject, &model(20), Needs { cadence, ..Needs::default() });
         for number in 1..=6 {
-            step(&mut *backend, &view(number % 3), number, RATES, cadence);
+            step(&mut *backend, &view(number % 3), number, cadence);
         }
         let mut plan = EditPlan::new(20, 20);
         let opacity = OpacityRule::Same;
@@ -332,8 +289,8 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         plan.update(11, update).expect("the row is free");
         backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
         let before = backend.download().expect("a model");
-        step(&mut *backend, &view(0), 7, RATES, cadence);
-        step(&mut *backend, &view(1), 8, RATES, cadence);
+        step(&mut *backend, &view(0), 7, cadence);
+        step(&mut *backend, &view(1), 8, cadence);
         let after = backend.download().expect("a model");
         // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
         let moved = |row: usize| -> Vec<f32> {

@@ -32,10 +32,10 @@
 //! | 22 lenses | selftest; `src/dataset/pose.rs: fields_of_view_that_no_pinhole_has_are_refused` |
 //! | 23 plain photographs | selftest; `src/dataset/images.rs: every_colour_type_packs_to_eight_bits`; `policies/src/taming/score.rs: terms_are_relative_to_the_median_of_the_positive`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
 //! | 24 similarity | selftest; `src/metrics/ssim.rs: flat_images_a_hair_apart_stay_below_one`; `src/metrics/ssim.rs: noise_of_a_thousandth_on_a_flat_image` |
-//! | 25 the optimiser | selftest; `src/backend/cpu/adam.rs: a_thousand_steps_of_any_size`; `tests/it/agreement.rs: steps_are_those_of_the_native_backend` |
+//! | 25 the optimiser | selftest; `tests/it/declared.rs: a_step_takes_the_sum_of_the_gradients_since_the_last`; `tests/it/agreement.rs: steps_are_those_of_the_native_backend` |
 //! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_number_that_is_none_is_found`; `src/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
 //! | 27 all faint, all prunable | selftest; `policies/src/vanilla/tests.rs: the_last_row_lives`; `policies/src/diet/tests.rs: the_last_row_lives`; `policies/src/taming/tests.rs: one_row_is_left`; `policies/src/mcmc/tests.rs: without_the_living_nothing_is_done` |
-//! | 28 half precision | `src/backend/cpu/narrow/tests.rs: halves_are_what_the_standard_says`; `src/backend/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `src/backend/cpu/narrow/tests.rs: small_steps_are_not_lost`; `tests/it/quarantine.rs: every_number_that_is_none_is_found` |
+//! | 28 half precision | `src/backend/cpu/narrow/tests.rs: halves_are_what_the_standard_says`; `src/backend/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `tests/it/quarantine.rs: every_number_that_is_none_is_found` |
 //! | 29 whole numbers | `src/backend/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/backend/cpu/budget.rs: huge_budgets_are_refused_and_do_not_wrap`; `src/backend/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/checkpoint/tests.rs: headers_that_promise_too_much_are_refused_without_allocation` |
 //! | 30 a long run | selftest, in full with `--long`; `src/trainer/edit.rs: slots_written_before_the_moves_count_for_the_peak`; `tests/it/edits/mod.rs: any_plans_do_to_the_backend_what_they_do_to_a_plain_vector` |
 

@@ -2,22 +2,20 @@
 //! as they were: after measurements from which nothing follows, a run has the same bits as one that
 //! measured nothing.
 
-use std::sync::Arc;
-
 use densify::backend::{Backend, Storage, Tensor};
-use densify::camera::Camera;
-use densify::dataset::images::SharedImage;
+use densify::dataset::{Dataset, LoadOptions};
 use densify::gaussians::Gaussians;
+use densify::init::initialise;
 use densify::schedule::{Background, RateOptions};
 use densify::trainer::{OnNan, Required, Savings, TrainOptions, Trainer, growth_signals};
-use densify::verify::{Setup, Subject, scenes};
-use densify::views::{ViewError, ViewSource};
+use densify::verify::{Setup, Subject};
+use densify::views::DatasetViews;
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
-use glam::DVec3;
 
-use crate::subject::{devices, make_with, native, photograph, saved, storages};
+use crate::photographs::Photographs;
+use crate::subject::{devices, make_with, saved, storages};
 
 const ROWS: usize = 60;
 /// The probes are measured at step 100, and at step 200 also without the rows of least weight.
@@ -43,47 +41,11 @@ fn needs() -> Needs {
     Needs { signals: growth_signals(), ..Needs::default() }
 }
 
-#[derive(Clone)]
-struct Views(Vec<(Camera, SharedImage)>);
-
-impl ViewSource for Views {
-    fn count(&self) -> usize {
-        self.0.len()
-    }
-    fn name(&self, _: usize) -> &str {
-        "a view"
-    }
-    fn camera(&self, view: usize) -> &Camera {
-        &self.0[view].0
-    }
-    fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
-        Ok(self.0[view].1.clone())
-    }
-    fn prefetch(&self, _: &[usize]) {}
-}
-
-/// A model, and photographs of another one whose colours are others.
-fn scene() -> (Gaussians, Views) {
-    let camera = scenes::camera(40, 32, 11);
-    let truth = scenes::cloud(ROWS, 1, &camera, 12);
-    let mut native = native(&truth);
-    let photographed = |view: u32| {
-        let aside = DVec3::new(0.02 * f64::from(view), 0.0, 0.0);
-        let camera = scenes::rounded(&Camera { translation: camera.translation + aside, ..camera });
-        let rendering = native.render(&camera, [0.0; 3], 1).expect("a small image");
-        (camera, Arc::new(photograph(&rendering)))
-    };
-    let views = Views((0..8).map(photographed).collect());
-    let mut model = truth;
-    model.sh.iter_mut().enumerate().for_each(|(i, x)| *x += 0.2 * (i as f32 * 1.7).sin());
-    (model, views)
-}
-
 /// The bits of a run from which it goes on, after [`MEASURED_AT`] steps with or without measurements.
-fn bits(backend: Box<dyn Backend>, views: &Views, measures: bool) -> (Gaussians, Vec<Tensor>) {
+fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussians, Vec<Tensor>) {
     let scene = SceneInfo {
         extent: 1.0,
-        train_views: views.count() as u32,
+        train_views: dataset.train.len() as u32,
         budget: backend.budget(),
         initial_rows: ROWS,
         iterations: ITERATIONS,
@@ -100,7 +62,8 @@ fn bits(backend: Box<dyn Backend>, views: &Views, measures: bool) -> (Gaussians,
         on_nan: OnNan::Stop,
         savings: Savings::NONE,
     };
-    let trainer = Trainer::new(views.clone(), backend, ("idle", Box::new(Idle)), scene, options);
+    let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
+    let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);
     let mut trainer = trainer.expect("they agree");
     trainer = trainer.requiring(Required { rows: measures, ..Required::default() });
     for _ in 0..MEASURED_AT {
@@ -116,13 +79,15 @@ fn bits(backend: Box<dyn Backend>, views: &Views, measures: bool) -> (Gaussians,
 
 #[test]
 fn measuring_changes_no_bit() {
-    let (model, views) = scene();
+    let photographs = Photographs::colmap_text();
+    let dataset = Dataset::load(photographs.path(), &LoadOptions::default()).expect("a dataset");
+    let (model, _) = initialise(&dataset.points, ROWS, 1, 7).expect("points to start from");
     let stored = storages().map(|storage| (Subject::NATIVE, storage));
     let device = devices().first().map(|device| (Subject::Gpu(device.clone()), Storage::default()));
     for (subject, storage) in stored.into_iter().chain(device) {
         let [without, with] = [false, true].map(|measures| {
             let setup = Setup { storage, needs: needs(), ..Setup::default() };
-            bits(make_with(&subject, &model, setup), &views, measures)
+            bits(make_with(&subject, &model, setup), &dataset, measures)
         });
         assert!(with == without, "{}, {storage:?}", subject.name());
     }

@@ -8,8 +8,8 @@ use densify::verify::{Setup, Subject, scenes};
 use crate::subject::{GREY, make, make_with, photograph, step_input, storages};
 
 /// The loss falls as it does with f32, to a twentieth. At its end it wanders with the rounding. That
-/// small steps are not lost, as they would be by rounding to the nearest, is held number by number in
-/// `cpu/narrow/tests.rs`.
+/// small steps are not lost, as they would be by rounding to the nearest, follows from what
+/// `cpu/narrow/tests.rs` holds number by number: that rounding is fair, and draws are independent.
 #[test]
 fn training_is_as_good() {
     let camera = scenes::camera(64, 48, 11);

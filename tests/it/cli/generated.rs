@@ -4,7 +4,7 @@ use std::path::Path;
 
 use densify::dataset::{Dataset, LoadOptions};
 
-use super::{call, files, json, read_text, records, scratch, text, train};
+use super::{call, files, json, scratch, text, train};
 
 fn load(path: &Path) -> Dataset {
     Dataset::load(path, &LoadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -96,22 +96,6 @@ fn written_scenes_are_measured_against_their_files() {
     let said = call(&format!("eval {}", text(&run))).ok().stdout;
     assert!(said.contains("PSNR") && !said.contains("Chamfer"), "{said}");
     assert!(!run.join("geometry.json").exists() && !run.join("geometry_train.json").exists());
-}
-
-#[test]
-fn comparisons_have_columns_for_a_known_surface() {
-    let (root, output) = scratch();
-    let folder = root.path().join("wires");
-    wires(&folder);
-    let what = "--seeds 1 --policies vanilla,diet --budget 350 --iterations 8";
-    call(&format!("compare {} -o {} {what}", text(&folder), text(&output))).ok();
-    let table = read_text(&output.join("compare.md"));
-    for word in ["depth RMSE [%]", "Chamfer [%]", "F-score at 1 %", "floaters"] {
-        assert!(table.contains(word), "{word} is not in {table}");
-    }
-    for record in records(&output.join("compare.jsonl")) {
-        assert!(record["geometry"]["depth"]["rmse"].as_f64() > Some(0.0), "{record}");
-    }
 }
 
 #[test]

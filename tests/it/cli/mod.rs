@@ -6,6 +6,7 @@ mod configuring;
 mod exporting;
 mod faults;
 mod generated;
+mod geometry;
 mod killing;
 mod knobs;
 mod looking;

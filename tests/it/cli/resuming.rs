@@ -163,17 +163,13 @@ fn a_run_that_diverges_is_kept() {
 }
 
 #[test]
-fn the_two_newest_are_kept() {
+fn a_run_without_checkpoints_cannot_go_on() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    short_run(&scene, &run, "");
-    let names: Vec<String> = files(&run.join("checkpoints")).into_keys().collect();
-    assert_eq!(names, ["iteration_30.safetensors", "iteration_40.safetensors"]);
-    let (_root, none) = scratch();
-    train(scene.path(), &none, 20, "--budget 330 --checkpoint-every 0").ok();
-    assert!(!none.join("checkpoints").exists());
-    resume(scene.path(), &none, "")
-        .refused("none", &["no checkpoint to go on from", "--overwrite"]);
+    train(scene.path(), &run, 20, "--budget 330 --checkpoint-every 0").ok();
+    assert!(!run.join("checkpoints").exists());
+    let refused = resume(scene.path(), &run, "");
+    refused.refused("none", &["no checkpoint to go on from", "--overwrite"]);
 }
 
 #[test]
@@ -282,20 +278,4 @@ fn a_run_is_extended_by_the_schedule_it_began_with() {
     // It is remembered.
     let outcome = resume(scene.path(), &run, "").ok();
     assert!(outcome.stdout.contains("all 65 iterations are done"), "{}", outcome.stdout);
-}
-
-#[test]
-fn nothing_yet_to_go_on_from_is_a_start() {
-    let scene = Photographs::colmap_text();
-    let (_root, run) = scratch();
-    let flags = "--budget 330 --resume";
-    let outcome = train(scene.path(), &run, 20, flags).ok();
-    assert!(outcome.stdout.contains("begins at its start"), "{}", outcome.stdout);
-    let expected = model(&run, 20);
-    // As after a kill before the first checkpoint.
-    std::fs::remove_dir_all(run.join("checkpoints")).expect("checkpoints");
-    std::fs::remove_dir_all(run.join("point_cloud")).expect("models");
-    train(scene.path(), &run, 20, flags).ok();
-    assert!(model(&run, 20) == expected);
-    assert_eq!(records(&run.join("stats/train.jsonl")).len(), 2);
 }

@@ -214,55 +214,6 @@ fn ratios_of_nothing() {
     }
 }
 
-/// What is stored after each of many small steps, on average over rows.
-fn after_steps(
-    start: f32,
-    step: impl Fn(f32) -> f32,
-    store: impl Fn(&mut [f32], &mut Draws),
-) -> f32 {
-    const BLOCKS: usize = 16;
-    let mut sum = 0.0;
-    for block in 0..BLOCKS {
-        let mut plane = [start; WIDTH];
-        for at in 1..=2000 {
-            let [mut draws, ..] = Draws::of_block(&PolicyRng::new(5, at), block * WIDTH);
-            plane = plane.map(&step);
-            store(&mut plane, &mut draws);
-        }
-        sum += plane.iter().sum::<f32>();
-    }
-    sum / (BLOCKS * WIDTH) as f32
-}
-
-fn stored<T: Narrow>(plane: &mut [f32], draws: &mut Draws) {
-    let mut kept = [T::default(); WIDTH];
-    narrow(plane, &mut kept, draws);
-    widen(&kept, plane);
-}
-
-/// Steps far shorter than the distance of two neighbours go as far as in f32. Rounded to the nearest,
-/// none would change anything.
-#[test]
-fn small_steps_are_not_lost() {
-    // A twentieth of the distance of f16 below 1; of fixed point; and a second moment at rest.
-    let half = after_steps(1.0, |x| x - 2.5e-5, stored::<F16>);
-    assert!((half - 0.95).abs() < 2e-3, "{half}");
-    let fixed = after_steps(
-        -5.0,
-        |x| x - 2.5e-5,
-        |plane, draws| {
-            let (mut kept, (plane, _)) = ([0; WIDTH], plane.as_chunks_mut::<WIDTH>());
-            narrow_fixed(&plane[0], &mut kept, 11, draws);
-            widen_fixed(&kept, &mut plane[0], 11);
-        },
-    );
-    assert!((fixed + 5.05).abs() < 2e-3, "{fixed}");
-    let expected = 0.999_f32.powi(2000);
-    // Of codes a third apart, each number wanders by its own size; their mean does not.
-    let byte = after_steps(1.0, |x| 0.999 * x, stored::<F8>);
-    assert!((byte / expected - 1.0).abs() < 0.2, "{byte} instead of {expected}");
-}
-
 /// Draws of a row, of a plane after another, of a step after another, and for the three arrays, are
 /// independent: so are the decisions that they make.
 #[test]

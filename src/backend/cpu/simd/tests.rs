@@ -44,30 +44,6 @@ fn grid(from: f32, to: f32) -> Vec<f32> {
     (0..n).map(|i| from + (to - from) * i as f32 / (n - 1) as f32).collect()
 }
 
-struct Sums;
-
-impl WithSimd for Sums {
-    type Output = [f32; 4];
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> [f32; 4] {
-        let lanes: Vec<f32> = (0..4 * WIDTH).map(|i| (i * i) as f32).collect();
-        sums_of_four(each!(k in 4 => V::load(s, &lanes[WIDTH * k..])))
-    }
-}
-
-#[test]
-fn four_vectors_are_summed_together() {
-    let arch = Arch::new();
-    let lanes = match arch.dispatch(Sums)[0] {
-        // Σ i² for i < 16, 8 or 4, by the lanes this machine has.
-        1240.0 => 16,
-        140.0 => 8,
-        _ => 4,
-    };
-    let sum = |k: usize| (WIDTH * k..WIDTH * k + lanes).map(|i| (i * i) as f32).sum::<f32>();
-    assert_eq!(arch.dispatch(Sums), [0, 1, 2, 3].map(sum));
-}
-
 #[test]
 fn elementary_functions_are_accurate() {
     let arch = Arch::new();

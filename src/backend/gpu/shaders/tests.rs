@@ -1,16 +1,14 @@
 //! Shaders and their kernels, offline. What they compute is compared in `tests/it`.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::mem::offset_of;
 
+use wgpu::naga::AddressSpace;
 use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
-use wgpu::naga::{AddressSpace, Module, StructMember, TypeInner};
 
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet,
 };
 
-use super::super::frame::{Frame, State};
 use super::super::launches::Launches;
 use super::super::photographs::KeptPhotographs;
 use super::super::pipelines::Variant;
@@ -167,34 +165,4 @@ fn every_kernel_is_launched_and_every_variable_has_a_buffer() {
         let all: BTreeSet<_> = kernels.keys().map(|name| &**name).collect();
         assert_eq!(*launched.borrow(), all, "{accumulation}");
     }
-}
-
-fn offsets(module: &Module, name: &str) -> (BTreeMap<String, u32>, u32) {
-    let found = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some(name));
-    let Some((_, ty)) = found else { panic!("no struct {name}") };
-    let TypeInner::Struct { members, span } = &ty.inner else { panic!("{name} is no struct") };
-    let of = |m: &StructMember| (m.name.clone().unwrap_or_default(), m.offset);
-    (members.iter().map(of).collect(), *span)
-}
-
-#[test]
-fn structs_lie_as_the_shaders_read_them() {
-    macro_rules! check {
-        ($offsets:expr, $ty:ty, $($field:ident)*) => {{
-            $(assert_eq!($offsets[stringify!($field)] as usize, offset_of!($ty, $field),
-                "{}", stringify!($field));)*
-            [$(stringify!($field)),*].len()
-        }};
-    }
-    let tiles = &STAGES[1];
-    let module = tiles.parse(&tiles.text(Accumulation::Slots).expect("all devices have it"));
-    let (frame, span) = offsets(&module, "Frame");
-    let fields = check!(frame, Frame, rotation centre lens ratio background image model rates
-        more_rates noise draw planes);
-    assert_eq!((fields, span as usize), (frame.len(), size_of::<Frame>()));
-    let (state, _) = offsets(&module, "State");
-    let fields = check!(state, State, visible total bands short entries_low entries_high held
-        broken_off l1 ssim spare_f);
-    assert_eq!(state["cuts"] as usize, size_of::<State>());
-    assert_eq!(fields + 1, state.len());
 }
