@@ -77,10 +77,4 @@ mod tests {
             assert!(!found.last().unwrap().holds(), "{found:?}");
         }
     }
-
-    #[test]
-    fn numbers_ascend_and_are_unique() {
-        let numbers: Vec<u8> = cases().iter().map(|case| case.number).collect();
-        assert!(numbers.is_sorted_by(|a, b| a < b), "{numbers:?}");
-    }
 }

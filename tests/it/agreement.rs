@@ -93,7 +93,7 @@ fn compare_models(table: &mut Table, what: &str, found: &Gaussians, expected: &G
 }
 
 /// What policies ask for, each with the cadence of its steps.
-fn asked_for() -> [(&'static str, Needs, Cadence); 8] {
+fn asked_for() -> [(&'static str, Needs, Cadence); 7] {
     let all = SignalSet::from(Signal::ALL);
     let absolute = SignalSet::from([Signal::ScreenGradientAbs]);
     let pixels = SignalSet::from([Signal::PixelCount, Signal::WeightMax, Signal::ScreenGradient]);
@@ -107,12 +107,6 @@ fn asked_for() -> [(&'static str, Needs, Cadence); 8] {
         ("all signals", Needs { signals: all, ..Needs::default() }, plain),
         ("absolute gradients", Needs { signals: absolute, ..Needs::default() }, plain),
         ("pixels and weights", Needs { signals: pixels, ..Needs::default() }, plain),
-        // Half of the rows are nearer.
-        (
-            "near views weigh less",
-            Needs { signals: all, full_depth: 3.5, ..Needs::default() },
-            plain,
-        ),
         (
             "terms and noise",
             Needs { signals: some, loss_terms, noise: Some(noise), ..Needs::default() },

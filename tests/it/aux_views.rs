@@ -38,7 +38,7 @@ fn scene() -> Scene {
     model.means[..3].fill(scenes::world(&camera, [0.1, 0.2, -3.0]));
     let (_, mut target) = scenes::noisy((camera.width, camera.height), 0.0, 93);
     // Half of the pixels count in full, the others by half or not at all.
-    let weight = |i: usize| if i % 2 == 0 { 255 } else { (i % 3) as u8 * 64 };
+    let weight = |i: usize| if i.is_multiple_of(2) { 255 } else { (i % 3) as u8 * 64 };
     target.mask = Some((0..target.rgb.len() / 3).map(weight).collect());
     Scene { camera, model, target }
 }

@@ -5,7 +5,6 @@ use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use densify::backend::Backend;
 use densify::camera::Camera;
 use densify::gaussians::{Gaussians, logit, rgb_to_dc};
 use glam::{DMat3, DQuat, DVec3};
@@ -14,8 +13,8 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 use tempfile::TempDir;
 
-use crate::subject::native;
-use densify::verify::scenes;
+use crate::subject::make;
+use densify::verify::{Subject, scenes};
 
 /// Views taken.
 pub(crate) const VIEWS: usize = 14;
@@ -97,7 +96,7 @@ fn camera(view: usize) -> Camera {
 fn shots() -> &'static [Shot] {
     static SHOTS: OnceLock<Vec<Shot>> = OnceLock::new();
     SHOTS.get_or_init(|| {
-        let mut backend = native(&blobs());
+        let mut backend = make(&Subject::NATIVE, &blobs());
         let shoot = |view: usize| {
             let camera = camera(view);
             let seen = backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");

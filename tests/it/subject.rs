@@ -6,10 +6,8 @@
 
 use std::sync::OnceLock;
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, InstructionSet};
-use densify::backend::gpu::{
-    Accumulation, AdapterChoice, AdapterSummary, GpuBackend, GpuDevice, GpuOptions, adapters,
-};
+use densify::backend::cpu::InstructionSet;
+use densify::backend::gpu::{Accumulation, AdapterChoice, AdapterSummary, GpuDevice, adapters};
 use densify::backend::{
     Backend, MomentStorage, ParameterStorage, Rendering, StateArray, StepInput, Storage, Tensor,
 };
@@ -134,22 +132,6 @@ pub(crate) fn make_with(
     setup: Setup,
 ) -> Box<dyn Differentiable> {
     subject.with(model, setup).expect("a small model fits")
-}
-
-/// The native backend as it is by default.
-pub(crate) fn native(model: &Gaussians) -> CpuBackend {
-    CpuBackend::new(model, &CpuOptions::new(model.len().max(1))).expect("a small model fits")
-}
-
-/// A GPU backend, for tests of what only it has.
-pub(crate) fn gpu(
-    device: &GpuDevice,
-    model: &Gaussians,
-    change: impl FnOnce(&mut GpuOptions),
-) -> GpuBackend {
-    let mut options = GpuOptions::new(model.len().max(1));
-    change(&mut options);
-    GpuBackend::new(model, &options, device).expect("a small model fits")
 }
 
 /// How proptest is set up: as many cases as `PROPTEST_CASES` says, or so many.

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use densify::backend::gpu::GpuDevice;
+
 use super::{Outcome, config, copy_unfinished, densify, model, scratch, text};
 use crate::photographs::Photographs;
 use crate::subject::{devices, ways};
@@ -75,7 +77,7 @@ fn contradictions_and_what_a_device_lacks_are_refused_by_name() {
             .refused(way, &[&knob, "native backend", "accumulation=auto", "--backend gpu"]);
     }
     try_with(&["--knob", "accumulation=fast"]).refused("no such way", &["auto|slots|cas|atomics"]);
-    for adapter in devices().iter().map(|device| device.adapter()) {
+    for adapter in devices().iter().map(GpuDevice::adapter) {
         for (way, feature) in [("cas", "SUBGROUP"), ("atomics", "SHADER_FLOAT32_ATOMIC")] {
             if adapter.accumulations.iter().all(|there| there.name() != way) {
                 let knob = format!("accumulation={way}");
@@ -90,7 +92,7 @@ fn contradictions_and_what_a_device_lacks_are_refused_by_name() {
 #[test]
 fn devices_say_how_they_add_up() {
     let listed = densify(&["devices"]).ok().stdout;
-    for adapter in devices().iter().map(|device| device.adapter()) {
+    for adapter in devices().iter().map(GpuDevice::adapter) {
         let about = listed.lines().skip_while(|line| *line != adapter.name);
         let line = about.into_iter().find_map(|line| line.strip_prefix("  accumulation    "));
         let line = line.expect("a line");

@@ -112,7 +112,8 @@ fn a_bare_model_renders_as_its_run() {
     let (ply, dataset) = (text(&ply), text(scene.path()));
     let (of_run, from_run) = render(text(&run), "a");
     let (of_file, from_file) = render(&format!("{ply} --scene {dataset} --eval"), "b");
-    (of_run.ok(), of_file.ok());
+    of_run.ok();
+    of_file.ok();
     assert!(files(&from_run) == files(&from_file));
     let (refused, nowhere) = render(ply, "c");
     refused.refused("no cameras", &["--scene"]);

@@ -248,14 +248,9 @@ fn another_dataset_is_refused_with_what_differs() {
     short_run(&scene, &run, "");
     scene.replace("sparse/0/cameras.txt", "52 52", "52 52.5");
     resume(scene.path(), &run, "").refused("cameras", &["the cameras of the views", "--resume"]);
-    scene.replace("sparse/0/cameras.txt", "52 52.5", "52 52");
-    // It may lie elsewhere.
+    // It may lie elsewhere. What else may differ is in `src/checkpoint/tests.rs`.
     let moved = Photographs::colmap_text();
     resume(moved.path(), &run, "").ok();
-    std::fs::remove_file(scene.file("images/view_03.png")).expect("a view");
-    let picture = image::RgbImage::from_pixel(48, 40, image::Rgb([9, 9, 9]));
-    picture.save(scene.file("images/view_03.png")).expect("another picture");
-    resume(scene.path(), &run, "").refused("images", &["the image files of the views"]);
 }
 
 #[test]

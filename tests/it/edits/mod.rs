@@ -36,11 +36,6 @@ fn view() -> Camera {
     scenes::camera(33, 25, 71)
 }
 
-/// It sees nothing of the model, whatever the plans did.
-fn away() -> Camera {
-    turned_away(&view())
-}
-
 fn needs() -> Needs {
     let signals = SignalSet::from(SIGNALS);
     Needs { signals, ..Needs::default() }
@@ -89,7 +84,7 @@ fn rows(backend: &mut dyn Backend) -> Vec<Row> {
 fn twin(subject: &Subject) -> [Vec<Row>; 2] {
     let mut backend = trained(subject, ROWS);
     let before = rows(&mut *backend);
-    assert_eq!(step(&mut *backend, &away(), 4), 0, "the camera sees something");
+    assert_eq!(step(&mut *backend, &turned_away(&view()), 4), 0, "the camera sees something");
     [before, rows(&mut *backend)]
 }
 
@@ -150,7 +145,7 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
         check_rows(&rows(&mut *backend), &expected);
     }
     let before = rows(&mut *backend);
-    assert_eq!(step(&mut *backend, &away(), 9), 0);
+    assert_eq!(step(&mut *backend, &turned_away(&view()), 9), 0);
     check_movement(twin, &before, &rows(&mut *backend), &expected);
 }
 
@@ -170,7 +165,8 @@ fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector() {
 /// That a plan keeps these rules is held in `policies/src/ops/tests.rs`; a backend relies on none.
 #[test]
 fn a_corrupted_plan_stops_the_run() {
-    let corruptions: [(&str, fn(&mut RowOps)); 4] = [
+    type Corruption = (&'static str, fn(&mut RowOps));
+    let corruptions: [Corruption; 4] = [
         ("another number of rows", |ops| ops.rows_before -= 1),
         ("another budget", |ops| ops.budget += 100),
         ("over the budget", |ops| ops.rows_after = ROWS + 3),

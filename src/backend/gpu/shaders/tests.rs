@@ -43,25 +43,6 @@ fn every_shader_is_valid_and_within_the_portable_limits() {
     assert_eq!(seen.len(), STAGES.len(), "stages that no device has");
 }
 
-/// A device is asked for no more than its way to add up needs, and for all of that.
-#[test]
-fn a_shader_needs_what_its_way_to_add_up_asks_for() {
-    let is_valid = |stage: &Stage, accumulation, allowed| {
-        let text = stage.text(accumulation).expect("it has the stage");
-        let module = stage.parse(&text);
-        Validator::new(ValidationFlags::all(), allowed).validate(&module).is_ok()
-    };
-    for stage in STAGES.iter().filter(|stage| stage.on == On::Atomics) {
-        for accumulation in [Accumulation::SubgroupCas, Accumulation::SubgroupAtomics] {
-            let all = capabilities(accumulation);
-            assert!(is_valid(stage, accumulation, all), "{accumulation}");
-            for one in all.difference(Capabilities::IMMEDIATES).iter() {
-                assert!(!is_valid(stage, accumulation, all.difference(one)), "{one:?}");
-            }
-        }
-    }
-}
-
 /// Every device has the portable limits of WebGPU.
 fn check_stage(stage: &Stage, text: &str, capabilities: Capabilities) {
     let module = stage.parse(text);
