@@ -70,8 +70,7 @@ fn call(words: &str) -> Outcome {
     densify(&words.split_whitespace().collect::<Vec<_>>())
 }
 
-/// A short run with a small budget. `flags` are words separated by spaces; later ones win nothing
-/// over the fixed ones, so that they must not repeat them.
+/// A short run. `flags` must not repeat the fixed ones.
 fn train(scene: &Path, output: &Path, iterations: u32, flags: &str) -> Outcome {
     let fixed = format!("--sh-degree 1 --iterations {iterations}");
     call(&format!("train {} -o {} {fixed} {flags}", text(scene), text(output)))
