@@ -52,10 +52,10 @@ fn flags_out_of_range_are_refused() {
 #[test]
 fn damaged_datasets_are_refused() {
     let scene = Photographs::colmap_text();
-    scene.truncate("sparse/0/points3D.txt", 12);
-    refused(&scene, "", &["points3D.txt", "line 300"]);
     std::fs::remove_file(scene.file("images/view_03.png")).expect("a view");
     refused(&scene, "", &["images.txt", "view_03.png", "--images"]);
+    scene.truncate("sparse/0/points3D.txt", 12);
+    refused(&scene, "", &["points3D.txt", "line 300"]);
     std::fs::remove_dir_all(scene.file("sparse")).expect("the model");
     refused(&scene, "", &["is not a dataset", "COLMAP"]);
 }

@@ -104,19 +104,20 @@ fn bad_input_is_refused_and_leaves_nothing() {
     let broken = root.path().join("broken.glb");
     std::fs::write(&broken, b"glTF\x02\0\0\0\xff\xff\xff\xff").expect("write");
     let (broken, out) = (text(&broken), text(&out));
-    for (what, words) in [
-        (broken, ["broken.glb", "GLB header"]),
-        ("nothing.obj", ["nothing.obj", "cannot"]),
-        ("mesh.fbx", ["mesh.fbx", ".obj"]),
-        ("--preset nonsense", ["nonsense", "spheres"]),
-        ("--preset thin --size 99999", ["--size", "99999"]),
-        ("--preset thin --fov 180", ["--fov", "180"]),
-        ("--preset thin --rig file", ["--rig", "file"]),
-        ("--preset thin --train 0", ["--train", "0 views"]),
-        ("--preset thin --sky none.hdr", ["none.hdr", "cannot"]),
-        (&format!("--preset thin --sky {broken}"), ["broken.glb", "HDR"]),
-    ] {
-        call(&format!("scenegen {what} -o {out}")).refused(what, &words);
+    let cases: [(&str, &[&str]); 10] = [
+        (broken, &["broken.glb", "GLB header"]),
+        ("nothing.obj", &["nothing.obj"]),
+        ("mesh.fbx", &["mesh.fbx", ".obj"]),
+        ("--preset nonsense", &["nonsense", "spheres"]),
+        ("--preset thin --size 99999", &["--size", "99999"]),
+        ("--preset thin --fov 180", &["--fov"]),
+        ("--preset thin --rig file", &["--rig"]),
+        ("--preset thin --train 0", &["--train", "0 views"]),
+        ("--preset thin --sky none.hdr", &["none.hdr"]),
+        (&format!("--preset thin --sky {broken}"), &["broken.glb", "HDR"]),
+    ];
+    for (what, words) in cases {
+        call(&format!("scenegen {what} -o {out}")).refused(what, words);
     }
     call("train scene:nonsense").refused("no such scene", &["nonsense", "spheres"]);
     let left = files(root.path());
