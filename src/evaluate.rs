@@ -9,11 +9,11 @@ use crate::metrics::{MetricError, flip, psnr, ssim};
 use crate::views::{ViewError, ViewSource};
 
 /// Part of a dataset.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Split {
-    /// Views held out.
+    /// The views held out
     Test,
-    /// Views trained on.
+    /// The views trained on
     Train,
 }
 
@@ -71,18 +71,18 @@ impl Scores {
     }
 }
 
-/// Why a view cannot be scored.
+/// Why a model cannot be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
-    /// Its pixels could not be read.
+    /// A view's pixels or known surface could not be read, or not be compared with the rendering.
     #[error("view `{view}`: {source}")]
     View {
         /// The view's name.
         view: String,
-        /// The error of the source of views.
+        /// What is wrong with it.
         source: ViewError,
     },
-    /// It could not be rendered.
+    /// A view could not be rendered.
     #[error("view `{view}`: {source}")]
     Backend {
         /// The view's name.
@@ -90,14 +90,12 @@ pub enum EvaluateError {
         /// The error of the backend.
         source: BackendError,
     },
-    /// Rendering and image cannot be compared.
-    #[error("view `{view}`: {source}")]
-    Metric {
-        /// The view's name.
-        view: String,
-        /// The error of the metric.
-        source: MetricError,
-    },
+    /// The model or its signals could not be copied from the device.
+    #[error(transparent)]
+    Model(#[from] BackendError),
+    /// The neighbour search does not support so many rows.
+    #[error("{0} rows are too many to search for neighbours")]
+    TooManyRows(usize),
     /// Stopped by the caller.
     #[error("stopped before all views were measured")]
     Stopped,
@@ -126,7 +124,7 @@ pub fn evaluate(
         let rendering = backend
             .render(views.camera(view), background, sh_degree)
             .map_err(|source| EvaluateError::Backend { view: name(), source })?;
-        let metric = |source| EvaluateError::Metric { view: name(), source };
+        let metric = |e: MetricError| EvaluateError::View { view: name(), source: e.into() };
         let score = ViewScore {
             name: name(),
             psnr: psnr(&rendering.rgb, &image, background).map_err(metric)?,

@@ -8,7 +8,6 @@ use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
 use crate::import::ply::PlyError;
 use crate::init::InitError;
-use crate::metrics::geometry::GeometryError;
 use crate::output::OutputError;
 use crate::trainer::TrainError;
 
@@ -120,7 +119,7 @@ impl From<OutputError> for Failure {
 impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
-            TrainError::NoViews | TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
+            TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
             TrainError::Backend { source, .. } if is_input(source) => INPUT,
             TrainError::Backend { .. } => DEVICE,
             _ => OTHER,
@@ -142,25 +141,15 @@ impl From<CheckpointError> for Failure {
     }
 }
 
-impl From<GeometryError> for Failure {
-    fn from(error: GeometryError) -> Self {
-        let code = match &error {
-            GeometryError::Backend { source, .. } | GeometryError::Model(source)
-                if !is_input(source) =>
-            {
-                DEVICE
-            }
-            _ => INPUT,
-        };
-        Self { code, message: error.to_string() }
-    }
-}
-
 impl From<EvaluateError> for Failure {
     fn from(error: EvaluateError) -> Self {
         let code = match &error {
             EvaluateError::Stopped => OTHER,
-            EvaluateError::Backend { source, .. } if !is_input(source) => DEVICE,
+            EvaluateError::Backend { source, .. } | EvaluateError::Model(source)
+                if !is_input(source) =>
+            {
+                DEVICE
+            }
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

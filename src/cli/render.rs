@@ -9,9 +9,9 @@ use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
 
 use super::console::Console;
-use super::flags::SplitArg;
 use crate::backend::Rendering;
 use crate::dataset::images::Image8;
+use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::output::{OutputError, write_atomically, write_json};
 use crate::run::finished::{Machine, Opened, iteration, open, open_run};
@@ -38,8 +38,8 @@ pub(super) struct RenderArgs {
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Which views to render
-    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
-    split: SplitArg,
+    #[arg(long, value_enum, default_value_t = Split::Test)]
+    split: Split,
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
@@ -71,7 +71,7 @@ Examples:
 
 pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     let mut opened = open_model(args, console)?;
-    let views = opened.views(args.split.into())?;
+    let views = opened.views(args.split)?;
     let background = opened.data.background.fixed();
     let units = 1.0 / opened.dataset.normalisation.scale;
     let names: Vec<&str> = (0..views.count()).map(|view| views.name(view)).collect();

@@ -79,11 +79,8 @@ pub fn dataset(
     let mut sampler = TrackSampler::new();
     let found = points.positions.iter().zip(&points.colours);
     for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
-        let views = seen_by.len() as u64;
-        if options.tracks && sampler.wants(views) {
+        if options.tracks && sampler.wants(seen_by.len() as u64) {
             sampler.add(position, colour, seen_by.iter().copied());
-        } else {
-            sampler.skip(views);
         }
     }
     let view_of = |number: u32| number_of.get(&number).copied();

@@ -289,9 +289,8 @@ impl ImageDemand {
 
 /// Loads an image; a panic of the decoder becomes an error.
 fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
-    catch_unwind(AssertUnwindSafe(|| source.load())).unwrap_or_else(|_| {
-        Err(DatasetError::Image { path: source.path.clone(), problem: "the decoder failed".into() })
-    })
+    catch_unwind(AssertUnwindSafe(|| source.load()))
+        .unwrap_or_else(|_| Err(DatasetError::image(&source.path, "the decoder failed")))
 }
 
 #[cfg(test)]

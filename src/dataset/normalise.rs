@@ -146,17 +146,7 @@ mod tests {
 
     fn camera(centre: DVec3) -> Camera {
         let rotation = DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(0.9);
-        let (fx, fy, cx, cy) = (200.0, 210.0, 100.0, 80.0);
-        Camera {
-            width: 200,
-            height: 160,
-            fx,
-            fy,
-            cx,
-            cy,
-            rotation,
-            translation: rotation * -centre,
-        }
+        Camera::centred((200, 160), (200.0, 210.0), rotation, centre)
     }
 
     #[test]

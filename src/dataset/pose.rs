@@ -13,7 +13,7 @@ const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
 /// Largest entry of |RᵀR − I| accepted; smaller deviations are corrected.
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
-const POSE_REMEDY: &str = "repair the pose or remove the frame";
+pub(super) const POSE_REMEDY: &str = "repair the pose or remove the frame";
 
 /// Checks `camera_from_world` and makes the rotation orthonormal.
 pub(super) fn checked_pose(

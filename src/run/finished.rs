@@ -111,7 +111,7 @@ pub(crate) fn load(
     data: &DataSpec,
     observer: &dyn Observer,
 ) -> Result<Dataset, Failure> {
-    let dataset = Dataset::load(path, &data.load_options(false)?)?;
+    let dataset = Dataset::load(path, &data.load_options(false))?;
     for note in &dataset.notes {
         observer.say(format_args!("note: {note}"));
     }

@@ -252,7 +252,7 @@ impl<'a> Session<'a> {
                 self.record(&report)?;
                 Ok(report)
             }
-            Err(error @ (TrainError::Policy { .. } | TrainError::BrokenPlan { .. })) => {
+            Err(error @ TrainError::Policy { .. }) => {
                 let step = self.run.trainer.steps_done();
                 let saved = match self.save(step) {
                     Ok(path) => {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use toml::Value;
 
-use super::child::{Child, Summary, has_geometry, in_run};
+use super::child::{Child, has_geometry, in_run, summary};
 use super::record::Outcome;
 use crate::failure::{Failure, OTHER};
 use crate::output::{geometry_of, model_path, scores_of};
@@ -84,11 +84,11 @@ impl Cell {
     }
 
     fn record(&self, folder: &Path) -> Result<Outcome, Failure> {
-        let summary = Summary::read(folder)?;
-        let iterations = summary.number("iterations")? as u32;
+        let summary = summary(folder)?;
+        let iterations = summary.iterations;
         let scores = match self.scores_without_shortcuts {
             true => scores_of(folder, iterations)?,
-            false => summary.tests.values().next_back().copied(),
+            false => summary.test.values().next_back().copied(),
         };
         let Some(scores) = scores else {
             let scene = self.scene.display();
@@ -97,9 +97,8 @@ impl Cell {
         let path = model_path(folder, iterations);
         let model = fs::read(&path)
             .map_err(|e| Failure { code: OTHER, message: format!("{}: {e}", path.display()) })?;
-        let stages = summary.get("stage_seconds").clone();
         Ok(Outcome {
-            densify: summary.text("densify"),
+            densify: summary.densify,
             scene: self.label.clone(),
             factor: self.factor.clone(),
             level: self.level.clone(),
@@ -112,15 +111,15 @@ impl Cell {
             psnr: scores.psnr,
             ssim: scores.ssim,
             flip: scores.flip,
-            rows: summary.number("rows")? as usize,
-            peak_rows: summary.number("peak_rows")? as usize,
-            peak_bytes: summary.get("peak_bytes").as_u64(),
-            ledger_bytes: summary.number("ledger_bytes")? as u64,
-            seconds: summary.number("seconds")?,
-            cpu_seconds: summary.get("cpu_seconds").as_f64(),
-            stage_seconds: serde_json::from_value(stages).unwrap_or_default(),
-            extra_forwards: summary.number("extra_forwards")? as u64,
-            curve: summary.tests.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
+            rows: summary.rows,
+            peak_rows: summary.peak_rows,
+            peak_bytes: summary.peak_bytes,
+            ledger_bytes: summary.ledger_bytes,
+            seconds: summary.seconds,
+            cpu_seconds: summary.cpu_seconds,
+            stage_seconds: summary.stage_seconds,
+            extra_forwards: summary.extra_forwards,
+            curve: summary.test.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
             geometry: geometry_of(folder, iterations)?,
         })
     }

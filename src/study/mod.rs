@@ -17,8 +17,8 @@ mod trade;
 
 use std::path::{Path, PathBuf};
 
-pub use compare::{Comparison, SceneBudget};
-pub use trade::Trade;
+pub(crate) use compare::Comparison;
+pub(crate) use trade::Trade;
 
 use crate::dataset::builtin;
 use crate::failure::Failure;
@@ -30,7 +30,7 @@ use record::{Outcome, Record};
 
 /// What a finished study leaves.
 #[derive(Debug)]
-pub struct Finished {
+pub(crate) struct Finished {
     /// A few lines for the terminal.
     pub summary: String,
     /// The file with tables and pictures.

@@ -90,8 +90,7 @@ mod tests {
 
     fn camera(x: f64, degrees: f64, fx: f64) -> Camera {
         let rotation = DMat3::from_rotation_y(degrees.to_radians());
-        let translation = -(rotation * DVec3::new(x, 0.0, 0.0));
-        Camera { width: 64, height: 48, fx, fy: 50.0, cx: 32.0, cy: 24.0, rotation, translation }
+        Camera::centred((64, 48), (fx, 50.0), rotation, DVec3::new(x, 0.0, 0.0))
     }
 
     #[test]

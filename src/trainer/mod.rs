@@ -78,8 +78,8 @@ impl<V: ViewSource> Trainer<V> {
     /// A new run. `backend` holds the initial model; `policy_name` is for messages only.
     ///
     /// # Errors
-    /// [`TrainError::NoViews`], and [`TrainError::BadOption`] if `scene` or `options` disagree
-    /// with the views or the backend.
+    /// [`TrainError::BadOption`] if there is no view, or `scene` or `options` disagree with the views or
+    /// the backend.
     pub fn new(
         views: V,
         backend: Box<dyn Backend>,

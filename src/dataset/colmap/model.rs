@@ -45,11 +45,10 @@ impl Model {
     fn supported(file: &Path, camera: &str, name: &str) -> Result<Self, DatasetError> {
         match MODELS[..5].iter().position(|(known, _)| *known == name) {
             Some(id) => Ok(Self(id)),
-            None => Err(DatasetError::Lens {
-                path: file.to_owned(),
-                field: camera.to_owned(),
-                problem: format!("the camera model {name} is not one of {SUPPORTED}"),
-            }),
+            None => {
+                let problem = format!("the camera model {name} is not one of {SUPPORTED}");
+                Err(DatasetError::lens(file, camera, problem))
+            }
         }
     }
 

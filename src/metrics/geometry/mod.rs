@@ -14,10 +14,11 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Needs, Signal, SignalSet};
 use densify_scenegen::{GroundTruth, Sight};
 use serde::{Deserialize, Serialize};
 
-use crate::backend::{Backend, BackendError};
+use crate::backend::Backend;
 use crate::camera::Camera;
 use crate::dataset::normalise::Normalisation;
-use crate::views::{ViewError, ViewSource};
+use crate::evaluate::EvaluateError;
+use crate::views::ViewSource;
 use pixels::Pixels;
 use rows::Rows;
 use visibility::Visibility;
@@ -136,41 +137,6 @@ pub struct Ground<'a> {
     pub sh_degree: u8,
 }
 
-/// Why geometry cannot be measured.
-#[derive(Debug, thiserror::Error)]
-pub enum GeometryError {
-    /// A ground-truth file is damaged.
-    #[error("view `{view}`: {source}")]
-    Truth {
-        /// The view's name.
-        view: String,
-        /// The error of the file.
-        source: densify_scenegen::Error,
-    },
-    /// A view's pixels could not be read.
-    #[error("view `{view}`: {source}")]
-    View {
-        /// The view's name.
-        view: String,
-        /// The error of the source of views.
-        source: ViewError,
-    },
-    /// A view could not be rendered.
-    #[error("view `{view}`: {source}")]
-    Backend {
-        /// The view's name.
-        view: String,
-        /// The error of the backend.
-        source: BackendError,
-    },
-    /// The model could not be copied from the device.
-    #[error(transparent)]
-    Model(#[from] BackendError),
-    /// The neighbour search does not support so many rows.
-    #[error("{0} rows are too many to search for neighbours")]
-    TooManyRows(usize),
-}
-
 /// The needs with which the backend for [`measure`] is made.
 #[must_use]
 pub fn needs() -> Needs {
@@ -187,13 +153,13 @@ pub fn needs() -> Needs {
 /// trained on; depth, normals and thin structures in `views`.
 ///
 /// # Errors
-/// [`GeometryError`] at the first view that cannot be measured.
+/// [`EvaluateError`] at the first view that cannot be measured.
 pub fn measure(
     backend: &mut dyn Backend,
     ground: &Ground<'_>,
     train: &impl ViewSource,
     views: &impl ViewSource,
-) -> Result<Geometry, GeometryError> {
+) -> Result<Geometry, EvaluateError> {
     let rows = Rows::new(&backend.download()?, ground);
     let visibility = Visibility::measure(backend, ground, &rows, train)?;
     let mut pixels = Pixels::new(&rows, ground)?;
@@ -232,9 +198,9 @@ impl Ground<'_> {
         (world, caster)
     }
 
-    fn sight(&self, name: &str, caster: &densify_scenegen::Camera) -> Result<Sight, GeometryError> {
+    fn sight(&self, name: &str, caster: &densify_scenegen::Camera) -> Result<Sight, EvaluateError> {
         let sight = self.truth.sight(name, caster);
-        sight.map_err(|source| GeometryError::Truth { view: name.to_owned(), source })
+        sight.map_err(|e| EvaluateError::View { view: name.to_owned(), source: e.into() })
     }
 }
 

@@ -9,6 +9,7 @@ use super::*;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::dataset::images::{Image8, SharedImage};
 use crate::gaussians::{Gaussians, logit, rgb_to_dc};
+use crate::views::ViewError;
 
 const WORLD: Normalisation = Normalisation { centre: DVec3::new(40.0, -7.0, 2.0), scale: 0.375 };
 const DISTANCE: f64 = 3.0;
@@ -23,15 +24,9 @@ struct Pair {
 
 impl Pair {
     fn new() -> Self {
-        let camera = |x: f64| Camera {
-            width: 64,
-            height: 64,
-            fx: 64.0,
-            fy: 64.0,
-            cx: 32.0,
-            cy: 32.0,
-            rotation: DMat3::IDENTITY,
-            translation: DVec3::new(-x, 0.0, DISTANCE),
+        let camera = |x: f64| {
+            let centre = DVec3::new(x, 0.0, -DISTANCE);
+            Camera::centred((64, 64), (64.0, 64.0), DMat3::IDENTITY, centre)
         };
         let rgb = vec![128; 3 * 64 * 64];
         let image = Image8 { width: 64, height: 64, rgb, alpha: None, mask: None };

@@ -2,6 +2,7 @@
 
 use super::{DECODERS, Inputs, TEST_DECODERS};
 use crate::backend::BackendKind;
+use crate::dataset::Resolution;
 use crate::failure::{DEVICE, Failure};
 use crate::memory::{
     Bytes, Fit, Grant, Ledger, PAIRS, Setting, SizeRequest, fit, grant, min_memory, resident,
@@ -23,7 +24,8 @@ const THREADS: usize = 64;
 /// What "give --memory" is rounded up to.
 const MIB: u64 = 1 << 20;
 /// Divisors of the images' sides that are alternatives.
-pub(super) const RESOLUTIONS: [u32; 3] = [1, 2, 4];
+pub(super) const RESOLUTIONS: [Resolution; 3] =
+    [Resolution::Divisor(1), Resolution::Divisor(2), Resolution::Divisor(4)];
 
 /// The size of a run.
 pub(in crate::run) struct Size {
@@ -257,10 +259,10 @@ fn too_little(inputs: &Inputs<'_>, request: &SizeRequest) -> Result<Failure, Fai
         let names: Vec<&str> = fixed.iter().filter(|(is, _)| *is).map(|(_, name)| *name).collect();
         message += &format!(", or {}MiB without {}", free_least / MIB, names.join(" and "));
     }
-    let smaller = RESOLUTIONS.iter().filter_map(|&divisor| {
-        let smaller = inputs.at_resolution(divisor)?;
+    let smaller = RESOLUTIONS.iter().filter_map(|&resolution| {
+        let smaller = inputs.at_resolution(resolution)?;
         let request = super::size::request(&smaller, request.memory).ok()?;
-        Some((divisor, least_of(&smaller, &request).ok()??))
+        Some((resolution.number(), least_of(&smaller, &request).ok()??))
     });
     let smaller: Vec<(u32, u64)> = smaller.filter(|&(_, bytes)| bytes < least).collect();
     let fits = smaller.iter().find(|(_, bytes)| *bytes <= request.memory);

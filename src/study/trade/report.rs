@@ -89,7 +89,7 @@ impl Report {
             budget: study.budget,
             seeds: study.seeds,
             scenes,
-            train: study.train_words.clone(),
+            train: study.train.join(" "),
             outcomes,
             images,
             effects: Vec::new(),
@@ -283,10 +283,9 @@ pub(super) fn sample() -> Report {
         seeds: 3,
         iterations: 100,
         budget: 1000,
-        factorial: true,
+        no_factorial: false,
         output: "x".into(),
-        train: crate::run::Partial::default(),
-        train_words: "--policy=diet".into(),
+        train: vec!["--policy=diet".into()],
     };
     let factor = |name: &str, levels: &[&str]| Factor {
         name: name.to_owned(),

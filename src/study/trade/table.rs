@@ -39,7 +39,7 @@ pub(super) fn markdown(report: &Report) -> String {
 
 /// What the differences are from.
 fn exact(report: &Report) -> String {
-    let mut table = MarkdownTable::new(&["scene", "PSNR [dB]", "time [s]", "peak [MiB]"]);
+    let mut table = MarkdownTable::new("scene | PSNR [dB] | time [s] | peak [MiB]");
     for scene in &report.scenes {
         let psnr = number_or_dash(report.mean(scene, "", "", PSNR), 2);
         let seconds = number_or_dash(report.mean(scene, "", "", SECONDS).map(f64::exp), 1);
@@ -50,14 +50,9 @@ fn exact(report: &Report) -> String {
 }
 
 fn numerical(report: &Report) -> String {
-    let mut table = MarkdownTable::new(&[
-        "knob",
-        "level",
-        "scene",
-        "standard rules [dB]",
-        "everything blended [dB]",
-        "largest error",
-    ]);
+    let mut table = MarkdownTable::new(
+        "knob | level | scene | standard rules [dB] | everything blended [dB] | largest error",
+    );
     for image in &report.images {
         table.row(&[
             knob_or_exact(&image.knob).to_owned(),
@@ -80,22 +75,10 @@ fn knob_or_exact(knob: &str) -> &str {
 }
 
 fn outcomes(report: &Report) -> String {
-    let mut table = MarkdownTable::new(&[
-        "knob",
-        "level",
-        "class",
-        "ΔPSNR [dB]",
-        "ΔSSIM",
-        "ΔFLIP",
-        "depth error ×",
-        "Chamfer ×",
-        "time ×",
-        "processor time ×",
-        "peak ×",
-        "images [dB]",
-        "same bits",
-        "verdict",
-    ]);
+    let mut table = MarkdownTable::new(
+        "knob | level | class | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | \
+         processor time × | peak × | images [dB] | same bits | verdict",
+    );
     for effect in &report.effects {
         let mut cells = row(effect);
         if effect.dominated.is_some() {
@@ -153,15 +136,9 @@ fn together(report: &Report) -> String {
     if report.together.is_empty() {
         return String::new();
     }
-    let mut table = MarkdownTable::new(&[
-        "knob",
-        "level",
-        "ΔPSNR alone [dB]",
-        "among others [dB]",
-        "time × alone",
-        "among others",
-        "interacts",
-    ]);
+    let mut table = MarkdownTable::new(
+        "knob | level | ΔPSNR alone [dB] | among others [dB] | time × alone | among others | interacts",
+    );
     for one in &report.together {
         let [psnr, seconds] = one.alone;
         let differs =
@@ -205,7 +182,7 @@ fn stages(report: &Report) -> String {
     let base = mean("", "");
     let names: Vec<&String> = base.keys().collect();
     let titles = ["knob", "level"].into_iter().chain(names.iter().map(|name| &***name));
-    let mut table = MarkdownTable::new(&titles.collect::<Vec<_>>());
+    let mut table = MarkdownTable::new(&titles.collect::<Vec<_>>().join(" | "));
     let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
     for (knob, level) in std::iter::once(("", "")).chain(levels) {
         let seconds = mean(knob, level);
