@@ -49,21 +49,14 @@ fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
-/// Scores of a set of views.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Scores {
-    /// One entry per view, in the order of the views.
-    pub views: Vec<ViewScore>,
-}
-
-impl Scores {
+impl Mean {
     /// Mean over the views; NaN without views.
     #[must_use]
-    pub fn mean(&self) -> Mean {
+    pub fn of(views: &[ViewScore]) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
-            self.views.iter().map(score).sum::<f64>() / self.views.len() as f64
+            views.iter().map(score).sum::<f64>() / views.len() as f64
         };
-        Mean {
+        Self {
             psnr: mean(|view| view.psnr),
             ssim: mean(|view| view.ssim),
             flip: mean(|view| view.flip),
@@ -103,18 +96,15 @@ pub enum EvaluateError {
 
 /// Renders every view and compares it with its image. `after_view` is called after each view and may
 /// stop the evaluation.
-///
-/// # Errors
-/// [`EvaluateError`] at the first view that cannot be scored; [`EvaluateError::Stopped`].
 pub fn evaluate(
     backend: &mut dyn Backend,
     views: &impl ViewSource,
     background: [f32; 3],
     sh_degree: u8,
     mut after_view: impl FnMut(&ViewScore) -> ControlFlow<()>,
-) -> Result<Scores, EvaluateError> {
+) -> Result<Vec<ViewScore>, EvaluateError> {
     let count = views.count();
-    let mut scores = Scores::default();
+    let mut scores = Vec::new();
     for view in 0..count {
         let ahead: Vec<usize> = (view + 1..count.min(view + 3)).collect();
         views.prefetch(&ahead);
@@ -132,7 +122,7 @@ pub fn evaluate(
             flip: flip(&rendering.rgb, &image, background).map_err(metric)?,
         };
         let flow = after_view(&score);
-        scores.views.push(score);
+        scores.push(score);
         if flow.is_break() {
             return Err(EvaluateError::Stopped);
         }

@@ -40,6 +40,7 @@ pub mod memory;
 pub mod metrics;
 mod number;
 pub mod output;
+mod pictures;
 pub mod run;
 pub mod schedule;
 pub mod sh;

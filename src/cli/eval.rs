@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use crate::evaluate::{Split, evaluate};
+use crate::evaluate::{Mean, Split, evaluate};
 use crate::failure::Failure;
 use crate::metrics::geometry::{self, Geometry, Ground};
 use crate::number::grouped;
@@ -65,7 +65,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
         line(&view.name, view.psnr, view.ssim, view.flip);
         ControlFlow::Continue(())
     })?;
-    let mean = scores.mean();
+    let mean = Mean::of(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip);
     write_scores(run, args.split, iteration, &scores)?;
     if let Some(truth) = opened.dataset.ground_truth()? {

@@ -39,9 +39,6 @@ pub(super) fn load(
 }
 
 /// The geometry of a built-in scene, as [`load`] renders it.
-///
-/// # Errors
-/// When there is no such scene.
 pub(super) fn ground_truth(name: &str) -> Result<GroundTruth, DatasetError> {
     let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
     Ok(GroundTruth::of_scene(scene))
@@ -174,33 +171,5 @@ mod tests {
                 assert!((z / depth - 1.0).abs() < 1e-9, "{z} for {depth}");
             }
         }
-    }
-
-    #[test]
-    fn a_built_in_scene_needs_no_file() {
-        let path = Path::new("scene:spheres");
-        let options =
-            LoadOptions { resolution: Some("4".parse().unwrap()), ..LoadOptions::default() };
-        let dataset = Dataset::load(path, &options).unwrap();
-        assert_eq!((dataset.train.len(), dataset.test.len()), (30, 10));
-        assert!(dataset.points.len() > 3000, "{} points", dataset.points.len());
-        let view = &dataset.train[0];
-        let image = view.source.load().unwrap();
-        assert_eq!((image.width, image.height), (32, 32));
-        assert_eq!((view.camera.width, view.camera.height), (32, 32));
-        // Points lie where cameras look: most project into every view.
-        let inside = |p: &&DVec3| {
-            let (pixel, depth) = view.camera.project(**p);
-            depth > 0.0 && (0.0..32.0).contains(&pixel.x) && (0.0..32.0).contains(&pixel.y)
-        };
-        let seen = dataset.points.positions.iter().filter(inside).count();
-        assert!(seen * 4 > dataset.points.len() * 3, "{seen} of {}", dataset.points.len());
-    }
-
-    #[test]
-    fn unknown_scenes_are_refused_by_name() {
-        let error = Dataset::load(Path::new("scene:nonsense"), &LoadOptions::default());
-        let message = error.unwrap_err().to_string();
-        assert!(message.contains("nonsense") && message.contains("spheres"), "{message}");
     }
 }

@@ -61,6 +61,15 @@ pub struct ImageHeader {
 }
 
 impl ImageSource {
+    /// An image file as it is.
+    #[cfg(test)]
+    pub(super) fn whole(path: PathBuf) -> Self {
+        let header = probe(&path).expect("an image");
+        let (width, height) = (header.width, header.height);
+        let (mask, undistortion, rendered) = (None, None, None);
+        Self { path, mask, width, height, undistortion, header, rendered }
+    }
+
     /// Most bytes of the loaded image.
     #[must_use]
     pub fn loaded_bytes(&self) -> u64 {
@@ -215,19 +224,6 @@ mod tests {
 
     use super::*;
 
-    fn source(path: PathBuf) -> ImageSource {
-        let header = probe(&path).unwrap();
-        ImageSource {
-            path,
-            mask: None,
-            width: header.width,
-            height: header.height,
-            undistortion: None,
-            header,
-            rendered: None,
-        }
-    }
-
     #[test]
     fn every_colour_type_packs_to_eight_bits() {
         let folder = tempfile::tempdir().unwrap();
@@ -243,7 +239,7 @@ mod tests {
         for (name, image, rgb, alpha) in cases {
             let path = folder.path().join(name);
             image.save(&path).unwrap();
-            let loaded = source(path).load().unwrap();
+            let loaded = ImageSource::whole(path).load().unwrap();
             assert_eq!((loaded.width, loaded.height), (3, 2), "{name}");
             assert_eq!(loaded.rgb, rgb.repeat(6), "{name}");
             assert_eq!(loaded.alpha, alpha.map(|a| vec![a; 6]), "{name}");
@@ -259,7 +255,8 @@ mod tests {
         image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
             .save(&mask)
             .unwrap();
-        let source = ImageSource { mask: Some(mask), width: 2, height: 2, ..source(path) };
+        let source =
+            ImageSource { mask: Some(mask), width: 2, height: 2, ..ImageSource::whole(path) };
         let loaded = source.load().unwrap();
         assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
         assert_eq!(loaded.rgb, [10, 20, 30].repeat(4));
@@ -277,7 +274,7 @@ mod tests {
         let bytes = std::fs::read(&good).unwrap();
         let cut = folder.path().join("cut.png");
         std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
-        let message = source(cut).load().unwrap_err().to_string();
+        let message = ImageSource::whole(cut).load().unwrap_err().to_string();
         assert!(message.contains("cut.png"), "{message}");
         // A header that promises 100,000 x 100,000 px.
         let mut huge = bytes.clone();

@@ -164,7 +164,7 @@ fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError>
     } else if let Some(folder) = model {
         colmap::read(root, &folder, &Folders::new(root, options, true)?, options.tracks)
     } else if here(transforms::SINGLE) {
-        transforms::read_single(root, &Folders::new(root, options, false)?)
+        transforms::read(root, &Folders::new(root, options, false)?, transforms::SINGLE, false)
     } else {
         Err(DatasetError(format!(
             "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \

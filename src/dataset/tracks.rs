@@ -28,20 +28,12 @@ pub struct Tracks {
 
 impl Tracks {
     /// Number of tracks.
-    #[must_use]
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.positions.len()
     }
 
-    /// Whether there is no track.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.positions.is_empty()
-    }
-
     /// Their size `[bytes]`.
-    #[must_use]
-    pub fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
         let views: usize = self.views.iter().map(Vec::len).sum();
         (self.len() * track + views * size_of::<u32>()) as u64

@@ -46,13 +46,14 @@ pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, Dataset
     Ok(scene)
 }
 
-/// Reads `transforms.json`. Its own test split, if any, is under `test_filenames`, or under
-/// `val_filenames` if there is no other, as in nerfstudio.
-pub(super) fn read_single(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
-    read(root, folders, SINGLE, false)
-}
-
-fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
+/// Reads the file `name`. Its own test split, if any, is under `test_filenames`, or under `val_filenames`
+/// if there is no other, as in nerfstudio.
+pub(super) fn read(
+    root: &Root,
+    folders: &Folders,
+    name: &str,
+    held_out: bool,
+) -> Result<Scene, DatasetError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
     let Value::Object(top) = parse(&path)? else {

@@ -1,5 +1,7 @@
 //! Scales, colours and numbers of the first rows; where random points lie.
 
+use rand_chacha::rand_core::Rng;
+
 use super::*;
 use crate::camera::Camera;
 use crate::sh::C0;

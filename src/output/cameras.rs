@@ -20,9 +20,6 @@ struct CameraRecord<'a> {
 }
 
 /// Cameras in world coordinates with the names of their images, numbered in order, as JSON.
-///
-/// # Errors
-/// Those of [`serde_json`].
 pub fn cameras_json<'a>(
     cameras: impl IntoIterator<Item = (&'a str, Camera)>,
 ) -> serde_json::Result<String> {

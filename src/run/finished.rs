@@ -134,9 +134,6 @@ pub(crate) fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussia
 
 impl Opened {
     /// The views of a split.
-    ///
-    /// # Errors
-    /// When there is none.
     pub(crate) fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
         let views: &[View] = match split {
             Split::Train => &self.dataset.train,

@@ -16,7 +16,7 @@ mod spec;
 mod summary;
 mod values;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 pub use config::{DegreeSource, Resolved, RunConfig};
 pub use observer::{Interrupt, Observer, Silent};
@@ -72,28 +72,10 @@ impl Run {
         build::build(spec, resumed, observer)
     }
 
-    /// The run, with everything decided.
-    #[must_use]
-    pub fn config(&self) -> &RunConfig {
-        &self.config
-    }
-
     /// Bytes per buffer, as promised.
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
-    }
-
-    /// The folder that [`train`](Self::train) writes to.
-    #[must_use]
-    pub fn output(&self) -> &Path {
-        &self.output
-    }
-
-    /// The dataset, without its points.
-    #[must_use]
-    pub fn dataset(&self) -> &Dataset {
-        &self.dataset
     }
 
     /// The trainer.

@@ -47,9 +47,6 @@ impl Partial {
 
     /// Reads a TOML file that holds any of the options. The `config.toml` of a run is one; what was found
     /// out about that run is passed over.
-    ///
-    /// # Errors
-    /// When it cannot be read; those of [`new`](Self::new).
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let (mut table, origin) = read_table("--config", path)?;
         table.retain(|key, _| !FOUND_OUT.contains(&key));
@@ -57,18 +54,12 @@ impl Partial {
     }
 
     /// Reads a TOML file with a table of parameters for each policy.
-    ///
-    /// # Errors
-    /// When it cannot be read; those of [`new`](Self::new).
     pub fn read_policies(path: &Path) -> Result<Self, Failure> {
         let (table, origin) = read_table("--policy-config", path)?;
         Self::new([("policy_set".to_owned(), table.into())].into_iter().collect(), &origin)
     }
 
     /// Those options of a description that `is_given` names.
-    ///
-    /// # Errors
-    /// When an option that may be repeated contradicts itself.
     pub fn given(spec: &RunSpec, is_given: impl Fn(&str) -> bool) -> Result<Self, Failure> {
         let all = spec.table()?;
         check_names(spec)?;
@@ -76,9 +67,6 @@ impl Partial {
     }
 
     /// Everything that a description says.
-    ///
-    /// # Errors
-    /// As [`given`](Self::given).
     pub fn all(spec: &RunSpec) -> Result<Self, Failure> {
         Self::given(spec, |_| true)
     }
@@ -90,9 +78,6 @@ impl Partial {
     }
 
     /// The levels of a preset.
-    ///
-    /// # Errors
-    /// When there is no such preset.
     pub fn preset(name: &str) -> Result<Self, Failure> {
         let preset =
             knobs::preset(name).map_err(|error| Failure::input(format!("--preset: {error}")))?;
@@ -149,9 +134,6 @@ impl Partial {
 
     /// The run that these options describe, over their preset (`balanced` where they name none) and the
     /// defaults.
-    ///
-    /// # Errors
-    /// When there is no such preset.
     pub fn describe(self) -> Result<RunSpec, Failure> {
         let name = self.get("preset").and_then(Value::as_str).unwrap_or(DEFAULT_PRESET);
         let preset = Self::preset(name)?;
@@ -159,9 +141,6 @@ impl Partial {
     }
 
     /// The run that these options describe, over the defaults.
-    ///
-    /// # Errors
-    /// None: values are sound.
     pub(super) fn spec(self) -> Result<RunSpec, Failure> {
         RunSpec::deserialize(self.0).map_err(Failure::input)
     }

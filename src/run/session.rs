@@ -313,7 +313,7 @@ impl<'a> Session<'a> {
             }
             (scores, _) => scores?,
         };
-        let mean = scores.mean();
+        let mean = Mean::of(&scores);
         write_scores(&self.folder, Split::Test, step, &scores)?;
         let Mean { psnr, ssim, flip } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];

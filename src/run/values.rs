@@ -12,6 +12,7 @@ use toml::{Table, Value};
 use crate::dataset::Resolution;
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::number;
+use crate::schedule::Background;
 
 /// A number of rows: `200000`, `28k`, `1.5M`; in a file also a plain number. At least 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -203,6 +204,7 @@ macro_rules! number_or_text {
 }
 
 number_or_text! {
+    [] Background;
     [] Rows;
     [] ByteCount;
     [] Fraction;

@@ -13,7 +13,7 @@ use crate::output::{geometry_of, model_path, scores_of};
 use crate::run::Partial;
 
 /// A run of a study.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Cell {
     pub(super) scene: PathBuf,
     /// The scene's short name.
@@ -41,25 +41,33 @@ impl fmt::Display for Cell {
     }
 }
 
-/// What every run of a study sets, over the options that all of its runs share.
-pub(super) fn run_options(
-    shared: &Partial,
-    scene: &Path,
-    budget: usize,
-    seed: u32,
-    iterations: u32,
-) -> Partial {
-    let own = [
-        ("scene", Value::from(scene.to_string_lossy().into_owned())),
-        ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
-        ("seed", Value::from(seed)),
-        ("iterations", Value::from(iterations)),
-    ];
-    let lay = |spec: Partial, (name, value)| Partial::option(name, value).over(spec);
-    own.into_iter().fold(shared.clone(), lay)
-}
-
 impl Cell {
+    /// A run of a study with nothing varied: the options that all runs share, under those that each sets.
+    pub(super) fn new(
+        shared: &Partial,
+        (scene, label): (&Path, &str),
+        budget: usize,
+        seed: u32,
+        iterations: u32,
+    ) -> Self {
+        let own = [
+            ("scene", Value::from(scene.to_string_lossy().into_owned())),
+            ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
+            ("seed", Value::from(seed)),
+            ("iterations", Value::from(iterations)),
+        ];
+        let lay = |spec: Partial, (name, value)| Partial::option(name, value).over(spec);
+        Self {
+            scene: scene.to_owned(),
+            label: label.to_owned(),
+            budget,
+            seed,
+            iterations,
+            spec: own.into_iter().fold(shared.clone(), lay),
+            ..Self::default()
+        }
+    }
+
     /// Name of the run's folder.
     fn run(&self) -> String {
         format!("{}-{}-seed{}", self.label, self.folder, self.seed)
@@ -71,9 +79,6 @@ impl Cell {
     }
 
     /// Trains, measures what was trained, and returns the record.
-    ///
-    /// # Errors
-    /// With the trainer's message and exit code when it fails.
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
         let folder = self.path(output);
         let child = Child { spec: &self.spec, folder: &folder };

@@ -21,9 +21,6 @@ pub(super) struct Child<'a> {
 
 impl Child<'_> {
     /// Trains.
-    ///
-    /// # Errors
-    /// With the trainer's message and exit code when it fails.
     pub(super) fn train(&self) -> Result<(), Failure> {
         // Appended, as a name may hold a dot.
         let mut file = self.folder.as_os_str().to_owned();
@@ -36,9 +33,6 @@ impl Child<'_> {
     }
 
     /// Measures what was trained, with `densify eval`, on the device that trained it.
-    ///
-    /// # Errors
-    /// With its message and exit code when it fails.
     pub(super) fn measure(&self) -> Result<(), Failure> {
         let RunSpec { start, device, .. } = self.spec.clone().describe()?;
         let mut command = Command::new(program()?);
@@ -58,9 +52,6 @@ impl Child<'_> {
 /// The description that all runs of a study share: the options that the user gave, but views are held
 /// out, and no checkpoints are written, as a run that is interrupted runs again so that its times are
 /// whole.
-///
-/// # Errors
-/// When an option is the study's own.
 pub(super) fn shared_options(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
     if let Some((name, _)) = given.iter().find(|(name, _)| own.contains(name)) {
         return Err(Failure::input(format!(

@@ -127,16 +127,3 @@ fn unless_taken(taken: &[String], name: String) -> Result<String, Failure> {
     }
     Ok(name)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn built_in_scenes_go_by_their_names() {
-        let paths = ["scene:table", "scene:thin"].map(PathBuf::from);
-        assert_eq!(labels(&paths).ok(), Some(vec!["table".to_owned(), "thin".to_owned()]));
-        let twice = ["scene:table", "scene:table"].map(PathBuf::from);
-        assert!(labels(&twice).is_err_and(|failure| failure.message.contains("table")));
-    }
-}

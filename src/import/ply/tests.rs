@@ -226,11 +226,3 @@ fn shared_splats_of_other_programs_load_or_are_refused_by_name() {
         }
     }
 }
-
-#[test]
-#[ignore = "needs files of other programs: set DENSIFY_SHARED"]
-fn malformed_shared_files_do_not_panic() {
-    for path in shared("meshes/malformed") {
-        let _ = (read_points(&path), read_splats(&path));
-    }
-}

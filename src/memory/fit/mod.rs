@@ -79,9 +79,6 @@ impl SizeRequest {
 ///
 /// The degree is the highest at which enough rows fit, or else the lowest. Rows are as many as fit; if
 /// all wanted rows fit, the remaining memory goes to the tile lists and then to the images.
-///
-/// # Errors
-/// Those of `bytes`.
 pub fn fit<E>(
     request: &SizeRequest,
     mut bytes: impl FnMut(&Setting) -> Result<u64, E>,
@@ -124,9 +121,6 @@ pub fn fit<E>(
 }
 
 /// The smallest memory in which a model fits, in multiples of `step` bytes, if there is any.
-///
-/// # Errors
-/// Those of `bytes`.
 pub fn min_memory<E>(
     request: &SizeRequest,
     step: u64,

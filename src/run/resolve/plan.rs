@@ -6,15 +6,13 @@ use super::size::{self, RESOLUTIONS, Size};
 use super::{Inputs, RunSpec};
 use crate::dataset::Resolution;
 use crate::failure::Failure;
-use crate::memory::{Bytes, Ledger, Setting};
+use crate::memory::{Bytes, Ledger};
 use crate::number::grouped;
 use crate::run::observer::Observer;
 
 /// How large a run would be, and what it would take.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// Rows, degree, tile lists and image cache.
-    pub setting: Setting,
     /// Bytes per buffer.
     pub ledger: Ledger,
     /// Why the size is what it is, a line each.
@@ -35,9 +33,6 @@ pub struct Alternatives {
 }
 
 /// Finds out what a run would take. Trains nothing and writes nothing.
-///
-/// # Errors
-/// All that preparing the run would fail for.
 pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     let inputs = Inputs::load(spec, None, observer)?;
     let size = Size::choose(&inputs)?;
@@ -47,7 +42,7 @@ pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     size::check(&inputs, &ledger)?;
     let memory = spec.size.memory.map_or_else(|| inputs.device.limited_bytes(&ledger), |it| it.0);
     let alternatives = alternatives(inputs, memory)?;
-    Ok(Plan { setting: size.setting, ledger, lines, alternatives })
+    Ok(Plan { ledger, lines, alternatives })
 }
 
 fn alternatives(inputs: Inputs<'_>, memory: u64) -> Result<Alternatives, Failure> {

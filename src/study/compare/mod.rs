@@ -12,7 +12,7 @@ use std::path::PathBuf;
 use clap::Args;
 use toml::Value;
 
-use super::cell::{Cell, run_options};
+use super::cell::Cell;
 use super::child::shared_options;
 use super::difference::Difference;
 use super::record::Outcome;
@@ -97,9 +97,6 @@ impl fmt::Display for SceneBudget {
 
 impl SceneBudget {
     /// Reads `ROWS`, or `SCENE=ROWS` with the label of a scene.
-    ///
-    /// # Errors
-    /// When there is no such number of rows.
     pub(crate) fn parse(text: &str) -> Result<Self, String> {
         let (scene, rows) = match text.rsplit_once('=') {
             Some((scene, rows)) => (Some(scene.to_owned()), rows),
@@ -111,9 +108,6 @@ impl SceneBudget {
 
 impl Comparison {
     /// Makes the runs that are not done yet, all with the options `train`, and writes tables and pictures.
-    ///
-    /// # Errors
-    /// When the comparison makes no sense, a run fails, or the folder cannot be written.
     pub(crate) fn run(&self, train: Partial, observer: &dyn Observer) -> Result<Finished, Failure> {
         let cells = self.cells(train)?;
         let mut study = Study::open(&self.output, "compare", observer)?;
@@ -151,20 +145,15 @@ impl Comparison {
         for seed in 0..self.seeds {
             for ((scene, label), budgets) in self.scenes.iter().zip(&labels).zip(&budgets) {
                 for &budget in budgets {
-                    let options = run_options(&shared, scene, budget, seed, self.iterations);
+                    let base = Cell::new(&shared, (scene, label), budget, seed, self.iterations);
                     cells.extend(self.policies.iter().zip(&contenders).map(
                         |(policy, contender)| Cell {
-                            scene: scene.clone(),
-                            label: label.clone(),
                             factor: policy.clone(),
                             level: budget.to_string(),
-                            budget,
-                            seed,
-                            iterations: self.iterations,
                             title: format!("{policy}, {} rows", grouped(budget)),
                             folder: format!("{}-{budget}", contender.folder()),
-                            spec: contender.options().over(options.clone()),
-                            scores_without_shortcuts: false,
+                            spec: contender.options().over(base.spec.clone()),
+                            ..base.clone()
                         },
                     ));
                 }

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::cell::{Cell, run_options};
+use super::cell::Cell;
 use super::child::shared_options;
 use super::record::{ImageError, Outcome, Record};
 use super::{Finished, Study, labels};
@@ -82,9 +82,6 @@ pub(crate) struct Trade {
 
 impl Trade {
     /// Makes what is not done yet, all runs with the options `train`, and writes tables and plots.
-    ///
-    /// # Errors
-    /// When the study makes no sense, a run fails, or the folder cannot be written.
     pub(crate) fn run(&self, train: Partial, observer: &dyn Observer) -> Result<Finished, Failure> {
         let shared = shared_options(train, &OWN_OPTIONS)?;
         let factors = factors(self, &shared, observer)?;
@@ -115,19 +112,14 @@ impl Trade {
         let mut cells = Vec::new();
         for seed in 0..self.seeds {
             for (scene, label) in self.scenes.iter().zip(&labels) {
-                let options = run_options(shared, scene, self.budget, seed, self.iterations);
+                let base = Cell::new(shared, (scene, label), self.budget, seed, self.iterations);
                 let base = Cell {
-                    scene: scene.clone(),
-                    label: label.clone(),
                     factor: BASE.to_owned(),
-                    level: String::new(),
-                    budget: self.budget,
-                    seed,
-                    iterations: self.iterations,
                     title: "exact".to_owned(),
                     folder: "exact".to_owned(),
-                    spec: Partial::option("preset", EXACT).over(options),
+                    spec: Partial::option("preset", EXACT).over(base.spec.clone()),
                     scores_without_shortcuts: true,
+                    ..base
                 };
                 cells.push(base.clone());
                 for factor in factors {

@@ -11,12 +11,9 @@ use crate::study::distinct;
 
 /// A study's results.
 pub(super) struct Report {
-    pub(super) iterations: u32,
-    pub(super) budget: usize,
-    pub(super) seeds: u32,
+    pub(super) study: Trade,
+    /// Labels of the scenes.
     pub(super) scenes: Vec<String>,
-    /// More options of every run.
-    pub(super) train: String,
     pub(super) outcomes: Vec<Outcome>,
     pub(super) images: Vec<ImageError>,
     pub(super) effects: Vec<Effect>,
@@ -85,11 +82,8 @@ impl Report {
     ) -> Self {
         let scenes = distinct(outcomes.iter().map(|outcome| outcome.scene.clone()));
         let mut report = Self {
-            iterations: study.iterations,
-            budget: study.budget,
-            seeds: study.seeds,
+            study: study.clone(),
             scenes,
-            train: study.train.join(" "),
             outcomes,
             images,
             effects: Vec::new(),

@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use super::Trade;
 use super::report::{Effect, PSNR, Report, SECONDS};
 use crate::knobs::Class;
 use crate::number::grouped;
@@ -14,9 +15,11 @@ use crate::study::markdown::{MarkdownTable, number_or_dash};
 /// The whole study.
 pub(super) fn markdown(report: &Report) -> String {
     let mut text = String::from("# What each knob costs and buys\n\n");
-    let Report { iterations, budget, seeds, scenes, train, .. } = report;
-    let options =
-        if train.is_empty() { String::new() } else { format!(" Options of every run: `{train}`.") };
+    let Trade { iterations, budget, seeds, train, .. } = &report.study;
+    let options = match train.join(" ") {
+        words if words.is_empty() => String::new(),
+        words => format!(" Options of every run: `{words}`."),
+    };
     let _ = writeln!(
         text,
         "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
@@ -24,7 +27,7 @@ pub(super) fn markdown(report: &Report) -> String {
          intervals of their mean; ratios are geometric means. Scores are of views held out, rendered \
          without any shortcut.",
         env!("CARGO_PKG_VERSION"),
-        scenes.join(", "),
+        report.scenes.join(", "),
         grouped(*iterations as usize),
         grouped(*budget),
         if *seeds == 1 { "seed" } else { "seeds" },

@@ -7,7 +7,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 
 use densify::dataset::{Dataset, LoadOptions, Split, builtin};
-use densify::evaluate::evaluate;
+use densify::evaluate::{Mean, evaluate};
 use densify::gaussians::Gaussians;
 use densify::init::{initialise, restart};
 use densify::metrics::geometry::{self, Geometry, Ground};
@@ -129,9 +129,8 @@ impl Known {
             background: [0.0; 3],
             sh_degree: 0,
         };
-        let scores = evaluate(last.as_mut(), &test, [0.0; 3], 0, |_| ControlFlow::Continue(()))
-            .expect("scores")
-            .mean();
+        let scores = evaluate(last.as_mut(), &test, [0.0; 3], 0, |_| ControlFlow::Continue(()));
+        let scores = Mean::of(&scores.expect("scores"));
         let outcome = Outcome {
             geometry: geometry::measure(last.as_mut(), &ground, &train, &test).expect("measured"),
             psnr: scores.psnr,
