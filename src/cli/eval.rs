@@ -9,7 +9,7 @@ use clap::Args;
 use super::console::Console;
 use crate::evaluate::{Mean, Split, evaluate};
 use crate::failure::Failure;
-use crate::metrics::geometry::{self, Geometry, Ground};
+use crate::metrics::geometry::{self, Geometry, KnownScene};
 use crate::number::grouped;
 use crate::output::{write_geometry, write_scores};
 use crate::run::finished::{Machine, iteration, open_run};
@@ -70,7 +70,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     write_scores(run, args.split, iteration, &scores)?;
     if let Some(truth) = opened.dataset.ground_truth()? {
         let train = opened.views(Split::Train)?;
-        let ground = Ground {
+        let ground = KnownScene {
             truth: &truth,
             normalisation: &opened.dataset.normalisation,
             background,

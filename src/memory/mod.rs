@@ -11,8 +11,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use fit::IMAGES;
-pub use fit::{Fit, PAIRS, Setting, SizeRequest, fit, min_memory};
-pub use grant::{Grant, grant};
+pub use fit::{Fit, PAIRS, RunSize, SizeRequest, fit, min_memory};
+pub use grant::{MemoryLimit, grant};
 
 /// All buffers of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -31,7 +31,7 @@ pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth
 use distinct_views::distinct_views;
 pub use error::TrainError;
 use nonfinite::AUDIT_EVERY;
-pub use options::{OnNan, Required, Savings, TrainOptions};
+pub use options::{AutoChoices, OnNan, Savings, TrainOptions};
 use policy_calls::call_policy;
 pub use report::{EditEvent, StepReport};
 pub use state::TrainerState;
@@ -111,7 +111,7 @@ impl<V: ViewSource> Trainer<V> {
     /// Lets the run make automatic choices; to be called before the first step. To choose the number of
     /// rows, the backend must have been made with [`growth_signals`] too.
     #[must_use]
-    pub fn requiring(mut self, choices: Required) -> Self {
+    pub fn requiring(mut self, choices: AutoChoices) -> Self {
         if choices.rows {
             self.probes = probe::probes(self.views.count(), self.options.seed);
         }

@@ -9,7 +9,7 @@ use crate::gaussians::Gaussians;
 use crate::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// The measurements and the limit of rows, if they are [chosen automatically](super::Required::rows).
+    /// The measurements and the limit of rows, if they are [chosen automatically](super::AutoChoices::rows).
     #[must_use]
     pub fn growth(&self) -> Option<&AutoBudget> {
         self.auto_budget.as_ref()

@@ -11,7 +11,7 @@ use densify::camera::Camera;
 use densify::dataset::images::{Image8, SharedImage};
 use densify::gaussians::Gaussians;
 use densify::schedule::{Background, RateOptions};
-use densify::trainer::{OnNan, Required, Savings, TrainOptions, Trainer, growth_signals};
+use densify::trainer::{AutoChoices, OnNan, Savings, TrainOptions, Trainer, growth_signals};
 use densify::verify::scenes;
 use densify::views::{ViewError, ViewSource};
 use densify_policies::plan::EditPlan;
@@ -116,7 +116,7 @@ fn bits(backend: Box<dyn Backend>, views: &Views, measures: bool) -> (Gaussians,
     };
     let trainer = Trainer::new(views.clone(), backend, ("idle", Box::new(Idle)), scene, options);
     let mut trainer = trainer.expect("they agree");
-    trainer = trainer.requiring(Required { rows: measures, ..Required::default() });
+    trainer = trainer.requiring(AutoChoices { rows: measures, ..AutoChoices::default() });
     for _ in 0..MEASURED_AT {
         trainer.step().expect("a small image is rendered");
     }

@@ -18,8 +18,8 @@ struct Model {
 }
 
 impl Model {
-    fn bytes(&self, setting: &Setting) -> u64 {
-        let Setting { rows, sh_degree, tile_cap, image_cache } = *setting;
+    fn bytes(&self, setting: &RunSize) -> u64 {
+        let RunSize { rows, sh_degree, tile_cap, image_cache } = *setting;
         let coefficients = (u64::from(sh_degree) + 1).pow(2);
         let rows = rows.next_multiple_of(16) as u64;
         let held = image_cache.max(2 * self.largest_image) + self.largest_image;
@@ -30,7 +30,7 @@ impl Model {
     }
 
     fn fit(&self, request: &SizeRequest) -> Option<Fit> {
-        let bytes = |setting: &Setting| Ok::<_, Infallible>(self.bytes(setting));
+        let bytes = |setting: &RunSize| Ok::<_, Infallible>(self.bytes(setting));
         fit(request, bytes).unwrap_or_else(|never| match never {})
     }
 }
@@ -100,7 +100,7 @@ fn check_fit(model: &Model, request: &SizeRequest) -> Result<(), TestCaseError> 
     } else {
         let more = request.setting(setting.rows, setting.sh_degree, pairs[2]);
         prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
-        let images = Setting { image_cache: model.all_images, ..setting };
+        let images = RunSize { image_cache: model.all_images, ..setting };
         prop_assert!(
             image_cache.is_some()
                 || setting.image_cache == model.all_images
@@ -141,7 +141,7 @@ proptest! {
     #[test]
     fn the_least_memory_is_the_least(model in models(), step in 1..2_000_000_u64) {
         let request = request(&model, 0);
-        let bytes = |setting: &Setting| Ok::<_, Infallible>(model.bytes(setting));
+        let bytes = |setting: &RunSize| Ok::<_, Infallible>(model.bytes(setting));
         let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
         let least = least.expect("a number");
         prop_assert!(least.is_multiple_of(step));

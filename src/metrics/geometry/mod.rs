@@ -126,7 +126,7 @@ pub struct Redundancy {
 
 /// The scene that a model is measured in.
 #[derive(Debug, Clone, Copy)]
-pub struct Ground<'a> {
+pub struct KnownScene<'a> {
     /// The surface.
     pub truth: &'a GroundTruth,
     /// From the coordinates of the surface to those of the model and the cameras.
@@ -153,7 +153,7 @@ pub fn needs() -> Needs {
 /// trained on; depth, normals and thin structures in `views`.
 pub fn measure(
     backend: &mut dyn Backend,
-    ground: &Ground<'_>,
+    ground: &KnownScene<'_>,
     train: &impl ViewSource,
     views: &impl ViewSource,
 ) -> Result<Geometry, EvaluateError> {
@@ -173,7 +173,7 @@ pub fn measure(
     })
 }
 
-impl Ground<'_> {
+impl KnownScene<'_> {
     /// Diagonal of the mesh's bounding box `[world units]`.
     fn diagonal(&self) -> f64 {
         self.truth.surface().diagonal()

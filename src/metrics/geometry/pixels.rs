@@ -6,7 +6,7 @@ use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
-use super::{DepthErrors, Ground, ThinRecall, ratio};
+use super::{DepthErrors, KnownScene, ThinRecall, ratio};
 use crate::backend::{Backend, Rendering};
 use crate::dataset::images::Image8;
 use crate::evaluate::EvaluateError;
@@ -24,7 +24,7 @@ const COLOUR_SLACK: f32 = 0.1;
 /// Sums over the pixels.
 pub(super) struct Pixels<'a> {
     rows: &'a Rows,
-    ground: &'a Ground<'a>,
+    ground: &'a KnownScene<'a>,
     finder: Finder,
     surface: usize,
     covered: usize,
@@ -37,7 +37,7 @@ pub(super) struct Pixels<'a> {
 }
 
 impl<'a> Pixels<'a> {
-    pub(super) fn new(rows: &'a Rows, ground: &'a Ground<'a>) -> Result<Self, EvaluateError> {
+    pub(super) fn new(rows: &'a Rows, ground: &'a KnownScene<'a>) -> Result<Self, EvaluateError> {
         Ok(Self {
             rows,
             ground,

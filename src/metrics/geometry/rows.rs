@@ -6,7 +6,7 @@ use glam::{DMat3, DQuat, DVec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-use super::Ground;
+use super::KnownScene;
 use crate::evaluate::EvaluateError;
 use crate::gaussians::{Gaussians, sigmoid};
 
@@ -29,7 +29,7 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub(super) fn new(model: &Gaussians, ground: &Ground<'_>) -> Self {
+    pub(super) fn new(model: &Gaussians, ground: &KnownScene<'_>) -> Self {
         let to_world = ground.normalisation;
         let surface = ground.truth.surface();
         let vector = |v: &[f32; 3]| DVec3::from(v.map(f64::from));

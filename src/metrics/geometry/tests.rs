@@ -134,7 +134,7 @@ fn measured(truth: &GroundTruth, world: &Gaussians) -> Geometry {
     let model = WORLD.model_from_world(world.clone());
     let options = CpuOptions { needs: needs(), ..CpuOptions::new(model.len().max(1)) };
     let mut backend = CpuBackend::new(&model, &options).unwrap();
-    let ground = Ground { truth, normalisation: &WORLD, background: [0.0; 3], sh_degree: 0 };
+    let ground = KnownScene { truth, normalisation: &WORLD, background: [0.0; 3], sh_degree: 0 };
     measure(&mut backend, &ground, &Pair::new(), &Pair::new()).unwrap()
 }
 

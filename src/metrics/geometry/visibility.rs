@@ -8,7 +8,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::prelude::*;
 
 use super::rows::Rows;
-use super::{Floaters, Ground, Redundancy, needs, ratio};
+use super::{Floaters, KnownScene, Redundancy, needs, ratio};
 use crate::backend::{AuxInput, Backend};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -44,7 +44,7 @@ pub(super) struct Visibility {
 impl Visibility {
     pub(super) fn measure(
         backend: &mut dyn Backend,
-        ground: &Ground<'_>,
+        ground: &KnownScene<'_>,
         rows: &Rows,
         views: &impl ViewSource,
     ) -> Result<Self, EvaluateError> {
@@ -92,7 +92,7 @@ impl Visibility {
     fn weigh(
         &mut self,
         backend: &mut dyn Backend,
-        ground: &Ground<'_>,
+        ground: &KnownScene<'_>,
         camera: &Camera,
         request: &AuxRequest,
     ) -> Result<(), crate::backend::BackendError> {

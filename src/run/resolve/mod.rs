@@ -28,7 +28,7 @@ use crate::knobs::Knobs;
 use crate::memory::{peak_resident, resident};
 use crate::number::grouped;
 use crate::schedule::Background;
-use crate::trainer::{Required, growth_signals, needs};
+use crate::trainer::{AutoChoices, growth_signals, needs};
 use degree::Degree;
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
@@ -51,7 +51,7 @@ pub(super) struct Inputs<'a> {
     pub(super) dataset: Dataset,
     pub(super) degree: Degree,
     /// What the run is to find out by itself.
-    pub(super) required: Required,
+    pub(super) required: AutoChoices,
     /// What training and test images take.
     images: [ImageDemand; 2],
     /// Rows that a start on the dataset's points would have, were there no limit.
@@ -85,7 +85,7 @@ impl<'a> Inputs<'a> {
         let (resident, peak) = (resident(), peak_resident());
         let degree = Degree::decide(spec, saved, &dataset)?;
         dataset.tracks = Tracks::default();
-        let required = Required {
+        let required = AutoChoices {
             rows: spec.size.budget.is_some_and(Budget::is_auto),
             scored_views: !spec.size.full,
         };

@@ -51,7 +51,8 @@ fn near_duplicates_are_not_scored() {
     let case = Case { fresh_views: 100, ..CASE };
     let info = SceneInfo { extent: 150.0, ..scene(&case, 3) };
     let (trainer, log, _) = build(&case, 3, info, OPTIONS).unwrap();
-    let mut trainer = trainer.requiring(Required { scored_views: true, ..Required::default() });
+    let mut trainer =
+        trainer.requiring(AutoChoices { scored_views: true, ..AutoChoices::default() });
     for _ in 0..9 {
         trainer.step().unwrap();
     }

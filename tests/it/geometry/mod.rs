@@ -10,7 +10,7 @@ use densify::dataset::{Dataset, LoadOptions, Split, builtin};
 use densify::evaluate::{Mean, evaluate};
 use densify::gaussians::Gaussians;
 use densify::init::{initialise, restart};
-use densify::metrics::geometry::{self, Geometry, Ground};
+use densify::metrics::geometry::{self, Geometry, KnownScene};
 use densify::schedule::{Background, RateOptions};
 use densify::trainer::{OnNan, Savings, TrainOptions, Trainer, needs};
 use densify::verify::{Setup, Subject};
@@ -123,7 +123,7 @@ impl Known {
         }
         let model = trainer.model().expect("a model");
         let mut last = make(&model, model.len().max(1), geometry::needs());
-        let ground = Ground {
+        let ground = KnownScene {
             truth,
             normalisation: &dataset.normalisation,
             background: [0.0; 3],
