@@ -9,8 +9,7 @@ use densify_scenegen::{
 };
 
 use super::images::{Image8, ImageHeader, ImageSource};
-use super::normalise::Normalisation;
-use super::prepare::{Views, split, target_size};
+use super::prepare::{assemble, target_size};
 use super::tracks::TrackSampler;
 use super::{Dataset, DatasetError, LoadOptions, PointCloud, View};
 use crate::camera::Camera;
@@ -65,14 +64,6 @@ pub fn dataset(
         })
         .collect();
     views.sort_by(|a, b| a.0.name.as_bytes().cmp(b.0.name.as_bytes()));
-    let Views { mut train, mut test, number_of } = split(views.into_iter(), options.split, true)?;
-    let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
-    let normalisation = Normalisation::fit(&centres, &points.positions);
-    for view in train.iter_mut().chain(&mut test) {
-        view.camera = normalisation.scene_from_world_camera(&view.camera);
-    }
-    let positions =
-        points.positions.iter().map(|&point| normalisation.scene_from_world(point)).collect();
     let mut sampler = TrackSampler::new();
     let found = points.positions.iter().zip(&points.colours);
     for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
@@ -80,17 +71,14 @@ pub fn dataset(
             sampler.add(position, colour, seen_by.iter().copied());
         }
     }
-    let view_of = |number: u32| number_of.get(&number).copied();
-    let tracks = sampler.finish().in_training_views(&normalisation, view_of);
-    Ok(Dataset {
-        root: path.to_owned(),
-        train,
-        test,
-        points: PointCloud { positions, colours: points.colours },
-        tracks,
-        normalisation,
+    let read = super::Scene {
+        points: PointCloud { positions: points.positions, colours: points.colours },
+        tracks: sampler.finish(),
+        own_split: true,
         notes: scene.model.notes.clone(),
-    })
+        ..super::Scene::default()
+    };
+    assemble(path, views.into_iter(), read, options.split)
 }
 
 /// The trainer's camera of a rendered view.

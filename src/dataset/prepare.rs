@@ -16,17 +16,16 @@ use crate::camera::Camera;
 /// Fraction of the points that may be unusable.
 const MAX_BAD_POINTS: f64 = 0.01;
 
-/// Checks every frame, splits, and moves all into normalised coordinates.
+/// Checks every frame of a format's reader, splits, and moves all into normalised coordinates.
 pub(super) fn prepare(
     path: &Path,
-    scene: Scene,
+    mut scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let Scene { listing, mut frames, mut points, points_file, tracks, own_split, mut notes } =
-        scene;
+    let mut frames = std::mem::take(&mut scene.frames);
     // Bytewise, as other trainers sort names for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
-    refuse_duplicates(&listing, &frames)?;
+    refuse_duplicates(&scene.listing, &frames)?;
     // All views first, then the first error: the message does not depend on the threads.
     let views: Vec<Result<View, DatasetError>> =
         frames.par_iter().map(|frame| view(frame, options.resolution)).collect();
@@ -34,16 +33,49 @@ pub(super) fn prepare(
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, views.first())
         && views.iter().any(|view| view.source.header.width < width)
     {
-        notes.push(format!("images narrower than {width} px are not enlarged ({})", first.name));
+        let first = &first.name;
+        scene.notes.push(format!("images narrower than {width} px are not enlarged ({first})"));
     }
+    let views = views.into_iter().zip(&frames);
+    let views = views.map(|(view, frame)| (view, frame.held_out, frame.id));
+    assemble(path, views, scene, options.split)
+}
 
-    let candidates = views.into_iter().zip(&frames);
-    let candidates = candidates.map(|(view, frame)| (view, frame.held_out, frame.id));
-    let Views { mut train, mut test, number_of } = split(candidates, options.split, own_split)?;
-
+/// Splits views, which are sorted by name, and moves all into normalised coordinates. Each view comes with
+/// whether the dataset holds it out, and with the id that tracks use.
+pub(super) fn assemble(
+    path: &Path,
+    views: impl Iterator<Item = (View, bool, Option<u32>)>,
+    scene: Scene,
+    split: Split,
+) -> Result<Dataset, DatasetError> {
+    let Scene { listing, mut points, points_file, tracks, own_split, mut notes, .. } = scene;
+    let every = match split {
+        Split::Every(every) => Some(every.get() as usize),
+        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
+        Split::None | Split::Eval => None,
+    };
+    // Number of a training view by the id that tracks use.
+    let mut number_of = HashMap::new();
+    let (mut train, mut test) = (Vec::new(), Vec::new());
+    for (index, (view, held_out, id)) in views.enumerate() {
+        if every.map_or(held_out, |every| index % every == 0) {
+            test.push(view);
+        } else {
+            number_of.extend(id.map(|id| (id, train.len() as u32)));
+            train.push(view);
+        }
+    }
+    if train.is_empty() {
+        return Err(DatasetError(format!(
+            "no view is left to train on: the test split takes all {}; use a larger --test-every, or leave it \
+             out",
+            test.len()
+        )));
+    }
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
-    let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
+    let centres: Vec<_> = train.iter().map(|view: &View| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.scene_from_world_camera(&view.camera);
@@ -60,45 +92,6 @@ pub(super) fn prepare(
     })?;
     let tracks = tracks.in_training_views(&normalisation, |id| number_of.get(&id).copied());
     Ok(Dataset { root: path.to_owned(), train, test, points, tracks, normalisation, notes })
-}
-
-/// Views after the split.
-pub(super) struct Views {
-    pub(super) train: Vec<View>,
-    pub(super) test: Vec<View>,
-    /// Number of a training view by the id that tracks use.
-    pub(super) number_of: HashMap<u32, u32>,
-}
-
-/// Splits views, which are sorted by name. Each comes with whether the dataset holds it out, and with
-/// the id that tracks use.
-pub(super) fn split(
-    views: impl Iterator<Item = (View, bool, Option<u32>)>,
-    split: Split,
-    own_split: bool,
-) -> Result<Views, DatasetError> {
-    let every = match split {
-        Split::Every(every) => Some(every.get() as usize),
-        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
-        Split::None | Split::Eval => None,
-    };
-    let (mut train, mut test, mut number_of) = (Vec::new(), Vec::new(), HashMap::new());
-    for (index, (view, held_out, id)) in views.enumerate() {
-        if every.map_or(held_out, |every| index % every == 0) {
-            test.push(view);
-        } else {
-            number_of.extend(id.map(|id| (id, train.len() as u32)));
-            train.push(view);
-        }
-    }
-    if train.is_empty() {
-        return Err(DatasetError(format!(
-            "no view is left to train on: the test split takes all {}; use a larger --test-every, or leave it \
-             out",
-            test.len()
-        )));
-    }
-    Ok(Views { train, test, number_of })
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {

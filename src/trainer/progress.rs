@@ -1,6 +1,5 @@
 //! Read access to a run in progress: counters, times, events, and the model.
 
-use std::ops::Range;
 use std::time::Duration;
 
 use super::{AutoBudget, Trainer};
@@ -68,12 +67,7 @@ impl<V: ViewSource> Trainer<V> {
 
     /// A copy of the current model, in the coordinates of training.
     pub fn model(&self) -> Result<Gaussians, BackendError> {
-        self.model_rows(0..self.backend.rows())
-    }
-
-    /// Some rows of the [`model`](Self::model), which must exist.
-    pub fn model_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
-        self.backend.download_rows(rows)
+        self.backend.download()
     }
 
     /// The backend, for rendering and its ledger.

@@ -64,7 +64,8 @@ fn colmap_text() {
             refused(&format!("{file}: {new}"), &made, &LoadOptions::default(), words);
         }
     }
-    let cases: [(&str, fn(&Made), &str); 10] = [
+    type Edit = (&'static str, fn(&Made), &'static str);
+    let cases: [Edit; 10] = [
         ("no cameras", |m| m.remove("sparse/0/cameras.txt"), "cameras.txt, check that it exists"),
         ("no points", |m| m.remove("sparse/0/points3D.txt"), "points3D.txt"),
         ("zero images", |m| m.write("sparse/0/images.txt", "# none\n"), "images.txt, no image"),

@@ -50,7 +50,7 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
         .collect::<Result<Vec<_>, _>>()?;
 
     let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
-    let (mut total, mut dropped, mut repaired) = (0, 0, 0);
+    let (mut total, mut dropped, mut repaired) = (0_usize, 0, 0);
     let mut values = vec![0f32; columns.len()];
     ply.each_row(&vertices, &columns, |row| {
         total += 1;
