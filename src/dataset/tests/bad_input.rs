@@ -226,6 +226,7 @@ fn transforms() {
     let made = Made::transforms(|_| ());
     made.replace("points.ply", "vertex 200", "vertex 201");
     refused("points", &made, &options, "points.ply");
+    let made = Made::transforms(|_| ());
     std::fs::remove_dir_all(made.file("images")).unwrap();
     refused("no image at all", &made, &options, "transforms.json, no image");
 }
