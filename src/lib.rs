@@ -5,21 +5,21 @@
 //! command line. All that `densify train` does can be done from code:
 //!
 //! ```no_run
-//! use densify::run::{Budget, Occupied, Run, RunSpec};
+//! use densify::run::{Budget, Occupied, Run, RunSpec, Silent};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let mut spec = RunSpec::default();
 //! spec.start.scene = Some("data/garden".into());
 //! spec.size.budget = Some(Budget::Rows(50_000));
 //! spec.density.policy_set = vec!["diet.rho=0.2".parse()?];
-//! let mut run = Run::prepare(&spec)?;
+//! let mut run = Run::prepare(&spec, None, &Silent)?;
 //! println!("{}", run.ledger());
 //! // Step by step, with the model at hand ...
 //! for event in run.trainer().step()?.events {
 //!     println!("step {}: {} Gaussians, {} denied", event.step, event.after, event.denied);
 //! }
 //! // ... or to the end, with everything that `densify train` writes.
-//! println!("the run is in {}", run.train(Occupied::Refuse)?.display());
+//! println!("the run is in {}", run.train(Occupied::Refuse, &Silent)?.display());
 //! # Ok(())
 //! # }
 //! ```
@@ -40,11 +40,12 @@ pub mod memory;
 pub mod metrics;
 mod number;
 pub mod output;
+mod pictures;
 pub mod run;
 pub mod schedule;
 pub mod sh;
 pub mod spread;
-pub mod study;
+pub(crate) mod study;
 pub mod trainer;
 pub mod verify;
 pub mod views;

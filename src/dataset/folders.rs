@@ -107,11 +107,7 @@ impl Folders {
         } else {
             self.below_root(named.value)
         };
-        DatasetError::MissingImage {
-            path: named.file.to_owned(),
-            field: named.field.to_owned(),
-            image: folder.path().join(within),
-        }
+        DatasetError::missing_image(named.file, named.field, &folder.path().join(within))
     }
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {

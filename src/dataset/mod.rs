@@ -40,7 +40,7 @@ pub use crate::import::PointCloud;
 pub use error::DatasetError;
 use folders::Folders;
 use normalise::Normalisation;
-pub use options::{LoadOptions, ParseResolutionError, Resolution, Split};
+pub use options::{LoadOptions, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
 use undistort::Lens;
@@ -123,7 +123,10 @@ impl Dataset {
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {
-            return Err(DatasetError::NoImages { path: scene.listing });
+            let listing = scene.listing.display();
+            return Err(DatasetError(format!(
+                "{listing} lists no image that exists; check the file and the images beside it"
+            )));
         }
         prepare::prepare(path, scene, options)
     }
@@ -161,12 +164,13 @@ fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError>
     } else if let Some(folder) = model {
         colmap::read(root, &folder, &Folders::new(root, options, true)?, options.tracks)
     } else if here(transforms::SINGLE) {
-        transforms::read_single(root, &Folders::new(root, options, false)?)
+        transforms::read(root, &Folders::new(root, options, false)?, transforms::SINGLE, false)
     } else {
-        Err(DatasetError::Unrecognised {
-            path: root.path().to_owned(),
-            looked_for: "transforms_train.json with transforms_test.json, nor sparse/0/cameras.bin or .txt, \
-                         nor sparse/cameras.bin or .txt, nor transforms.json",
-        })
+        Err(DatasetError(format!(
+            "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \
+             sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt, nor transforms.json; name a folder \
+             with a COLMAP model or transforms files",
+            root.path().display()
+        )))
     }
 }

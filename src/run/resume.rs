@@ -28,24 +28,20 @@ pub struct Resumed {
     pub(super) last: u32,
 }
 
-/// How a run that is to be resumed starts.
-pub enum Start {
-    /// There is nothing yet to go on from, and nothing to lose.
-    Anew(RunSpec),
-    /// From a checkpoint, with all options.
-    From(RunSpec, Box<Resumed>),
-}
-
 /// Options within the table of knobs that change no byte of the result, or are compared as what came of
 /// them.
 const FREE_KNOBS: [&str; 2] = ["knob.pairs_per_row", "knob.accumulation"];
 
 /// Looks for the newest sound checkpoint in the output folder that `given` describes, and lays `given`
-/// over the options that were saved with it.
+/// over the options that were saved with it. Without a checkpoint there is nothing to lose, and the run
+/// starts anew.
 ///
 /// # Errors
 /// When the folder is in use, holds a run without a checkpoint, or the checkpoint cannot be used.
-pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> {
+pub fn start(
+    given: Partial,
+    observer: &dyn Observer,
+) -> Result<(RunSpec, Option<Resumed>), Failure> {
     let described = given.clone().describe()?;
     let output = described.output_folder()?;
     if let Some(staged) = RunFolder::staged(&output).iter().find(|path| newest(path).0.is_some()) {
@@ -65,7 +61,7 @@ pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> 
     let (checkpoint, rejected) = newest(&output);
     let Some(checkpoint) = checkpoint else {
         nothing(&output, &rejected, observer)?;
-        return Ok(Start::Anew(described));
+        return Ok((described, None));
     };
     for error in &rejected {
         observer.say(format_args!("note: a newer checkpoint cannot be used: {error}"));
@@ -87,7 +83,7 @@ pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> 
     spec.schedule.iterations.0 = length;
     // It is this folder that goes on, wherever it was when the run began.
     spec.output.output = Some(output);
-    Ok(Start::From(spec, Box::new(Resumed { checkpoint, config, last })))
+    Ok((spec, Some(Resumed { checkpoint, config, last })))
 }
 
 /// The saved options under those that are given.

@@ -38,16 +38,8 @@ fn scene(shade: impl Fn(usize, usize, f32) -> f32) -> (Tracks, Vec<View>) {
 
 fn posed(image: Image8) -> View {
     let (width, height) = (image.width, image.height);
-    let camera = Camera {
-        width,
-        height,
-        fx: 1.0,
-        fy: 1.0,
-        cx: 0.0,
-        cy: 0.0,
-        rotation: DMat3::IDENTITY,
-        translation: DVec3::ZERO,
-    };
+    let camera = Camera::centred((width, height), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
+    let camera = Camera { cx: 0.0, cy: 0.0, ..camera };
     let header = ImageHeader {
         width,
         height,

@@ -7,7 +7,7 @@ use densify::dataset::{Dataset, LoadOptions};
 use densify::gaussians::Gaussians;
 use densify::init::initialise;
 use densify::schedule::{Background, RateOptions};
-use densify::trainer::{OnNan, Required, Savings, TrainOptions, Trainer, growth_signals};
+use densify::trainer::{AutoChoices, OnNan, Savings, TrainOptions, Trainer, growth_signals};
 use densify::verify::{Setup, Subject};
 use densify::views::DatasetViews;
 use densify_policies::plan::EditPlan;
@@ -65,7 +65,7 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
     let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
     let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);
     let mut trainer = trainer.expect("they agree");
-    trainer = trainer.requiring(Required { rows: measures, ..Required::default() });
+    trainer = trainer.requiring(AutoChoices { rows: measures, ..AutoChoices::default() });
     for _ in 0..MEASURED_AT {
         trainer.step().expect("a small image is rendered");
     }
