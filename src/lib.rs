@@ -12,7 +12,7 @@
 //! spec.start.scene = Some("data/garden".into());
 //! spec.size.budget = Some(Budget::Rows(50_000));
 //! spec.density.policy_set = vec!["diet.rho=0.2".parse()?];
-//! let mut run = Run::prepare(&spec, None, &Silent)?;
+//! let mut run = Run::prepare(&spec)?;
 //! println!("{}", run.ledger());
 //! // Step by step, with the model at hand ...
 //! for event in run.trainer().step()?.events {

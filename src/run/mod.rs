@@ -58,13 +58,21 @@ pub struct Run {
 }
 
 impl Run {
-    /// Prepares a run: opens scene and device, decides its size, and makes the trainer. Nothing is
-    /// written. With `resumed` it goes on from a checkpoint; see [`start`].
+    /// Prepares a new run: opens scene and device, decides its size, and makes the trainer. Nothing is
+    /// written.
     ///
     /// # Errors
-    /// Everything that can be wrong with the description, its files and the device; and when it would give
-    /// another result than that of the checkpoint.
-    pub fn prepare(
+    /// Everything that can be wrong with the description, its files and the device.
+    pub fn prepare(spec: &RunSpec) -> Result<Self, Failure> {
+        Self::prepare_observed(spec, None, &Silent)
+    }
+
+    /// The same, and says what there is to say. With `resumed` it goes on with the run that [`start`] has
+    /// found.
+    ///
+    /// # Errors
+    /// As [`prepare`](Self::prepare), and when it would give another result than the run that goes on.
+    pub fn prepare_observed(
         spec: &RunSpec,
         resumed: Option<Resumed>,
         observer: &dyn Observer,

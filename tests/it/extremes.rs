@@ -8,7 +8,7 @@
 //!
 //! | extreme | tested in |
 //! |---|---|
-//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/import/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/vanilla/tests.rs: an_empty_model_stays_empty` |
+//! | 1 no row | selftest; `src/init/tests.rs: impossible_requests_are_errors`; `src/import/ply/tests.rs: splats_make_the_round_trip_bit_for_bit`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
 //! | 2 one row | selftest; `src/init/tests.rs: few_points` |
 //! | 3 duplicates | selftest; `src/init/tests.rs: duplicates_are_merged_and_counted_and_break_nothing` |
 //! | 4 a budget below the points | `src/init/tests.rs: the_budget_is_kept_by_a_seeded_subsample`; `tests/it/cli/training.rs: more_points_than_the_budget_are_subsampled_and_it_is_said`; `tests/it/cli/training.rs: a_budget_of_one_row_trains`; `tests/it/cli/faults.rs: flags_out_of_range_are_refused` |
@@ -34,7 +34,7 @@
 //! | 24 similarity | selftest; `src/metrics/ssim.rs: flat_images_a_hair_apart_stay_below_one`; `src/metrics/ssim.rs: agrees_with_the_textbook_pixel_by_pixel_at_every_size` |
 //! | 25 the optimiser | selftest; `tests/it/declared.rs: a_step_takes_the_sum_of_the_gradients_since_the_last`; `tests/it/agreement.rs: steps_are_those_of_the_native_backend` |
 //! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_number_that_is_none_is_found`; `src/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
-//! | 27 all faint, all prunable | selftest; `policies/src/vanilla/tests.rs: the_last_row_lives`; `policies/src/diet/tests.rs: the_last_row_lives`; `policies/src/taming/tests.rs: one_row_is_left`; `policies/src/mcmc/tests.rs: without_the_living_nothing_is_done` |
+//! | 27 all faint, all prunable | selftest; `policies/src/adc.rs: one_row_is_spared`; `policies/src/conformance/tests.rs: every_registered_policy_conforms`; `policies/src/mcmc/tests.rs: without_the_living_nothing_is_done` |
 //! | 28 half precision | `src/backend/cpu/narrow/tests.rs: halves_are_what_the_standard_says`; `src/backend/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `tests/it/quarantine.rs: every_number_that_is_none_is_found` |
 //! | 29 whole numbers | `src/backend/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/backend/cpu/budget.rs: huge_budgets_are_refused_and_do_not_wrap`; `src/backend/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/checkpoint/tests.rs: headers_that_promise_too_much_are_refused_without_allocation` |
 //! | 30 a long run | selftest, in full with `--long`; `src/trainer/edit.rs: slots_written_before_the_moves_count_for_the_peak`; `tests/it/edits/mod.rs: any_plans_do_to_the_backend_what_they_do_to_a_plain_vector` |

@@ -92,7 +92,7 @@ pub(super) fn run(
     if occupied != Occupied::Resume {
         RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
-    let run = Run::prepare(&spec, resumed, &follower)?;
+    let run = Run::prepare_observed(&spec, resumed, &follower)?;
     if occupied != Occupied::Resume {
         announce_preset(&spec, console)?;
     }
