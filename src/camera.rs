@@ -25,6 +25,18 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// A camera at `centre` with the principal point in the middle of its image.
+    #[must_use]
+    pub fn centred(
+        (width, height): (u32, u32),
+        (fx, fy): (f64, f64),
+        rotation: DMat3,
+        centre: DVec3,
+    ) -> Self {
+        let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+        Self { width, height, fx, fy, cx, cy, rotation, translation: -(rotation * centre) }
+    }
+
     /// The camera's centre in world coordinates, −Rᵀt.
     #[must_use]
     pub fn centre(&self) -> DVec3 {

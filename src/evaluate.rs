@@ -9,11 +9,11 @@ use crate::metrics::{MetricError, flip, psnr, ssim};
 use crate::views::{ViewError, ViewSource};
 
 /// Part of a dataset.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Split {
-    /// Views held out.
+    /// The views held out
     Test,
-    /// Views trained on.
+    /// The views trained on
     Train,
 }
 
@@ -49,21 +49,14 @@ fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
-/// Scores of a set of views.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Scores {
-    /// One entry per view, in the order of the views.
-    pub views: Vec<ViewScore>,
-}
-
-impl Scores {
+impl Mean {
     /// Mean over the views; NaN without views.
     #[must_use]
-    pub fn mean(&self) -> Mean {
+    pub fn of(views: &[ViewScore]) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
-            self.views.iter().map(score).sum::<f64>() / self.views.len() as f64
+            views.iter().map(score).sum::<f64>() / views.len() as f64
         };
-        Mean {
+        Self {
             psnr: mean(|view| view.psnr),
             ssim: mean(|view| view.ssim),
             flip: mean(|view| view.flip),
@@ -71,18 +64,18 @@ impl Scores {
     }
 }
 
-/// Why a view cannot be scored.
+/// Why a model cannot be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
-    /// Its pixels could not be read.
+    /// A view's pixels or known surface could not be read, or not be compared with the rendering.
     #[error("view `{view}`: {source}")]
     View {
         /// The view's name.
         view: String,
-        /// The error of the source of views.
+        /// What is wrong with it.
         source: ViewError,
     },
-    /// It could not be rendered.
+    /// A view could not be rendered.
     #[error("view `{view}`: {source}")]
     Backend {
         /// The view's name.
@@ -90,14 +83,12 @@ pub enum EvaluateError {
         /// The error of the backend.
         source: BackendError,
     },
-    /// Rendering and image cannot be compared.
-    #[error("view `{view}`: {source}")]
-    Metric {
-        /// The view's name.
-        view: String,
-        /// The error of the metric.
-        source: MetricError,
-    },
+    /// The model or its signals could not be copied from the device.
+    #[error(transparent)]
+    Model(#[from] BackendError),
+    /// The neighbour search does not support so many rows.
+    #[error("{0} rows are too many to search for neighbours")]
+    TooManyRows(usize),
     /// Stopped by the caller.
     #[error("stopped before all views were measured")]
     Stopped,
@@ -105,18 +96,15 @@ pub enum EvaluateError {
 
 /// Renders every view and compares it with its image. `after_view` is called after each view and may
 /// stop the evaluation.
-///
-/// # Errors
-/// [`EvaluateError`] at the first view that cannot be scored; [`EvaluateError::Stopped`].
 pub fn evaluate(
     backend: &mut dyn Backend,
     views: &impl ViewSource,
     background: [f32; 3],
     sh_degree: u8,
     mut after_view: impl FnMut(&ViewScore) -> ControlFlow<()>,
-) -> Result<Scores, EvaluateError> {
+) -> Result<Vec<ViewScore>, EvaluateError> {
     let count = views.count();
-    let mut scores = Scores::default();
+    let mut scores = Vec::new();
     for view in 0..count {
         let ahead: Vec<usize> = (view + 1..count.min(view + 3)).collect();
         views.prefetch(&ahead);
@@ -126,7 +114,7 @@ pub fn evaluate(
         let rendering = backend
             .render(views.camera(view), background, sh_degree)
             .map_err(|source| EvaluateError::Backend { view: name(), source })?;
-        let metric = |source| EvaluateError::Metric { view: name(), source };
+        let metric = |e: MetricError| EvaluateError::View { view: name(), source: e.into() };
         let score = ViewScore {
             name: name(),
             psnr: psnr(&rendering.rgb, &image, background).map_err(metric)?,
@@ -134,7 +122,7 @@ pub fn evaluate(
             flip: flip(&rendering.rgb, &image, background).map_err(metric)?,
         };
         let flow = after_view(&score);
-        scores.views.push(score);
+        scores.push(score);
         if flow.is_break() {
             return Err(EvaluateError::Stopped);
         }

@@ -1,14 +1,17 @@
 //! Errors as they reach a user: one message with the remedy, and the exit code that it stands for.
 
+use std::fmt::Display;
+
 use densify_policies::policy::PolicyError;
 
 use crate::backend::BackendError;
 use crate::checkpoint::CheckpointError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
+use crate::export::FormatError;
 use crate::import::ply::PlyError;
 use crate::init::InitError;
-use crate::metrics::geometry::GeometryError;
+use crate::knobs::KnobError;
 use crate::output::OutputError;
 use crate::trainer::TrainError;
 
@@ -50,14 +53,19 @@ impl Failure {
     }
 }
 
-impl From<DatasetError> for Failure {
-    fn from(error: DatasetError) -> Self {
-        Self::input(error)
-    }
-}
+/// Errors that are always of bad input.
+pub trait BadInput: Display {}
 
-impl From<PlyError> for Failure {
-    fn from(error: PlyError) -> Self {
+impl BadInput for DatasetError {}
+impl BadInput for FormatError {}
+impl BadInput for InitError {}
+impl BadInput for KnobError {}
+impl BadInput for PlyError {}
+/// Before training: the policy's name or parameters are wrong.
+impl BadInput for PolicyError {}
+
+impl<E: BadInput> From<E> for Failure {
+    fn from(error: E) -> Self {
         Self::input(error)
     }
 }
@@ -69,24 +77,6 @@ impl From<densify_scenegen::Error> for Failure {
             _ => INPUT,
         };
         Self { code, message: error.to_string() }
-    }
-}
-
-impl From<InitError> for Failure {
-    fn from(error: InitError) -> Self {
-        match error {
-            InitError::NoPoints => Self::input(
-                "the scene has no usable point to start from; start from random ones with --init random",
-            ),
-            other => Self::input(other),
-        }
-    }
-}
-
-/// An error before training: the policy's name or parameters are wrong.
-impl From<PolicyError> for Failure {
-    fn from(error: PolicyError) -> Self {
-        Self::input(error)
     }
 }
 
@@ -120,7 +110,7 @@ impl From<OutputError> for Failure {
 impl From<TrainError> for Failure {
     fn from(error: TrainError) -> Self {
         let code = match &error {
-            TrainError::NoViews | TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
+            TrainError::BadOption(_) | TrainError::View { .. } => INPUT,
             TrainError::Backend { source, .. } if is_input(source) => INPUT,
             TrainError::Backend { .. } => DEVICE,
             _ => OTHER,
@@ -142,25 +132,15 @@ impl From<CheckpointError> for Failure {
     }
 }
 
-impl From<GeometryError> for Failure {
-    fn from(error: GeometryError) -> Self {
-        let code = match &error {
-            GeometryError::Backend { source, .. } | GeometryError::Model(source)
-                if !is_input(source) =>
-            {
-                DEVICE
-            }
-            _ => INPUT,
-        };
-        Self { code, message: error.to_string() }
-    }
-}
-
 impl From<EvaluateError> for Failure {
     fn from(error: EvaluateError) -> Self {
         let code = match &error {
             EvaluateError::Stopped => OTHER,
-            EvaluateError::Backend { source, .. } if !is_input(source) => DEVICE,
+            EvaluateError::Backend { source, .. } | EvaluateError::Model(source)
+                if !is_input(source) =>
+            {
+                DEVICE
+            }
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

@@ -65,9 +65,6 @@ pub struct Gaussians {
 
 impl Gaussians {
     /// A model of this degree from its arrays, each row after row.
-    ///
-    /// # Errors
-    /// What `array` returns.
     pub fn from_arrays<E>(
         sh_degree: u8,
         mut array: impl FnMut(ModelArray) -> Result<Vec<f32>, E>,

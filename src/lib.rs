@@ -5,7 +5,7 @@
 //! command line. All that `densify train` does can be done from code:
 //!
 //! ```no_run
-//! use densify::run::{Budget, Occupied, Run, RunSpec};
+//! use densify::run::{Budget, Occupied, Run, RunSpec, Silent};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let mut spec = RunSpec::default();
@@ -19,7 +19,7 @@
 //!     println!("step {}: {} Gaussians, {} denied", event.step, event.after, event.denied);
 //! }
 //! // ... or to the end, with everything that `densify train` writes.
-//! println!("the run is in {}", run.train(Occupied::Refuse)?.display());
+//! println!("the run is in {}", run.train(Occupied::Refuse, &Silent)?.display());
 //! # Ok(())
 //! # }
 //! ```
@@ -41,11 +41,12 @@ pub mod memory;
 pub mod metrics;
 mod number;
 pub mod output;
+mod pictures;
 pub mod run;
 pub mod schedule;
 pub mod sh;
 pub mod spread;
-pub mod study;
+pub(crate) mod study;
 pub mod trainer;
 pub mod verify;
 pub mod views;

@@ -71,15 +71,7 @@ pub(crate) fn fraction(text: &str) -> Result<f64, String> {
 
 /// 1234567 as 1,234,567.
 pub(crate) fn grouped(number: usize) -> String {
-    let digits = number.to_string();
-    let mut out = String::with_capacity(digits.len() + digits.len() / 3);
-    for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            out.push(',');
-        }
-        out.push(digit);
-    }
-    out
+    indicatif::HumanCount(number as u64).to_string()
 }
 
 /// A duration to the second: 45 s, 2 min 5 s, 3 h 0 min.

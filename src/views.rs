@@ -21,13 +21,12 @@ pub trait ViewSource: Send {
     fn camera(&self, view: usize) -> &Camera;
 
     /// Pixels of a view, of the camera's size.
-    ///
-    /// # Errors
-    /// When they cannot be read.
     fn image(&self, view: usize) -> Result<SharedImage, ViewError>;
 
     /// Announces the next views, soonest first.
-    fn prefetch(&self, upcoming: &[usize]);
+    fn prefetch(&self, upcoming: &[usize]) {
+        let _ = upcoming;
+    }
 
     /// Divides both sides of all cameras and images by this from now on. Sources that cannot shrink
     /// images ignore it.

@@ -8,7 +8,7 @@ use std::ops::Bound::Excluded;
 
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
-use crate::policy::{PolicyError, SceneInfo, Signal, Snapshot};
+use crate::policy::{PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
 /// A schedule: the multiples of `every` with `from` < step < `until`; none if `every` is 0.
@@ -62,7 +62,7 @@ impl OpacityResets {
         white_at: u32,
         reset_opacity: f64,
         scene: &SceneInfo,
-    ) -> Result<Self, PolicyError> {
+    ) -> PolicyResult<Self> {
         let max_opacity = reset_opacity as f32;
         in_range("reset_opacity", f64::from(max_opacity), (Excluded(0.0), Excluded(1.0)))?;
         let white = (scene.white_background && white_at < until).then_some(white_at);
@@ -187,7 +187,7 @@ impl PruneLimits {
     ///
     /// # Errors
     /// When the policy does not declare [`Signal::Opacity`] and [`Signal::ScaleMax`].
-    pub fn dead_rows(&self, now: &Snapshot<'_>) -> Result<Vec<u32>, PolicyError> {
+    pub fn dead_rows(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<u32>> {
         let (opacity, scale) = (now.signal(Signal::Opacity)?, now.signal(Signal::ScaleMax)?);
         let rows = (0..).zip(opacity).zip(scale);
         let dead = rows.filter(|((_, opacity), scale)| self.exceeded(**opacity, **scale));

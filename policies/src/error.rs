@@ -2,6 +2,9 @@
 
 use crate::signals::{AuxColumn, Signal};
 
+/// What a policy returns: nothing or a value, unless it cannot go on.
+pub type PolicyResult<T = ()> = Result<T, PolicyError>;
+
 /// Why a policy cannot be built or cannot go on.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PolicyError {

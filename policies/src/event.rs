@@ -3,7 +3,7 @@
 use crate::conformance::check_policy_with;
 use crate::plan::{EditPlan, ParentFate, RowOps};
 use crate::policy::{
-    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyError, SceneInfo, Signal, SignalSet,
+    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, SignalSet,
     Signals, Snapshot,
 };
 use crate::registry::find;
@@ -99,10 +99,7 @@ impl Event {
     }
 
     /// Lets the policy plan, with exactly the signals and as many of the views as it asks for.
-    pub(crate) fn run_policy(
-        &self,
-        policy: &mut dyn DensityPolicy,
-    ) -> Result<Outcome, PolicyError> {
+    pub(crate) fn run_policy(&self, policy: &mut dyn DensityPolicy) -> PolicyResult<Outcome> {
         let request = policy.needs(&self.scene).aux.unwrap_or_default();
         let wanted = policy.aux_views(self.step, self.rows, self.budget) as usize;
         for view in self.views.iter().take(wanted) {

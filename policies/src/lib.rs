@@ -74,7 +74,7 @@
 //! use densify_policies::parameters::in_range;
 //! use densify_policies::plan::EditPlan;
 //! use densify_policies::policy::{
-//!     DensityPolicy, Needs, PolicyError, SceneInfo, Signal, Snapshot,
+//!     DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snapshot,
 //! };
 //! use densify_policies::registry::ConfiguredPolicy;
 //! use densify_policies::rng::PolicyRng;
@@ -101,7 +101,7 @@
 //!     type Params = FadeParams;
 //!     const STEP_PARAMETERS: &'static [&'static str] = &["every"];
 //!
-//!     fn new(params: FadeParams, _scene: &SceneInfo) -> Result<Self, PolicyError> {
+//!     fn new(params: FadeParams, _scene: &SceneInfo) -> PolicyResult<Self> {
 //!         in_range("every", f64::from(params.every), 1.0..)?;
 //!         in_range("share", params.share, 0.0..=1.0)?;
 //!         Ok(Self(params))
@@ -118,12 +118,7 @@
 //!         step.is_multiple_of(self.0.every)
 //!     }
 //!
-//!     fn plan(
-//!         &mut self,
-//!         now: &Snapshot<'_>,
-//!         _rng: &PolicyRng,
-//!         plan: &mut EditPlan,
-//!     ) -> Result<(), PolicyError> {
+//!     fn plan(&mut self, now: &Snapshot, _: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
 //!         plan.cause("fade");
 //!         let count = (self.0.share * now.rows() as f64) as usize;
 //!         let rows: Vec<u32> = (0..now.rows() as u32).collect();

@@ -185,20 +185,6 @@ mod tests {
                     (at(0), at(1))
                 }),
             ),
-            (
-                "words",
-                joint(|i| {
-                    let [a, b, ..] = rng.bits(i, select, 0).map(unit_open);
-                    (a, b)
-                }),
-            ),
-            (
-                "words",
-                joint(|i| {
-                    let [.., c, d] = rng.bits(i, select, 0).map(unit_open);
-                    (c, d)
-                }),
-            ),
         ];
         let bad: Vec<_> = found.iter().filter(|(_, deviation)| deviation.abs() > 5.0).collect();
         assert!(bad.is_empty(), "{bad:?}");

@@ -125,7 +125,7 @@ fn main() {
         });
         println!(
             "{:9}  {ours:12.2}  {cwbvh:5.2}  {bvh2:4.2}  {:11.0}%  {:8.2} s  {:9.2} s",
-            surface.len(),
+            model.triangles.len(),
             100.0 * ours / cwbvh.max(bvh2),
             built.as_secs_f64(),
             wide_built.as_secs_f64(),

@@ -44,18 +44,6 @@ pub enum Error {
         /// The remedy.
         remedy: String,
     },
-    /// A reference to another file leaves the mesh's folder or is not a relative path.
-    #[error("{}: {element}: the URI {uri:?} {problem}; keep all files in the mesh's own folder", path.display())]
-    Uri {
-        /// The file that refers.
-        path: PathBuf,
-        /// Where in the file the reference is.
-        element: String,
-        /// The reference, shortened.
-        uri: String,
-        /// Why it is refused.
-        problem: &'static str,
-    },
     /// The mesh has nothing to render.
     #[error("{name}: there is no triangle to render; export the mesh with its faces")]
     Empty {

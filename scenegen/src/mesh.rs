@@ -3,8 +3,11 @@
 //! Coordinates are the source's own (right-handed, +y up unless the source says otherwise) and in
 //! f64: nodes far from the origin lose nothing before the tracer recentres them.
 
+use std::path::Path;
+
 use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
 
+use crate::error::Error;
 use crate::texture::{Texture, TextureRef};
 
 /// Everything a source describes.
@@ -204,8 +207,9 @@ impl Model {
     ) {
         let first = self.positions.len() as u32;
         self.positions.extend_from_slice(positions);
-        pad(&mut self.normals, normals, first as usize, positions.len(), Vec3::ZERO);
-        pad(&mut self.uvs[0], uvs, first as usize, positions.len(), Vec2::ZERO);
+        let place = (first as usize, positions.len());
+        pad(&mut self.normals, normals.iter().copied(), place, Vec3::ZERO);
+        pad(&mut self.uvs[0], uvs.iter().copied(), place, Vec2::ZERO);
         self.triangles.extend(triangles.iter().map(|t| t.map(|i| i + first)));
         self.triangle_materials.resize(self.triangles.len(), material);
     }
@@ -214,6 +218,23 @@ impl Model {
     pub fn material(&mut self, material: Material) -> u32 {
         self.materials.push(material);
         self.materials.len() as u32 - 1
+    }
+
+    /// Named after the file that it was read from; an error if there is nothing to render.
+    pub(crate) fn of_file(mut self, path: &Path) -> Result<Self, Error> {
+        if self.triangles.is_empty() {
+            return Err(Error::Empty { name: path.display().to_string() });
+        }
+        self.name =
+            path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        Ok(self)
+    }
+
+    /// Whether a triangle belongs to a thin structure.
+    #[must_use]
+    pub fn is_thin(&self, triangle: u32) -> bool {
+        let material = self.triangle_materials.get(triangle as usize);
+        material.is_some_and(|&m| self.materials[m as usize].thin)
     }
 
     /// Smallest and largest coordinates of all triangles' vertices.
@@ -238,18 +259,19 @@ impl Model {
     }
 }
 
-/// Appends one value per vertex to a list that is empty until the first source has any.
+/// Appends the values of the `count` vertices after the first `before`, if there are any, to a list
+/// that is empty until vertices have any.
 pub(crate) fn pad<T: Copy>(
     list: &mut Vec<T>,
-    values: &[T],
-    before: usize,
-    count: usize,
+    values: impl IntoIterator<Item = T>,
+    (before, count): (usize, usize),
     missing: T,
 ) {
-    if values.is_empty() && list.is_empty() {
-        return;
+    let mut values = values.into_iter().peekable();
+    if values.peek().is_some() || !list.is_empty() {
+        list.reserve(before + count - list.len());
+        list.resize(before, missing);
+        list.extend(values);
+        list.resize(before + count, missing);
     }
-    list.resize(before, missing);
-    list.extend_from_slice(values);
-    list.resize(before + count, missing);
 }

@@ -260,10 +260,8 @@ impl Surface {
         packet.walk(self, |slot, lanes| {
             let mut changed = false;
             for lane in each(lanes) {
-                let met = packet.sheared[lane].intersect(&self.triangles[slot as usize]);
-                let Some(at) = met.filter(|at| at.t > rays[lane].tmin && at.t <= tmax[lane]) else {
-                    continue;
-                };
+                let (sheared, ray) = (&packet.sheared[lane], &rays[lane]);
+                let Some(at) = self.meet(slot, sheared, ray.tmin, tmax[lane]) else { continue };
                 let first = best[lane].is_none_or(|best| {
                     at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
                 });
@@ -325,8 +323,8 @@ impl Surface {
         packet.walk(self, |slot, lanes| {
             for lane in each(lanes & open) {
                 let ray = &others[lane];
-                let met = packet.sheared[lane].intersect(&self.triangles[slot as usize]);
-                if met.is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at)) {
+                let met = self.meet(slot, &packet.sheared[lane], ray.tmin, ray.tmax);
+                if met.is_some_and(|at| accept(slot, &at)) {
                     open &= !(1 << lane);
                     hidden |= 1 << left[lane];
                     *hint = Some(slot);

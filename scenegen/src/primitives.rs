@@ -158,17 +158,12 @@ fn consecutive(corners: usize) -> Vec<[u32; 3]> {
 pub(crate) fn icosphere(level: u32) -> (Vec<DVec3>, Vec<[u32; 3]>) {
     let g = (1.0 + 5.0_f64.sqrt()) / 2.0;
     let mut corners: Vec<DVec3> = Vec::new();
-    for (a, b) in [(-1.0, g), (1.0, g), (-1.0, -g), (1.0, -g)] {
-        corners.push(DVec3::new(a, b, 0.0));
-    }
-    for (a, b) in [(-1.0, g), (1.0, g), (-1.0, -g), (1.0, -g)] {
-        corners.push(DVec3::new(0.0, a, b));
-    }
-    for (a, b) in [(-1.0, g), (1.0, g), (-1.0, -g), (1.0, -g)] {
-        corners.push(DVec3::new(b, 0.0, a));
-    }
-    for corner in &mut corners {
-        *corner = corner.normalize();
+    for shift in 0..3 {
+        for (a, b) in [(-1.0, g), (1.0, g), (-1.0, -g), (1.0, -g)] {
+            let mut corner = [a, b, 0.0];
+            corner.rotate_right(shift);
+            corners.push(DVec3::from(corner).normalize());
+        }
     }
     // Of all triples of corners, those whose sides are edges (the shortest distance there is).
     let edge = 2.0 / (1.0 + g * g).sqrt() + 1e-9;

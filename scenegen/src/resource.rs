@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use image::{ImageFormat, ImageReader, Limits};
 
 use crate::error::Error;
+use crate::mesh::Model;
 use crate::texture::Texture;
 
 /// Largest file read `[bytes]`.
@@ -22,6 +23,8 @@ const MAX_SIDE: u32 = 16_384;
 const MAX_PIXELS: u64 = 1 << 28;
 /// Most bytes a decoder may allocate.
 pub(crate) const MAX_DECODED: u64 = 1 << 30;
+/// Most bytes that one byte of a compressed file can stand for: zip's limit, 1032, and a margin.
+pub(crate) const EXPANSION: u64 = 1100;
 /// Most texels of all textures of a model.
 const MAX_TEXELS: u64 = 1 << 29;
 /// Longest reference `[bytes]`.
@@ -64,14 +67,7 @@ impl Folder {
 
     /// The path of a reference; the file may be missing.
     pub(crate) fn resolve(&self, element: &str, reference: &str) -> Result<PathBuf, Error> {
-        let refuse = |problem| {
-            Err(Error::Uri {
-                path: self.file.clone(),
-                element: element.to_owned(),
-                uri: reference.chars().take(80).collect(),
-                problem,
-            })
-        };
+        let refuse = |problem| Err(self.refused(element, reference, problem));
         if reference.is_empty() || reference.len() > MAX_NAME {
             return refuse("is empty or longer than 4 KiB");
         }
@@ -95,6 +91,13 @@ impl Folder {
         }
     }
 
+    /// The error for a reference that is no relative path within the folder.
+    fn refused(&self, element: &str, uri: &str, problem: &str) -> Error {
+        let uri: String = uri.chars().take(80).collect();
+        let remedy = "keep all files in the mesh's own folder";
+        Error::malformed(&self.file, element, format!("the URI {uri:?} {problem}"), remedy)
+    }
+
     /// Reads the file that a percent-encoded relative URI stands for.
     pub(crate) fn read_uri(&self, element: &str, uri: &str) -> Result<Vec<u8>, Error> {
         // A name that is literally there wins: files with a % in their names exist.
@@ -102,11 +105,9 @@ impl Folder {
         if literal.is_file() {
             return read(&literal);
         }
-        let decoded = percent_decoded(uri).ok_or_else(|| Error::Uri {
-            path: self.file.clone(),
-            element: element.to_owned(),
-            uri: uri.chars().take(80).collect(),
-            problem: "has a % without two hexadecimal digits of UTF-8 after it",
+        let decoded = percent_decoded(uri).ok_or_else(|| {
+            let problem = "has a % without two hexadecimal digits of UTF-8 after it";
+            self.refused(element, uri, problem)
         })?;
         self.read(element, &self.resolve(element, &decoded)?)
     }
@@ -123,24 +124,24 @@ impl Folder {
     }
 }
 
-/// Refuses a texture with which a model would have too many texels: many small files can name many
-/// large images.
-pub(crate) fn check_texels(
+/// Adds a texture to a model and returns its number; an error if the model then had too many texels:
+/// many small files can name many large images.
+pub(crate) fn add_texture(
     file: &Path,
     element: &str,
-    before: &[Texture],
-    texture: &Texture,
-) -> Result<(), Error> {
+    model: &mut Model,
+    texture: Texture,
+) -> Result<u32, Error> {
     let texels = |texture: &Texture| {
         let (width, height) = texture.size();
         u64::from(width) * u64::from(height)
     };
-    let total: u64 = before.iter().chain([texture]).map(texels).sum();
-    if total <= MAX_TEXELS {
-        return Ok(());
+    model.textures.push(texture);
+    if model.textures.iter().map(texels).sum::<u64>() > MAX_TEXELS {
+        let problem = "all textures together have more than 2^29 texels";
+        return Err(Error::malformed(file, element, problem, "store smaller textures"));
     }
-    let problem = "all textures together have more than 2^29 texels";
-    Err(Error::malformed(file, element, problem, "store smaller textures"))
+    Ok(model.textures.len() as u32 - 1)
 }
 
 fn percent_decoded(text: &str) -> Option<String> {
@@ -247,10 +248,12 @@ mod tests {
             "..",
             "x\\..\\..\\y",
         ] {
-            assert!(matches!(here.resolve("buffer 0", bad), Err(Error::Uri { .. })), "{bad}");
+            let error = here.resolve("buffer 0", bad).expect_err(bad).to_string();
+            assert!(error.contains("keep all files"), "{error}");
         }
         for bad in ["%2e%2e/b.bin", "%2Fetc/passwd", "%zz", "%", "%ff"] {
-            assert!(matches!(here.read_uri("buffer 0", bad), Err(Error::Uri { .. })), "{bad}");
+            let error = here.read_uri("buffer 0", bad).expect_err(bad).to_string();
+            assert!(error.contains("keep all files"), "{error}");
         }
         std::fs::write(folder.path().join("a b.bin"), "seen").expect("write");
         assert_eq!(here.read_uri("buffer 0", "a%20b.bin").expect("read"), b"seen");
@@ -258,7 +261,7 @@ mod tests {
         #[cfg(unix)]
         {
             std::os::unix::fs::symlink("/etc", folder.path().join("out")).expect("link");
-            assert!(matches!(here.resolve("image 1", "out/hostname"), Err(Error::Uri { .. })));
+            assert!(here.resolve("image 1", "out/hostname").is_err());
         }
     }
 

@@ -5,7 +5,6 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
@@ -262,32 +261,13 @@ impl Scene {
         self.tracer().render(&self.views[view].camera, view as u64)
     }
 
-    /// Renders the scene as another camera sees it.
-    #[must_use]
-    pub fn render_from(&self, camera: &Camera) -> Frame {
-        self.tracer().render(camera, u64::MAX)
-    }
-
     /// Gathers initial points from training views as they are rendered.
     #[must_use]
     pub fn point_collector(&self) -> PointCollector<'_> {
         PointCollector::new(self.tracer(), &self.train_cameras, self.options.points)
     }
 
-    /// Whether a triangle belongs to a thin structure.
-    #[must_use]
-    pub fn is_thin(&self, triangle: u32) -> bool {
-        let material = self.model.triangle_materials.get(triangle as usize);
-        material.is_some_and(|&m| self.model.materials[m as usize].thin)
-    }
-
-    /// Depth, as a ray parameter, and normal of the first surface with alpha of at least one half.
-    pub(crate) fn first_solid(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
-        let solid = self.tracer().first_solid(origin, direction, None);
-        solid.map(|(depth, normal, _)| (depth, normal))
-    }
-
-    fn tracer(&self) -> Tracer<'_> {
+    pub(crate) fn tracer(&self) -> Tracer<'_> {
         Tracer {
             surface: &self.surface,
             model: &self.model,

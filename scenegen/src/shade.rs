@@ -406,7 +406,7 @@ impl TriangleFlags {
                 see_through: material.alpha != AlphaMode::Opaque,
             }
         };
-        let all: Vec<Self> = (0..surface.len()).map(flags).collect();
+        let all: Vec<Self> = (0..surface.triangles.len()).map(flags).collect();
         if all.iter().all(|&t| t == Self::default()) { Vec::new() } else { all }
     }
 }

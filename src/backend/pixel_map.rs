@@ -99,33 +99,9 @@ fn stretch(values: &mut [f32]) {
 }
 
 #[cfg(test)]
-#[allow(clippy::float_cmp, reason = "results are exact")]
+#[expect(clippy::float_cmp, reason = "results are exact")]
 mod tests {
     use super::*;
-
-    fn image(width: u32, grey: &[u8]) -> Image8 {
-        let height = grey.len() as u32 / width;
-        let rgb = grey.iter().flat_map(|&v| [v; 3]).collect();
-        Image8 { width, height, rgb, alpha: None, mask: None }
-    }
-
-    #[test]
-    fn edges_are_the_laplacian_of_the_luma() {
-        // A step from 10 to 30: 8·30 − (5·30 + 3·10) = 60 on the bright side, clipped to 0 on the dark.
-        let step = image(4, &[10, 10, 30, 30, 10, 10, 30, 30, 10, 10, 30, 30]);
-        let row = [0.0, 0.0, 60.0, 0.0];
-        assert_eq!(edges(&step, [0.0; 3]), [row, row, row].concat());
-        // A bright pixel: 8·200, clipped to 255. Its dark neighbours have none.
-        let dot = image(3, &[0, 0, 0, 0, 200, 0, 0, 0, 0]);
-        assert_eq!(edges(&dot, [0.0; 3])[4], 255.0);
-        assert_eq!(edges(&dot, [0.0; 3]).iter().sum::<f32>(), 255.0);
-        // Green counts most: 0.587·100 = 58.7.
-        let green = Image8 { rgb: vec![0, 0, 0, 0, 100, 0], ..image(2, &[0, 0]) };
-        assert_eq!(edges(&green, [0.0; 3]), [0.0, 177.0]);
-        let mut clear = image(2, &[0, 200]);
-        clear.alpha = Some(vec![255, 0]);
-        assert_eq!(edges(&clear, [0.0; 3]), [0.0, 0.0]);
-    }
 
     #[test]
     fn maps_are_stretched_to_one() {

@@ -77,9 +77,6 @@ impl Console {
     }
 
     /// Whether everything said could be written.
-    ///
-    /// # Errors
-    /// The first error of standard output, such as a full disk.
     pub(super) fn finish(&self) -> Result<(), Failure> {
         match self.broken.take() {
             None => Ok(()),

@@ -7,10 +7,9 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use super::flags::SplitArg;
-use crate::evaluate::{Split, evaluate};
+use crate::evaluate::{Mean, Split, evaluate};
 use crate::failure::Failure;
-use crate::metrics::geometry::{self, Geometry, Ground};
+use crate::metrics::geometry::{self, Geometry, KnownScene};
 use crate::number::grouped;
 use crate::output::{write_geometry, write_scores};
 use crate::run::finished::{Machine, iteration, open_run};
@@ -32,8 +31,8 @@ pub(super) struct EvalArgs {
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
     /// Which views to measure
-    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
-    split: SplitArg,
+    #[arg(long, value_enum, default_value_t = Split::Test)]
+    split: Split,
     /// Folder of the dataset, where it is no longer where it was
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
@@ -54,7 +53,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let moved_to = args.scene.clone();
     let machine = Machine::open(&args.device, console)?;
     let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
-    let views = opened.views(args.split.into())?;
+    let views = opened.views(args.split)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
@@ -66,12 +65,12 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
         line(&view.name, view.psnr, view.ssim, view.flip);
         ControlFlow::Continue(())
     })?;
-    let mean = scores.mean();
+    let mean = Mean::of(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip);
-    write_scores(run, args.split.into(), iteration, &scores)?;
+    write_scores(run, args.split, iteration, &scores)?;
     if let Some(truth) = opened.dataset.ground_truth()? {
         let train = opened.views(Split::Train)?;
-        let ground = Ground {
+        let ground = KnownScene {
             truth: &truth,
             normalisation: &opened.dataset.normalisation,
             background,
@@ -79,7 +78,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
         };
         let measured = geometry::measure(opened.backend.as_mut(), &ground, &train, &views)?;
         console.result(table(&measured));
-        write_geometry(run, args.split.into(), iteration, &measured)?;
+        write_geometry(run, args.split, iteration, &measured)?;
     }
     Ok(())
 }

@@ -1,33 +1,13 @@
 //! The options of a run as flags: their defaults in the help, and which of them a call gives.
 
 use std::ffi::OsString;
-use std::path::Path;
 
 use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use toml::{Table, Value};
 
-use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::run::{Partial, RunSpec};
-
-/// Spelling of [`Split`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum SplitArg {
-    /// The views held out
-    Test,
-    /// The views trained on
-    Train,
-}
-
-impl From<SplitArg> for Split {
-    fn from(split: SplitArg) -> Self {
-        match split {
-            SplitArg::Test => Self::Test,
-            SplitArg::Train => Self::Train,
-        }
-    }
-}
 
 /// Gives every option of a run in `command` the default that [`RunSpec`] has for it.
 pub(super) fn with_defaults(command: Command) -> Command {
@@ -62,22 +42,6 @@ pub(super) fn parsed(words: &[String], of: &'static str) -> Result<Partial, Fail
     let matches = command.try_get_matches_from(words).map_err(usage)?;
     let spec = RunSpec::from_arg_matches(&matches).map_err(usage)?;
     given(&matches, &spec)
-}
-
-/// The parameters of policies in a file with a table for each: `--policy-config`.
-pub(super) fn policy_config(path: &Path) -> Result<Partial, Failure> {
-    let origin = format!("--policy-config {}", path.display());
-    let fail = |problem: String| Failure::input(format!("{origin}: {}", problem.trim()));
-    let text = crate::foreign::read_text(path, crate::foreign::MAX_OPTIONS)
-        .map_err(|error| fail(error.to_string()))?;
-    let table: Table = text.parse().map_err(|error: toml::de::Error| fail(error.to_string()))?;
-    for (policy, parameters) in &table {
-        densify_policies::registry::find(policy).map_err(|error| fail(error.to_string()))?;
-        if !parameters.is_table() {
-            return Err(fail(format!("`{policy}` must be a table: [{policy}]")));
-        }
-    }
-    Partial::new([("policy_set".to_owned(), table.into())].into_iter().collect(), &origin)
 }
 
 /// Fails where `--policy-set` among these flags names another policy than that of the run.
@@ -143,6 +107,8 @@ pub(super) fn markdown() -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     #[test]
@@ -166,16 +132,5 @@ mod tests {
         assert_eq!(names, ["eval", "knob", "lr", "near"]);
         let spec = found.describe().unwrap();
         assert!(spec.data.eval && spec.schedule.iterations.0 == 24_000);
-        for (bad, part) in [
-            ("--knob=alpha_mim=1/64", "alpha_min"),
-            ("--lr=opacty=1", "opacity"),
-            ("--budget=0", "out of range"),
-            ("--sh-degree=4", "auto"),
-            ("--policy-set=dite.rho=1", "diet"),
-            ("--sh-every=1001", "1000"),
-        ] {
-            let message = parsed(&[bad.to_owned()], "train").unwrap_err().message;
-            assert!(message.contains(part), "{bad}: {message}");
-        }
     }
 }

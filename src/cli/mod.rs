@@ -13,7 +13,6 @@
 //! }
 //! ```
 
-mod compare;
 mod console;
 mod devices;
 mod eval;
@@ -27,7 +26,7 @@ mod progress;
 mod render;
 mod scenegen;
 mod selftest;
-mod trade;
+mod study;
 mod train;
 
 use std::ffi::OsString;
@@ -36,6 +35,7 @@ use std::process::ExitCode;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::failure;
+use crate::study::{Comparison, Trade};
 use console::Console;
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
@@ -87,13 +87,13 @@ enum Command {
     Eval(eval::EvalArgs),
     Export(export::ExportArgs),
     Render(Box<render::RenderArgs>),
-    Compare(compare::CompareArgs),
+    Compare(Comparison),
     Devices(devices::DevicesArgs),
     Knobs(knobs::KnobsArgs),
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
-    Trade(trade::TradeArgs),
+    Trade(Trade),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -130,12 +130,12 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Export(export) => export::run(&export, &console),
         Command::Render(render) => render::run(&render, &console),
-        Command::Compare(compare) => compare::run(&compare, &console),
+        Command::Compare(comparison) => study::compare(&comparison, &console),
         Command::Devices(devices) => devices::run(&devices, &console),
         Command::Knobs(knobs) => knobs::run(&knobs, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
-        Command::Trade(trade) => trade::run(&trade, &console),
+        Command::Trade(trade) => study::trade(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
     };
     match done.and_then(|()| console.finish()) {

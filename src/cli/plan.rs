@@ -19,7 +19,9 @@ pub(super) fn run(
              to plan a new one",
         ));
     }
-    let plan = plan(&args.describe(matches)?, &Follower::new(console))?;
+    let follower = Follower::new(console);
+    let (spec, _) = args.describe(matches, &follower)?;
+    let plan = plan(&spec, &follower)?;
     for line in &plan.lines {
         console.result(line);
     }

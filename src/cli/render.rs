@@ -1,19 +1,19 @@
 //! `densify render`.
 
 use std::collections::{BTreeMap, HashSet};
-use std::io::Cursor;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use densify_policies::policy::Needs;
-use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, Rgb};
+use image::{DynamicImage, ImageBuffer, Luma};
 
 use super::console::Console;
-use super::flags::SplitArg;
 use crate::backend::Rendering;
 use crate::dataset::images::Image8;
+use crate::evaluate::Split;
 use crate::failure::Failure;
-use crate::output::{OutputError, write_atomically, write_json};
+use crate::output::write_json;
+use crate::pictures::{photograph, picture, side_by_side, to_u8, write_png};
 use crate::run::finished::{Machine, Opened, iteration, open, open_run};
 use crate::run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use crate::views::ViewSource;
@@ -38,8 +38,8 @@ pub(super) struct RenderArgs {
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Which views to render
-    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
-    split: SplitArg,
+    #[arg(long, value_enum, default_value_t = Split::Test)]
+    split: Split,
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
@@ -71,7 +71,7 @@ Examples:
 
 pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     let mut opened = open_model(args, console)?;
-    let views = opened.views(args.split.into())?;
+    let views = opened.views(args.split)?;
     let background = opened.data.background.fixed();
     let units = 1.0 / opened.dataset.normalisation.scale;
     let names: Vec<&str> = (0..views.count()).map(|view| views.name(view)).collect();
@@ -80,18 +80,18 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     for (view, name) in files.iter().enumerate() {
         let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
         let to = |ending: &str| args.output.join(format!("{name}{ending}"));
-        write_png(&to(".png"), picture(&rendering))?;
+        write_png(&to(".png"), &picture(&rendering).into())?;
         if args.alpha {
-            write_png(&to(".alpha.png"), alpha(&rendering))?;
+            write_png(&to(".alpha.png"), &alpha(&rendering))?;
         }
         if args.depth {
             let (png, largest) = depth(&rendering);
-            write_png(&to(".depth.png"), png)?;
+            write_png(&to(".depth.png"), &png)?;
             depths.insert(format!("{name}.depth.png"), f64::from(largest) * units);
         }
         if args.side_by_side {
             let image = views.image(view).map_err(Failure::input)?;
-            write_png(&to(".pair.png"), pair(&image, background, &rendering))?;
+            write_png(&to(".pair.png"), &pair(&image, background, &rendering))?;
         }
     }
     if args.depth {
@@ -157,19 +157,6 @@ fn file_names(views: &[&str]) -> Vec<String> {
     full.iter().enumerate().map(|(i, name)| format!("{name}-{i}")).collect()
 }
 
-fn to_u8(value: f32) -> u8 {
-    (value.clamp(0.0, 1.0) * 255.0).round() as u8
-}
-
-fn picture(rendering: &Rendering) -> DynamicImage {
-    let Rendering { width, height, rgb, .. } = rendering;
-    let pixel = |x: u32, y: u32| {
-        let at = 3 * (y as usize * *width as usize + x as usize);
-        Rgb([rgb[at], rgb[at + 1], rgb[at + 2]].map(to_u8))
-    };
-    ImageBuffer::from_fn(*width, *height, pixel).into()
-}
-
 fn alpha(rendering: &Rendering) -> DynamicImage {
     let Rendering { width, height, alpha, .. } = rendering;
     let pixel = |x: u32, y: u32| Luma([to_u8(alpha[y as usize * *width as usize + x as usize])]);
@@ -191,22 +178,7 @@ fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
 
 /// Photograph on the left, rendering on the right.
 fn pair(image: &Image8, background: [f32; 3], rendering: &Rendering) -> DynamicImage {
-    let truth =
-        |x: u32, y: u32| Rgb(image.composited(x as usize, y as usize, background).map(to_u8));
-    let right = picture(rendering).into_rgb8();
-    let (width, height) = right.dimensions();
-    let pixel = |x: u32, y: u32| {
-        if x < width { truth(x, y) } else { *right.get_pixel(x - width, y) }
-    };
-    ImageBuffer::from_fn(2 * width, height, pixel).into()
-}
-
-fn write_png(path: &Path, image: DynamicImage) -> Result<(), OutputError> {
-    write_atomically(path, |out| {
-        let mut encoded = Cursor::new(Vec::new());
-        image.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
-        out.write_all(&encoded.into_inner())
-    })
+    side_by_side(&[photograph(image, background), picture(rendering)], 0).into()
 }
 
 #[cfg(test)]
@@ -234,7 +206,7 @@ mod tests {
 
     #[test]
     fn pixels_are_rounded_and_clamped() {
-        assert_eq!(picture(&rendering()).into_rgb8().into_raw(), [0, 128, 255, 0, 255, 0]);
+        assert_eq!(picture(&rendering()).into_raw(), [0, 128, 255, 0, 255, 0]);
         assert_eq!(alpha(&rendering()).into_luma8().into_raw(), [255, 51]);
         let (png, largest) = depth(&rendering());
         assert_eq!(png.into_luma16().into_raw(), [65_535, 16_384]);

@@ -247,7 +247,7 @@ fn describe(scene: &Scene, console: &Console) {
     console.say(format_args!(
         "scene    {}: {} triangles, {}",
         scene.name,
-        number::grouped(scene.surface.len()),
+        number::grouped(scene.model.triangles.len()),
         if needs.view_independent { "view-independent" } else { "view-dependent" }
     ));
     console.say(format_args!(

@@ -8,8 +8,7 @@ use densify_scenegen::{
 };
 
 use super::images::{Image8, ImageHeader, ImageSource, SourceFile};
-use super::normalise::Normalisation;
-use super::prepare::{Views, split, target_size};
+use super::prepare::{assemble, target_size};
 use super::scene_cache::Entry;
 use super::tracks::TrackSampler;
 use super::{Dataset, DatasetError, LoadOptions, PointCloud, View};
@@ -52,9 +51,6 @@ pub(super) fn load(
 }
 
 /// The geometry of a built-in scene, as [`load`] renders it.
-///
-/// # Errors
-/// When there is no such scene.
 pub(super) fn ground_truth(name: &str) -> Result<GroundTruth, DatasetError> {
     let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
     Ok(GroundTruth::of_scene(scene))
@@ -81,35 +77,21 @@ pub fn dataset(
         })
         .collect();
     views.sort_by(|a, b| a.0.name.as_bytes().cmp(b.0.name.as_bytes()));
-    let Views { mut train, mut test, number_of } = split(views.into_iter(), options.split, true)?;
-    let centres: Vec<_> = train.iter().map(|view| view.camera.centre()).collect();
-    let normalisation = Normalisation::fit(&centres, &points.positions);
-    for view in train.iter_mut().chain(&mut test) {
-        view.camera = normalisation.scene_from_world_camera(&view.camera);
-    }
-    let positions =
-        points.positions.iter().map(|&point| normalisation.scene_from_world(point)).collect();
     let mut sampler = TrackSampler::new();
     let found = points.positions.iter().zip(&points.colours);
     for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
-        let views = seen_by.len() as u64;
-        if options.tracks && sampler.wants(views) {
+        if options.tracks && sampler.wants(seen_by.len() as u64) {
             sampler.add(position, colour, seen_by.iter().copied());
-        } else {
-            sampler.skip(views);
         }
     }
-    let view_of = |number: u32| number_of.get(&number).copied();
-    let tracks = sampler.finish().in_training_views(&normalisation, view_of);
-    Ok(Dataset {
-        root: path.to_owned(),
-        train,
-        test,
-        points: PointCloud { positions, colours: points.colours },
-        tracks,
-        normalisation,
+    let read = super::Scene {
+        points: PointCloud { positions: points.positions, colours: points.colours },
+        tracks: sampler.finish(),
+        own_split: true,
         notes: scene.model.notes.clone(),
-    })
+        ..super::Scene::default()
+    };
+    assemble(path, views, read, options)
 }
 
 /// The trainer's camera of a rendered view.
@@ -190,33 +172,5 @@ mod tests {
                 assert!((z / depth - 1.0).abs() < 1e-9, "{z} for {depth}");
             }
         }
-    }
-
-    #[test]
-    fn a_built_in_scene_needs_no_file() {
-        let path = Path::new("scene:spheres");
-        let options =
-            LoadOptions { resolution: Some("4".parse().unwrap()), ..LoadOptions::default() };
-        let dataset = Dataset::load(path, &options).unwrap();
-        assert_eq!((dataset.train.len(), dataset.test.len()), (30, 10));
-        assert!(dataset.points.len() > 3000, "{} points", dataset.points.len());
-        let view = &dataset.train[0];
-        let image = view.source.load().unwrap();
-        assert_eq!((image.width, image.height), (32, 32));
-        assert_eq!((view.camera.width, view.camera.height), (32, 32));
-        // Points lie where cameras look: most project into every view.
-        let inside = |p: &&DVec3| {
-            let (pixel, depth) = view.camera.project(**p);
-            depth > 0.0 && (0.0..32.0).contains(&pixel.x) && (0.0..32.0).contains(&pixel.y)
-        };
-        let seen = dataset.points.positions.iter().filter(inside).count();
-        assert!(seen * 4 > dataset.points.len() * 3, "{seen} of {}", dataset.points.len());
-    }
-
-    #[test]
-    fn unknown_scenes_are_refused_by_name() {
-        let error = Dataset::load(Path::new("scene:nonsense"), &LoadOptions::default());
-        let message = error.unwrap_err().to_string();
-        assert!(message.contains("nonsense") && message.contains("spheres"), "{message}");
     }
 }

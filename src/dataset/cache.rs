@@ -89,18 +89,6 @@ impl ImageCache {
         Self { shared, threads }
     }
 
-    /// Number of images.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.shared.sources.len()
-    }
-
-    /// Whether there are no images at all.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.shared.sources.is_empty()
-    }
-
     /// Announces the images needed next, in order; replaces what was announced before.
     pub fn prefetch(&self, upcoming: &[usize]) {
         let mut state = self.shared.lock();
@@ -127,7 +115,7 @@ impl ImageCache {
     /// When the file cannot be loaded. The next call tries again.
     ///
     /// # Panics
-    /// When `index` is not below [`Self::len`].
+    /// When there is no such source.
     pub fn get(&self, index: usize) -> Result<SharedImage, DatasetError> {
         let source = &self.shared.sources[index];
         let mut state = self.shared.lock();
@@ -161,7 +149,11 @@ impl ImageCache {
         let result = load(source).map(Arc::new);
         if cached {
             let mut state = self.shared.lock();
-            state.finish(&self.shared, index, result.as_ref().map(Arc::clone).map_err(|_| None));
+            state.finish(&self.shared, index, result.clone());
+            if result.is_err() {
+                // The caller has the error, and may try again.
+                state.slots[index].content = Content::Empty;
+            }
             drop(state);
             self.shared.loaded.notify_all();
             self.shared.work.notify_all();
@@ -200,7 +192,7 @@ impl Shared {
             drop(state);
             let result = load(&self.sources[index]).map(Arc::new);
             state = self.lock();
-            state.finish(self, index, result.map_err(Some));
+            state.finish(self, index, result);
             self.loaded.notify_all();
         }
     }
@@ -225,21 +217,14 @@ impl State {
         true
     }
 
-    /// Stores the result of a load for which [`Self::make_room`] reserved memory. `Err(None)` stands for
-    /// an error that the caller returns itself.
-    fn finish(
-        &mut self,
-        shared: &Shared,
-        index: usize,
-        result: Result<SharedImage, Option<DatasetError>>,
-    ) {
+    /// Stores the result of a load for which [`Self::make_room`] reserved memory.
+    fn finish(&mut self, shared: &Shared, index: usize, result: Result<SharedImage, DatasetError>) {
         if result.is_err() {
             self.bytes -= shared.sources[index].loaded_bytes();
         }
         self.slots[index].content = match result {
             Ok(image) => Content::Ready(image),
-            Err(Some(error)) => Content::Failed(error),
-            Err(None) => Content::Empty,
+            Err(error) => Content::Failed(error),
         };
     }
 }
@@ -289,17 +274,12 @@ impl ImageDemand {
 
 /// Loads an image; a panic of the decoder becomes an error.
 fn load(source: &ImageSource) -> Result<Image8, DatasetError> {
-    catch_unwind(AssertUnwindSafe(|| source.load())).unwrap_or_else(|_| {
-        Err(DatasetError::Image {
-            path: source.file.path.clone(),
-            problem: "the decoder failed".into(),
-        })
-    })
+    catch_unwind(AssertUnwindSafe(|| source.load()))
+        .unwrap_or_else(|_| Err(DatasetError::image(&source.file.path, "the decoder failed")))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::images::{SourceFile, probe};
     use super::*;
 
     /// `count` images of 16x16 px, told apart by their colour; 768 bytes each.
@@ -308,16 +288,7 @@ mod tests {
             .map(|i| {
                 let path = folder.join(format!("{i}.png"));
                 image::RgbImage::from_pixel(16, 16, [i, 0, 0].into()).save(&path).unwrap();
-                let header = probe(&path).unwrap();
-                ImageSource {
-                    file: SourceFile::found(path).unwrap(),
-                    mask: None,
-                    width: 16,
-                    height: 16,
-                    undistortion: None,
-                    header,
-                    rendered: None,
-                }
+                ImageSource::whole(path)
             })
             .collect()
     }

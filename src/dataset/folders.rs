@@ -101,11 +101,7 @@ impl Folders {
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {
-        DatasetError::MissingImage {
-            path: named.file.to_owned(),
-            field: named.field.to_owned(),
-            image: self.place(named),
-        }
+        DatasetError::missing_image(named.file, named.field, &self.place(named))
     }
 
     /// Where an image is looked for first.

@@ -101,6 +101,16 @@ pub struct ImageHeader {
 }
 
 impl ImageSource {
+    /// An image file as it is.
+    #[cfg(test)]
+    pub(super) fn whole(path: PathBuf) -> Self {
+        let header = probe(&path).expect("an image");
+        let (width, height) = (header.width, header.height);
+        let (mask, undistortion, rendered) = (None, None, None);
+        let file = SourceFile::found(path).expect("an image");
+        Self { file, mask, width, height, undistortion, header, rendered }
+    }
+
     /// Most bytes of the loaded image.
     #[must_use]
     pub fn loaded_bytes(&self) -> u64 {
@@ -141,13 +151,8 @@ impl ImageSource {
         }
         let decoded = decode(&self.file)?;
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
-            return Err(DatasetError::ImageSize {
-                path: self.file.path.clone(),
-                width: decoded.width(),
-                height: decoded.height(),
-                camera_width: header.width,
-                camera_height: header.height,
-            });
+            let found = (decoded.width(), decoded.height());
+            return Err(DatasetError::size(&self.file.path, found, (header.width, header.height)));
         }
         let mut image = pack(decoded);
         if let Some(file) = &self.mask {
@@ -206,11 +211,6 @@ fn limits() -> Limits {
     limits
 }
 
-fn fault(path: &Path, problem: impl std::fmt::Display) -> DatasetError {
-    let problem = foreign::one_line(problem.to_string().trim());
-    DatasetError::Image { path: path.to_owned(), problem }
-}
-
 /// Reads the header of an image file, without decoding it, and checks it against the limits.
 pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
     let mut file = foreign::open(path).map_err(DatasetError::io(path))?;
@@ -229,16 +229,14 @@ pub(super) fn probe(path: &Path) -> Result<ImageHeader, DatasetError> {
         }
         header => header,
     }
-    .map_err(|problem| fault(path, problem))?;
+    .map_err(|problem| DatasetError::image(path, problem))?;
     let pixels = u64::from(header.width) * u64::from(header.height);
     if pixels == 0 {
-        return Err(fault(path, "it has no pixels"));
+        return Err(DatasetError::image(path, "it has no pixels"));
     }
     if pixels > MAX_PIXELS || header.decoded_bytes > MAX_DECODED_BYTES {
-        return Err(fault(
-            path,
-            format!("{}x{} px are more than supported", header.width, header.height),
-        ));
+        let problem = format!("{}x{} px are more than supported", header.width, header.height);
+        return Err(DatasetError::image(path, problem));
     }
     Ok(header)
 }
@@ -269,76 +267,34 @@ fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
         let mut bytes = Vec::new();
         let mut input = reader.into_inner().take(MAX_FILE_BYTES);
         input.read_to_end(&mut bytes).map_err(DatasetError::io(path))?;
-        return jpeg::decode(&bytes).map_err(|problem| fault(path, problem));
+        return jpeg::decode(&bytes).map_err(|problem| DatasetError::image(path, problem));
     }
     reader.limits(limits());
-    reader.decode().map_err(|problem| fault(path, problem))
+    reader.decode().map_err(|problem| DatasetError::image(path, problem))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use image::{ImageBuffer, RgbImage};
 
-    fn source(path: PathBuf) -> ImageSource {
-        let header = probe(&path).unwrap();
-        ImageSource {
-            file: SourceFile::found(path).unwrap(),
-            mask: None,
-            width: header.width,
-            height: header.height,
-            undistortion: None,
-            header,
-            rendered: None,
-        }
-    }
+    use super::*;
 
     #[test]
     fn every_colour_type_packs_to_eight_bits() {
         let folder = tempfile::tempdir().unwrap();
+        let rgba = |alpha| ImageBuffer::from_pixel(3, 2, image::Rgba([1_u8, 2, 3, alpha]));
+        let deep = ImageBuffer::from_pixel(3, 2, image::Rgb([257_u16, 65535, 0]));
         let cases: [(&str, DynamicImage, [u8; 3], Option<u8>); 5] = [
-            (
-                "l8.png",
-                DynamicImage::ImageLuma8(image::ImageBuffer::from_pixel(3, 2, [7].into())),
-                [7; 3],
-                None,
-            ),
-            (
-                "rgb16.png",
-                DynamicImage::ImageRgb16(image::ImageBuffer::from_pixel(
-                    3,
-                    2,
-                    [257, 65535, 0].into(),
-                )),
-                [1, 255, 0],
-                None,
-            ),
-            (
-                "rgba.png",
-                DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(3, 2, [1, 2, 3, 4].into())),
-                [1, 2, 3],
-                Some(4),
-            ),
-            (
-                "opaque.png",
-                DynamicImage::ImageRgba8(image::ImageBuffer::from_pixel(
-                    3,
-                    2,
-                    [1, 2, 3, 255].into(),
-                )),
-                [1, 2, 3],
-                None,
-            ),
-            (
-                "rgb.webp",
-                DynamicImage::ImageRgb8(image::ImageBuffer::from_pixel(3, 2, [9, 8, 7].into())),
-                [9, 8, 7],
-                None,
-            ),
+            ("l8.png", ImageBuffer::from_pixel(3, 2, image::Luma([7_u8])).into(), [7; 3], None),
+            ("rgb16.png", deep.into(), [1, 255, 0], None),
+            ("rgba.png", rgba(4).into(), [1, 2, 3], Some(4)),
+            ("opaque.png", rgba(255).into(), [1, 2, 3], None),
+            ("rgb.webp", RgbImage::from_pixel(3, 2, [9, 8, 7].into()).into(), [9, 8, 7], None),
         ];
         for (name, image, rgb, alpha) in cases {
             let path = folder.path().join(name);
             image.save(&path).unwrap();
-            let loaded = source(path).load().unwrap();
+            let loaded = ImageSource::whole(path).load().unwrap();
             assert_eq!((loaded.width, loaded.height), (3, 2), "{name}");
             assert_eq!(loaded.rgb, rgb.repeat(6), "{name}");
             assert_eq!(loaded.alpha, alpha.map(|a| vec![a; 6]), "{name}");
@@ -349,13 +305,13 @@ mod tests {
     fn a_mask_of_another_size_is_fitted_and_shrunk_along() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");
-        image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
         let mask = folder.path().join("m.png");
         image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
             .save(&mask)
             .unwrap();
         let mask = Some(SourceFile::found(mask).unwrap());
-        let source = ImageSource { mask, width: 2, height: 2, ..source(path) };
+        let source = ImageSource { mask, width: 2, height: 2, ..ImageSource::whole(path) };
         let loaded = source.load().unwrap();
         assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
         assert_eq!(loaded.rgb, [10, 20, 30].repeat(4));
@@ -367,10 +323,11 @@ mod tests {
     fn a_mask_that_hides_everything_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let [path, mask] = ["a.png", "m.png"].map(|name| folder.path().join(name));
-        image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
         image::GrayImage::new(4, 4).save(&mask).unwrap();
         let mask = Some(SourceFile::found(mask).unwrap());
-        let message = ImageSource { mask, ..source(path) }.load().unwrap_err().to_string();
+        let source = ImageSource { mask, ..ImageSource::whole(path) };
+        let message = source.load().unwrap_err().to_string();
         assert!(message.contains("m.png") && message.contains("hides every pixel"), "{message}");
     }
 
@@ -379,9 +336,9 @@ mod tests {
     fn a_photograph_that_becomes_a_link_is_not_followed() {
         let folder = tempfile::tempdir().unwrap();
         let [path, other] = ["a.png", "b.png"].map(|name| folder.path().join(name));
-        image::RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
+        RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
         std::fs::copy(&path, &other).unwrap();
-        let source = source(path.clone());
+        let source = ImageSource::whole(path.clone());
         source.load().unwrap();
         std::fs::remove_file(&path).unwrap();
         std::os::unix::fs::symlink(&other, &path).unwrap();
@@ -393,13 +350,13 @@ mod tests {
     fn broken_and_oversized_files_are_errors_that_name_them() {
         let folder = tempfile::tempdir().unwrap();
         let good = folder.path().join("good.png");
-        image::RgbImage::from_fn(64, 64, |x, y| [x as u8, y as u8, (x * y) as u8].into())
+        RgbImage::from_fn(64, 64, |x, y| [x as u8, y as u8, (x * y) as u8].into())
             .save(&good)
             .unwrap();
         let bytes = std::fs::read(&good).unwrap();
         let cut = folder.path().join("cut.png");
         std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
-        let message = source(cut).load().unwrap_err().to_string();
+        let message = ImageSource::whole(cut).load().unwrap_err().to_string();
         assert!(message.contains("cut.png"), "{message}");
         // A header that promises 100,000 x 100,000 px.
         let mut huge = bytes.clone();
@@ -414,7 +371,8 @@ mod tests {
             let message = probe(&path).unwrap_err().to_string();
             assert!(message.contains(name), "{message}");
         }
-        assert!(matches!(probe(&folder.path().join("none.png")), Err(DatasetError::Io { .. })));
+        let message = probe(&folder.path().join("none.png")).unwrap_err().to_string();
+        assert!(message.contains("cannot read"), "{message}");
     }
 
     fn crc32(bytes: &[u8]) -> u32 {

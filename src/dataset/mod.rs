@@ -42,7 +42,7 @@ pub use crate::import::PointCloud;
 pub use error::DatasetError;
 use folders::Folders;
 use normalise::Normalisation;
-pub use options::{FarCameras, LoadOptions, ParseResolutionError, Resolution, Split};
+pub use options::{FarCameras, LoadOptions, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
 use undistort::Lens;
@@ -127,10 +127,14 @@ impl Dataset {
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {
-            return Err(DatasetError::NoImages {
-                path: scene.listing,
-                looked_for: scene.first_missing,
+            let listing = scene.listing.display();
+            let first = scene.first_missing.map_or_else(String::new, |path| {
+                format!("; the first one looked for is {}", path.display())
             });
+            return Err(DatasetError(format!(
+                "{listing} lists no image that exists{first}; put the images there, or name their folder \
+                 with --images"
+            )));
         }
         prepare::prepare(path, scene, options)
     }
@@ -168,12 +172,13 @@ fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError>
     } else if let Some(folder) = model {
         colmap::read(root, &folder, &Folders::new(root, options, true)?, options.tracks)
     } else if here(transforms::SINGLE) {
-        transforms::read_single(root, &Folders::new(root, options, false)?)
+        transforms::read(root, &Folders::new(root, options, false)?, transforms::SINGLE, false)
     } else {
-        Err(DatasetError::Unrecognised {
-            path: root.path().to_owned(),
-            looked_for: "transforms_train.json with transforms_test.json, nor sparse/0/cameras.bin or .txt, \
-                         nor sparse/cameras.bin or .txt, nor transforms.json",
-        })
+        Err(DatasetError(format!(
+            "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \
+             sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt, nor transforms.json; name a folder \
+             with a COLMAP model or transforms files",
+            root.path().display()
+        )))
     }
 }

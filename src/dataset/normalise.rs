@@ -10,10 +10,9 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 
-/// Factor between the radius of the cameras and the extent (3DGS, `getNerfppNorm`).
-const EXTENT_MARGIN: f64 = 1.1;
-/// Extent of every normalised scene `[scene units]`.
-pub const EXTENT: f64 = EXTENT_MARGIN;
+/// Extent of every normalised scene `[scene units]`: the factor between the radius of the cameras and the
+/// extent (3DGS, `getNerfppNorm`).
+pub const EXTENT: f64 = 1.1;
 /// Cameras are at one place if their radius is below this fraction of their distance from the origin:
 /// the precision of f64 is 2.2e-16, and poses from other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
@@ -34,12 +33,6 @@ pub struct Normalisation {
     pub centre: DVec3,
     /// Scene units per world unit, > 0.
     pub scale: f64,
-}
-
-/// 1.1 times the largest distance of a camera centre from their mean; 0 for one camera.
-#[must_use]
-pub fn extent(centres: &[DVec3]) -> f64 {
-    EXTENT_MARGIN * rig(centres).1
 }
 
 /// Mean of the centres and their largest distance from it.
@@ -201,17 +194,7 @@ mod tests {
 
     fn camera(centre: DVec3) -> Camera {
         let rotation = DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(0.9);
-        let (fx, fy, cx, cy) = (200.0, 210.0, 100.0, 80.0);
-        Camera {
-            width: 200,
-            height: 160,
-            fx,
-            fy,
-            cx,
-            cy,
-            rotation,
-            translation: rotation * -centre,
-        }
+        Camera::centred((200, 160), (200.0, 210.0), rotation, centre)
     }
 
     #[test]
@@ -220,7 +203,7 @@ mod tests {
         let centres = [DVec3::X * 3.0, DVec3::Y * 5.0, DVec3::Z * -2.0].map(|c| c + offset);
         let n = Normalisation::fit(&centres, &[]);
         let scene = centres.map(|c| n.scene_from_world_camera(&camera(c)).centre());
-        assert!((extent(&scene) - EXTENT).abs() < 1e-8);
+        assert!((rig(&scene).1 - 1.0).abs() < 1e-8);
         assert!((scene.iter().sum::<DVec3>()).length() < 1e-8);
         assert!(n.f32_warning().is_some());
         assert!(Normalisation::fit(&[DVec3::X, DVec3::Y], &[]).f32_warning().is_none());

@@ -4,7 +4,7 @@ use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 
 /// How to load a dataset.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -63,21 +63,32 @@ impl Split {
     pub const EVAL_EVERY: u32 = 8;
 }
 
-/// Not a valid resolution.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{0:?} is not a resolution: give 1, 2, 4 or 8 to divide the sides of images by, or a width in px above 8"
-)]
-pub struct ParseResolutionError(String);
+impl Resolution {
+    /// The number that stands for it on the command line.
+    #[must_use]
+    pub fn number(self) -> u32 {
+        let (Self::Divisor(number) | Self::Width(number)) = self;
+        number
+    }
+}
+
+impl Serialize for Resolution {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.number().serialize(serializer)
+    }
+}
 
 impl FromStr for Resolution {
-    type Err = ParseResolutionError;
+    type Err = String;
 
     fn from_str(word: &str) -> Result<Self, Self::Err> {
         match word.parse() {
             Ok(k @ (1 | 2 | 4 | 8)) => Ok(Self::Divisor(k)),
             Ok(width) if width > 8 => Ok(Self::Width(width)),
-            _ => Err(ParseResolutionError(word.to_owned())),
+            _ => Err(format!(
+                "{word:?} is not a resolution: give 1, 2, 4 or 8 to divide the sides of images by, or a width in \
+                 px above 8"
+            )),
         }
     }
 }

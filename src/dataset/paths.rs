@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use super::error::DatasetError;
-use crate::foreign::one_line;
 
 /// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
@@ -28,10 +27,7 @@ impl Root {
     pub(super) fn new(folder: &Path) -> Result<Self, DatasetError> {
         let canonical = folder.canonicalize().map_err(DatasetError::io(folder))?;
         if !canonical.is_dir() {
-            return Err(DatasetError::Io {
-                path: folder.to_owned(),
-                source: std::io::Error::from(std::io::ErrorKind::NotADirectory),
-            });
+            return Err(DatasetError::io(folder)(std::io::ErrorKind::NotADirectory.into()));
         }
         Ok(Self { shown: folder.to_owned(), canonical })
     }
@@ -62,13 +58,12 @@ impl Root {
 }
 
 impl DataPath<'_> {
-    fn fault(self, problem: &'static str) -> DatasetError {
-        DatasetError::UnsafePath {
-            path: self.file.to_owned(),
-            field: one_line(self.field),
-            value: self.value.chars().take(200).collect(),
-            problem,
-        }
+    fn fault(self, problem: &str) -> DatasetError {
+        let value: String = self.value.chars().take(200).collect();
+        let problem = format!("the path {value:?} {problem}");
+        let remedy = "only paths below the dataset's folder are followed (a folder elsewhere can be named with \
+                      --images)";
+        DatasetError::malformed(self.file, self.field, problem, remedy)
     }
 }
 
@@ -126,10 +121,8 @@ mod tests {
             "a\nb",
             &long,
         ] {
-            assert!(
-                matches!(root.join(named(bad)), Err(DatasetError::UnsafePath { .. })),
-                "{bad:?}"
-            );
+            let message = root.join(named(bad)).unwrap_err().to_string();
+            assert!(message.contains("x.json: file_path: the path"), "{message}");
         }
         assert_eq!(root.join(named("./a//b.png")).unwrap(), folder.path().join("a/b.png"));
         assert_eq!(root.existing(named("a/b.png")).unwrap(), None);
@@ -145,7 +138,8 @@ mod tests {
         std::os::unix::fs::symlink(outside.path(), folder.path().join("out")).unwrap();
         std::os::unix::fs::symlink("b.png", folder.path().join("c.png")).unwrap();
         let root = Root::new(folder.path()).unwrap();
-        assert!(matches!(root.existing(named("out/a.png")), Err(DatasetError::UnsafePath { .. })));
+        let refused = root.existing(named("out/a.png")).unwrap_err().to_string();
+        assert!(refused.contains("symbolic link"), "{refused}");
         assert!(root.existing(named("c.png")).unwrap().is_some());
     }
 }

@@ -1,6 +1,6 @@
 //! Turns the frames of any format into views: checks sizes and lenses, splits, normalises.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
@@ -9,64 +9,87 @@ use rayon::prelude::*;
 use super::error::DatasetError;
 use super::images::{self, ImageHeader, ImageSource, SourceFile};
 use super::normalise::{self, Normalisation};
+use super::pose::POSE_REMEDY;
 use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Resolution, Scene, Split, View};
 use crate::camera::Camera;
 
 /// Fraction of the points that may be unusable.
 const MAX_BAD_POINTS: f64 = 0.01;
 
-/// Checks every frame, splits, and moves all into normalised coordinates.
+/// Checks every frame of a format's reader, splits, and moves all into normalised coordinates.
 pub(super) fn prepare(
     path: &Path,
-    scene: Scene,
+    mut scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let Scene {
-        listing, mut frames, mut points, points_file, tracks, own_split, mut notes, ..
-    } = scene;
+    let mut frames = std::mem::take(&mut scene.frames);
     // Bytewise, as other trainers sort names for their test splits.
     frames.sort_by(|a, b| (a.name.as_bytes(), a.held_out).cmp(&(b.name.as_bytes(), b.held_out)));
-    refuse_duplicates(&listing, &frames)?;
+    refuse_duplicates(&scene.listing, &frames)?;
     // All views first, then the first error: the message does not depend on the threads.
     let views: Vec<Result<View, DatasetError>> =
-        frames.par_iter().map(|frame| view(&listing, frame, options.resolution)).collect();
+        frames.par_iter().map(|frame| view(&scene.listing, frame, options.resolution)).collect();
     let views: Vec<View> = views.into_iter().collect::<Result<_, _>>()?;
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, views.first())
         && views.iter().any(|view| view.source.header.width < width)
     {
-        notes.push(format!("images narrower than {width} px are not enlarged ({})", first.name));
+        let first = &first.name;
+        scene.notes.push(format!("images narrower than {width} px are not enlarged ({first})"));
     }
+    let views = views.into_iter().zip(&frames);
+    let views = views.map(|(view, frame)| (view, frame.held_out, frame.id));
+    assemble(path, views.collect(), scene, options)
+}
 
-    let centres: Vec<_> = views.iter().map(|view| view.camera.centre()).collect();
-    let far = normalise::far(&centres);
-    notes.extend(far_note(&views, &far, options.far_cameras));
+/// Splits views, which are sorted by name, and moves all into normalised coordinates. Each view comes with
+/// whether the dataset holds it out, and with the id that tracks use.
+pub(super) fn assemble(
+    path: &Path,
+    views: Vec<(View, bool, Option<u32>)>,
+    scene: Scene,
+    options: &LoadOptions,
+) -> Result<Dataset, DatasetError> {
+    let Scene { listing, mut points, points_file, tracks, own_split, mut notes, .. } = scene;
+    let centres: Vec<_> = views.iter().map(|(view, ..)| view.camera.centre()).collect();
+    let far = views.iter().zip(normalise::far(&centres)).filter(|(_, far)| *far);
+    let far: BTreeSet<String> = far.map(|((view, ..), _)| view.name.clone()).collect();
+    notes.extend(far_note(&far, options.far_cameras));
+    let is_far = |view: &View| far.contains(&view.name);
     let leave_out = options.far_cameras == FarCameras::LeaveOut;
-    let far_names: HashSet<String> = views
-        .iter()
-        .zip(&far)
-        .filter(|(_, far)| **far)
-        .map(|(view, _)| view.name.clone())
-        .collect();
-    let candidates = views.into_iter().zip(&frames);
-    let candidates = candidates.filter(|(view, _)| !(leave_out && far_names.contains(&view.name)));
-    let candidates = candidates.map(|(view, frame)| (view, frame.held_out, frame.id));
-    let Views { mut train, mut test, number_of } = split(candidates, options.split, own_split)?;
-
+    let views = views.into_iter().filter(|(view, ..)| !(leave_out && is_far(view)));
+    let every = match options.split {
+        Split::Every(every) => Some(every.get() as usize),
+        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
+        Split::None | Split::Eval => None,
+    };
+    // Number of a training view by the id that tracks use.
+    let mut number_of = HashMap::new();
+    let (mut train, mut test) = (Vec::new(), Vec::new());
+    for (index, (view, held_out, id)) in views.enumerate() {
+        if every.map_or(held_out, |every| index % every == 0) {
+            test.push(view);
+        } else {
+            number_of.extend(id.map(|id| (id, train.len() as u32)));
+            train.push(view);
+        }
+    }
+    if train.is_empty() {
+        return Err(DatasetError(format!(
+            "no view is left to train on: the test split takes all {}; use a larger --test-every, or leave it \
+             out",
+            test.len()
+        )));
+    }
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
-    let near = train.iter().filter(|view| !far_names.contains(&view.name));
-    let centres: Vec<_> = near.map(|view| view.camera.centre()).collect();
+    let near = train.iter().filter(|view| !is_far(view));
+    let centres: Vec<_> = near.map(|view: &View| view.camera.centre()).collect();
     let normalisation = Normalisation::fit(&centres, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.scene_from_world_camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
             let problem = "the camera is too far from the others";
-            return Err(DatasetError::malformed(
-                &listing,
-                &view.name,
-                problem,
-                "repair the pose or remove the frame",
-            ));
+            return Err(DatasetError::malformed(&listing, &view.name, problem, POSE_REMEDY));
         }
     }
     for position in &mut points.positions {
@@ -80,13 +103,12 @@ pub(super) fn prepare(
 }
 
 /// Names the views whose camera is far from all others.
-fn far_note(views: &[View], far: &[bool], what: FarCameras) -> Option<String> {
+fn far_note(names: &BTreeSet<String>, what: FarCameras) -> Option<String> {
     const SHOWN: usize = 5;
-    let names: Vec<&str> =
-        views.iter().zip(far).filter(|(_, far)| **far).map(|(view, _)| &*view.name).collect();
     let more = names.len().saturating_sub(SHOWN);
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-    let shown = names.get(..SHOWN).unwrap_or(&names).join(", ");
+    let shown: Vec<&str> = names.iter().take(SHOWN).map(String::as_str).collect();
+    let shown = shown.join(", ");
     let fate = match what {
         FarCameras::LeaveOut => "left out (--far-cameras keep keeps them)",
         FarCameras::Keep => "kept, but do not count for the extent of the scene",
@@ -96,51 +118,11 @@ fn far_note(views: &[View], far: &[bool], what: FarCameras) -> Option<String> {
         .then(|| format!("{} {many} far from all others: {fate}: {shown}{more}", names.len()))
 }
 
-/// Views after the split.
-pub(super) struct Views {
-    pub(super) train: Vec<View>,
-    pub(super) test: Vec<View>,
-    /// Number of a training view by the id that tracks use.
-    pub(super) number_of: HashMap<u32, u32>,
-}
-
-/// Splits views, which are sorted by name. Each comes with whether the dataset holds it out, and with
-/// the id that tracks use.
-pub(super) fn split(
-    views: impl Iterator<Item = (View, bool, Option<u32>)>,
-    split: Split,
-    own_split: bool,
-) -> Result<Views, DatasetError> {
-    let every = match split {
-        Split::Every(every) => Some(every.get() as usize),
-        Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
-        Split::None | Split::Eval => None,
-    };
-    let (mut train, mut test, mut number_of) = (Vec::new(), Vec::new(), HashMap::new());
-    for (index, (view, held_out, id)) in views.enumerate() {
-        if every.map_or(held_out, |every| index % every == 0) {
-            test.push(view);
-        } else {
-            number_of.extend(id.map(|id| (id, train.len() as u32)));
-            train.push(view);
-        }
-    }
-    if train.is_empty() {
-        return Err(DatasetError::NoTrainingViews { views: test.len() });
-    }
-    Ok(Views { train, test, number_of })
-}
-
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
-            let problem = "the image is listed twice";
-            return Err(DatasetError::malformed(
-                listing,
-                &pair[0].name,
-                problem,
-                "remove one of the two",
-            ));
+            let (problem, remedy) = ("the image is listed twice", "remove one of the two");
+            return Err(DatasetError::malformed(listing, &pair[0].name, problem, remedy));
         }
     }
     Ok(())
@@ -156,7 +138,10 @@ fn drop_bad(
     let total = points.len();
     let bad = points.retain(keep);
     if bad as f64 > MAX_BAD_POINTS * total as f64 {
-        return Err(DatasetError::BadPoints { path: path.to_owned(), bad, total });
+        let path = path.display();
+        return Err(DatasetError(format!(
+            "{path}: {bad} of {total} points are not finite, more than 1 %; repair the reconstruction"
+        )));
     }
     if bad > 0 {
         notes.push(format!(
@@ -175,53 +160,36 @@ fn view(
 ) -> Result<View, DatasetError> {
     let header = images::probe(&frame.image)?;
     let lens = &frame.lens;
-    let size_fault =
-        |path: &Path, found: ImageHeader, width: u32, height: u32| DatasetError::ImageSize {
-            path: path.to_owned(),
-            width: found.width,
-            height: found.height,
-            camera_width: width,
-            camera_height: height,
-        };
+    let size = (header.width, header.height);
     let k = frame.reduced.unwrap_or(1);
+    let expected = (divided(lens.width, k), divided(lens.height, k));
     let fits = match frame.reduced {
-        Some(k) => {
-            let near = |side: u32, full: u32| side.abs_diff(divided(full, k)) <= 1;
-            near(header.width, lens.width) && near(header.height, lens.height)
-        }
-        None => proportional((header.width, header.height), (lens.width, lens.height)),
+        Some(_) => size.0.abs_diff(expected.0) <= 1 && size.1.abs_diff(expected.1) <= 1,
+        None => proportional(size, (lens.width, lens.height)),
     };
     if !fits {
-        return Err(size_fault(
-            &frame.image,
-            header,
-            divided(lens.width, k),
-            divided(lens.height, k),
-        ));
+        return Err(DatasetError::size(&frame.image, size, expected));
     }
     if let Some(mask) = &frame.mask {
         let found = images::probe(mask)?;
-        if !proportional((found.width, found.height), (header.width, header.height)) {
-            return Err(size_fault(mask, found, header.width, header.height));
+        let found = (found.width, found.height);
+        if !proportional(found, size) {
+            return Err(DatasetError::size(mask, found, size));
         }
     }
     let lens = lens.resized(header.width, header.height);
     // Cut-outs of a photograph have it outside, but hardly by more than their own size.
-    let size = DVec2::new(f64::from(header.width), f64::from(header.height));
-    if !(lens.principal.cmpge(-size) & lens.principal.cmple(2.0 * size)).all() {
+    let extent = DVec2::new(f64::from(header.width), f64::from(header.height));
+    if !(lens.principal.cmpge(-extent) & lens.principal.cmple(2.0 * extent)).all() {
         let DVec2 { x, y } = lens.principal;
-        return Err(DatasetError::malformed(
-            listing,
-            &frame.name,
-            format!("the principal point ({x}, {y}) px is far outside the image"),
-            "repair the camera or remove the frame",
-        ));
+        let problem = format!("the principal point ({x}, {y}) px is far outside the image");
+        let remedy = "repair the camera or remove the frame";
+        return Err(DatasetError::malformed(listing, &frame.name, problem, remedy));
     }
     let undistortion = if lens.is_distorted() {
-        Some(lens.undistortion().map_err(|problem| DatasetError::Lens {
-            path: frame.image.clone(),
-            field: frame.origin.clone(),
-            problem: format!("{problem} (k1, k2, p1, p2 = {:?})", lens.distortion),
+        Some(lens.undistortion().map_err(|problem| {
+            let problem = format!("{problem} (k1, k2, p1, p2 = {:?})", lens.distortion);
+            DatasetError::lens(&frame.image, &frame.origin, problem)
         })?)
     } else {
         None

@@ -28,20 +28,12 @@ pub struct Tracks {
 
 impl Tracks {
     /// Number of tracks.
-    #[must_use]
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.positions.len()
     }
 
-    /// Whether there is no track.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.positions.is_empty()
-    }
-
     /// Their size `[bytes]`.
-    #[must_use]
-    pub fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
         let views: usize = self.views.iter().map(Vec::len).sum();
         (self.len() * track + views * size_of::<u32>()) as u64
@@ -85,12 +77,16 @@ impl TrackSampler {
         Self { tracks: Tracks::default(), stride: 1, seen: 0 }
     }
 
-    /// Whether the next track, which has so many views, is to be added.
-    pub(super) fn wants(&self, views: u64) -> bool {
-        views >= MIN_VIEWS as u64 && self.seen.is_multiple_of(self.stride)
+    /// Counts the next track, which has so many views; says whether it is to be [added](Self::add).
+    pub(super) fn wants(&mut self, views: u64) -> bool {
+        if views < MIN_VIEWS as u64 {
+            return false;
+        }
+        self.seen += 1;
+        (self.seen - 1).is_multiple_of(self.stride)
     }
 
-    /// Adds the next track, with the ids of its views; at most [`MAX_VIEWS`] of them are kept.
+    /// Adds a track, with the ids of its views; at most [`MAX_VIEWS`] of them are kept.
     pub(super) fn add(
         &mut self,
         position: DVec3,
@@ -100,18 +96,12 @@ impl TrackSampler {
         self.tracks.positions.push(position);
         self.tracks.colours.push(colour);
         self.tracks.views.push(views.into_iter().take(MAX_VIEWS as usize).collect());
-        self.seen += 1;
         if self.tracks.len() >= 2 * MAX_TRACKS {
             self.stride *= 2;
             keep_every_second(&mut self.tracks.positions);
             keep_every_second(&mut self.tracks.colours);
             keep_every_second(&mut self.tracks.views);
         }
-    }
-
-    /// Skips the next track.
-    pub(super) fn skip(&mut self, views: u64) {
-        self.seen += usize::from(views >= MIN_VIEWS as u64);
     }
 
     pub(super) fn finish(self) -> Tracks {
@@ -138,8 +128,6 @@ mod tests {
             let views = if i % 2 == 0 { 5 } else { 3 };
             if sampler.wants(views) {
                 sampler.add(DVec3::splat(i as f64), [0; 3], 0..views as u32);
-            } else {
-                sampler.skip(views);
             }
         }
         let tracks = sampler.finish();

@@ -5,6 +5,7 @@
 //! at the top level or in the frame; those in the frame take precedence.
 
 use std::collections::HashSet;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec2, DVec3};
@@ -43,13 +44,14 @@ pub(super) fn read_pair(root: &Root, folders: &Folders) -> Result<Scene, Dataset
     Ok(scene)
 }
 
-/// Reads `transforms.json`. Its own test split, if any, is under `test_filenames`, or under
-/// `val_filenames` if there is no other, as in nerfstudio.
-pub(super) fn read_single(root: &Root, folders: &Folders) -> Result<Scene, DatasetError> {
-    read(root, folders, SINGLE, false)
-}
-
-fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Scene, DatasetError> {
+/// Reads the file `name`. Its own test split, if any, is under `test_filenames`, or under `val_filenames`
+/// if there is no other, as in nerfstudio.
+pub(super) fn read(
+    root: &Root,
+    folders: &Folders,
+    name: &str,
+    held_out: bool,
+) -> Result<Scene, DatasetError> {
     let path = root.path().join(name);
     root.existing(DataPath { file: &path, field: "the file", value: name })?;
     let Value::Object(top) = parse(&path)? else {
@@ -91,10 +93,8 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
             Some(value) => {
                 let field = fields.full("mask_path");
                 let named = DataPath { file: &path, field: &field, value };
-                let missing = || DatasetError::MissingImage {
-                    path: path.clone(),
-                    field: field.clone(),
-                    image: root.path().join(relative(value)),
+                let missing = || {
+                    DatasetError::missing_image(&path, &field, &root.path().join(relative(value)))
                 };
                 Some(root.existing(named)?.ok_or_else(missing)?)
             }
@@ -127,8 +127,8 @@ fn read(root: &Root, folders: &Folders, name: &str, held_out: bool) -> Result<Sc
     }
     let points_file = points_file(root, &top, held_out, &mut notes)?;
     let listing = path.clone();
-    let mut scene =
-        Scene { frames, first_missing, notes, points_file, listing, own_split, ..Scene::default() };
+    let rest = Scene::default();
+    let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
     if !held_out && let Some(file) = &scene.points_file {
         scene.points = crate::import::ply::read_points(file)?;
     }
@@ -180,7 +180,7 @@ impl<'a> Fields<'a> {
         format!("{}{field}", self.place)
     }
 
-    fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
+    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
         DatasetError::malformed(self.path, self.full(field), problem, REMEDY)
     }
 
@@ -291,10 +291,8 @@ impl<'a> Fields<'a> {
     }
 
     fn refuse_other_lenses(&self) -> Result<(), DatasetError> {
-        let refusal = |field: &str, problem: String| DatasetError::Lens {
-            path: self.path.to_owned(),
-            field: self.full(field),
-            problem,
+        let refusal = |field: &str, problem: String| {
+            DatasetError::lens(self.path, &self.full(field), problem)
         };
         if let Some(model) = self.inherited("camera_model") {
             let model =

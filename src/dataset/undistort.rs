@@ -231,17 +231,6 @@ mod tests {
     }
 
     #[test]
-    fn the_jacobian_agrees_with_central_differences() {
-        let lens = lens([0.3, -0.1, 2e-3, -3e-3]);
-        let (p, h) = (DVec2::new(0.4, -0.3), 1e-6);
-        let j = lens.distort_jacobian(p);
-        for axis in [DVec2::X, DVec2::Y] {
-            let numeric = (lens.distort(p + axis * h) - lens.distort(p - axis * h)) / (2.0 * h);
-            assert!((j * axis - numeric).length() < 1e-9);
-        }
-    }
-
-    #[test]
     fn the_pinhole_sees_only_what_the_lens_saw_and_touches_every_side() {
         for k in LENSES {
             let undistortion = lens(k).undistortion().unwrap();

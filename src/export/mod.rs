@@ -73,25 +73,8 @@ inventory::collect!(Format);
 
 /// Why no format can be chosen.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum FormatError {
-    /// No format has this name.
-    #[error("there is no format `{name}`{}; choose one of: {}", suggestion(name), names())]
-    UnknownName {
-        /// The name.
-        name: String,
-    },
-    /// No format has the extension of this file.
-    #[error("the name {file} has the extension of no format; choose one of: {}", names())]
-    UnknownExtension {
-        /// The file's name.
-        file: String,
-    },
-}
-
-fn suggestion(name: &str) -> String {
-    let nearest = nearest(name, formats().iter().map(|format| format.name));
-    nearest.map_or_else(String::new, |nearest| format!("; did you mean `{nearest}`?"))
-}
+#[error("{0}; choose one of: {names}", names = names())]
+pub struct FormatError(String);
 
 fn names() -> String {
     formats().iter().map(|format| format.name).collect::<Vec<_>>().join(", ")
@@ -108,16 +91,20 @@ pub fn formats() -> Vec<&'static Format> {
 /// The format of this name.
 ///
 /// # Errors
-/// [`FormatError::UnknownName`], which names the nearest.
+/// When there is none; names the nearest.
 pub fn find(name: &str) -> Result<&'static Format, FormatError> {
     let found = formats().into_iter().find(|format| format.name == name);
-    found.ok_or_else(|| FormatError::UnknownName { name: name.to_owned() })
+    found.ok_or_else(|| {
+        let nearest = nearest(name, formats().iter().map(|format| format.name));
+        let like = nearest.map_or_else(String::new, |name| format!("; did you mean `{name}`?"));
+        FormatError(format!("there is no format `{name}`{like}"))
+    })
 }
 
 /// The format with the extension of `path`; the longest extension wins (`a.b` over `b`).
 ///
 /// # Errors
-/// [`FormatError::UnknownExtension`].
+/// When there is none.
 pub fn find_by_extension(path: &Path) -> Result<&'static Format, FormatError> {
     let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let lower = file.to_lowercase();
@@ -125,7 +112,7 @@ pub fn find_by_extension(path: &Path) -> Result<&'static Format, FormatError> {
         lower.strip_suffix(format.extension).is_some_and(|stem| stem.ends_with('.'))
     };
     let found = formats().into_iter().filter(fits).max_by_key(|format| format.extension.len());
-    found.ok_or(FormatError::UnknownExtension { file })
+    found.ok_or_else(|| FormatError(format!("the name {file} has the extension of no format")))
 }
 
 impl Format {

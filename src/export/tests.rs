@@ -91,17 +91,6 @@ fn rows_that_cannot_be_had_leave_the_old_file() {
 }
 
 #[test]
-fn names_and_extensions_are_unique() {
-    let formats = formats();
-    for (i, format) in formats.iter().enumerate() {
-        for other in &formats[i + 1..] {
-            assert!(format.name != other.name, "two formats are called {}", other.name);
-            assert!(format.extension != other.extension, "{} and {}", format.name, other.name);
-        }
-    }
-}
-
-#[test]
 fn an_unknown_format_names_the_nearest_and_the_list() {
     let message = find("plz").unwrap_err().to_string();
     assert!(

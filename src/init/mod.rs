@@ -12,12 +12,13 @@ use densify_policies::policy::StartRule;
 use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{Rng, SeedableRng};
+use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
 use crate::dataset::PointCloud;
 use crate::dataset::normalise::EXTENT;
 use crate::gaussians::{Gaussians, logit, rgb_to_dc, sh_coefficients};
+use crate::schedule;
 pub use random::random_points;
 
 /// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
@@ -54,7 +55,9 @@ pub struct InitReport {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InitError {
     /// There is no usable point.
-    #[error("there is no point to start from; start from random points instead")]
+    #[error(
+        "the scene has no usable point to start from; start from random ones with --init random"
+    )]
     NoPoints,
     /// The budget is 0.
     #[error("a budget of 0 Gaussians holds no model; give --budget at least 1")]
@@ -69,9 +72,6 @@ pub enum InitError {
 
 /// Makes one Gaussian per point, in normalised coordinates. If there are more points than `budget`,
 /// the seed chooses a subset. Rows keep the order of the points.
-///
-/// # Errors
-/// See [`InitError`].
 pub fn initialise(
     points: &PointCloud,
     budget: usize,
@@ -95,7 +95,8 @@ pub fn initialise(
     }
     if chosen.len() > budget {
         report.over_budget = chosen.len() - budget;
-        subsample(&mut chosen, budget, seed);
+        schedule::draw(&mut chosen, budget, &mut ChaCha8Rng::seed_from_u64(seed));
+        chosen.sort_unstable();
     }
     report.rows = chosen.len();
 
@@ -152,19 +153,6 @@ fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
     order.dedup_by_key(|i| key(*i));
     order.par_sort_unstable();
     *chosen = order;
-}
-
-/// Keeps `count` of them in order, all subsets equally likely. A partial Fisher–Yates shuffle, written
-/// out because the sampling functions of a library may change with its version.
-fn subsample(chosen: &mut Vec<usize>, count: usize, seed: u64) {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    for i in 0..count {
-        let span = (chosen.len() - i) as u128;
-        let j = i + ((u128::from(rng.next_u64()) * span) >> 64) as usize;
-        chosen.swap(i, j);
-    }
-    chosen.truncate(count);
-    chosen.sort_unstable();
 }
 
 /// Logarithm of the root mean square distance to the (up to) three nearest neighbours. The points are

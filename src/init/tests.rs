@@ -1,5 +1,7 @@
 //! Scales, colours and numbers of the first rows; where random points lie.
 
+use rand_chacha::rand_core::Rng;
+
 use super::*;
 use crate::camera::Camera;
 use crate::sh::C0;
@@ -123,17 +125,7 @@ fn ring(direction: impl Fn(DVec3) -> DVec3) -> Vec<Camera> {
         let z = direction(centre).normalize();
         let x = DVec3::Y.cross(z).normalize();
         let rotation = glam::DMat3::from_cols(x, z.cross(x), z).transpose();
-        let (fx, fy, cx, cy) = (100.0, 100.0, 50.0, 50.0);
-        Camera {
-            width: 100,
-            height: 100,
-            fx,
-            fy,
-            cx,
-            cy,
-            rotation,
-            translation: rotation * -centre,
-        }
+        Camera::centred((100, 100), (100.0, 100.0), rotation, centre)
     };
     (0..12).map(camera).collect()
 }

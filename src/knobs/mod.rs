@@ -79,22 +79,13 @@ pub fn find(name: &str) -> Result<&'static Knob, KnobError> {
     })
 }
 
-/// The number of a knob in [`KNOBS`], and a value of it as the table spells it.
-///
-/// # Errors
-/// When there is no such knob, or the value is outside its domain.
-fn parse_setting(name: &str, value: &str) -> Result<(usize, String), KnobError> {
-    let knob = find(name)?;
-    let number = KNOBS.iter().position(|other| other.name == knob.name);
-    Ok((number.unwrap_or_default(), knob.canonical(value.trim())?))
-}
-
 impl Knob {
     /// A value as the table spells it, so that equal values are equal texts.
     ///
     /// # Errors
     /// When it is outside the domain, with the nearest that is not.
     pub fn canonical(&self, text: &str) -> Result<String, KnobError> {
+        let text = text.trim();
         let bad = |nearest: String| {
             let Self { name, domain, .. } = self;
             KnobError(format!(
@@ -103,12 +94,8 @@ impl Knob {
             ))
         };
         match self.domain {
-            Domain::Choice(words) => {
-                if words.contains(&text) {
-                    return Ok(text.to_owned());
-                }
-                Err(bad(nearest_word(text, words).to_owned()))
-            }
+            Domain::Choice(words) if words.contains(&text) => Ok(text.to_owned()),
+            Domain::Choice(words) => Err(bad(nearest_word(text, words).to_owned())),
             Domain::Number { least, most } => match number(text) {
                 Some(value) if (least..=most).contains(&value) => Ok(self.spelled(value)),
                 Some(value) if value < least => Err(bad(self.spelled(least))),
@@ -124,12 +111,6 @@ impl Knob {
         let same =
             |text: &&str| number(text).is_some_and(|number| number.total_cmp(&value).is_eq());
         known.into_iter().find(same).map_or_else(|| plain(value), str::to_owned)
-    }
-
-    /// Whether a value, as [`canonical`](Self::canonical) spells it, is the default.
-    #[must_use]
-    pub fn is_default(&self, value: &str) -> bool {
-        value == self.default
     }
 }
 

@@ -139,8 +139,7 @@ impl fmt::Display for Preset {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let levels: Vec<String> =
             self.levels.iter().map(|(knob, value)| format!("{knob}={value}")).collect();
-        let levels = if levels.is_empty() { "the defaults".to_owned() } else { levels.join(" ") };
-        write!(f, "{}: {}; {levels}; ", self.name, self.promise)?;
+        write!(f, "{}: {}; {}; ", self.name, self.promise, levels.join(" "))?;
         match self.measured {
             None => f.write_str("what the others are measured against"),
             Some(Measured { psnr, interval: [low, high], seconds, peak, on, .. }) => write!(

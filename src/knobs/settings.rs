@@ -1,8 +1,10 @@
 //! The knobs of a run, with what follows from them for backends and for the trainer.
 
+use std::collections::BTreeMap;
+
 use toml::{Table, Value};
 
-use super::{KNOBS, Knob, KnobError, parse_setting};
+use super::{KNOBS, Knob, KnobError, find};
 use crate::backend::gpu::Accumulation;
 use crate::backend::{Shortcuts, Storage};
 use crate::trainer::Savings;
@@ -20,8 +22,8 @@ pub struct Knobs {
     pub pairs_per_row: Option<usize>,
     /// How a GPU adds up gradients; `None`: the fastest way that it has.
     pub accumulation: Option<Accumulation>,
-    /// Each knob's value as the table spells it, in the table's order.
-    values: Vec<String>,
+    /// Values that were set, by name, as the table spells them.
+    values: BTreeMap<&'static str, String>,
 }
 
 impl Default for Knobs {
@@ -32,7 +34,7 @@ impl Default for Knobs {
             savings: Savings::NONE,
             pairs_per_row: None,
             accumulation: None,
-            values: KNOBS.iter().map(|knob| knob.default.to_owned()).collect(),
+            values: BTreeMap::new(),
         };
         for knob in KNOBS {
             (knob.set)(&mut knobs, knob.default);
@@ -59,24 +61,22 @@ impl Knobs {
     }
 
     /// Sets a knob.
-    ///
-    /// # Errors
-    /// As [`from_table`](Self::from_table).
     pub fn set(&mut self, name: &str, value: &str) -> Result<(), KnobError> {
-        let (number, value) = parse_setting(name, value)?;
-        (KNOBS[number].set)(self, &value);
-        self.values[number] = value;
+        let knob = find(name)?;
+        let value = knob.canonical(value)?;
+        (knob.set)(self, &value);
+        self.values.insert(knob.name, value);
         Ok(())
     }
 
     /// Each knob with its value.
     pub fn iter(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
-        KNOBS.iter().zip(&self.values).map(|(knob, value)| (knob, &**value))
+        KNOBS.iter().map(|knob| (knob, self.values.get(knob.name).map_or(knob.default, |it| it)))
     }
 
     /// Each knob that is not as it is by default.
     pub fn changed(&self) -> impl Iterator<Item = (&'static Knob, &str)> {
-        self.iter().filter(|(knob, value)| !knob.is_default(value))
+        self.iter().filter(|(knob, value)| *value != knob.default)
     }
 
     /// Every knob by name, as a file has them.

@@ -6,11 +6,10 @@ use super::*;
 use crate::backend::BackendKind;
 use crate::run::RunOption;
 
-/// `NAME=VALUE` in the table's spelling.
-fn canonical(setting: &str) -> Result<(&'static str, String), KnobError> {
+/// The value of `NAME=VALUE` in the table's spelling.
+fn canonical(setting: &str) -> Result<String, KnobError> {
     let (name, value) = setting.split_once('=').unwrap();
-    let (number, value) = parse_setting(name, value)?;
-    Ok((KNOBS[number].name, value))
+    find(name)?.canonical(value)
 }
 
 #[test]
@@ -37,7 +36,7 @@ fn equal_values_are_equal_texts() {
         ("transmittance_stop=0.0001", "1e-4"),
         ("ssim_every=5", "5"),
     ] {
-        assert_eq!(canonical(setting).unwrap().1, value, "{setting}");
+        assert_eq!(canonical(setting).unwrap(), value, "{setting}");
     }
 }
 

@@ -13,7 +13,7 @@ const ADDRESSES_PER_THREAD: u64 = (2 + 64) << 20;
 
 /// Memory left to the process, and its limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Grant {
+pub struct MemoryLimit {
     /// How much more the process can have `[bytes]`.
     pub left: u64,
     /// Name of the limit, for messages.
@@ -22,12 +22,14 @@ pub struct Grant {
 
 /// The tightest limit for a process with `threads` busy threads; `None` if unknown.
 #[must_use]
-pub fn grant(threads: usize) -> Option<Grant> {
+pub fn grant(threads: usize) -> Option<MemoryLimit> {
     let grants = [
         address_space(threads)
-            .map(|left| Grant { left, by: "the limit of its address space (ulimit -v)" }),
-        control_group().map(|left| Grant { left, by: "the memory limit of its control group" }),
-        available().map(|left| Grant { left, by: "the memory that the system has available" }),
+            .map(|left| MemoryLimit { left, by: "the limit of its address space (ulimit -v)" }),
+        control_group()
+            .map(|left| MemoryLimit { left, by: "the memory limit of its control group" }),
+        available()
+            .map(|left| MemoryLimit { left, by: "the memory that the system has available" }),
     ];
     grants.into_iter().flatten().min_by_key(|grant| grant.left)
 }
@@ -96,12 +98,5 @@ mod tests {
         assert_eq!(group_left("1000\n", "1300\n", stat), Some(0));
         assert_eq!(group_left("1000\n", "900\n", ""), Some(100));
         assert_eq!(group_left("max\n", "900\n", stat), None);
-    }
-
-    #[test]
-    fn this_process_is_granted_something() {
-        if let Some(Grant { left, by }) = grant(1) {
-            assert!(left > 0, "{by}");
-        }
     }
 }

@@ -8,21 +8,21 @@ mod grant;
 
 use std::fmt;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 pub(crate) use fit::IMAGES;
-pub use fit::{Fit, PAIRS, Setting, SizeRequest, fit, min_memory};
-pub use grant::{Grant, grant};
+pub use fit::{Fit, PAIRS, RunSize, SizeRequest, fit, min_memory};
+pub use grant::{MemoryLimit, grant};
 
 /// All buffers of a run.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ledger {
     /// One line per buffer.
     pub lines: Vec<LedgerLine>,
 }
 
 /// One buffer.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LedgerLine {
     /// Part of the program that it belongs to.
     pub section: Section,
@@ -31,7 +31,7 @@ pub struct LedgerLine {
     /// Its size `[bytes]`.
     pub bytes: u64,
     /// Whether it is in the memory of a GPU.
-    #[serde(skip_serializing_if = "is_false")]
+    #[serde(default, skip_serializing_if = "is_false")]
     pub on_device: bool,
 }
 
@@ -41,7 +41,7 @@ fn is_false(flag: &bool) -> bool {
 }
 
 /// Part of the program, in the order of the table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Section {
     /// Parameters, moments, age.
@@ -81,11 +81,6 @@ impl Section {
 }
 
 impl Ledger {
-    /// Adds a buffer of the renderer.
-    pub fn add(&mut self, what: impl Into<String>, bytes: u64) {
-        self.add_to(Section::Renderer, what, bytes);
-    }
-
     /// Adds a buffer to a section.
     pub fn add_to(&mut self, section: Section, what: impl Into<String>, bytes: u64) {
         self.lines.push(LedgerLine { section, what: what.into(), bytes, on_device: false });
@@ -102,11 +97,6 @@ impl Ledger {
                 self.lines.push(LedgerLine { section, what, bytes, on_device: true });
             }
         }
-    }
-
-    /// Adds all lines of another ledger.
-    pub fn extend(&mut self, other: &Self) {
-        self.lines.extend_from_slice(&other.lines);
     }
 
     /// The most memory held at a time `[bytes]`. Of [`Section::Passing`] and [`Section::Before`] only the
@@ -224,7 +214,7 @@ mod tests {
         ledger.add_to(Section::Process, "program", 3 << 20);
         ledger.add_to(Section::Model, "parameters", 10 << 20);
         ledger.add_to(Section::Model, "moments", 20 << 20);
-        ledger.add("projections", 1536);
+        ledger.add_to(Section::Renderer, "projections", 1536);
         ledger.add_to(Section::Passing, "evaluation", 5 << 20);
         ledger.add_to(Section::Passing, "export", 7 << 20);
         ledger
@@ -234,8 +224,8 @@ mod tests {
     fn of_passing_buffers_only_the_largest_counts() {
         assert_eq!(sample().total(), (40 << 20) + 1536);
         let mut full = Ledger::default();
-        full.add("a", u64::MAX);
-        full.add("b", 1);
+        full.add_to(Section::Renderer, "a", u64::MAX);
+        full.add_to(Section::Renderer, "b", 1);
         assert_eq!(full.total(), u64::MAX);
     }
 

@@ -44,30 +44,19 @@ fn by_blocks<T: Send>(height: usize, function: impl Fn(Range<usize>) -> T + Sync
     blocks.chunks(AT_ONCE).flat_map(several).collect()
 }
 
+/// The sum of pairs of a weighted error and its weight, in order; the weight is above 0.
+fn total(sums: &[[f64; 2]]) -> Result<[f64; 2], MetricError> {
+    let total = sums.iter().fold([0.0; 2], |sum, part| [sum[0] + part[0], sum[1] + part[1]]);
+    if total[1] == 0.0 { Err(MetricError::NothingToCompare) } else { Ok(total) }
+}
+
 /// Why two images cannot be compared.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MetricError {
-    /// The render does not have the target's size.
-    #[error(
-        "the render has {rendered} values, the target of {width}x{height} px needs {expected}; \
-         render at the size of the target"
-    )]
-    SizeMismatch {
-        /// Values in the render.
-        rendered: usize,
-        /// 3 · width · height.
-        expected: usize,
-        /// The target's width `[px]`.
-        width: u32,
-        /// The target's height `[px]`.
-        height: u32,
-    },
-    /// A channel of the target contradicts its width and height.
-    #[error(
-        "the target's {part} has {found} values, its size of {width}x{height} px needs {expected}"
-    )]
-    BadTarget {
-        /// Colours, coverage or mask.
+    /// The render, or a channel of the target, does not have the target's size.
+    #[error("the {part} has {found} values, the target of {width}x{height} px needs {expected}")]
+    Size {
+        /// The render, or the target's colours, coverage or mask.
         part: &'static str,
         /// Values it has.
         found: usize,
@@ -101,23 +90,16 @@ impl<'a> Pair<'a> {
         let (width, height) = (target.width as usize, target.height as usize);
         let pixels = width * height;
         let parts = [
-            ("colours", Some(target.rgb.len()), 3 * pixels),
-            ("coverage", target.alpha.as_ref().map(Vec::len), pixels),
-            ("mask", target.mask.as_ref().map(Vec::len), pixels),
+            ("target's colours", Some(target.rgb.len()), 3 * pixels),
+            ("target's coverage", target.alpha.as_ref().map(Vec::len), pixels),
+            ("target's mask", target.mask.as_ref().map(Vec::len), pixels),
+            ("render", Some(rendered.len()), 3 * pixels),
         ];
         for (part, found, expected) in parts {
             if let Some(found) = found.filter(|&found| found != expected) {
                 let (width, height) = (target.width, target.height);
-                return Err(MetricError::BadTarget { part, found, expected, width, height });
+                return Err(MetricError::Size { part, found, expected, width, height });
             }
-        }
-        if rendered.len() != 3 * pixels {
-            return Err(MetricError::SizeMismatch {
-                rendered: rendered.len(),
-                expected: 3 * pixels,
-                width: target.width,
-                height: target.height,
-            });
         }
         Ok(Self { rendered, target, background: background.map(f64::from), width, height })
     }

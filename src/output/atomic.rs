@@ -133,35 +133,6 @@ mod tests {
         assert_eq!(names(path.parent().unwrap()), ["file.json"]);
     }
 
-    #[test]
-    fn an_error_of_the_contents_is_passed_on() {
-        let root = tempfile::tempdir().unwrap();
-        let path = root.path().join("a");
-        write_atomically(&path, |out| out.write_all(b"old")).unwrap();
-        let lost = || OutputError::io("fetch", Path::new("b"))(io::Error::other("lost"));
-        let error = write_atomically_from(&path, |out| {
-            out.write_all(b"new")?;
-            Err(WriteError::Source(lost()))
-        });
-        assert_eq!(error.unwrap_err().to_string(), lost().to_string());
-        assert_eq!(std::fs::read(&path).unwrap(), b"old");
-        assert_eq!(names(root.path()), ["a"]);
-    }
-
-    #[test]
-    fn until_it_is_complete_the_old_file_stands() {
-        let root = tempfile::tempdir().unwrap();
-        let path = root.path().join("a");
-        write_atomically(&path, |out| out.write_all(b"old")).unwrap();
-        write_atomically(&path, |out| {
-            out.write_all(&[b'x'; 1 << 20])?;
-            assert_eq!(std::fs::read(&path)?, b"old");
-            Ok(())
-        })
-        .unwrap();
-        assert_eq!(std::fs::read(&path).unwrap().len(), 1 << 20);
-    }
-
     #[cfg(unix)]
     #[test]
     fn others_may_read_as_with_any_new_file() {

@@ -20,9 +20,6 @@ struct CameraRecord<'a> {
 }
 
 /// Cameras in world coordinates with the names of their images, numbered in order, as JSON.
-///
-/// # Errors
-/// Those of [`serde_json`].
 pub fn cameras_json<'a>(
     cameras: impl IntoIterator<Item = (&'a str, Camera)>,
 ) -> serde_json::Result<String> {
@@ -57,16 +54,7 @@ mod tests {
         // Turned by 90° about z: the camera's x axis is the world's −y.
         let rotation = DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z);
         let centre = DVec3::new(1.0, 2.0, 3.0);
-        let camera = Camera {
-            width: 4,
-            height: 3,
-            fx: 5.0,
-            fy: 6.0,
-            cx: 2.0,
-            cy: 1.5,
-            rotation,
-            translation: -(rotation * centre),
-        };
+        let camera = Camera::centred((4, 3), (5.0, 6.0), rotation, centre);
         let json = cameras_json([("a/b.png", camera), ("c.png", camera)]);
         let json: serde_json::Value = serde_json::from_str(&json.unwrap()).unwrap();
         let first = &json[0];

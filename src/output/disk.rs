@@ -20,9 +20,6 @@ pub(crate) enum Operation {
 }
 
 /// Fails if a test has requested it.
-///
-/// # Errors
-/// The requested error.
 #[cfg(not(test))]
 pub(super) fn attempt(_: Operation, _: &Path) -> io::Result<()> {
     Ok(())

@@ -5,12 +5,13 @@ use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::disk::{Operation, WatchedFile, attempt};
 use super::{OutputError, write_atomically};
-use crate::evaluate::{Mean, Scores, Split, ViewScore};
+use crate::evaluate::{Mean, Split, ViewScore};
 use crate::memory::Ledger;
 use crate::metrics::geometry::Geometry;
 
@@ -23,9 +24,6 @@ pub struct RecordLog {
 
 impl RecordLog {
     /// Starts an empty log; creates the folder.
-    ///
-    /// # Errors
-    /// [`OutputError::Io`].
     pub fn create(path: &Path) -> Result<Self, OutputError> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)
@@ -40,9 +38,6 @@ impl RecordLog {
 
     /// Continues a log, cut to the `bytes` that it had at the checkpoint. Also returns whether it still
     /// had them; missing records stay missing.
-    ///
-    /// # Errors
-    /// [`OutputError::Io`].
     pub fn resume(path: &Path, bytes: u64) -> Result<(Self, bool), OutputError> {
         let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else {
             return Ok((Self::create(path)?, bytes == 0));
@@ -66,9 +61,6 @@ impl RecordLog {
     }
 
     /// Syncs the file; returns its length `[bytes]`.
-    ///
-    /// # Errors
-    /// [`OutputError::Io`].
     pub fn synced(&self) -> Result<u64, OutputError> {
         let length = attempt(Operation::Sync, &self.path)
             .and_then(|()| self.file.sync_all())
@@ -77,9 +69,6 @@ impl RecordLog {
     }
 
     /// Adds a line.
-    ///
-    /// # Errors
-    /// [`OutputError::Io`].
     pub fn append(&mut self, record: &impl Serialize) -> Result<(), OutputError> {
         let line = serde_json::to_string(record).map_err(std::io::Error::other);
         // One write per line: readers, and a killed process, leave whole lines.
@@ -90,7 +79,7 @@ impl RecordLog {
 }
 
 /// A line of `stats/train.jsonl`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StepRecord {
     /// Iteration, 1-based.
     pub step: u32,
@@ -105,12 +94,11 @@ pub struct StepRecord {
     /// Wall time since the first step `[s]`.
     pub seconds: f64,
     /// Resident memory of the process `[bytes]`, if known.
-    #[serde(default)]
     pub resident_bytes: Option<u64>,
 }
 
 /// `stats/summary.json`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// Version of densify.
     pub densify: String,
@@ -152,9 +140,6 @@ pub struct Summary {
 }
 
 /// Writes a value as indented JSON.
-///
-/// # Errors
-/// [`OutputError::Io`].
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
     write_atomically(path, |out| {
         serde_json::to_writer_pretty(&mut *out, value)?;
@@ -165,21 +150,18 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), OutputError
 /// Adds scores to the files of a split: mean scores to `results.json` as
 /// `{"ours_3000": {"PSNR": …, "SSIM": …, "FLIP": …}}`, scores by view to `per_view.json` as
 /// `{"ours_3000": {"PSNR": {"00000.png": …}, "SSIM": …}}`. Entries of other iterations stay.
-///
-/// # Errors
-/// [`OutputError`].
 pub fn write_scores(
     run: &Path,
     split: Split,
     iteration: u32,
-    scores: &Scores,
+    scores: &[ViewScore],
 ) -> Result<(), OutputError> {
     let (results, per_view) = match split {
         Split::Test => ("results.json", "per_view.json"),
         Split::Train => ("results_train.json", "per_view_train.json"),
     };
     let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
-        scores.views.iter().map(|view| (view.name.clone(), score(view).into())).collect()
+        scores.iter().map(|view| (view.name.clone(), score(view).into())).collect()
     };
     let views = serde_json::json!({
         "PSNR": column(|v| v.psnr),
@@ -187,15 +169,12 @@ pub fn write_scores(
         "FLIP": column(|v| v.flip),
     });
     insert_entry(&run.join(per_view), iteration, views)?;
-    let mean = serde_json::to_value(scores.mean()).unwrap_or_default();
+    let mean = serde_json::to_value(Mean::of(scores)).unwrap_or_default();
     insert_entry(&run.join(results), iteration, mean)
 }
 
 /// Adds geometric measurements to `geometry.json` (`geometry_train.json` for the views trained
 /// on) as `{"ours_3000": {"depth": {…}, …}}`. Entries of other iterations stay.
-///
-/// # Errors
-/// [`OutputError`].
 pub fn write_geometry(
     run: &Path,
     split: Split,
@@ -207,29 +186,13 @@ pub fn write_geometry(
 }
 
 /// The mean scores of an iteration on the test views, if there are any.
-///
-/// # Errors
-/// [`OutputError`] when the file is invalid.
 pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError> {
-    let path = run.join("results.json");
-    let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
-    let entry = read_entries(&path)?.remove(&entry_name(iteration));
-    entry.map(serde_json::from_value).transpose().map_err(|e| malformed(e.to_string()))
+    entry_of(&run.join("results.json"), iteration)
 }
 
 /// The geometric measurements of an iteration on the test views, if there are any.
-///
-/// # Errors
-/// [`OutputError`] when the file is invalid.
 pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, OutputError> {
-    let path = run.join(geometry_file(Split::Test));
-    let malformed = |problem: String| OutputError::Malformed { path: path.clone(), problem };
-    match read_entries(&path)?.remove(&entry_name(iteration)) {
-        None => Ok(None),
-        Some(entry) => {
-            serde_json::from_value(entry).map(Some).map_err(|e| malformed(e.to_string()))
-        }
-    }
+    entry_of(&run.join(geometry_file(Split::Test)), iteration)
 }
 
 fn geometry_file(split: Split) -> &'static str {
@@ -249,11 +212,20 @@ fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputE
     write_json(path, &all)
 }
 
+/// The entry of an iteration, if there is any.
+fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, OutputError> {
+    let entry = read_entries(path)?.remove(&entry_name(iteration));
+    entry.map(serde_json::from_value).transpose().map_err(|e| malformed(path, &e))
+}
+
+fn malformed(path: &Path, problem: &serde_json::Error) -> OutputError {
+    OutputError::Malformed { path: path.to_owned(), problem: problem.to_string() }
+}
+
 /// The entries of a file; none if it does not exist.
 fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
     match std::fs::read_to_string(path) {
-        Ok(text) => serde_json::from_str(&text)
-            .map_err(|e| OutputError::Malformed { path: path.to_owned(), problem: e.to_string() }),
+        Ok(text) => serde_json::from_str(&text).map_err(|e| malformed(path, &e)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(Map::new()),
         Err(e) => Err(OutputError::io("read", path)(e)),
     }
@@ -263,9 +235,9 @@ fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
 mod tests {
     use super::*;
 
-    fn scores(psnr: f64) -> Scores {
+    fn scores(psnr: f64) -> [ViewScore; 2] {
         let view = |name: &str, psnr| ViewScore { name: name.into(), psnr, ssim: 0.5, flip: 0.25 };
-        Scores { views: vec![view("b.png", psnr), view("a/c.png", psnr + 2.0)] }
+        [view("b.png", psnr), view("a/c.png", psnr + 2.0)]
     }
 
     #[test]
@@ -316,27 +288,5 @@ mod tests {
         let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0 };
         let text = serde_json::to_string(&perfect).unwrap();
         assert_eq!(serde_json::from_str::<Mean>(&text).unwrap(), perfect);
-    }
-
-    #[test]
-    fn logs_hold_one_record_a_line() {
-        let root = tempfile::tempdir().unwrap();
-        let path = root.path().join("stats/train.jsonl");
-        let mut log = RecordLog::create(&path).unwrap();
-        let record = StepRecord {
-            step: 1,
-            loss: 0.5,
-            l1: 0.25,
-            ssim: 0.75,
-            rows: 9,
-            seconds: 0.125,
-            resident_bytes: Some(4096),
-        };
-        log.append(&record).unwrap();
-        log.append(&StepRecord { step: 2, ..record }).unwrap();
-        let text = std::fs::read_to_string(&path).unwrap();
-        let read: Vec<StepRecord> =
-            text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-        assert_eq!(read, [record, StepRecord { step: 2, ..record }]);
     }
 }

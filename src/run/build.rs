@@ -16,7 +16,7 @@ use crate::checkpoint::Fingerprint;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::init::{initialise, random_points, restart};
-use crate::memory::Setting;
+use crate::memory::RunSize;
 use crate::number::grouped;
 use crate::schedule::RateOptions;
 use crate::trainer::{TrainOptions, Trainer, needs};
@@ -116,7 +116,7 @@ pub(super) fn build(
 
 /// Everything that was open in the description of a run.
 struct Decided {
-    setting: Setting,
+    setting: RunSize,
     init: InitChoice,
     init_points: Option<usize>,
     rates: RateOptions,
@@ -182,7 +182,7 @@ fn as_written(mut table: toml::Table) -> toml::Table {
 /// The initial model in the coordinates of training, and how it was made.
 fn first_model(
     inputs: &Inputs<'_>,
-    setting: &Setting,
+    setting: &RunSize,
     observer: &dyn Observer,
 ) -> Result<(Gaussians, InitChoice, Option<usize>), Failure> {
     let (choice, given) = (inputs.init(), inputs.spec.start.init_points);

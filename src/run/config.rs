@@ -57,9 +57,6 @@ pub enum DegreeSource {
 
 impl RunConfig {
     /// The content of `config.toml`.
-    ///
-    /// # Errors
-    /// When an option that may be repeated contradicts itself.
     pub fn table(&self) -> Result<Table, Failure> {
         let mut table = self.spec.table()?;
         table.insert("densify".into(), self.densify.clone().into());
@@ -90,9 +87,6 @@ impl RunConfig {
     }
 
     /// Writes `config.toml` into the run's folder.
-    ///
-    /// # Errors
-    /// When it cannot be written.
     pub fn write(&self, run: &Path) -> Result<(), Failure> {
         let text = toml::to_string_pretty(&self.table()?).map_err(Failure::input)?;
         let path = run.join(CONFIG_FILE);

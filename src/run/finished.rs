@@ -111,7 +111,7 @@ pub(crate) fn load(
     data: &DataSpec,
     observer: &dyn Observer,
 ) -> Result<Dataset, Failure> {
-    let dataset = Dataset::load(path, &data.load_options(false)?)?;
+    let dataset = Dataset::load(path, &data.load_options(false))?;
     for note in &dataset.notes {
         observer.say(format_args!("note: {note}"));
     }
@@ -134,9 +134,6 @@ pub(crate) fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussia
 
 impl Opened {
     /// The views of a split.
-    ///
-    /// # Errors
-    /// When there is none.
     pub(crate) fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
         let views: &[View] = match split {
             Split::Train => &self.dataset.train,

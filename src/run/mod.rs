@@ -16,7 +16,7 @@ mod spec;
 mod summary;
 mod values;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 pub use config::{DegreeSource, Resolved, RunConfig};
 pub use observer::{Interrupt, Observer, Silent};
@@ -24,15 +24,13 @@ pub use overlay::Partial;
 pub use report::{LeftOut, Requirements};
 pub(crate) use resolve::use_threads;
 pub use resolve::{Alternatives, DEFAULT_BUDGET, Plan, plan};
-pub use resume::{Resumed, Start, start};
+pub use resume::{Resumed, start};
 pub use session::Occupied;
 pub use spec::{
     DataSpec, DeviceSpec, OPTIONS, OnResume, OutputSpec, PolicySpec, RunOption, RunSpec,
     ScheduleSpec, SizeSpec, StartSpec,
 };
-pub use values::{
-    Assignment, Budget, ByteCount, Fraction, ImageSize, InitChoice, Rows, ShDegree, Whole,
-};
+pub use values::{Assignment, Budget, ByteCount, Fraction, InitChoice, Rows, ShDegree, Whole};
 
 use crate::checkpoint::Fingerprint;
 use crate::dataset::Dataset;
@@ -66,52 +64,26 @@ impl Run {
     /// # Errors
     /// Everything that can be wrong with the description, its files and the device.
     pub fn prepare(spec: &RunSpec) -> Result<Self, Failure> {
-        Self::prepare_observed(spec, &Silent)
+        Self::prepare_observed(spec, None, &Silent)
     }
 
-    /// The same, and says what there is to say.
+    /// The same, and says what there is to say. With `resumed` it goes on with the run that [`start`] has
+    /// found.
     ///
     /// # Errors
-    /// As [`prepare`](Self::prepare).
-    pub fn prepare_observed(spec: &RunSpec, observer: &dyn Observer) -> Result<Self, Failure> {
-        build::build(spec, None, observer)
-    }
-
-    /// Prepares a run that goes on; see [`start`].
-    ///
-    /// # Errors
-    /// As [`prepare`](Self::prepare), and when the description would give another result than the saved
-    /// one.
-    pub fn resume(
+    /// As [`prepare`](Self::prepare), and when it would give another result than the run that goes on.
+    pub fn prepare_observed(
         spec: &RunSpec,
-        resumed: Resumed,
+        resumed: Option<Resumed>,
         observer: &dyn Observer,
     ) -> Result<Self, Failure> {
-        build::build(spec, Some(resumed), observer)
-    }
-
-    /// The run, with everything decided.
-    #[must_use]
-    pub fn config(&self) -> &RunConfig {
-        &self.config
+        build::build(spec, resumed, observer)
     }
 
     /// Bytes per buffer, as promised.
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
-    }
-
-    /// The folder that [`train`](Self::train) writes to.
-    #[must_use]
-    pub fn output(&self) -> &Path {
-        &self.output
-    }
-
-    /// The dataset, without its points.
-    #[must_use]
-    pub fn dataset(&self) -> &Dataset {
-        &self.dataset
     }
 
     /// The trainer.
@@ -124,19 +96,7 @@ impl Run {
     /// # Errors
     /// When a view cannot be read, the device or the disk fails, or the policy does. What was written
     /// until then stays, and is named.
-    pub fn train(self, occupied: Occupied) -> Result<PathBuf, Failure> {
-        self.train_observed(occupied, &Silent)
-    }
-
-    /// The same, and says what there is to say.
-    ///
-    /// # Errors
-    /// As [`train`](Self::train).
-    pub fn train_observed(
-        self,
-        occupied: Occupied,
-        observer: &dyn Observer,
-    ) -> Result<PathBuf, Failure> {
+    pub fn train(self, occupied: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
         session::train(self, occupied, observer)
     }
 }

@@ -7,6 +7,7 @@ use toml::{Table, Value};
 
 use super::spec::{OPTIONS, RunOption, RunSpec};
 use crate::failure::Failure;
+use crate::foreign;
 use crate::knobs::{self, DEFAULT_PRESET};
 use densify_policies::parameters::{nearest, parse_value};
 use densify_policies::policy::RateOverrides;
@@ -29,9 +30,9 @@ impl Partial {
             if RunOption::find(name).is_none() {
                 let like = nearest(name, OPTIONS.iter().map(|option| option.name));
                 let like =
-                    like.map_or_else(String::new, |like| format!("; did you mean `{like}`?"));
+                    like.map_or_else(String::new, |like| format!(" (did you mean `{like}`?)"));
                 return Err(Failure::input(format!(
-                    "{origin}: no option is called `{name}`{like} docs/options.md lists them all"
+                    "{origin}: no option is called `{name}`{like}; docs/options.md lists them all"
                 )));
             }
             let alone: Table = [(name.clone(), value.clone())].into_iter().collect();
@@ -47,24 +48,19 @@ impl Partial {
 
     /// Reads a TOML file that holds any of the options. The `config.toml` of a run is one; what was found
     /// out about that run is passed over.
-    ///
-    /// # Errors
-    /// When it cannot be read; those of [`new`](Self::new).
     pub fn read(path: &Path) -> Result<Self, Failure> {
-        let origin = format!("--config {}", path.display());
-        let fail = |problem: String| Failure::input(format!("{origin}: {}", problem.trim()));
-        let text = crate::foreign::read_text(path, crate::foreign::MAX_OPTIONS)
-            .map_err(|error| fail(error.to_string()))?;
-        let mut table: Table =
-            text.parse().map_err(|error: toml::de::Error| fail(error.to_string()))?;
+        let (mut table, origin) = read_table("--config", path)?;
         table.retain(|key, _| !FOUND_OUT.contains(&key));
         Self::new(table, &origin)
     }
 
+    /// Reads a TOML file with a table of parameters for each policy.
+    pub fn read_policies(path: &Path) -> Result<Self, Failure> {
+        let (table, origin) = read_table("--policy-config", path)?;
+        Self::new([("policy_set".to_owned(), table.into())].into_iter().collect(), &origin)
+    }
+
     /// Those options of a description that `is_given` names.
-    ///
-    /// # Errors
-    /// When an option that may be repeated contradicts itself.
     pub fn given(spec: &RunSpec, is_given: impl Fn(&str) -> bool) -> Result<Self, Failure> {
         let all = spec.table()?;
         check_names(spec)?;
@@ -72,9 +68,6 @@ impl Partial {
     }
 
     /// Everything that a description says.
-    ///
-    /// # Errors
-    /// As [`given`](Self::given).
     pub fn all(spec: &RunSpec) -> Result<Self, Failure> {
         Self::given(spec, |_| true)
     }
@@ -86,9 +79,6 @@ impl Partial {
     }
 
     /// The levels of a preset.
-    ///
-    /// # Errors
-    /// When there is no such preset.
     pub fn preset(name: &str) -> Result<Self, Failure> {
         let preset =
             knobs::preset(name).map_err(|error| Failure::input(format!("--preset: {error}")))?;
@@ -145,9 +135,6 @@ impl Partial {
 
     /// The run that these options describe, over their preset (`balanced` where they name none) and the
     /// defaults.
-    ///
-    /// # Errors
-    /// When there is no such preset.
     pub fn describe(self) -> Result<RunSpec, Failure> {
         let name = self.get("preset").and_then(Value::as_str).unwrap_or(DEFAULT_PRESET);
         let preset = Self::preset(name)?;
@@ -155,12 +142,19 @@ impl Partial {
     }
 
     /// The run that these options describe, over the defaults.
-    ///
-    /// # Errors
-    /// None: values are sound.
     pub(super) fn spec(self) -> Result<RunSpec, Failure> {
         RunSpec::deserialize(self.0).map_err(Failure::input)
     }
+}
+
+/// The table in the TOML file that a flag names, and what messages call it.
+fn read_table(flag: &str, path: &Path) -> Result<(Table, String), Failure> {
+    let origin = format!("{flag} {}", path.display());
+    let text = foreign::read_text(path, foreign::MAX_OPTIONS)
+        .map_err(|e| Failure::input(e).within(&origin))?;
+    let table = text.parse::<Table>();
+    let table = table.map_err(|e| Failure::input(e.to_string().trim()).within(&origin))?;
+    Ok((table, origin))
 }
 
 fn lay(upper: Table, lower: &mut Table) {

@@ -29,14 +29,6 @@ pub struct Resumed {
     pub(super) last: u32,
 }
 
-/// How a run that is to be resumed starts.
-pub enum Start {
-    /// There is nothing yet to go on from, and nothing to lose.
-    Anew(RunSpec),
-    /// From where the run in the folder is, with its options.
-    From(RunSpec, Box<Resumed>),
-}
-
 impl Resumed {
     /// The file that says how the run began.
     fn origin(&self, output: &Path) -> PathBuf {
@@ -56,11 +48,15 @@ const FREE_KNOBS: [&str; 2] = ["knob.pairs_per_row", "knob.accumulation"];
 
 /// Looks in the output folder that `given` describes for the newest sound checkpoint, or else for the
 /// description of a run that has none yet, and lays `given` over the options that were saved with it.
+/// Where there is neither, there is nothing to lose, and the run starts anew.
 ///
 /// # Errors
 /// When a process is training there, the folder holds a run that can no longer go on, or what is there
 /// cannot be used.
-pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> {
+pub fn start(
+    given: Partial,
+    observer: &dyn Observer,
+) -> Result<(RunSpec, Option<Resumed>), Failure> {
     let described = given.clone().describe()?;
     let output = described.output_folder()?;
     RunFolder::check(&output, true)?;
@@ -84,7 +80,7 @@ pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> 
         None => {
             nothing(&output, &rejected, observer)?;
             if !output.join(CONFIG_FILE).exists() {
-                return Ok(Start::Anew(described));
+                return Ok((described, None));
             }
             RunConfig::read(&output)?
         }
@@ -107,7 +103,7 @@ pub fn start(given: Partial, observer: &dyn Observer) -> Result<Start, Failure> 
     spec.schedule.iterations.0 = length;
     // It is this folder that goes on, wherever it was when the run began.
     spec.output.output = Some(output);
-    Ok(Start::From(spec, Box::new(resumed)))
+    Ok((spec, Some(resumed)))
 }
 
 /// The saved options under those that are given.

@@ -271,7 +271,7 @@ impl<'a> Session<'a> {
                 self.record(&report)?;
                 Ok(report)
             }
-            Err(error @ (TrainError::Policy { .. } | TrainError::BrokenPlan { .. })) => {
+            Err(error @ TrainError::Policy { .. }) => {
                 let step = self.run.trainer.steps_done();
                 let saved = match self.save(step) {
                     Ok(path) => {
@@ -310,11 +310,10 @@ impl<'a> Session<'a> {
     /// Writes the model; returns where.
     fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
         let path = model_path(&self.folder, step);
-        let (trainer, to_world) = (&mut self.run.trainer, &self.run.dataset.normalisation);
-        let sh_degree = trainer.model_rows(0..0)?.sh_degree;
-        let shape = Shape { rows: trainer.backend().rows(), sh_degree };
+        let (backend, to_world) = (self.run.trainer.backend(), &self.run.dataset.normalisation);
+        let shape = Shape { rows: backend.rows(), sh_degree: backend.sh_degree() };
         PLY.write_file(&path, shape, |piece| {
-            Ok::<_, Failure>(to_world.world_from_model(trainer.model_rows(piece)?))
+            Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
         })?;
         Ok(path)
     }
@@ -336,7 +335,7 @@ impl<'a> Session<'a> {
             }
             (scores, _) => scores?,
         };
-        let mean = scores.mean();
+        let mean = Mean::of(&scores);
         write_scores(&self.folder, Split::Test, step, &scores)?;
         let Mean { psnr, ssim, flip } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];

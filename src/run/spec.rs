@@ -12,10 +12,10 @@ use clap::{ArgAction, Args};
 use serde::{Deserialize, Serialize};
 
 use super::values::{
-    Assignment, Budget, ByteCount, Fraction, ImageSize, InitChoice, Rows, ShDegree, Whole, as_table,
+    Assignment, Budget, ByteCount, Fraction, InitChoice, Rows, ShDegree, Whole, as_table,
 };
 use crate::backend::BackendChoice;
-use crate::dataset::FarCameras;
+use crate::dataset::{FarCameras, Resolution};
 use crate::schedule::{Background, REFERENCE_ITERATIONS};
 use crate::trainer::OnNan;
 
@@ -127,7 +127,7 @@ run_spec! {
         /// 1, 2, 4 or 8: photographs that many times smaller (uses images_2, images_4, images_8 where
         /// they exist); any larger number: their width in pixels
         #[arg(short, long, value_name = "N")]
-        resolution: Option<ImageSize> = None, Fixed;
+        resolution: Option<Resolution> = None, Fixed;
 
         /// What lies behind the scene, and behind transparent images: black, white, random (another
         /// colour at every step) or #rrggbb

@@ -1,36 +1,34 @@
 //! Types of options that need more than a number or a word: how they are written on the command line
 //! and in a file, and what is out of range.
 
-use std::fmt;
+use std::fmt::Display;
 use std::str::FromStr;
 
 use clap::ValueEnum;
-use serde::de::Visitor;
+use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use toml::{Table, Value};
 
+use crate::dataset::Resolution;
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::number;
+use crate::schedule::Background;
 
 /// A number of rows: `200000`, `28k`, `1.5M`; in a file also a plain number. At least 1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Rows(pub usize);
 
 /// A number of bytes: `512MiB`, `800MB`, `1000000`; in a file also a plain number.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct ByteCount(pub u64);
 
 /// A number greater than 0 and less than 1.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
 pub struct Fraction(pub f64);
 
 /// A whole number from `LEAST` to `MOST`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Whole<const LEAST: u32, const MOST: u32>(pub u32);
-
-/// `--resolution`: 1, 2, 4 or 8 to divide the images' sides by, or a width `[px]` above 8.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ImageSize(pub u32);
 
 /// `--budget`: the most Gaussians there may ever be, or `auto`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -134,15 +132,6 @@ impl<const LEAST: u32, const MOST: u32> FromStr for Whole<LEAST, MOST> {
     }
 }
 
-impl FromStr for ImageSize {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        text.parse::<crate::dataset::Resolution>().map_err(|error| error.to_string())?;
-        text.parse().map(Self).map_err(|_| format!("`{text}` is not a whole number"))
-    }
-}
-
 impl FromStr for Budget {
     type Err = String;
 
@@ -170,131 +159,57 @@ impl FromStr for ShDegree {
     }
 }
 
-/// How a value is written to a file.
-trait InFile: FromStr<Err = String> + Copy {
-    /// What the message says was expected.
-    const EXPECTED: &'static str;
-
-    fn to_value(self) -> Value;
-}
-
-fn integer(number: impl TryInto<i64>) -> Value {
-    Value::Integer(number.try_into().unwrap_or(i64::MAX))
-}
-
-impl InFile for Rows {
-    const EXPECTED: &'static str = "a number of Gaussians such as 200000 or \"200k\"";
-
-    fn to_value(self) -> Value {
-        integer(self.0)
-    }
-}
-
-impl InFile for ByteCount {
-    const EXPECTED: &'static str = "a number of bytes such as 1000000 or \"512MiB\"";
-
-    fn to_value(self) -> Value {
-        integer(self.0)
-    }
-}
-
-impl InFile for Fraction {
-    const EXPECTED: &'static str = "a number greater than 0 and less than 1";
-
-    fn to_value(self) -> Value {
-        Value::Float(self.0)
-    }
-}
-
-impl<const LEAST: u32, const MOST: u32> InFile for Whole<LEAST, MOST> {
-    const EXPECTED: &'static str = "a whole number";
-
-    fn to_value(self) -> Value {
-        integer(self.0)
-    }
-}
-
-impl InFile for ImageSize {
-    const EXPECTED: &'static str = "1, 2, 4, 8, or a width in pixels";
-
-    fn to_value(self) -> Value {
-        integer(self.0)
-    }
-}
-
-impl InFile for Budget {
-    const EXPECTED: &'static str = "a number of Gaussians such as 200000 or \"200k\", or \"auto\"";
-
-    fn to_value(self) -> Value {
+impl Serialize for Budget {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         match self {
-            Self::Rows(rows) => integer(rows),
-            Self::Auto(None) => AUTO.into(),
-            Self::Auto(Some(rows)) => format!("{AUTO}:{rows}").into(),
+            Self::Rows(rows) => rows.serialize(serializer),
+            Self::Auto(None) => AUTO.serialize(serializer),
+            Self::Auto(Some(rows)) => format!("{AUTO}:{rows}").serialize(serializer),
         }
     }
 }
 
-impl InFile for ShDegree {
-    const EXPECTED: &'static str = "0, 1, 2, 3, or \"auto\"";
-
-    fn to_value(self) -> Value {
+impl Serialize for ShDegree {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         match self {
-            Self::Fixed(degree) => integer(degree),
-            Self::Auto(None) => AUTO.into(),
-            Self::Auto(Some(degree)) => format!("{AUTO}:{degree}").into(),
+            Self::Fixed(degree) => degree.serialize(serializer),
+            Self::Auto(None) => AUTO.serialize(serializer),
+            Self::Auto(Some(degree)) => format!("{AUTO}:{degree}").serialize(serializer),
         }
     }
 }
 
-/// Reads a value that is a number or a text in a file.
-struct NumberOrText<T>(std::marker::PhantomData<T>);
-
-impl<T: InFile> Visitor<'_> for NumberOrText<T> {
-    type Value = T;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(T::EXPECTED)
-    }
-
-    fn visit_i64<E: serde::de::Error>(self, number: i64) -> Result<T, E> {
-        number.to_string().parse().map_err(E::custom)
-    }
-
-    fn visit_u64<E: serde::de::Error>(self, number: u64) -> Result<T, E> {
-        number.to_string().parse().map_err(E::custom)
-    }
-
-    fn visit_f64<E: serde::de::Error>(self, number: f64) -> Result<T, E> {
-        number.to_string().parse().map_err(E::custom)
-    }
-
-    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<T, E> {
-        text.parse().map_err(E::custom)
-    }
+/// Reads from a file what may be a number or a text there, as the command line would read it.
+fn number_or_text<'de, D, T>(deserializer: D) -> Result<T, D::Error>
+where
+    D: Deserializer<'de>,
+    T: FromStr<Err: Display>,
+{
+    let text = match Value::deserialize(deserializer)? {
+        Value::String(text) => text,
+        Value::Float(number) => number.to_string(),
+        other => other.to_string(),
+    };
+    text.parse().map_err(D::Error::custom)
 }
 
-macro_rules! in_files {
+macro_rules! number_or_text {
     ($([$($parameters:tt)*] $type:ty;)*) => {$(
-        impl<$($parameters)*> Serialize for $type {
-            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-                self.to_value().serialize(serializer)
-            }
-        }
-
         impl<'de, $($parameters)*> Deserialize<'de> for $type {
             fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-                deserializer.deserialize_any(NumberOrText(std::marker::PhantomData))
+                number_or_text(deserializer)
             }
         }
     )*};
 }
 
-in_files! {
+number_or_text! {
+    [] Background;
     [] Rows;
     [] ByteCount;
     [] Fraction;
     [const LEAST: u32, const MOST: u32] Whole<LEAST, MOST>;
-    [] ImageSize;
+    [] Resolution;
     [] Budget;
     [] ShDegree;
 }
@@ -364,7 +279,7 @@ pub(super) fn assignments(table: &Table) -> Vec<Assignment> {
 
 /// For `#[serde(with)]`: assignments as a table.
 pub(super) mod as_table {
-    use super::{Assignment, Deserialize, Deserializer, Serialize, Serializer};
+    use super::{Assignment, Deserialize, Deserializer, Serialize, Serializer, Value};
     use serde::de::Error as _;
 
     pub(in crate::run) fn serialize<S: Serializer>(
@@ -377,8 +292,8 @@ pub(super) mod as_table {
     pub(in crate::run) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
     ) -> Result<Vec<Assignment>, D::Error> {
-        match toml::Value::deserialize(deserializer)? {
-            toml::Value::Table(table) => Ok(super::assignments(&table)),
+        match Value::deserialize(deserializer)? {
+            Value::Table(table) => Ok(super::assignments(&table)),
             other => Err(D::Error::custom(format!("{other} is not a table of NAME = VALUE"))),
         }
     }

@@ -11,7 +11,7 @@ use std::str::FromStr;
 use densify_policies::policy::RateOverrides;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 
 use crate::backend::LearningRates;
 use crate::gaussians::MAX_SH_DEGREE;
@@ -154,8 +154,7 @@ pub fn divisor(step: u32, iterations: u32, coarse_until: f64) -> u32 {
 }
 
 /// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(into = "String", try_from = "String")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Background {
     /// (0, 0, 0).
     Black,
@@ -224,17 +223,9 @@ impl FromStr for Background {
     }
 }
 
-impl From<Background> for String {
-    fn from(background: Background) -> Self {
-        background.to_string()
-    }
-}
-
-impl TryFrom<String> for Background {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        text.parse()
+impl Serialize for Background {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
     }
 }
 
@@ -257,13 +248,18 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Use::FreshViews, u64::from(step));
-    let count = count.min(views);
-    // The first elements of a Fisher–Yates shuffle.
-    for place in 0..count {
-        chosen.swap(place, place + below(&mut draws, (views - place) as u64) as usize);
-    }
-    chosen.truncate(count);
+    draw(&mut chosen, count.min(views), &mut draws);
     chosen
+}
+
+/// Keeps `count` of the values, all choices equally likely: the first elements of a Fisher–Yates shuffle,
+/// written out because the sampling functions of a library may change with its version.
+pub(crate) fn draw(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng) {
+    for place in 0..count {
+        let other = place + below(rng, (values.len() - place) as u64) as usize;
+        values.swap(place, other);
+    }
+    values.truncate(count);
 }
 
 /// What random numbers are used for; the streams of different uses are independent.

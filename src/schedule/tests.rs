@@ -37,15 +37,6 @@ fn mean_rate_falls_log_linearly_between_its_ends() {
 }
 
 #[test]
-fn invalid_names_the_rate() {
-    assert_eq!(RateOptions::default().invalid(), None);
-    let rates = RateOptions { quat: f32::NAN, ..RateOptions::default() };
-    assert_eq!(rates.invalid(), Some("quat"));
-    let rates = RateOptions { mean_end: 0.0, ..RateOptions::default() };
-    assert_eq!(rates.invalid(), Some("mean_end"));
-}
-
-#[test]
 fn steps_scale_with_the_run() {
     assert_eq!(scaled(1_000, 30_000), 1_000);
     assert_eq!(scaled(1_000, 3_000), 100);

@@ -89,9 +89,6 @@ pub fn bytes(tracks: &Tracks) -> u64 {
 }
 
 /// Measures the tracks in their views; decodes each view once.
-///
-/// # Errors
-/// When an image cannot be read.
 pub fn measure(tracks: &Tracks, views: &[View]) -> Result<Spread, DatasetError> {
     let mut tracks_in = vec![Vec::new(); views.len()];
     for (track, seen_by) in tracks.views.iter().enumerate() {

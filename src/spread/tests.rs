@@ -38,16 +38,8 @@ fn scene(shade: impl Fn(usize, usize, f32) -> f32) -> (Tracks, Vec<View>) {
 
 fn posed(image: Image8) -> View {
     let (width, height) = (image.width, image.height);
-    let camera = Camera {
-        width,
-        height,
-        fx: 1.0,
-        fy: 1.0,
-        cx: 0.0,
-        cy: 0.0,
-        rotation: DMat3::IDENTITY,
-        translation: DVec3::ZERO,
-    };
+    let camera = Camera::centred((width, height), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
+    let camera = Camera { cx: 0.0, cy: 0.0, ..camera };
     let header = ImageHeader {
         width,
         height,
@@ -113,6 +105,7 @@ fn points_that_are_not_on_a_surface_decide_nothing() {
 }
 
 #[test]
+#[ignore = "takes minutes: run by .ci/run"]
 fn built_in_scenes_ask_for_what_their_materials_need() {
     for (name, degrees) in [("spheres", 0..=0), ("room", 0..=0), ("glossy", 2..=3)] {
         let options = LoadOptions { tracks: true, ..LoadOptions::default() };

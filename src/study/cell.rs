@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 
 use toml::Value;
 
-use super::child::{Child, Summary, has_geometry, in_run};
+use super::child::{Child, has_geometry, in_run, summary};
 use super::record::Outcome;
 use crate::failure::{Failure, OTHER};
 use crate::output::{geometry_of, model_path, scores_of};
 use crate::run::Partial;
 
 /// A run of a study.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Cell {
     pub(super) scene: PathBuf,
     /// The scene's short name.
@@ -41,25 +41,33 @@ impl fmt::Display for Cell {
     }
 }
 
-/// What every run of a study sets, over the options that all of its runs share.
-pub(super) fn run_options(
-    shared: &Partial,
-    scene: &Path,
-    budget: usize,
-    seed: u32,
-    iterations: u32,
-) -> Partial {
-    let own = [
-        ("scene", Value::from(scene.to_string_lossy().into_owned())),
-        ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
-        ("seed", Value::from(seed)),
-        ("iterations", Value::from(iterations)),
-    ];
-    let lay = |spec: Partial, (name, value)| Partial::option(name, value).over(spec);
-    own.into_iter().fold(shared.clone(), lay)
-}
-
 impl Cell {
+    /// A run of a study with nothing varied: the options that all runs share, under those that each sets.
+    pub(super) fn new(
+        shared: &Partial,
+        (scene, label): (&Path, &str),
+        budget: usize,
+        seed: u32,
+        iterations: u32,
+    ) -> Self {
+        let own = [
+            ("scene", Value::from(scene.to_string_lossy().into_owned())),
+            ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
+            ("seed", Value::from(seed)),
+            ("iterations", Value::from(iterations)),
+        ];
+        let lay = |spec: Partial, (name, value)| Partial::option(name, value).over(spec);
+        Self {
+            scene: scene.to_owned(),
+            label: label.to_owned(),
+            budget,
+            seed,
+            iterations,
+            spec: own.into_iter().fold(shared.clone(), lay),
+            ..Self::default()
+        }
+    }
+
     /// Name of the run's folder.
     fn run(&self) -> String {
         format!("{}-{}-seed{}", self.label, self.folder, self.seed)
@@ -71,9 +79,6 @@ impl Cell {
     }
 
     /// Trains, measures what was trained, and returns the record.
-    ///
-    /// # Errors
-    /// With the trainer's message and exit code when it fails.
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
         let folder = self.path(output);
         let child = Child { spec: &self.spec, folder: &folder };
@@ -84,11 +89,11 @@ impl Cell {
     }
 
     fn record(&self, folder: &Path) -> Result<Outcome, Failure> {
-        let summary = Summary::read(folder)?;
-        let iterations = summary.number("iterations")? as u32;
+        let summary = summary(folder)?;
+        let iterations = summary.iterations;
         let scores = match self.scores_without_shortcuts {
             true => scores_of(folder, iterations)?,
-            false => summary.tests.values().next_back().copied(),
+            false => summary.test.values().next_back().copied(),
         };
         let Some(scores) = scores else {
             let scene = self.scene.display();
@@ -97,9 +102,8 @@ impl Cell {
         let path = model_path(folder, iterations);
         let model = fs::read(&path)
             .map_err(|e| Failure { code: OTHER, message: format!("{}: {e}", path.display()) })?;
-        let stages = summary.get("stage_seconds").clone();
         Ok(Outcome {
-            densify: summary.text("densify"),
+            densify: summary.densify,
             scene: self.label.clone(),
             factor: self.factor.clone(),
             level: self.level.clone(),
@@ -112,15 +116,15 @@ impl Cell {
             psnr: scores.psnr,
             ssim: scores.ssim,
             flip: scores.flip,
-            rows: summary.number("rows")? as usize,
-            peak_rows: summary.number("peak_rows")? as usize,
-            peak_bytes: summary.get("peak_bytes").as_u64(),
-            ledger_bytes: summary.number("ledger_bytes")? as u64,
-            seconds: summary.number("seconds")?,
-            cpu_seconds: summary.get("cpu_seconds").as_f64(),
-            stage_seconds: serde_json::from_value(stages).unwrap_or_default(),
-            extra_forwards: summary.number("extra_forwards")? as u64,
-            curve: summary.tests.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
+            rows: summary.rows,
+            peak_rows: summary.peak_rows,
+            peak_bytes: summary.peak_bytes,
+            ledger_bytes: summary.ledger_bytes,
+            seconds: summary.seconds,
+            cpu_seconds: summary.cpu_seconds,
+            stage_seconds: summary.stage_seconds,
+            extra_forwards: summary.extra_forwards,
+            curve: summary.test.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
             geometry: geometry_of(folder, iterations)?,
         })
     }

@@ -1,18 +1,16 @@
 //! Runs of `densify` in processes of their own, whose memory is then the run's alone; each is given a file
 //! that describes it.
 
-use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use densify_scenegen::GroundTruth;
-use serde_json::Value;
 
 use crate::dataset::builtin;
 use crate::failure::{Failure, OTHER};
-use crate::output::{Mean, write_atomically};
+use crate::output::{Summary, write_atomically};
 use crate::run::{Partial, RunSpec};
 
 /// A run of a study, by its description, and the folder that it writes.
@@ -23,9 +21,6 @@ pub(super) struct Child<'a> {
 
 impl Child<'_> {
     /// Trains.
-    ///
-    /// # Errors
-    /// With the trainer's message and exit code when it fails.
     pub(super) fn train(&self) -> Result<(), Failure> {
         // Appended, as a name may hold a dot.
         let mut file = self.folder.as_os_str().to_owned();
@@ -38,9 +33,6 @@ impl Child<'_> {
     }
 
     /// Measures what was trained, with `densify eval`, on the device that trained it.
-    ///
-    /// # Errors
-    /// With its message and exit code when it fails.
     pub(super) fn measure(&self) -> Result<(), Failure> {
         let RunSpec { start, device, .. } = self.spec.clone().describe()?;
         let mut command = Command::new(program()?);
@@ -60,9 +52,6 @@ impl Child<'_> {
 /// The description that all runs of a study share: the options that the user gave, but views are held
 /// out, and no checkpoints are written, as a run that is interrupted runs again so that its times are
 /// whole.
-///
-/// # Errors
-/// When an option is the study's own.
 pub(super) fn shared_options(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
     if let Some((name, _)) = given.iter().find(|(name, _)| own.contains(name)) {
         return Err(Failure::input(format!(
@@ -105,44 +94,10 @@ fn wait_for(command: &mut Command) -> Result<(), Failure> {
 }
 
 /// `stats/summary.json` of a run.
-pub(super) struct Summary {
-    path: PathBuf,
-    all: Value,
-    /// Scores of the views held out, by iteration.
-    pub(super) tests: BTreeMap<u32, Mean>,
-}
-
-impl Summary {
-    /// # Errors
-    /// When it cannot be read, or lacks the scores.
-    pub(super) fn read(run: &Path) -> Result<Self, Failure> {
-        let path = run.join("stats/summary.json");
-        let bad = |problem: String| fault(&path, &problem);
-        let text = fs::read(&path).map_err(|e| bad(e.to_string()))?;
-        let all: Value = serde_json::from_slice(&text).map_err(|e| bad(e.to_string()))?;
-        let tests = serde_json::from_value(all["test"].clone());
-        let tests = tests.map_err(|e| bad(format!("`test`: {e}")))?;
-        Ok(Self { path, all, tests })
-    }
-
-    pub(super) fn get(&self, field: &str) -> &Value {
-        &self.all[field]
-    }
-
-    pub(super) fn text(&self, field: &str) -> String {
-        self.all[field].as_str().unwrap_or_default().to_owned()
-    }
-
-    /// # Errors
-    /// When there is no such number.
-    pub(super) fn number(&self, field: &str) -> Result<f64, Failure> {
-        let number = self.all[field].as_f64();
-        number.ok_or_else(|| fault(&self.path, &format!("`{field}` is missing")))
-    }
-}
-
-fn fault(path: &Path, problem: &str) -> Failure {
-    Failure { code: OTHER, message: format!("{}: {problem}", path.display()) }
+pub(super) fn summary(run: &Path) -> Result<Summary, Failure> {
+    let path = run.join("stats/summary.json");
+    let read = fs::read(&path).and_then(|text| Ok(serde_json::from_slice(&text)?));
+    read.map_err(|e| Failure { code: OTHER, message: format!("{}: {e}", path.display()) })
 }
 
 /// Whether the surface of a scene is known.

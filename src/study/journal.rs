@@ -16,9 +16,6 @@ pub(super) struct Journal {
 
 impl Journal {
     /// Reads what is there. A last line that was cut off is not: its run runs again.
-    ///
-    /// # Errors
-    /// When a line is no record.
     pub(super) fn open(path: &Path) -> Result<Self, Failure> {
         let text = match fs::read_to_string(path) {
             Ok(text) => text,
@@ -62,9 +59,6 @@ impl Journal {
     }
 
     /// Adds a record and writes them all.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub(super) fn add(&mut self, record: Record) -> Result<(), OutputError> {
         self.records.push(record);
         let lines = self.records.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));

@@ -6,11 +6,9 @@ use std::fmt;
 pub(super) struct MarkdownTable(String);
 
 impl MarkdownTable {
-    /// A table without rows.
-    pub(super) fn new(titles: &[&str]) -> Self {
-        let titles_and_rule =
-            format!("| {} |\n|{}\n", titles.join(" | "), "---|".repeat(titles.len()));
-        Self(titles_and_rule)
+    /// A table without rows; titles are separated by ` | `.
+    pub(super) fn new(titles: &str) -> Self {
+        Self(format!("| {titles} |\n|{}\n", "---|".repeat(titles.split(" | ").count())))
     }
 
     /// Adds a row, with a cell for every title.

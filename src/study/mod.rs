@@ -17,8 +17,8 @@ mod trade;
 
 use std::path::{Path, PathBuf};
 
-pub use compare::{Comparison, SceneBudget};
-pub use trade::Trade;
+pub(crate) use compare::Comparison;
+pub(crate) use trade::Trade;
 
 use crate::dataset::builtin;
 use crate::failure::Failure;
@@ -30,7 +30,7 @@ use record::{Outcome, Record};
 
 /// What a finished study leaves.
 #[derive(Debug)]
-pub struct Finished {
+pub(crate) struct Finished {
     /// A few lines for the terminal.
     pub summary: String,
     /// The file with tables and pictures.
@@ -126,17 +126,4 @@ fn unless_taken(taken: &[String], name: String) -> Result<String, Failure> {
         )));
     }
     Ok(name)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn built_in_scenes_go_by_their_names() {
-        let paths = ["scene:table", "scene:thin"].map(PathBuf::from);
-        assert_eq!(labels(&paths).ok(), Some(vec!["table".to_owned(), "thin".to_owned()]));
-        let twice = ["scene:table", "scene:table"].map(PathBuf::from);
-        assert!(labels(&twice).is_err_and(|failure| failure.message.contains("table")));
-    }
 }

@@ -14,9 +14,6 @@ use crate::output::write_atomically;
 pub(super) type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// The SVG of so many pixels that `draw` draws on white.
-///
-/// # Errors
-/// When it cannot be drawn.
 pub(super) fn svg(
     size: (u32, u32),
     draw: impl FnOnce(&Area<'_>) -> Result<(), Box<dyn Error>>,
@@ -34,9 +31,6 @@ pub(super) fn svg(
 }
 
 /// Writes a plot into the folder `output`.
-///
-/// # Errors
-/// When the file cannot be written.
 pub(super) fn write(
     output: &Path,
     file: String,

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use densify_policies::plan::{EditPlan, RowOps};
-use densify_policies::policy::{SceneInfo, Snapshot};
+use densify_policies::policy::{PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 
 use super::policy_calls::call_policy;
@@ -62,15 +62,16 @@ impl<V: ViewSource> Trainer<V> {
         let (rows, budget) = (self.backend.rows(), self.row_limit());
         let reason = if ops.rows_before != rows || ops.budget != budget {
             let RowOps { rows_before, budget: planned, .. } = ops;
-            Some(format!(
+            format!(
                 "made for {rows_before} rows of {planned}, but the model has {rows} of {budget}"
-            ))
+            )
+        } else if let Err(broken) = ops.check() {
+            broken.to_string()
         } else {
-            ops.check().err().map(|broken| broken.to_string())
+            return Ok(());
         };
-        reason.map_or(Ok(()), |reason| {
-            Err(TrainError::BrokenPlan { step, policy: self.policy_name.clone(), reason })
-        })
+        let problem = format!("its plan is broken: {reason}; this is a bug, please report it");
+        Err(self.policy_error(step, PolicyError::Other(problem)))
     }
 }
 

@@ -9,9 +9,6 @@ use crate::views::ViewError;
 /// [read](super::Trainer::model); only after [`Diverged`](Self::Diverged) it is worthless.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// There is nothing to train on.
-    #[error("there is no training view; use a larger --test-every or add images")]
-    NoViews,
     /// An option is out of its range.
     #[error("{0}")]
     BadOption(String),
@@ -53,7 +50,7 @@ pub enum TrainError {
         /// Names the first of them and its value.
         first: String,
     },
-    /// The policy reported an error.
+    /// The policy reported an error, panicked, or returned a plan that breaks an invariant.
     #[error("step {step}: policy `{policy}`: {source}")]
     Policy {
         /// Iteration.
@@ -62,18 +59,6 @@ pub enum TrainError {
         policy: String,
         /// What it reported.
         source: PolicyError,
-    },
-    /// The policy's plan breaks an invariant.
-    #[error(
-        "step {step}: the plan of policy `{policy}` is broken: {reason}; this is a bug, please report it"
-    )]
-    BrokenPlan {
-        /// Iteration.
-        step: u32,
-        /// The policy's name.
-        policy: String,
-        /// What is wrong.
-        reason: String,
     },
     /// The backend failed.
     #[error("step {step}: {source}")]

@@ -28,10 +28,10 @@ use crate::dataset::images::SharedImage;
 use crate::schedule;
 use crate::views::ViewSource;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth_signals};
-use distinct_views::ScoringViews;
+use distinct_views::distinct_views;
 pub use error::TrainError;
 use nonfinite::AUDIT_EVERY;
-pub use options::{OnNan, Required, Savings, TrainOptions};
+pub use options::{AutoChoices, OnNan, Savings, TrainOptions};
 use policy_calls::call_policy;
 pub use report::{EditEvent, StepReport};
 pub use state::TrainerState;
@@ -68,7 +68,7 @@ pub struct Trainer<V> {
     images_time: Duration,
     events: Vec<EditEvent>,
     /// Training views that the policy's scores are measured in.
-    scored: ScoringViews,
+    scored: Vec<usize>,
     /// Training views that `--budget auto` measures; empty without it.
     probes: Vec<usize>,
     auto_budget: Option<AutoBudget>,
@@ -76,10 +76,6 @@ pub struct Trainer<V> {
 
 impl<V: ViewSource> Trainer<V> {
     /// A new run. `backend` holds the initial model; `policy_name` is for messages only.
-    ///
-    /// # Errors
-    /// [`TrainError::NoViews`], and [`TrainError::BadOption`] if `scene` or `options` disagree
-    /// with the views or the backend.
     pub fn new(
         views: V,
         backend: Box<dyn Backend>,
@@ -106,7 +102,7 @@ impl<V: ViewSource> Trainer<V> {
             options,
             step: 0,
             events: Vec::new(),
-            scored: ScoringViews::all(count),
+            scored: (0..count).collect(),
             probes: Vec::new(),
             auto_budget: None,
         })
@@ -115,12 +111,12 @@ impl<V: ViewSource> Trainer<V> {
     /// Lets the run make automatic choices; to be called before the first step. To choose the number of
     /// rows, the backend must have been made with [`growth_signals`] too.
     #[must_use]
-    pub fn requiring(mut self, choices: Required) -> Self {
+    pub fn requiring(mut self, choices: AutoChoices) -> Self {
         if choices.rows {
             self.probes = probe::probes(self.views.count(), self.options.seed);
         }
         if choices.scored_views {
-            self.scored = ScoringViews::distinct(&self.views, self.scene.extent);
+            self.scored = distinct_views(&self.views, self.scene.extent);
         }
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
         self.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
@@ -174,6 +170,12 @@ impl<V: ViewSource> Trainer<V> {
         }
         self.policy_time = self.policy_time.saturating_add(start.elapsed());
         Ok(StepReport { step, view, output, rows: self.backend.rows(), events })
+    }
+
+    /// `count` of the scored views, or all of them if there are fewer, drawn from (seed, step).
+    fn draw_scored(&self, count: usize, step: u32) -> Vec<usize> {
+        let drawn = schedule::fresh_views(self.scored.len(), count, self.options.seed, step);
+        drawn.into_iter().map(|place| self.scored[place]).collect()
     }
 
     fn image(&self, step: u32, view: usize) -> Result<SharedImage, TrainError> {

@@ -70,7 +70,7 @@ impl Default for Savings {
 
 /// Choices that a run makes by itself, from measurements of its scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Required {
+pub struct AutoChoices {
     /// The number of rows, up to the budget (`--budget auto`).
     pub rows: bool,
     /// Which training views the policy's scores are measured in: near-duplicates are left out.

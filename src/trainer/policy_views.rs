@@ -21,7 +21,7 @@ impl<V: ViewSource> Trainer<V> {
         }
         let degree = self.sh_degree(step);
         let count = needs.fresh_views as usize;
-        for view in self.scored.draw(count, self.options.seed, step) {
+        for view in self.draw_scored(count, step) {
             let measured = self.backend.measure_weights(self.views.camera(view), degree);
             measured.map_err(|e| self.backend_error(step, e))?;
             self.extra_forwards += 1;
@@ -38,7 +38,7 @@ impl<V: ViewSource> Trainer<V> {
             return Ok(());
         };
         let (options, degree) = (self.options, self.sh_degree(step));
-        for view in self.scored.draw(count, options.seed, step) {
+        for view in self.draw_scored(count, step) {
             let image = self.image(step, view)?;
             let measured = self.backend.observe(&AuxInput {
                 step,

@@ -1,17 +1,14 @@
 //! Read access to a run in progress: counters, times, events, and the model.
 
-use std::ops::Range;
 use std::time::Duration;
 
-use densify_policies::policy::SceneInfo;
-
-use super::{AutoBudget, EditEvent, Trainer};
+use super::{AutoBudget, Trainer};
 use crate::backend::{Backend, BackendError};
 use crate::gaussians::Gaussians;
 use crate::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// The measurements and the limit of rows, if they are [chosen automatically](super::Required::rows).
+    /// The measurements and the limit of rows, if they are [chosen automatically](super::AutoChoices::rows).
     #[must_use]
     pub fn growth(&self) -> Option<&AutoBudget> {
         self.auto_budget.as_ref()
@@ -22,7 +19,7 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn unscored_views(&self) -> usize {
         let scores = self.needs.fresh_views > 0 || self.needs.aux.is_some();
-        if scores { self.views.count() - self.scored.count() } else { 0 }
+        if scores { self.views.count() - self.scored.len() } else { 0 }
     }
 
     /// Steps done so far.
@@ -62,18 +59,6 @@ impl<V: ViewSource> Trainer<V> {
         self.images_time
     }
 
-    /// All edits so far.
-    #[must_use]
-    pub fn events(&self) -> &[EditEvent] {
-        &self.events
-    }
-
-    /// The scene and the run, as the policy sees them.
-    #[must_use]
-    pub fn scene(&self) -> &SceneInfo {
-        &self.scene
-    }
-
     /// The training views.
     #[must_use]
     pub fn views(&self) -> &V {
@@ -81,19 +66,8 @@ impl<V: ViewSource> Trainer<V> {
     }
 
     /// A copy of the current model, in the coordinates of training.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
     pub fn model(&self) -> Result<Gaussians, BackendError> {
-        self.model_rows(0..self.backend.rows())
-    }
-
-    /// Some rows of the [`model`](Self::model), which must exist.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    pub fn model_rows(&self, rows: Range<usize>) -> Result<Gaussians, BackendError> {
-        self.backend.download_rows(rows)
+        self.backend.download()
     }
 
     /// The backend, for rendering and its ledger.

@@ -40,9 +40,6 @@ pub struct TrainerState {
 
 impl<V: ViewSource> Trainer<V> {
     /// What a checkpoint must hold, beside the model and the backend's state.
-    ///
-    /// # Errors
-    /// When the policy panics.
     pub fn state(&self) -> Result<TrainerState, PolicyError> {
         Ok(TrainerState {
             step: self.step,

@@ -14,7 +14,7 @@ pub(super) fn check_options(
 ) -> Result<(), TrainError> {
     let bad = |reason: String| Err(TrainError::BadOption(reason));
     if views == 0 {
-        return Err(TrainError::NoViews);
+        return bad("there is no training view; use a larger --test-every or add images".into());
     }
     if u32::try_from(views) != Ok(scene.train_views) {
         return bad(format!("{views} views, but the scene has {}", scene.train_views));

@@ -3,11 +3,9 @@
 use densify_policies::policy::Needs;
 
 use super::compare::Limits;
-use crate::backend::cpu::{CpuBackend, CpuOptions, ImageGradient, InstructionSet, ModelGradient};
+use crate::backend::cpu::{CpuBackend, CpuOptions, InstructionSet};
 use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
-use crate::backend::{Backend, BackendError, Rendering, Shortcuts, StepOutput};
-use crate::camera::Camera;
-use crate::dataset::images::Image8;
+use crate::backend::{BackendError, Differentiable, Shortcuts, Storage};
 use crate::gaussians::Gaussians;
 
 /// What is tested.
@@ -22,9 +20,6 @@ pub enum Subject {
     },
     /// A GPU, or what stands for one.
     Gpu(GpuDevice),
-    /// The native backend with an error on purpose.
-    #[cfg(test)]
-    Sabotaged(super::sabotage::Sabotage),
 }
 
 /// What a backend is made for, beside its model. The default is what the model needs.
@@ -40,78 +35,12 @@ pub struct Setup {
     pub record_cap: Option<usize>,
     /// Largest image that its ledger shall cover `[px]`.
     pub largest_image: (u32, u32),
+    /// How parameters and moments are stored; only the native backend has the choice.
+    pub storage: Storage,
     /// Signals to collect.
     pub needs: Needs,
     /// Where to compute less than could be.
     pub shortcuts: Shortcuts,
-}
-
-/// A backend with gradients and losses on their own.
-pub trait Differentiable: Backend {
-    /// Renders a view and differentiates Σ image · upstream.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    fn differentiate(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        upstream: &ImageGradient,
-    ) -> Result<(Rendering, ModelGradient), BackendError>;
-
-    /// The training loss of a rendering, and its gradient.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    fn loss(
-        &mut self,
-        rendering: &Rendering,
-        target: &Image8,
-        background: [f32; 3],
-    ) -> Result<(StepOutput, Vec<f32>), BackendError>;
-}
-
-impl Differentiable for CpuBackend {
-    fn differentiate(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        upstream: &ImageGradient,
-    ) -> Result<(Rendering, ModelGradient), BackendError> {
-        self.differentiate(camera, background, sh_degree, upstream)
-    }
-
-    fn loss(
-        &mut self,
-        rendering: &Rendering,
-        target: &Image8,
-        background: [f32; 3],
-    ) -> Result<(StepOutput, Vec<f32>), BackendError> {
-        Ok(self.loss(rendering, target, background))
-    }
-}
-
-impl Differentiable for GpuBackend {
-    fn differentiate(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        upstream: &ImageGradient,
-    ) -> Result<(Rendering, ModelGradient), BackendError> {
-        self.differentiate(camera, background, sh_degree, upstream)
-    }
-
-    fn loss(
-        &mut self,
-        rendering: &Rendering,
-        target: &Image8,
-        background: [f32; 3],
-    ) -> Result<(StepOutput, Vec<f32>), BackendError> {
-        self.loss(rendering, target, background)
-    }
 }
 
 impl Subject {
@@ -124,8 +53,6 @@ impl Subject {
         match self {
             Self::Native { instructions: InstructionSet::Best, .. } => "native".into(),
             Self::Native { instructions, .. } => format!("native ({instructions})"),
-            #[cfg(test)]
-            Self::Sabotaged(how) => format!("native, with errors in {how:?}"),
             Self::Gpu(device) => {
                 let (adapter, way) = (device.adapter(), device.accumulation());
                 let note = match way.is_deterministic() {
@@ -154,26 +81,19 @@ impl Subject {
         model: &Gaussians,
         setup: Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
-        let Setup { budget, near, tile_cap, record_cap, largest_image, needs, shortcuts } = setup;
+        let Setup { budget, near, tile_cap, record_cap, largest_image, storage, needs, shortcuts } =
+            setup;
         let budget = budget.max(model.len()).max(1);
-        let native = |instructions, threads, needs| {
-            let mut options = CpuOptions::new(budget);
-            (options.instructions, options.threads) = (instructions, threads);
-            options.near = near.unwrap_or(options.near);
-            options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
-            options.record_cap = record_cap.unwrap_or(options.record_cap);
-            (options.largest_image, options.needs) = (largest_image, needs);
-            options.shortcuts = shortcuts;
-            CpuBackend::new(model, &options)
-        };
         match self {
             Self::Native { instructions, threads } => {
-                Ok(Box::new(native(*instructions, *threads, needs)?))
-            }
-            #[cfg(test)]
-            Self::Sabotaged(how) => {
-                let inner = native(InstructionSet::Best, None, needs)?;
-                Ok(Box::new(super::sabotage::Saboteur::new(inner, *how)))
+                let mut options = CpuOptions::new(budget);
+                (options.instructions, options.threads) = (*instructions, *threads);
+                options.near = near.unwrap_or(options.near);
+                options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
+                options.record_cap = record_cap.unwrap_or(options.record_cap);
+                (options.largest_image, options.needs) = (largest_image, needs);
+                (options.storage, options.shortcuts) = (storage, shortcuts);
+                Ok(Box::new(CpuBackend::new(model, &options)?))
             }
             Self::Gpu(device) => {
                 let mut options = GpuOptions {
@@ -194,7 +114,7 @@ impl Subject {
     pub fn is_deterministic(&self) -> bool {
         match self {
             Self::Gpu(device) => device.accumulation().is_deterministic(),
-            _ => true,
+            Self::Native { .. } => true,
         }
     }
 
@@ -204,7 +124,7 @@ impl Subject {
     pub fn limits(&self) -> Limits {
         match self {
             Self::Gpu(_) => Limits { interior: 1e-4, ..Limits::CPU },
-            _ => Limits::CPU,
+            Self::Native { .. } => Limits::CPU,
         }
     }
 
@@ -215,7 +135,7 @@ impl Subject {
     pub fn gradient(&self) -> f64 {
         match self {
             Self::Gpu(_) => 1e-3,
-            _ => 1e-4,
+            Self::Native { .. } => 1e-4,
         }
     }
 }

@@ -7,21 +7,18 @@
 
 use std::path::Path;
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, ImageGradient};
-use densify::camera::Camera;
+use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::checkpoint::Checkpoint;
 use densify::dataset::{Dataset, LoadOptions};
-use densify::gaussians::Gaussians;
 use densify::import::ply::{read_points, read_splats};
 use densify::run::RunConfig;
 use densify_scenegen::{Options, PointOptions, Scene, Source};
-use glam::{DMat3, DQuat, DVec3};
 
 /// A format and what reads it.
 pub type Format = (&'static str, fn(&[u8]) -> bool);
 
-/// All of them. The names are those of the fuzz targets and of the corpora's folders.
-pub const FORMATS: [Format; 11] = [
+/// All of them. The names are those of the fuzz targets in `Cargo.toml` and of the corpora's folders.
+pub const FORMATS: [Format; 10] = [
     ("colmap_bin", colmap_bin),
     ("colmap_txt", colmap_txt),
     ("transforms", transforms),
@@ -32,22 +29,30 @@ pub const FORMATS: [Format; 11] = [
     ("checkpoint", checkpoint),
     ("config", config),
     ("image", image),
-    ("scene", scene),
 ];
 
+/// Reads bytes as a file of a format.
+///
+/// # Panics
+/// When there is no such format, or the bytes do to it what they must not.
+pub fn read(format: &str, bytes: &[u8]) -> bool {
+    let known = FORMATS.iter().find(|(name, _)| *name == format);
+    known.expect("a format").1(bytes)
+}
+
 /// What stands between the files of a format that has several.
-pub const BETWEEN: &[u8] = b"\n=====\n";
+const BETWEEN: &[u8] = b"\n=====\n";
 
 /// The photographs of datasets whose other files are looked at.
 const PHOTOGRAPH: &[u8] = include_bytes!("corpus/image/photograph.png");
 
 /// `cameras.bin`, `images.bin` and `points3D.bin`.
-pub fn colmap_bin(bytes: &[u8]) -> bool {
+fn colmap_bin(bytes: &[u8]) -> bool {
     colmap(bytes, ["cameras.bin", "images.bin", "points3D.bin"])
 }
 
 /// `cameras.txt`, `images.txt` and `points3D.txt`.
-pub fn colmap_txt(bytes: &[u8]) -> bool {
+fn colmap_txt(bytes: &[u8]) -> bool {
     colmap(bytes, ["cameras.txt", "images.txt", "points3D.txt"])
 }
 
@@ -58,12 +63,12 @@ fn colmap(bytes: &[u8], names: [&str; 3]) -> bool {
 }
 
 /// `transforms.json`.
-pub fn transforms(bytes: &[u8]) -> bool {
+fn transforms(bytes: &[u8]) -> bool {
     dataset(&[("transforms.json", bytes)])
 }
 
 /// A photograph: its header when the dataset is loaded, its pixels after that.
-pub fn image(bytes: &[u8]) -> bool {
+fn image(bytes: &[u8]) -> bool {
     let listing = br#"{"camera_angle_x": 0.8, "frames": [
         {"file_path": "images/0.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]},
         {"file_path": "images/1.png", "transform_matrix": [[1,0,0,1],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}]}"#;
@@ -71,7 +76,7 @@ pub fn image(bytes: &[u8]) -> bool {
 }
 
 /// A PLY file, as a model and as a cloud of points.
-pub fn ply(bytes: &[u8]) -> bool {
+fn ply(bytes: &[u8]) -> bool {
     within(&[("model.ply", bytes)], |folder| {
         let path = folder.join("model.ply");
         let model = read_splats(&path);
@@ -87,24 +92,24 @@ pub fn ply(bytes: &[u8]) -> bool {
 }
 
 /// A glTF file with everything inside.
-pub fn gltf(bytes: &[u8]) -> bool {
+fn gltf(bytes: &[u8]) -> bool {
     mesh(&[("mesh.gltf", bytes)])
 }
 
 /// A binary glTF file.
-pub fn glb(bytes: &[u8]) -> bool {
+fn glb(bytes: &[u8]) -> bool {
     mesh(&[("mesh.glb", bytes)])
 }
 
 /// An OBJ file and its `mesh.mtl`.
-pub fn obj(bytes: &[u8]) -> bool {
+fn obj(bytes: &[u8]) -> bool {
     let mut files = split(bytes);
     let (mesh_file, library) = (files.next().unwrap_or(&[]), files.next().unwrap_or(&[]));
     mesh(&[("mesh.obj", mesh_file), ("mesh.mtl", library), ("texture.png", PHOTOGRAPH)])
 }
 
 /// A checkpoint: its header, its model, and what a backend keeps beside it.
-pub fn checkpoint(bytes: &[u8]) -> bool {
+fn checkpoint(bytes: &[u8]) -> bool {
     within(&[("step.safetensors", bytes)], |folder| {
         let Ok(mut found) = Checkpoint::open(&folder.join("step.safetensors")) else {
             return false;
@@ -123,100 +128,11 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
 }
 
 /// `config.toml` of a run.
-pub fn config(bytes: &[u8]) -> bool {
+fn config(bytes: &[u8]) -> bool {
     within(&[("config.toml", bytes)], |folder| {
         let config = RunConfig::read(folder);
         config.is_ok_and(|config| !config.scene_path().as_os_str().is_empty())
     })
-}
-
-/// Log-scales up to which gradients must be finite.
-const LARGEST_LOG_SCALE: f32 = 20.0;
-
-/// Any finite Gaussians, rendered and differentiated: all pixels must be finite, and all gradients of
-/// rows that can come up in training.
-/// 52 bytes are a camera, each 92 after them a row.
-pub fn scene(bytes: &[u8]) -> bool {
-    let mut numbers = Numbers { bytes };
-    let camera = camera(&mut numbers);
-    let mut model = Gaussians { sh_degree: 1, ..Gaussians::default() };
-    while !numbers.bytes.is_empty() && model.len() < 64 {
-        model.means.push(std::array::from_fn(|_| numbers.within(1e6)));
-        model.log_scales.push(std::array::from_fn(|_| numbers.within(40.0)));
-        // Shorter ones no file brings in (`src/ply/splats.rs`): a gradient is as many times longer.
-        let quat = DQuat::from_array(std::array::from_fn(|_| f64::from(numbers.within(1e10))));
-        let quat = if quat.length() > 1e-6 { quat } else { DQuat::IDENTITY };
-        model.quats.push(quat.to_array().map(|v| v as f32));
-        model.opacity_logits.push(numbers.within(100.0));
-        model.sh.extend((0..12).map(|_| numbers.within(1e6)));
-    }
-    let mut options = CpuOptions::new(model.len().max(1));
-    options.threads = Some(1);
-    options.tile_cap = 256;
-    let mut backend = CpuBackend::new(&model, &options).expect("a few rows fit");
-    let pixels = (camera.width * camera.height) as usize;
-    let upstream = ImageGradient {
-        rgb: (0..3 * pixels).map(|i| (i % 7) as f32 - 3.0).collect(),
-        alpha: vec![0.5; pixels],
-        depth: vec![0.0; pixels],
-    };
-    let outcome = backend.differentiate(&camera, [0.2, 0.5, 0.8], 1, &upstream);
-    let (rendering, gradient) = outcome.expect("a small image is rendered");
-    assert!(rendering.rgb.iter().chain(&rendering.alpha).all(|v| v.is_finite()));
-    let (means, log_scales) = (gradient.means.as_flattened(), gradient.log_scales.as_flattened());
-    let classes: [(&str, &[f32], usize); 5] = [
-        ("mean", means, 3),
-        ("log_scale", log_scales, 3),
-        ("quat", gradient.quats.as_flattened(), 4),
-        ("opacity", &gradient.opacity_logits, 1),
-        ("sh", &gradient.sh, 12),
-    ];
-    for (class, values, width) in classes {
-        for (row, values) in values.chunks(width).enumerate() {
-            // The optimiser keeps them below 2.3, and no other row is differentiated in training;
-            // products of squares leave f32 beyond some e²⁰.
-            let is_trainable = model.log_scales[row].iter().all(|s| *s <= LARGEST_LOG_SCALE);
-            let finite = !is_trainable || values.iter().all(|g| g.is_finite());
-            assert!(
-                finite,
-                "gradient of {class} {row}: {values:?}; mean {:?}, log_scale {:?}, quat {:?}, \
-                 opacity {}, {camera:?}",
-                model.means[row],
-                model.log_scales[row],
-                model.quats[row],
-                model.opacity_logits[row],
-            );
-        }
-    }
-    true
-}
-
-fn camera(numbers: &mut Numbers) -> Camera {
-    let size = |number: f32| number.abs() as u32 % 96 + 1;
-    let (width, height) = (size(numbers.within(1e6)), size(numbers.within(1e6)));
-    let mut positive = |most: f32| f64::from(numbers.within(most).abs().max(1e-2));
-    let (fx, fy) = (positive(1e4), positive(1e4));
-    let (cx, cy) = (positive(1e3), positive(1e3));
-    let turn = DQuat::from_array(std::array::from_fn(|_| f64::from(numbers.within(1.0))));
-    let turn = if turn.length() > 1e-3 { turn.normalize() } else { DQuat::IDENTITY };
-    let translation = DVec3::from_array(std::array::from_fn(|_| f64::from(numbers.within(1e3))));
-    let rotation = DMat3::from_quat(turn);
-    Camera { width, height, fx, fy, cx, cy, rotation, translation }
-}
-
-/// Bytes as numbers: any bits, and what is not finite or too large is brought back.
-struct Numbers<'a> {
-    bytes: &'a [u8],
-}
-
-impl Numbers<'_> {
-    fn within(&mut self, most: f32) -> f32 {
-        let (first, rest) = self.bytes.split_at(self.bytes.len().min(4));
-        self.bytes = rest;
-        let bits = first.iter().fold(0, |bits, &byte| bits << 8 | u32::from(byte));
-        let number = f32::from_bits(bits);
-        if number.is_finite() { number.clamp(-most, most) } else { most }
-    }
 }
 
 fn dataset(files: &[(&str, &[u8])]) -> bool {

@@ -8,12 +8,9 @@ use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap, Signal, SignalSet};
 use glam::DVec3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::reference::blend::each_blended;
-use densify::verify::reference::loss::loss;
 use densify::verify::reference::project::{by_depth, project};
 use densify::verify::reference::{Image, Model, Rules, View, render};
 use densify::verify::{Differentiable, Setup, Subject, scenes};
@@ -39,13 +36,10 @@ fn scene() -> Scene {
     }
     // Behind the camera.
     model.means[..3].fill(scenes::world(&camera, [0.1, 0.2, -3.0]));
-    let mut rng = ChaCha8Rng::seed_from_u64(93);
-    let n = (camera.width * camera.height) as usize;
-    let rgb = (0..3 * n).map(|_| rng.random()).collect();
+    let (_, mut target) = scenes::noisy((camera.width, camera.height), 0.0, 93);
     // Half of the pixels count in full, the others by half or not at all.
-    let mask = (0..n).map(|i| if i % 2 == 0 { 255 } else { (i % 3) as u8 * 64 }).collect();
-    let target =
-        Image8 { width: camera.width, height: camera.height, rgb, alpha: None, mask: Some(mask) };
+    let weight = |i: usize| if i.is_multiple_of(2) { 255 } else { (i % 3) as u8 * 64 };
+    target.mask = Some((0..target.rgb.len() / 3).map(weight).collect());
     Scene { camera, model, target }
 }
 
@@ -67,11 +61,8 @@ fn backend(
     };
     let (tile_cap, record_cap) = (Some(cap), Some(cap.div_ceil(2)));
     let budget = scene.model.len() + 3;
-    make_with(
-        subject,
-        &scene.model,
-        Setup { budget, tile_cap, record_cap, needs, ..Setup::default() },
-    )
+    let setup = Setup { budget, tile_cap, record_cap, needs, ..Setup::default() };
+    make_with(subject, &scene.model, setup)
 }
 
 fn observe(
@@ -174,39 +165,17 @@ fn every_column_is_that_of_the_reference() {
             let mut table = Table::new(&format!("auxiliary views, {}", subject.name()));
             let found = observe_on(&subject, &scene, &request(weights), cap);
             assert_eq!(found.columns.len(), AuxColumn::ALL.len());
+            let what = format!("{weights:?}, cap {cap}");
             for (column, values) in &found.columns {
-                assert!(
-                    values[..3].iter().all(|x| x.to_bits() == 0),
-                    "{column:?} of rows not seen"
-                );
+                let unseen = &values[..3];
+                assert!(unseen.iter().all(|x| x.to_bits() == 0), "{column:?} of rows not seen");
                 let measured: Vec<f32> = shown.iter().map(|&row| values[row]).collect();
                 let expected: Vec<f64> = shown.iter().map(|&row| expected(*column, row)).collect();
                 let error = relative_error(&measured, &expected);
-                table.check(
-                    &format!("{weights:?}, cap {cap}"),
-                    &format!("{column:?}"),
-                    error,
-                    TOLERANCE,
-                );
+                table.check(&what, &format!("{column:?}"), error, TOLERANCE);
             }
             table.finish();
         }
-    }
-}
-
-#[test]
-fn the_loss_is_that_of_training() {
-    let mut scene = scene();
-    scene.target.mask = None;
-    let request = request(PixelMap::default());
-    let view = View { camera: &scene.camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
-    let image = render(&Model::of(&scene.model), view, &Rules::STANDARD);
-    let truth: Vec<f64> = scene.target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
-    let (width, height) = (scene.camera.width as usize, scene.camera.height as usize);
-    let expected = loss(&image.rgb, &truth, width, height).loss;
-    for subject in all() {
-        let found = observe_on(&subject, &scene, &request, 10_000).loss;
-        assert!((f64::from(found) - expected).abs() < 1e-5, "{found} {expected}");
     }
 }
 
@@ -232,15 +201,16 @@ fn training_goes_on_as_if_nothing_had_been_observed() {
     let request = AuxRequest { points: 9, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
     let run = |subject: &Subject, observes: bool| {
         let mut backend = backend(subject, &scene, &request, 10_000);
+        let mut observed = None;
         for step in 1..=4 {
             let input = StepInput {
                 background: BACKGROUND,
                 ..step_input(step, &scene.camera, &scene.target, 2)
             };
-            backend.train_step(&input).expect("a small image is rendered");
-            if observes {
-                observe(&mut *backend, &scene, &request, 0);
-            }
+            let output = backend.train_step(&input).expect("a small image is rendered");
+            // It is the loss with which the next step begins.
+            assert!(observed.is_none_or(|loss: f32| (loss - output.loss).abs() < 1e-6));
+            observed = observes.then(|| observe(&mut *backend, &scene, &request, 0).loss);
         }
         let signals = SignalSet::from([Signal::ScreenGradient, Signal::WeightSum]);
         let signals = backend.take_signals(signals).expect("signals can be taken");

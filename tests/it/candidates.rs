@@ -7,10 +7,7 @@ use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, logit, rgb_to_dc};
 use densify::verify::compare::Table;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
-use densify_policies::policy::{
-    Candidate, CandidateRequest, DepthMode, ErrorMode, Needs, SceneInfo,
-};
-use densify_policies::registry::find;
+use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode, Needs};
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::subject::{devices, make_with, others, repeatable, step_input};
@@ -182,23 +179,6 @@ fn nothing_comes_from_where_nothing_was_hit() {
         assert!(mode == ErrorMode::Gradient || faint > all / 2, "{mode:?}: nothing to keep away");
     }
 }
-
-#[test]
-fn diet_asks_for_that_guard() {
-    let scene = SceneInfo {
-        extent: 1.1,
-        train_views: 24,
-        budget: 1000,
-        initial_rows: 300,
-        iterations: 30_000,
-        white_background: false,
-    };
-    let policy = find("diet").expect("diet").build(&toml::Table::new(), &scene).expect("defaults");
-    let request = policy.needs(&scene).candidates.expect("it compensates");
-    assert!(request.min_alpha >= 0.5 && request.error != ErrorMode::Gradient, "{request:?}");
-}
-
-// --- The same on every backend ------------------------------------------------------------------
 
 /// A cloud, of which some rows end the light of their pixels.
 fn cloud() -> (Gaussians, Camera) {

@@ -8,7 +8,9 @@ use rand_chacha::ChaCha8Rng;
 use densify::verify::compare::Table;
 use densify::verify::reference::loss::loss;
 use densify::verify::reference::project::{by_depth, project};
-use densify::verify::reference::{CLASSES, Model, Rules, Upstream, View, blend, differentiate};
+use densify::verify::reference::{
+    CLASSES, Model, Rules, Upstream, View, blend, differentiate, render,
+};
 use densify::verify::scenes;
 
 /// Half the distance between the two evaluations.
@@ -75,13 +77,8 @@ fn gradients_where_the_jacobian_is_clamped() {
         [("x", [4.0, 0.2, 2.0]), ("y", [0.1, -3.5, 2.2]), ("both", [-2.6, 2.0, 2.1])]
     {
         let model = Model::of(&scenes::one_at(&camera, local, [1.1, 0.9, 1.3]));
-        let seen =
-            differentiate(&model, view(&camera, 1), &Rules::SMOOTH, &scenes::upstream(&camera, 9))
-                .0
-                .alpha
-                .iter()
-                .fold(0.0_f64, |m, &a| m.max(a));
-        assert!(seen > 0.01, "{what}: the row is not seen, largest alpha {seen:e}");
+        let seen = render(&model, view(&camera, 1), &Rules::SMOOTH);
+        assert!(seen.alpha.iter().any(|&alpha| alpha > 0.01), "{what}: the row is not seen");
         check(&mut table, what, &model, view(&camera, 1), &scenes::upstream(&camera, 9));
     }
     table.finish();
@@ -115,13 +112,4 @@ fn gradient_of_the_loss() {
         table.check(&format!("{width}x{height}"), "rendered", worst / largest, TOLERANCE);
     }
     table.finish();
-}
-
-#[test]
-fn equal_images_have_no_loss_and_no_gradient() {
-    let image: Vec<f64> = (0..3 * 12 * 9).map(|i| f64::from(i % 7) / 7.0).collect();
-    let same = loss(&image, &image, 12, 9);
-    assert!(same.loss.abs() < 1e-15 && same.l1.abs() < 1e-15, "{} {}", same.loss, same.l1);
-    assert!((same.ssim - 1.0).abs() < 1e-15, "{}", same.ssim);
-    assert!(same.gradient.iter().all(|g| g.abs() < 1e-15));
 }

@@ -1,20 +1,23 @@
 //! What policies declare beside signals: terms of the loss, noise on the means, and the optimiser's
-//! cadence. Each is held to its formula, worked out here in f64. One piece, as all train the same
-//! small model in the same way.
+//! cadence. Each is held to its formula, worked out here in f64.
 
 #![expect(clippy::float_cmp, reason = "what rests does so to the last bit")]
 
+use std::ops::Range;
+
 use densify::backend::cpu::{ImageGradient, ModelGradient};
-use densify::backend::{Backend, LearningRates, StepInput};
+use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 
-use crate::subject::{RATES, class, make, make_with, on_each, repeatable, step_input};
+use crate::subject::{
+    RATES, class, make, make_with, normalised, on_each, repeatable, step_input, turned_away,
+};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 const EVERY: Cadence = Cadence { all: 1, sh_rest: 1 };
@@ -25,78 +28,28 @@ fn view(number: u32) -> Camera {
     scenes::rounded(&Camera { translation: first.translation + shift, ..first })
 }
 
-/// A camera turned around and far off: it sees nothing.
-fn away() -> Camera {
-    let turn = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
-    let view = view(0);
-    let translation = turn * view.translation - DVec3::new(0.0, 0.0, 1000.0);
-    Camera { rotation: turn * view.rotation, translation, ..view }
-}
-
 fn target(camera: &Camera, seed: u64) -> Image8 {
     scenes::noisy((camera.width, camera.height), 0.0, seed).1
 }
 
 fn model(rows: usize) -> Gaussians {
-    let mut model = scenes::cloud(rows, 1, &view(0), 82);
-    // As training leaves them.
-    for quat in &mut model.quats {
-        let norm = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
-        *quat = quat.map(|v| v / norm);
-    }
-    model
+    normalised(scenes::cloud(rows, 1, &view(0), 82))
 }
 
 fn backend(subject: &Subject, model: &Gaussians, needs: Needs) -> Box<dyn Differentiable> {
     make_with(subject, model, Setup { needs, ..Setup::default() })
 }
 
-fn step(
-    backend: &mut dyn Backend,
-    camera: &Camera,
-    step: u32,
-    rates: LearningRates,
-    cadence: Cadence,
-) {
+fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, cadence: Cadence) {
     let target = target(camera, step.into());
     let sh_degree = backend.sh_degree();
     let input = StepInput {
         background: BACKGROUND,
-        rates,
         cadence,
         seed: 5,
         ..step_input(step, camera, &target, sh_degree)
     };
     backend.train_step(&input).expect("a small image is rendered");
-}
-
-#[test]
-fn terms_of_the_loss_pull_at_rows_that_no_view_shows() {
-    on_each(repeatable(), |subject| {
-        let model = model(30);
-        let camera = away();
-        for (opacity, scale) in [(0.01, 0.0), (0.0, 0.02), (0.01, 0.02), (0.0, 0.0)] {
-            let needs = Needs { loss_terms: LossTerms { opacity, scale }, ..Needs::default() };
-            let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &camera, 1, RATES, EVERY);
-            let after = backend.download().expect("a model");
-            // The first step of Adam is one learning rate long, whatever the gradient.
-            let moved = |on: f32, before: f32, after: f32, rate: f32| {
-                let expected = if on > 0.0 { rate } else { 0.0 };
-                assert!((before - after - expected).abs() < 1e-3 * rate, "{opacity} {scale}");
-            };
-            for row in 0..30 {
-                let logits = (model.opacity_logits[row], after.opacity_logits[row]);
-                moved(opacity, logits.0, logits.1, RATES.opacity);
-                for axis in 0..3 {
-                    let (before, after) =
-                        (model.log_scales[row][axis], after.log_scales[row][axis]);
-                    moved(scale, before, after, RATES.log_scale);
-                }
-            }
-            assert_eq!((after.means, after.sh), (model.means.clone(), model.sh.clone()));
-        }
-    });
 }
 
 /// Rows in pairs of one shape, every second one turned by a quarter.
@@ -119,7 +72,7 @@ fn noise_has_the_declared_covariance() {
         let run = |subject: &Subject, at: u32| {
             let needs = Needs { noise: Some(noise), ..Needs::default() };
             let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &away(), at, RATES, EVERY);
+            step(&mut *backend, &turned_away(&view(0)), at, EVERY);
             backend.download().expect("a model")
         };
         let moved = run(subject, 3);
@@ -159,29 +112,6 @@ fn noise_has_the_declared_covariance() {
     });
 }
 
-#[test]
-fn rows_opaque_enough_are_not_disturbed() {
-    on_each(repeatable(), |subject| {
-        let mut model = alike(64);
-        // Opacities 0.16 and 0.18: shares of 1.9e-7 and 2.5e-8, on either side of 6e-8.
-        for (row, logit) in model.opacity_logits.iter_mut().enumerate() {
-            *logit = if row < 32 { -1.658_23 } else { -1.516_35 };
-        }
-        let noise = NoiseTerm { strength: 1e8, sharpness: 100.0, opacity: 0.005 };
-        let mut backend =
-            backend(subject, &model, Needs { noise: Some(noise), ..Needs::default() });
-        step(&mut *backend, &away(), 1, RATES, EVERY);
-        let moved: Vec<bool> = backend
-            .download()
-            .expect("a model")
-            .means
-            .iter()
-            .map(|mean| *mean != [0.5; 3])
-            .collect();
-        assert_eq!(moved, (0..64).map(|row| row < 32).collect::<Vec<_>>());
-    });
-}
-
 /// The gradient of the image's loss, without a step.
 fn gradient(subject: &Subject, model: &Gaussians, camera: &Camera, seed: u64) -> ModelGradient {
     let mut backend = make(subject, model);
@@ -208,7 +138,7 @@ struct Adam {
     class: &'static str,
     rate: f64,
     /// Which of the values of a row belong to it, of how many.
-    values: std::ops::Range<usize>,
+    values: Range<usize>,
     of: usize,
     steps: i32,
     sums: Vec<f64>,
@@ -216,13 +146,7 @@ struct Adam {
 }
 
 impl Adam {
-    fn new(
-        class: &'static str,
-        rate: f32,
-        values: std::ops::Range<usize>,
-        of: usize,
-        rows: usize,
-    ) -> Self {
+    fn new(class: &'static str, rate: f32, values: Range<usize>, of: usize, rows: usize) -> Self {
         let zeros = vec![0.0; of * rows];
         let moments = [zeros.clone(), zeros.clone()];
         Self { class, rate: rate.into(), values, of, steps: 0, sums: zeros, moments }
@@ -243,11 +167,8 @@ impl Adam {
         let mine: Vec<usize> =
             (0..before.len()).filter(|i| self.values.contains(&(i % self.of))).collect();
         if !due {
-            assert!(
-                mine.iter().all(|&i| before[i].to_bits() == after[i].to_bits()),
-                "{}",
-                self.class
-            );
+            let rests = mine.iter().all(|&i| before[i].to_bits() == after[i].to_bits());
+            assert!(rests, "{}", self.class);
             return 0.0;
         }
         self.steps += 1;
@@ -271,20 +192,23 @@ impl Adam {
     }
 }
 
+/// And of the terms of the loss, which pull at rows that no view shows, too.
 #[test]
 fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
+    const ROWS: usize = 40;
+    let none = LossTerms::default();
+    let pulling = LossTerms { opacity: 0.01, scale: 0.02 };
+    let cases = [(2, 1, none), (1, 3, none), (2, 4, none), (20, 16, none), (1, 1, pulling)];
     on_each(repeatable(), |subject| {
-        const ROWS: usize = 40;
-        let longest =
-            [(2, 1), (1, 3), (2, 4), (20, 16)].map(|(all, sh_rest)| Cadence { all, sh_rest });
-        for longest in longest {
-            // The last of them: shorter than declared, and changing on the way.
-            let cadence_at = |step: u32| match longest.all {
+        for (all, sh_rest, loss_terms) in cases {
+            let longest = Cadence { all, sh_rest };
+            // One of them: shorter than declared, and changing on the way.
+            let cadence_at = |step: u32| match all {
                 20 if step < 5 => Cadence { all: 1, sh_rest: 2 },
                 20 => Cadence { all: 2, sh_rest: 3 },
                 _ => longest,
             };
-            let needs = Needs { cadence: longest, ..Needs::default() };
+            let needs = Needs { cadence: longest, loss_terms, ..Needs::default() };
             let mut backend = backend(subject, &model(ROWS), needs);
             let mut classes = [
                 Adam::new("means", RATES.mean, 0..3, 3, ROWS),
@@ -293,11 +217,23 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                 Adam::new("sh", RATES.sh_dc, 0..3, 12, ROWS),
                 Adam::new("sh", RATES.sh_rest, 3..12, 12, ROWS),
             ];
-            for number in 1..=8 {
-                let camera = view(number % 3);
+            let steps = if loss_terms == none { 8 } else { 30 };
+            for number in 1..=steps {
+                let is_away = loss_terms != none && number % 2 == 0;
+                let camera = if is_away { turned_away(&view(0)) } else { view(number % 3) };
                 let before = backend.download().expect("a model");
-                let gradient = gradient(subject, &before, &camera, number.into());
-                step(&mut *backend, &camera, number, RATES, cadence_at(number));
+                let mut gradient = gradient(subject, &before, &camera, number.into());
+                for row in 0..ROWS {
+                    let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
+                    gradient.opacity_logits[row] +=
+                        loss_terms.opacity / ROWS as f32 * opacity * (1.0 - opacity);
+                    for (g, scale) in
+                        gradient.log_scales[row].iter_mut().zip(before.log_scales[row])
+                    {
+                        *g += loss_terms.scale / (3 * ROWS) as f32 * scale.exp();
+                    }
+                }
+                step(&mut *backend, &camera, number, cadence_at(number));
                 let after = backend.download().expect("a model");
                 let [main, rest] = cadence_at(number).steps_at(number);
                 for (i, class) in classes.iter_mut().enumerate() {
@@ -312,74 +248,30 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
 }
 
 #[test]
-fn terms_of_the_loss_add_to_the_gradient_of_the_image() {
-    on_each(repeatable(), |subject| {
-        const ROWS: usize = 40;
-        let terms = LossTerms { opacity: 0.01, scale: 0.02 };
-        let mut backend =
-            backend(subject, &model(ROWS), Needs { loss_terms: terms, ..Needs::default() });
-        let mut classes = [
-            Adam::new("means", RATES.mean, 0..3, 3, ROWS),
-            Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
-            Adam::new("opacity_logits", RATES.opacity, 0..1, 1, ROWS),
-        ];
-        for number in 1..=8 {
-            let camera = if number % 2 == 0 { away() } else { view(number % 3) };
-            let before = backend.download().expect("a model");
-            let mut gradient = gradient(subject, &before, &camera, number.into());
-            for row in 0..ROWS {
-                let opacity = 1.0 / (1.0 + (-before.opacity_logits[row]).exp());
-                gradient.opacity_logits[row] += 0.01 / ROWS as f32 * opacity * (1.0 - opacity);
-                for axis in 0..3 {
-                    let scale = before.log_scales[row][axis].exp();
-                    gradient.log_scales[row][axis] += 0.02 / (3 * ROWS) as f32 * scale;
-                }
-            }
-            step(&mut *backend, &camera, number, RATES, EVERY);
-            let after = backend.download().expect("a model");
-            for class in &mut classes {
-                let error = class.check(&before, &after, &gradient, true);
-                assert!(error < 0.01, "step {number}, {}: {error} learning rates", class.class);
-            }
-        }
-    });
-}
-
-#[test]
 fn sums_move_with_their_rows_and_end_with_them() {
     on_each(repeatable(), |subject| {
         let cadence = Cadence { all: 2, sh_rest: 2 };
         let model = model(20);
-        let run = |edit: bool| {
+        let run = |edit: fn(&mut EditPlan)| {
             let needs = Needs { cadence, ..Needs::default() };
             let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &view(0), 1, RATES, cadence);
-            if edit {
-                // Row 19 takes the place of row 4.
-                let mut plan = EditPlan::new(20, 20);
-                plan.prune(4).expect("the row is free");
-                backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-            }
+            step(&mut *backend, &view(0), 1, cadence);
+            let mut plan = EditPlan::new(20, 20);
+            edit(&mut plan);
+            backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
             // Nothing is seen: only what waits is left.
-            step(&mut *backend, &away(), 2, RATES, cadence);
+            step(&mut *backend, &turned_away(&view(0)), 2, cadence);
             backend.download().expect("a model")
         };
-        let (plain, edited) = (run(false), run(true));
+        // Row 19 takes the place of row 4.
+        let (plain, edited) = (run(|_| {}), run(|plan| plan.prune(4).expect("the row is free")));
         assert!(plain.means[19] != model.means[19] && plain.sh_of(19) != model.sh_of(19));
         assert_eq!((plain.means[19], plain.sh_of(19)), (edited.means[4], edited.sh_of(4)));
         assert_eq!(plain.means[..4], edited.means[..4]);
-
         // Bounding opacities forgets what waits for them, as it forgets their moments.
-        let needs = Needs { cadence, ..Needs::default() };
-        let mut backend = backend(subject, &model, needs);
-        step(&mut *backend, &view(0), 1, RATES, cadence);
-        let mut plan = EditPlan::new(20, 20);
-        plan.clamp_opacity(0.999).expect("the bound is sound");
-        backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
-        step(&mut *backend, &away(), 2, RATES, cadence);
-        let after = backend.download().expect("a model");
-        assert_eq!(after.opacity_logits, model.opacity_logits);
-        assert_eq!(after.means, plain.means);
+        let bounded = run(|plan| plan.clamp_opacity(0.999).expect("the bound is sound"));
+        assert_eq!(bounded.opacity_logits, model.opacity_logits);
+        assert_eq!(bounded.means, plain.means);
     });
 }
 
@@ -389,7 +281,7 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         let cadence = Cadence { all: 1, sh_rest: 2 };
         let mut backend = backend(subject, &model(20), Needs { cadence, ..Needs::default() });
         for number in 1..=6 {
-            step(&mut *backend, &view(number % 3), number, RATES, cadence);
+            step(&mut *backend, &view(number % 3), number, cadence);
         }
         let mut plan = EditPlan::new(20, 20);
         let opacity = OpacityRule::Same;
@@ -397,8 +289,8 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         plan.update(11, update).expect("the row is free");
         backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
         let before = backend.download().expect("a model");
-        step(&mut *backend, &view(0), 7, RATES, cadence);
-        step(&mut *backend, &view(1), 8, RATES, cadence);
+        step(&mut *backend, &view(0), 7, cadence);
+        step(&mut *backend, &view(1), 8, cadence);
         let after = backend.download().expect("a model");
         // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
         let moved = |row: usize| -> Vec<f32> {
@@ -408,20 +300,6 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         assert!(moved(11).iter().all(|rates| (rates - 1.0).abs() < 1e-2), "{:?}", moved(11));
         assert!(moved(12).iter().any(|rates| (rates - 1.0).abs() > 0.1), "{:?}", moved(12));
     });
-}
-
-#[test]
-fn what_is_declared_is_in_the_ledger() {
-    let model = model(20);
-    let bytes = |needs: Needs| backend(&Subject::NATIVE, &model, needs).ledger().total();
-    let plain = bytes(Needs::default());
-    let with = |all, sh_rest| Needs { cadence: Cadence { all, sh_rest }, ..Needs::default() };
-    // 32 padded rows of 11 + 12 numbers; of 9; and two bytes each to count steps.
-    assert_eq!(bytes(with(5, 1)) - plain, 32 * 23 * 4);
-    assert_eq!(bytes(with(1, 16)) - plain, 32 * (9 * 4 + 2));
-    assert_eq!(bytes(with(5, 16)) - plain, 32 * (23 * 4 + 2));
-    let still = Needs { loss_terms: LossTerms { opacity: 1.0, scale: 1.0 }, ..Needs::default() };
-    assert_eq!(bytes(still), plain);
 }
 
 #[test]

@@ -5,8 +5,8 @@
 //! holds it and the backends against stored float64 renders; `extremes` runs the cases of the selftest and
 //! says where every extreme is tested; `agreement` holds every backend to the native one; `properties` are
 //! of any scene; `sameness` and `resuming` compare bits; `edits` applies any plan to a backend and to a
-//! plain vector. `cli` runs the program on photographs of a small scene; `fuzz` damages files; `geometry`
-//! holds policies to surfaces that are known; `gpu` is what only the GPU backend has; `invariants` keeps
+//! plain vector. `cli` runs the program on photographs of a small scene, and holds policies to surfaces that
+//! are known; `fuzz` damages files; `gpu` is what only the GPU backend has; `invariants` keeps
 //! the walls of ARCHITECTURE.md standing.
 
 mod agreement;
@@ -18,10 +18,8 @@ mod declared;
 mod edits;
 mod extremes;
 mod fuzz;
-mod geometry;
 mod gpu;
 mod invariants;
-mod loss;
 mod oracle;
 mod photographs;
 mod probes;

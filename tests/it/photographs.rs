@@ -5,7 +5,6 @@ use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use densify::backend::Backend;
 use densify::camera::Camera;
 use densify::gaussians::{Gaussians, logit, rgb_to_dc};
 use glam::{DMat3, DQuat, DVec3};
@@ -14,8 +13,8 @@ use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 use tempfile::TempDir;
 
-use crate::subject::native;
-use densify::verify::scenes;
+use crate::subject::make;
+use densify::verify::{Subject, scenes};
 
 /// Views taken.
 pub(crate) const VIEWS: usize = 14;
@@ -97,7 +96,7 @@ fn camera(view: usize) -> Camera {
 fn shots() -> &'static [Shot] {
     static SHOTS: OnceLock<Vec<Shot>> = OnceLock::new();
     SHOTS.get_or_init(|| {
-        let mut backend = native(&blobs());
+        let mut backend = make(&Subject::NATIVE, &blobs());
         let shoot = |view: usize| {
             let camera = camera(view);
             let seen = backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");
@@ -133,8 +132,9 @@ impl Photographs {
         let camera = format!("1 PINHOLE {width} {height} {FOCAL} {FOCAL} 24 20\n");
         made.write("sparse/0/cameras.txt", camera);
         let mut images = String::new();
-        for (view, (q, t)) in poses().enumerate() {
-            let pose: Vec<String> = q.iter().chain(&t).map(ToString::to_string).collect();
+        for (view, Shot { camera, .. }) in shots().iter().enumerate() {
+            let (q, t) = (DQuat::from_mat3(&camera.rotation), camera.translation);
+            let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|number| number.to_string());
             images += &format!("{} {} 1 {}\n\n", view + 1, pose.join(" "), name(view));
         }
         made.write("sparse/0/images.txt", images);
@@ -143,35 +143,6 @@ impl Photographs {
             lines += &format!("{} {x} {y} {z} {r} {g} {b} 0.5\n", id + 1);
         }
         made.write("sparse/0/points3D.txt", lines);
-        made
-    }
-
-    /// The same COLMAP model in binary.
-    pub(crate) fn colmap_binary() -> Self {
-        let made = Self::with_images();
-        let mut cameras = 1_u64.to_le_bytes().to_vec();
-        cameras.extend([1_u32, 1].iter().flat_map(|v| v.to_le_bytes()));
-        cameras.extend([SIZE.0, SIZE.1].iter().flat_map(|&v| u64::from(v).to_le_bytes()));
-        cameras.extend([FOCAL, FOCAL, 24.0, 20.0].iter().flat_map(|v| v.to_le_bytes()));
-        made.write("sparse/0/cameras.bin", cameras);
-        let mut images = (VIEWS as u64).to_le_bytes().to_vec();
-        for (view, (q, t)) in poses().enumerate() {
-            images.extend((view as u32 + 1).to_le_bytes());
-            images.extend(q.iter().chain(&t).flat_map(|v| v.to_le_bytes()));
-            images.extend(1_u32.to_le_bytes());
-            images.extend(name(view).bytes().chain([0]));
-            images.extend(0_u64.to_le_bytes());
-        }
-        made.write("sparse/0/images.bin", images);
-        let mut file = (POINTS as u64).to_le_bytes().to_vec();
-        for (id, (position, colour)) in points().into_iter().enumerate() {
-            file.extend((id as u64 + 1).to_le_bytes());
-            file.extend(position.iter().flat_map(|v| v.to_le_bytes()));
-            file.extend(colour);
-            file.extend(0.5_f64.to_le_bytes());
-            file.extend(0_u64.to_le_bytes());
-        }
-        made.write("sparse/0/points3D.bin", file);
         made
     }
 
@@ -240,12 +211,4 @@ impl Photographs {
         let contents = std::fs::read(self.file(name)).expect("a file of the dataset");
         self.write(name, &contents[..contents.len() - bytes]);
     }
-}
-
-/// Quaternions (w, x, y, z) and translations of camera_from_world.
-fn poses() -> impl Iterator<Item = ([f64; 4], [f64; 3])> {
-    shots().iter().map(|Shot { camera, .. }| {
-        let q = DQuat::from_mat3(&camera.rotation);
-        ([q.w, q.x, q.y, q.z], camera.translation.to_array())
-    })
 }

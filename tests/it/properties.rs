@@ -3,11 +3,12 @@
 use densify::backend::Rendering;
 use densify::camera::Camera;
 use densify::gaussians::{Gaussians, sh_coefficients};
+use densify::verify::reference::CLASSES;
 use densify::verify::values::SIZES;
 use densify::verify::{Setup, Subject, scenes};
 use proptest::prelude::*;
 
-use crate::subject::{GREY, bits, cases, make_with, repeatable};
+use crate::subject::{GREY, bits, cases, class, make_with, repeatable};
 
 /// A row: position in the camera's axes as shares of the image and depth, log-scales, quaternion,
 /// opacity logit, and what its colours are drawn from.
@@ -93,6 +94,13 @@ proptest! {
             let render = |model: &Gaussians, cap| render(&subject, model, &camera, GREY, cap);
             let image = render(&whole, None);
             prop_assert!(image.rgb.iter().chain(&image.depth).all(|v| v.is_finite()));
+            let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
+            let mut backend = make_with(&subject, &whole, Setup::default());
+            let outcome = backend.differentiate(&camera, GREY, degree, &upstream);
+            let (_, gradient) = outcome.expect("a small image is rendered");
+            for name in CLASSES {
+                prop_assert!(class(&gradient, name).iter().all(|g| g.is_finite()), "{}", name);
+            }
             prop_assert!(image.alpha.iter().all(|a| (0.0..=1.0).contains(a)));
             prop_assert!(bits(&render(&whole, Some(cap))) == bits(&image), "bands");
             if depths.windows(2).all(|pair| pair[1] - pair[0] > 1e-5 * pair[1].abs()) {

@@ -1,11 +1,11 @@
 //! What a checkpoint holds of a backend is all that its future depends on.
 
-use densify::backend::{Backend, StateArray, StepInput, Tensor, Values};
+use densify::backend::{Backend, StepInput, Storage, Tensor, Values};
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, Signal, SignalSet,
 };
 
-use crate::subject::{make, make_with, repeatable, step_input};
+use crate::subject::{make, make_with, repeatable, saved, step_input, storages};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
@@ -34,8 +34,8 @@ fn needs() -> Needs {
     }
 }
 
-fn backend(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
-    make_with(subject, model, Setup { needs: needs(), ..Setup::default() })
+fn backend(subject: &Subject, storage: Storage, model: &Gaussians) -> Box<dyn Differentiable> {
+    make_with(subject, model, Setup { storage, needs: needs(), ..Setup::default() })
 }
 
 fn step(backend: &mut dyn Backend, camera: &Camera, number: u32) {
@@ -75,25 +75,25 @@ fn is_zero(tensor: &Tensor) -> bool {
 fn a_backend_that_took_back_its_state_has_the_same_future() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
-    for subject in repeatable() {
-        let mut whole = backend(&subject, &model);
+    let stored = storages().map(|storage| (Subject::NATIVE, storage));
+    let all = repeatable().into_iter().map(|subject| (subject, Storage::default()));
+    for (subject, storage) in all.chain(stored) {
+        let mut whole = backend(&subject, storage, &model);
         whole.begin_epoch();
         for i in 1..=BEFORE {
             step(&mut *whole, &camera, i);
         }
-        let saved = |array: StateArray| whole.save(&array.name).expect("an array of the state");
-        let state: Vec<Tensor> = whole.state().into_iter().map(saved).collect();
-        let model = whole.download().expect("the model");
+        let (model, state) = saved(&*whole);
         let expected = future(&mut *whole);
 
         let without = |left_out: &str| {
-            let mut backend = backend(&subject, &model);
+            let mut backend = backend(&subject, storage, &model);
             for tensor in state.iter().filter(|t| t.name != left_out) {
                 backend.restore(tensor.clone()).expect("it is this backend's");
             }
             future(&mut *backend)
         };
-        let name = subject.name();
+        let name = format!("{}, {storage:?}", subject.name());
         assert!(without("") == expected, "{name}");
         // None of it is idle.
         let told: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();

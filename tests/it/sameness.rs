@@ -1,19 +1,18 @@
-//! What must not change a single bit of a repeatable backend: threads, the room for tile lists, the order of
-//! the rows, running twice, rows that are not seen. Sums in any order stay near to those.
+//! What must not change a single bit of a repeatable backend: threads, the room for tile lists and records,
+//! running twice; for the order of rows, and rows that are not seen, see `properties`. Sums in any order
+//! stay near to those.
 
 use densify::backend::cpu::{InstructionSet, ModelGradient};
-use densify::backend::{Rendering, StepOutput};
+use densify::backend::{Rendering, StepOutput, Storage};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::reference::CLASSES;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
-use rand::SeedableRng;
-use rand::seq::SliceRandom;
-use rand_chacha::ChaCha8Rng;
+use densify_policies::plan::EditPlan;
 
 use crate::subject::{
-    GREY, atomics, class, devices, make, make_with, repeatable, step_input, wide,
+    GREY, atomics, class, devices, make, make_with, repeatable, saved, step_input, storages, wide,
 };
 
 /// An image with its gradients, and a model after some steps with what each of them said.
@@ -64,18 +63,23 @@ fn without_bands((seen, model, outputs): Run) -> Run {
     (seen, model, outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect())
 }
 
+/// However parameters are stored, and where depths are equal.
 #[test]
 fn threads_change_nothing() {
     let camera = scenes::camera(150, 90, 31);
-    let model = scenes::cloud(700, 2, &camera, 41);
-    for instructions in InstructionSet::available() {
+    let mut model = scenes::cloud(700, 2, &camera, 41);
+    model.means[..300].fill(scenes::world(&camera, [0.0, 0.0, 3.0]));
+    let stored = storages().map(|storage| (InstructionSet::Best, storage));
+    let all = InstructionSet::available().into_iter().map(|set| (set, Storage::default()));
+    for (instructions, storage) in all.chain(stored) {
         let with = |threads| {
-            let threads = Some(threads);
-            run(&mut *make(&Subject::Native { instructions, threads }, &model), &camera)
+            let setup = Setup { storage, ..Setup::default() };
+            let subject = Subject::Native { instructions, threads: Some(threads) };
+            run(&mut *make_with(&subject, &model, setup), &camera)
         };
         let expected = with(1);
         for threads in [2, 5] {
-            assert!(with(threads) == expected, "{threads} threads, {instructions}");
+            assert!(with(threads) == expected, "{threads} threads, {instructions}, {storage:?}");
         }
     }
 }
@@ -138,82 +142,24 @@ fn running_twice_changes_nothing() {
     }
 }
 
-fn permuted(model: &Gaussians, order: &[usize]) -> Gaussians {
-    Gaussians {
-        sh_degree: model.sh_degree,
-        means: order.iter().map(|&r| model.means[r]).collect(),
-        log_scales: order.iter().map(|&r| model.log_scales[r]).collect(),
-        quats: order.iter().map(|&r| model.quats[r]).collect(),
-        opacity_logits: order.iter().map(|&r| model.opacity_logits[r]).collect(),
-        sh: order.iter().flat_map(|&r| model.sh_of(r).to_vec()).collect(),
-    }
-}
-
+/// With room for few records at a time, rows that were removed leave nothing behind in which the rest
+/// would find its own.
 #[test]
-fn the_order_of_the_rows_changes_nothing_where_depths_differ() {
-    let camera = scenes::camera(70, 40, 35);
-    let model = scenes::cloud(90, 1, &camera, 44);
-    let mut order: Vec<usize> = (0..model.len()).collect();
-    order.shuffle(&mut ChaCha8Rng::seed_from_u64(9));
-    for subject in repeatable() {
-        let look = |model: &Gaussians| differentiate(&mut *make(&subject, model), &camera, 1);
-        let (image, gradient) = look(&model);
-        let (shuffled_image, shuffled) = look(&permuted(&model, &order));
-        let name = subject.name();
-        assert!(image == shuffled_image, "{name}: the image depends on the order of the rows");
-        for what in CLASSES {
-            let (from, to) = (class(&gradient, what), class(&shuffled, what));
-            let n = from.len() / model.len();
-            for (new, &old) in order.iter().enumerate() {
-                let (old_row, new_row) =
-                    (&from[old * n..(old + 1) * n], &to[new * n..(new + 1) * n]);
-                assert!(old_row == new_row, "{name}: {what} of {old}");
-            }
-        }
-    }
-}
-
-/// Case 15 of the [selftest](densify::verify) holds the same against the reference.
-#[test]
-fn equal_depths_are_drawn_in_row_order() {
-    let camera = scenes::camera(40, 40, 36);
-    let mut model = scenes::cloud(1000, 0, &camera, 45);
-    let place = scenes::world(&camera, [0.0, 0.0, 3.0]);
-    model.means.fill(place);
-    let with = |threads| {
-        let subject =
-            Subject::Native { instructions: InstructionSet::Best, threads: Some(threads) };
-        bits(&differentiate(&mut *make(&subject, &model), &camera, 0))
+fn rows_that_are_gone_have_no_records() {
+    let camera = scenes::camera(64, 48, 11);
+    let model = scenes::cloud(400, 2, &camera, 12);
+    let with = |record_cap| {
+        let setup = Setup { record_cap: Some(record_cap), ..Setup::default() };
+        let mut backend = make_with(&Subject::NATIVE, &model, setup);
+        run(&mut *backend, &camera);
+        let mut plan = EditPlan::new(model.len(), model.len());
+        plan.prune_all(10..model.len() as u32);
+        backend.apply(&plan.compile(), 7, 4).expect("an edit");
+        run(&mut *backend, &camera);
+        saved(&*backend)
     };
-    let expected = with(1);
-    for threads in [1, 2, 3, 8, 64] {
-        assert!((0..2).all(|_| with(threads) == expected), "{threads} threads");
-    }
-}
-
-#[test]
-fn a_row_that_is_not_seen_changes_nothing() {
-    let camera = scenes::camera(50, 44, 37);
-    let model = scenes::cloud(40, 1, &camera, 46);
-    for subject in repeatable() {
-        let look = |model: &Gaussians| differentiate(&mut *make(&subject, model), &camera, 1);
-        let (image, _) = look(&model);
-        let unseen: [(&str, [f64; 3], f32); 3] = [
-            ("behind", [0.0, 0.0, -1.0], 1.0),
-            ("beside", [50.0, 0.0, 2.0], 1.0),
-            ("transparent", [0.0, 0.0, 2.0], -6.0),
-        ];
-        for (what, local, logit) in unseen {
-            let mut more = model.clone();
-            let mean = scenes::world(&camera, local);
-            scenes::push(&mut more, mean, [0.1; 3], [1.0, 0.0, 0.0, 0.0], logit, |_| 0.3);
-            let (with, gradient) = look(&more);
-            assert!(with == image, "{what}, {}", subject.name());
-            let last = more.len() - 1;
-            assert_eq!(gradient.pixel_count[last], 0, "{what}");
-            assert_eq!(gradient.means[last].map(f32::to_bits), [0; 3], "{what}");
-        }
-    }
+    // Enough for all records of the ten rows that stay, not for the slots of those that went.
+    assert!(with(200) == with(1 << 20));
 }
 
 /// Sums start at 0 with every pass, go on over bands, and start again where a pass is taken again because

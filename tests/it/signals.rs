@@ -5,11 +5,8 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet};
-use glam::DVec3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 
-use crate::subject::{all, make_with, repeatable, step_input};
+use crate::subject::{all, make_with, normalised, repeatable, step_input};
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::reference::loss::loss;
 use densify::verify::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
@@ -42,21 +39,10 @@ fn views() -> Views {
     let mut second = Camera { width: 38, height: 50, ..first };
     second.translation.x += 0.3;
     let cameras = vec![first, scenes::rounded(&second)];
-    let mut model = scenes::cloud(21, 2, &first, 62);
     // Rounded where training would round: a step of length zero normalises quaternions.
-    for quat in &mut model.quats {
-        let norm = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
-        *quat = quat.map(|v| v / norm);
-    }
-    let mut rng = ChaCha8Rng::seed_from_u64(63);
-    let targets = cameras
-        .iter()
-        .map(|c| {
-            let n = 3 * (c.width * c.height) as usize;
-            let rgb = (0..n).map(|_| rng.random()).collect();
-            Image8 { width: c.width, height: c.height, rgb, alpha: None, mask: None }
-        })
-        .collect();
+    let model = normalised(scenes::cloud(21, 2, &first, 62));
+    let target = |camera: &Camera| scenes::noisy((camera.width, camera.height), 0.0, 63).1;
+    let targets = cameras.iter().map(target).collect();
     Views { model, cameras, targets }
 }
 
@@ -77,38 +63,38 @@ fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
     values.into_iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// One view's contribution to a signal. Shape: [rows].
-fn contribution(signal: Signal, gradient: &Gradient, camera: &Camera) -> Vec<f64> {
+/// One view's contribution to a signal, where views count in full from a depth on. Shape: [rows].
+fn contribution(
+    signal: Signal,
+    gradient: &Gradient,
+    camera: &Camera,
+    depths: &[f64],
+    full_depth: f64,
+) -> Vec<f64> {
     let ndc = [0.5 * f64::from(camera.width), 0.5 * f64::from(camera.height)];
-    let rows = gradient.screen.iter().zip(&gradient.model.means);
-    rows.map(|(s, mean)| match signal {
-        Signal::VisibleCount => f64::from(u8::from(s.pixels > 0)),
-        Signal::ScreenGradient => norm([0, 1].map(|i| s.mean[i] * ndc[i])),
-        Signal::ScreenGradientAbs => norm([0, 1].map(|i| s.mean_abs[i] * ndc[i])),
-        Signal::ColourGradient => norm(s.colour),
-        Signal::MeanGradientX => mean[0],
-        Signal::MeanGradientY => mean[1],
-        Signal::MeanGradientZ => mean[2],
-        Signal::MeanGradientNorm => norm(*mean),
-        Signal::WeightMax => s.max_weight,
-        Signal::WeightSum => s.sum_weight,
-        Signal::PixelCount => f64::from(s.pixels),
-        other => panic!("{other:?} is no sum over views"),
+    let rows = gradient.screen.iter().zip(&gradient.model.means).zip(depths);
+    rows.map(|((s, mean), depth)| {
+        let near = if full_depth > 0.0 { (depth / full_depth).min(1.0).powi(2) } else { 1.0 };
+        match signal {
+            Signal::VisibleCount => f64::from(u8::from(s.pixels > 0)),
+            Signal::ScreenGradient => near * norm([0, 1].map(|i| s.mean[i] * ndc[i])),
+            Signal::ScreenGradientAbs => near * norm([0, 1].map(|i| s.mean_abs[i] * ndc[i])),
+            Signal::ColourGradient => near * norm(s.colour),
+            Signal::MeanGradientX => mean[0],
+            Signal::MeanGradientY => mean[1],
+            Signal::MeanGradientZ => mean[2],
+            Signal::MeanGradientNorm => norm(*mean),
+            Signal::WeightMax => s.max_weight,
+            Signal::WeightSum => s.sum_weight,
+            Signal::PixelCount => f64::from(s.pixels),
+            other => panic!("{other:?} is no sum over views"),
+        }
     })
     .collect()
 }
 
 /// Runs one step per view and takes the signals.
 fn collect(
-    subject: &Subject,
-    views: &Views,
-    wanted: &[Signal],
-) -> (Box<dyn Differentiable>, Vec<Vec<f32>>) {
-    collect_from(subject, views, wanted, 0.0)
-}
-
-/// The same, where views count in full from this depth on.
-fn collect_from(
     subject: &Subject,
     views: &Views,
     wanted: &[Signal],
@@ -137,30 +123,39 @@ fn every_signal_whatever_else_is_asked_for() {
     let everything: Vec<Signal> = Signal::ALL.into_iter().filter(is_accumulated).collect();
     let mut base = everything.clone();
     base.retain(|signal| signal.pixel_sums().is_empty());
+    let depths = |camera: &Camera| -> Vec<f64> {
+        let depth = |mean: &[f32; 3]| camera.project(mean.map(f64::from).into()).1;
+        views.model.means.iter().map(depth).collect()
+    };
+    let mut of_first = depths(&views.cameras[0]);
+    of_first.sort_by(f64::total_cmp);
+    let middle = of_first[of_first.len() / 2] as f32;
     // Alone, beside the others that cost nothing, and all together: a backend keeps only what is asked
-    // for, and must not lose its place.
-    let mut requests = vec![base.clone(), everything.clone()];
+    // for, and must not lose its place. And where near views weigh less, by screen and colour only.
+    let mut requests =
+        vec![(base.clone(), 0.0), (everything.clone(), 0.0), (everything.clone(), middle)];
     for &signal in &everything {
-        requests.push(vec![signal]);
+        requests.push((vec![signal], 0.0));
         if !base.contains(&signal) {
-            requests.push([&base[..], &[signal]].concat());
+            requests.push(([&base[..], &[signal]].concat(), 0.0));
         }
     }
 
     for subject in all() {
         let mut table = Table::new(&format!("signals, {}", subject.name()));
-        for request in &requests {
-            let (_, columns) = collect(&subject, &views, request);
+        for (request, full_depth) in &requests {
+            let (_, columns) = collect(&subject, &views, request, *full_depth);
             for (&signal, column) in request.iter().zip(columns) {
                 let mut expected = vec![0.0; views.model.len()];
                 for (gradient, camera) in gradients.iter().zip(&views.cameras) {
-                    let parts = contribution(signal, gradient, camera);
+                    let full_depth = f64::from(*full_depth);
+                    let parts = contribution(signal, gradient, camera, &depths(camera), full_depth);
                     for (sum, part) in expected.iter_mut().zip(parts) {
                         let is_maximum = signal.kind() == SignalKind::EpochMaximum;
                         *sum = if is_maximum { part.max(*sum) } else { *sum + part };
                     }
                 }
-                let what = format!("{} signals", request.len());
+                let what = format!("{} signals, full from {full_depth}", request.len());
                 let error = relative_error(&column, &expected);
                 let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
                 table.check(&what, &format!("{signal:?}"), error, tolerance(&subject) + flips);
@@ -170,48 +165,11 @@ fn every_signal_whatever_else_is_asked_for() {
     }
 }
 
-/// Gradients on screen and by colour; nothing else.
-#[test]
-fn near_views_weigh_less_where_asked_for() {
-    let views = views();
-    let gradients: Vec<Gradient> = (0..views.cameras.len()).map(|v| reference(&views, v)).collect();
-    let depth = |camera: &Camera, row: usize| {
-        let mean = views.model.means[row].map(f64::from);
-        (camera.rotation * DVec3::from_array(mean) + camera.translation).z
-    };
-    let rows = 0..views.model.len();
-    let mut depths: Vec<f64> = rows.clone().map(|row| depth(&views.cameras[0], row)).collect();
-    depths.sort_by(f64::total_cmp);
-    let full_depth = depths[rows.len() / 2] as f32;
-    let weighed = [Signal::ScreenGradient, Signal::ScreenGradientAbs, Signal::ColourGradient];
-    let others = [Signal::VisibleCount, Signal::MeanGradientNorm, Signal::WeightSum];
-    let wanted = [weighed, others].concat();
-
-    for subject in all() {
-        let mut table = Table::new(&format!("signals of near views, {}", subject.name()));
-        let (_, columns) = collect_from(&subject, &views, &wanted, full_depth);
-        for (&signal, column) in wanted.iter().zip(columns) {
-            let mut expected = vec![0.0; rows.len()];
-            for (gradient, camera) in gradients.iter().zip(&views.cameras) {
-                let parts = contribution(signal, gradient, camera);
-                for (row, part) in parts.into_iter().enumerate() {
-                    let near = (depth(camera, row) / f64::from(full_depth)).min(1.0);
-                    let share = if weighed.contains(&signal) { near * near } else { 1.0 };
-                    expected[row] += share * part;
-                }
-            }
-            let error = relative_error(&column, &expected);
-            table.check("near", &format!("{signal:?}"), error, tolerance(&subject));
-        }
-        table.finish();
-    }
-}
-
 #[test]
 fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     let views = views();
     for subject in all() {
-        let (mut backend, columns) = collect(&subject, &views, &[Signal::WeightMax]);
+        let (mut backend, columns) = collect(&subject, &views, &[Signal::WeightMax], 0.0);
         let mut now = |begins_epoch: bool| {
             if begins_epoch {
                 backend.begin_epoch();
@@ -226,8 +184,46 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
     }
 }
 
+/// Of the views measured since it was last taken.
+#[test]
+fn the_fresh_weight_is_the_largest_over_the_views_measured() {
+    let views = views();
+    let signals = SignalSet::from([Signal::FreshWeightMax, Signal::WeightMax]);
+    for subject in all() {
+        let [first, last] = [0, 1].map(|view| {
+            let camera = &views.cameras[view];
+            let upstream = scenes::narrowed(&scenes::upstream(camera, 3));
+            let mut backend = make_with(&subject, &views.model, Setup::default());
+            let outcome = backend.differentiate(camera, BACKGROUND, 2, &upstream);
+            outcome.expect("a small image is rendered").1.max_weight
+        });
+        let both: Vec<f32> = first.iter().zip(&last).map(|(a, b)| a.max(*b)).collect();
+        // The smaller cap takes several bands.
+        for cap in [10_000, 1] {
+            let needs = Needs { signals, ..Needs::default() };
+            let setup = Setup { tile_cap: Some(cap), needs, ..Setup::default() };
+            let mut backend = make_with(&subject, &views.model, setup);
+            let mut measured = |cameras: &[Camera]| {
+                for camera in cameras {
+                    backend.measure_weights(camera, 2).expect("a small image is rendered");
+                }
+                let taken = backend.take_signals(signals).expect("signals can be taken");
+                taken.get(Signal::FreshWeightMax).expect("it was asked for").to_vec()
+            };
+            let near = |found: &[f32], expected: &[f32]| {
+                found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6)
+            };
+            let what = format!("{}, {cap} entries", subject.name());
+            assert!(both != last && near(&measured(&views.cameras), &both), "{what}");
+            assert!(near(&measured(&views.cameras[1..]), &last), "{what}: not forgotten");
+            assert!(measured(&[]).iter().all(|weight| weight.to_bits() == 0), "{what}");
+        }
+    }
+}
+
 /// Signals lie where a step sums gradients: whether they are given back or not, and however many they
-/// are, the steps after them and an image beside them are the same to the bit.
+/// are, the steps after them and an image beside them are the same to the bit; so they are where fresh
+/// weights are measured.
 #[test]
 fn what_is_lent_for_signals_changes_nothing() {
     let views = views();
@@ -236,7 +232,7 @@ fn what_is_lent_for_signals_changes_nothing() {
     // More columns than a step has sums.
     let many = SignalSet::from(Signal::ALL);
     let run = |subject: &Subject, read: Option<SignalSet>, gives_back: bool| {
-        let needs = Needs { signals: declared, ..Needs::default() };
+        let needs = Needs { signals: declared.with(Signal::FreshWeightMax), ..Needs::default() };
         let setup = Setup { needs, ..Setup::default() };
         let mut backend = make_with(subject, &views.model, setup);
         let mut image = None;
@@ -244,6 +240,9 @@ fn what_is_lent_for_signals_changes_nothing() {
             let (camera, target) = (&views.cameras[0], &views.targets[0]);
             let input = StepInput { background: BACKGROUND, ..step_input(step, camera, target, 2) };
             backend.train_step(&input).expect("a small image is rendered");
+            if read.is_some() {
+                backend.measure_weights(camera, 2).expect("a small image is rendered");
+            }
             let taken = read.map(|wanted| backend.take_signals(wanted).expect("signals"));
             image = Some(backend.render(camera, BACKGROUND, 2).expect("a small image"));
             if let Some(signals) = taken.filter(|_| gives_back) {

@@ -6,16 +6,17 @@
 
 use std::sync::OnceLock;
 
-use densify::backend::cpu::{CpuBackend, CpuOptions, InstructionSet};
-use densify::backend::gpu::{
-    Accumulation, AdapterChoice, AdapterSummary, GpuBackend, GpuDevice, GpuOptions, adapters,
+use densify::backend::cpu::InstructionSet;
+use densify::backend::gpu::{Accumulation, AdapterChoice, AdapterSummary, GpuDevice, adapters};
+use densify::backend::{
+    Backend, MomentStorage, ParameterStorage, Rendering, StateArray, StepInput, Storage, Tensor,
 };
-use densify::backend::{Rendering, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject};
 use densify_policies::policy::Cadence;
+use glam::{DMat3, DVec3};
 use proptest::prelude::ProptestConfig;
 
 pub(crate) use densify::verify::compare::class;
@@ -110,6 +111,15 @@ pub(crate) fn on_each(subjects: Vec<Subject>, mut check: impl FnMut(&Subject)) {
     }
 }
 
+/// The ways in which the native backend can store parameters and moments, the default first.
+pub(crate) fn storages() -> [Storage; 4] {
+    use {MomentStorage as Moments, ParameterStorage as Parameters};
+    let both = [Moments::F32, Moments::Both8];
+    let [a, b] = both.map(|moments| Storage { parameters: Parameters::F32, moments });
+    let [c, d] = both.map(|moments| Storage { parameters: Parameters::F16, moments });
+    [a, b, c, d]
+}
+
 /// A backend for a model.
 pub(crate) fn make(subject: &Subject, model: &Gaussians) -> Box<dyn Differentiable> {
     make_with(subject, model, Setup::default())
@@ -122,22 +132,6 @@ pub(crate) fn make_with(
     setup: Setup,
 ) -> Box<dyn Differentiable> {
     subject.with(model, setup).expect("a small model fits")
-}
-
-/// The native backend as it is by default.
-pub(crate) fn native(model: &Gaussians) -> CpuBackend {
-    CpuBackend::new(model, &CpuOptions::new(model.len().max(1))).expect("a small model fits")
-}
-
-/// A GPU backend, for tests of what only it has.
-pub(crate) fn gpu(
-    device: &GpuDevice,
-    model: &Gaussians,
-    change: impl FnOnce(&mut GpuOptions),
-) -> GpuBackend {
-    let mut options = GpuOptions::new(model.len().max(1));
-    change(&mut options);
-    GpuBackend::new(model, &options, device).expect("a small model fits")
 }
 
 /// How proptest is set up: as many cases as `PROPTEST_CASES` says, or so many.
@@ -166,6 +160,35 @@ pub(crate) fn step_input<'a>(
         seed: 1,
         ssim_weight: 1.0,
     }
+}
+
+/// The model with quaternions of length 1, as training leaves them.
+pub(crate) fn normalised(mut model: Gaussians) -> Gaussians {
+    for quat in &mut model.quats {
+        let norm = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
+        *quat = quat.map(|v| v / norm);
+    }
+    model
+}
+
+/// The camera turned around and far off: it sees nothing of what the camera sees.
+pub(crate) fn turned_away(camera: &Camera) -> Camera {
+    let turn = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, -1.0));
+    let translation = turn * camera.translation - DVec3::new(0.0, 0.0, 1000.0);
+    Camera { rotation: turn * camera.rotation, translation, ..*camera }
+}
+
+/// A rendering as a photograph.
+pub(crate) fn photograph(image: &Rendering) -> Image8 {
+    let rgb = image.rgb.iter().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    Image8 { width: image.width, height: image.height, rgb, alpha: None, mask: None }
+}
+
+/// What a run goes on from: the model, and the arrays beside it.
+pub(crate) fn saved(backend: &dyn Backend) -> (Gaussians, Vec<Tensor>) {
+    let save = |array: StateArray| backend.save(&array.name).expect("an array of the state");
+    let arrays = backend.state().into_iter().map(save).collect();
+    (backend.download().expect("a model"), arrays)
 }
 
 /// The bits of an image.

@@ -11,8 +11,8 @@ use crate::adc::clone_at;
 use crate::parameters::in_range;
 use crate::plan::EditPlan;
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PolicyState, Signal, SignalSet,
-    Snapshot,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PolicyResult, PolicyState,
+    Signal, SignalSet, Snapshot,
 };
 use crate::registry::{ConfiguredPolicy, policies};
 use crate::rng::{PolicyRng, Purpose};
@@ -21,24 +21,15 @@ use crate::sample::{smallest, top_k};
 #[test]
 fn every_registered_policy_conforms() {
     for entry in policies().unwrap() {
-        if let Err(report) = check_policy(entry) {
-            panic!("{report}");
-        }
-    }
-}
-
-#[test]
-fn every_registered_policy_is_documented() {
-    for entry in policies().unwrap() {
-        if let Err(report) = check_manual(entry) {
-            panic!("{report}");
-        }
+        let conforms = check_policy(entry).and_then(|()| check_manual(entry));
+        conforms.unwrap_or_else(|report| panic!("{report}"));
     }
 }
 
 /// What is wrong with a [`Faulty`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 enum Fault {
+    #[default]
     None,
     ReadsUndeclared,
     ReadsUndeclaredIfPresent,
@@ -99,37 +90,39 @@ fn next_call() -> u64 {
 #[serde(deny_unknown_fields, default)]
 struct Params {
     every: u32,
+    fault: Fault,
 }
 
 /// A policy with a state: at every third event of its life it prunes the faintest row, at the
 /// others it clones two rows, one by gradient and one at random. It conforms but for its fault.
-struct Faulty<const FAULT: usize> {
+struct Faulty {
+    fault: Fault,
     events: u64,
     /// Bits of the numbers seen in the auxiliary views of its life.
     seen: u64,
 }
 
-impl<const FAULT: usize> ConfiguredPolicy for Faulty<FAULT> {
+impl ConfiguredPolicy for Faulty {
     type Params = Params;
     const STEP_PARAMETERS: &'static [&'static str] = &["every"];
-    fn new(_params: Params, _scene: &SceneInfo) -> Result<Self, PolicyError> {
-        Ok(Self { events: 0, seen: 0 })
+    fn new(params: Params, _scene: &SceneInfo) -> PolicyResult<Self> {
+        Ok(Self { fault: params.fault, events: 0, seen: 0 })
     }
 }
 
-impl<const FAULT: usize> Faulty<FAULT> {
+impl Faulty {
     fn has(&self, fault: Fault) -> bool {
-        FAULTS[FAULT].0 == fault
+        self.fault == fault
     }
 }
 
-impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
+impl DensityPolicy for Faulty {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let mut signals = SignalSet::from([Signal::Opacity, Signal::ScreenGradient]);
         if self.has(Fault::HasRandomNeeds) && next_call().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
-        let fresh = [Fault::None, Fault::ReadsFreshUnwanted].contains(&FAULTS[FAULT].0);
+        let fresh = [Fault::None, Fault::ReadsFreshUnwanted].contains(&self.fault);
         if fresh || self.has(Fault::ReadsFreshWithoutViews) {
             signals = signals.with(Signal::FreshWeightMax);
         }
@@ -161,7 +154,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         u32::from(step.is_multiple_of(10)) * 2
     }
 
-    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+    fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
         if self.has(Fault::ReadsUndeclaredColumn) {
             view.column(AuxColumn::Radius)?;
         }
@@ -180,15 +173,10 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         at_random || step.is_multiple_of(15)
     }
 
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         self.events += 1;
         let opacity = now.signal(Signal::Opacity)?;
-        let reads_fresh = match FAULTS[FAULT].0 {
+        let reads_fresh = match self.fault {
             Fault::None => now.step.is_multiple_of(15),
             Fault::ReadsFreshUnwanted => now.step.is_multiple_of(10),
             _ => false,
@@ -245,7 +233,7 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
         serde_json::json!({ "events": self.events, "seen": self.seen })
     }
 
-    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
+    fn restore(&mut self, state: PolicyState) -> PolicyResult {
         if self.has(Fault::RestoresNothing) && state["events"].is_u64() {
             return Ok(());
         }
@@ -259,26 +247,20 @@ impl<const FAULT: usize> DensityPolicy for Faulty<FAULT> {
     }
 }
 
-fn faulty<const FAULT: usize>() -> PolicyEntry {
-    PolicyEntry::new::<Faulty<FAULT>>("faulty", "for tests", "nowhere", "", ("tests.rs", 1))
+/// The report on a policy with this fault.
+fn report(fault: Fault) -> Result<(), Report> {
+    let entry = PolicyEntry::new::<Faulty>("faulty", "for tests", "nowhere", "", ("tests.rs", 1));
+    check_policy_with(&entry, &Table::try_from(Params { every: 0, fault }).unwrap())
 }
 
 #[test]
 fn every_fault_is_found() {
-    macro_rules! entries {
-        ($($fault:literal)*) => { [$(faulty::<$fault>()),*] };
-    }
-    let entries = entries!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21);
-    assert_eq!(entries.len(), FAULTS.len());
     let mut missed = Vec::new();
-    for (entry, (fault, expected)) in entries.iter().zip(FAULTS) {
-        let report = check_policy(entry);
-        let found: Vec<Check> = match &report {
-            Ok(()) => Vec::new(),
-            Err(report) => report.failures.iter().map(|(check, _)| *check).collect(),
-        };
-        let is_found = expected.map_or(found.is_empty(), |check| found.contains(&check));
-        if !is_found {
+    for (fault, expected) in FAULTS {
+        let report = report(fault);
+        let found = report.as_ref().err().map_or(&[][..], |report| &report.failures);
+        let is_found = |check| found.iter().any(|(failed, _)| *failed == check);
+        if !expected.map_or(found.is_empty(), is_found) {
             missed.push(format!("{fault:?}: {report:?}"));
         }
     }
@@ -287,7 +269,7 @@ fn every_fault_is_found() {
 
 #[test]
 fn a_report_names_the_policy_and_the_step() {
-    let report = check_policy(&faulty::<1>()).unwrap_err().to_string();
+    let report = report(Fault::ReadsUndeclared).unwrap_err().to_string();
     assert!(
         report
             .starts_with("policy `faulty` (tests.rs:1) does not conform:\n- failed: it reads only")
@@ -308,7 +290,7 @@ struct Unbuildable;
 impl ConfiguredPolicy for Unbuildable {
     type Params = Lax;
     const STEP_PARAMETERS: &'static [&'static str] = &["threshold"];
-    fn new(params: Lax, scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: Lax, scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("threshold", params.threshold, 0.0..=1.0)?;
         if scene.iterations == 7 {
             Err(PolicyError::Other("not seven".to_owned()))
@@ -330,7 +312,7 @@ impl DensityPolicy for Unbuildable {
         _now: &Snapshot<'_>,
         _rng: &PolicyRng,
         _plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         Ok(())
     }
 }

@@ -4,7 +4,7 @@ use super::quota::rows_of_event;
 use super::{Diet, NewbornSize};
 use crate::adc::Window;
 use crate::plan::{EditPlan, Seed};
-use crate::policy::{CandidateRequest, PolicyError, SceneInfo, Signal, Snapshot};
+use crate::policy::{CandidateRequest, PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
 impl Diet {
@@ -36,7 +36,7 @@ impl Diet {
         now: &Snapshot<'_>,
         plan: &mut EditPlan,
         exempt: &dyn Fn(u32) -> bool,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         let code_size = match self.params.newborn_size {
             NewbornSize::Pixel => None,
             NewbornSize::Code => Some(squared_geometric_mean(now.signal(Signal::ScaleMax)?)),

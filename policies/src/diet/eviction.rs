@@ -2,7 +2,7 @@
 
 use super::{Diet, Importance};
 use crate::plan::EditPlan;
-use crate::policy::{PolicyError, Signal, Snapshot};
+use crate::policy::{PolicyResult, Signal, Snapshot};
 use crate::sample::smallest;
 
 impl Diet {
@@ -22,7 +22,7 @@ impl Diet {
         plan: &mut EditPlan,
         count: usize,
         exempt: &dyn Fn(u32) -> bool,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         if count == 0 {
             return Ok(());
         }

@@ -148,7 +148,7 @@
 use crate::adc::{PruneLimits, Window, mean_over_views, spare_one};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxView, Candidate, DensityPolicy, Needs, PolicyError, SceneInfo, Signal, SignalSet, Snapshot,
+    AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -200,7 +200,7 @@ impl ConfiguredPolicy for Diet {
         "reinit_at",
     ];
 
-    fn new(params: DietParams, scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: DietParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let compensates = params.rho_c > 0.0;
         Ok(Self {
@@ -283,17 +283,12 @@ impl DensityPolicy for Diet {
         if self.is_reinit(step) { u32::MAX } else { 0 }
     }
 
-    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+    fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
         self.surface.extend_from_slice(view.points);
         Ok(())
     }
 
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        _rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, now: &Snapshot<'_>, _rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         if self.is_reinit(now.step) {
             self.reinit(now.scene.extent, plan);
             return Ok(());
@@ -344,7 +339,7 @@ const MEAN_GRADIENT: [Signal; 3] =
 
 impl Diet {
     /// The gradient g of every row. Shape: `[rows]`.
-    fn gradient(&self, now: &Snapshot<'_>) -> Result<Vec<f32>, PolicyError> {
+    fn gradient(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<f32>> {
         let views = now.signal(Signal::VisibleCount)?;
         let mut gradient = mean_over_views(now.signal(Signal::ScreenGradient)?, views);
         if self.params.mixed_gradient {
@@ -362,7 +357,7 @@ impl Diet {
     }
 
     /// The dead rows, ascending; never all of them.
-    fn dead(&self, now: &Snapshot<'_>) -> Result<Vec<u32>, PolicyError> {
+    fn dead(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<u32>> {
         let DietParams { min_opacity, max_scale, max_scale_from, .. } = self.params;
         let limits = PruneLimits::at(now, min_opacity, max_scale, max_scale_from);
         let mut dead = limits.dead_rows(now)?;

@@ -3,15 +3,11 @@
 use super::{CloneOpacity, Diet, DietParams, MEAN_GRADIENT, Shift, Split};
 use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::plan::{Offspring, OpacityRule, ParentFate, ScaleRule};
-use crate::policy::{PolicyError, Signal, Snapshot};
+use crate::policy::{PolicyResult, Signal, Snapshot};
 
 impl Diet {
     /// The children of a candidate.
-    pub(super) fn offspring(
-        &self,
-        now: &Snapshot<'_>,
-        row: usize,
-    ) -> Result<Offspring, PolicyError> {
+    pub(super) fn offspring(&self, now: &Snapshot<'_>, row: usize) -> PolicyResult<Offspring> {
         if now.signal(Signal::ScaleMax)?[row] > self.scene_units(self.params.small, now.scene) {
             let DietParams { split_factor, split_share, child_opacity, .. } = self.params;
             return Ok(match self.params.split {
@@ -35,7 +31,7 @@ impl Diet {
     }
 
     /// Offset of a clone from its parent `[scene units]`.
-    fn shift(&self, now: &Snapshot<'_>, row: usize) -> Result<[f32; 3], PolicyError> {
+    fn shift(&self, now: &Snapshot<'_>, row: usize) -> PolicyResult<[f32; 3]> {
         let read = |signal| now.signal(signal).map(|column| column[row]);
         if self.params.shift == Shift::None {
             return Ok([0.0; 3]);

@@ -5,7 +5,7 @@ use std::ops::Bound::{Excluded, Included, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::parameters::in_range;
-use crate::policy::{DepthMode, ErrorMode, PolicyError};
+use crate::policy::{DepthMode, ErrorMode, PolicyResult};
 
 /// Parameters of [`Diet`](super::Diet).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -167,7 +167,7 @@ impl Default for DietParams {
 
 impl DietParams {
     /// Checks ranges.
-    pub(super) fn check(&self) -> Result<(), PolicyError> {
+    pub(super) fn check(&self) -> PolicyResult {
         in_range("tau", self.tau, 0.0..)?;
         in_range("colour_weight", self.colour_weight, 0.0..)?;
         in_range("full_depth", self.full_depth, 0.0..)?;

@@ -76,10 +76,10 @@
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `recover`, `sum` and `sum_more` do not scale.
 
-use crate::adc::{PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
+use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyError,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
@@ -103,6 +103,7 @@ crate::register_policy!(
 pub struct Igs {
     params: IgsParams,
     grow: Window,
+    resets: OpacityResets,
     /// Steps from a reset to its recovery prune.
     recover: u32,
     score: EdgeScore,
@@ -130,11 +131,15 @@ impl ConfiguredPolicy for Igs {
         "sum_more_from",
     ];
 
-    fn new(params: IgsParams, _scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: IgsParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let IgsParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
+        let last_reset = params.reset_every.saturating_mul(params.resets);
+        let resets_until = until.min(last_reset.saturating_add(1));
+        let opacity = params.reset_opacity;
         Ok(Self {
             grow: Window { from, until, every },
+            resets: OpacityResets::new(params.reset_every, resets_until, 0, opacity, scene)?,
             recover: params.recover.min((params.reset_every / 2).max(1)),
             score: EdgeScore::default(),
             params,
@@ -169,7 +174,7 @@ impl DensityPolicy for Igs {
     fn is_due(&self, step: u32) -> bool {
         self.grow.is_due(step)
             || self.is_first_prune(step)
-            || self.is_reset(step)
+            || self.resets.is_due(step)
             || self.is_recovery_prune(step)
     }
 
@@ -192,17 +197,12 @@ impl DensityPolicy for Igs {
         if after_prune { u32::MAX } else { self.params.views }
     }
 
-    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+    fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
         self.score.add(view.step, view.column(AuxColumn::MapSum)?);
         Ok(())
     }
 
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         let score = std::mem::take(&mut self.score);
         self.prune(now, plan)?;
         if self.grow.is_due(now.step) {
@@ -210,11 +210,7 @@ impl DensityPolicy for Igs {
             self.split(now, &score, rng, plan)?;
             plan.reset(Reset::Signals);
         }
-        if self.is_reset(now.step) {
-            plan.cause("reset");
-            // `new` checked the range.
-            let _ = plan.clamp_opacity(self.params.reset_opacity as f32);
-        }
+        self.resets.plan(now.step, plan);
         Ok(())
     }
 }
@@ -241,19 +237,10 @@ impl Igs {
         step > 0 && step == self.params.first_prune_at
     }
 
-    /// Whether opacities are reset at `step`: the first multiples of the interval.
-    fn is_reset(&self, step: u32) -> bool {
-        let IgsParams { reset_every: every, resets, grow_until, .. } = self.params;
-        every > 0
-            && (1..=resets).contains(&(step / every))
-            && step.is_multiple_of(every)
-            && step < grow_until
-    }
-
     fn is_recovery_prune(&self, step: u32) -> bool {
         self.params.recovery_share > 0.0
             && step < self.params.grow_until
-            && step.checked_sub(self.recover).is_some_and(|reset| self.is_reset(reset))
+            && step.checked_sub(self.recover).is_some_and(|reset| self.resets.is_due(reset))
     }
 
     /// Number of rows that the growth curve allows at `step`.
@@ -264,7 +251,7 @@ impl Igs {
         (budget as f64 * passed.min(1.0).sqrt()).floor() as usize
     }
 
-    fn prune(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> Result<(), PolicyError> {
+    fn prune(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> PolicyResult {
         let opacity = now.signal(Signal::Opacity)?;
         let mut least: f64 = 0.0;
         if self.grow.is_due(now.step) {
@@ -297,7 +284,7 @@ impl Igs {
         score: &EdgeScore,
         rng: &PolicyRng,
         plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         let views = now.signal(Signal::VisibleCount)?;
         let gradient = mean_over_views(now.signal(Signal::ScreenGradientAbs)?, views);
         let by_gradient = now.step >= self.params.final_from;

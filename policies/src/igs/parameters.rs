@@ -5,7 +5,7 @@ use std::ops::Bound::{Excluded, Included, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::parameters::in_range;
-use crate::policy::PolicyError;
+use crate::policy::PolicyResult;
 
 /// Parameters of [`Igs`](super::Igs).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -73,7 +73,7 @@ impl Default for IgsParams {
 
 impl IgsParams {
     /// Checks ranges.
-    pub(super) fn check(&self) -> Result<(), PolicyError> {
+    pub(super) fn check(&self) -> PolicyResult {
         let positive = (Excluded(0.0), Unbounded);
         let inside = (Excluded(0.0), Excluded(1.0));
         // Rounded to the f32 that plans take: 0.99999999 becomes 1.
@@ -85,7 +85,6 @@ impl IgsParams {
         in_range("final_divisor", self.final_divisor, 1.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("first_prune_opacity", self.first_prune_opacity, 0.0..=1.0)?;
-        in_range("reset_opacity", rounded(self.reset_opacity), inside)?;
         in_range("recover", self.recover.into(), 1.0..)?;
         in_range("recovery_share", self.recovery_share, 0.0..=1.0)?;
         in_range("sum", self.sum.into(), 1.0..=1000.0)?;

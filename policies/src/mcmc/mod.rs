@@ -69,7 +69,7 @@ use crate::adc::Window;
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
 use crate::policy::{
-    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyError, SceneInfo, Signal, SignalSet,
+    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyResult, SceneInfo, Signal, SignalSet,
     Snapshot, StartRule,
 };
 use crate::registry::ConfiguredPolicy;
@@ -139,7 +139,7 @@ impl ConfiguredPolicy for Mcmc {
 
     const STEP_PARAMETERS: &'static [&'static str] = &["grow_from", "grow_until", "grow_every"];
 
-    fn new(params: McmcParams, _scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: McmcParams, _scene: &SceneInfo) -> PolicyResult<Self> {
         // Rounded to the f32 that plans take: 0.99999999 becomes 1.
         let rounded = |value: f64| f64::from(value as f32);
         in_range("min_opacity", rounded(params.min_opacity), (Excluded(0.0), Excluded(1.0)))?;
@@ -185,12 +185,7 @@ impl DensityPolicy for Mcmc {
         self.grow.is_due(step)
     }
 
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         let opacity = now.signal(Signal::Opacity)?;
         let least = self.params.min_opacity as f32;
         let is_alive = |opacity: f32| opacity.is_finite() && opacity > least;

@@ -111,12 +111,6 @@ impl EditPlan {
         self.pruned
     }
 
-    /// Edits refused so far.
-    #[must_use]
-    pub fn denied(&self) -> usize {
-        self.denied
-    }
-
     /// Whether `row` exists and has no edit yet.
     #[must_use]
     pub fn is_free(&self, row: u32) -> bool {

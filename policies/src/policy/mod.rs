@@ -8,7 +8,7 @@
 
 use serde::{Deserialize, Serialize};
 
-pub use crate::error::PolicyError;
+pub use crate::error::{PolicyError, PolicyResult};
 pub use crate::needs::{
     AuxRequest, Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, NoiseTerm,
     PixelMap, RateOverrides, StartRule,
@@ -55,7 +55,7 @@ pub trait DensityPolicy: Send {
     ///
     /// # Errors
     /// As for [`plan`](Self::plan).
-    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+    fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
         let _ = view;
         Ok(())
     }
@@ -65,12 +65,7 @@ pub trait DensityPolicy: Send {
     ///
     /// # Errors
     /// [`PolicyError`] stops the run with the policy's name and the step; the plan is dropped.
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError>;
+    fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult;
 
     /// The state that future decisions depend on, beside the parameters. The default is for
     /// policies that have none.
@@ -82,7 +77,7 @@ pub trait DensityPolicy: Send {
     ///
     /// # Errors
     /// [`PolicyError::State`] when `state` is not this policy's.
-    fn restore(&mut self, state: PolicyState) -> Result<(), PolicyError> {
+    fn restore(&mut self, state: PolicyState) -> PolicyResult {
         if state.is_null() {
             return Ok(());
         }
@@ -140,7 +135,7 @@ impl<'a> Snapshot<'a> {
     /// [`PolicyError::Undeclared`] when the policy's needs do not list it, or when it is
     /// [`Signal::FreshWeightMax`] and the policy [did not want it](DensityPolicy::wants_fresh) at
     /// this event.
-    pub fn signal(&self, signal: Signal) -> Result<&'a [f32], PolicyError> {
+    pub fn signal(&self, signal: Signal) -> PolicyResult<&'a [f32]> {
         self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
     }
 }
@@ -179,7 +174,7 @@ impl<'a> AuxView<'a> {
     ///
     /// # Errors
     /// [`PolicyError::UndeclaredColumn`] when the policy's [`AuxRequest`] does not list it.
-    pub fn column(&self, column: AuxColumn) -> Result<&'a [f32], PolicyError> {
+    pub fn column(&self, column: AuxColumn) -> PolicyResult<&'a [f32]> {
         let listed = self.columns.iter().find(|(name, _)| *name == column);
         listed.map(|(_, values)| &values[..]).ok_or(PolicyError::UndeclaredColumn { column })
     }

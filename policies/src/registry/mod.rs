@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
 use crate::parameters::{field_names, nearest, scale_steps};
-use crate::policy::{DensityPolicy, PolicyError, SceneInfo};
+use crate::policy::{DensityPolicy, PolicyError, PolicyResult, SceneInfo};
 
 #[doc(hidden)]
 pub use inventory;
@@ -29,7 +29,7 @@ pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
     ///
     /// # Errors
     /// [`PolicyError::BadParameter`] when a value is out of range.
-    fn new(params: Self::Params, scene: &SceneInfo) -> Result<Self, PolicyError>;
+    fn new(params: Self::Params, scene: &SceneInfo) -> PolicyResult<Self>;
 }
 
 /// Registers a policy under a name.
@@ -54,7 +54,7 @@ macro_rules! register_policy {
 
 inventory::collect!(PolicyEntry);
 
-type BuildResult = Result<Box<dyn DensityPolicy>, PolicyError>;
+type BuildResult = PolicyResult<Box<dyn DensityPolicy>>;
 
 /// A registered policy.
 #[derive(Debug, Clone, Copy)]
@@ -158,7 +158,7 @@ impl PolicyEntry {
     ///
     /// # Errors
     /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type.
-    pub fn effective(&self, set: &Table, scene: &SceneInfo) -> Result<Table, PolicyError> {
+    pub fn effective(&self, set: &Table, scene: &SceneInfo) -> PolicyResult<Table> {
         let mut table = self.defaults()?;
         for parameter in set.keys() {
             self.check_known(parameter)?;
@@ -181,11 +181,7 @@ impl PolicyEntry {
     /// # Errors
     /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type or a
     /// value out of range; any other error of the policy.
-    pub fn build(
-        &self,
-        set: &Table,
-        scene: &SceneInfo,
-    ) -> Result<Box<dyn DensityPolicy>, PolicyError> {
+    pub fn build(&self, set: &Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>> {
         (self.build)(self.effective(set, scene)?, scene).map_err(|error| match error {
             PolicyError::BadParameter { parameter, reason, .. } => {
                 PolicyError::BadParameter { policy: self.name.to_owned(), parameter, reason }
@@ -194,7 +190,7 @@ impl PolicyEntry {
         })
     }
 
-    fn check_known(&self, parameter: &str) -> Result<(), PolicyError> {
+    fn check_known(&self, parameter: &str) -> PolicyResult {
         let known = self.parameter_names();
         if known.iter().any(|name| name == parameter) {
             return Ok(());
@@ -206,7 +202,7 @@ impl PolicyEntry {
         })
     }
 
-    fn defaults(&self) -> Result<Table, PolicyError> {
+    fn defaults(&self) -> PolicyResult<Table> {
         (self.defaults)().map_err(|reason| self.bad_defaults(&reason))
     }
 
@@ -223,7 +219,7 @@ impl PolicyEntry {
 ///
 /// # Errors
 /// [`PolicyError::DuplicateName`] when two have one name.
-pub fn policies() -> Result<Vec<&'static PolicyEntry>, PolicyError> {
+pub fn policies() -> PolicyResult<Vec<&'static PolicyEntry>> {
     sorted(inventory::iter::<PolicyEntry>.into_iter().collect())
 }
 
@@ -231,7 +227,7 @@ pub fn policies() -> Result<Vec<&'static PolicyEntry>, PolicyError> {
 ///
 /// # Errors
 /// [`PolicyError::UnknownPolicy`] with the nearest name; [`PolicyError::DuplicateName`].
-pub fn find(name: &str) -> Result<&'static PolicyEntry, PolicyError> {
+pub fn find(name: &str) -> PolicyResult<&'static PolicyEntry> {
     let all = policies()?;
     all.iter().find(|entry| entry.name == name).copied().ok_or_else(|| PolicyError::UnknownPolicy {
         name: name.to_owned(),
@@ -239,7 +235,7 @@ pub fn find(name: &str) -> Result<&'static PolicyEntry, PolicyError> {
     })
 }
 
-fn sorted(mut entries: Vec<&PolicyEntry>) -> Result<Vec<&PolicyEntry>, PolicyError> {
+fn sorted(mut entries: Vec<&PolicyEntry>) -> PolicyResult<Vec<&PolicyEntry>> {
     entries.sort_by_key(|entry| (entry.name, entry.place));
     match entries.windows(2).find(|pair| pair[0].name == pair[1].name) {
         None => Ok(entries),

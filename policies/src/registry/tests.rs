@@ -45,7 +45,7 @@ impl DensityPolicy for Idle {
         _now: &Snapshot<'_>,
         _rng: &PolicyRng,
         _plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         Ok(())
     }
 }
@@ -53,7 +53,7 @@ impl DensityPolicy for Idle {
 impl ConfiguredPolicy for Idle {
     type Params = Params;
     const STEP_PARAMETERS: &'static [&'static str] = &["every", "from"];
-    fn new(params: Params, _scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: Params, _scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("threshold", params.threshold, 0.0..=1.0)?;
         Ok(Self(params))
     }

@@ -93,7 +93,7 @@ use crate::adc::{
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyError,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
@@ -136,7 +136,7 @@ impl ConfiguredPolicy for Taming {
         "white_reset_at",
     ];
 
-    fn new(params: TamingParams, scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: TamingParams, scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("multiplier", params.multiplier, 0.0..)?;
         in_range("tau", params.tau, 0.0..)?;
         in_range("small", params.small, 0.0..)?;
@@ -205,16 +205,11 @@ impl DensityPolicy for Taming {
         }
     }
 
-    fn observe(&mut self, view: &AuxView<'_>) -> Result<(), PolicyError> {
+    fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
         self.score.add(view, &self.params)
     }
 
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         if self.grow.is_due(now.step) {
             plan.cause("densify");
             self.densify(now, rng, plan)?;
@@ -239,7 +234,7 @@ impl Taming {
         now: &Snapshot<'_>,
         rng: &PolicyRng,
         plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         let views = now.signal(Signal::VisibleCount)?;
         let gradient = mean_over_views(now.signal(Signal::ScreenGradient)?, views);
         let scale = now.signal(Signal::ScaleMax)?;
@@ -285,7 +280,7 @@ impl Taming {
         is_split: &[bool],
         rng: &PolicyRng,
         plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    ) -> PolicyResult {
         let weights: Vec<f32> = score.iter().map(|s| 1.0 / (1e-6 + s)).collect();
         let count = (self.params.prune_share * dead.len() as f64).floor() as usize;
         let mut pruned = match self.params.prune {

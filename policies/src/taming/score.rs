@@ -4,7 +4,7 @@
 //! common factor is summed over views: Σ 50·L over those that show the row.
 
 use super::TamingParams;
-use crate::policy::{AuxColumn, AuxView, PolicyError, Signal, Snapshot};
+use crate::policy::{AuxColumn, AuxView, PolicyResult, Signal, Snapshot};
 
 /// Factor on a view's loss in the published code. It matters only beside the 10⁻⁶ of pruning.
 const VIEW_WEIGHT: f32 = 50.0;
@@ -21,11 +21,7 @@ pub(super) struct Score {
 
 impl Score {
     /// Adds one view.
-    pub(super) fn add(
-        &mut self,
-        view: &AuxView<'_>,
-        params: &TamingParams,
-    ) -> Result<(), PolicyError> {
+    pub(super) fn add(&mut self, view: &AuxView<'_>, params: &TamingParams) -> PolicyResult {
         if self.step != view.step || self.loss_sums.len() != view.rows {
             let zeros = vec![0.0; view.rows];
             *self = Self { step: view.step, view_terms: zeros.clone(), loss_sums: zeros };
@@ -60,7 +56,7 @@ impl Score {
         now: &Snapshot<'_>,
         gradient: &[f32],
         params: &TamingParams,
-    ) -> Result<Vec<f32>, PolicyError> {
+    ) -> PolicyResult<Vec<f32>> {
         if self.step != now.step || self.loss_sums.len() != now.rows() {
             return Ok(vec![0.0; now.rows()]);
         }

@@ -92,18 +92,6 @@ fn the_score_by_hand() {
 }
 
 #[test]
-fn the_score_does_not_depend_on_the_unit_of_a_term() {
-    let mut event = event(1000, 4, 9).with(Signal::ScaleProduct, &[1e-4, 3e-4, 2e-5, 0.0]);
-    set(&mut event.views[0], AuxColumn::Depth, &[1.0, 2.0, 3.0, 0.5]);
-    let expected = score(&event, "");
-    let mut scaled = event.clone().with(Signal::ScaleProduct, &[1e-1, 3e-1, 2e-2, 0.0]);
-    set(&mut scaled.views[0], AuxColumn::Depth, &[10.0, 20.0, 30.0, 5.0]);
-    for (found, expected) in score(&scaled, "").iter().zip(expected) {
-        assert!((found / expected - 1.0).abs() < 1e-5, "{found} {expected}");
-    }
-}
-
-#[test]
 fn scores_of_another_event_are_forgotten() {
     let late = Event { views: Vec::new(), ..event(1500, 3, 9) };
     let mut policy = build("taming", "", &late.scene);
@@ -218,12 +206,6 @@ fn the_published_draw_hits_few_and_others() {
     event.scene.budget = 1000;
     let done = run(&event, "prune = \"published\"");
     assert_eq!((done.split.len(), done.pruned), (2, vec![4]));
-}
-
-#[test]
-fn one_row_is_left() {
-    let event = event(1000, 2, 2).with(Signal::Opacity, &[0.001, 0.002]);
-    assert_eq!(run(&event, "prune_share = 1").pruned, [0]);
 }
 
 #[test]

@@ -65,7 +65,7 @@ use crate::adc::{
 };
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
-use crate::policy::{DensityPolicy, Needs, PolicyError, SceneInfo, Signal, SignalSet, Snapshot};
+use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
@@ -138,7 +138,7 @@ impl ConfiguredPolicy for Vanilla {
         "white_reset_at",
     ];
 
-    fn new(params: VanillaParams, scene: &SceneInfo) -> Result<Self, PolicyError> {
+    fn new(params: VanillaParams, scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("tau", params.tau, 0.0..)?;
         in_range("small", params.small, 0.0..)?;
         in_range("split_factor", params.split_factor, 1.0..=100.0)?;
@@ -171,12 +171,7 @@ impl DensityPolicy for Vanilla {
         self.grow.is_due(step) || self.resets.is_due(step)
     }
 
-    fn plan(
-        &mut self,
-        now: &Snapshot<'_>,
-        _rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> Result<(), PolicyError> {
+    fn plan(&mut self, now: &Snapshot<'_>, _rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         if self.grow.is_due(now.step) {
             plan.cause("densify");
             self.densify(now, plan)?;
@@ -190,7 +185,7 @@ impl DensityPolicy for Vanilla {
 impl Vanilla {
     /// Grows, then prunes. As in the original, rows are pruned as they are after growth: a huge row
     /// that is split is judged by the size of its children.
-    fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> Result<(), PolicyError> {
+    fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> PolicyResult {
         let opacity = now.signal(Signal::Opacity)?;
         let scale = now.signal(Signal::ScaleMax)?;
         let screen_gradient = now.signal(Signal::ScreenGradient)?;

@@ -92,12 +92,6 @@ fn the_largest_gradients_grow_first() {
 }
 
 #[test]
-fn the_last_row_lives() {
-    let event = event(600, &[0.0; 3], 8).with(Signal::Opacity, &[0.001, 0.003, 0.002]);
-    assert_eq!(run(&event, "").pruned, [0, 2]);
-}
-
-#[test]
 fn events_happen_when_the_original_has_them() {
     let due = |set: &str, white_background, iterations| {
         let scene = SceneInfo { white_background, iterations, ..Event::new(1, 1, 1).scene };
@@ -140,13 +134,6 @@ fn the_governor_follows_the_curve_and_not_the_threshold() {
     ahead.scene.initial_rows = 2;
     ahead.scene.budget = 5;
     assert!(run(&ahead, "governor = true").cloned.is_empty());
-}
-
-#[test]
-fn an_empty_model_stays_empty() {
-    let done = run(&event(600, &[], 4), "");
-    assert_eq!(done.ops.rows_after, 0);
-    assert!(!done.ops.edits_rows());
 }
 
 #[test]

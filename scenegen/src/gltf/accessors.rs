@@ -19,7 +19,7 @@ const MAX_ZEROS: usize = 1 << 24;
 pub(super) struct Buffers<'a> {
     path: &'a Path,
     root: &'a json::Root,
-    folder: &'a Folder,
+    folder: Folder,
     blob: Option<&'a [u8]>,
     read: Vec<Option<Cow<'a, [u8]>>>,
 }
@@ -54,14 +54,18 @@ impl<'a> Buffers<'a> {
     pub(super) fn new(
         path: &'a Path,
         root: &'a json::Root,
-        folder: &'a Folder,
         blob: Option<&'a [u8]>,
-    ) -> Self {
-        Self { path, root, folder, blob, read: vec![None; root.buffers.len()] }
+    ) -> Result<Self, Error> {
+        let folder = Folder::around(path)?;
+        Ok(Self { path, root, folder, blob, read: vec![None; root.buffers.len()] })
     }
 
-    pub(super) fn folder(&self) -> &'a Folder {
-        self.folder
+    /// The bytes that a URI stands for: a file's, or its own.
+    pub(super) fn uri(&self, element: &str, uri: &str) -> Result<Vec<u8>, Error> {
+        if !uri.starts_with("data:") {
+            return self.folder.read_uri(element, uri);
+        }
+        data_uri(uri).ok_or_else(|| fault(self.path, element, "its data URI is no base64"))
     }
 
     /// The bytes of a buffer view.
@@ -92,22 +96,14 @@ impl<'a> Buffers<'a> {
         };
         if self.read[index].is_none() {
             let bytes: Cow<'a, [u8]> = match &buffer.uri {
-                Some(uri) if uri.starts_with("data:") => match data_uri(uri) {
-                    Some(bytes) => bytes.into(),
-                    None => return Err(fault(self.path, name(), "its data URI is no base64")),
-                },
-                Some(uri) => self.folder.read_uri(&name(), uri)?.into(),
-                None if index == 0 => match self.blob {
+                Some(uri) => self.uri(&name(), uri)?.into(),
+                None => match self.blob.filter(|_| index == 0) {
                     Some(blob) => blob.into(),
                     None => {
-                        return Err(fault(
-                            self.path,
-                            name(),
-                            "it has neither a URI nor a binary chunk",
-                        ));
+                        let problem = "it has neither a URI nor a binary chunk";
+                        return Err(fault(self.path, name(), problem));
                     }
                 },
-                None => return Err(fault(self.path, name(), "it has no URI")),
             };
             let declared = buffer.byte_length.0;
             if (bytes.len() as u64) < declared {
@@ -193,8 +189,7 @@ impl<'a> Buffers<'a> {
                 let stride = self.root.buffer_views.get(view.value()).and_then(|v| v.byte_stride);
                 let bytes = self.view(view.value(), name)?;
                 let place = Place { offset, stride: stride.map(|s| s.0), width };
-                gather(bytes, &place, layout, convert_ref(&convert))
-                    .ok_or_else(|| beyond(path, name))?
+                gather(bytes, &place, layout, &convert).ok_or_else(|| beyond(path, name))?
             }
             None if layout.count > MAX_ZEROS => {
                 return Err(fault(path, name, "it has more than 2^24 elements and no buffer view"));
@@ -216,8 +211,7 @@ impl<'a> Buffers<'a> {
         let many = Layout { count, ..*layout };
         let view = self.view(sparse.values.buffer_view.value(), name)?;
         let place = Place { offset: sparse.values.byte_offset.0, stride: None, width };
-        let news =
-            gather(view, &place, &many, convert_ref(&convert)).ok_or_else(|| beyond(path, name))?;
+        let news = gather(view, &place, &many, &convert).ok_or_else(|| beyond(path, name))?;
         for (&target, new) in places.iter().zip(news.chunks_exact(layout.size)) {
             let at = target as usize * layout.size;
             let Some(old) = values.get_mut(at..at + layout.size) else {
@@ -227,10 +221,6 @@ impl<'a> Buffers<'a> {
         }
         Ok(values)
     }
-}
-
-fn convert_ref<T>(convert: &impl Fn(&[u8]) -> T) -> impl Fn(&[u8]) -> T + '_ {
-    move |bytes| convert(bytes)
 }
 
 fn beyond(path: &Path, name: &str) -> Error {

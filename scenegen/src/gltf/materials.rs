@@ -1,7 +1,6 @@
 //! Reads glTF materials, textures and samplers.
 
-use std::collections::HashMap;
-use std::path::Path;
+use std::borrow::Cow;
 
 use glam::{Vec3, Vec4};
 use gltf::json;
@@ -9,21 +8,11 @@ use json::material::AlphaMode as JsonAlpha;
 use json::texture::{MagFilter, MinFilter, WrappingMode};
 use json::validation::Checked;
 
-use super::accessors::Buffers;
-use super::fault;
+use super::Reader;
 use crate::error::Error;
-use crate::mesh::{AlphaMode, Material, Model, Reflection};
-use crate::resource::{check_texels, data_uri, decode};
-use crate::texture::{Sampler, TextureRef, Wrap};
-
-/// Materials and images read so far.
-#[derive(Default)]
-pub(super) struct Materials {
-    /// Number in the model by number in the file; None is glTF's default material.
-    numbers: HashMap<Option<usize>, u32>,
-    /// Texture in the model by image and whether it is sRGB.
-    images: HashMap<(usize, bool), u32>,
-}
+use crate::mesh::{AlphaMode, Material, Reflection};
+use crate::resource::{self, decode};
+use crate::texture::{Sampler, Texture, TextureRef, Wrap};
 
 /// A reference to a texture, from wherever in the JSON.
 struct Use<'j> {
@@ -32,29 +21,23 @@ struct Use<'j> {
     transform: Option<&'j json::extensions::texture::TextureTransform>,
 }
 
-impl Materials {
+impl Reader<'_> {
     /// The model's number of a material, which is read at its first use.
-    pub(super) fn number(
-        &mut self,
-        path: &Path,
-        root: &json::Root,
-        buffers: &mut Buffers<'_>,
-        model: &mut Model,
-        index: Option<usize>,
-    ) -> Result<u32, Error> {
-        if let Some(&number) = self.numbers.get(&index) {
+    pub(super) fn material(&mut self, index: Option<usize>) -> Result<u32, Error> {
+        if let Some(&number) = self.materials.get(&index) {
             return Ok(number);
         }
+        let root = self.root;
         let default = json::Material::default();
         let source = match index {
             None => &default,
             Some(index) => root.materials.get(index).ok_or_else(|| {
-                fault(path, format!("material {index}"), "there is no such material")
+                self.fault(format!("material {index}"), "there is no such material")
             })?,
         };
         let name = index.map_or_else(|| "default material".to_owned(), |i| format!("material {i}"));
         let mut texture = |used: Option<Use<'_>>, srgb| match used {
-            Some(used) => self.texture(path, root, buffers, model, &name, &used, srgb),
+            Some(used) => self.texture(&name, &used, srgb),
             None => Ok(None),
         };
         let pbr = &source.pbr_metallic_roughness;
@@ -87,7 +70,7 @@ impl Materials {
         let base = Vec4::from(pbr.base_color_factor.0);
         let sane = |v: f32| if v.is_finite() { v.clamp(0.0, 1e6) } else { 0.0 };
         let material = Material {
-            name: source.name.clone().unwrap_or(name),
+            name: source.name.clone().unwrap_or_else(|| name.clone()),
             reflection: match (unlit, diffuse) {
                 (true, _) => Reflection::Unlit,
                 (_, true) => Reflection::Lambert,
@@ -110,42 +93,31 @@ impl Materials {
                     AlphaMode::Mask(source.alpha_cutoff.map_or(0.5, |cutoff| cutoff.0))
                 }
                 Checked::Valid(JsonAlpha::Blend) => AlphaMode::Blend,
-                Checked::Invalid => {
-                    return Err(fault(
-                        path,
-                        format!("material {index:?}"),
-                        "its alphaMode is unknown",
-                    ));
-                }
+                Checked::Invalid => return Err(self.fault(name, "its alphaMode is unknown")),
             },
             double_sided: source.double_sided,
             thin: false,
             is_light: false,
         };
-        let number = model.material(material);
-        self.numbers.insert(index, number);
+        let number = self.model.material(material);
+        self.materials.insert(index, number);
         Ok(number)
     }
 
-    #[expect(clippy::too_many_arguments, reason = "the parts of the reader that a texture needs")]
     fn texture(
         &mut self,
-        path: &Path,
-        root: &json::Root,
-        buffers: &mut Buffers<'_>,
-        model: &mut Model,
         material: &str,
         used: &Use<'_>,
         srgb: bool,
     ) -> Result<Option<TextureRef>, Error> {
         let name = format!("{material}, texture {}", used.texture);
-        let Some(texture) = root.textures.get(used.texture) else {
-            return Err(fault(path, name, "there is no such texture"));
+        let Some(texture) = self.root.textures.get(used.texture) else {
+            return Err(self.fault(name, "there is no such texture"));
         };
         let uv_set = used.transform.and_then(|t| t.tex_coord).unwrap_or(used.uv_set);
         // The crate's mark of an absent source: another extension brings the image.
         if texture.source.value() == u32::MAX as usize || uv_set > 1 {
-            model.notes.push(format!(
+            self.model.notes.push(format!(
                 "{name} has no plain image, or a third set of coordinates, and is left out"
             ));
             return Ok(None);
@@ -154,24 +126,19 @@ impl Materials {
         let number = match self.images.get(&(image, srgb)) {
             Some(&number) => number,
             None => {
-                let decoded = read_image(path, root, buffers, image, srgb)?;
-                check_texels(path, &name, &model.textures, &decoded)?;
-                model.textures.push(decoded);
-                let number = model.textures.len() as u32 - 1;
+                let decoded = self.image(image, srgb)?;
+                let number = resource::add_texture(self.path, &name, &mut self.model, decoded)?;
                 self.images.insert((image, srgb), number);
                 number
             }
         };
         let sampler = match texture.sampler {
             None => Sampler::default(),
-            Some(index) => match root.samplers.get(index.value()) {
+            Some(index) => match self.root.samplers.get(index.value()) {
                 Some(sampler) => sampler_of(sampler),
                 None => {
-                    return Err(fault(
-                        path,
-                        name,
-                        format!("there is no sampler {}", index.value()),
-                    ));
+                    let problem = format!("there is no sampler {}", index.value());
+                    return Err(self.fault(name, problem));
                 }
             },
         };
@@ -184,6 +151,21 @@ impl Materials {
         }
         Ok(Some(found))
     }
+
+    fn image(&mut self, index: usize, srgb: bool) -> Result<Texture, Error> {
+        let name = format!("image {index}");
+        let Some(image) = self.root.images.get(index) else {
+            return Err(self.fault(name, "there is no such image"));
+        };
+        let bytes = match (&image.uri, image.buffer_view) {
+            (Some(uri), _) => Cow::from(self.buffers.uri(&name, uri)?),
+            (None, Some(view)) => Cow::from(self.buffers.view(view.value(), &name)?),
+            (None, None) => {
+                return Err(self.fault(name, "it has neither a URI nor a buffer view"));
+            }
+        };
+        decode(self.path, &name, &bytes, srgb)
+    }
 }
 
 fn of_info(info: &json::texture::Info) -> Use<'_> {
@@ -191,31 +173,6 @@ fn of_info(info: &json::texture::Info) -> Use<'_> {
         texture: info.index.value(),
         uv_set: info.tex_coord,
         transform: info.extensions.as_ref().and_then(|e| e.texture_transform.as_ref()),
-    }
-}
-
-fn read_image(
-    path: &Path,
-    root: &json::Root,
-    buffers: &mut Buffers<'_>,
-    index: usize,
-    srgb: bool,
-) -> Result<crate::texture::Texture, Error> {
-    let name = format!("image {index}");
-    let Some(image) = root.images.get(index) else {
-        return Err(fault(path, name, "there is no such image"));
-    };
-    match (&image.uri, image.buffer_view) {
-        (Some(uri), _) if uri.starts_with("data:") => match data_uri(uri) {
-            Some(bytes) => decode(path, &name, &bytes, srgb),
-            None => Err(fault(path, name, "its data URI is no base64")),
-        },
-        (Some(uri), _) => {
-            let bytes = buffers.folder().read_uri(&name, uri)?;
-            decode(path, &name, &bytes, srgb)
-        }
-        (None, Some(view)) => decode(path, &name, buffers.view(view.value(), &name)?, srgb),
-        (None, None) => Err(fault(path, name, "it has neither a URI nor a buffer view")),
     }
 }
 

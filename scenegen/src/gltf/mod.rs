@@ -13,6 +13,7 @@
 mod accessors;
 mod materials;
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DMat4, DQuat, DVec3, Vec2, Vec3, Vec4};
@@ -23,10 +24,9 @@ use json::validation::Checked;
 use serde_json::Value;
 
 use crate::error::Error;
-use crate::mesh::{FileCamera, Light, LightKind, Model};
-use crate::resource::{self, Folder};
+use crate::mesh::{FileCamera, Light, LightKind, Model, pad};
+use crate::resource;
 use accessors::Buffers;
-use materials::Materials;
 
 /// Largest JSON part `[bytes]`. (serde_json bounds the depth to 128.)
 const MAX_JSON: usize = 64 << 20;
@@ -65,7 +65,10 @@ struct Reader<'a> {
     path: &'a Path,
     root: &'a json::Root,
     buffers: Buffers<'a>,
-    materials: Materials,
+    /// Numbers of materials in the model, by those in the file; None is glTF's default material.
+    materials: HashMap<Option<usize>, u32>,
+    /// Textures of the model, by image and whether it is sRGB.
+    images: HashMap<(usize, bool), u32>,
     model: Model,
 }
 
@@ -90,23 +93,17 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
             return Err(fault(path, what, "there are more than a million"));
         }
     }
-    let folder = Folder::around(path)?;
     let mut reader = Reader {
         path,
         root: &root,
-        buffers: Buffers::new(path, &root, &folder, blob),
-        materials: Materials::default(),
+        buffers: Buffers::new(path, &root, blob)?,
+        materials: HashMap::new(),
+        images: HashMap::new(),
         model: Model::default(),
     };
-    reader.model.name =
-        path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     reader.notes();
     reader.scene()?;
-    let model = reader.model;
-    if model.triangles.is_empty() {
-        return Err(Error::Empty { name: path.display().to_string() });
-    }
-    Ok(model)
+    reader.model.of_file(path)
 }
 
 pub(super) fn fault(path: &Path, element: impl Into<String>, problem: impl Into<String>) -> Error {
@@ -247,17 +244,13 @@ impl Reader<'_> {
     /// Visits the nodes of the default scene.
     fn scene(&mut self) -> Result<(), Error> {
         let root = self.root;
-        let roots: Vec<usize> = match (&root.scene, root.scenes.first()) {
-            (Some(index), _) => match root.scenes.get(index.value()) {
-                Some(scene) => scene.nodes.iter().map(json::Index::value).collect(),
-                None => {
-                    return Err(
-                        self.fault(format!("scene {}", index.value()), "there is no such scene")
-                    );
-                }
-            },
-            (None, Some(scene)) => scene.nodes.iter().map(json::Index::value).collect(),
-            (None, None) => {
+        let number = root.scene.map_or(0, |index| index.value());
+        let roots: Vec<usize> = match root.scenes.get(number) {
+            Some(scene) => scene.nodes.iter().map(json::Index::value).collect(),
+            None if root.scene.is_some() => {
+                return Err(self.fault(format!("scene {number}"), "there is no such scene"));
+            }
+            None => {
                 // Without scenes, everything that is no one's child.
                 let mut is_child = vec![false; root.nodes.len()];
                 for child in root.nodes.iter().flat_map(|node| node.children.iter().flatten()) {
@@ -374,13 +367,7 @@ impl Reader<'_> {
         {
             return Err(self.fault(element, "the scene has more than 2^26 triangles"));
         }
-        let material = self.materials.number(
-            self.path,
-            self.root,
-            &mut self.buffers,
-            &mut self.model,
-            primitive.material.map(|index| index.value()),
-        )?;
+        let material = self.material(primitive.material.map(|index| index.value()))?;
 
         let first = self.model.positions.len();
         for vertex in 0..count {
@@ -402,12 +389,13 @@ impl Reader<'_> {
             t.normalize_or_zero().extend(w * side)
         };
         let colour = |v: [f32; 4]| Vec4::from(v).clamp(Vec4::ZERO, Vec4::splat(1e4));
-        append(&mut model.normals, first, count, Vec3::ZERO, normals.as_ref(), normal);
-        append(&mut model.tangents, first, count, Vec4::ZERO, tangents.as_ref(), tangent);
+        let place = (first, count);
+        pad(&mut model.normals, converted(normals.as_ref(), normal), place, Vec3::ZERO);
+        pad(&mut model.tangents, converted(tangents.as_ref(), tangent), place, Vec4::ZERO);
         for (list, values) in model.uvs.iter_mut().zip(&uvs) {
-            append(list, first, count, Vec2::ZERO, values.as_ref(), Vec2::from);
+            pad(list, converted(values.as_ref(), Vec2::from), place, Vec2::ZERO);
         }
-        append(&mut model.colours, first, count, Vec4::ONE, colours.as_ref(), colour);
+        pad(&mut model.colours, converted(colours.as_ref(), colour), place, Vec4::ONE);
         let first = first as u32;
         model.triangles.extend(triangles.iter().map(|t| t.map(|i| i + first)));
         model.triangle_materials.resize(model.triangles.len(), material);
@@ -479,24 +467,14 @@ impl Reader<'_> {
     }
 }
 
-/// Appends an attribute to a list that stays empty until a primitive has it.
-fn append<T: Copy, const N: usize>(
-    list: &mut Vec<T>,
-    first: usize,
-    count: usize,
-    missing: T,
+/// The values of an attribute, if a primitive has it.
+fn converted<T, const N: usize>(
     values: Option<&accessors::Floats>,
     convert: impl Fn([f32; N]) -> T,
-) {
-    let Some(values) = values else {
-        if !list.is_empty() {
-            list.resize(first + count, missing);
-        }
-        return;
-    };
-    list.resize(first, missing);
+) -> impl Iterator<Item = T> {
     let finite = |v: [f32; N]| v.map(|x| if x.is_finite() { x } else { 0.0 });
-    list.extend((0..count).map(|i| convert(finite(values.get(i)))));
+    let count = values.map_or(0, accessors::Floats::count);
+    (0..count).filter_map(move |i| Some(convert(finite(values?.get(i)))))
 }
 
 /// A node's own transform.

@@ -1,12 +1,11 @@
 //! Reads MTL material libraries with their textures.
 
-use std::collections::{HashMap, HashSet};
-use std::io::BufReader;
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
 
-use super::statements::{Statement, Statements, shortened, split_word};
+use super::statements::{self, Statement, shortened, split_word};
 use crate::error::Error;
 use crate::mesh::{AlphaMode, Material, Model, Reflection};
 use crate::resource::{self, Folder};
@@ -15,64 +14,67 @@ use crate::texture::{TextureRef, Wrap};
 /// Linear base colour of materials that state none, and of faces without a material.
 pub(super) const GREY: [f32; 3] = [0.6; 3];
 
-/// A library as `tobj` returns it.
-type Library = (Vec<tobj::Material>, HashMap<String, usize>);
-
 /// The materials of all libraries of an OBJ file.
 pub(super) struct Materials {
     folder: Folder,
-    /// Materials that are defined or were noted as missing.
-    names: HashSet<String>,
+    /// Numbers of the materials that are defined; None for those that were noted as missing.
+    numbers: HashMap<String, Option<u32>>,
     /// Numbers of the textures, by file and whether it is sRGB.
     textures: HashMap<(PathBuf, bool), u32>,
-    /// Has the materials, textures and notes.
+    /// The model that gets the materials, textures and notes.
     pub(super) model: Model,
 }
 
 impl Materials {
     pub(super) fn new(obj: &Path) -> Result<Self, Error> {
-        let (names, textures) = (HashSet::new(), HashMap::new());
-        Ok(Self { folder: Folder::around(obj)?, names, textures, model: Model::default() })
+        let (numbers, textures) = (HashMap::new(), HashMap::new());
+        Ok(Self { folder: Folder::around(obj)?, numbers, textures, model: Model::default() })
     }
 
-    /// Notes, once, that a material is not defined.
-    pub(super) fn note_missing(&mut self, name: &str) {
-        if self.names.insert(name.to_owned()) {
-            let name = shortened(name);
-            self.model.notes.push(format!("there is no material {name}; a grey one is used"));
+    /// The model's number of a material. One that is not defined is noted once.
+    pub(super) fn number(&mut self, name: &str) -> Option<u32> {
+        if let Some(&number) = self.numbers.get(name) {
+            return number;
         }
+        self.numbers.insert(name.to_owned(), None);
+        let name = shortened(name);
+        self.model.notes.push(format!("there is no material {name}; a grey one is used"));
+        None
     }
 
     /// Reads the libraries that a `mtllib` statement names. Missing ones are noted.
-    pub(super) fn read_libraries(&mut self, s: Statement<'_>) -> Result<Vec<Library>, Error> {
+    pub(super) fn read_libraries(&mut self, s: Statement<'_>) -> Result<(), Error> {
         let element = format!("line {}: mtllib", s.line);
         // One name with spaces, or several names.
         let names: Vec<&str> = match self.folder.resolve(&element, &slashed(s.text)) {
             Ok(path) if path.is_file() => vec![s.text],
             _ => s.words().collect(),
         };
-        let mut libraries = Vec::new();
         for name in names {
             let path = self.folder.resolve(&element, &slashed(name))?;
             if path.is_file() {
-                libraries.push(self.read(&path)?);
+                self.read(&path)?;
             } else {
                 let name = shortened(name);
                 self.model.notes.push(format!("there is no {name}; its materials are grey"));
             }
         }
-        Ok(libraries)
+        Ok(())
     }
 
-    fn read(&mut self, path: &Path) -> Result<Library, Error> {
-        let mut check = check;
-        let mut statements = Statements::open(path, &mut check)?;
-        let result = tobj::load_mtl_buf(&mut BufReader::new(&mut statements));
-        let library = statements.outcome(result)?;
-        for material in &library.0 {
-            self.add(path, material)?;
-        }
-        Ok(library)
+    /// Reads a library. `tobj` gets its statements checked: it panics if a colour has not three
+    /// numbers (`Kd 1 1`), and its errors name no line.
+    fn read(&mut self, path: &Path) -> Result<(), Error> {
+        let mut text = String::new();
+        statements::each(path, |statement| {
+            text += &checked(statement)?;
+            Ok(())
+        })?;
+        let library = tobj::load_mtl_buf(&mut text.as_bytes()).map_err(|error| {
+            let remedy = "correct the file or export it again";
+            Error::malformed(path, "the library", error.to_string(), remedy)
+        })?;
+        library.0.iter().try_for_each(|material| self.add(path, material))
     }
 
     fn add(&mut self, path: &Path, source: &tobj::Material) -> Result<(), Error> {
@@ -110,8 +112,8 @@ impl Materials {
                 "material {name}: bump maps are not supported; store a normal map (norm) instead"
             ));
         }
-        self.names.insert(source.name.clone());
-        self.model.material(material);
+        let number = self.model.material(material);
+        self.numbers.insert(source.name.clone(), Some(number));
         Ok(())
     }
 
@@ -125,10 +127,7 @@ impl Materials {
             None => {
                 let bytes = self.folder.read(&element, &file)?;
                 let texture = resource::decode(&file, &element, &bytes, srgb)?;
-                let textures = &mut self.model.textures;
-                resource::check_texels(path, &element, textures, &texture)?;
-                textures.push(texture);
-                let number = textures.len() as u32 - 1;
+                let number = resource::add_texture(path, &element, &mut self.model, texture)?;
                 self.textures.insert(key, number);
                 number
             }
@@ -151,7 +150,7 @@ fn linear(colour: [f64; 3]) -> Vec3 {
 
 /// Returns the lines that `tobj` reads in place of a statement. Texture statements get their line's
 /// number in front, for messages.
-fn check(statement: Statement<'_>) -> Result<String, Error> {
+fn checked(statement: Statement<'_>) -> Result<String, Error> {
     let (key, line) = (statement.key, statement.line);
     let fault = |problem: &str| statement.fault(format!("{key} {problem}"));
     let number = |word: &str| match word.parse::<f32>() {
@@ -165,8 +164,9 @@ fn check(statement: Statement<'_>) -> Result<String, Error> {
         Ok(number(word)?.clamp(0.0, 1.0))
     };
     Ok(match key {
+        "newmtl" if statement.value().is_empty() => return Err(fault("has no name")),
         "newmtl" => format!("newmtl {}\n", statement.value()),
-        // `tobj` panics if there are not three numbers. Spectral files are not read.
+        // Spectral files are not read.
         "Kd" | "Ke" if !statement.text.starts_with(['s', 'x']) => {
             let [r, g, b] = match words.clone().map(number).collect::<Result<Vec<_>, _>>()?[..] {
                 [r, g, b] => [r, g, b],

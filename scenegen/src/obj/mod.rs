@@ -1,9 +1,9 @@
-//! Loads Wavefront OBJ files with their MTL libraries through `tobj`.
+//! Loads Wavefront OBJ files. Their MTL libraries are read through `tobj`.
 //!
-//! Every statement is checked before `tobj` reads it, because `tobj` panics on short colours
-//! (`Kd 1 1`), misreads indices of 0 and files in which only some vertices have colours, texture
-//! coordinates or normals, and its errors name no line. Polygons are cut by ear clipping rather than
-//! as fans. Read here and not by `tobj`: smoothing groups, and the options of texture statements.
+//! Faces are not: `tobj` holds about 100 bytes for each face of an object until the object ends, and
+//! its objects share no vertices, so that one of the two takes twice this reader's memory. It also
+//! mixes up files in which only some vertices have colours, texture coordinates or normals, and its
+//! errors name no line.
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
@@ -13,149 +13,212 @@
 //! normals of the group's faces there, weighted by their angles (Thürmer and Wüthrich, "Computing
 //! Vertex Normals from Polygonal Facets", 1998).
 
-mod geometry;
 mod materials;
 mod polygons;
 mod statements;
 
-use std::cell::RefCell;
-use std::collections::{HashMap, VecDeque};
-use std::io::{BufReader, Read as _};
+use std::collections::HashMap;
 use std::path::Path;
 
 use glam::{DVec3, Vec2, Vec3, Vec4};
-use tobj::{LoadError, LoadOptions};
 
 use crate::error::Error;
 use crate::mesh::{Material, Model, pad};
-use geometry::{Geometry, PLACEHOLDERS};
 use materials::{GREY, Materials};
-use statements::{Statement, Statements};
+use statements::{Statement, shortened};
+
+/// Most triangles of a file.
+const MAX_TRIANGLES: usize = 1 << 26;
+
+/// A face's corner. There is one for each vertex of the model, so it is small.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Corner {
+    /// Numbers of position, texture coordinates and normal, counted from 1; 0 is none.
+    numbers: [u32; 3],
+    /// Smoothing group; 0 is none. Faces with normals need none.
+    group: u32,
+}
+
+/// A file as far as it is read.
+struct Reader {
+    materials: Materials,
+    positions: Vec<DVec3>,
+    /// Empty, or one per position up to the last that has one.
+    colours: Vec<Vec3>,
+    uvs: Vec<Vec2>,
+    normals: Vec<Vec3>,
+    /// The model's vertices.
+    vertices: HashMap<Corner, u32>,
+    /// Sums of face normals weighted by angles, by position and smoothing group.
+    sums: HashMap<(u32, u32), DVec3>,
+    /// Material of the faces to come, if it is defined.
+    material: Option<u32>,
+    /// The material of faces without one.
+    grey: Option<u32>,
+    /// Smoothing group of the faces to come; 0 is none.
+    group: u32,
+}
 
 /// Loads a file with its materials.
 pub(crate) fn load(path: &Path) -> Result<Model, Error> {
-    let libraries = RefCell::new(VecDeque::new());
-    let mut geometry = Geometry::new(Materials::new(path)?, &libraries);
-    let mut check = |statement: Statement<'_>| geometry.check(statement);
-    let mut statements = Statements::open(path, &mut check)?;
-    let mut file = BufReader::new(PLACEHOLDERS.chain(&mut statements));
-    let options = LoadOptions { single_index: true, ..LoadOptions::default() };
-    let result = tobj::load_obj_buf(&mut file, &options, |_| {
-        libraries.borrow_mut().pop_front().unwrap_or(Err(LoadError::GenericFailure))
-    });
-    let (objects, _) = statements.outcome(result)?;
-    let mut model = joined(objects, geometry);
-    if model.triangles.is_empty() {
-        return Err(Error::Empty { name: path.display().to_string() });
-    }
-    model.name =
-        path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    Ok(model)
+    let mut reader = Reader {
+        materials: Materials::new(path)?,
+        positions: Vec::new(),
+        colours: Vec::new(),
+        uvs: Vec::new(),
+        normals: Vec::new(),
+        vertices: HashMap::new(),
+        sums: HashMap::new(),
+        material: None,
+        grey: None,
+        group: 0,
+    };
+    statements::each(path, |statement| reader.read(statement))?;
+    reader.finish().of_file(path)
 }
 
-/// Joins the objects to one model.
-fn joined(objects: Vec<tobj::Model>, geometry: Geometry<'_>) -> Model {
-    let mut model = geometry.materials.model;
-    let mut smooth_corners = geometry.smooth_corners.into_iter();
-    let mut smoothing = Smoothing::default();
-    let mut without_material = None;
-    for tobj::Model { mesh, name } in objects {
-        let first = model.positions.len();
-        let positions: Vec<DVec3> = mesh.positions.chunks_exact(3).map(DVec3::from_slice).collect();
-        let normals: Vec<Vec3> = mesh.normals.chunks_exact(3).map(unit).collect();
-        // OBJ's v points up.
-        let uv = |uv: &[f64]| Vec2::new(uv[0] as f32, 1.0 - uv[1] as f32);
-        let uvs: Vec<Vec2> = mesh.texcoords.chunks_exact(2).map(uv).collect();
-        let mut colours: Vec<Vec4> = mesh.vertex_color.chunks_exact(3).map(colour).collect();
-        if colours.iter().all(|colour| *colour == Vec4::ONE) {
-            colours.clear();
-        }
-        let mut triangles = Vec::with_capacity(mesh.indices.len() / 3);
-        let mut rest = &mesh.indices[..];
-        // There are no arities where all faces are triangles.
-        let mut arities = mesh.face_arities.iter();
-        while !rest.is_empty() {
-            let corners = arities.next().map_or(3, |&arity| arity as usize);
-            let (face, others) = rest.split_at(corners);
-            polygons::cut(&positions, face, &mut triangles);
-            rest = others;
-        }
-        let group = name.parse().unwrap_or(0);
-        if group > 0 {
-            let mut numbers = vec![0; positions.len()];
-            for (&vertex, number) in mesh.indices.iter().zip(&mut smooth_corners) {
-                numbers[vertex as usize] = number;
+impl Reader {
+    fn read(&mut self, statement: Statement<'_>) -> Result<(), Error> {
+        match statement.key {
+            "v" => self.vertex(statement)?,
+            "vt" => {
+                let uv = statement.numbers(2)?;
+                let [u, v] = [0, 1].map(|i| uv.get(i).copied().unwrap_or(0.0) as f32);
+                // OBJ's v points up.
+                self.uvs.push(Vec2::new(u, 1.0 - v));
             }
-            smoothing.add(first, &positions, &triangles, |vertex| (numbers[vertex], group));
+            "vn" => {
+                let normal = statement.vector()?.normalize_or_zero().as_vec3();
+                self.normals.push(if normal.is_finite() { normal } else { Vec3::ZERO });
+            }
+            "f" => self.face(statement)?,
+            "s" => {
+                self.group = match statement.value() {
+                    "off" | "" => 0,
+                    "on" => 1,
+                    word => word.parse().map_err(|_| {
+                        statement.fault(format!("{:?} is not a smoothing group", shortened(word)))
+                    })?,
+                };
+            }
+            "usemtl" => self.material = self.materials.number(statement.value()),
+            "mtllib" => self.materials.read_libraries(statement)?,
+            // Lines, points, groups and curves: nothing to render.
+            _ => {}
         }
-        let material = match mesh.material_id {
-            Some(number) => number as u32,
-            None => *without_material
-                .get_or_insert_with(|| model.material(Material::lambert("none", GREY))),
+        Ok(())
+    }
+
+    fn vertex(&mut self, statement: Statement<'_>) -> Result<(), Error> {
+        let position = statement.vector()?;
+        if !position.is_finite() {
+            let vertex = self.positions.len() + 1;
+            return Err(statement.fault(format!("vertex {vertex} is not finite")));
+        }
+        // x y z r g b, or x y z w r g b.
+        if let &([r, g, b] | [_, r, g, b]) = &statement.numbers(8)?[3..] {
+            let rgb = DVec3::new(r, g, b).as_vec3();
+            self.colours.resize(self.positions.len(), Vec3::ONE);
+            self.colours.push(if rgb.is_finite() { rgb.max(Vec3::ZERO) } else { Vec3::ONE });
+        }
+        self.positions.push(position);
+        Ok(())
+    }
+
+    fn face(&mut self, statement: Statement<'_>) -> Result<(), Error> {
+        let mut corners: Vec<Corner> =
+            statement.words().map(|word| self.corner(statement, word)).collect::<Result<_, _>>()?;
+        // Points and lines written as faces.
+        if corners.len() < 3 {
+            return Ok(());
+        }
+        if corners.iter().any(|corner| corner.numbers[2] > 0) {
+            corners.iter_mut().for_each(|corner| corner.group = 0);
+        }
+        let places: Vec<DVec3> =
+            corners.iter().map(|corner| self.positions[corner.numbers[0] as usize - 1]).collect();
+        let vertices: Vec<u32> = corners.iter().map(|&corner| self.model_vertex(corner)).collect();
+        let material = match self.material {
+            Some(material) => material,
+            None => *self.grey.get_or_insert_with(|| {
+                self.materials.model.material(Material::lambert("none", GREY))
+            }),
         };
-        pad(&mut model.colours, &colours, first, positions.len(), Vec4::ONE);
-        model.add(&positions, &normals, &uvs, &triangles, material);
-    }
-    smoothing.finish(&mut model);
-    model
-}
-
-/// A unit normal; zero where it has no direction.
-fn unit(normal: &[f64]) -> Vec3 {
-    let normal = DVec3::from_slice(normal).normalize_or_zero().as_vec3();
-    if normal.is_finite() { normal } else { Vec3::ZERO }
-}
-
-fn colour(rgb: &[f64]) -> Vec4 {
-    let rgb = DVec3::from_slice(rgb).as_vec3();
-    if rgb.is_finite() { rgb.max(Vec3::ZERO).extend(1.0) } else { Vec4::ONE }
-}
-
-/// A position's number in the file, and a smoothing group.
-type SmoothCorner = (u32, u32);
-
-/// Normals of smoothing groups.
-#[derive(Default)]
-struct Smoothing {
-    /// Sums of face normals, weighted by angles.
-    sums: HashMap<SmoothCorner, DVec3>,
-    /// The model's vertices that get them.
-    vertices: Vec<(usize, SmoothCorner)>,
-}
-
-impl Smoothing {
-    /// Adds the triangles of an object whose vertices follow the model's first ones.
-    fn add(
-        &mut self,
-        first: usize,
-        positions: &[DVec3],
-        triangles: &[[u32; 3]],
-        corner_of: impl Fn(usize) -> SmoothCorner,
-    ) {
-        self.vertices.extend((0..positions.len()).map(|i| (first + i, corner_of(i))));
-        for triangle in triangles {
-            let corners = triangle.map(|i| i as usize);
+        for triangle in polygons::cut(&places) {
             for i in 0..3 {
-                let [a, b, c] = [i, (i + 1) % 3, (i + 2) % 3].map(|k| positions[corners[k]]);
-                let (u, v) = (b - a, c - a);
-                // Nothing for triangles without area: they have no normal.
-                let angle = u.cross(v).length().atan2(u.dot(v));
-                let sum = self.sums.entry(corner_of(corners[i])).or_default();
-                *sum += angle * u.cross(v).normalize_or_zero();
+                let [a, b, c] = [i, (i + 1) % 3, (i + 2) % 3].map(|k| places[triangle[k]]);
+                let Corner { numbers: [position, ..], group } = corners[triangle[i]];
+                if group > 0 {
+                    let (u, v) = (b - a, c - a);
+                    // Nothing for triangles without area: they have no normal.
+                    let angle = u.cross(v).length().atan2(u.dot(v));
+                    let sum = self.sums.entry((position, group)).or_default();
+                    *sum += angle * u.cross(v).normalize_or_zero();
+                }
+            }
+            let model = &mut self.materials.model;
+            if model.triangles.len() == MAX_TRIANGLES {
+                return Err(statement.fault("the file has more than 2^26 triangles"));
+            }
+            model.triangles.push(triangle.map(|i| vertices[i]));
+            model.triangle_materials.push(material);
+        }
+        Ok(())
+    }
+
+    fn corner(&self, statement: Statement<'_>, word: &str) -> Result<Corner, Error> {
+        let mut numbers = [0; 3];
+        let counts = [self.positions.len(), self.uvs.len(), self.normals.len()];
+        let fields = numbers.iter_mut().zip(counts).zip(["vertex", "texture", "normal"]);
+        for (((number, count), what), text) in fields.zip(word.split('/')) {
+            if text.is_empty() {
+                continue;
+            }
+            let value: i64 = text.parse().map_err(|_| {
+                statement.fault(format!("{:?} is not a {what} index", shortened(text)))
+            })?;
+            // Negative ones count back from the last.
+            let found = if value < 0 { count as i64 + 1 + value } else { value };
+            *number = u32::try_from(found)
+                .ok()
+                .filter(|&found| (1..=count).contains(&(found as usize)))
+                .ok_or_else(|| statement.fault(format!("{what} index {value} of {count}")))?;
+        }
+        if numbers[0] == 0 {
+            return Err(statement.fault("a corner has no vertex index"));
+        }
+        Ok(Corner { numbers, group: self.group })
+    }
+
+    /// The model's vertex of a corner.
+    fn model_vertex(&mut self, corner: Corner) -> u32 {
+        let model = &mut self.materials.model;
+        *self.vertices.entry(corner).or_insert_with(|| {
+            let first = model.positions.len();
+            let [position, uv, normal] = corner.numbers.map(|number| number as usize);
+            model.positions.push(self.positions[position - 1]);
+            let colour = self.colours.get(position - 1).map(|colour| colour.extend(1.0));
+            pad(&mut model.colours, colour, (first, 1), Vec4::ONE);
+            let uv = uv.checked_sub(1).map(|place| self.uvs[place]);
+            pad(&mut model.uvs[0], uv, (first, 1), Vec2::ZERO);
+            let normal = normal.checked_sub(1).map(|place| self.normals[place]);
+            pad(&mut model.normals, normal, (first, 1), Vec3::ZERO);
+            first as u32
+        })
+    }
+
+    /// The model, with the normals of smoothing groups.
+    fn finish(self) -> Model {
+        let mut model = self.materials.model;
+        if !self.sums.is_empty() {
+            model.normals.resize(model.positions.len(), Vec3::ZERO);
+        }
+        for (Corner { numbers: [position, ..], group }, vertex) in self.vertices {
+            if let Some(sum) = self.sums.get(&(position, group)) {
+                model.normals[vertex as usize] = sum.normalize_or_zero().as_vec3();
             }
         }
-    }
-
-    /// Gives the vertices their normals.
-    fn finish(self, model: &mut Model) {
-        if self.vertices.is_empty() {
-            return;
-        }
-        model.normals.resize(model.positions.len(), Vec3::ZERO);
-        for (vertex, corner) in self.vertices {
-            let sum = self.sums.get(&corner).copied().unwrap_or_default();
-            model.normals[vertex] = sum.normalize_or_zero().as_vec3();
-        }
+        model
     }
 }
 

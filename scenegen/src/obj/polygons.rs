@@ -8,41 +8,32 @@ use glam::DVec3;
 /// number; larger ones are taken as convex.
 const MAX_EARS: usize = 256;
 
-/// Appends a polygon's triangles, wound as it is. `polygon` numbers its corners' positions.
-pub(super) fn cut(positions: &[DVec3], polygon: &[u32], triangles: &mut Vec<[u32; 3]>) {
-    if let &[a, b, c] = polygon {
-        triangles.push([a, b, c]);
-        return;
+/// The triangles of a polygon, by its corners' places in the list, wound as it is.
+pub(super) fn cut(corners: &[DVec3]) -> Vec<[usize; 3]> {
+    let count = corners.len();
+    if count == 3 {
+        return vec![[0, 1, 2]];
     }
     // earcut begins with the last corner: this makes it the polygon's first.
-    let mut ring = polygon.to_vec();
-    ring.rotate_left(1);
+    let ring: Vec<usize> = (1..count).chain([0]).collect();
     // Far from the origin, the plane would be lost in rounding.
-    let place = |i: u32| (positions[i as usize] - positions[ring[0] as usize]).to_array();
-    let places: Vec<[f64; 3]> = ring.iter().map(|&i| place(i)).collect();
-    let (mut projected, mut ears) = (Vec::new(), Vec::<u32>::new());
-    if ring.len() <= MAX_EARS && project3d_to_2d(&places, ring.len(), &mut projected) {
+    let places: Vec<[f64; 3]> =
+        ring.iter().map(|&i| (corners[i] - corners[ring[0]]).to_array()).collect();
+    let (mut projected, mut ears) = (Vec::new(), Vec::<usize>::new());
+    if count <= MAX_EARS && project3d_to_2d(&places, count, &mut projected) {
         Earcut::new().earcut_slice(&projected, &[], &mut ears);
     }
     // Two triangles at least, even where the projection crosses itself.
     if ears.len() >= 6 {
-        let corner = |i: u32| ring[i as usize];
-        triangles.extend(ears.chunks_exact(3).map(|t| [t[0], t[1], t[2]].map(corner)));
+        ears.chunks_exact(3).map(|t| [t[0], t[1], t[2]].map(|i| ring[i])).collect()
     } else {
-        triangles.extend(ring[1..].windows(2).map(|edge| [ring[0], edge[0], edge[1]]));
+        ring[1..].windows(2).map(|edge| [ring[0], edge[0], edge[1]]).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn triangulated(corners: &[DVec3]) -> Vec<[usize; 3]> {
-        let polygon: Vec<u32> = (0..corners.len() as u32).collect();
-        let mut triangles = Vec::new();
-        cut(corners, &polygon, &mut triangles);
-        triangles.iter().map(|t| t.map(|i| i as usize)).collect()
-    }
 
     #[test]
     fn concave_polygons_keep_their_area() {
@@ -57,7 +48,7 @@ mod tests {
                 corners.reverse();
             }
             let normal = DVec3::new(-0.5, -1.0, 1.0) * if is_reversed { -1.0 } else { 1.0 };
-            let triangles = triangulated(&corners);
+            let triangles = cut(&corners);
             let areas = triangles.iter().map(|t| {
                 let [a, b, c] = t.map(|i| corners[i]);
                 0.5 * (b - a).cross(c - a).dot(normal.normalize())
@@ -73,7 +64,7 @@ mod tests {
         let bow = [(0., 0.), (1., 1.), (1., 0.), (0., 1.)].map(|(x, y)| DVec3::new(x, y, 0.0));
         let huge = bow.map(|p| 1e308 * p * if p.x > 0.0 { 1.0 } else { -1.0 });
         for corners in [&[DVec3::ONE; 5][..], &bow, &huge, &[DVec3::X; 300]] {
-            let triangles = triangulated(corners);
+            let triangles = cut(corners);
             assert!((1..=corners.len() - 2).contains(&triangles.len()), "{triangles:?}");
         }
     }

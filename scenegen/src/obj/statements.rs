@@ -1,11 +1,10 @@
-//! Lets `tobj` read a text file statement by statement, each checked before.
+//! Reads OBJ and MTL files statement by statement.
 
-use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{self, BufRead as _, BufReader, Read};
+use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
-use tobj::LoadError;
+use glam::DVec3;
 
 use crate::error::Error;
 
@@ -32,95 +31,61 @@ impl<'a> Statement<'a> {
         self.value().split_whitespace()
     }
 
+    /// The first words, at most `most`, as numbers.
+    pub(super) fn numbers(&self, most: usize) -> Result<Vec<f64>, Error> {
+        let parse = |word: &str| {
+            word.parse().map_err(|_| self.fault(format!("{:?} is not a number", shortened(word))))
+        };
+        self.words().take(most).map(parse).collect()
+    }
+
+    /// The first three words as a vector.
+    pub(super) fn vector(&self) -> Result<DVec3, Error> {
+        match self.numbers(3)?[..] {
+            [x, y, z] => Ok(DVec3::new(x, y, z)),
+            _ => Err(self.fault(format!("{} needs three numbers", self.key))),
+        }
+    }
+
     /// An error in this statement.
     pub(super) fn fault(&self, problem: impl Into<String>) -> Error {
         fault(self.path, self.line, problem)
     }
 }
 
-/// A file that `tobj` reads. However large it is, only one line is in memory.
-pub(super) struct Statements<'a> {
-    path: &'a Path,
-    file: BufReader<File>,
-    /// Returns the lines that `tobj` reads in place of a statement.
-    check: &'a mut dyn FnMut(Statement<'_>) -> Result<String, Error>,
-    /// Lines read so far.
-    lines: usize,
-    /// What is left to read of the last statement's lines.
-    checked: VecDeque<u8>,
-    /// Why a statement was refused: `tobj` drops the causes of read errors.
-    refused: Option<Error>,
-}
-
-impl<'a> Statements<'a> {
-    pub(super) fn open(
-        path: &'a Path,
-        check: &'a mut dyn FnMut(Statement<'_>) -> Result<String, Error>,
-    ) -> Result<Self, Error> {
-        let file = BufReader::new(File::open(path).map_err(Error::io(path))?);
-        Ok(Self { path, file, check, lines: 0, checked: VecDeque::new(), refused: None })
-    }
-
-    /// What `tobj` made of the file. Its errors get the line that was read last.
-    pub(super) fn outcome<T>(self, result: Result<T, LoadError>) -> Result<T, Error> {
-        match self.refused {
-            Some(error) => Err(error),
-            None => result.map_err(|error| fault(self.path, self.lines, error.to_string())),
-        }
-    }
-
-    /// Checks the next statement; false at the end of the file.
-    fn check_next(&mut self) -> Result<bool, Error> {
-        let mut line = Vec::new();
-        if !self.append_line(&mut line)? {
-            return Ok(false);
-        }
-        let number = self.lines;
+/// Hands the statements of a file to `read`. However large it is, only one line is in memory.
+pub(super) fn each(
+    path: &Path,
+    mut read: impl FnMut(Statement<'_>) -> Result<(), Error>,
+) -> Result<(), Error> {
+    let mut file = BufReader::new(File::open(path).map_err(Error::io(path))?);
+    let (mut text, mut lines) = (Vec::new(), 0);
+    loop {
+        text.clear();
+        let line = lines + 1;
         // A backslash at the end continues a line.
-        while line.ends_with(b"\\") {
-            line.pop();
-            line.push(b' ');
-            if !self.append_line(&mut line)? {
+        loop {
+            let room = MAX_LINE - text.len() as u64;
+            let count = (&mut file).take(room + 1).read_until(b'\n', &mut text);
+            if count.map_err(Error::io(path))? == 0 {
                 break;
             }
-        }
-        let line = String::from_utf8_lossy(&line);
-        let (key, text) = split_word(line.trim());
-        let statement = Statement { path: self.path, line: number, key, text };
-        self.checked = (self.check)(statement)?.into_bytes().into();
-        Ok(true)
-    }
-
-    /// Appends the text up to the next line break; false at the end of the file.
-    fn append_line(&mut self, line: &mut Vec<u8>) -> Result<bool, Error> {
-        let room = MAX_LINE.saturating_sub(line.len() as u64);
-        let read = (&mut self.file).take(room + 1).read_until(b'\n', line);
-        if read.map_err(Error::io(self.path))? == 0 {
-            return Ok(false);
-        }
-        self.lines += 1;
-        if line.len() as u64 > MAX_LINE {
-            return Err(fault(self.path, self.lines, "it is longer than 16 MiB"));
-        }
-        line.truncate(line.trim_ascii_end().len());
-        Ok(true)
-    }
-}
-
-/// Reads no further than to the end of a statement, so that the last line is that of an error.
-impl Read for Statements<'_> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        while self.checked.is_empty() {
-            match self.check_next() {
-                Ok(true) => {}
-                Ok(false) => break,
-                Err(error) => {
-                    self.refused = Some(error);
-                    return Err(io::ErrorKind::InvalidData.into());
-                }
+            lines += 1;
+            if text.len() as u64 > MAX_LINE {
+                return Err(fault(path, lines, "it is longer than 16 MiB"));
+            }
+            text.truncate(text.trim_ascii_end().len());
+            match text.last_mut() {
+                Some(end) if *end == b'\\' => *end = b' ',
+                _ => break,
             }
         }
-        self.checked.read(buffer)
+        if lines < line {
+            return Ok(());
+        }
+        let text = String::from_utf8_lossy(&text);
+        let (key, text) = split_word(text.trim());
+        read(Statement { path, line, key, text })?;
     }
 }
 
@@ -148,11 +113,11 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("lines.obj");
         std::fs::write(&path, text).expect("written");
-        let mut numbered = |s: Statement<'_>| Ok(format!("{} {} {}\n", s.line, s.key, s.text));
-        let mut statements = Statements::open(&path, &mut numbered)?;
         let mut all = String::new();
-        let result = statements.read_to_string(&mut all).map_err(|_| LoadError::ReadError);
-        statements.outcome(result)?;
+        each(&path, |s| {
+            all += &format!("{} {} {}\n", s.line, s.key, s.text);
+            Ok(())
+        })?;
         Ok(all)
     }
 

@@ -1,8 +1,7 @@
 //! Light from all around as an equirectangular image: Radiance `.hdr` or OpenEXR.
 //!
 //! +y is up; the image's middle shows what lies towards +x, and its right half what lies towards
-//! +z, as it looks from within. Files are untrusted: sizes are checked before anything is decoded,
-//! NaN
+//! +z, as it looks from within. Files are untrusted: sizes are checked before anything is decoded, NaN
 //! becomes black, and infinity the largest half float.
 //!
 //! Blurred copies are made once, so that a surface that asks for no occlusion needs no secondary
@@ -19,10 +18,8 @@ use rayon::prelude::*;
 use serde::{Serialize, Serializer, ser::SerializeStruct};
 
 use crate::error::Error;
-use crate::resource::{self, MAX_DECODED};
+use crate::resource::{self, EXPANSION, MAX_DECODED};
 
-/// Most bytes of an image that one byte of its file can stand for: zip's limit, 1032, and a margin.
-const EXPANSION: u64 = 1100;
 /// Largest radiance, a half float's.
 const BRIGHTEST: f32 = 65_504.0;
 /// Columns of the cells that are averaged, and of the averages; half as many rows. Both suffice for

@@ -134,7 +134,9 @@ impl<'a> PointCollector<'a> {
             luminance(after) - luminance(before)
         };
         let weight = |i: usize| {
-            if !solid(i) || (self.options.without_thin && self.is_thin(frame.triangles[i])) {
+            if !solid(i)
+                || (self.options.without_thin && self.tracer.model.is_thin(frame.triangles[i]))
+            {
                 return 0.0;
             }
             let (x, y) = (i % width, i / width);
@@ -143,12 +145,6 @@ impl<'a> PointCollector<'a> {
             dx.hypot(dy) + GRADIENT_FLOOR
         };
         (0..width * height).map(weight).collect()
-    }
-
-    fn is_thin(&self, triangle: u32) -> bool {
-        let model = self.tracer.model;
-        let material = model.triangle_materials.get(triangle as usize);
-        material.is_some_and(|&m| model.materials[m as usize].thin)
     }
 
     /// The points of all views observed.

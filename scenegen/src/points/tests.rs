@@ -1,7 +1,7 @@
 //! Initial points: how many, where, and how far off.
 
 use super::*;
-use crate::{Options, Scene, Source, Split};
+use crate::{Options, Scene, Source, generate};
 
 fn points(name: &str, size: u32, options: PointOptions) -> (Scene, InitPoints) {
     let options = Options {
@@ -12,15 +12,8 @@ fn points(name: &str, size: u32, options: PointOptions) -> (Scene, InitPoints) {
         points: options,
         ..Options::default()
     };
-    let scene = Scene::prepare(&Source::Preset(name.into()), &options).expect("preset");
-    let mut collector = scene.point_collector();
-    for (i, view) in scene.views.iter().enumerate() {
-        if view.split == Split::Train {
-            collector.observe(i, &scene.render(i));
-        }
-    }
-    let points = collector.finish();
-    (scene, points)
+    let made = generate(&Source::Preset(name.into()), &options).expect("preset");
+    (made.scene, made.points)
 }
 
 const EXACT: PointOptions = PointOptions {
@@ -83,7 +76,7 @@ fn detail_draws_points_and_plain_walls_few() {
 #[test]
 fn thin_structures_and_patches_are_left_out_on_request() {
     let on_thin = |scene: &Scene, points: &InitPoints| {
-        let thin = |p: &&DVec3| scene.is_thin(scene.surface.nearest(**p).triangle);
+        let thin = |p: &&DVec3| scene.model.is_thin(scene.surface.nearest(**p).triangle);
         points.positions.iter().filter(thin).count()
     };
     let (scene, with) = points("thin", 96, EXACT);

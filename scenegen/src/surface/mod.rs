@@ -44,7 +44,6 @@ pub struct Surface {
     scale: f64,
     depth: usize,
     bounds: (DVec3, DVec3),
-    build_seconds: f64,
 }
 
 /// Where a ray hits the surface.
@@ -95,7 +94,6 @@ impl Surface {
         if model.triangles.is_empty() {
             return Err(Error::Empty { name: model.name.clone() });
         }
-        let start = std::time::Instant::now();
         let bounds = model.bounds();
         let centre = 0.5 * (bounds.0 + bounds.1);
         let half = (0.5 * (bounds.1 - bounds.0)).max_element();
@@ -109,8 +107,7 @@ impl Surface {
         let in_leaves = bvh.primitive_indices.iter().map(|&id| &model.triangles[id as usize]);
         let triangles = in_leaves.map(triangle).collect();
         let depth = tree::depth(&bvh);
-        let build_seconds = start.elapsed().as_secs_f64();
-        Ok(Self { bvh, triangles, centre, scale, depth, bounds, build_seconds })
+        Ok(Self { bvh, triangles, centre, scale, depth, bounds })
     }
 
     /// The first triangle a ray meets, seen from either side, nearer than `range` (a ray
@@ -139,18 +136,6 @@ impl Surface {
         ray.is_some_and(|ray| self.occluder(&ray, |_, _| true).is_some())
     }
 
-    /// Number of triangles.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.triangles.len()
-    }
-
-    /// Never: a surface has triangles.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.triangles.is_empty()
-    }
-
     /// Smallest and largest coordinates.
     #[must_use]
     pub fn bounds(&self) -> (DVec3, DVec3) {
@@ -161,12 +146,6 @@ impl Surface {
     #[must_use]
     pub fn diagonal(&self) -> f64 {
         (self.bounds.1 - self.bounds.0).length()
-    }
-
-    /// Seconds it took to build the tree.
-    #[must_use]
-    pub fn build_seconds(&self) -> f64 {
-        self.build_seconds
     }
 
     /// Bytes of tree and triangles.
@@ -304,10 +283,7 @@ impl Surface {
         let mut best: Option<LocalHit> = None;
         // Whether a meeting is nearer than the best so far.
         let nearer = |slot: u32, tmax: f32, best: &Option<LocalHit>| -> Option<Intersection> {
-            let at = sheared.intersect(&self.triangles[slot as usize])?;
-            if !(at.t > ray.tmin && at.t <= tmax) {
-                return None;
-            }
+            let at = self.meet(slot, &sheared, ray.tmin, tmax)?;
             let first = best.is_none_or(|best| {
                 at.t < best.at.t || self.triangle_of(slot) < self.triangle_of(best.slot)
             });
@@ -344,8 +320,19 @@ impl Surface {
         accept: impl Fn(u32, &Intersection) -> bool,
     ) -> bool {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
-        let met = sheared.intersect(&self.triangles[slot as usize]);
-        met.is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
+        self.meet(slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(slot, &at))
+    }
+
+    /// Where a ray meets a triangle, by its place in leaf order, after `tmin` and up to `tmax`.
+    #[inline]
+    pub(crate) fn meet(
+        &self,
+        slot: u32,
+        ray: &ShearedRay,
+        tmin: f32,
+        tmax: f32,
+    ) -> Option<Intersection> {
+        ray.intersect(&self.triangles[slot as usize]).filter(|at| at.t > tmin && at.t <= tmax)
     }
 
     /// Any triangle whose meeting counts, by its place in leaf order.
@@ -370,15 +357,12 @@ impl Surface {
         accept: impl Fn(u32, &Intersection) -> bool,
     ) -> Option<u32> {
         let sheared = ShearedRay::new(ray.origin, ray.direction);
-        let counts = |slot: u32| {
-            sheared
-                .intersect(&self.triangles[slot as usize])
-                .is_some_and(|at| at.t > ray.tmin && at.t <= ray.tmax && accept(slot, &at))
+        let counts = |slot: &u32| {
+            self.meet(*slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(*slot, &at))
         };
         let mut found = None;
         let look = |node: &Bvh2Node, _: &mut Ray, _: &mut RayHit| {
-            found =
-                (node.first_index..node.first_index + node.prim_count).find(|&slot| counts(slot));
+            found = (node.first_index..node.first_index + node.prim_count).find(counts);
             found.is_none()
         };
         self.bvh.ray_traverse_dynamic(&mut stack, box_ray(ray), &mut RayHit::none(), look);

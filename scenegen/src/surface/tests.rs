@@ -47,16 +47,27 @@ fn soup(count: usize, seed: u64) -> Vec<[DVec3; 3]> {
     all
 }
 
-/// The first meeting by trying every triangle.
-fn brute_force(surface: &Surface, ray: &LocalRay) -> Option<(f32, u32)> {
+/// All meetings in order, by trying every triangle.
+fn meetings(surface: &Surface, ray: &LocalRay) -> Vec<(f32, u32)> {
     let sheared = ShearedRay::new(ray.origin, ray.direction);
     let meet = |slot: u32| {
-        let at = sheared.intersect(&surface.triangles[slot as usize])?;
-        (at.t > ray.tmin && at.t <= ray.tmax).then_some((at.t, surface.triangle_of(slot)))
+        let at = surface.meet(slot, &sheared, ray.tmin, ray.tmax)?;
+        Some((at.t, surface.triangle_of(slot)))
     };
-    (0..surface.len() as u32)
-        .filter_map(meet)
-        .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
+    let mut all: Vec<_> = (0..surface.triangles.len() as u32).filter_map(meet).collect();
+    all.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    all
+}
+
+/// The first meeting by trying every triangle.
+fn brute_force(surface: &Surface, ray: &LocalRay) -> Option<(f32, u32)> {
+    meetings(surface, ray).first().copied()
+}
+
+/// The first meeting as the tree finds it, a triangle tried first or not.
+fn closest(surface: &Surface, ray: &LocalRay, hint: Option<u32>) -> Option<(f32, u32)> {
+    let hit = surface.closest(ray, None, hint, |_, _| true)?;
+    Some((hit.at.t, surface.triangle_of(hit.slot)))
 }
 
 fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
@@ -68,7 +79,7 @@ fn rays(surface: &Surface, count: usize, seed: u64) -> Vec<LocalRay> {
             0 => point(&mut draws),
             // At a corner, where several triangles may meet.
             1 => {
-                let at = (draws.bits() % surface.len() as u64) as usize;
+                let at = (draws.bits() % surface.triangles.len() as u64) as usize;
                 surface.world_from_local(surface.triangles[at][0].as_dvec3()) - origin
             }
             // Along axes, with zeros of both signs.
@@ -92,15 +103,11 @@ fn the_closest_hit_is_that_of_trying_every_triangle() {
         let surface = Surface::new(&model(&soup(count, seed))).expect("triangles");
         for ray in rays(&surface, 4000, seed + 100) {
             let expected = brute_force(&surface, &ray);
-            let found = surface.closest(&ray, None, None, |_, _| true);
-            let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
-            assert_eq!(found, expected, "{count} triangles, {ray:?}");
             assert_eq!(surface.occluder(&ray, |_, _| true).is_some(), expected.is_some());
             // Whatever is tried first, and whichever triangle it is.
-            for hint in [0, surface.len() as u32 / 2] {
-                let found = surface.closest(&ray, None, Some(hint), |_, _| true);
-                let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
-                assert_eq!(found, expected);
+            for hint in [None, Some(0), Some(surface.triangles.len() as u32 / 2)] {
+                let found = closest(&surface, &ray, hint);
+                assert_eq!(found, expected, "{count} triangles, {ray:?}");
             }
             hits += usize::from(expected.is_some());
         }
@@ -112,20 +119,12 @@ fn the_closest_hit_is_that_of_trying_every_triangle() {
 fn intersections_behind_the_first_come_in_order_and_all() {
     let surface = Surface::new(&model(&soup(300, 8))).expect("triangles");
     for ray in rays(&surface, 500, 9) {
-        let sheared = ShearedRay::new(ray.origin, ray.direction);
-        let mut expected: Vec<(f32, u32)> = (0..surface.len() as u32)
-            .filter_map(|slot| {
-                let at = sheared.intersect(&surface.triangles[slot as usize])?;
-                (at.t > ray.tmin && at.t <= ray.tmax).then_some((at.t, surface.triangle_of(slot)))
-            })
-            .collect();
-        expected.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let (mut after, mut found) = (None, Vec::new());
         while let Some(hit) = surface.closest(&ray, after, None, |_, _| true) {
             after = Some((hit.at.t, surface.triangle_of(hit.slot)));
             found.extend(after);
         }
-        assert_eq!(found, expected);
+        assert_eq!(found, meetings(&surface, &ray));
     }
 }
 
@@ -188,8 +187,7 @@ fn trees_of_any_depth_are_traversed() {
             for from in [middle + DVec3::X, middle - DVec3::X, middle - DVec3::new(1.0, 0.01, 0.0)]
             {
                 let ray = surface.enter(from, middle - from, 9.0).expect("it points there");
-                let found = surface.closest(&ray, None, None, |_, _| true);
-                let found = found.map(|hit| (hit.at.t, surface.triangle_of(hit.slot)));
+                let found = closest(&surface, &ray, None);
                 assert_eq!(found, brute_force(&surface, &ray));
                 assert!(found.is_some());
             }

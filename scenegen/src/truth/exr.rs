@@ -9,9 +9,7 @@ use exr::prelude::{ReadChannels, ReadLayers, SampleType, read as reader};
 
 use super::REMEDY;
 use crate::error::Error;
-
-/// Most bytes that one byte of a compressed file can stand for: zip's limit, 1032, and a margin.
-const EXPANSION: u64 = 1100;
+use crate::resource::EXPANSION;
 
 /// The channels of the image, in the order named; `None` if it has another size.
 pub(super) fn read<const N: usize>(

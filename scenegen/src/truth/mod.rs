@@ -106,7 +106,10 @@ impl GroundTruth {
     /// When a file is there but damaged.
     pub fn sight(&self, view: &str, camera: &Camera) -> Result<Sight, Error> {
         match &self.kind {
-            Kind::Scene(scene) => Ok(trace(camera, |ray| scene.first_solid(camera.centre, ray))),
+            Kind::Scene(scene) => Ok(trace(camera, |ray| {
+                let (depth, normal, _) = scene.tracer().first_solid(camera.centre, ray, None)?;
+                Some((depth, normal))
+            })),
             Kind::Folder { root, surface, .. } => {
                 if let Some(stored) = stored(root, view, (camera.width, camera.height))? {
                     return Ok(stored);
@@ -137,7 +140,7 @@ impl GroundTruth {
         let surface = self.surface();
         let hit = surface.cast(origin, direction, depth * (1.0 + SAME_DEPTH))?;
         let is_thin = match &self.kind {
-            Kind::Scene(scene) => scene.is_thin(hit.triangle),
+            Kind::Scene(scene) => scene.model.is_thin(hit.triangle),
             Kind::Folder { thin, .. } => thin[hit.triangle as usize],
         };
         if !is_thin || hit.t < depth * (1.0 - SAME_DEPTH) {

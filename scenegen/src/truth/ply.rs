@@ -7,79 +7,46 @@ use glam::DVec3;
 
 use super::REMEDY;
 use crate::error::Error;
+use crate::write::mesh_header;
 
 /// Longest header accepted `[bytes]`.
 const HEADER: usize = 4096;
+/// Bytes of a corner.
+const CORNER: usize = 24;
 
 /// Corners, three per triangle, and for each triangle whether it is thin (absent in files of
 /// earlier versions: none is).
 pub(super) fn read(path: &Path) -> Result<(Vec<DVec3>, Vec<bool>), Error> {
     let bytes = fs::read(path).map_err(Error::io(path))?;
-    let bad = |element: &str, problem: String| Error::malformed(path, element, problem, REMEDY);
-    let start = &bytes[..bytes.len().min(HEADER)];
-    const END: &[u8] = b"end_header\n";
-    let end = start.windows(END.len()).position(|at| at == END);
-    let end = end.ok_or_else(|| bad("header", "it has no end".into()))?;
-    let header = String::from_utf8_lossy(&start[..end]);
-    let mut lines = header.lines();
-    let mut next = || lines.next().unwrap_or_default().to_owned();
-    let mut expect = |wanted: &str| -> Result<usize, Error> {
-        let line = next();
-        match line.strip_prefix(wanted) {
-            Some("") => Ok(0),
-            Some(rest) if wanted.ends_with(' ') => {
-                rest.parse().map_err(|_| bad("header", format!("{line:?} has no count")))
-            }
-            _ => Err(bad("header", format!("{line:?} stands where {wanted:?} should"))),
-        }
-    };
-    expect("ply")?;
-    expect("format binary_little_endian 1.0")?;
-    let vertices = expect("element vertex ")?;
-    for axis in ["x", "y", "z"] {
-        expect(&format!("property double {axis}"))?;
-    }
-    let faces = expect("element face ")?;
-    expect("property list uchar uint vertex_indices")?;
-    let knows_thin = match lines.next() {
-        None => false,
-        Some("property uchar thin") => true,
-        Some(other) => return Err(bad("header", format!("{other:?} is not expected"))),
-    };
-    let body = &bytes[end + END.len()..];
+    let bad = |element: &str, problem: &str| Error::malformed(path, element, problem, REMEDY);
+    let start = String::from_utf8_lossy(&bytes[..bytes.len().min(HEADER)]);
+    let faces = start.lines().find_map(|line| line.strip_prefix("element face ")?.parse().ok());
+    let faces: u32 = faces.ok_or_else(|| bad("header", "it has no number of faces"))?;
+    let is_this = |knows_thin: &bool| bytes.starts_with(mesh_header(faces, *knows_thin).as_bytes());
+    let knows_thin = [true, false].into_iter().find(is_this);
+    let knows_thin = knows_thin.ok_or_else(|| bad("header", "this program writes another"))?;
+    let body = &bytes[mesh_header(faces, knows_thin).len()..];
     let face = if knows_thin { 14 } else { 13 };
-    let needed = faces.checked_mul(face).zip(vertices.checked_mul(24));
-    let needed = needed.and_then(|(f, v)| f.checked_add(v));
-    if needed != Some(body.len()) {
-        let problem = format!(
-            "{} bytes follow the header; {vertices} vertices and {faces} faces need another number",
-            body.len()
-        );
-        return Err(bad("body", problem));
-    }
-    if faces.checked_mul(3) != Some(vertices) || u32::try_from(vertices).is_err() {
+    if body.len() as u64 != u64::from(faces) * (3 * CORNER + face) as u64 {
         let problem =
-            format!("{faces} triangles with corners of their own do not have {vertices} vertices");
-        return Err(bad("body", problem));
+            format!("{faces} faces do not need the {} bytes after the header", body.len());
+        return Err(bad("body", &problem));
     }
-    let (positions, indices) = body.split_at(24 * vertices);
+    let (positions, records) = body.split_at(3 * CORNER * faces as usize);
     let number = |bytes: &[u8]| f64::from_le_bytes(std::array::from_fn(|i| bytes[i]));
-    let mut corners = Vec::with_capacity(vertices);
-    for (i, vertex) in positions.chunks_exact(24).enumerate() {
+    let mut corners = Vec::with_capacity(3 * faces as usize);
+    for (i, vertex) in positions.chunks_exact(CORNER).enumerate() {
         let place = DVec3::from_array([0, 8, 16].map(|at| number(&vertex[at..at + 8])));
         if !place.is_finite() {
-            return Err(bad(&format!("vertex {i}"), format!("{place} is not finite")));
+            return Err(bad(&format!("vertex {i}"), &format!("{place} is not finite")));
         }
         corners.push(place);
     }
-    let mut thin = Vec::with_capacity(faces);
-    for (i, record) in indices.chunks_exact(face).enumerate() {
-        let index = |c: usize| {
-            u32::from_le_bytes(std::array::from_fn(|byte| record[1 + 4 * c + byte])) as usize
-        };
-        if record[0] != 3 || (0..3).any(|c| index(c) != 3 * i + c) {
-            let problem = "its corners are not its own".to_owned();
-            return Err(bad(&format!("face {i}"), problem));
+    let mut thin = Vec::with_capacity(faces as usize);
+    for (i, record) in (0..faces).zip(records.chunks_exact(face)) {
+        let own = [3 * i, 3 * i + 1, 3 * i + 2].map(u32::to_le_bytes);
+        if record[0] != 3 || record[1..13] != *own.as_flattened() {
+            return Err(bad(&format!("face {i}"), "its corners are not its own"));
         }
         thin.push(knows_thin && record[13] != 0);
     }

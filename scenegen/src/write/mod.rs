@@ -19,6 +19,7 @@ use crate::points::InitPoints;
 use crate::scene::{Scene, Split};
 use crate::trace::Frame;
 
+pub(crate) use ply::mesh_header;
 pub(crate) use record::NAME as SCENE_FILE;
 
 /// A summary of the files written.

@@ -31,21 +31,26 @@ pub(super) fn write_points(path: &Path, points: &InitPoints) -> Result<(), Error
     write_file(path, &bytes)
 }
 
+/// The header of a mesh of `faces` triangles; `knows_thin` is whether each says if it is thin.
+pub(crate) fn mesh_header(faces: u32, knows_thin: bool) -> String {
+    let vertices = 3 * u64::from(faces);
+    let thin = if knows_thin { "property uchar thin\n" } else { "" };
+    format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\nproperty double x\n\
+         property double y\nproperty double z\nelement face {faces}\n\
+         property list uchar uint vertex_indices\n{thin}end_header\n"
+    )
+}
+
 /// The triangles as traced, in world coordinates, each with its own corners; f64, as a mesh far from
 /// the origin needs it. With each triangle goes whether it is of a thin structure. Written as it is
 /// made: the file is larger than the mesh.
 pub(super) fn write_mesh(path: &Path, scene: &Scene) -> Result<(), Error> {
-    let count = scene.surface.len();
-    let mut header =
-        format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", 3 * count);
-    for name in ["x", "y", "z"] {
-        header += &format!("property double {name}\n");
-    }
-    header += &format!("element face {count}\n");
-    header += "property list uchar uint vertex_indices\nproperty uchar thin\nend_header\n";
+    // Numbers of corners are 32 bits wide.
+    let count = scene.model.triangles.len() as u32;
     let write = || -> std::io::Result<()> {
         let mut out = BufWriter::new(File::create(path)?);
-        out.write_all(header.as_bytes())?;
+        out.write_all(mesh_header(count, true).as_bytes())?;
         for &triangle in &scene.model.triangles {
             for corner in triangle {
                 let traced = scene.surface.traced(scene.model.positions[corner as usize]);
@@ -54,12 +59,12 @@ pub(super) fn write_mesh(path: &Path, scene: &Scene) -> Result<(), Error> {
                 }
             }
         }
-        for triangle in 0..count as u32 {
+        for triangle in 0..count {
             out.write_all(&[3])?;
             for corner in 0..3 {
                 out.write_all(&(3 * triangle + corner).to_le_bytes())?;
             }
-            out.write_all(&[u8::from(scene.is_thin(triangle))])?;
+            out.write_all(&[u8::from(scene.model.is_thin(triangle))])?;
         }
         out.flush()
     };

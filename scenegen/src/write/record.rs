@@ -48,8 +48,5 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             "points3d.ply": "initial points",
         },
     });
-    let path = root.join(NAME);
-    let text = serde_json::to_vec_pretty(&record);
-    let text = text.map_err(|error| Error::write(&path)(std::io::Error::other(error)))?;
-    write_file(&path, &text)
+    write_file(&root.join(NAME), format!("{record:#}").as_bytes())
 }

@@ -39,10 +39,7 @@ pub(super) fn write(scene: &Scene, root: &Path, split: Split) -> Result<(), Erro
         frame
     });
     top["frames"] = frames.collect();
-    let path = root.join(name);
-    let text = serde_json::to_vec_pretty(&top);
-    let text = text.map_err(|error| Error::write(&path)(std::io::Error::other(error)))?;
-    write_file(&path, &text)
+    write_file(&root.join(name), format!("{top:#}").as_bytes())
 }
 
 fn intrinsics(camera: &Camera) -> Value {

@@ -185,36 +185,3 @@ impl<T> BlockTask<'_, T> {
         &mut self.data[block * self.stride..(block + 1) * self.stride]
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// More blocks than a task has, the last one not full; and buffers of nothing.
-    #[test]
-    fn rows_are_found_in_blocks_views_and_tasks() {
-        let (rows, planes) = (16 * 40 - 3, 3);
-        let mut all: Blocks<u32> = Blocks::zeros(rows, planes);
-        let value = |row: usize, plane: usize| (10 * row + plane) as u32;
-        for row in 0..rows {
-            (0..planes).for_each(|plane| all.set(row, plane, value(row, plane)));
-        }
-        let copy = all.clone();
-        let first = |block: usize| value(block * WIDTH, 1);
-        assert_eq!(copy.view(rows).block(39)[WIDTH], first(39));
-        assert_eq!(copy.view(rows).part(7..9).block(1)[WIDTH], first(8));
-        for (task, mut blocks) in all.tasks(rows).into_iter().enumerate() {
-            for block in 0..BLOCKS_PER_TASK.min(40 - task * BLOCKS_PER_TASK) {
-                let expected = first(task * BLOCKS_PER_TASK + block);
-                assert_eq!(blocks.block(block)[WIDTH], expected, "task {task}, block {block}");
-            }
-        }
-        all.copy_row(5, 600);
-        all.clear_row(6);
-        assert_eq!(all.to_rows(600..601, 0..3), copy.to_rows(5..6, 0..3));
-        assert_eq!(all.to_rows(5..8, 1..2), [value(5, 1), 0, value(7, 1)]);
-        let mut nothing: Blocks<u32> = Blocks::zeros(rows, 0);
-        assert!(nothing.view(rows).block(39).is_empty());
-        assert_eq!(nothing.tasks(rows).len(), all.tasks(rows).len());
-    }
-}

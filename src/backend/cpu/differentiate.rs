@@ -6,23 +6,14 @@ use super::rasterize::DARK;
 use super::tiles::Grid;
 use super::{CpuBackend, ImageGradient, ModelGradient, for_each_pixel, scalars};
 use crate::backend::signals::RecordLayout;
-use crate::backend::{BackendError, Rendering, StepOutput};
+use crate::backend::{BackendError, Differentiable, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
+#[cfg(test)]
+use crate::verify::sabotage;
 
-impl CpuBackend {
-    /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
-    /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
-    ///
-    /// Needs every field of a record, so that it allocates more than the ledger says where the
-    /// policy's needs are smaller: it is a tool for tests and for research, not part of training.
-    ///
-    /// # Errors
-    /// [`BackendError::ImageTooLarge`].
-    ///
-    /// # Panics
-    /// When `upstream` does not have the image's size.
-    pub fn differentiate(
+impl Differentiable for CpuBackend {
+    fn differentiate(
         &mut self,
         camera: &Camera,
         background: [f32; 3],
@@ -58,20 +49,17 @@ impl CpuBackend {
             view: &frame.view,
             out: &mut gradient,
         });
+        #[cfg(test)]
+        sabotage::spoil_gradient(&mut gradient);
         Ok((rendering, gradient))
     }
 
-    /// The training loss of a rendering against a target and its gradient by the rendering's
-    /// pixels. Shape of the gradient: `[height, width, 3]`.
-    ///
-    /// # Panics
-    /// When rendering and target differ in size.
-    pub fn loss(
+    fn loss(
         &mut self,
         rendering: &Rendering,
         target: &Image8,
         background: [f32; 3],
-    ) -> (StepOutput, Vec<f32>) {
+    ) -> Result<(StepOutput, Vec<f32>), BackendError> {
         let grid = Grid::new(rendering.width, rendering.height);
         assert_eq!(
             grid,
@@ -95,6 +83,11 @@ impl CpuBackend {
                 }
             });
         }
-        (scalars(value), gradient)
+        let output = scalars(value);
+        #[cfg(test)]
+        let output = sabotage::spoilt_output(output);
+        #[cfg(test)]
+        sabotage::spoil_numbers(&mut gradient);
+        Ok((output, gradient))
     }
 }

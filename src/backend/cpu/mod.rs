@@ -54,6 +54,8 @@ use super::{
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
+#[cfg(test)]
+use crate::verify::sabotage;
 use adam::BiasCorrection;
 use blocks::planes;
 use loss::{ImageTerms, LossBuffers};
@@ -223,12 +225,15 @@ impl Backend for CpuBackend {
         self.backward(&frame, self.signals.layout());
         self.optimise(&frame, input);
         self.clock.lap("project_bwd + adam");
-        Ok(StepOutput {
+        let output = StepOutput {
             visible: frame.visible,
             entries: frame.entries,
             bands: frame.bands.len() as u32,
             ..scalars(value)
-        })
+        };
+        #[cfg(test)]
+        let output = sabotage::spoilt_output(output);
+        Ok(output)
     }
 
     fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
@@ -282,7 +287,10 @@ impl Backend for CpuBackend {
     }
 
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {
-        Ok(self.unsound())
+        let found = self.unsound();
+        #[cfg(test)]
+        let found = sabotage::spoilt_audit(found);
+        Ok(found)
     }
 
     fn render(
@@ -301,7 +309,10 @@ impl Backend for CpuBackend {
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
-        Ok(self.params.to_rows(rows, array.parameters(self.sh_degree)))
+        let values = self.params.to_rows(rows, array.parameters(self.sh_degree));
+        #[cfg(test)]
+        let values = sabotage::spoilt_array(array, values);
+        Ok(values)
     }
 
     fn upload_array(

@@ -267,6 +267,8 @@ impl CpuBackend {
                 out.depth[at] = canvas.planes[DEPTH][patch][lane];
             });
         }
+        #[cfg(test)]
+        crate::verify::sabotage::spoil_image(&mut out);
         out
     }
 

@@ -132,37 +132,3 @@ impl Part {
         );
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn parts_hold_every_entry_once_and_no_more_than_fit() {
-        for lengths in [vec![], vec![0], vec![5, 0, 3, 9, 1, 1, 0, 25, 2], vec![7; 40]] {
-            let mut firsts = vec![0];
-            firsts.extend(lengths.iter().scan(0, |sum, n| {
-                *sum += n;
-                Some(*sum)
-            }));
-            let total = firsts[lengths.len()];
-            for cap in [1, 2, 4, 9, 10, 24, 25, 26, 300] {
-                let parts = cut(&firsts, cap);
-                if total <= cap {
-                    assert_eq!(parts, [Part { tiles: 0..lengths.len(), entries: None }]);
-                    continue;
-                }
-                let mut next = 0;
-                for part in &parts {
-                    let held = part.entries.clone().expect("not all");
-                    assert!(held.start == next && held.len() <= cap && !held.is_empty());
-                    let of_tiles = firsts[part.tiles.start]..firsts[part.tiles.end];
-                    assert!(held.start >= of_tiles.start && held.end <= of_tiles.end);
-                    assert!(part.tiles.len() == 1 || held == of_tiles, "{part:?}");
-                    next = held.end;
-                }
-                assert_eq!(next, total, "{lengths:?}, {cap}");
-            }
-        }
-    }
-}

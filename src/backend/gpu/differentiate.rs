@@ -4,7 +4,7 @@ use super::GpuBackend;
 use super::frame::{Frame, State, grid};
 use crate::backend::cpu::{ImageGradient, ModelGradient};
 use crate::backend::signals::{Field, RecordLayout};
-use crate::backend::{BackendError, Rendering, StepOutput};
+use crate::backend::{BackendError, Differentiable, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::sh_coefficients;
@@ -14,47 +14,6 @@ use crate::sh;
 const FOLD: f32 = 0.849_321_8;
 
 impl GpuBackend {
-    /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
-    /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
-    ///
-    /// Needs every field of a record, so that it allocates more than the ledger says where the
-    /// policy's needs are smaller: it is a tool for tests and for research, not part of training.
-    ///
-    /// # Errors
-    /// [`BackendError`].
-    ///
-    /// # Panics
-    /// When `upstream` does not have the image's size.
-    pub fn differentiate(
-        &mut self,
-        camera: &Camera,
-        background: [f32; 3],
-        sh_degree: u8,
-        upstream: &ImageGradient,
-    ) -> Result<(Rendering, ModelGradient), BackendError> {
-        let pixels = camera.width as usize * camera.height as usize;
-        assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
-        assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
-        assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
-        if !self.sizes.more {
-            (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
-            self.rebuild()?;
-        }
-        self.fit_image(camera.width, camera.height)?;
-        let channel = |c: usize| upstream.rgb.iter().skip(c).step_by(3).copied();
-        let planes = (0..3).flat_map(channel).chain(upstream.alpha.iter().copied());
-        let planes: Vec<f32> = planes.chain(upstream.depth.iter().copied()).collect();
-        self.write("pixel gradient", bytemuck::cast_slice(&planes));
-        let frame = self.frame(camera, background, sh_degree);
-        self.run(&frame, |passes, to| {
-            passes.forward(to);
-            passes.backward(to);
-            passes.differentiate(to);
-        })?;
-        let rendering = self.rendering(camera.width, camera.height)?;
-        Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
-    }
-
     /// What stages 5 and 6 have left.
     fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
         let n = self.rows as u64;
@@ -98,16 +57,40 @@ impl GpuBackend {
         }
         Ok(out)
     }
+}
 
-    /// The training loss of a rendering against a target and its gradient by the rendering's
-    /// pixels. Shape of the gradient: `[height, width, 3]`.
-    ///
-    /// # Errors
-    /// [`BackendError`].
-    ///
-    /// # Panics
-    /// When rendering and target differ in size.
-    pub fn loss(
+impl Differentiable for GpuBackend {
+    fn differentiate(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        upstream: &ImageGradient,
+    ) -> Result<(Rendering, ModelGradient), BackendError> {
+        let pixels = camera.width as usize * camera.height as usize;
+        assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
+        assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
+        assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
+        if !self.sizes.more {
+            (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
+            self.rebuild()?;
+        }
+        self.fit_image(camera.width, camera.height)?;
+        let channel = |c: usize| upstream.rgb.iter().skip(c).step_by(3).copied();
+        let planes = (0..3).flat_map(channel).chain(upstream.alpha.iter().copied());
+        let planes: Vec<f32> = planes.chain(upstream.depth.iter().copied()).collect();
+        self.write("pixel gradient", bytemuck::cast_slice(&planes));
+        let frame = self.frame(camera, background, sh_degree);
+        self.run(&frame, |passes, to| {
+            passes.forward(to);
+            passes.backward(to);
+            passes.differentiate(to);
+        })?;
+        let rendering = self.rendering(camera.width, camera.height)?;
+        Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
+    }
+
+    fn loss(
         &mut self,
         rendering: &Rendering,
         target: &Image8,

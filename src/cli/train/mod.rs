@@ -12,7 +12,7 @@ use super::interrupt::Interrupts;
 use super::progress::Progress;
 use crate::failure::Failure;
 use crate::output::RunFolder;
-use crate::run::{self, Interrupt, Observer, Occupied, Partial, Run, RunSpec, Start};
+use crate::run::{self, Interrupt, Observer, Occupied, Partial, Resumed, Run, RunSpec};
 
 /// Trains a scene.
 ///
@@ -55,21 +55,25 @@ Examples:
   densify train data/garden --resume";
 
 impl TrainArgs {
-    /// The options that this call gives, by file or by flag.
-    fn given(&self, flags: &Partial) -> Result<Partial, Failure> {
+    /// The run that this call describes, by file or by flag; with the checkpoint that it goes on from, if it
+    /// does.
+    pub(super) fn describe(
+        &self,
+        matches: &ArgMatches,
+        follower: &Follower<'_>,
+    ) -> Result<(RunSpec, Option<Resumed>), Failure> {
+        let flags = flags::given(matches, &self.run)?;
         let mut given = self.config.as_deref().map(Partial::read).transpose()?.unwrap_or_default();
         if let Some(path) = &self.policy_config {
-            given = flags::policy_config(path)?.over(given);
+            given = Partial::read_policies(path)?.over(given);
         }
-        Ok(flags.clone().over(given))
-    }
-
-    /// The new run that this call describes.
-    pub(super) fn describe(&self, matches: &ArgMatches) -> Result<RunSpec, Failure> {
-        let flags = flags::given(matches, &self.run)?;
-        let spec = self.given(&flags)?.describe()?;
+        let given = flags.clone().over(given);
+        let (spec, resumed) = match self.resume {
+            true => run::start(given, follower)?,
+            false => (given.describe()?, None),
+        };
         flags::check_policy(&flags, &spec)?;
-        Ok(spec)
+        Ok((spec, resumed))
     }
 }
 
@@ -79,33 +83,22 @@ pub(super) fn run(
     console: &Console,
 ) -> Result<(), Failure> {
     let follower = Follower::new(console);
-    let (run, occupied) = match args.resume {
-        true => (resume(args, matches, &follower)?, Occupied::Resume),
-        false => {
-            let spec = args.describe(matches)?;
-            RunFolder::check(&spec.output_folder()?, args.overwrite)?;
-            let run = Run::prepare_observed(&spec, &follower)?;
-            announce_preset(&spec, console)?;
-            (run, if args.overwrite { Occupied::Replace } else { Occupied::Refuse })
-        }
+    let (spec, resumed) = args.describe(matches, &follower)?;
+    let occupied = match (args.resume, args.overwrite) {
+        (true, _) => Occupied::Resume,
+        (false, true) => Occupied::Replace,
+        (false, false) => Occupied::Refuse,
     };
-    follower.listen();
-    run.train_observed(occupied, &follower)?;
-    Ok(())
-}
-
-fn resume(args: &TrainArgs, matches: &ArgMatches, follower: &Follower<'_>) -> Result<Run, Failure> {
-    let flags = flags::given(matches, &args.run)?;
-    match run::start(args.given(&flags)?, follower)? {
-        Start::Anew(spec) => {
-            flags::check_policy(&flags, &spec)?;
-            Run::prepare_observed(&spec, follower)
-        }
-        Start::From(spec, resumed) => {
-            flags::check_policy(&flags, &spec)?;
-            Run::resume(&spec, *resumed, follower)
-        }
+    if occupied != Occupied::Resume {
+        RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
+    let run = Run::prepare_observed(&spec, resumed, &follower)?;
+    if occupied != Occupied::Resume {
+        announce_preset(&spec, console)?;
+    }
+    follower.listen();
+    run.train(occupied, &follower)?;
+    Ok(())
 }
 
 /// Says what the preset was measured to cost and gain, where the run is as long as it was then.

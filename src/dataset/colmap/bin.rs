@@ -3,6 +3,7 @@
 //! A count is checked against the size of the file before anything is allocated from it.
 
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
@@ -33,7 +34,7 @@ impl<'a> Reader<'a> {
         Ok(Self { path, input: BufReader::with_capacity(1 << 16, file), length, left: length })
     }
 
-    fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
+    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
         let place = format!("byte {}: {field}", self.length - self.left);
         DatasetError::malformed(self.path, place, problem, REMEDY)
     }
@@ -192,25 +193,20 @@ pub(super) fn points(
         reader.skip(field, 1, 8)?;
         let position = DVec3::from(position);
         let views = reader.u64(field)?;
-        match tracks.as_deref_mut() {
-            Some(tracks) if tracks.wants(views) => {
-                // Pairs of image id and observation index.
-                let (kept, rest) = (views.min(MAX_VIEWS), views.saturating_sub(MAX_VIEWS));
-                let mut ids = Vec::new();
-                for _ in 0..kept {
-                    ids.push(reader.u32(field)?);
-                    reader.skip(field, 1, 4)?;
-                }
-                reader.skip(field, rest, 8)?;
-                tracks.add(position, colour, ids);
+        // Pairs of image id and observation index.
+        let mut left = views;
+        if let Some(tracks) = tracks.as_deref_mut()
+            && tracks.wants(views)
+        {
+            let mut ids = Vec::new();
+            for _ in 0..views.min(MAX_VIEWS) {
+                ids.push(reader.u32(field)?);
+                reader.skip(field, 1, 4)?;
             }
-            tracks => {
-                reader.skip(field, views, 8)?;
-                if let Some(tracks) = tracks {
-                    tracks.skip(views);
-                }
-            }
+            left -= ids.len() as u64;
+            tracks.add(position, colour, ids);
         }
+        reader.skip(field, left, 8)?;
         points.positions.push(position);
         points.colours.push(colour);
     }

@@ -33,23 +33,18 @@ impl Model {
     pub(super) fn from_id(file: &Path, camera: &str, id: i32) -> Result<Self, DatasetError> {
         let known = usize::try_from(id).ok().filter(|&id| id < MODELS.len());
         match known {
-            Some(id) => Self::supported(file, camera, MODELS[id].0),
-            None => Self::supported(file, camera, &format!("number {id}")),
+            Some(id) => Self::from_name(file, camera, MODELS[id].0),
+            None => Self::from_name(file, camera, &format!("number {id}")),
         }
     }
 
     pub(super) fn from_name(file: &Path, camera: &str, name: &str) -> Result<Self, DatasetError> {
-        Self::supported(file, camera, name)
-    }
-
-    fn supported(file: &Path, camera: &str, name: &str) -> Result<Self, DatasetError> {
         match MODELS[..5].iter().position(|(known, _)| *known == name) {
             Some(id) => Ok(Self(id)),
-            None => Err(DatasetError::Lens {
-                path: file.to_owned(),
-                field: camera.to_owned(),
-                problem: format!("the camera model {name} is not one of {SUPPORTED}"),
-            }),
+            None => {
+                let problem = format!("the camera model {name} is not one of {SUPPORTED}");
+                Err(DatasetError::lens(file, camera, problem))
+            }
         }
     }
 

@@ -1,6 +1,7 @@
 //! Reads COLMAP's text files: one line per record (two per image), `#` for comments.
 
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -33,7 +34,7 @@ impl<'a> Lines<'a> {
         Ok(Self { path, input: BufReader::new(file), number: 0, line: Vec::new() })
     }
 
-    fn fault(&self, field: &str, problem: impl Into<String>) -> DatasetError {
+    fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
         DatasetError::malformed(
             self.path,
             format!("line {}: {field}", self.number),
@@ -208,8 +209,6 @@ pub(super) fn points(
                     );
                 }
                 tracks.add(position, colour, ids);
-            } else {
-                tracks.skip(views);
             }
         }
         points.positions.push(position);

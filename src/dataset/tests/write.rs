@@ -124,6 +124,10 @@ impl Made {
         std::fs::write(path, contents).unwrap();
     }
 
+    pub(super) fn remove(&self, name: &str) {
+        std::fs::remove_file(self.file(name)).unwrap();
+    }
+
     /// Replaces the first occurrence of `old` in a text file.
     pub(super) fn replace(&self, name: &str, old: &str, new: &str) {
         let text = std::fs::read_to_string(self.file(name)).unwrap();

@@ -1,5 +1,6 @@
 //! Parses the header of a PLY file: encoding, elements, properties.
 
+use std::fmt::Display;
 use std::io::{BufRead, Read};
 use std::path::Path;
 
@@ -197,7 +198,7 @@ struct Lines<'a, R> {
 }
 
 impl<R: BufRead> Lines<'_, R> {
-    fn fault(&self, problem: impl Into<String>) -> PlyError {
+    fn fault(&self, problem: impl Display) -> PlyError {
         PlyError::malformed(self.path, format!("header line {}", self.number), problem)
     }
 

@@ -21,10 +21,8 @@ pub fn read_points(path: &Path) -> Result<PointCloud, PlyError> {
     let vertices = ply.element("vertex")?;
     let mut columns = Vec::new();
     for axis in ["x", "y", "z"] {
-        columns.push(vertices.find(&[axis]).ok_or_else(|| {
-            let remedy = "a point cloud needs x, y and z";
-            PlyError::Missing { path: path.to_owned(), property: axis.to_owned(), remedy }
-        })?);
+        let missing = || PlyError::missing(path, axis, "a point cloud needs x, y and z");
+        columns.push(vertices.find(&[axis]).ok_or_else(missing)?);
     }
     let channels: [Option<usize>; 3] = [
         ["red", "diffuse_red", "r"],

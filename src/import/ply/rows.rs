@@ -1,5 +1,6 @@
 //! Reads chosen columns of one element in any encoding, as f64 (which represents every type exactly).
 
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::Path;
@@ -55,7 +56,7 @@ impl<'a> Ply<'a> {
         Ok(())
     }
 
-    fn fault(&self, element: &Element, row: u64, problem: impl Into<String>) -> PlyError {
+    fn fault(&self, element: &Element, row: u64, problem: impl Display) -> PlyError {
         PlyError::malformed(
             self.path,
             format!("{} {row} of {}", element.name, element.rows),
@@ -139,7 +140,7 @@ impl<'a> Ply<'a> {
         let size = kind.size();
         self.input.read_exact(&mut bytes[..size]).map_err(|source| match source.kind() {
             ErrorKind::UnexpectedEof => self.fault(element, row, "the file ends here (truncated?)"),
-            _ => PlyError::Io { path: self.path.to_owned(), source },
+            _ => PlyError::io(self.path)(source),
         })?;
         if self.header.encoding == Encoding::BigEndian {
             bytes[..size].reverse();
@@ -165,9 +166,7 @@ impl<'a> Ply<'a> {
             let buffer = match self.input.fill_buf() {
                 Ok(buffer) => buffer,
                 Err(source) if source.kind() == ErrorKind::Interrupted => continue,
-                Err(source) => {
-                    return Err(PlyError::Io { path: self.path.to_owned(), source });
-                }
+                Err(source) => return Err(PlyError::io(self.path)(source)),
             };
             let at_end = buffer.is_empty();
             let mut used = 0;

@@ -36,7 +36,11 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
         element.name == "chunk" || element.properties.iter().any(|p| p.name == "packed_position")
     };
     if ply.header.elements.iter().any(packed) {
-        return Err(PlyError::Compressed { path: path.to_owned() });
+        return Err(PlyError(format!(
+            "{} is a compressed splat PLY (element chunk, packed properties), which densify does not read; \
+             export it as an uncompressed .ply, e.g. with SuperSplat or splat-transform",
+            path.display()
+        )));
     }
     let vertices = ply.element("vertex")?;
     let sh_degree = sh_degree(path, &vertices)?;
@@ -46,7 +50,7 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
         .collect::<Result<Vec<_>, _>>()?;
 
     let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
-    let (mut total, mut dropped, mut repaired) = (0, 0, 0);
+    let (mut total, mut dropped, mut repaired) = (0_usize, 0, 0);
     let mut values = vec![0f32; columns.len()];
     ply.each_row(&vertices, &columns, |row| {
         total += 1;
@@ -60,7 +64,10 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
         repaired += usize::from(push(&mut gaussians, &values, rest));
     })?;
     if dropped as f64 > MAX_BAD_ROWS * total as f64 {
-        return Err(PlyError::NotFinite { path: path.to_owned(), bad: dropped, total });
+        return Err(PlyError(format!(
+            "{}: {dropped} of {total} rows are not finite, more than 1 %; the file is damaged: export it again",
+            path.display()
+        )));
     }
     Ok(SplatFile { gaussians, dropped, repaired })
 }
@@ -104,12 +111,9 @@ fn push(gaussians: &mut Gaussians, values: &[f32], rest: usize) -> bool {
 }
 
 fn column(path: &Path, vertices: &Element, name: &str) -> Result<usize, PlyError> {
-    vertices.find(&[name]).ok_or_else(|| PlyError::Missing {
-        path: path.to_owned(),
-        property: name.to_owned(),
-        remedy: "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 \
-                 (a point cloud is not a splat file)",
-    })
+    let remedy = "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 \
+                  (a point cloud is not a splat file)";
+    vertices.find(&[name]).ok_or_else(|| PlyError::missing(path, name, remedy))
 }
 
 fn sh_degree(path: &Path, vertices: &Element) -> Result<u8, PlyError> {

@@ -133,7 +133,8 @@ fn what_cannot_be_splats_is_refused_by_name() {
             assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
         }
     }
-    assert!(matches!(read_splats(std::path::Path::new("/none/x.ply")), Err(PlyError::Io { .. })));
+    let message = read_splats(Path::new("/none/x.ply")).unwrap_err().to_string();
+    assert!(message.contains("cannot read /none/x.ply"), "{message}");
 }
 
 /// Cut or damaged anywhere: an error or a model, never a panic or a huge allocation.
@@ -209,10 +210,10 @@ fn shared_clouds_of_other_programs_load() {
 fn shared_splats_of_other_programs_load_or_are_refused_by_name() {
     for path in shared("splats") {
         match read_splats(&path) {
-            Err(PlyError::Compressed { .. }) => {
-                assert!(path.to_string_lossy().contains("compressed"));
+            Err(error) => {
+                assert!(path.to_string_lossy().contains("compressed"), "{error}");
+                assert!(error.to_string().contains("is a compressed splat PLY"), "{error}");
             }
-            Err(error) => panic!("{error}"),
             Ok(file) => {
                 assert!(!path.to_string_lossy().contains("compressed"), "{}", path.display());
                 assert!(file.gaussians.len() >= 3 && file.dropped == 0, "{}", path.display());
@@ -223,13 +224,5 @@ fn shared_splats_of_other_programs_load_or_are_refused_by_name() {
                 }
             }
         }
-    }
-}
-
-#[test]
-#[ignore = "needs files of other programs: set DENSIFY_SHARED"]
-fn malformed_shared_files_do_not_panic() {
-    for path in shared("meshes/malformed") {
-        let _ = (read_points(&path), read_splats(&path));
     }
 }

@@ -8,7 +8,7 @@ use std::ops::RangeInclusive;
 
 /// The size of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Setting {
+pub struct RunSize {
     /// Most rows there may ever be, >= 1.
     pub rows: usize,
     /// Highest spherical-harmonic degree, 0 to 3.
@@ -49,7 +49,7 @@ pub struct SizeRequest {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fit {
     /// The setting.
-    pub setting: Setting,
+    pub setting: RunSize,
     /// Whether the number of rows is limited by the memory.
     pub by_memory: bool,
     /// Rows that fit at the wanted degree.
@@ -64,12 +64,12 @@ pub(crate) const IMAGES: u64 = 8;
 
 impl SizeRequest {
     /// A setting with so many pairs per row, and at most [`IMAGES`] of the memory for images.
-    fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> Setting {
+    fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
         let most = self.most_pairs.max(rows);
         let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
         let images = || self.all_images.min(self.memory / IMAGES);
         let image_cache = self.image_cache.unwrap_or_else(images);
-        Setting { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache }
+        RunSize { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache }
     }
 }
 
@@ -79,12 +79,9 @@ impl SizeRequest {
 ///
 /// The degree is the highest at which enough rows fit, or else the lowest. Rows are as many as fit; if
 /// all wanted rows fit, the remaining memory goes to the tile lists and then to the images.
-///
-/// # Errors
-/// Those of `bytes`.
 pub fn fit<E>(
     request: &SizeRequest,
-    mut bytes: impl FnMut(&Setting) -> Result<u64, E>,
+    mut bytes: impl FnMut(&RunSize) -> Result<u64, E>,
 ) -> Result<Option<Fit>, E> {
     let most = request.most_rows.max(1);
     let least = request.least_rows.clamp(1, most);
@@ -110,7 +107,7 @@ pub fn fit<E>(
             }
         }
         if request.image_cache.is_none() {
-            let all = Setting { image_cache: request.all_images, ..setting };
+            let all = RunSize { image_cache: request.all_images, ..setting };
             let left = request.memory.saturating_sub(bytes(&setting)?);
             // Images in use are counted even if the cache is smaller.
             setting.image_cache = match bytes(&all)? <= request.memory {
@@ -124,15 +121,12 @@ pub fn fit<E>(
 }
 
 /// The smallest memory in which a model fits, in multiples of `step` bytes, if there is any.
-///
-/// # Errors
-/// Those of `bytes`.
 pub fn min_memory<E>(
     request: &SizeRequest,
     step: u64,
-    mut bytes: impl FnMut(&Setting) -> Result<u64, E>,
+    mut bytes: impl FnMut(&RunSize) -> Result<u64, E>,
 ) -> Result<Option<u64>, E> {
-    let fits = |steps: usize, bytes: &mut dyn FnMut(&Setting) -> Result<u64, E>| {
+    let fits = |steps: usize, bytes: &mut dyn FnMut(&RunSize) -> Result<u64, E>| {
         let request = SizeRequest { memory: steps as u64 * step, ..request.clone() };
         fit(&request, bytes).map(|fit| fit.is_some())
     };

@@ -18,8 +18,8 @@ struct Model {
 }
 
 impl Model {
-    fn bytes(&self, setting: &Setting) -> u64 {
-        let Setting { rows, sh_degree, tile_cap, image_cache } = *setting;
+    fn bytes(&self, setting: &RunSize) -> u64 {
+        let RunSize { rows, sh_degree, tile_cap, image_cache } = *setting;
         let coefficients = (u64::from(sh_degree) + 1).pow(2);
         let rows = rows.next_multiple_of(16) as u64;
         let held = image_cache.max(2 * self.largest_image) + self.largest_image;
@@ -30,7 +30,7 @@ impl Model {
     }
 
     fn fit(&self, request: &SizeRequest) -> Option<Fit> {
-        let bytes = |setting: &Setting| Ok::<_, Infallible>(self.bytes(setting));
+        let bytes = |setting: &RunSize| Ok::<_, Infallible>(self.bytes(setting));
         fit(request, bytes).unwrap_or_else(|never| match never {})
     }
 }
@@ -59,45 +59,30 @@ fn request(model: &Model, memory: u64) -> SizeRequest {
     }
 }
 
-/// Sizes that a run may be given.
-#[derive(Debug, Clone)]
-struct Given {
-    most_rows: usize,
-    tile_cap: Option<usize>,
-    image_cache: Option<u64>,
-    lowest_degree: u8,
-    pairs: [usize; 3],
-}
-
-fn given() -> impl Strategy<Value = Given> {
-    (
+/// Requests of any memory for runs whose sizes may be given.
+fn requests() -> impl Strategy<Value = (Model, SizeRequest)> {
+    let sizes = (
+        0..2_000_000_000_u64,
         prop_oneof![Just(u32::MAX as usize), 1..200_000_usize],
         prop_oneof![Just(None), (1..500_000_usize).prop_map(Some)],
         prop_oneof![Just(None), (0..200_000_000_u64).prop_map(Some)],
         0..=3_u8,
         prop_oneof![Just(PAIRS), Just([1; 3]), Just([4; 3])],
-    )
-        .prop_map(|(most_rows, tile_cap, image_cache, lowest_degree, pairs)| Given {
-            most_rows,
-            tile_cap,
-            image_cache,
-            lowest_degree,
-            pairs,
-        })
+    );
+    (models(), sizes).prop_map(|(model, sizes)| {
+        let (memory, most_rows, tile_cap, image_cache, lowest, pairs) = sizes;
+        let sh_degree = lowest..=3;
+        let open = request(&model, memory);
+        let request = SizeRequest { most_rows, tile_cap, image_cache, sh_degree, pairs, ..open };
+        (model, request)
+    })
 }
 
 /// What is found fits, keeps what was given, and could not be larger.
-fn check_fit(model: &Model, memory: u64, given: &Given) -> Result<(), TestCaseError> {
-    let Given { most_rows: most, tile_cap, image_cache, lowest_degree: lowest, pairs } = *given;
-    let request = SizeRequest {
-        most_rows: most,
-        tile_cap,
-        pairs,
-        image_cache,
-        sh_degree: lowest..=3,
-        ..request(model, memory)
-    };
-    let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(&request) else {
+fn check_fit(model: &Model, request: &SizeRequest) -> Result<(), TestCaseError> {
+    let SizeRequest { memory, most_rows: most, tile_cap, image_cache, pairs, .. } = *request;
+    let lowest = *request.sh_degree.start();
+    let Some(Fit { setting, by_memory, at_wanted_degree }) = model.fit(request) else {
         let least = request.setting(1_000.min(most), lowest, pairs[0]);
         prop_assert!(model.bytes(&least) > memory);
         return Ok(());
@@ -115,7 +100,7 @@ fn check_fit(model: &Model, memory: u64, given: &Given) -> Result<(), TestCaseEr
     } else {
         let more = request.setting(setting.rows, setting.sh_degree, pairs[2]);
         prop_assert!(setting.tile_cap == more.tile_cap || model.bytes(&more) > memory);
-        let images = Setting { image_cache: model.all_images, ..setting };
+        let images = RunSize { image_cache: model.all_images, ..setting };
         prop_assert!(
             image_cache.is_some()
                 || setting.image_cache == model.all_images
@@ -132,31 +117,12 @@ fn check_fit(model: &Model, memory: u64, given: &Given) -> Result<(), TestCaseEr
     Ok(())
 }
 
-#[test]
-fn a_run_of_one_row_and_one_image_fits() {
-    let model = Model {
-        fixed: 0,
-        per_row: 1,
-        per_coefficient: 1,
-        per_pair: 1,
-        largest_image: 1,
-        all_images: 1,
-    };
-    let given =
-        Given { most_rows: 1, tile_cap: None, image_cache: None, lowest_degree: 0, pairs: [1; 3] };
-    check_fit(&model, 2_825_121, &given).unwrap();
-}
-
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
 
     #[test]
-    fn what_is_found_fits_and_a_row_more_does_not(
-        model in models(),
-        memory in 0..2_000_000_000_u64,
-        given in given(),
-    ) {
-        check_fit(&model, memory, &given)?;
+    fn what_is_found_fits_and_a_row_more_does_not((model, request) in requests()) {
+        check_fit(&model, &request)?;
     }
 
     #[test]
@@ -175,7 +141,7 @@ proptest! {
     #[test]
     fn the_least_memory_is_the_least(model in models(), step in 1..2_000_000_u64) {
         let request = request(&model, 0);
-        let bytes = |setting: &Setting| Ok::<_, Infallible>(model.bytes(setting));
+        let bytes = |setting: &RunSize| Ok::<_, Infallible>(model.bytes(setting));
         let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
         let least = least.expect("a number");
         prop_assert!(least.is_multiple_of(step));
@@ -207,21 +173,4 @@ fn a_degree_is_lowered_only_for_the_rows_that_the_scene_starts_with() {
         assert_eq!((found.sh_degree, found.rows), (degree, rows), "{memory}");
     }
     assert_eq!(model.fit(&request(&model, 1_008 * 136 - 1)), None);
-}
-
-#[test]
-fn errors_are_passed_on() {
-    let request = request(
-        &Model {
-            fixed: 0,
-            per_row: 1,
-            per_coefficient: 1,
-            per_pair: 1,
-            largest_image: 1,
-            all_images: 1,
-        },
-        100,
-    );
-    assert_eq!(fit(&request, |_| Err::<u64, _>("no")), Err("no"));
-    assert_eq!(min_memory(&request, 1, |_| Err::<u64, _>("no")), Err("no"));
 }

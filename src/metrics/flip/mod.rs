@@ -7,7 +7,7 @@
 
 use std::f64::consts::PI;
 
-use super::{BLOCK, MetricError, Pair, by_blocks};
+use super::{BLOCK, MetricError, Pair, by_blocks, total};
 use crate::dataset::images::Image8;
 
 /// Pixels per degree of the visual field: a monitor 0.7 m wide with 3840 px, seen from 0.7 m; the
@@ -69,11 +69,7 @@ pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
             }
         })
     });
-    let [error, weight] =
-        sums.iter().fold([0.0; 2], |sum, block| [sum[0] + block[0], sum[1] + block[1]]);
-    if weight == 0.0 {
-        return Err(MetricError::NothingToCompare);
-    }
+    let [error, weight] = total(&sums)?;
     Ok(error / weight)
 }
 

@@ -4,13 +4,14 @@ use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
 use super::visibility::Visibility;
-use super::{CentreErrors, GeometryError, Ground, ratio};
+use super::{CentreErrors, KnownScene, ratio};
+use crate::evaluate::EvaluateError;
 
 pub(super) fn errors(
     rows: &Rows,
     visibility: &Visibility,
-    ground: &Ground<'_>,
-) -> Result<CentreErrors, GeometryError> {
+    ground: &KnownScene<'_>,
+) -> Result<CentreErrors, EvaluateError> {
     let diagonal = ground.diagonal();
     let finder = Finder::new(rows)?;
     let back: Vec<f64> =

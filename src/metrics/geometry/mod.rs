@@ -12,12 +12,13 @@ mod visibility;
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, Signal, SignalSet};
 use densify_scenegen::{GroundTruth, Sight};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::backend::{Backend, BackendError};
+use crate::backend::Backend;
 use crate::camera::Camera;
 use crate::dataset::normalise::Normalisation;
-use crate::views::{ViewError, ViewSource};
+use crate::evaluate::EvaluateError;
+use crate::views::ViewSource;
 use pixels::Pixels;
 use rows::Rows;
 use visibility::Visibility;
@@ -32,7 +33,7 @@ pub struct Geometry {
     /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
     /// opacity above 0.1 with the nearest centres; it approximates the one with the largest blend
     /// weight. Over the pixels of [`DepthErrors`], on a regular grid of about 2,000 per view.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub normal_error: f64,
     /// Distance from centres to surface and back.
     pub centres: CentreErrors,
@@ -49,13 +50,13 @@ pub struct Geometry {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DepthErrors {
     /// Root mean square error `[diagonals]`.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub rmse: f64,
     /// Mean of |error| / depth.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub abs_rel: f64,
     /// Fraction of the pixels showing a surface that have a rendered alpha above 0.5.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub coverage: f64,
 }
 
@@ -63,24 +64,24 @@ pub struct DepthErrors {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CentreErrors {
     /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub accuracy: f64,
     /// 95th percentile of the distance, weighted by w `[diagonals]`.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub accuracy_p95: f64,
     /// Mean distance from the mesh to the nearest centre of opacity above 0.1 `[diagonals]`. Over
     /// those of 20,000 uniform samples of the mesh that at least two training views see.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub completeness: f64,
     /// Accuracy + completeness `[diagonals]`.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub chamfer: f64,
     /// Harmonic mean of precision (fraction of the weight w within 0.5 % of the diagonal from the
     /// mesh) and recall (fraction of the samples within that of a centre), in 0..=1.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub f_score_half_percent: f64,
     /// The same at 1 %.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub f_score_one_percent: f64,
 }
 
@@ -92,10 +93,10 @@ pub struct Floaters {
     /// Their number.
     pub count: usize,
     /// Fraction of the rows.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub of_rows: f64,
     /// Fraction of the weight w.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub of_weight: f64,
 }
 
@@ -116,16 +117,16 @@ pub struct ThinRecall {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Redundancy {
     /// Mean number of rows blended per pixel.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub blended_per_pixel: f64,
     /// Fraction of the rows whose largest blend weight in any pixel of any view is below 0.01.
-    #[serde(with = "nullable")]
+    #[serde(deserialize_with = "or_nan")]
     pub below_one_percent: f64,
 }
 
 /// The scene that a model is measured in.
 #[derive(Debug, Clone, Copy)]
-pub struct Ground<'a> {
+pub struct KnownScene<'a> {
     /// The surface.
     pub truth: &'a GroundTruth,
     /// From the coordinates of the surface to those of the model and the cameras.
@@ -134,41 +135,6 @@ pub struct Ground<'a> {
     pub background: [f32; 3],
     /// Spherical-harmonic degree evaluated, <= the model's.
     pub sh_degree: u8,
-}
-
-/// Why geometry cannot be measured.
-#[derive(Debug, thiserror::Error)]
-pub enum GeometryError {
-    /// A ground-truth file is damaged.
-    #[error("view `{view}`: {source}")]
-    Truth {
-        /// The view's name.
-        view: String,
-        /// The error of the file.
-        source: densify_scenegen::Error,
-    },
-    /// A view's pixels could not be read.
-    #[error("view `{view}`: {source}")]
-    View {
-        /// The view's name.
-        view: String,
-        /// The error of the source of views.
-        source: ViewError,
-    },
-    /// A view could not be rendered.
-    #[error("view `{view}`: {source}")]
-    Backend {
-        /// The view's name.
-        view: String,
-        /// The error of the backend.
-        source: BackendError,
-    },
-    /// The model could not be copied from the device.
-    #[error(transparent)]
-    Model(#[from] BackendError),
-    /// The neighbour search does not support so many rows.
-    #[error("{0} rows are too many to search for neighbours")]
-    TooManyRows(usize),
 }
 
 /// The needs with which the backend for [`measure`] is made.
@@ -185,15 +151,12 @@ pub fn needs() -> Needs {
 
 /// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the views
 /// trained on; depth, normals and thin structures in `views`.
-///
-/// # Errors
-/// [`GeometryError`] at the first view that cannot be measured.
 pub fn measure(
     backend: &mut dyn Backend,
-    ground: &Ground<'_>,
+    ground: &KnownScene<'_>,
     train: &impl ViewSource,
     views: &impl ViewSource,
-) -> Result<Geometry, GeometryError> {
+) -> Result<Geometry, EvaluateError> {
     let rows = Rows::new(&backend.download()?, ground);
     let visibility = Visibility::measure(backend, ground, &rows, train)?;
     let mut pixels = Pixels::new(&rows, ground)?;
@@ -210,7 +173,7 @@ pub fn measure(
     })
 }
 
-impl Ground<'_> {
+impl KnownScene<'_> {
     /// Diagonal of the mesh's bounding box `[world units]`.
     fn diagonal(&self) -> f64 {
         self.truth.surface().diagonal()
@@ -232,9 +195,9 @@ impl Ground<'_> {
         (world, caster)
     }
 
-    fn sight(&self, name: &str, caster: &densify_scenegen::Camera) -> Result<Sight, GeometryError> {
+    fn sight(&self, name: &str, caster: &densify_scenegen::Camera) -> Result<Sight, EvaluateError> {
         let sight = self.truth.sight(name, caster);
-        sight.map_err(|source| GeometryError::Truth { view: name.to_owned(), source })
+        sight.map_err(|e| EvaluateError::View { view: name.to_owned(), source: e.into() })
     }
 }
 
@@ -244,18 +207,9 @@ fn ratio(sum: f64, count: f64) -> f64 {
     if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
 }
 
-/// Stores NaN as `null`, as JSON has no NaN.
-mod nullable {
-    use serde::{Deserialize, Deserializer, Serializer};
-
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde's signature")]
-    pub(super) fn serialize<S: Serializer>(value: &f64, to: S) -> Result<S::Ok, S::Error> {
-        if value.is_finite() { to.serialize_f64(*value) } else { to.serialize_none() }
-    }
-
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
-        Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::NAN))
-    }
+/// JSON has no NaN, and writes it as null.
+fn or_nan<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::NAN))
 }
 
 #[cfg(test)]

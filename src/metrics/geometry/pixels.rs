@@ -6,9 +6,10 @@ use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::rows::{Finder, Rows};
-use super::{DepthErrors, GeometryError, Ground, ThinRecall, ratio};
+use super::{DepthErrors, KnownScene, ThinRecall, ratio};
 use crate::backend::{Backend, Rendering};
 use crate::dataset::images::Image8;
+use crate::evaluate::EvaluateError;
 use crate::views::ViewSource;
 
 /// Alpha above which a pixel is covered.
@@ -23,7 +24,7 @@ const COLOUR_SLACK: f32 = 0.1;
 /// Sums over the pixels.
 pub(super) struct Pixels<'a> {
     rows: &'a Rows,
-    ground: &'a Ground<'a>,
+    ground: &'a KnownScene<'a>,
     finder: Finder,
     surface: usize,
     covered: usize,
@@ -36,7 +37,7 @@ pub(super) struct Pixels<'a> {
 }
 
 impl<'a> Pixels<'a> {
-    pub(super) fn new(rows: &'a Rows, ground: &'a Ground<'a>) -> Result<Self, GeometryError> {
+    pub(super) fn new(rows: &'a Rows, ground: &'a KnownScene<'a>) -> Result<Self, EvaluateError> {
         Ok(Self {
             rows,
             ground,
@@ -56,14 +57,14 @@ impl<'a> Pixels<'a> {
         backend: &mut dyn Backend,
         views: &impl ViewSource,
         view: usize,
-    ) -> Result<(), GeometryError> {
+    ) -> Result<(), EvaluateError> {
         let ground = self.ground;
         let name = views.name(view);
         let (_, caster) = ground.cameras(views.camera(view));
         let sight = ground.sight(name, &caster)?;
         let rendering = backend
             .render(views.camera(view), ground.background, ground.sh_degree)
-            .map_err(|source| GeometryError::Backend { view: name.to_owned(), source })?;
+            .map_err(|source| EvaluateError::Backend { view: name.to_owned(), source })?;
         let width = sight.width as usize;
         let at = |i: usize| DVec2::new((i % width) as f64, (i / width) as f64) + 0.5;
         let shown: Vec<usize> = (0..sight.depth.len()).filter(|&i| sight.depth[i] > 0.0).collect();
@@ -89,7 +90,7 @@ impl<'a> Pixels<'a> {
         let angles: Vec<f64> = angles.collect();
         self.angles.extend(angles);
         if ground.truth.has_thin() {
-            let source = |source| GeometryError::View { view: name.to_owned(), source };
+            let source = |source| EvaluateError::View { view: name.to_owned(), source };
             let image = views.image(view).map_err(source)?;
             let thin_pixels: Vec<(i32, bool)> = shown
                 .par_iter()

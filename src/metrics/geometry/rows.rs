@@ -6,7 +6,8 @@ use glam::{DMat3, DQuat, DVec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-use super::{GeometryError, Ground};
+use super::KnownScene;
+use crate::evaluate::EvaluateError;
 use crate::gaussians::{Gaussians, sigmoid};
 
 /// Opacity above which a row counts as part of the surface.
@@ -28,7 +29,7 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub(super) fn new(model: &Gaussians, ground: &Ground<'_>) -> Self {
+    pub(super) fn new(model: &Gaussians, ground: &KnownScene<'_>) -> Self {
         let to_world = ground.normalisation;
         let surface = ground.truth.surface();
         let vector = |v: &[f32; 3]| DVec3::from(v.map(f64::from));
@@ -62,7 +63,7 @@ pub(super) struct Finder {
 }
 
 impl Finder {
-    pub(super) fn new(rows: &Rows) -> Result<Self, GeometryError> {
+    pub(super) fn new(rows: &Rows) -> Result<Self, EvaluateError> {
         let solid: Vec<usize> = (0..rows.len())
             .filter(|&row| rows.opacities[row] > SOLID && rows.centres[row].is_finite())
             .collect();
@@ -71,7 +72,7 @@ impl Finder {
             None
         } else {
             let tree = ImmutableKdTree::new_from_slice(&places);
-            Some(tree.map_err(|_| GeometryError::TooManyRows(places.len()))?)
+            Some(tree.map_err(|_| EvaluateError::TooManyRows(places.len()))?)
         };
         Ok(Self { tree, rows: solid })
     }

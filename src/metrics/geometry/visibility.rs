@@ -8,10 +8,11 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::prelude::*;
 
 use super::rows::Rows;
-use super::{Floaters, GeometryError, Ground, Redundancy, needs, ratio};
+use super::{Floaters, KnownScene, Redundancy, needs, ratio};
 use crate::backend::{AuxInput, Backend};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
+use crate::evaluate::EvaluateError;
 use crate::views::ViewSource;
 
 /// Number of points on the mesh.
@@ -43,10 +44,10 @@ pub(super) struct Visibility {
 impl Visibility {
     pub(super) fn measure(
         backend: &mut dyn Backend,
-        ground: &Ground<'_>,
+        ground: &KnownScene<'_>,
         rows: &Rows,
         views: &impl ViewSource,
-    ) -> Result<Self, GeometryError> {
+    ) -> Result<Self, EvaluateError> {
         let mut samples: Vec<(DVec3, u32)> =
             sample(&ground.truth.surface().triangles()).into_iter().map(|p| (p, 0)).collect();
         let mut visibility = Self {
@@ -60,7 +61,7 @@ impl Visibility {
         let request = wanted.aux.clone().unwrap_or_default();
         for number in 0..views.count() {
             let name = views.name(number);
-            let failed = |source| GeometryError::Backend { view: name.to_owned(), source };
+            let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
             let camera = views.camera(number);
             visibility.weigh(backend, ground, camera, &request).map_err(failed)?;
             let (world, ray_camera) = ground.cameras(camera);
@@ -80,8 +81,7 @@ impl Visibility {
         }
         let enough = samples.into_iter().filter(|(_, views)| *views >= MIN_VIEWS);
         visibility.samples = enough.map(|(place, _)| place).collect();
-        let failed = |source| GeometryError::Backend { view: "all".to_owned(), source };
-        let signals = backend.take_signals(wanted.signals).map_err(failed)?;
+        let signals = backend.take_signals(wanted.signals)?;
         // `needs` requests this signal.
         visibility.peaks =
             signals.get(Signal::FreshWeightMax).map(<[f32]>::to_vec).unwrap_or_default();
@@ -92,7 +92,7 @@ impl Visibility {
     fn weigh(
         &mut self,
         backend: &mut dyn Backend,
-        ground: &Ground<'_>,
+        ground: &KnownScene<'_>,
         camera: &Camera,
         request: &AuxRequest,
     ) -> Result<(), crate::backend::BackendError> {

@@ -11,9 +11,9 @@ use crate::backend::{BackendOptions, ROWS_AT_A_TIME};
 use crate::dataset::{Dataset, View};
 use crate::export::{PLY, Shape};
 use crate::gaussians::sh_coefficients;
-use crate::memory::{IMAGES, Ledger, Section, Setting};
+use crate::memory::{IMAGES, Ledger, RunSize, Section};
 use crate::metrics::scratch_bytes;
-use crate::trainer::Required;
+use crate::trainer::AutoChoices;
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
 /// Measured at 10 to 13 MiB.
@@ -33,7 +33,7 @@ impl Inputs<'_> {
     /// How the backend is made for a size.
     pub(in crate::run) fn backend_options(
         &self,
-        setting: &Setting,
+        setting: &RunSize,
         needs: Needs,
     ) -> BackendOptions {
         BackendOptions {
@@ -51,7 +51,7 @@ impl Inputs<'_> {
     }
 
     /// Gradient records for two pairs in five, where pairs are counted; else for all.
-    fn record_cap(&self, setting: &Setting) -> usize {
+    fn record_cap(&self, setting: &RunSize) -> usize {
         match self.knobs.pairs_per_row {
             Some(_) => (setting.tile_cap / 5 * 2).max(1),
             None => usize::MAX,
@@ -60,7 +60,7 @@ impl Inputs<'_> {
 
     /// What of the training images stays on a GPU: as much as decoded images may take on the host, and
     /// no more than their share of the device's memory.
-    fn kept_photographs(&self, setting: &Setting) -> KeptPhotographs {
+    fn kept_photographs(&self, setting: &RunSize) -> KeptPhotographs {
         let train = &self.dataset.train;
         let with_masks = train.iter().any(|view| view.source.mask.is_some());
         let one = KeptPhotographs::bytes(self.dataset.largest_image(), with_masks);
@@ -73,7 +73,7 @@ impl Inputs<'_> {
     /// Everything that a run takes with these needs, on so many threads.
     pub(in crate::run) fn ledger(
         &self,
-        setting: &Setting,
+        setting: &RunSize,
         needs: &Needs,
         threads: usize,
     ) -> Ledger {
@@ -104,7 +104,7 @@ impl Inputs<'_> {
         let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
         pass("export of the model, checkpoint", 2 * piece * row + held);
         let measures_test = !self.dataset.test.is_empty();
-        if measures_test || self.required != Required::default() {
+        if measures_test || self.required != AutoChoices::default() {
             let (width, height) = self.dataset.largest_image();
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
             let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
@@ -123,7 +123,7 @@ impl Inputs<'_> {
     }
 
     /// Signals on the host, the plan, and what the policy makes of the former.
-    fn event_bytes(&self, setting: &Setting, needs: &Needs) -> u64 {
+    fn event_bytes(&self, setting: &RunSize, needs: &Needs) -> u64 {
         let float = size_of::<f32>() as u64;
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;

@@ -21,14 +21,14 @@ use super::values::{Budget, InitChoice, ShDegree};
 use crate::backend::gpu::Accumulation;
 use crate::backend::{BackendKind, Device};
 use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, Tracks, View};
+use crate::dataset::{Dataset, Resolution, Tracks, View};
 use crate::failure::Failure;
 use crate::init::usable_points;
 use crate::knobs::Knobs;
 use crate::memory::{peak_resident, resident};
 use crate::number::grouped;
 use crate::schedule::Background;
-use crate::trainer::{Required, growth_signals, needs};
+use crate::trainer::{AutoChoices, growth_signals, needs};
 use degree::Degree;
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
@@ -51,7 +51,7 @@ pub(super) struct Inputs<'a> {
     pub(super) dataset: Dataset,
     pub(super) degree: Degree,
     /// What the run is to find out by itself.
-    pub(super) required: Required,
+    pub(super) required: AutoChoices,
     /// What training and test images take.
     images: [ImageDemand; 2],
     /// Rows that a start on the dataset's points would have, were there no limit.
@@ -75,7 +75,7 @@ impl<'a> Inputs<'a> {
         use_threads(spec.device.threads.map(std::num::NonZeroU16::get));
         let scene = spec.scene()?;
         let with_tracks = saved.is_none() && spec.size.sh_degree == Some(ShDegree::Auto(None));
-        let mut dataset = Dataset::load(scene, &spec.data.load_options(with_tracks)?)?;
+        let mut dataset = Dataset::load(scene, &spec.data.load_options(with_tracks))?;
         for note in &dataset.notes {
             observer.say(format_args!("note: {note}"));
         }
@@ -85,7 +85,7 @@ impl<'a> Inputs<'a> {
         let (resident, peak) = (resident(), peak_resident());
         let degree = Degree::decide(spec, saved, &dataset)?;
         dataset.tracks = Tracks::default();
-        let required = Required {
+        let required = AutoChoices {
             rows: spec.size.budget.is_some_and(Budget::is_auto),
             scored_views: !spec.size.full,
         };
@@ -108,11 +108,9 @@ impl<'a> Inputs<'a> {
     }
 
     /// The same with images of another size; `None` where there are none of it.
-    fn at_resolution(&self, resolution: u32) -> Option<Self> {
-        let resolution = Some(super::values::ImageSize(resolution));
-        let data = DataSpec { resolution, ..self.data.clone() };
-        let dataset =
-            Dataset::load(self.spec.scene().ok()?, &data.load_options(false).ok()?).ok()?;
+    fn at_resolution(&self, resolution: Resolution) -> Option<Self> {
+        let data = DataSpec { resolution: Some(resolution), ..self.data.clone() };
+        let dataset = Dataset::load(self.spec.scene().ok()?, &data.load_options(false)).ok()?;
         let (parameters, knobs) = (self.parameters.clone(), self.knobs.clone());
         let (device, degree, images) = (self.device.clone(), self.degree.clone(), images(&dataset));
         Some(Self { dataset, images, data, parameters, knobs, device, degree, ..*self })

@@ -4,16 +4,15 @@ use std::fmt;
 
 use super::size::{self, RESOLUTIONS, Size};
 use super::{Inputs, RunSpec};
+use crate::dataset::Resolution;
 use crate::failure::Failure;
-use crate::memory::{Bytes, Ledger, Setting};
+use crate::memory::{Bytes, Ledger};
 use crate::number::grouped;
 use crate::run::observer::Observer;
 
 /// How large a run would be, and what it would take.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// Rows, degree, tile lists and image cache.
-    pub setting: Setting,
     /// Bytes per buffer.
     pub ledger: Ledger,
     /// Why the size is what it is, a line each.
@@ -34,9 +33,6 @@ pub struct Alternatives {
 }
 
 /// Finds out what a run would take. Trains nothing and writes nothing.
-///
-/// # Errors
-/// All that preparing the run would fail for.
 pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     let inputs = Inputs::load(spec, None, observer)?;
     let size = Size::choose(&inputs)?;
@@ -46,24 +42,29 @@ pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     size::check(&inputs, &ledger)?;
     let memory = spec.size.memory.map_or_else(|| inputs.device.limited_bytes(&ledger), |it| it.0);
     let alternatives = alternatives(inputs, memory)?;
-    Ok(Plan { setting: size.setting, ledger, lines, alternatives })
+    Ok(Plan { ledger, lines, alternatives })
 }
 
 fn alternatives(inputs: Inputs<'_>, memory: u64) -> Result<Alternatives, Failure> {
-    let own = inputs.data.resolution.map_or(1, |size| size.0);
-    let mut all: Vec<(u32, Inputs<'_>)> = RESOLUTIONS
-        .iter()
-        .filter(|&&divisor| divisor != own)
-        .filter_map(|&divisor| Some((divisor, inputs.at_resolution(divisor)?)))
+    let own = inputs.data.resolution.unwrap_or(Resolution::Divisor(1));
+    let mut all: Vec<(Resolution, Inputs<'_>)> = RESOLUTIONS
+        .into_iter()
+        .filter(|&resolution| resolution != own)
+        .filter_map(|resolution| Some((resolution, inputs.at_resolution(resolution)?)))
         .collect();
     all.push((own, inputs));
-    // A number above 8 is a width.
-    all.sort_by_key(|(resolution, _)| if *resolution > 8 { 0 } else { *resolution });
+    all.sort_by_key(|(resolution, _)| match resolution {
+        Resolution::Width(_) => 0,
+        Resolution::Divisor(divisor) => *divisor,
+    });
     let rows_at =
         |degree| all.iter().map(|(_, inputs)| size::rows_at(inputs, memory, degree)).collect();
     Ok(Alternatives {
         memory,
-        images: all.iter().map(|(size, inputs)| (*size, inputs.dataset.largest_image())).collect(),
+        images: all
+            .iter()
+            .map(|(resolution, inputs)| (resolution.number(), inputs.dataset.largest_image()))
+            .collect(),
         rows: (0..=3).map(rows_at).collect::<Result<_, _>>()?,
     })
 }

@@ -2,9 +2,10 @@
 
 use super::{DECODERS, Inputs, TEST_DECODERS};
 use crate::backend::BackendKind;
+use crate::dataset::Resolution;
 use crate::failure::{DEVICE, Failure};
 use crate::memory::{
-    Bytes, Fit, Grant, Ledger, PAIRS, Setting, SizeRequest, fit, grant, min_memory, resident,
+    Bytes, Fit, Ledger, MemoryLimit, PAIRS, RunSize, SizeRequest, fit, grant, min_memory, resident,
 };
 use crate::number::grouped;
 use crate::run::values::Budget;
@@ -23,11 +24,12 @@ const THREADS: usize = 64;
 /// What "give --memory" is rounded up to.
 const MIB: u64 = 1 << 20;
 /// Divisors of the images' sides that are alternatives.
-pub(super) const RESOLUTIONS: [u32; 3] = [1, 2, 4];
+pub(super) const RESOLUTIONS: [Resolution; 3] =
+    [Resolution::Divisor(1), Resolution::Divisor(2), Resolution::Divisor(4)];
 
 /// The size of a run.
 pub(in crate::run) struct Size {
-    pub(in crate::run) setting: Setting,
+    pub(in crate::run) setting: RunSize,
     /// The memory given, and what follows from it.
     solved: Option<(u64, Fit)>,
 }
@@ -39,7 +41,7 @@ impl Size {
         let most = most_pairs(inputs, rows)?;
         let per_row = inputs.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
         let pairs = rows.saturating_mul(per_row).min(most);
-        let setting = Setting {
+        let setting = RunSize {
             rows,
             sh_degree: inputs.degree.highest(),
             tile_cap: inputs.tile_cap().unwrap_or(pairs).max(rows),
@@ -76,7 +78,7 @@ impl Size {
 
     /// What there is to say about it, a line each.
     pub(in crate::run) fn lines(&self, inputs: &Inputs<'_>) -> Vec<String> {
-        let Setting { rows, sh_degree, tile_cap, image_cache } = self.setting;
+        let RunSize { rows, sh_degree, tile_cap, image_cache } = self.setting;
         let said = grouped(rows);
         let Some((memory, fit)) = &self.solved else {
             let default = match inputs.spec.size.budget {
@@ -161,7 +163,7 @@ pub(in crate::run) fn check(inputs: &Inputs<'_>, ledger: &Ledger) -> Result<(), 
 /// Fails where the system does not grant this process what a run takes.
 pub(in crate::run) fn check_grant(inputs: &Inputs<'_>, ledger: &Ledger) -> Result<(), Failure> {
     let granted = grant(inputs.threads() + DECODERS + TEST_DECODERS);
-    let (Some(Grant { left, by }), Some(now)) = (granted, resident()) else { return Ok(()) };
+    let (Some(MemoryLimit { left, by }), Some(now)) = (granted, resident()) else { return Ok(()) };
     let more = ledger.on_host().saturating_sub(now);
     if more <= left {
         return Ok(());
@@ -194,7 +196,7 @@ pub(super) fn rows_at(
     Ok(fit.map(|fit| fit.setting.rows))
 }
 
-fn bytes(inputs: &Inputs<'_>, setting: &Setting) -> Result<u64, Failure> {
+fn bytes(inputs: &Inputs<'_>, setting: &RunSize) -> Result<u64, Failure> {
     let needs = inputs.needs(setting.rows)?;
     let threads = inputs.threads().max(THREADS);
     Ok(inputs.device.limited_bytes(&inputs.ledger(setting, &needs, threads)))
@@ -257,10 +259,10 @@ fn too_little(inputs: &Inputs<'_>, request: &SizeRequest) -> Result<Failure, Fai
         let names: Vec<&str> = fixed.iter().filter(|(is, _)| *is).map(|(_, name)| *name).collect();
         message += &format!(", or {}MiB without {}", free_least / MIB, names.join(" and "));
     }
-    let smaller = RESOLUTIONS.iter().filter_map(|&divisor| {
-        let smaller = inputs.at_resolution(divisor)?;
+    let smaller = RESOLUTIONS.iter().filter_map(|&resolution| {
+        let smaller = inputs.at_resolution(resolution)?;
         let request = super::size::request(&smaller, request.memory).ok()?;
-        Some((divisor, least_of(&smaller, &request).ok()??))
+        Some((resolution.number(), least_of(&smaller, &request).ok()??))
     });
     let smaller: Vec<(u32, u64)> = smaller.filter(|&(_, bytes)| bytes < least).collect();
     let fits = smaller.iter().find(|(_, bytes)| *bytes <= request.memory);

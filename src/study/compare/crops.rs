@@ -3,19 +3,19 @@
 //! The window is chosen by a rule and not by hand: of all windows of a quarter of the picture's
 //! sides, over all views held out, the one whose photograph has the most edges.
 
-use std::io::Cursor;
 use std::path::Path;
 
 use densify_policies::policy::Needs;
-use image::{ImageFormat, Rgb, RgbImage, imageops};
+use image::{RgbImage, imageops};
 
 use super::{Outcome, at, scenes_and_budgets};
 use crate::dataset::images::Image8;
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::number::grouped;
-use crate::output::{model_path, write_atomically};
-use crate::run::finished::{Machine, Opened, open_run};
+use crate::output::model_path;
+use crate::pictures::{photograph, picture, side_by_side, write_png};
+use crate::run::finished::{Machine, open_run};
 use crate::run::{Observer, Silent};
 use crate::study::Picture;
 use crate::views::{DatasetViews, ViewSource};
@@ -36,9 +36,6 @@ struct Window {
 
 /// Draws a row of crops for every scene and budget: the photograph, then every policy at the first
 /// seed. Runs whose model is gone are left out.
-///
-/// # Errors
-/// When a model cannot be rendered or a file cannot be written.
 pub(super) fn draw(
     output: &Path,
     outcomes: &[Outcome],
@@ -51,12 +48,7 @@ pub(super) fn draw(
             continue;
         }
         let file = format!("crops-{scene}-{budget}.png");
-        let mut encoded = Cursor::new(Vec::new());
-        let picture = side_by_side(&crops);
-        write_atomically(&output.join(&file), |out| {
-            picture.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
-            out.write_all(encoded.get_ref())
-        })?;
+        write_png(&output.join(&file), &side_by_side(&crops, GAP).into())?;
         let order = shown.join(", ");
         let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
         pictures.push(Picture { file, caption });
@@ -92,7 +84,8 @@ fn crops(
                 *place.insert((view, window))
             }
         };
-        crops.push(cut(&rendering(&mut opened, &views, view)?, window));
+        let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
+        crops.push(cut(&picture(&rendering), window));
         shown.push(run.factor.clone());
     }
     Ok((crops, shown))
@@ -118,25 +111,6 @@ fn richest_window(
         }
     }
     Ok(best.map(|(_, view, window)| (view, window)))
-}
-
-fn rendering(opened: &mut Opened, views: &DatasetViews, view: usize) -> Result<RgbImage, Failure> {
-    let background = opened.data.background.fixed();
-    let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
-    let at = |x: u32, y: u32| {
-        let first = 3 * (y as usize * rendering.width as usize + x as usize);
-        let rgb = &rendering.rgb[first..first + 3];
-        Rgb([0, 1, 2].map(|c| (rgb[c].clamp(0.0, 1.0) * 255.0).round() as u8))
-    };
-    Ok(RgbImage::from_fn(rendering.width, rendering.height, at))
-}
-
-fn photograph(image: &Image8, background: [f32; 3]) -> RgbImage {
-    let at = |x: u32, y: u32| {
-        let colour = image.composited(x as usize, y as usize, background);
-        Rgb(colour.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8))
-    };
-    RgbImage::from_fn(image.width, image.height, at)
 }
 
 /// The window with the largest sum of |∂G/∂x| + |∂G/∂y| of the green channel, and that sum; of equal
@@ -180,18 +154,6 @@ fn cut(picture: &RgbImage, Window { x, y, width, height }: Window) -> RgbImage {
     imageops::resize(&crop, width * times, height * times, imageops::FilterType::Nearest)
 }
 
-fn side_by_side(crops: &[RgbImage]) -> RgbImage {
-    let width = crops.iter().map(|crop| crop.width() + GAP).sum::<u32>() - GAP;
-    let height = crops.iter().map(RgbImage::height).max().unwrap_or(1);
-    let mut picture = RgbImage::from_pixel(width, height, Rgb([255; 3]));
-    let mut x = 0;
-    for crop in crops {
-        imageops::replace(&mut picture, crop, i64::from(x), 0);
-        x += crop.width() + GAP;
-    }
-    picture
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -213,6 +175,6 @@ mod tests {
         assert_eq!((window.width, window.height), (10, 6));
         let crop = cut(&photograph(&image, [0.0; 3]), window);
         assert_eq!(crop.dimensions(), (240, 144));
-        assert_eq!(side_by_side(&[crop.clone(), crop]).dimensions(), (486, 144));
+        assert_eq!(side_by_side(&[crop.clone(), crop], GAP).dimensions(), (486, 144));
     }
 }

@@ -38,9 +38,6 @@ struct Panel {
 }
 
 /// Draws every plot into the folder `output`.
-///
-/// # Errors
-/// When a file cannot be written.
 pub(super) fn draw(
     output: &Path,
     outcomes: &[Outcome],

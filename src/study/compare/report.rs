@@ -38,18 +38,10 @@ pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
     for (scene, budget) in scenes_and_budgets(outcomes) {
         let here = at(outcomes, scene, budget);
         let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
-        let mut table = MarkdownTable::new(&[
-            "policy",
-            "PSNR",
-            "SSIM",
-            "FLIP",
-            "rows",
-            "true peak",
-            "peak memory [MiB]",
-            "time [s]",
-            "processor time [s]",
-            "extra passes",
-        ]);
+        let mut table = MarkdownTable::new(
+            "policy | PSNR | SSIM | FLIP | rows | true peak | peak memory [MiB] | time [s] | \
+             processor time [s] | extra passes",
+        );
         for policy in policies {
             if here.iter().any(|run| run.factor == *policy) {
                 table.row(&row(policy, first, &here, budget));
@@ -63,15 +55,8 @@ pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
 
 /// Every policy against the first.
 fn ranking(outcomes: &[Outcome], first: &str, others: &[String]) -> MarkdownTable {
-    let mut table = MarkdownTable::new(&[
-        "policy",
-        "PSNR",
-        "better in",
-        "SSIM",
-        "better in",
-        "FLIP",
-        "better in",
-    ]);
+    let mut table =
+        MarkdownTable::new("policy | PSNR | better in | SSIM | better in | FLIP | better in");
     for policy in others {
         let versus = |score: fn(&Outcome) -> f64| difference(outcomes.iter(), policy, first, score);
         let all = (versus(|r| r.psnr), versus(|r| r.ssim), versus(|r| r.flip));
@@ -139,13 +124,9 @@ fn geometry(here: &[&Outcome], policies: &[String]) -> String {
         (|g| g.centres.f_score_one_percent, 1),
         (|g| g.floaters.of_rows, 2),
     ];
-    let mut table = MarkdownTable::new(&[
-        "policy",
-        "depth RMSE [%]",
-        "Chamfer [%]",
-        "F-score at 1 % [%]",
-        "floaters [% of rows]",
-    ]);
+    let mut table = MarkdownTable::new(
+        "policy | depth RMSE [%] | Chamfer [%] | F-score at 1 % [%] | floaters [% of rows]",
+    );
     for policy in policies {
         let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == *policy).copied().collect();
         if runs.is_empty() {

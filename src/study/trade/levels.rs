@@ -4,7 +4,7 @@ use super::Trade;
 use crate::backend::{BackendChoice, BackendKind};
 use crate::failure::Failure;
 use crate::knobs::{Class, KNOBS, find};
-use crate::run::{Observer, Partial, RunOption, RunSpec};
+use crate::run::{Observer, Partial, RunOption};
 
 /// A knob or an option of a run that a study varies.
 #[derive(Debug, Clone)]
@@ -123,8 +123,7 @@ fn sized(study: &Trade, levels: &Levels) -> (bool, Vec<String>) {
 fn check(train: &Partial, one: &Factor) -> Result<(), Failure> {
     for level in &one.levels {
         let setting = Partial::setting(&one.name, level).into_table();
-        let spec = Partial::new(setting, &one.name)?.over(train.clone()).describe()?;
-        let _: RunSpec = spec;
+        Partial::new(setting, &one.name)?.over(train.clone()).describe()?;
     }
     Ok(())
 }

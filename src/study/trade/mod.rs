@@ -9,13 +9,16 @@ mod table;
 
 use std::path::PathBuf;
 
-use super::cell::{Cell, run_options};
+use clap::Args;
+
+use super::cell::Cell;
 use super::child::shared_options;
 use super::record::{ImageError, Outcome, Record};
 use super::{Finished, Study, labels};
 use crate::failure::Failure;
 use crate::knobs::{Class, EXACT, preset};
-use crate::run::{Observer, Partial};
+use crate::number;
+use crate::run::{DEFAULT_BUDGET, Observer, Partial};
 use crate::schedule::REFERENCE_ITERATIONS;
 use levels::{Factor, factors};
 use numerical::Subject;
@@ -30,44 +33,64 @@ const OWN_OPTIONS: [&str; 7] =
 const BASE: &str = "";
 const FACTORIAL: &str = "factorial";
 
-/// A study of what knobs cost and buy: one at a time from the preset `exact`, then together those that
-/// stand out.
-#[derive(Debug, Clone)]
-pub struct Trade {
-    /// Folders of the scenes, or built-in scenes.
+const EXAMPLES: &str = "\
+Examples:
+  densify trade scene:room -i 2000 -b 20k
+  densify trade data/garden --knobs alpha_min,ssim_every,sh_every --seeds 5 -- -r 4
+  densify trade scene:spheres --knobs coarse_until:0.3:0.5 -i 1000 -b 5k -- --policy taming";
+
+/// Measures what each shortcut costs and buys.
+///
+/// For every knob (`densify knobs`) and each of its levels: how far off the same model's images are,
+/// against a renderer in float64; and what training with it arrives at, on views held out, with time
+/// by stage and memory at its peak. One knob at a time from the preset `exact`, with the same seeds; then
+/// those that stand out together, in a design of twelve runs.
+///
+/// A run that is finished is not run again: call the same command to go on after an interruption. The
+/// folder then holds trade.md (tables and plots), trade.jsonl (a record per line), plots as SVG, and
+/// the runs themselves. "Free" is said only of what costs less than can be seen, by all of its
+/// intervals.
+#[derive(Debug, Clone, Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Trade {
+    /// Folders of the scenes, or built-in scenes (scene:NAME)
+    #[arg(required = true)]
     pub scenes: Vec<PathBuf>,
-    /// Knobs, as `NAME` or `NAME:VALUE:VALUE`; all that these runs have where there is none.
+    /// Knobs, separated by commas; a knob with levels of its own as alpha_min:1/64:1/32
+    /// `[default: all that the policy has]`
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     pub knobs: Vec<String>,
-    /// Runs of each kind, with seeds from 0.
+    /// Runs of each kind, with seeds 0, 1, …
+    #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub seeds: u32,
-    /// Length of each run.
+    /// Length of each run
+    #[arg(short, long, value_name = "N", default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..))]
     pub iterations: u32,
-    /// Most Gaussians of each run.
+    /// Most Gaussians of each run
+    #[arg(short, long, value_name = "ROWS", default_value_t = DEFAULT_BUDGET, value_parser = number::rows)]
     pub budget: usize,
-    /// Whether the knobs that stand out are changed together.
-    pub factorial: bool,
-    /// Folder for the results.
+    /// Leave out the runs in which several knobs are changed together
+    #[arg(long)]
+    pub no_factorial: bool,
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR", default_value = "trade")]
     pub output: PathBuf,
-    /// Options of every run.
-    pub train: Partial,
-    /// The same, as the report shows them.
-    pub train_words: String,
+    /// Options of `densify train` for every run
+    #[arg(last = true, value_name = "TRAIN OPTIONS")]
+    pub train: Vec<String>,
 }
 
 impl Trade {
-    /// Makes what is not done yet, and writes tables and plots.
-    ///
-    /// # Errors
-    /// When the study makes no sense, a run fails, or the folder cannot be written.
-    pub fn run(&self, observer: &dyn Observer) -> Result<Finished, Failure> {
-        let shared = shared_options(self.train.clone(), &OWN_OPTIONS)?;
+    /// Makes what is not done yet, all runs with the options `train`, and writes tables and plots.
+    pub(crate) fn run(&self, train: Partial, observer: &dyn Observer) -> Result<Finished, Failure> {
+        let shared = shared_options(train, &OWN_OPTIONS)?;
         let factors = factors(self, &shared, observer)?;
         let cells = self.cells(&factors, &shared)?;
         let mut study = Study::open(&self.output, "trade", observer)?;
         let outcomes = study.run(&cells)?;
         let images = measure_images(&mut study, &cells, &factors)?;
         let mut report = Report::new(self, &factors, outcomes, images);
-        let together = if self.factorial { report.knobs_that_stand_out() } else { Vec::new() };
+        let together = if self.no_factorial { Vec::new() } else { report.knobs_that_stand_out() };
         if together.len() > 1 {
             let runs = factorial(&cells, &together);
             observer.say(format_args!("{} knobs stand out; together:", together.len()));
@@ -89,19 +112,14 @@ impl Trade {
         let mut cells = Vec::new();
         for seed in 0..self.seeds {
             for (scene, label) in self.scenes.iter().zip(&labels) {
-                let options = run_options(shared, scene, self.budget, seed, self.iterations);
+                let base = Cell::new(shared, (scene, label), self.budget, seed, self.iterations);
                 let base = Cell {
-                    scene: scene.clone(),
-                    label: label.clone(),
                     factor: BASE.to_owned(),
-                    level: String::new(),
-                    budget: self.budget,
-                    seed,
-                    iterations: self.iterations,
                     title: "exact".to_owned(),
                     folder: "exact".to_owned(),
-                    spec: Partial::option("preset", EXACT).over(options),
+                    spec: Partial::option("preset", EXACT).over(base.spec.clone()),
                     scores_without_shortcuts: true,
+                    ..base
                 };
                 cells.push(base.clone());
                 for factor in factors {

@@ -43,9 +43,6 @@ struct SampledView {
 
 impl Subject {
     /// The model of a run, in the views that it held out.
-    ///
-    /// # Errors
-    /// When it cannot be read.
     pub(super) fn read(folder: &Path, observer: &dyn Observer) -> Result<Self, Failure> {
         let config = RunConfig::read(folder)?;
         let dataset = load(&config.scene_path(), &config.spec.data, observer)?;
@@ -61,9 +58,6 @@ impl Subject {
     }
 
     /// The error with a knob at a level.
-    ///
-    /// # Errors
-    /// When the backend cannot be made.
     pub(super) fn measure(
         &self,
         cell: &Cell,

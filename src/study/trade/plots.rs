@@ -28,9 +28,6 @@ struct Point {
 }
 
 /// Draws a plot per scene into the folder `output`.
-///
-/// # Errors
-/// When a file cannot be written.
 pub(super) fn draw(output: &Path, report: &Report) -> Result<Vec<Picture>, Failure> {
     let mut drawn = Vec::new();
     for scene in &report.scenes {

@@ -11,12 +11,9 @@ use crate::study::distinct;
 
 /// A study's results.
 pub(super) struct Report {
-    pub(super) iterations: u32,
-    pub(super) budget: usize,
-    pub(super) seeds: u32,
+    pub(super) study: Trade,
+    /// Labels of the scenes.
     pub(super) scenes: Vec<String>,
-    /// More options of every run.
-    pub(super) train: String,
     pub(super) outcomes: Vec<Outcome>,
     pub(super) images: Vec<ImageError>,
     pub(super) effects: Vec<Effect>,
@@ -85,11 +82,8 @@ impl Report {
     ) -> Self {
         let scenes = distinct(outcomes.iter().map(|outcome| outcome.scene.clone()));
         let mut report = Self {
-            iterations: study.iterations,
-            budget: study.budget,
-            seeds: study.seeds,
+            study: study.clone(),
             scenes,
-            train: study.train_words.clone(),
             outcomes,
             images,
             effects: Vec::new(),
@@ -283,10 +277,9 @@ pub(super) fn sample() -> Report {
         seeds: 3,
         iterations: 100,
         budget: 1000,
-        factorial: true,
+        no_factorial: false,
         output: "x".into(),
-        train: crate::run::Partial::default(),
-        train_words: "--policy=diet".into(),
+        train: vec!["--policy=diet".into()],
     };
     let factor = |name: &str, levels: &[&str]| Factor {
         name: name.to_owned(),

@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use super::Trade;
 use super::report::{Effect, PSNR, Report, SECONDS};
 use crate::knobs::Class;
 use crate::number::grouped;
@@ -14,9 +15,11 @@ use crate::study::markdown::{MarkdownTable, number_or_dash};
 /// The whole study.
 pub(super) fn markdown(report: &Report) -> String {
     let mut text = String::from("# What each knob costs and buys\n\n");
-    let Report { iterations, budget, seeds, scenes, train, .. } = report;
-    let options =
-        if train.is_empty() { String::new() } else { format!(" Options of every run: `{train}`.") };
+    let Trade { iterations, budget, seeds, train, .. } = &report.study;
+    let options = match train.join(" ") {
+        words if words.is_empty() => String::new(),
+        words => format!(" Options of every run: `{words}`."),
+    };
     let _ = writeln!(
         text,
         "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
@@ -24,7 +27,7 @@ pub(super) fn markdown(report: &Report) -> String {
          intervals of their mean; ratios are geometric means. Scores are of views held out, rendered \
          without any shortcut.",
         env!("CARGO_PKG_VERSION"),
-        scenes.join(", "),
+        report.scenes.join(", "),
         grouped(*iterations as usize),
         grouped(*budget),
         if *seeds == 1 { "seed" } else { "seeds" },
@@ -39,7 +42,7 @@ pub(super) fn markdown(report: &Report) -> String {
 
 /// What the differences are from.
 fn exact(report: &Report) -> String {
-    let mut table = MarkdownTable::new(&["scene", "PSNR [dB]", "time [s]", "peak [MiB]"]);
+    let mut table = MarkdownTable::new("scene | PSNR [dB] | time [s] | peak [MiB]");
     for scene in &report.scenes {
         let psnr = number_or_dash(report.mean(scene, "", "", PSNR), 2);
         let seconds = number_or_dash(report.mean(scene, "", "", SECONDS).map(f64::exp), 1);
@@ -50,14 +53,9 @@ fn exact(report: &Report) -> String {
 }
 
 fn numerical(report: &Report) -> String {
-    let mut table = MarkdownTable::new(&[
-        "knob",
-        "level",
-        "scene",
-        "standard rules [dB]",
-        "everything blended [dB]",
-        "largest error",
-    ]);
+    let mut table = MarkdownTable::new(
+        "knob | level | scene | standard rules [dB] | everything blended [dB] | largest error",
+    );
     for image in &report.images {
         table.row(&[
             knob_or_exact(&image.knob).to_owned(),
@@ -80,22 +78,10 @@ fn knob_or_exact(knob: &str) -> &str {
 }
 
 fn outcomes(report: &Report) -> String {
-    let mut table = MarkdownTable::new(&[
-        "knob",
-        "level",
-        "class",
-        "ΔPSNR [dB]",
-        "ΔSSIM",
-        "ΔFLIP",
-        "depth error ×",
-        "Chamfer ×",
-        "time ×",
-        "processor time ×",
-        "peak ×",
-        "images [dB]",
-        "same bits",
-        "verdict",
-    ]);
+    let mut table = MarkdownTable::new(
+        "knob | level | class | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | \
+         processor time × | peak × | images [dB] | same bits | verdict",
+    );
     for effect in &report.effects {
         let mut cells = row(effect);
         if effect.dominated.is_some() {
@@ -153,15 +139,9 @@ fn together(report: &Report) -> String {
     if report.together.is_empty() {
         return String::new();
     }
-    let mut table = MarkdownTable::new(&[
-        "knob",
-        "level",
-        "ΔPSNR alone [dB]",
-        "among others [dB]",
-        "time × alone",
-        "among others",
-        "interacts",
-    ]);
+    let mut table = MarkdownTable::new(
+        "knob | level | ΔPSNR alone [dB] | among others [dB] | time × alone | among others | interacts",
+    );
     for one in &report.together {
         let [psnr, seconds] = one.alone;
         let differs =
@@ -205,7 +185,7 @@ fn stages(report: &Report) -> String {
     let base = mean("", "");
     let names: Vec<&String> = base.keys().collect();
     let titles = ["knob", "level"].into_iter().chain(names.iter().map(|name| &***name));
-    let mut table = MarkdownTable::new(&titles.collect::<Vec<_>>());
+    let mut table = MarkdownTable::new(&titles.collect::<Vec<_>>().join(" | "));
     let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
     for (knob, level) in std::iter::once(("", "")).chain(levels) {
         let seconds = mean(knob, level);

@@ -319,16 +319,7 @@ fn build(
     scene: SceneInfo,
     options: TrainOptions,
 ) -> Result<(Trainer<FakeViews>, CallLog, CallLog), TrainError> {
-    let camera = Camera {
-        width: 1,
-        height: 1,
-        fx: 1.0,
-        fy: 1.0,
-        cx: 0.5,
-        cy: 0.5,
-        rotation: DMat3::IDENTITY,
-        translation: DVec3::ZERO,
-    };
+    let camera = Camera::centred((1, 1), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
     let (log, prefetched) = (CallLog::default(), CallLog::default());
     let backend = CountingBackend {
         rows: case.rows,

@@ -46,12 +46,33 @@ fn fresh_signals_can_be_read_only_where_they_are_wanted() {
 }
 
 #[test]
+fn the_first_of_near_duplicates_is_kept() {
+    let camera = |x: f64, degrees: f64, fx: f64| {
+        let rotation = DMat3::from_rotation_y(degrees.to_radians());
+        Camera::centred((64, 48), (fx, 50.0), rotation, DVec3::new(x, 0.0, 0.0))
+    };
+    // Extent 10: within 0.1 and one degree of an earlier view that is kept.
+    let cameras = vec![
+        camera(0.0, 0.0, 50.0),
+        camera(0.09, 0.9, 50.0),
+        camera(0.15, 0.0, 50.0),
+        camera(0.0, 1.1, 50.0),
+        camera(0.0, 0.0, 60.0),
+        camera(0.16, 0.1, 50.0),
+    ];
+    let views = FakeViews { cameras, unreadable: None, prefetched: CallLog::default() };
+    assert_eq!(distinct_views(&views, 10.0), [0, 2, 3, 4]);
+    assert_eq!(distinct_views(&views, 1e-3), [0, 1, 2, 3, 4, 5]);
+}
+
+#[test]
 fn near_duplicates_are_not_scored() {
     // Cameras one apart: with an extent of 150, the second is the first, and the third is not.
     let case = Case { fresh_views: 100, ..CASE };
     let info = SceneInfo { extent: 150.0, ..scene(&case, 3) };
     let (trainer, log, _) = build(&case, 3, info, OPTIONS).unwrap();
-    let mut trainer = trainer.requiring(Required { scored_views: true, ..Required::default() });
+    let mut trainer =
+        trainer.requiring(AutoChoices { scored_views: true, ..AutoChoices::default() });
     for _ in 0..9 {
         trainer.step().unwrap();
     }

@@ -3,13 +3,13 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::backend::BackendError;
+use crate::backend::{BackendError, Differentiable};
 use crate::dataset::images::Image8;
 use crate::gaussians::Gaussians;
 use crate::verify::compare::relative_error;
 use crate::verify::reference::loss::{Loss, loss};
 use crate::verify::scenes;
-use crate::verify::subject::{Differentiable, Subject};
+use crate::verify::subject::Subject;
 use crate::verify::trial::{Trial, count_broken, step};
 use crate::verify::values::SIZES;
 

@@ -1,11 +1,10 @@
 //! Rows that hold no number, or one that no row should hold, among sound ones.
 
-use crate::backend::BackendError;
+use crate::backend::{BackendError, Differentiable};
 use crate::gaussians::Gaussians;
 use crate::verify::compare::class;
 use crate::verify::reference::CLASSES;
 use crate::verify::scenes;
-use crate::verify::subject::Differentiable;
 use crate::verify::trial::{Trial, count_broken, count_different};
 use crate::verify::values::{EXTREMES, POISON, SLOTS, name_of_slot, remove, slot_of};
 

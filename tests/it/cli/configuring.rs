@@ -1,13 +1,15 @@
 //! Runs described by a file: what it may say, what wins over it, and what is refused.
 
-use densify::run::{OPTIONS, Occupied, Partial, Run};
+use std::path::Path;
 
-use super::{densify, files, model, read, scratch, text};
+use densify::run::{OPTIONS, Occupied, Partial, Run, Silent};
+
+use super::{call, config, files, model, read, scratch, text, train};
 use crate::photographs::Photographs;
 
 const ITERATIONS: u32 = 12;
 
-fn write(folder: &std::path::Path, text: &str) -> String {
+fn write(folder: &Path, text: &str) -> String {
     let path = folder.join("run.toml");
     std::fs::write(&path, text).expect("it is written");
     path.to_str().expect("temporary paths are UTF-8").to_owned()
@@ -17,9 +19,10 @@ fn write(folder: &std::path::Path, text: &str) -> String {
 fn a_file_describes_a_run_and_flags_win_over_it() {
     let scene = Photographs::colmap_text();
     let (root, by_flags) = scratch();
-    let words = ["train", text(scene.path()), "-o", text(&by_flags), "-i", "12", "--budget", "250"];
-    let more = ["--sh-degree", "1", "--seed", "5", "--knob", "alpha_min=1/64", "--eval"];
-    densify(&[&words[..], &more, &["--policy-set", "diet.rho=0.2"]].concat()).ok();
+    let train = |what: &str, to: &Path| call(&format!("train {what} -o {}", text(to))).ok();
+    let flags = "-i 12 --budget 250 --sh-degree 1 --seed 5 --knob alpha_min=1/64 --eval";
+    let described = format!("{} {flags} --policy-set diet.rho=0.2", text(scene.path()));
+    train(&described, &by_flags);
     // The same from a file, but for the seed, which a flag gives.
     let file = write(
         root.path(),
@@ -29,22 +32,20 @@ fn a_file_describes_a_run_and_flags_win_over_it() {
             scene.path()
         ),
     );
-    let by_file = root.path().join("file");
-    densify(&["train", "--config", &file, "--seed", "5", "-o", text(&by_file)]).ok();
-    assert!(model(&by_flags, ITERATIONS) == model(&by_file, ITERATIONS));
-    assert!(read(&by_flags.join("config.toml")) == read(&by_file.join("config.toml")));
     // A run's own file repeats it.
     let config = by_flags.join("config.toml");
-    let again = root.path().join("again");
-    densify(&["train", "--config", text(&config), "-o", text(&again)]).ok();
-    assert!(model(&by_flags, ITERATIONS) == model(&again, ITERATIONS));
-    assert!(read(&by_flags.join("config.toml")) == read(&again.join("config.toml")));
+    for what in [format!("--config {file} --seed 5"), format!("--config {}", text(&config))] {
+        let again = root.path().join("again");
+        train(&format!("{what} --overwrite"), &again);
+        assert!(model(&by_flags, ITERATIONS) == model(&again, ITERATIONS), "{what}");
+        assert!(read(&config) == read(&again.join("config.toml")), "{what}");
+    }
     // So does a program without the command line.
     let library = root.path().join("library");
     let mut spec = Partial::read(&config).and_then(Partial::describe).expect("it is sound");
     spec.output.output = Some(library.clone());
     let run = Run::prepare(&spec).expect("it was prepared before");
-    assert_eq!(run.train(Occupied::Refuse).expect("it trains"), library);
+    assert_eq!(run.train(Occupied::Refuse, &Silent).expect("it trains"), library);
     assert!(model(&by_flags, ITERATIONS) == model(&library, ITERATIONS));
 }
 
@@ -52,9 +53,8 @@ fn a_file_describes_a_run_and_flags_win_over_it() {
 fn a_run_has_every_option_in_its_file() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    densify(&["train", text(scene.path()), "-o", text(&run), "-i", "2", "--budget", "250"]).ok();
-    let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
-    let config: toml::Table = config.parse().expect("TOML");
+    train(scene.path(), &run, 2, "--budget 250").ok();
+    let config = config(&run);
     // What is not set is what there is nothing to set to.
     let unset =
         ["test_every", "images", "resolution", "init_points", "memory", "sh_every", "preset"];
@@ -85,14 +85,11 @@ fn files_that_say_what_cannot_be_are_refused_by_key() {
     for (line, words) in cases {
         let (root, output) = scratch();
         let file = write(root.path(), line);
-        let call = ["train", text(scene.path()), "--config", &file, "-o", text(&output)];
         let words: Vec<&str> = words.iter().copied().chain(["run.toml"]).collect();
-        densify(&call).refused(line, &words);
+        let (scene, to) = (text(scene.path()), text(&output));
+        call(&format!("train {scene} --config {file} -o {to}")).refused(line, &words);
         assert_eq!(files(root.path()).len(), 1, "{line}: something was written");
-        assert!(!output.exists());
     }
-    let (root, output) = scratch();
-    let nowhere = root.path().join("no.toml");
-    densify(&["train", "--config", text(&nowhere)]).refused("no file", &["no.toml"]);
-    densify(&["train", "-o", text(&output)]).refused("no scene", &["no scene", "scene:spheres"]);
+    call("train --config no.toml").refused("no file", &["no.toml"]);
+    call("train -o run").refused("no scene", &["no scene", "scene:spheres"]);
 }

@@ -90,18 +90,12 @@ fn a_model_that_draws_nothing_is_no_result() {
 
 #[test]
 fn names_from_files_cannot_command_a_terminal() {
-    const NAME: &str = "view\u{1b}[2J\n\u{7}.png";
-    let escaped = "view\\u{1b}[2J\\n\\u{7}.png";
     let (_root, run) = scratch();
-    let binary = Photographs::colmap_binary();
-    let images = std::fs::read(binary.file("sparse/0/images.bin")).expect("a model");
-    let old = name(0).into_bytes();
-    let at = images.windows(old.len()).position(|bytes| bytes == old).expect("its name");
-    let changed = [&images[..at], NAME.as_bytes(), &images[at + old.len()..]].concat();
-    binary.write("sparse/0/images.bin", changed);
+    let colmap = Photographs::colmap_text();
+    colmap.replace("sparse/0/images.txt", &name(0), "view\u{1b}[2J\u{7}.png");
     let json = Photographs::transforms();
     json.replace("transforms_train.json", "./train/r_1", "./train/r\\u001b[2J\\n\\u0007");
-    for (scene, shown) in [(&binary, escaped), (&json, "r\\u{1b}[2J\\n\\u{7}")] {
+    for (scene, shown) in [(&colmap, "view\\u{1b}[2J\\u{7}.png"), (&json, "r\\u{1b}[2J\\n\\u{7}")] {
         let outcome = train(scene.path(), &run, 3, "--budget 300");
         let message = refusal(&outcome);
         assert!(message.contains(shown) && message.contains("control character"), "{message}");

@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
-use super::{densify, files, model, read, records, scratch, text, train};
+use super::{call, files, model, read, records, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
 /// Kills where the environment does not say.
@@ -23,8 +23,6 @@ const FLAGS: &str = "--budget 360 --checkpoint-every 3 --eval --save-iterations 
 /// When to kill.
 #[derive(Debug, Clone, Copy)]
 enum Moment {
-    /// After so many looks at the folder.
-    Looks(u32),
     /// When the log has so many records.
     Records(usize),
     /// When a file that is being written is seen for the so-many-th time.
@@ -34,19 +32,16 @@ enum Moment {
 impl Moment {
     fn any(rng: &mut ChaCha8Rng) -> Self {
         match rng.random_range(0..4) {
-            0 => Self::Looks(rng.random_range(0..100_000)),
-            1 => Self::Records(rng.random_range(1..ITERATIONS as usize / 10)),
+            0 | 1 => Self::Records(rng.random_range(0..ITERATIONS as usize / 10)),
             _ => Self::Writing(rng.random_range(1..30)),
         }
     }
 
     /// Looks on until the moment has come, or the child has ended by itself: whether it has come.
     fn wait(self, child: &mut Child, run: &Path) -> bool {
-        let (mut looks, mut seen) = (0, 0);
+        let mut seen = 0;
         while child.try_wait().expect("a child").is_none() {
-            looks += 1;
             let come = match self {
-                Self::Looks(wanted) => looks >= wanted,
                 Self::Records(wanted) => lines(&run.join("stats/train.jsonl")) >= wanted,
                 Self::Writing(wanted) => {
                     seen += u32::from(is_writing(&run.join("checkpoints")));
@@ -71,23 +66,17 @@ fn is_writing(folder: &Path) -> bool {
     entries.map(|entry| entry.file_name()).any(|name| name.to_string_lossy().starts_with('.'))
 }
 
-/// Starts the program.
-fn spawn(arguments: &[&str]) -> Child {
+/// Starts the program with words separated by spaces.
+fn spawn(words: &str) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
-    command.args(arguments).env_remove("RUST_LOG");
+    command.args(words.split_whitespace()).env_remove("RUST_LOG");
     command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("it starts")
 }
 
-fn arguments<'a>(
-    scene: &'a Path,
-    run: &'a Path,
-    iterations: &'a str,
-    flags: &'a str,
-) -> Vec<&'a str> {
-    let mut words = vec!["train", text(scene), "-o", text(run), "--sh-degree", "1", "--quiet"];
-    words.extend(["--iterations", iterations]);
-    words.extend(flags.split_whitespace());
-    words
+/// The words of a call that trains.
+fn arguments(scene: &Photographs, run: &Path, iterations: u32, flags: &str) -> String {
+    let (scene, run) = (text(scene.path()), text(run));
+    format!("train {scene} -o {run} --sh-degree 1 --quiet --iterations {iterations} {flags}")
 }
 
 /// All that a run must end with, whatever has happened to it.
@@ -116,8 +105,7 @@ fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
     for number in 0.. {
         let run = root.path().join(format!("run{number}"));
         // The same call again and again, as a supervisor would do it.
-        let iterations = ITERATIONS.to_string();
-        let words = [arguments(scene.path(), &run, &iterations, FLAGS), vec!["--resume"]].concat();
+        let words = arguments(&scene, &run, ITERATIONS, &format!("{FLAGS} --resume"));
         for _ in 0..rng.random_range(1..4) {
             let mut child = spawn(&words);
             let moment = Moment::any(&mut rng);
@@ -130,7 +118,7 @@ fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
             let said = String::from_utf8_lossy(&ended.stderr);
             assert!(said.is_empty(), "run {number}, {moment:?}: {said}");
         }
-        densify(&words).ok();
+        call(&words).ok();
         assert!(outcome(&run, ITERATIONS) == expected, "run {number} of seed 11 differs");
         let left = files(&run);
         let hidden = left.keys().find(|name| name.split('/').any(|part| part.starts_with('.')));
@@ -146,8 +134,7 @@ fn killed_anywhere_and_resumed_it_ends_in_the_same_bytes() {
 /// Sends signals to a run that has begun, and waits for its end: exit code, message, folder.
 #[cfg(unix)]
 fn signalled(scene: &Photographs, run: &Path, signals: &[&str]) -> (Option<i32>, String) {
-    let flags = "--budget 360 --checkpoint-every 0";
-    let mut child = spawn(&arguments(scene.path(), run, LONG, flags));
+    let mut child = spawn(&arguments(scene, run, LONG, "--budget 360 --checkpoint-every 0"));
     assert!(Moment::Records(3).wait(&mut child, run), "it has ended by itself");
     let id = child.id();
     // By one shell, so that there is next to no time between them.
@@ -158,7 +145,7 @@ fn signalled(scene: &Photographs, run: &Path, signals: &[&str]) -> (Option<i32>,
 }
 
 #[cfg(unix)]
-const LONG: &str = "1500";
+const LONG: u32 = 1500;
 
 #[cfg(unix)]
 fn checkpoints(run: &Path) -> Vec<PathBuf> {
@@ -171,23 +158,23 @@ fn checkpoints(run: &Path) -> Vec<PathBuf> {
 fn a_signal_ends_the_run_in_order_and_it_goes_on() {
     let scene = Photographs::colmap_text();
     let (root, whole) = scratch();
-    train(scene.path(), &whole, 1500, "--quiet --budget 360 --checkpoint-every 0").ok();
+    train(scene.path(), &whole, LONG, "--quiet --budget 360 --checkpoint-every 0").ok();
     for (signal, name, code) in [("-INT", "SIGINT", 130), ("-TERM", "SIGTERM", 143)] {
         let run = root.path().join(name);
         let (ended, said) = signalled(&scene, &run, &[signal]);
         assert_eq!(ended, Some(code), "{said}");
         let kept = checkpoints(&run);
         assert_eq!(kept.len(), 1, "{kept:?}");
-        for words in [&format!("error: stopped by {name} after step "), text(&kept[0]), "--resume"]
-        {
+        let stopped = format!("error: stopped by {name} after step ");
+        for words in [&stopped, text(&kept[0]), "--resume"] {
             assert!(said.contains(words), "{words:?} is not in {said}");
         }
         let summary = super::json(&run.join("stats/summary.json"));
         let done = summary["iterations"].as_u64().expect("a number");
         assert!(summary["finished"] == false && (30..1500).contains(&done), "{summary}");
         assert!(text(&kept[0]).ends_with(&format!("iteration_{done}.safetensors")));
-        densify(&["train", text(scene.path()), "-o", text(&run), "--resume", "--quiet"]).ok();
-        assert!(model(&run, 1500) == model(&whole, 1500), "{name}");
+        resume(scene.path(), &run, "--quiet").ok();
+        assert!(model(&run, LONG) == model(&whole, LONG), "{name}");
         assert!(read(&run.join("stats/events.jsonl")) == read(&whole.join("stats/events.jsonl")));
     }
 }
@@ -197,7 +184,7 @@ fn a_signal_ends_the_run_in_order_and_it_goes_on() {
 fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    let mut child = spawn(&arguments(scene.path(), &run, "100000", "--budget 360"));
+    let mut child = spawn(&arguments(&scene, &run, 100_000, "--budget 360"));
     assert!(Moment::Records(3).wait(&mut child, &run), "it has ended by itself");
     let process = format!("is in use: process {} is training there", child.id());
     for flags in ["", "--overwrite --policy mcmc", "--resume"] {
@@ -206,7 +193,7 @@ fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     child.kill().expect("it can be killed");
     child.wait().expect("it ends");
     // One that is killed while it replaces another leaves nothing once a run has ended there.
-    let mut child = spawn(&arguments(scene.path(), &run, "100000", "--budget 360 --overwrite"));
+    let mut child = spawn(&arguments(&scene, &run, 100_000, "--budget 360 --overwrite"));
     let staged = || {
         let staged = densify::output::RunFolder::staged(&run);
         staged.iter().any(|path| path.join("stats/train.jsonl").exists())

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::{densify, files, json, scratch, text, train};
+use super::{call, files, json, scratch, text, train};
 use crate::photographs::{Photographs, SIZE, VIEWS, name};
 
 const ITERATIONS: u32 = 40;
@@ -35,7 +35,7 @@ fn eval_repeats_what_training_measured() {
     let paths = ["results.json", "per_view.json"].map(|name| run.join(name));
     let trained = paths.clone().map(|path| json(&path));
     paths.iter().for_each(|path| std::fs::remove_file(path).expect("it was there"));
-    let outcome = densify(&["eval", text(&run)]).ok();
+    let outcome = call(&format!("eval {}", text(&run))).ok();
     // The model went through its file, in the dataset's own coordinates.
     for (path, trained) in paths.iter().zip(&trained) {
         agree(&json(path), trained, 2e-3);
@@ -45,7 +45,7 @@ fn eval_repeats_what_training_measured() {
     }
     assert!(outcome.stdout.contains("mean"), "{}", outcome.stdout);
 
-    densify(&["eval", text(&run), "--split", "train"]).ok();
+    call(&format!("eval {} --split train", text(&run))).ok();
     let views = &json(&run.join("per_view_train.json"))["ours_40"]["PSNR"];
     assert_eq!(views.as_object().map(serde_json::Map::len), Some(VIEWS - 2));
     agree(&json(&run.join("results.json")), &trained[0], 2e-3);
@@ -63,8 +63,8 @@ fn render_writes_pictures_of_the_views() {
     let (root, run) = scratch();
     run_of(&scene, &run);
     let pictures = root.path().join("pictures");
-    let all = ["--alpha", "--depth", "--side-by-side"];
-    densify(&[&["render", text(&run), "-o", text(&pictures)][..], &all].concat()).ok();
+    let all = "--alpha --depth --side-by-side";
+    call(&format!("render {} -o {} {all}", text(&run), text(&pictures))).ok();
     let names: Vec<String> = files(&pictures).into_keys().collect();
     let of = |view: &str| {
         ["alpha", "depth", "pair"].map(|kind| format!("{view}.{kind}.png")).into_iter()
@@ -95,7 +95,7 @@ fn render_writes_pictures_of_the_views() {
     }
 
     let train = root.path().join("train");
-    densify(&["render", text(&run), "-o", text(&train), "--split", "train"]).ok();
+    call(&format!("render {} -o {} --split train", text(&run), text(&train))).ok();
     assert_eq!(files(&train).len(), VIEWS - 2);
 }
 
@@ -104,15 +104,19 @@ fn a_bare_model_renders_as_its_run() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     run_of(&scene, &run);
-    let [from_run, from_file] = ["a", "b"].map(|name| root.path().join(name));
-    densify(&["render", text(&run), "-o", text(&from_run)]).ok();
+    let render = |what: &str, to: &str| {
+        let to = root.path().join(to);
+        (call(&format!("render {what} -o {}", text(&to))), to)
+    };
     let ply = densify::output::model_path(&run, ITERATIONS);
     let (ply, dataset) = (text(&ply), text(scene.path()));
-    densify(&["render", ply, "--scene", dataset, "--eval", "-o", text(&from_file)]).ok();
+    let (of_run, from_run) = render(text(&run), "a");
+    let (of_file, from_file) = render(&format!("{ply} --scene {dataset} --eval"), "b");
+    of_run.ok();
+    of_file.ok();
     assert!(files(&from_run) == files(&from_file));
-
-    let nowhere = root.path().join("c");
-    densify(&["render", ply, "-o", text(&nowhere)]).refused("no cameras", &["--scene"]);
+    let (refused, nowhere) = render(ply, "c");
+    refused.refused("no cameras", &["--scene"]);
     assert!(!nowhere.exists());
 }
 
@@ -120,28 +124,27 @@ fn a_bare_model_renders_as_its_run() {
 fn the_selftest_prints_its_figures_and_writes_them() {
     let (root, _) = scratch();
     let file = root.path().join("deep/figures.md");
-    let outcome =
-        densify(&["selftest", "--backend", "cpu", "1", "16", "--markdown", text(&file)]).ok();
+    let outcome = call(&format!("selftest --backend cpu 1 16 --markdown {}", text(&file))).ok();
     for words in ["on native", "no row", "ok", "depths one bit apart", "within their tolerances"] {
         assert!(outcome.stdout.contains(words), "{words}: {}", outcome.stdout);
     }
     let written = std::fs::read_to_string(&file).expect("it was written");
     assert!(written.contains("## native") && written.contains("| 16 | depths"), "{written}");
-    densify(&["selftest", "99"]).refused("no such case", &["no case 99", "30"]);
-    densify(&["selftest", "--all", "--gpu", "x"]).refused("two choices", &["--all"]);
+    call("selftest 99").refused("no such case", &["no case 99", "30"]);
+    call("selftest --all --gpu x").refused("two choices", &["--all"]);
 }
 
 #[test]
 fn policies_are_listed_and_explained() {
-    let list = densify(&["policies"]).ok().stdout;
+    let list = call("policies").ok().stdout;
     for entry in densify_policies::registry::policies().expect("the registry is sound") {
         assert!(list.contains(entry.name) && list.contains(entry.summary), "{list}");
-        let manual = densify(&["policies", entry.name]).ok().stdout;
+        let manual = call(&format!("policies {}", entry.name)).ok().stdout;
         for (parameter, _) in entry.parameters() {
             let set = format!("--policy-set {}.{parameter}=", entry.name);
             assert!(manual.contains(&set), "{set} is not in {manual}");
         }
         assert!(manual.contains(entry.manual().lines().next().unwrap_or("?")), "{manual}");
     }
-    densify(&["policies", "diett"]).refused("misspelt", &["diett", "diet"]);
+    call("policies diett").refused("misspelt", &["diett", "diet"]);
 }

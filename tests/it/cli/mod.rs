@@ -7,6 +7,7 @@ mod configuring;
 mod exporting;
 mod faults;
 mod generated;
+mod geometry;
 mod hostile;
 mod killing;
 mod knobs;
@@ -68,14 +69,20 @@ fn densify(arguments: &[&str]) -> Outcome {
     Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
-/// A short run with a small budget. `flags` are words separated by spaces; later ones win nothing
-/// over the fixed ones, so that they must not repeat them.
+/// Calls the program with words separated by spaces.
+fn call(words: &str) -> Outcome {
+    densify(&words.split_whitespace().collect::<Vec<_>>())
+}
+
+/// A short run. `flags` must not repeat the fixed ones.
 fn train(scene: &Path, output: &Path, iterations: u32, flags: &str) -> Outcome {
-    let iterations = iterations.to_string();
-    let mut arguments = vec!["train", text(scene), "-o", text(output), "--sh-degree", "1"];
-    arguments.extend(["--iterations", &iterations]);
-    arguments.extend(flags.split_whitespace());
-    densify(&arguments)
+    let fixed = format!("--sh-degree 1 --iterations {iterations}");
+    call(&format!("train {} -o {} {fixed} {flags}", text(scene), text(output)))
+}
+
+/// Goes on with a run.
+fn resume(scene: &Path, run: &Path, flags: &str) -> Outcome {
+    call(&format!("train {} -o {} --resume {flags}", text(scene), text(run)))
 }
 
 /// Flags that make a policy act often in a run of some dozen steps. Intervals do not shrink with
@@ -104,13 +111,26 @@ fn read(path: &Path) -> Vec<u8> {
     std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
+fn read_text(path: &Path) -> String {
+    String::from_utf8(read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// The options of a run as it has them.
+fn config(run: &Path) -> toml::Table {
+    read_text(&run.join("config.toml")).parse().expect("config.toml is TOML")
+}
+
+fn count(value: &Value, key: &str) -> u64 {
+    value[key].as_u64().unwrap_or_else(|| panic!("no count {key} in {value}"))
+}
+
 fn json(path: &Path) -> Value {
     serde_json::from_slice(&read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
 /// The records of a log.
 fn records(path: &Path) -> Vec<Value> {
-    let text = String::from_utf8(read(path)).expect("logs are UTF-8");
+    let text = read_text(path);
     assert!(text.is_empty() || text.ends_with('\n'), "{}: its last line is cut", path.display());
     let line = |line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{line}: {e}"));
     text.lines().map(line).collect()
@@ -133,6 +153,17 @@ fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
         }
     }
     found
+}
+
+/// Copies a run into another folder as a process leaves it that is killed before its last checkpoint:
+/// without what it wrote after the last iteration.
+fn copy_unfinished(run: &Path, to: &Path, iterations: u32) {
+    let last = format!("iteration_{iterations}");
+    for (name, bytes) in files(run).into_iter().filter(|(name, _)| !name.contains(&last)) {
+        let path = to.join(name);
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+        std::fs::write(path, bytes).expect("a copy");
+    }
 }
 
 /// The model that a run saved after its last iteration.

@@ -38,9 +38,3 @@ fn a_cache_of_two_photographs_is_enough() {
     assert!(small == trained(&scene, "--image-cache 1GiB"));
     assert!(small == trained(&scene, "--image-cache 0"));
 }
-
-#[test]
-fn text_and_binary_reconstructions_give_the_same_model() {
-    let [a, b] = [Photographs::colmap_text(), Photographs::colmap_binary()];
-    assert!(trained(&a, "") == trained(&b, ""));
-}

@@ -4,13 +4,11 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::{Outcome, densify, files, read, records, scratch, text};
+use super::{Outcome, call, files, read, read_text, records, scratch, text};
 use crate::photographs::Photographs;
 
-fn trade(scene: &Path, output: &Path, more: &[&str]) -> Outcome {
-    let mut arguments = vec!["trade", text(scene), "-o", text(output), "-b", "250", "-i", "24"];
-    arguments.extend(more);
-    densify(&arguments)
+fn trade(scene: &Path, output: &Path, more: &str) -> Outcome {
+    call(&format!("trade {} -o {} -b 250 -i 24 {more}", text(scene), text(output)))
 }
 
 #[test]
@@ -18,7 +16,7 @@ fn every_level_is_measured_once_and_in_the_table() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
     let knobs = "alpha_min:1/32,ssim_every:2,tile_cap,transmittance_stop:1e-3:1e-2";
-    let call = ["--knobs", knobs, "--seeds", "2", "--", "--sh-degree", "0"];
+    let call = format!("--knobs {knobs} --seeds 2 -- --sh-degree 0");
     let said = trade(scene.path(), &output, &call).ok().stdout;
     assert!(said.contains("[16/16]") && said.contains("alpha_min=1/32"), "{said}");
     let all = records(&output.join("trade.jsonl"));
@@ -63,7 +61,7 @@ fn every_level_is_measured_once_and_in_the_table() {
     assert!(psnr("alpha_min", "1/32") < 60.0 && psnr("transmittance_stop", "1e-2") < exact);
     assert!(images.iter().all(|r| r["knob"] != "ssim_every"), "it changes no image");
 
-    let table = String::from_utf8(read(&output.join("trade.md"))).expect("UTF-8");
+    let table = read_text(&output.join("trade.md"));
     for words in ["--sh-degree 0", "2 of 2", "bounded", "(exact)", "pareto-", "rasterize"] {
         assert!(table.contains(words), "{words} is not in {table}");
     }
@@ -83,17 +81,16 @@ fn every_level_is_measured_once_and_in_the_table() {
 fn bad_studies_are_refused_before_anything_runs() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    let cases: [(&[&str], &[&str]); 7] = [
-        (&["--knobs", "alpha_mim"], &["alpha_mim", "alpha_min"]),
-        (&["--knobs", "alpha_min:1/2"], &["alpha_min", "1/2", "1/32"]),
-        (&["--knobs", "alpha_min,alpha_min"], &["alpha_min", "twice"]),
-        (&["--knobs", "near"], &["near", "VALUE"]),
-        (&["--knobs", "near:2"], &["near", "less than 1"]),
-        (&["--", "--knob", "alpha_min=1/64"], &["--knob", "study"]),
-        (&["--", "--seed", "3"], &["--seed", "study"]),
-    ];
-    for (more, words) in cases {
-        trade(scene.path(), &output, more).refused(&more.join(" "), words);
-        assert!(!output.exists(), "{more:?}: something was written");
+    for (more, words) in [
+        ("--knobs alpha_mim", ["alpha_mim", "alpha_min"]),
+        ("--knobs alpha_min:1/2", ["alpha_min", "1/32"]),
+        ("--knobs alpha_min,alpha_min", ["alpha_min", "twice"]),
+        ("--knobs near", ["near", "VALUE"]),
+        ("--knobs near:2", ["near", "less than 1"]),
+        ("-- --knob alpha_min=1/64", ["--knob", "study"]),
+        ("-- --seed 3", ["--seed", "study"]),
+    ] {
+        trade(scene.path(), &output, more).refused(more, &words);
+        assert!(!output.exists(), "{more}: something was written");
     }
 }

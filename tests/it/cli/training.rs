@@ -5,7 +5,7 @@ use std::path::Path;
 use densify_policies::registry::{find, policies};
 use serde_json::Value;
 
-use super::{Outcome, files, json, model, often, read, records, scratch, train};
+use super::{Outcome, config, count, files, json, model, often, records, scratch, train};
 use crate::photographs::{POINTS, Photographs, VIEWS};
 
 const ITERATIONS: u32 = 100;
@@ -13,10 +13,6 @@ const BUDGET: u64 = 360;
 
 fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("no number {key} in {value}"))
-}
-
-fn count(value: &Value, key: &str) -> u64 {
-    value[key].as_u64().unwrap_or_else(|| panic!("no count {key} in {value}"))
 }
 
 /// Fails unless every file is there that DESIGN and users expect, and nothing else.
@@ -41,9 +37,7 @@ fn check_tree(run: &Path) {
     assert_eq!(names, expected);
     let cameras = json(&run.join("cameras.json"));
     assert_eq!(cameras.as_array().map(Vec::len), Some(VIEWS));
-    let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
-    let config: toml::Table = config.parse().expect("config.toml is TOML");
-    assert_eq!(config["budget"].as_integer(), Some(BUDGET as i64));
+    assert_eq!(config(run)["budget"].as_integer(), Some(BUDGET as i64));
 }
 
 /// Fails unless rows stay within the budget in every event, and follow from one to the next.
@@ -146,7 +140,7 @@ fn transparent_photographs_without_points_are_trained_on() {
 
 #[test]
 fn more_points_than_the_budget_are_subsampled_and_it_is_said() {
-    let scene = Photographs::colmap_binary();
+    let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     let outcome = train(scene.path(), &run, 3, "--budget 100").ok();
     let told = format!("{} points beyond the budget", POINTS - 100);
@@ -158,7 +152,7 @@ fn more_points_than_the_budget_are_subsampled_and_it_is_said() {
 
 #[test]
 fn a_budget_of_one_row_trains() {
-    let scene = Photographs::colmap_binary();
+    let scene = Photographs::colmap_text();
     for policy in policies().expect("the registry is sound").iter().map(|entry| entry.name) {
         let (_root, run) = scratch();
         train(scene.path(), &run, 100, &format!("--budget 1 --policy {policy} --quiet")).ok();
@@ -169,7 +163,7 @@ fn a_budget_of_one_row_trains() {
 
 #[test]
 fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
-    let scene = Photographs::colmap_binary();
+    let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
     train(scene.path(), &run, 2, "--budget 300").ok();
     std::fs::write(run.join("notes.txt"), "mine").expect("a note");
@@ -191,9 +185,7 @@ fn view_dependent_colour_steps_as_often_as_is_said() {
     let trained = |flags: &str| {
         let (_root, run) = scratch();
         let outcome = train(scene.path(), &run, 20, &format!("--budget 330 {flags}")).ok();
-        let config = String::from_utf8(read(&run.join("config.toml"))).expect("UTF-8");
-        let config: toml::Table = config.parse().expect("config.toml is TOML");
-        let sh_every = config.get("sh_every").and_then(toml::Value::as_integer);
+        let sh_every = config(&run).get("sh_every").and_then(toml::Value::as_integer);
         (model(&run, 20), sh_every, outcome.stdout.contains("gradients summed between steps"))
     };
     let [plain, every, fourth] = ["", "--sh-every 1", "--sh-every 4"].map(trained);

@@ -1,12 +1,12 @@
 //! Photographs that stay on the device.
 
-use densify::backend::gpu::{GpuBackend, GpuDevice, KeptPhotographs};
+use densify::backend::gpu::{GpuBackend, GpuDevice, GpuOptions, KeptPhotographs};
 use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 
-use crate::subject::{devices, gpu, step_input};
+use crate::subject::{devices, step_input};
 use densify::verify::scenes;
 
 /// A view of this size, with a random image.
@@ -15,10 +15,12 @@ fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {
 }
 
 fn backend(device: &GpuDevice, model: &Gaussians, count: usize, with_masks: bool) -> GpuBackend {
-    gpu(device, model, |options| {
-        options.photographs = KeptPhotographs { count, with_masks };
-        options.largest_image = (41, 30);
-    })
+    let options = GpuOptions {
+        photographs: KeptPhotographs { count, with_masks },
+        largest_image: (41, 30),
+        ..GpuOptions::new(model.len())
+    };
+    GpuBackend::new(model, &options, device).expect("a small model fits")
 }
 
 fn step(backend: &mut GpuBackend, step: u32, view: usize, (camera, target): &(Camera, Image8)) {

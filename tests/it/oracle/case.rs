@@ -5,19 +5,19 @@ use std::path::Path;
 
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DMat4};
 use safetensors::{Dtype, SafeTensors};
 
 use densify::verify::reference::Upstream;
 
 /// One scene with everything that is stored about it.
 #[derive(Debug)]
-pub(crate) struct Case {
-    pub(crate) name: String,
-    pub(crate) sh_degree: u8,
-    pub(crate) model: Gaussians,
-    pub(crate) cameras: Vec<Camera>,
-    pub(crate) background: [f32; 3],
+pub(super) struct Case {
+    pub(super) name: String,
+    pub(super) sh_degree: u8,
+    pub(super) model: Gaussians,
+    pub(super) cameras: Vec<Camera>,
+    pub(super) background: [f32; 3],
     /// What the same arithmetic loses in `f32`, by quantity, relative to the largest value.
     floors: BTreeMap<String, f64>,
     arrays: BTreeMap<String, Vec<f64>>,
@@ -25,7 +25,7 @@ pub(crate) struct Case {
 
 /// Which images a stored loss weighs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Part {
+pub(super) enum Part {
     Colour,
     Alpha,
     Depth,
@@ -33,10 +33,10 @@ pub(crate) enum Part {
 }
 
 impl Part {
-    pub(crate) const ALL: [Self; 4] = [Self::Colour, Self::Alpha, Self::Depth, Self::Full];
+    pub(super) const ALL: [Self; 4] = [Self::Colour, Self::Alpha, Self::Depth, Self::Full];
 
     /// The part's name in the names of arrays.
-    pub(crate) fn key(self) -> &'static str {
+    pub(super) fn key(self) -> &'static str {
         match self {
             Self::Colour => "color",
             Self::Alpha => "alpha",
@@ -47,7 +47,7 @@ impl Part {
 }
 
 /// All cases.
-pub(crate) fn cases() -> Vec<Case> {
+pub(super) fn cases() -> Vec<Case> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/oracle");
     let text = std::fs::read_to_string(folder.join("index.json")).expect("the stored cases");
     let index: serde_json::Value = serde_json::from_str(&text).expect("index.json is JSON");
@@ -85,7 +85,7 @@ impl Case {
     }
 
     /// A stored array of our convention.
-    pub(crate) fn expected(&self, key: &str) -> &[f64] {
+    pub(super) fn expected(&self, key: &str) -> &[f64] {
         self.array(&format!("gsplat.{key}"))
     }
 
@@ -94,7 +94,7 @@ impl Case {
     }
 
     /// One camera's part of a stored array whose first axis is the camera.
-    pub(crate) fn of_camera(&self, key: &str, camera: usize) -> &[f64] {
+    pub(super) fn of_camera(&self, key: &str, camera: usize) -> &[f64] {
         self.split(self.expected(key), camera)
     }
 
@@ -104,12 +104,12 @@ impl Case {
     }
 
     /// Whether no decision in a pixel is close. Shape: [height, width].
-    pub(crate) fn decided(&self, camera: usize) -> Vec<bool> {
+    pub(super) fn decided(&self, camera: usize) -> Vec<bool> {
         self.split(self.array("pixel_ok"), camera).iter().map(|&ok| ok > 0.0).collect()
     }
 
     /// The weights of a stored loss.
-    pub(crate) fn upstream(&self, camera: usize, part: Part) -> Upstream {
+    pub(super) fn upstream(&self, camera: usize, part: Part) -> Upstream {
         let take = |key: &str, of: Part| -> Vec<f64> {
             let weights = self.split(self.array(&format!("loss_weight.{key}")), camera);
             let on = part == of || part == Part::Full;
@@ -124,7 +124,7 @@ impl Case {
 
     /// Ten times what `f32` loses in this quantity. Where that was not measured, the largest
     /// loss of the same parameter class, of another loss, or else of any gradient, stands in.
-    pub(crate) fn tolerance(&self, key: &str) -> f64 {
+    pub(super) fn tolerance(&self, key: &str) -> f64 {
         let class = key.rsplit('.').next().unwrap_or(key);
         let largest = |of: &dyn Fn(&str) -> bool| {
             let floors = self.floors.iter().filter(|(k, _)| !k.contains(':') && of(k));
@@ -170,21 +170,18 @@ fn model(arrays: &BTreeMap<String, Vec<f64>>, sh_degree: u8) -> Gaussians {
 fn cameras(arrays: &BTreeMap<String, Vec<f64>>, width: u32, height: u32) -> Vec<Camera> {
     let poses = arrays["in.viewmats"].as_chunks::<16>().0;
     let intrinsics = arrays["in.Ks"].as_chunks::<9>().0;
-    poses
-        .iter()
-        .zip(intrinsics)
-        .map(|(m, k)| Camera {
+    let camera = |(pose, k): (&[f64; 16], &[f64; 9])| {
+        let pose = DMat4::from_cols_array(pose).transpose();
+        Camera {
             width,
             height,
             fx: k[0],
             fy: k[4],
             cx: k[2],
             cy: k[5],
-            rotation: DMat3::from_cols_array(&[
-                m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10],
-            ])
-            .transpose(),
-            translation: DVec3::new(m[3], m[7], m[11]),
-        })
-        .collect()
+            rotation: DMat3::from_mat4(pose),
+            translation: pose.w_axis.truncate(),
+        }
+    };
+    poses.iter().zip(intrinsics).map(camera).collect()
 }

@@ -1,5 +1,5 @@
-//! Tests of the optional parts of the loss; `tests/it/loss.rs` compares its values and gradients with
-//! the reference.
+//! Tests of the optional parts of the loss; the selftest compares its values and gradients with the
+//! reference.
 
 use super::super::tiles::Grid;
 use super::*;

@@ -1,0 +1,43 @@
+//! Gradients and losses on their own: tools for tests and for research, not part of training.
+
+use super::cpu::{ImageGradient, ModelGradient};
+use super::{Backend, BackendError, Rendering, StepOutput};
+use crate::camera::Camera;
+use crate::dataset::images::Image8;
+
+/// A backend with gradients and losses on their own.
+pub trait Differentiable: Backend {
+    /// Renders a view and differentiates Σ rgb·upstream.rgb + Σ alpha·upstream.alpha +
+    /// Σ depth·upstream.depth with respect to every parameter. Changes nothing of the model.
+    ///
+    /// Needs every field of a record, so that it allocates more than the ledger says where the
+    /// policy's needs are smaller.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When `upstream` does not have the image's size.
+    fn differentiate(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        upstream: &ImageGradient,
+    ) -> Result<(Rendering, ModelGradient), BackendError>;
+
+    /// The training loss of a rendering against a target and its gradient by the rendering's
+    /// pixels. Shape of the gradient: `[height, width, 3]`.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When rendering and target differ in size.
+    fn loss(
+        &mut self,
+        rendering: &Rendering,
+        target: &Image8,
+        background: [f32; 3],
+    ) -> Result<(StepOutput, Vec<f32>), BackendError>;
+}

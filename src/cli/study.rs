@@ -1,0 +1,22 @@
+//! `densify compare` and `densify trade`.
+
+use super::console::Console;
+use super::flags;
+use crate::failure::Failure;
+use crate::study::{Comparison, Finished, Trade};
+
+pub(super) fn compare(args: &Comparison, console: &Console) -> Result<(), Failure> {
+    let train = flags::parsed(&args.train, "densify compare ... --")?;
+    finish(args.run(train, console)?, console)
+}
+
+pub(super) fn trade(args: &Trade, console: &Console) -> Result<(), Failure> {
+    let train = flags::parsed(&args.train, "densify trade ... --")?;
+    finish(args.run(train, console)?, console)
+}
+
+fn finish(Finished { summary, report }: Finished, console: &Console) -> Result<(), Failure> {
+    console.result(summary);
+    console.result(format_args!("everything in {}", report.display()));
+    Ok(())
+}

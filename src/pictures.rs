@@ -1,0 +1,52 @@
+//! Pictures of renderings and photographs, eight bits a channel, and PNG files of them.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use image::{DynamicImage, ImageFormat, Rgb, RgbImage, imageops};
+
+use crate::backend::Rendering;
+use crate::dataset::images::Image8;
+use crate::output::{OutputError, write_atomically};
+
+/// A value in `[0, 1]` in eight bits.
+pub(crate) fn to_u8(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+/// The colours of a rendering.
+pub(crate) fn picture(Rendering { width, height, rgb, .. }: &Rendering) -> RgbImage {
+    let pixel = |x: u32, y: u32| {
+        let at = 3 * (y as usize * *width as usize + x as usize);
+        Rgb([rgb[at], rgb[at + 1], rgb[at + 2]].map(to_u8))
+    };
+    RgbImage::from_fn(*width, *height, pixel)
+}
+
+/// A photograph over a background.
+pub(crate) fn photograph(image: &Image8, background: [f32; 3]) -> RgbImage {
+    let pixel =
+        |x: u32, y: u32| Rgb(image.composited(x as usize, y as usize, background).map(to_u8));
+    RgbImage::from_fn(image.width, image.height, pixel)
+}
+
+/// Pictures from left to right, with white gaps `[px]` between them.
+pub(crate) fn side_by_side(pictures: &[RgbImage], gap: u32) -> RgbImage {
+    let width = pictures.iter().map(|picture| picture.width() + gap).sum::<u32>() - gap;
+    let height = pictures.iter().map(RgbImage::height).max().unwrap_or(1);
+    let mut all = RgbImage::from_pixel(width, height, Rgb([255; 3]));
+    let mut x = 0;
+    for picture in pictures {
+        imageops::replace(&mut all, picture, i64::from(x), 0);
+        x += picture.width() + gap;
+    }
+    all
+}
+
+pub(crate) fn write_png(path: &Path, image: &DynamicImage) -> Result<(), OutputError> {
+    write_atomically(path, |out| {
+        let mut encoded = Cursor::new(Vec::new());
+        image.write_to(&mut encoded, ImageFormat::Png).map_err(std::io::Error::other)?;
+        out.write_all(&encoded.into_inner())
+    })
+}

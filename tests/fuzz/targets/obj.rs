@@ -1,6 +1,0 @@
-//! See `formats.rs`.
-#![no_main]
-
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    densify_fuzz::obj(bytes);
-});
