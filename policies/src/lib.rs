@@ -36,7 +36,7 @@
 //!    `>= a`, `> a`, `a to b`, `a to b, both excluded` (or `a excluded`), a list of words, or nothing.
 //! 2. **Parameters**: a struct with defaults, which `--policy-set NAME.parameter=value` overrides. Those
 //!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS) scale with the length
-//!    of the run.
+//!    of the run, and say whether they are a step or an interval.
 //! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and reading
 //!    another is an error. Signals measured in training cost little.
 //!    [`Signal::FreshWeightMax`](policy::Signal::FreshWeightMax) and auxiliary views
@@ -71,6 +71,7 @@
 //! //! | share | 0.05 | 0 to 1 | Gaussians | share that is replaced |
 //!
 //! use densify_policies::adc::split_by;
+//! use densify_policies::parameters::StepParameter::{self, Interval, Step};
 //! use densify_policies::parameters::in_range;
 //! use densify_policies::plan::EditPlan;
 //! use densify_policies::policy::{
@@ -99,7 +100,7 @@
 //!
 //! impl ConfiguredPolicy for Fade {
 //!     type Params = FadeParams;
-//!     const STEP_PARAMETERS: &'static [&'static str] = &["every"];
+//!     const STEP_PARAMETERS: &'static [StepParameter] = &[Interval("every")];
 //!
 //!     fn new(params: FadeParams, _scene: &SceneInfo) -> PolicyResult<Self> {
 //!         in_range("every", f64::from(params.every), 1.0..)?;

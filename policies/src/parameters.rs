@@ -91,16 +91,37 @@ pub fn parse_value(text: &str) -> Value {
 /// new rows must settle, which takes as many steps in a short run as in a long one.
 const MIN_INTERVAL: i64 = 100;
 
-/// Multiplies the step counts named in `names` by `iterations` / 30,000: rounded, at least 1, but
-/// 0 (which switches something off) stays 0. Intervals, whose names end in `_every`, stop shrinking
-/// at [`MIN_INTERVAL`].
-pub(crate) fn scale_steps(table: &mut Table, names: &[&str], iterations: u32) {
-    for name in names {
-        if let Some(Value::Integer(steps)) = table.get_mut(*name)
+/// A parameter that counts steps, by its name. Its default is meant for a run of 30,000 steps and scales
+/// with the length of the run; what is set is taken as it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StepParameter {
+    /// A step of the run, or a number of them: scales in proportion.
+    Step(&'static str),
+    /// The steps from one event to the next: scales, but does not shrink below 100.
+    Interval(&'static str),
+}
+
+impl StepParameter {
+    /// The parameter's name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        let (Self::Step(name) | Self::Interval(name)) = self;
+        name
+    }
+}
+
+/// Multiplies step counts by `iterations` / 30,000: rounded, at least 1, but 0 (which switches something
+/// off) stays 0. Intervals stop shrinking at [`MIN_INTERVAL`].
+pub(crate) fn scale_steps(table: &mut Table, parameters: &[StepParameter], iterations: u32) {
+    for parameter in parameters {
+        if let Some(Value::Integer(steps)) = table.get_mut(parameter.name())
             && *steps > 0
         {
             let factor = f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
-            let least = if name.ends_with("_every") { (*steps).min(MIN_INTERVAL) } else { 1 };
+            let least = match parameter {
+                StepParameter::Interval(_) => (*steps).min(MIN_INTERVAL),
+                StepParameter::Step(_) => 1,
+            };
             *steps = ((*steps as f64 * factor).round() as i64).max(least);
         }
     }
@@ -209,21 +230,25 @@ mod tests {
 
     #[test]
     fn schedules_scale_with_the_run() {
+        // The parameters' names say nothing.
         let scaled = |steps: i64, iterations| {
             let mut table = Table::new();
-            table.insert("every".into(), steps.into());
-            table.insert("rows".into(), 100.into());
-            scale_steps(&mut table, &["every", "absent"], iterations);
-            assert_eq!(table["rows"].as_integer(), Some(100));
-            table["every"].as_integer().unwrap()
+            for name in ["until_every", "every", "rows"] {
+                table.insert(name.into(), steps.into());
+            }
+            let kinds = ["until_every", "absent"].map(StepParameter::Step);
+            scale_steps(&mut table, &kinds, iterations);
+            scale_steps(&mut table, &[StepParameter::Interval("every")], iterations);
+            assert_eq!(table["rows"].as_integer(), Some(steps));
+            ["until_every", "every"].map(|name| table[name].as_integer().unwrap())
         };
-        assert_eq!(scaled(100, 30_000), 100);
-        assert_eq!(scaled(100, 2_000), 7);
-        assert_eq!(scaled(50, 2_000), 3);
-        assert_eq!(scaled(100, 60_000), 200);
-        assert_eq!(scaled(100, 1), 1);
-        assert_eq!(scaled(100, 0), 1);
-        assert_eq!(scaled(0, 60_000), 0);
+        assert_eq!(scaled(100, 30_000), [100, 100]);
+        assert_eq!(scaled(100, 2_000), [7, 100]);
+        assert_eq!(scaled(50, 2_000), [3, 50]);
+        assert_eq!(scaled(3_000, 2_000), [200, 200]);
+        assert_eq!(scaled(100, 60_000), [200, 200]);
+        assert_eq!(scaled(100, 0), [1, 100]);
+        assert_eq!(scaled(0, 60_000), [0, 0]);
     }
 
     #[test]

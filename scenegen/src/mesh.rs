@@ -225,6 +225,19 @@ impl Model {
         if self.triangles.is_empty() {
             return Err(Error::Empty { name: path.display().to_string() });
         }
+        let has_area = |triangle: &[u32; 3]| {
+            let [a, b, c] = triangle.map(|i| self.positions[i as usize]);
+            (b - a).cross(c - a).length_squared() > 0.0
+        };
+        if !self.triangles.iter().any(has_area) {
+            let problem = "no triangle has an area";
+            return Err(Error::malformed(
+                path,
+                "the mesh",
+                problem,
+                "correct the mesh or its scale",
+            ));
+        }
         self.name =
             path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         Ok(self)

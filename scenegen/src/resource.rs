@@ -3,7 +3,7 @@
 //! References are plain relative paths that stay in the mesh's folder, symbolic links followed. No
 //! allocation is sized by a header's declaration: readers take the bytes that exist, decoders have limits.
 
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
@@ -30,9 +30,24 @@ const MAX_TEXELS: u64 = 1 << 29;
 /// Longest reference `[bytes]`.
 const MAX_NAME: usize = 4096;
 
+/// Opens a file for reading. A pipe, a socket or a device is refused at once, not waited for.
+pub(crate) fn open(path: &Path) -> Result<File, Error> {
+    let mut options = OpenOptions::new();
+    options.read(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, libc::O_NONBLOCK);
+    let file = options.open(path).map_err(Error::io(path))?;
+    let known = file.metadata().map_err(Error::io(path))?;
+    if !known.is_file() && !known.is_dir() {
+        let problem = "it is a pipe, a socket or a device, not a file";
+        return Err(Error::malformed(path, "the file", problem, "put the right file there"));
+    }
+    Ok(file)
+}
+
 /// Reads a whole file.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
-    let file = File::open(path).map_err(Error::io(path))?;
+    let file = open(path)?;
     let known = file.metadata().map_err(Error::io(path))?;
     let too_large =
         || Error::malformed(path, "the file", "it is larger than 16 GiB", "split the mesh");

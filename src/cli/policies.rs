@@ -26,7 +26,7 @@ pub(super) fn run(args: &PoliciesArgs, console: &Console) -> Result<(), Failure>
         }
         for (parameter, value) in parameters {
             let key = format!("{name}.{parameter}");
-            let scales = entry.step_parameters().contains(&&*parameter);
+            let scales = entry.step_parameters().iter().any(|step| step.name() == parameter);
             let note = if scales { "   (scales with --iterations)" } else { "" };
             console.result(format_args!("  --policy-set {key}={value}{note}"));
         }

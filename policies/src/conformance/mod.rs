@@ -16,6 +16,7 @@
 //! same. [`Check`] lists what is checked of every plan:
 //!
 //! - the budget holds, and one row is left;
+//! - the policy edits at least one of these models, which have up to 5,000 rows, so that small shares count;
 //! - the same input gives the same plan, and a policy saved and restored in mid-run continues the same;
 //! - nothing is read that was not declared, and declarations are valid;
 //! - no statistics and no refusals cause an error or a panic;
@@ -59,6 +60,8 @@ pub enum Check {
     KeepsPlan,
     /// It leaves at least one row of a model that had any.
     LeavesARow,
+    /// It edits a model in at least one of the scripted runs; else the other checks have seen nothing.
+    Edits,
     /// From the same inputs it makes the same plan, has the same needs and is due at the same steps.
     IsDeterministic,
     /// Saved as JSON in mid-run and restored, it continues the same.
@@ -80,6 +83,7 @@ impl fmt::Display for Check {
             Self::NeverFails => "plans without error, whatever it is given",
             Self::KeepsPlan => "keeps the plan that it is given",
             Self::LeavesARow => "leaves at least one row",
+            Self::Edits => "edits a model",
             Self::IsDeterministic => "makes the same plan from the same inputs",
             Self::RestoresState => "continues the same after save and restore",
             Self::RejectsForeignState => "refuses a state that is not its own",
@@ -143,10 +147,17 @@ pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report>
     let mut report = Report::new(entry);
     check_building(entry, set, &mut report);
     if report.failures.is_empty() {
+        let mut edits = false;
         for scenario in scenarios::scenarios() {
-            if let Err((check, how)) = run::run(entry, set, &scenario) {
-                report.add(check, format!("{scenario}: {how}"));
+            match run::run(entry, set, &scenario) {
+                Ok(edited) => edits |= edited,
+                Err((check, how)) => report.add(check, format!("{scenario}: {how}")),
             }
+        }
+        if !edits && report.failures.is_empty() {
+            let how = "no plan of any run changed a row, although models had up to 5,000 rows and room \
+                       to grow; set parameters by which it acts, with check_policy_with";
+            report.add(Check::Edits, how.to_owned());
         }
     }
     report.result()
@@ -160,7 +171,7 @@ fn check_building(entry: &PolicyEntry, set: &Table, report: &mut Report) {
         }
     }
     let parameters = entry.parameters();
-    for step in entry.step_parameters() {
+    for step in entry.step_parameters().iter().map(|step| step.name()) {
         if !parameters.iter().any(|(name, value)| name == step && value.is_integer()) {
             report.add(Check::Builds, format!("`{step}` counts steps but is no integer parameter"));
         }

@@ -15,8 +15,6 @@ use crate::policy::{
 use crate::registry::PolicyEntry;
 use crate::rng::PolicyRng;
 
-/// Most events of one run, for policies that are due at every step.
-const MAX_EVENTS: usize = 400;
 /// Most auxiliary views of an event.
 const MAX_VIEWS: u32 = 3;
 
@@ -24,8 +22,8 @@ type Failure = (Check, String);
 
 /// Runs a scenario with several copies of the policy: one as in training; a second one; one that is
 /// shown more than it declares; and, from a third and from two thirds of the run on, one that was saved
-/// and restored. All must make the same plans.
-pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<(), Failure> {
+/// and restored. All must make the same plans. Returns whether any plan edited the model.
+pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<bool, Failure> {
     let scene = &scenario.scene;
     let build = || {
         let built = catch_panic(|| entry.build(set, scene));
@@ -43,7 +41,8 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
 
     let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
     let mut model = Model { rows: scene.initial_rows, candidates: Vec::new() };
-    let events = due.len().min(MAX_EVENTS);
+    let mut edits = false;
+    let events = due.len().min(scenario.most_events());
     for (event, &step) in due.iter().take(events).enumerate() {
         let rows = model.rows;
         let at = |(check, why): Failure| (check, format!("step {step}, {rows} rows: {why}"));
@@ -51,9 +50,11 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
             copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(at)?));
         }
         let ops = run_event(&mut *policy, &mut copies, &needs, scenario, &mut model, step);
-        model.apply(&ops.map_err(at)?);
+        let ops = ops.map_err(at)?;
+        edits |= ops.edits_rows();
+        model.apply(&ops);
     }
-    Ok(())
+    Ok(edits)
 }
 
 /// Checks that the needs are consistent and in range, and that no cadence exceeds the declared one.

@@ -15,7 +15,17 @@ pub(super) struct Scenario {
     pattern: Pattern,
 }
 
+/// Most events of one run, for policies that are due at every step; and of one with many rows.
+const MOST_EVENTS: [usize; 2] = [400, 40];
+/// Rows of a model in which even small shares are rows.
+const MANY: usize = 5_000;
+
 impl Scenario {
+    /// Most events that are looked at.
+    pub(super) fn most_events(&self) -> usize {
+        MOST_EVENTS[usize::from(self.scene.initial_rows >= MANY)]
+    }
+
     /// The budget of the plan for a model of `rows` rows.
     pub(super) fn budget(&self, rows: usize) -> usize {
         if self.refuses_growth { rows } else { self.scene.budget }
@@ -63,5 +73,11 @@ pub(super) fn scenarios() -> Vec<Scenario> {
     let runs = models.into_iter().flat_map(|(name, scene, refuses_growth)| {
         PATTERNS.map(|pattern| Scenario { name, scene: scene.clone(), refuses_growth, pattern })
     });
-    runs.collect()
+    let many = [Pattern::Plausible, Pattern::Mixture].map(|pattern| Scenario {
+        name: "thousands of rows",
+        scene: scene(MANY, MANY + MANY / 2),
+        refuses_growth: false,
+        pattern,
+    });
+    runs.chain(many).collect()
 }

@@ -3,11 +3,13 @@
 //! One piece, as all faults are those of one policy.
 
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
 use super::*;
 use crate::adc::clone_at;
+use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::EditPlan;
 use crate::policy::{
@@ -52,9 +54,15 @@ enum Fault {
     SavesOnlyPart,
     DeclaresNan,
     HasUndeclaredCadence,
+    NeverEdits,
+    /// Takes one row in a thousand, by the system's clock.
+    ReadsTheClock,
+    PanicsOnManyRows,
+    /// Remembers rows beyond the thousandth, and does not save them.
+    ForgetsManyRows,
 }
 
-const FAULTS: [(Fault, Option<Check>); 22] = [
+const FAULTS: [(Fault, Option<Check>); 26] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
     (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
@@ -77,6 +85,10 @@ const FAULTS: [(Fault, Option<Check>); 22] = [
     (Fault::SavesOnlyPart, Some(Check::RestoresState)),
     (Fault::DeclaresNan, Some(Check::DeclaresValidNumbers)),
     (Fault::HasUndeclaredCadence, Some(Check::DeclaresValidNumbers)),
+    (Fault::NeverEdits, Some(Check::Edits)),
+    (Fault::ReadsTheClock, Some(Check::IsDeterministic)),
+    (Fault::PanicsOnManyRows, Some(Check::NeverFails)),
+    (Fault::ForgetsManyRows, Some(Check::RestoresState)),
 ];
 
 /// Shared state that makes policies nondeterministic.
@@ -100,13 +112,15 @@ struct Faulty {
     events: u64,
     /// Bits of the numbers seen in the auxiliary views of its life.
     seen: u64,
+    /// What the policy forgets to save.
+    unsaved: u32,
 }
 
 impl ConfiguredPolicy for Faulty {
     type Params = Params;
-    const STEP_PARAMETERS: &'static [&'static str] = &["every"];
+    const STEP_PARAMETERS: &'static [StepParameter] = &[Interval("every")];
     fn new(params: Params, _scene: &SceneInfo) -> PolicyResult<Self> {
-        Ok(Self { fault: params.fault, events: 0, seen: 0 })
+        Ok(Self { fault: params.fault, events: 0, seen: 0, unsaved: 0 })
     }
 }
 
@@ -188,6 +202,24 @@ impl DensityPolicy for Faulty {
         let rows: Vec<u32> = (0..now.rows() as u32).collect();
         if self.has(Fault::ReplacesThePlan) {
             *plan = EditPlan::new(now.rows(), plan.budget() + 1);
+        }
+        match self.fault {
+            Fault::NeverEdits => return Ok(()),
+            Fault::ReadsTheClock => {
+                let now_ns = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+                let chosen = now_ns.subsec_nanos() % (now.rows() as u32).max(1);
+                for row in (0..now.rows() as u32 / 1000).map(|i| (chosen + i) % now.rows() as u32) {
+                    let _ = plan.prune(row);
+                }
+                return Ok(());
+            }
+            Fault::PanicsOnManyRows => assert!(now.rows() <= 1000, "too many rows"),
+            Fault::ForgetsManyRows if now.rows() > 1000 => {
+                let _ = plan.prune(self.unsaved % 1000);
+                self.unsaved += 1;
+                return Ok(());
+            }
+            _ => {}
         }
         if self.events.is_multiple_of(3) {
             let keep = if self.has(Fault::PrunesAll) { 0 } else { 1 };
@@ -289,7 +321,7 @@ struct Unbuildable;
 
 impl ConfiguredPolicy for Unbuildable {
     type Params = Lax;
-    const STEP_PARAMETERS: &'static [&'static str] = &["threshold"];
+    const STEP_PARAMETERS: &'static [StepParameter] = &[Step("threshold")];
     fn new(params: Lax, scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("threshold", params.threshold, 0.0..=1.0)?;
         if scene.iterations == 7 {

@@ -146,6 +146,7 @@
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
 
 use crate::adc::{PruneLimits, Window, mean_over_views, spare_one};
+use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
     AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
@@ -188,16 +189,16 @@ pub struct Diet {
 impl ConfiguredPolicy for Diet {
     type Params = DietParams;
 
-    const STEP_PARAMETERS: &'static [&'static str] = &[
-        "grow_from",
-        "grow_until",
-        "grow_every",
-        "max_scale_from",
-        "prune_every",
-        "compensate_from",
-        "compensate_until",
-        "insert_every",
-        "reinit_at",
+    const STEP_PARAMETERS: &'static [StepParameter] = &[
+        Step("grow_from"),
+        Step("grow_until"),
+        Interval("grow_every"),
+        Step("max_scale_from"),
+        Interval("prune_every"),
+        Step("compensate_from"),
+        Step("compensate_until"),
+        Interval("insert_every"),
+        Step("reinit_at"),
     ];
 
     fn new(params: DietParams, scene: &SceneInfo) -> PolicyResult<Self> {

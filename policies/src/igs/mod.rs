@@ -77,6 +77,7 @@
 //! (`…_every`) do not shrink below 100 steps. `recover`, `sum` and `sum_more` do not scale.
 
 use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
+use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult,
@@ -119,16 +120,16 @@ struct EdgeScore {
 impl ConfiguredPolicy for Igs {
     type Params = IgsParams;
 
-    const STEP_PARAMETERS: &'static [&'static str] = &[
-        "grow_from",
-        "grow_until",
-        "grow_every",
-        "curve_until",
-        "final_from",
-        "first_prune_at",
-        "reset_every",
-        "sum_from",
-        "sum_more_from",
+    const STEP_PARAMETERS: &'static [StepParameter] = &[
+        Step("grow_from"),
+        Step("grow_until"),
+        Interval("grow_every"),
+        Step("curve_until"),
+        Step("final_from"),
+        Step("first_prune_at"),
+        Interval("reset_every"),
+        Step("sum_from"),
+        Step("sum_more_from"),
     ];
 
     fn new(params: IgsParams, scene: &SceneInfo) -> PolicyResult<Self> {

@@ -66,6 +66,7 @@ use std::ops::Bound::{Excluded, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::adc::Window;
+use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
 use crate::policy::{
@@ -137,7 +138,8 @@ pub struct Mcmc {
 impl ConfiguredPolicy for Mcmc {
     type Params = McmcParams;
 
-    const STEP_PARAMETERS: &'static [&'static str] = &["grow_from", "grow_until", "grow_every"];
+    const STEP_PARAMETERS: &'static [StepParameter] =
+        &[Step("grow_from"), Step("grow_until"), Interval("grow_every")];
 
     fn new(params: McmcParams, _scene: &SceneInfo) -> PolicyResult<Self> {
         // Rounded to the f32 that plans take: 0.99999999 becomes 1.

@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use crate::parameters::{field_names, nearest, scale_steps};
+use crate::parameters::{StepParameter, field_names, nearest, scale_steps};
 use crate::policy::{DensityPolicy, PolicyError, PolicyResult, SceneInfo};
 
 #[doc(hidden)]
@@ -21,9 +21,9 @@ pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
     type Params: Serialize + DeserializeOwned + Default;
 
     /// Integer parameters that count steps. Their defaults are for a run of 30,000 steps and scale with
-    /// its length; values set by the user do not. Names that end in `_every` are intervals, which do
-    /// not shrink below 100 steps (or below their default, if that is less).
-    const STEP_PARAMETERS: &'static [&'static str] = &[];
+    /// its length; values set by the user do not. An [`Interval`](StepParameter::Interval) does not
+    /// shrink below 100 steps (or below its default, if that is less).
+    const STEP_PARAMETERS: &'static [StepParameter] = &[];
 
     /// Builds the policy. Check ranges here, with [`in_range`](crate::parameters::in_range).
     ///
@@ -67,7 +67,7 @@ pub struct PolicyEntry {
     pub source: &'static str,
     doc: &'static str,
     place: (&'static str, u32),
-    step_parameters: &'static [&'static str],
+    step_parameters: &'static [StepParameter],
     field_names: fn() -> Option<&'static [&'static str]>,
     defaults: fn() -> Result<Table, String>,
     /// The table after a round trip through the parameters' types.
@@ -124,9 +124,9 @@ impl PolicyEntry {
         text.trim().to_owned() + "\n"
     }
 
-    /// Names of the parameters that count steps and scale with the run's length.
+    /// The parameters that count steps and scale with the run's length.
     #[must_use]
-    pub fn step_parameters(&self) -> &'static [&'static str] {
+    pub fn step_parameters(&self) -> &'static [StepParameter] {
         self.step_parameters
     }
 

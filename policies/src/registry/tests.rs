@@ -3,6 +3,7 @@
 use serde::Deserialize;
 
 use super::*;
+use crate::parameters::StepParameter::Step;
 use crate::parameters::in_range;
 use crate::plan::EditPlan;
 use crate::policy::{Needs, Snapshot};
@@ -52,7 +53,7 @@ impl DensityPolicy for Idle {
 
 impl ConfiguredPolicy for Idle {
     type Params = Params;
-    const STEP_PARAMETERS: &'static [&'static str] = &["every", "from"];
+    const STEP_PARAMETERS: &'static [StepParameter] = &[Step("every"), Step("from")];
     fn new(params: Params, _scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("threshold", params.threshold, 0.0..=1.0)?;
         Ok(Self(params))

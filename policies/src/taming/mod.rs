@@ -90,6 +90,7 @@ use crate::adc::{
     OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
     split_by,
 };
+use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
@@ -126,14 +127,14 @@ pub struct Taming {
 impl ConfiguredPolicy for Taming {
     type Params = TamingParams;
 
-    const STEP_PARAMETERS: &'static [&'static str] = &[
-        "grow_from",
-        "grow_until",
-        "grow_every",
-        "max_scale_from",
-        "prune_until",
-        "reset_every",
-        "white_reset_at",
+    const STEP_PARAMETERS: &'static [StepParameter] = &[
+        Step("grow_from"),
+        Step("grow_until"),
+        Interval("grow_every"),
+        Step("max_scale_from"),
+        Step("prune_until"),
+        Interval("reset_every"),
+        Step("white_reset_at"),
     ];
 
     fn new(params: TamingParams, scene: &SceneInfo) -> PolicyResult<Self> {

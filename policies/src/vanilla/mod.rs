@@ -63,6 +63,7 @@ use crate::adc::{
     OpacityResets, PruneLimits, Window, clone_at, concave_curve, mean_over_views, spare_one,
     split_by,
 };
+use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
@@ -129,13 +130,13 @@ pub struct Vanilla {
 impl ConfiguredPolicy for Vanilla {
     type Params = VanillaParams;
 
-    const STEP_PARAMETERS: &'static [&'static str] = &[
-        "grow_from",
-        "grow_until",
-        "grow_every",
-        "max_scale_from",
-        "reset_every",
-        "white_reset_at",
+    const STEP_PARAMETERS: &'static [StepParameter] = &[
+        Step("grow_from"),
+        Step("grow_until"),
+        Interval("grow_every"),
+        Step("max_scale_from"),
+        Interval("reset_every"),
+        Step("white_reset_at"),
     ];
 
     fn new(params: VanillaParams, scene: &SceneInfo) -> PolicyResult<Self> {

@@ -110,8 +110,9 @@ pub(super) fn fault(path: &Path, element: impl Into<String>, problem: impl Into<
     Error::malformed(path, element, problem, REMEDY)
 }
 
-/// The JSON part. Whole numbers may be written as 1.0 (glTF 2.0, 2.7.1), which the crate's types
-/// refuse: these are written anew where it fails.
+/// The JSON part. Where the crate's types refuse it, it is written anew as they expect it: whole numbers
+/// may be written as 1.0 (glTF 2.0, 2.7.1), `extras` may be of any type (3.2), and a scene need not have
+/// nodes (5.25).
 fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
     let error = match json::deserialize::from_slice(text) {
         Ok(root) => return Ok(root),
@@ -120,15 +121,24 @@ fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
     let Ok(mut value) = serde_json::from_slice::<Value>(text) else {
         return Err(error);
     };
-    whole_numbers(&mut value);
+    normalise(&mut value);
+    for scene in value.get_mut("scenes").and_then(Value::as_array_mut).into_iter().flatten() {
+        if let Some(scene) = scene.as_object_mut() {
+            scene.entry("nodes").or_insert_with(|| Value::Array(Vec::new()));
+        }
+    }
     // What is wrong besides is where it was.
     serde_json::from_value(value).map_err(|_| error)
 }
 
-fn whole_numbers(value: &mut Value) {
+/// Leaves out what applications add for themselves, and writes whole numbers without a fraction.
+fn normalise(value: &mut Value) {
     match value {
-        Value::Array(list) => list.iter_mut().for_each(whole_numbers),
-        Value::Object(map) => map.values_mut().for_each(whole_numbers),
+        Value::Array(list) => list.iter_mut().for_each(normalise),
+        Value::Object(map) => {
+            map.remove("extras");
+            map.values_mut().for_each(normalise);
+        }
         Value::Number(number) => {
             // Beyond 2^53 not every whole number is a float.
             let float = number.as_f64().filter(|v| v.fract() == 0.0 && (0.0..9e15).contains(v));

@@ -227,3 +227,30 @@ fn whole_numbers_may_be_written_as_floats() {
     let message = with("/accessors/0/count", json!(4.5)).expect_err("no whole number").to_string();
     assert!(message.contains("JSON") && message.contains("4.5"), "{message}");
 }
+
+#[test]
+fn what_applications_add_for_themselves_may_be_anything() {
+    for extras in [json!("a word"), json!([1.5, null]), json!(7), json!({ "deep": { "er": [] } })] {
+        for place in
+            ["/extras", "/asset/extras", "/meshes/0/primitives/0/extras", "/nodes/0/extras"]
+        {
+            let model = with(place, extras.clone());
+            assert_eq!(model.expect("a valid file").triangles.len(), 2, "{place}: {extras}");
+        }
+    }
+}
+
+#[test]
+fn a_scene_without_nodes_is_valid_and_empty() {
+    let (mut json, bin) = square();
+    json["scenes"] = json!([{ "nodes": [0] }, { "name": "for later" }]);
+    assert_eq!(load_bytes(&glb(&json, &bin)).expect("a valid file").triangles.len(), 2);
+    json["scene"] = json!(1);
+    assert!(matches!(load_bytes(&glb(&json, &bin)), Err(Error::Empty { .. })));
+}
+
+#[test]
+fn a_mesh_without_an_area_is_refused() {
+    let error = with("/nodes/0/scale", json!([0, 1, 1])).expect_err("a line").to_string();
+    assert!(error.contains("no triangle has an area"), "{error}");
+}

@@ -8,7 +8,11 @@
 //! | grow_every | 100 | >= 1 | steps | interval |
 //! | grow_until | 15000 | >= 0 | step | end (exclusive) |
 
-use densify_policies::{adc, parameters::in_range, plan::*, policy::*, rng::PolicyRng, sample};
+use densify_policies::parameters::{
+    StepParameter::{self, Interval, Step},
+    in_range,
+};
+use densify_policies::{adc, plan::*, policy::*, rng::PolicyRng, sample};
 
 densify_policies::register_policy!("steady", Steady, summary: "splits where gradients are large",
     source: "an example", doc: include_str!("lib.rs"));
@@ -29,7 +33,7 @@ impl Default for Steady {
 
 impl densify_policies::registry::ConfiguredPolicy for Steady {
     type Params = Self;
-    const STEP_PARAMETERS: &'static [&'static str] = &["grow_every", "grow_until"];
+    const STEP_PARAMETERS: &'static [StepParameter] = &[Interval("grow_every"), Step("grow_until")];
     fn new(params: Self, _: &SceneInfo) -> Result<Self, PolicyError> {
         in_range("grow_every", f64::from(params.grow_every), 1.0..)?;
         Ok(params)
