@@ -19,6 +19,8 @@ use crate::trainer::TrainError;
 pub const OTHER: u8 = 1;
 /// Exit code of bad input and usage.
 pub const INPUT: u8 = 2;
+/// Exit code where a measured value is beyond the limit that was given for it.
+pub const LIMIT: u8 = 4;
 /// Exit code where device or memory do not suffice.
 pub const DEVICE: u8 = 3;
 

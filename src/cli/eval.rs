@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
+use super::limits::{self, Limit};
 use crate::evaluate::{Mean, Split, evaluate};
 use crate::failure::Failure;
 use crate::metrics::geometry::{self, Geometry, KnownScene};
@@ -36,6 +37,13 @@ pub(super) struct EvalArgs {
     /// Folder of the dataset, where it is no longer where it was
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
+    /// Exit with code 4 where a value is smaller: psnr, ssim, flip, or the path of a number in
+    /// geometry.json, such as centres.f_score_one_percent; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    fail_below: Vec<Limit>,
+    /// Exit with code 4 where a value is larger, such as flip or depth.rmse; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    fail_above: Vec<Limit>,
     #[command(flatten)]
     device: DeviceSpec,
 }
@@ -43,7 +51,8 @@ pub(super) struct EvalArgs {
 const EXAMPLES: &str = "\
 Examples:
   densify eval output/garden-diet
-  densify eval output/garden-diet --iteration 7000 --split train";
+  densify eval output/garden-diet --iteration 7000 --split train
+  densify eval output/garden-diet --fail-below psnr=25 --fail-above flip=0.1";
 
 pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let run = &args.run;
@@ -68,6 +77,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let mean = Mean::of(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip);
     write_scores(run, args.split, iteration, &scores)?;
+    let mut geometry = None;
     if let Some(truth) = opened.dataset.ground_truth()? {
         let train = opened.views(Split::Train)?;
         let ground = KnownScene {
@@ -79,8 +89,9 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
         let measured = geometry::measure(opened.backend.as_mut(), &ground, &train, &views)?;
         console.result(table(&measured));
         write_geometry(run, args.split, iteration, &measured)?;
+        geometry = Some(measured);
     }
-    Ok(())
+    limits::check(&limits::values(&mean, geometry.as_ref()), &args.fail_below, &args.fail_above)
 }
 
 /// The geometric measurements as lines; lengths as percentages of the diagonal.

@@ -20,6 +20,7 @@ mod export;
 mod flags;
 mod interrupt;
 mod knobs;
+mod limits;
 mod plan;
 mod policies;
 mod progress;
@@ -129,7 +130,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Export(export) => export::run(&export, &console),
-        Command::Render(render) => render::run(&render, &console),
+        Command::Render(render) => render::run(&render, given, &console),
         Command::Compare(comparison) => study::compare(&comparison, &console),
         Command::Devices(devices) => devices::run(&devices, &console),
         Command::Knobs(knobs) => knobs::run(&knobs, &console),

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{ArgMatches, Args};
 use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, Luma};
 
@@ -69,8 +69,12 @@ Examples:
   densify render output/garden-diet -o pictures --side-by-side
   densify render others.ply --scene data/garden --eval -o pictures --depth";
 
-pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
-    let mut opened = open_model(args, console)?;
+pub(super) fn run(
+    args: &RenderArgs,
+    matches: &ArgMatches,
+    console: &Console,
+) -> Result<(), Failure> {
+    let mut opened = open_model(args, matches, console)?;
     let views = opened.views(args.split)?;
     let background = opened.data.background.fixed();
     let units = 1.0 / opened.dataset.normalisation.scale;
@@ -105,7 +109,30 @@ pub(super) fn run(args: &RenderArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-fn open_model(args: &RenderArgs, console: &Console) -> Result<Opened, Failure> {
+/// Fails where an option was given that a run brings itself.
+fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failure> {
+    let scene = DataSpec::augment_args(clap::Command::new("scene"));
+    let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
+    let given = names
+        .into_iter()
+        .find(|name| matches.value_source(name) == Some(clap::parser::ValueSource::CommandLine));
+    match given {
+        None => Ok(()),
+        Some(name) => Err(Failure::input(format!(
+            "--{} is for a .ply; a run brings its own, so leave it out",
+            name.replace('_', "-")
+        ))),
+    }
+}
+
+fn open_model(
+    args: &RenderArgs,
+    matches: &ArgMatches,
+    console: &Console,
+) -> Result<Opened, Failure> {
+    if !args.model.is_file() {
+        refuse_options_of_a_file(matches)?;
+    }
     let machine = Machine::open(&args.device, console)?;
     if !args.model.is_file() {
         RunConfig::read(&args.model)?;

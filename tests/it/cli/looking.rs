@@ -95,6 +95,15 @@ fn render_writes_pictures_of_the_views() {
     }
 
     let train = root.path().join("train");
+    for flag in ["-r 1", "--background white", "--near 0.1"] {
+        let words = ["is for a .ply", "a run brings its own"];
+        call(&format!("render {} -o {} {flag}", text(&run), text(&pictures))).refused(flag, &words);
+    }
+    let limits = "--fail-below psnr=99 --fail-above flip=1";
+    let failed = call(&format!("eval {} {limits}", text(&run)));
+    assert_eq!(failed.code, Some(4), "{failed:?}");
+    assert!(failed.stderr.contains("beyond --fail-below psnr=99"), "{failed:?}");
+    call(&format!("eval {} --fail-below psnr=1 --fail-below ssim=0", text(&run))).ok();
     call(&format!("render {} -o {} --split train", text(&run), text(&train))).ok();
     assert_eq!(files(&train).len(), VIEWS - 2);
 }

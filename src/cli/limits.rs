@@ -1,0 +1,115 @@
+//! `--fail-below` and `--fail-above`: measured values as conditions of a script.
+
+use std::collections::BTreeMap;
+use std::str::FromStr;
+
+use serde_json::Value;
+
+use crate::evaluate::Mean;
+use crate::failure::{Failure, LIMIT};
+use crate::metrics::geometry::Geometry;
+
+/// A bound on a measured value.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Limit {
+    key: String,
+    bound: f64,
+}
+
+impl FromStr for Limit {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (key, bound) = text.split_once('=').unwrap_or((text, ""));
+        match bound.trim().parse() {
+            Ok(bound) if f64::is_finite(bound) => Ok(Self { key: key.trim().to_owned(), bound }),
+            _ => Err("give KEY=NUMBER, such as psnr=25".to_owned()),
+        }
+    }
+}
+
+/// The values that limits may name: the scores, and every number of geometry.json by its path.
+pub(super) fn values(mean: &Mean, geometry: Option<&Geometry>) -> BTreeMap<String, f64> {
+    let mut values = BTreeMap::new();
+    let geometry = geometry.and_then(|measured| serde_json::to_value(measured).ok());
+    flatten("", &geometry.unwrap_or_default(), &mut values);
+    for (key, value) in [("psnr", mean.psnr), ("ssim", mean.ssim), ("flip", mean.flip)] {
+        values.insert(key.to_owned(), value);
+    }
+    values
+}
+
+fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
+    let path = |key: &str| match prefix {
+        "" => key.to_owned(),
+        prefix => format!("{prefix}.{key}"),
+    };
+    match value {
+        Value::Object(map) => map.iter().for_each(|(key, it)| flatten(&path(key), it, values)),
+        Value::Array(list) => {
+            (0..).zip(list).for_each(|(at, it): (u32, _)| {
+                flatten(&path(&at.to_string()), it, values);
+            });
+        }
+        // What was not measured keeps no limit.
+        Value::Null if !prefix.is_empty() => _ = values.insert(prefix.to_owned(), f64::NAN),
+        value => values.extend(value.as_f64().map(|number| (prefix.to_owned(), number))),
+    }
+}
+
+/// Fails where a value is beyond its limit, or was not measured.
+///
+/// # Errors
+/// Code 4 with every value beyond its limit; code 2 for a key that there is not.
+pub(super) fn check(
+    values: &BTreeMap<String, f64>,
+    below: &[Limit],
+    above: &[Limit],
+) -> Result<(), Failure> {
+    let mut beyond = Vec::new();
+    for (limits, flag) in [(below, "--fail-below"), (above, "--fail-above")] {
+        for Limit { key, bound } in limits {
+            let Some(&value) = values.get(key) else {
+                let known: Vec<&str> = values.keys().map(String::as_str).collect();
+                let known = known.join(", ");
+                return Err(Failure::input(format!(
+                    "{flag}: nothing called `{key}` was measured; there are {known}"
+                )));
+            };
+            let holds = if flag == "--fail-below" { value >= *bound } else { value <= *bound };
+            if !holds {
+                beyond.push(format!("{key} is {value}, beyond {flag} {key}={bound}"));
+            }
+        }
+    }
+    match beyond.is_empty() {
+        true => Ok(()),
+        false => Err(Failure { code: LIMIT, message: beyond.join("\n") }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_beyond_their_limits_are_named() {
+        let mean = Mean { psnr: 24.5, ssim: 0.9, flip: 0.1 };
+        let mut values = values(&mean, None);
+        flatten("", &serde_json::json!({ "depth": { "rmse": 0.02 }, "thin": [null] }), &mut values);
+        let limit = |text: &str| vec![text.parse::<Limit>().unwrap()];
+        let check = |below: &str, above: &str| check(&values, &limit(below), &limit(above));
+        assert_eq!(check("psnr=24.5", "flip=0.1"), Ok(()));
+        let failure = check("psnr=25", "depth.rmse=0.01").unwrap_err();
+        assert_eq!(failure.code, LIMIT);
+        for words in ["psnr is 24.5", "--fail-below psnr=25", "depth.rmse is 0.02"] {
+            assert!(failure.message.contains(words), "{failure}");
+        }
+        assert_eq!(check("thin.0=0", "flip=1").unwrap_err().code, LIMIT);
+        let unknown = check("PSNR=1", "flip=1").unwrap_err();
+        assert!(unknown.code == 2 && unknown.message.contains("psnr, ssim"), "{unknown}");
+        for bad in ["psnr", "psnr=", "psnr=nan", "=x"] {
+            assert!(bad.parse::<Limit>().is_err(), "{bad}");
+        }
+    }
+}
