@@ -68,7 +68,7 @@ pub(super) struct RecordLayout {
 }
 
 impl RecordLayout {
-    /// Every field: what [`differentiate`](super::cpu::CpuBackend::differentiate) needs.
+    /// Every field: what [`Differentiable`](super::Differentiable) needs.
     pub(super) const ALL: Self = Self::with((1 << Field::ALL.len()) - 1);
     /// Numbers of a record that has every field.
     pub(super) const MOST: usize = BASE + Field::ALL.len();

@@ -126,7 +126,7 @@ impl WithSimd for Optimise<'_> {
     }
 }
 
-/// dL/dpixel for [`CpuBackend::differentiate`](super::CpuBackend::differentiate).
+/// dL/dpixel for [`Differentiable`](crate::backend::Differentiable).
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageGradient {
     /// Shape: `[height, width, 3]`.
