@@ -1,9 +1,10 @@
-//! Loads Wavefront OBJ files. Their MTL libraries are read through `tobj`.
+//! Loads Wavefront OBJ files with their MTL libraries through `tobj`.
 //!
-//! Faces are not: `tobj` holds about 100 bytes for each face of an object until the object ends, and
-//! its objects share no vertices, so that one of the two takes twice this reader's memory. It also
-//! mixes up files in which only some vertices have colours, texture coordinates or normals, and its
-//! errors name no line.
+//! Every statement is checked before, because errors of `tobj` name no line, and it misreads indices of
+//! 0 and files in which only some vertices have colours, texture coordinates or normals. It gets the
+//! faces in blocks: it holds about 100 bytes for each face of an object until the object ends. Its
+//! objects share no vertices, so the blocks' vertices are joined here. Polygons are cut by ear clipping
+//! rather than as fans.
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
@@ -13,17 +14,21 @@
 //! normals of the group's faces there, weighted by their angles (Thürmer and Wüthrich, "Computing
 //! Vertex Normals from Polygonal Facets", 1998).
 
+mod block;
 mod materials;
 mod polygons;
 mod statements;
 
 use std::collections::HashMap;
+use std::mem;
 use std::path::Path;
 
-use glam::{DVec3, Vec2, Vec3, Vec4};
+use glam::{DVec2, DVec3, Vec2, Vec3, Vec4};
+use tobj::Mesh;
 
 use crate::error::Error;
 use crate::mesh::{Material, Model, pad};
+use block::Block;
 use materials::{GREY, Materials};
 use statements::{Statement, shortened};
 
@@ -47,6 +52,10 @@ struct Reader {
     colours: Vec<Vec3>,
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
+    /// Triangles so far.
+    triangles: usize,
+    /// Faces that are not in the model yet.
+    block: Block,
     /// The model's vertices.
     vertices: HashMap<Corner, u32>,
     /// Sums of face normals weighted by angles, by position and smoothing group.
@@ -67,6 +76,8 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         colours: Vec::new(),
         uvs: Vec::new(),
         normals: Vec::new(),
+        triangles: 0,
+        block: Block::default(),
         vertices: HashMap::new(),
         sums: HashMap::new(),
         material: None,
@@ -74,6 +85,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         group: 0,
     };
     statements::each(path, |statement| reader.read(statement))?;
+    reader.add_block(path)?;
     reader.finish().of_file(path)
 }
 
@@ -132,37 +144,40 @@ impl Reader {
         if corners.len() < 3 {
             return Ok(());
         }
+        self.triangles += corners.len() - 2;
+        if self.triangles > MAX_TRIANGLES {
+            return Err(statement.fault("the file has more than 2^26 triangles"));
+        }
         if corners.iter().any(|corner| corner.numbers[2] > 0) {
             corners.iter_mut().for_each(|corner| corner.group = 0);
         }
-        let places: Vec<DVec3> =
-            corners.iter().map(|corner| self.positions[corner.numbers[0] as usize - 1]).collect();
-        let vertices: Vec<u32> = corners.iter().map(|&corner| self.model_vertex(corner)).collect();
+        let group = corners[0].group;
         let material = match self.material {
             Some(material) => material,
             None => *self.grey.get_or_insert_with(|| {
                 self.materials.model.material(Material::lambert("none", GREY))
             }),
         };
-        for triangle in polygons::cut(&places) {
-            for i in 0..3 {
-                let [a, b, c] = [i, (i + 1) % 3, (i + 2) % 3].map(|k| places[triangle[k]]);
-                let Corner { numbers: [position, ..], group } = corners[triangle[i]];
-                if group > 0 {
-                    let (u, v) = (b - a, c - a);
-                    // Nothing for triangles without area: they have no normal.
-                    let angle = u.cross(v).length().atan2(u.dot(v));
-                    let sum = self.sums.entry((position, group)).or_default();
-                    *sum += angle * u.cross(v).normalize_or_zero();
-                }
-            }
-            let model = &mut self.materials.model;
-            if model.triangles.len() == MAX_TRIANGLES {
-                return Err(statement.fault("the file has more than 2^26 triangles"));
-            }
-            model.triangles.push(triangle.map(|i| vertices[i]));
-            model.triangle_materials.push(material);
+        if self.block.is_full() || (self.block.material, self.block.group) != (material, group) {
+            self.add_block(statement.path)?;
+            (self.block.material, self.block.group) = (material, group);
         }
+        // All have everything: `tobj` would mix up what only some have.
+        self.block.add(&corners, |i, number| {
+            let place = number.wrapping_sub(1);
+            if i == 0 {
+                let [x, y, z] = self.positions[place].to_array();
+                let [r, g, b] = self.colours.get(place).map_or([1.0; 3], Vec3::to_array);
+                format!("v {x} {y} {z} {r} {g} {b}\n")
+            } else if i == 1 {
+                let uv = self.uvs.get(place).copied().unwrap_or_default().as_dvec2();
+                format!("vt {} {}\n", uv.x, uv.y)
+            } else {
+                let [x, y, z] =
+                    self.normals.get(place).copied().unwrap_or_default().as_dvec3().to_array();
+                format!("vn {x} {y} {z}\n")
+            }
+        });
         Ok(())
     }
 
@@ -190,20 +205,65 @@ impl Reader {
         Ok(Corner { numbers, group: self.group })
     }
 
-    /// The model's vertex of a corner.
-    fn model_vertex(&mut self, corner: Corner) -> u32 {
+    /// Adds the faces of the block to the model and begins a new one.
+    fn add_block(&mut self, path: &Path) -> Result<(), Error> {
+        let block = mem::take(&mut self.block);
+        let mesh = block.read().map_err(|error| {
+            let remedy = "correct the file or export it again";
+            Error::malformed(path, "the faces", error.to_string(), remedy)
+        })?;
+        let mut vertices = Vec::new();
+        for (&corner, &vertex) in block.corners.iter().zip(&mesh.indices) {
+            // They are numbered as they come.
+            if vertex as usize == vertices.len() {
+                vertices.push(self.model_vertex(corner, &mesh, vertices.len()));
+            }
+        }
+        // There are no arities where all faces are triangles.
+        let mut arities = mesh.face_arities.iter();
+        let mut first = 0;
+        while first < mesh.indices.len() {
+            let end = first + arities.next().map_or(3, |&arity| arity as usize);
+            let face = &mesh.indices[first..end];
+            let place = |&i: &u32| DVec3::from_slice(&mesh.positions[3 * i as usize..]);
+            let places: Vec<DVec3> = face.iter().map(place).collect();
+            for triangle in polygons::cut(&places) {
+                for i in 0..3 {
+                    let [a, b, c] = [i, (i + 1) % 3, (i + 2) % 3].map(|k| places[triangle[k]]);
+                    let Corner { numbers: [position, ..], group } =
+                        block.corners[first + triangle[i]];
+                    if group > 0 {
+                        let (u, v) = (b - a, c - a);
+                        // Nothing for triangles without area: they have no normal.
+                        let angle = u.cross(v).length().atan2(u.dot(v));
+                        let sum = self.sums.entry((position, group)).or_default();
+                        *sum += angle * u.cross(v).normalize_or_zero();
+                    }
+                }
+                let model = &mut self.materials.model;
+                model.triangles.push(triangle.map(|i| vertices[face[i] as usize]));
+                model.triangle_materials.push(block.material);
+            }
+            first = end;
+        }
+        Ok(())
+    }
+
+    /// The model's vertex of a corner that is vertex `i` of a block.
+    fn model_vertex(&mut self, corner: Corner, mesh: &Mesh, i: usize) -> u32 {
         let model = &mut self.materials.model;
         *self.vertices.entry(corner).or_insert_with(|| {
-            let first = model.positions.len();
-            let [position, uv, normal] = corner.numbers.map(|number| number as usize);
-            model.positions.push(self.positions[position - 1]);
-            let colour = self.colours.get(position - 1).map(|colour| colour.extend(1.0));
-            pad(&mut model.colours, colour, (first, 1), Vec4::ONE);
-            let uv = uv.checked_sub(1).map(|place| self.uvs[place]);
-            pad(&mut model.uvs[0], uv, (first, 1), Vec2::ZERO);
-            let normal = normal.checked_sub(1).map(|place| self.normals[place]);
-            pad(&mut model.normals, normal, (first, 1), Vec3::ZERO);
-            first as u32
+            let at = |values: &[f64]| DVec3::from_slice(&values[3 * i..]);
+            let place = (model.positions.len(), 1);
+            model.positions.push(at(&mesh.positions));
+            let colour = at(&mesh.vertex_color).as_vec3().extend(1.0);
+            let colour = (colour != Vec4::ONE).then_some(colour);
+            pad(&mut model.colours, colour, place, Vec4::ONE);
+            let uv = DVec2::from_slice(&mesh.texcoords[2 * i..]).as_vec2();
+            pad(&mut model.uvs[0], (corner.numbers[1] > 0).then_some(uv), place, Vec2::ZERO);
+            let normal = at(&mesh.normals).as_vec3();
+            pad(&mut model.normals, (corner.numbers[2] > 0).then_some(normal), place, Vec3::ZERO);
+            place.0 as u32
         })
     }
 

@@ -14,7 +14,7 @@ const MAX_LINE: u64 = 1 << 24;
 /// A line of an OBJ or MTL file.
 #[derive(Clone, Copy)]
 pub(super) struct Statement<'a> {
-    path: &'a Path,
+    pub(super) path: &'a Path,
     pub(super) line: usize,
     pub(super) key: &'a str,
     /// The text after the key, with comments.
