@@ -1,12 +1,12 @@
 //! Reads OBJ and MTL files statement by statement.
 
-use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
 use glam::DVec3;
 
 use crate::error::Error;
+use crate::resource;
 
 /// Longest line `[bytes]`: a polygon of a million corners.
 const MAX_LINE: u64 = 1 << 24;
@@ -58,7 +58,7 @@ pub(super) fn each(
     path: &Path,
     mut read: impl FnMut(Statement<'_>) -> Result<(), Error>,
 ) -> Result<(), Error> {
-    let mut file = BufReader::new(File::open(path).map_err(Error::io(path))?);
+    let mut file = BufReader::new(resource::open(path)?);
     let (mut text, mut lines) = (Vec::new(), 0);
     loop {
         text.clear();

@@ -172,3 +172,22 @@ fn nothing_is_waited_for_that_is_no_file() {
     let outcome = densify(&["export", text(&pipe), "-o", text(&run.with_extension("ply"))]);
     assert!(refusal(&outcome).contains("view_02.png"), "{outcome:?}");
 }
+
+#[cfg(unix)]
+#[test]
+fn a_mesh_that_is_no_file_is_not_waited_for() {
+    let (root, out) = scratch();
+    let (gltf, pipe) = (root.path().join("mesh.gltf"), root.path().join("data.bin"));
+    let obj = root.path().join("mesh.obj");
+    for path in [&pipe, &obj] {
+        let made = std::process::Command::new("mkfifo").arg(path).status().expect("mkfifo");
+        assert!(made.success());
+    }
+    let text_of = r#"{"asset":{"version":"2.0"},"buffers":[{"uri":"data.bin","byteLength":9}]}"#;
+    std::fs::write(&gltf, text_of).expect("a mesh");
+    for (mesh, name) in [(&obj, "mesh.obj"), (&gltf, "data.bin")] {
+        let outcome = densify(&["scenegen", text(mesh), "-o", text(&out)]);
+        let message = refusal(&outcome);
+        assert!(message.contains(name) && message.contains("a pipe"), "{message}");
+    }
+}
