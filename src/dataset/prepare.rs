@@ -56,7 +56,6 @@ pub(super) fn assemble(
     notes.extend(far_note(&far, options.far_cameras));
     let is_far = |view: &View| far.contains(&view.name);
     let leave_out = options.far_cameras == FarCameras::LeaveOut;
-    let views = views.into_iter().filter(|(view, ..)| !(leave_out && is_far(view)));
     let every = match options.split {
         Split::Every(every) => Some(every.get() as usize),
         Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
@@ -65,7 +64,11 @@ pub(super) fn assemble(
     // Number of a training view by the id that tracks use.
     let mut number_of = HashMap::new();
     let (mut train, mut test) = (Vec::new(), Vec::new());
-    for (index, (view, held_out, id)) in views.enumerate() {
+    for (index, (view, held_out, id)) in views.into_iter().enumerate() {
+        // It keeps its place in the order: the others are split as without it.
+        if leave_out && is_far(&view) {
+            continue;
+        }
         if every.map_or(held_out, |every| index % every == 0) {
             test.push(view);
         } else {
@@ -110,12 +113,11 @@ fn far_note(names: &BTreeSet<String>, what: FarCameras) -> Option<String> {
     let shown: Vec<&str> = names.iter().take(SHOWN).map(String::as_str).collect();
     let shown = shown.join(", ");
     let fate = match what {
-        FarCameras::LeaveOut => "left out (--far-cameras keep keeps them)",
-        FarCameras::Keep => "kept, but do not count for the extent of the scene",
+        FarCameras::LeaveOut => "left out (use --far-cameras keep to train on them)",
+        FarCameras::Keep => "kept, but not counted for the extent of the scene",
     };
-    let many = if names.len() == 1 { "view whose camera is" } else { "views whose cameras are" };
     (!names.is_empty())
-        .then(|| format!("{} {many} far from all others: {fate}: {shown}{more}", names.len()))
+        .then(|| format!("cameras far from all others, {} {fate}: {shown}{more}", names.len()))
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {

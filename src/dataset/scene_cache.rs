@@ -42,11 +42,11 @@ impl Entry {
 
     /// The images and points of the scene, if they are there and whole.
     pub(super) fn read(&self) -> Option<(Vec<Frame>, InitPoints)> {
-        let file = File::options().write(true).read(true).open(&self.path).ok()?;
         let mut bytes = Vec::new();
-        (&file).take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
-        // It has been used just now.
-        let _ = file.set_modified(SystemTime::now());
+        File::open(&self.path).ok()?.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
+        // It has been used just now. A cache that others share may be read only.
+        let file = File::options().write(true).open(&self.path);
+        let _ = file.and_then(|file| file.set_modified(SystemTime::now()));
         let (_, metadata) = SafeTensors::read_metadata(&bytes).ok()?;
         let tensors = SafeTensors::deserialize(&bytes).ok()?;
         let checksum = metadata.metadata().as_ref()?.get(CHECKSUM)?;
@@ -159,7 +159,9 @@ fn bound(folder: &Path, most: u64) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let known = entry.metadata()?;
-        if entry.path().extension().is_some_and(|ending| ending == ENDING) {
+        // What a killed process has left of writing is as good as an entry that nobody uses.
+        let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
+        if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
             entries.push((known.modified()?, known.len(), entry.path()));
         }
     }

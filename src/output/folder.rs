@@ -3,6 +3,7 @@
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 use super::atomic::{RUN_FOLDER_DEPTH, remove_incomplete};
 use super::disk::{Operation, attempt};
@@ -71,7 +72,24 @@ pub struct RunFolder {
     is_new: bool,
     /// Suffix of the hidden folder that is written to.
     staged: Option<String>,
-    lock: FolderLock,
+    lock: Rc<FolderLock>,
+}
+
+/// Tells whether the folder of a run is still its own.
+#[derive(Debug, Clone)]
+pub struct Guard(Rc<FolderLock>);
+
+impl Guard {
+    /// Fails when the folder was moved or removed, or another process has it.
+    ///
+    /// # Errors
+    /// [`OutputError::Lost`].
+    pub fn check(&self) -> Result<(), OutputError> {
+        match self.0.holds() {
+            true => Ok(()),
+            false => Err(OutputError::Lost { path: self.0.folder().to_owned() }),
+        }
+    }
 }
 
 impl RunFolder {
@@ -119,11 +137,22 @@ impl RunFolder {
     /// then its files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`OutputError::InUse`], [`OutputError::NotAFolder`], [`OutputError::Io`].
+    /// [`OutputError::InUse`], [`OutputError::NotAFolder`], [`OutputError::Io`];
+    /// [`OutputError::Occupied`] when a run that starts again would remove models or checkpoints, or
+    /// files of something that is no run.
     pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
         Self::check(target, true)?;
         let folder = Self::lock(target)?;
         if anew {
+            // What the caller has seen may have changed until the folder was locked.
+            let has = |name: &str| {
+                fs::read_dir(target.join(name)).is_ok_and(|mut it| it.next().is_some())
+            };
+            let is_foreign =
+                !target.join(CONFIG_FILE).exists() && !owned_entries(target)?.is_empty();
+            if is_foreign || has(MODELS) || has(CHECKPOINTS) {
+                return Err(OutputError::Occupied { path: target.to_owned() });
+            }
             // Its description stays until it is replaced: a kill must not lose it.
             remove_owned(target, |name| name != CONFIG_FILE);
         }
@@ -137,12 +166,31 @@ impl RunFolder {
         let fail = |e| OutputError::io("create the folder", target)(e);
         attempt(Operation::Create, target).map_err(fail)?;
         fs::create_dir_all(target).map_err(fail)?;
-        let lock = FolderLock::take(target)?;
+        let lock = Rc::new(FolderLock::take(target)?);
         recover(target)?;
         let is_worthless =
             |path: &PathBuf| !path.join(CHECKPOINTS).exists() && saved_iterations(path).is_err();
         remove_all(Self::staged(target).into_iter().filter(is_worthless));
         Ok(Self { target: target.to_owned(), is_new, staged: None, lock })
+    }
+
+    /// Ends a replacement in `target` that a kill has interrupted, if there is one, so that the folder can
+    /// be looked at.
+    ///
+    /// # Errors
+    /// [`OutputError::InUse`], [`OutputError::Io`].
+    pub fn settle(target: &Path) -> Result<(), OutputError> {
+        if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
+            return Ok(());
+        }
+        let _lock = FolderLock::take(target)?;
+        recover(target)
+    }
+
+    /// Tells during the run whether the folder is still its own.
+    #[must_use]
+    pub fn guard(&self) -> Guard {
+        Guard(Rc::clone(&self.lock))
     }
 
     /// Hidden folders in `target` of runs that were to replace the one there and were interrupted.
@@ -169,11 +217,7 @@ impl RunFolder {
         let Some(suffix) = &self.staged else {
             return Ok(self.target.clone());
         };
-        let replaced = match self.lock.holds() {
-            true => replace(&self.target, suffix),
-            false => Err(OutputError::InUse { path: self.target.clone(), process: None }),
-        };
-        match replaced {
+        match self.guard().check().and_then(|()| replace(&self.target, suffix)) {
             Ok(()) => {
                 remove_all(Self::staged(&self.target));
                 Ok(self.target.clone())
@@ -403,8 +447,15 @@ mod tests {
         assert_eq!(tree(&root.path().join("stats")), ["train.jsonl"]);
         assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
         assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-new-x")]);
+        // To start again would remove a model.
+        assert!(matches!(RunFolder::resume(root.path(), true), Err(OutputError::Occupied { .. })));
+        fs::remove_dir_all(root.path().join("point_cloud")).unwrap();
         drop(RunFolder::resume(root.path(), true).unwrap());
         assert_eq!(tree(root.path()), [".densify-new-x", "config.toml"]);
+        // Without a description it is no run.
+        fs::rename(root.path().join("config.toml"), root.path().join("stats")).unwrap();
+        assert!(matches!(RunFolder::resume(root.path(), true), Err(OutputError::Occupied { .. })));
+        fs::rename(root.path().join("stats"), root.path().join("config.toml")).unwrap();
         let run = RunFolder::create(root.path(), true).unwrap();
         write(&run.path().join("config.toml"), "new");
         run.finish().unwrap();
@@ -430,7 +481,7 @@ mod tests {
                 let folder = if is_in { String::new() } else { format!("{NEW}x/") };
                 write(&root.path().join(folder + name), "new");
             }
-            drop(RunFolder::resume(root.path(), false).unwrap());
+            RunFolder::settle(root.path()).unwrap();
             let (names, text) = match moved_in {
                 None => (OLD_RUN, "old"),
                 Some(_) => (NEW_RUN, "new"),
@@ -461,6 +512,21 @@ mod tests {
         fs::remove_file(root.path().join(LOCK)).unwrap();
         assert!(matches!(replacing.finish(), Err(OutputError::NotReplaced { .. })));
         assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"a");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_run_whose_folder_is_moved_knows_it() {
+        let root = tempfile::tempdir().unwrap();
+        let target = root.path().join("run");
+        let run = RunFolder::create(&target, false).unwrap();
+        run.guard().check().unwrap();
+        fs::rename(&target, root.path().join("moved")).unwrap();
+        assert!(matches!(run.guard().check(), Err(OutputError::Lost { .. })));
+        let other = RunFolder::create(&target, false).unwrap();
+        assert!(run.guard().check().is_err() && other.guard().check().is_ok());
+        drop(run);
+        other.guard().check().unwrap();
     }
 
     #[test]

@@ -9,6 +9,9 @@ use super::OutputError;
 /// Name of the locked file. It holds the number of the process that trains.
 pub(super) const LOCK: &str = "densify.lock";
 
+/// How often the file is locked just when its holder removes it, at most.
+const TRIES: usize = 10;
+
 /// The lock of a process on a folder; it ends with the process, even by a kill.
 ///
 /// Only Unix has locks that readers of the file need not mind; elsewhere, and on a file system without
@@ -29,27 +32,26 @@ impl FolderLock {
         if !cfg!(unix) {
             return Ok(Self { path, file: None });
         }
-        let fail = || OutputError::io("lock the folder with", &path);
-        loop {
+        for _ in 0..TRIES {
             let mut options = OpenOptions::new();
             let options = options.read(true).write(true).create(true).truncate(false);
-            let mut file = options.open(&path).map_err(fail())?;
+            let mut file = options.open(&path).map_err(OutputError::io("create", &path))?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Err(in_use(folder, file)),
-                Err(TryLockError::Error(_)) => {
-                    remove(&path);
-                    return Ok(Self { path, file: None });
-                }
+                // Such as a network file system without a lock service.
+                Err(TryLockError::Error(_)) => break,
             }
             // The process that had it may have removed the file just before.
             if is_at(&file, &path) {
                 let number = std::process::id().to_string();
-                let written = file.set_len(0).and_then(|()| file.write_all(number.as_bytes()));
-                written.map_err(fail())?;
+                // The lock holds without the number, too.
+                let _ = file.set_len(0).and_then(|()| file.write_all(number.as_bytes()));
                 return Ok(Self { path, file: Some(file) });
             }
         }
+        tracing::warn!("{}: the folder cannot be locked against other runs", folder.display());
+        Ok(Self { path, file: None })
     }
 
     /// Fails while a process has the lock on a folder. Writes nothing.
@@ -66,6 +68,11 @@ impl FolderLock {
         Ok(())
     }
 
+    /// The folder.
+    pub(super) fn folder(&self) -> &Path {
+        self.path.parent().unwrap_or(&self.path)
+    }
+
     /// Whether this process still has the lock on the folder at this path: the folder, or the file in
     /// it, may have been replaced meanwhile.
     pub(super) fn holds(&self) -> bool {
@@ -76,13 +83,9 @@ impl FolderLock {
 impl Drop for FolderLock {
     fn drop(&mut self) {
         if self.file.as_ref().is_some_and(|file| is_at(file, &self.path)) {
-            remove(&self.path);
+            let _ = std::fs::remove_file(&self.path);
         }
     }
-}
-
-fn remove(path: &Path) {
-    let _ = std::fs::remove_file(path);
 }
 
 fn in_use(folder: &Path, mut file: File) -> OutputError {

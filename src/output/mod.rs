@@ -25,7 +25,7 @@ mod tensorboard;
 
 pub use atomic::{WriteError, write_atomically, write_atomically_from};
 pub use cameras::cameras_json;
-pub use folder::{CHECKPOINTS, RunFolder, model_path, saved_iterations};
+pub use folder::{CHECKPOINTS, Guard, RunFolder, model_path, saved_iterations};
 pub use records::{
     RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,
@@ -60,6 +60,15 @@ pub enum OutputError {
         path: PathBuf,
         /// Number of the process, if known.
         process: Option<u32>,
+    },
+    /// The folder is no longer that of the run.
+    #[error(
+        "{path} was moved, removed or taken by another process while the run trained; nothing more is \
+         written there"
+    )]
+    Lost {
+        /// The folder.
+        path: PathBuf,
     },
     /// The path is not a folder.
     #[error("{path} is not a folder; choose another one with -o")]

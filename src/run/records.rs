@@ -1,7 +1,7 @@
 //! The logs of a run and its totals so far. Both go into checkpoints, so that the records of an interrupted
 //! run have no gap.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -23,6 +23,9 @@ pub(super) struct Totals {
     pub(super) cpu: Option<Duration>,
     /// Wall time by stage.
     pub(super) stages: BTreeMap<String, Duration>,
+    /// Whether anything was drawn in each of the last steps, one for each training view.
+    #[serde(default)]
+    pub(super) drawn: VecDeque<bool>,
     /// Scores of the views held out.
     pub(super) tested: BTreeMap<u32, Mean>,
     /// Largest resident memory of the processes before this one.
@@ -64,7 +67,12 @@ impl Totals {
         }
     }
 
-    pub(super) fn step(&mut self, output: &StepOutput) {
+    /// Counts a step of a run with so many training views.
+    pub(super) fn step(&mut self, output: &StepOutput, views: usize) {
+        self.drawn.push_back(output.entries > 0);
+        while self.drawn.len() > views {
+            self.drawn.pop_front();
+        }
         let Window { steps, loss, l1, ssim, without_ssim, .. } = &mut self.window;
         *steps = steps.saturating_add(1);
         *l1 += output.l1;

@@ -60,6 +60,7 @@ pub fn start(
     let described = given.clone().describe()?;
     let output = described.output_folder()?;
     RunFolder::check(&output, true)?;
+    RunFolder::settle(&output)?;
     if let Some(staged) = RunFolder::staged(&output).iter().find(|path| newest(path).0.is_some()) {
         return Err(Failure::input(format!(
             "--resume: {} holds a run that was to replace the one there and was interrupted: {}; \

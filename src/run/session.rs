@@ -1,6 +1,6 @@
 //! The loop around the trainer: progress, logs, saves, measurements, and the end, good or bad.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -15,7 +15,7 @@ use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::export::{PLY, Shape};
 use crate::failure::{Failure, INPUT, OTHER};
 use crate::output::{
-    CHECKPOINTS, CONFIG_FILE, Mean, OutputError, RunFolder, cameras_json, model_path,
+    CHECKPOINTS, CONFIG_FILE, Guard, Mean, OutputError, RunFolder, cameras_json, model_path,
     saved_iterations, write_atomically, write_scores,
 };
 use crate::trainer::{StepReport, TrainError};
@@ -34,8 +34,8 @@ pub(super) struct Session<'a> {
     pub(super) folder: PathBuf,
     logs: Logs,
     pub(super) totals: Totals,
-    /// Whether anything was drawn in each of the last steps, one for each training view.
-    drawn: VecDeque<bool>,
+    /// Whether the folder is still the run's own.
+    guard: Guard,
     /// Step of the last checkpoint that this process has written, or gone on from.
     checkpoint: Option<u32>,
 }
@@ -67,7 +67,8 @@ pub(super) fn train(
 ) -> Result<PathBuf, Failure> {
     let last = run.last;
     // Of a run that goes on nothing is removed, were it only its description.
-    let resumes = occupied == Occupied::Resume && run.output.join(CONFIG_FILE).exists();
+    let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
+    let resumes = occupied == Occupied::Resume && has_begun;
     let folder = match occupied {
         Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
         Occupied::Refuse => RunFolder::create(&run.output, false)?,
@@ -80,7 +81,7 @@ pub(super) fn train(
         checkpoint_every: output.checkpoint_every,
         last,
     };
-    let mut session = match Session::start(run, &folder.path(), observer) {
+    let mut session = match Session::start(run, &folder, observer) {
         Ok(session) => session,
         // Where nothing can be written nothing has been learned.
         Err(error) if resumes => return Err(error),
@@ -90,20 +91,25 @@ pub(super) fn train(
         }
     };
     let done = session.go(&duties);
-    let finished = done.and_then(|()| session.write_summary(true).map_err(Failure::from));
+    let guard = folder.guard();
+    let finished = done
+        .and_then(|()| guard.check().map_err(Failure::from))
+        .and_then(|()| session.write_summary(true).map_err(Failure::from));
     match finished {
         Ok(()) => {
             let path = folder.finish()?;
             session.report(&path);
             Ok(path)
         }
+        // Another run may be there now.
+        Err(failure) if guard.check().is_err() => Err(failure),
         // Such as a photograph that cannot be decoded: nothing was learned that is worth keeping.
         Err(failure) if failure.code == INPUT && !resumes && has_nothing(&folder.path()) => {
             drop(session);
             folder.discard();
             Err(failure)
         }
-        // What led here is told first; what cannot be written besides is no news.
+        // The cause is reported first; a further error of writing adds nothing.
         Err(failure) => {
             let _ = session.write_summary(false);
             let scene = session.run.config.spec.start.scene.clone().unwrap_or_default();
@@ -130,7 +136,13 @@ fn has_nothing(folder: &Path) -> bool {
 }
 
 impl<'a> Session<'a> {
-    fn start(mut run: Run, folder: &Path, observer: &'a dyn Observer) -> Result<Self, Failure> {
+    fn start(
+        mut run: Run,
+        folder: &RunFolder,
+        observer: &'a dyn Observer,
+    ) -> Result<Self, Failure> {
+        let (guard, folder) = (folder.guard(), folder.path());
+        let folder = folder.as_path();
         run.config.write(folder)?;
         let config = run.config.table()?;
         let to_world = &run.dataset.normalisation;
@@ -156,8 +168,7 @@ impl<'a> Session<'a> {
             }
         };
         let folder = folder.to_owned();
-        let drawn = VecDeque::with_capacity(run.dataset.train.len());
-        Ok(Self { run, config, observer, folder, logs, totals, drawn, checkpoint })
+        Ok(Self { run, config, observer, folder, logs, totals, guard, checkpoint })
     }
 
     /// All steps that are left.
@@ -183,7 +194,8 @@ impl<'a> Session<'a> {
 
     /// Fails where the model draws nothing in most of the last views: that is no result.
     fn check_drawn(&self) -> Result<(), Failure> {
-        let (all, empty) = (self.drawn.len(), self.drawn.iter().filter(|drawn| !**drawn).count());
+        let drawn = &self.totals.drawn;
+        let (all, empty) = (drawn.len(), drawn.iter().filter(|drawn| !**drawn).count());
         if 2 * empty <= all {
             return Ok(());
         }
@@ -191,7 +203,7 @@ impl<'a> Session<'a> {
             code: OTHER,
             message: format!(
                 "the model draws nothing in {empty} of the last {all} views; check the poses of the \
-                 cameras, and that they and the points have the same coordinates, or lower --near"
+                 cameras, and that they and the points use the same coordinate system, or lower --near"
             ),
         })
     }
@@ -199,6 +211,11 @@ impl<'a> Session<'a> {
     /// What follows a step: the model is saved, measured, and the run kept. Where the run is
     /// resumed, only what is not there yet.
     fn after(&mut self, step: u32, duties: &Duties, resumed: bool) -> Result<(), Failure> {
+        let every = duties.checkpoint_every;
+        let due = every > 0 && (step.is_multiple_of(every) || step == duties.last);
+        if due || duties.saves.contains(&step) || duties.tests.contains(&step) {
+            self.guard.check()?;
+        }
         let there = |path: PathBuf| resumed && path.is_file();
         if duties.saves.contains(&step) && !there(model_path(&self.folder, step)) {
             self.save(step)?;
@@ -206,8 +223,6 @@ impl<'a> Session<'a> {
         if duties.tests.contains(&step) && !(resumed && self.totals.tested.contains_key(&step)) {
             self.test(step, step == duties.last)?;
         }
-        let every = duties.checkpoint_every;
-        let due = every > 0 && (step.is_multiple_of(every) || step == duties.last);
         if due && !there(checkpoint_path(&self.folder, step)) {
             // The run is worth more than its checkpoint; the one before is still there.
             if let Err(error) = self.keep() {
@@ -287,15 +302,11 @@ impl<'a> Session<'a> {
     }
 
     fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
-        let Self { logs, totals, run, drawn, .. } = self;
+        let Self { logs, totals, run, .. } = self;
         for event in &report.events {
             logs.events.append(event)?;
         }
-        totals.step(&report.output);
-        if drawn.len() == run.dataset.train.len() {
-            drawn.pop_front();
-        }
-        drawn.push_back(report.output.entries > 0);
+        totals.step(&report.output, run.dataset.train.len());
         let step = report.step;
         // The end of a run is a record even where it is extended, so that records do not depend on it.
         let ends = [run.config.spec.schedule.iterations.0, run.last].contains(&step);

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::{Outcome, densify, scratch, text, train};
+use super::{Outcome, densify, resume, scratch, text, train};
 use crate::photographs::{Photographs, VIEWS, name};
 
 /// The message of a refusal, which is one line without control characters.
@@ -51,6 +51,9 @@ fn a_camera_far_from_all_others_is_left_out_and_named() {
         let outcome = train(scene.path(), &run, 60, &format!("--budget 300 --eval {flags}")).ok();
         let scores = super::json(&run.join("results.json"));
         let psnr = scores["ours_60"]["PSNR"].as_f64().expect("a number");
+        let per_view = super::json(&run.join("per_view.json"));
+        let views = per_view["ours_60"]["PSNR"].as_object().expect("a number for each view");
+        assert!(views.keys().eq(["view_00.png", "view_08.png"]), "{views:?}");
         (outcome.stdout, psnr)
     };
     let (said, usual) = trained("");
@@ -62,7 +65,10 @@ fn a_camera_far_from_all_others_is_left_out_and_named() {
     words[7] = "2000";
     scene.replace("sparse/0/images.txt", line, &words.join(" "));
     let (said, psnr) = trained("");
-    assert!(said.contains("1 view whose camera is far") && said.contains("view_05.png"), "{said}");
+    assert!(
+        said.contains("cameras far from all others, 1 left out") && said.contains("view_05.png"),
+        "{said}"
+    );
     assert!((psnr - usual).abs() < 2.0, "{psnr} dB, {usual} dB without the camera");
     let (said, psnr) = trained("--far-cameras keep");
     assert!(said.contains("view_05.png") && said.contains("kept"), "{said}");
@@ -86,6 +92,9 @@ fn a_model_that_draws_nothing_is_no_result() {
     let outcome = train(scene.path(), &run, 30, "--budget 300");
     assert_eq!(outcome.code, Some(1), "{outcome:?}");
     assert!(outcome.stderr.contains("draws nothing in 14 of the last 14 views"), "{outcome:?}");
+    // That all steps are done does not make it one.
+    let again = resume(scene.path(), &run, "");
+    assert!(again.code == Some(1) && again.stderr.contains("draws nothing in 14"), "{again:?}");
 }
 
 #[test]
@@ -183,7 +192,16 @@ fn a_mesh_that_is_no_file_is_not_waited_for() {
         let made = std::process::Command::new("mkfifo").arg(path).status().expect("mkfifo");
         assert!(made.success());
     }
-    let text_of = r#"{"asset":{"version":"2.0"},"buffers":[{"uri":"data.bin","byteLength":9}]}"#;
+    let text_of = serde_json::json!({
+        "asset": { "version": "2.0" },
+        "scenes": [{ "nodes": [0] }],
+        "nodes": [{ "mesh": 0 }],
+        "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0 } }] }],
+        "accessors": [{ "bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3" }],
+        "bufferViews": [{ "buffer": 0, "byteLength": 36 }],
+        "buffers": [{ "uri": "data.bin", "byteLength": 36 }],
+    });
+    let text_of = text_of.to_string();
     std::fs::write(&gltf, text_of).expect("a mesh");
     for (mesh, name) in [(&obj, "mesh.obj"), (&gltf, "data.bin")] {
         let outcome = densify(&["scenegen", text(mesh), "-o", text(&out)]);

@@ -181,6 +181,22 @@ fn a_signal_ends_the_run_in_order_and_it_goes_on() {
 
 #[cfg(unix)]
 #[test]
+fn a_run_whose_folder_is_moved_ends_and_writes_no_more() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    let flags = "--budget 360 --checkpoint-every 20";
+    let mut child = spawn(&arguments(&scene, &run, 100_000, flags));
+    assert!(Moment::Records(3).wait(&mut child, &run), "it has ended by itself");
+    std::fs::rename(&run, root.path().join("moved")).expect("a folder that is moved");
+    let ended = child.wait_with_output().expect("it ends");
+    let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+    assert_eq!(ended.status.code(), Some(1), "{said}");
+    assert!(said.contains("was moved, removed or taken by another process"), "{said}");
+    assert!(!run.exists(), "something was written");
+}
+
+#[cfg(unix)]
+#[test]
 fn a_run_in_progress_is_neither_resumed_nor_replaced() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
