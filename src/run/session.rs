@@ -241,6 +241,7 @@ impl<'a> Session<'a> {
         if self.checkpoint == Some(step) {
             return Ok(());
         }
+        self.guard.check()?;
         let trainer = self.run.trainer.state();
         let header = Header {
             densify: self.run.config.densify.clone(),
@@ -320,6 +321,7 @@ impl<'a> Session<'a> {
 
     /// Writes the model; returns where.
     fn save(&mut self, step: u32) -> Result<PathBuf, Failure> {
+        self.guard.check()?;
         let path = model_path(&self.folder, step);
         let (backend, to_world) = (self.run.trainer.backend(), &self.run.dataset.normalisation);
         let shape = Shape { rows: backend.rows(), sh_degree: backend.sh_degree() };
