@@ -102,7 +102,9 @@ fn is_input(error: &BackendError) -> bool {
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
         let code = match error {
-            OutputError::Io { .. } | OutputError::NotReplaced { .. } => OTHER,
+            OutputError::Io { .. } | OutputError::Lost { .. } | OutputError::NotReplaced { .. } => {
+                OTHER
+            }
             _ => INPUT,
         };
         Self { code, message: error.to_string() }

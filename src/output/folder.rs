@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use super::atomic::{RUN_FOLDER_DEPTH, remove_incomplete};
+use super::atomic::{RUN_FOLDER_DEPTH, is_temporary, remove_incomplete};
 use super::disk::{Operation, attempt};
 use super::lock::FolderLock;
 use super::tensorboard::PREFIX as EVENTS_PREFIX;
@@ -145,12 +145,13 @@ impl RunFolder {
         let folder = Self::lock(target)?;
         if anew {
             // What the caller has seen may have changed until the folder was locked.
-            let has = |name: &str| {
-                fs::read_dir(target.join(name)).is_ok_and(|mut it| it.next().is_some())
-            };
+            let checkpoints =
+                fs::read_dir(target.join(CHECKPOINTS)).into_iter().flatten().flatten();
+            let has_checkpoint =
+                checkpoints.into_iter().any(|entry| !is_temporary(&entry.file_name()));
             let is_foreign =
                 !target.join(CONFIG_FILE).exists() && !owned_entries(target)?.is_empty();
-            if is_foreign || has(MODELS) || has(CHECKPOINTS) {
+            if is_foreign || has_checkpoint || saved_iterations(target).is_ok() {
                 return Err(OutputError::Occupied { path: target.to_owned() });
             }
             // Its description stays until it is replaced: a kill must not lose it.

@@ -105,7 +105,8 @@ pub(super) fn train(
         Err(failure) if guard.check().is_err() => Err(failure),
         // Such as a photograph that cannot be decoded: nothing was learned that is worth keeping.
         Err(failure) if failure.code == INPUT && !resumes && has_nothing(&folder.path()) => {
-            drop(session);
+            // The lock goes with its last holder, and then the folder can be removed.
+            drop((session, guard));
             folder.discard();
             Err(failure)
         }
