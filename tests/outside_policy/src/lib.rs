@@ -8,11 +8,8 @@
 //! | grow_every | 100 | >= 1 | steps | interval |
 //! | grow_until | 15000 | >= 0 | step | end (exclusive) |
 
-use densify_policies::parameters::{
-    StepParameter::{self, Interval, Step},
-    in_range,
-};
-use densify_policies::{adc, plan::*, policy::*, rng::PolicyRng, sample};
+use densify_policies::parameters::StepParameter::{self, Interval, Step};
+use densify_policies::{adc, parameters::in_range, plan::*, policy::*, rng::PolicyRng, sample};
 
 densify_policies::register_policy!("steady", Steady, summary: "splits where gradients are large",
     source: "an example", doc: include_str!("lib.rs"));
