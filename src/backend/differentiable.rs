@@ -1,9 +1,30 @@
 //! Gradients and losses on their own: tools for tests and for research, not part of training.
 
-use super::cpu::{ImageGradient, ModelGradient};
+use super::cpu::ModelGradient;
 use super::{Backend, BackendError, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
+
+/// dL/dpixel of an image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ImageGradient {
+    /// Shape: `[height, width, 3]`.
+    pub rgb: Vec<f32>,
+    /// Shape: `[height, width]`.
+    pub alpha: Vec<f32>,
+    /// Shape: `[height, width]`.
+    pub depth: Vec<f32>,
+}
+
+impl ImageGradient {
+    /// Panics unless it is of a camera's image.
+    pub(super) fn assert_size(&self, camera: &Camera) {
+        let pixels = camera.width as usize * camera.height as usize;
+        assert_eq!(self.rgb.len(), 3 * pixels, "upstream.rgb");
+        assert_eq!(self.alpha.len(), pixels, "upstream.alpha");
+        assert_eq!(self.depth.len(), pixels, "upstream.depth");
+    }
+}
 
 /// A backend with gradients and losses on their own.
 pub trait Differentiable: Backend {

@@ -27,7 +27,7 @@ use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 pub use audit::{Attribute, Kept, Unsound};
 pub use choice::{BackendChoice, BackendKind, BackendOptions, Device};
-pub use differentiable::Differentiable;
+pub use differentiable::{Differentiable, ImageGradient};
 pub use shortcuts::Shortcuts;
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};
 pub use state::{StateArray, StateError, Tensor, Values};

@@ -1,5 +1,6 @@
 //! `--fail-below` and `--fail-above`: measured values as conditions of a script.
 
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
@@ -31,8 +32,9 @@ impl FromStr for Limit {
 /// The values that limits may name: the scores, and every number of geometry.json by its path.
 pub(super) fn values(mean: &Mean, geometry: Option<&Geometry>) -> BTreeMap<String, f64> {
     let mut values = BTreeMap::new();
-    let geometry = geometry.and_then(|measured| serde_json::to_value(measured).ok());
-    flatten("", &geometry.unwrap_or_default(), &mut values);
+    if let Some(geometry) = geometry.and_then(|measured| serde_json::to_value(measured).ok()) {
+        flatten("", &geometry, &mut values);
+    }
     for (key, value) in [("psnr", mean.psnr), ("ssim", mean.ssim), ("flip", mean.flip)] {
         values.insert(key.to_owned(), value);
     }
@@ -52,7 +54,7 @@ fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
             });
         }
         // What was not measured keeps no limit.
-        Value::Null if !prefix.is_empty() => _ = values.insert(prefix.to_owned(), f64::NAN),
+        Value::Null => _ = values.insert(prefix.to_owned(), f64::NAN),
         value => values.extend(value.as_f64().map(|number| (prefix.to_owned(), number))),
     }
 }
@@ -67,7 +69,9 @@ pub(super) fn check(
     above: &[Limit],
 ) -> Result<(), Failure> {
     let mut beyond = Vec::new();
-    for (limits, flag) in [(below, "--fail-below"), (above, "--fail-above")] {
+    let sides =
+        [(below, "--fail-below", Ordering::Less), (above, "--fail-above", Ordering::Greater)];
+    for (limits, flag, forbidden) in sides {
         for Limit { key, bound } in limits {
             let Some(&value) = values.get(key) else {
                 let known: Vec<&str> = values.keys().map(String::as_str).collect();
@@ -76,8 +80,8 @@ pub(super) fn check(
                     "{flag}: nothing called `{key}` was measured; there are {known}"
                 )));
             };
-            let holds = if flag == "--fail-below" { value >= *bound } else { value <= *bound };
-            if !holds {
+            // What is not a number compares with nothing, and is beyond every limit.
+            if value.partial_cmp(bound).is_none_or(|order| order == forbidden) {
                 beyond.push(format!("{key} is {value}, beyond {flag} {key}={bound}"));
             }
         }

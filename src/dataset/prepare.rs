@@ -1,6 +1,6 @@
 //! Turns the frames of any format into views: checks sizes and lenses, splits, normalises.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::path::Path;
 
 use glam::{DVec2, DVec3};
@@ -51,11 +51,10 @@ pub(super) fn assemble(
 ) -> Result<Dataset, DatasetError> {
     let Scene { listing, mut points, points_file, tracks, own_split, mut notes, .. } = scene;
     let centres: Vec<_> = views.iter().map(|(view, ..)| view.camera.centre()).collect();
-    let far = views.iter().zip(normalise::far(&centres)).filter(|(_, far)| *far);
-    let far: BTreeSet<String> = far.map(|((view, ..), _)| view.name.clone()).collect();
+    let is_far = normalise::far(&centres);
+    let far = views.iter().zip(&is_far).filter(|(_, is_far)| **is_far);
+    let far: Vec<&str> = far.map(|((view, ..), _)| &*view.name).collect();
     notes.extend(far_note(&far, options.far_cameras));
-    let is_far = |view: &View| far.contains(&view.name);
-    let leave_out = options.far_cameras == FarCameras::LeaveOut;
     let every = match options.split {
         Split::Every(every) => Some(every.get() as usize),
         Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
@@ -63,16 +62,19 @@ pub(super) fn assemble(
     };
     // Number of a training view by the id that tracks use.
     let mut number_of = HashMap::new();
-    let (mut train, mut test) = (Vec::new(), Vec::new());
+    let (mut train, mut test) = (Vec::<View>::new(), Vec::new());
+    // Centres of the training cameras that are not far from all others.
+    let mut near = Vec::new();
     for (index, (view, held_out, id)) in views.into_iter().enumerate() {
         // It keeps its place in the order: the others are split as without it.
-        if leave_out && is_far(&view) {
+        if is_far[index] && options.far_cameras == FarCameras::LeaveOut {
             continue;
         }
         if every.map_or(held_out, |every| index % every == 0) {
             test.push(view);
         } else {
             number_of.extend(id.map(|id| (id, train.len() as u32)));
+            near.extend((!is_far[index]).then(|| centres[index]));
             train.push(view);
         }
     }
@@ -85,9 +87,7 @@ pub(super) fn assemble(
     }
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
-    let near = train.iter().filter(|view| !is_far(view));
-    let centres: Vec<_> = near.map(|view: &View| view.camera.centre()).collect();
-    let normalisation = Normalisation::fit(&centres, &points.positions);
+    let normalisation = Normalisation::fit(&near, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.scene_from_world_camera(&view.camera);
         if !view.camera.translation.as_vec3().is_finite() {
@@ -106,12 +106,11 @@ pub(super) fn assemble(
 }
 
 /// Names the views whose camera is far from all others.
-fn far_note(names: &BTreeSet<String>, what: FarCameras) -> Option<String> {
+fn far_note(names: &[&str], what: FarCameras) -> Option<String> {
     const SHOWN: usize = 5;
     let more = names.len().saturating_sub(SHOWN);
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-    let shown: Vec<&str> = names.iter().take(SHOWN).map(String::as_str).collect();
-    let shown = shown.join(", ");
+    let shown = names.get(..SHOWN).unwrap_or(names).join(", ");
     let fate = match what {
         FarCameras::LeaveOut => "left out (use --far-cameras keep to train on them)",
         FarCameras::Keep => "kept, but not counted for the extent of the scene",

@@ -50,7 +50,7 @@ impl Entry {
         let (_, metadata) = SafeTensors::read_metadata(&bytes).ok()?;
         let tensors = SafeTensors::deserialize(&bytes).ok()?;
         let checksum = metadata.metadata().as_ref()?.get(CHECKSUM)?;
-        (*checksum == checksum_of(&tensors)).then(|| decode(&tensors))?
+        (*checksum == checksum_of(tensors.tensors())).then(|| decode(&tensors))?
     }
 
     /// Writes it. A cache that cannot be written is none; the run goes on.
@@ -82,10 +82,7 @@ impl Entry {
         ] {
             tensors.push((name.to_owned(), TensorView::new(kind, shape, bytes)?));
         }
-        let unsigned = safetensors::serialize(tensors.clone(), None)?;
-        let checksum = checksum_of(&SafeTensors::deserialize(&unsigned)?);
-        drop(unsigned);
-        let metadata = HashMap::from([(CHECKSUM.to_owned(), checksum)]);
+        let metadata = HashMap::from([(CHECKSUM.to_owned(), checksum_of(tensors.clone()))]);
         let bytes = safetensors::serialize(tensors, Some(metadata))?;
         write_atomically(&self.path, |out| out.write_all(&bytes))?;
         self.path.parent().map_or(Ok(()), |folder| bound(folder, MOST_BYTES))?;
@@ -98,10 +95,9 @@ fn image_name(index: usize) -> String {
 }
 
 /// Of all values, in the order of their names.
-fn checksum_of(tensors: &SafeTensors<'_>) -> String {
-    let mut all: Vec<_> = tensors.tensors();
-    all.sort_by(|(a, _), (b, _)| a.cmp(b));
-    let sum = all.iter().fold(0, |sum, (name, tensor)| {
+fn checksum_of(mut tensors: Vec<(String, TensorView<'_>)>) -> String {
+    tensors.sort_by(|(a, _), (b, _)| a.cmp(b));
+    let sum = tensors.iter().fold(0, |sum, (name, tensor)| {
         let sum = crc32c::crc32c_append(sum, format!("{name}{:?}", tensor.shape()).as_bytes());
         crc32c::crc32c_append(sum, tensor.data())
     });

@@ -5,6 +5,7 @@ use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
 use super::OutputError;
+use crate::foreign;
 
 /// Name of the locked file. It holds the number of the process that trains.
 pub(super) const LOCK: &str = "densify.lock";
@@ -60,7 +61,7 @@ impl FolderLock {
     /// [`OutputError::InUse`].
     pub(super) fn check(folder: &Path) -> Result<(), OutputError> {
         if cfg!(unix)
-            && let Ok(file) = File::open(folder.join(LOCK))
+            && let Ok(file) = foreign::open(&folder.join(LOCK))
             && matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
         {
             return Err(in_use(folder, file));
@@ -68,15 +69,16 @@ impl FolderLock {
         Ok(())
     }
 
-    /// The folder.
-    pub(super) fn folder(&self) -> &Path {
-        self.path.parent().unwrap_or(&self.path)
-    }
-
-    /// Whether this process still has the lock on the folder at this path: the folder, or the file in
-    /// it, may have been replaced meanwhile.
-    pub(super) fn holds(&self) -> bool {
-        self.file.as_ref().is_none_or(|file| is_at(file, &self.path))
+    /// Fails when the folder is no longer locked by this process: it, or the file in it, may have been
+    /// moved or replaced meanwhile.
+    ///
+    /// # Errors
+    /// [`OutputError::Lost`].
+    pub(super) fn confirm(&self) -> Result<(), OutputError> {
+        if self.file.as_ref().is_none_or(|file| is_at(file, &self.path)) {
+            return Ok(());
+        }
+        Err(OutputError::Lost { path: self.path.parent().unwrap_or(&self.path).to_owned() })
     }
 }
 
@@ -120,7 +122,7 @@ mod tests {
         let path = folder.path();
         FolderLock::check(path).unwrap();
         let held = FolderLock::take(path).unwrap();
-        assert!(held.holds());
+        held.confirm().unwrap();
         let own = std::process::id();
         for refused in [FolderLock::check(path), FolderLock::take(path).map(drop)] {
             let error = refused.unwrap_err();
@@ -138,8 +140,8 @@ mod tests {
         // Whoever replaces the file has the folder.
         std::fs::remove_file(path.join(LOCK)).unwrap();
         let other = FolderLock::take(path).unwrap();
-        assert!(!held.holds() && other.holds());
+        assert!(held.confirm().is_err() && other.confirm().is_ok());
         drop(held);
-        assert!(other.holds());
+        other.confirm().unwrap();
     }
 }

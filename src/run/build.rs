@@ -1,7 +1,6 @@
 //! From a description to a trainer. Everything that can fail for reasons of the user's making fails here,
 //! before anything is written.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use densify_policies::policy::DensityPolicy;
@@ -69,6 +68,9 @@ pub(super) fn build(
     }
     let rates = spec.learning_rates(&declared.rates)?;
     let parameters = inputs.entry.effective(&inputs.parameters, &scene)?;
+    let steps = inputs.entry.step_parameters().iter().map(|step| step.name());
+    let steps = steps.filter_map(|name| Some(format!("{name} {}", parameters.get(name)?)));
+    let steps: Vec<String> = steps.collect();
     let decided = Decided { setting, init, init_points, rates, parameters };
     let mut config = decided.config(&inputs)?;
     config.resolved.sh_degree_lowered = match saved {
@@ -84,7 +86,9 @@ pub(super) fn build(
         observer.say(format_args!("{line}"));
     }
     announce(&config, &output, inputs.entry.summary, observer);
-    announce_steps(&inputs, &config, observer);
+    if !steps.is_empty() {
+        observer.say(format_args!("steps    {}", steps.join(", ")));
+    }
     let needs = inputs.backend_needs(needs(policy.as_ref(), &scene, inputs.sh_every()));
     let ledger = inputs.ledger(&setting, &needs, threads);
     resolve::check(&inputs, &ledger)?;
@@ -222,24 +226,6 @@ fn first_model(
         grouped(report.points)
     ));
     Ok((model, choice, count))
-}
-
-/// Says what the parameters that count steps are in a run of this length.
-fn announce_steps(inputs: &Inputs<'_>, config: &RunConfig, observer: &dyn Observer) {
-    let used =
-        config.spec.density.policy_set.iter().filter_map(|setting| match &setting.path[..] {
-            [policy, name] if policy == inputs.entry.name => Some((&**name, &setting.value)),
-            _ => None,
-        });
-    let used: BTreeMap<&str, &toml::Value> = used.collect();
-    let steps =
-        inputs.entry.step_parameters().iter().filter_map(|step| {
-            used.get(step.name()).map(|value| format!("{} {value}", step.name()))
-        });
-    let steps: Vec<String> = steps.collect();
-    if !steps.is_empty() {
-        observer.say(format_args!("steps    {}", steps.join(", ")));
-    }
 }
 
 fn announce(config: &RunConfig, output: &Path, summary: &str, observer: &dyn Observer) {

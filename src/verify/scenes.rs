@@ -1,7 +1,7 @@
 //! Small scenes to test with: deterministic, in front of a camera in general position.
 
+use crate::backend::ImageGradient;
 use crate::backend::Rendering;
-use crate::backend::cpu::ImageGradient;
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, sh_coefficients};

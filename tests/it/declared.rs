@@ -5,7 +5,8 @@
 
 use std::ops::Range;
 
-use densify::backend::cpu::{ImageGradient, ModelGradient};
+use densify::backend::ImageGradient;
+use densify::backend::cpu::ModelGradient;
 use densify::backend::{Backend, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;

@@ -4,9 +4,9 @@ use super::loss::ImageTerms;
 use super::optimise::Differentiate;
 use super::rasterize::DARK;
 use super::tiles::Grid;
-use super::{CpuBackend, ImageGradient, ModelGradient, for_each_pixel, scalars};
+use super::{CpuBackend, ModelGradient, for_each_pixel, scalars};
 use crate::backend::signals::RecordLayout;
-use crate::backend::{BackendError, Differentiable, Rendering, StepOutput};
+use crate::backend::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 #[cfg(test)]
@@ -20,10 +20,7 @@ impl Differentiable for CpuBackend {
         sh_degree: u8,
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError> {
-        let pixels = camera.width as usize * camera.height as usize;
-        assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
-        assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
-        assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
+        upstream.assert_size(camera);
         let records = self.record_cap * RecordLayout::MOST;
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);

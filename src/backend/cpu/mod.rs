@@ -72,7 +72,7 @@ use summed::Summed;
 use tiles::TileLists;
 
 pub use instructions::InstructionSet;
-pub use optimise::{ImageGradient, ModelGradient};
+pub use optimise::ModelGradient;
 pub use options::CpuOptions;
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.

@@ -126,17 +126,6 @@ impl WithSimd for Optimise<'_> {
     }
 }
 
-/// dL/dpixel for [`Differentiable`](crate::backend::Differentiable).
-#[derive(Debug, Clone, PartialEq)]
-pub struct ImageGradient {
-    /// Shape: `[height, width, 3]`.
-    pub rgb: Vec<f32>,
-    /// Shape: `[height, width]`.
-    pub alpha: Vec<f32>,
-    /// Shape: `[height, width]`.
-    pub depth: Vec<f32>,
-}
-
 /// Gradients of every parameter and of what signals are made of, for one view.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ModelGradient {

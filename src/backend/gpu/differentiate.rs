@@ -2,9 +2,9 @@
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
-use crate::backend::cpu::{ImageGradient, ModelGradient};
+use crate::backend::cpu::ModelGradient;
 use crate::backend::signals::{Field, RecordLayout};
-use crate::backend::{BackendError, Differentiable, Rendering, StepOutput};
+use crate::backend::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::sh_coefficients;
@@ -67,10 +67,7 @@ impl Differentiable for GpuBackend {
         sh_degree: u8,
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError> {
-        let pixels = camera.width as usize * camera.height as usize;
-        assert_eq!(upstream.rgb.len(), 3 * pixels, "upstream.rgb");
-        assert_eq!(upstream.alpha.len(), pixels, "upstream.alpha");
-        assert_eq!(upstream.depth.len(), pixels, "upstream.depth");
+        upstream.assert_size(camera);
         if !self.sizes.more {
             (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
             self.rebuild()?;

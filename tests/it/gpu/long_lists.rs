@@ -1,7 +1,7 @@
 //! Tiles with so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
 //! invocation after 65,535 rounds together, without a word. What comes then must be an error, not a model.
 
-use densify::backend::cpu::ImageGradient;
+use densify::backend::ImageGradient;
 use densify::backend::gpu::{Accumulation, GpuDevice};
 use densify::backend::{BackendError, Shortcuts};
 use densify::camera::Camera;

@@ -1,0 +1,68 @@
+//! How a run takes the place of another: by renaming within the folder, so that a kill at any moment leaves
+//! enough to end or undo it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::{move_run, remove_all};
+use crate::output::OutputError;
+
+/// Hidden folder of a run that is to replace another, with a suffix of its own.
+pub(super) const NEW: &str = ".densify-new-";
+/// Hidden folder to which the old run goes out of the way; of the same suffix. While it is there, the old
+/// run is the one that counts.
+pub(super) const OLD: &str = ".densify-old-";
+/// What [`OLD`] is called once all of the old run is in it: from then on the new run counts.
+pub(super) const REPLACED: &str = ".densify-replaced-";
+
+/// Replaces the run in `target` by that in the hidden folder of this suffix, or leaves both unchanged.
+/// Killed within, it is ended by [`recover`].
+pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), OutputError> {
+    let [new, old, replaced] =
+        [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
+    fs::create_dir(&old).map_err(OutputError::io("create the folder", &old))?;
+    let out_of_the_way = move_run(target, &old)
+        .and_then(|()| fs::rename(&old, &replaced).map_err(OutputError::io("rename", &old)));
+    if let Err(error) = out_of_the_way {
+        // What cannot be moved back stays where it is, for `recover`.
+        let _ = move_run(&old, target).map(|()| fs::remove_dir(&old));
+        return Err(error);
+    }
+    if let Err(error) = move_run(&new, target) {
+        let _ = move_run(target, &new)
+            .and_then(|()| move_run(&replaced, target))
+            .map(|()| fs::remove_dir(&replaced));
+        return Err(error);
+    }
+    remove_all([new, replaced]);
+    Ok(())
+}
+
+/// Ends replacements that a kill has interrupted: one whose old run was still moving out is undone,
+/// one whose new run was moving in is completed.
+pub(super) fn recover(target: &Path) -> Result<(), OutputError> {
+    for old in hidden(target, OLD) {
+        move_run(&old, target)?;
+        remove_all([old]);
+    }
+    for replaced in hidden(target, REPLACED) {
+        let suffix = suffix(&replaced, REPLACED).unwrap_or_default();
+        let new = target.join(format!("{NEW}{suffix}"));
+        if new.exists() {
+            move_run(&new, target)?;
+        }
+        remove_all([new, replaced]);
+    }
+    Ok(())
+}
+
+/// Folders in `target` whose names begin so.
+pub(super) fn hidden(target: &Path, prefix: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(target).into_iter().flatten().flatten().map(|entry| entry.path());
+    entries.filter(|path| suffix(path, prefix).is_some() && path.is_dir()).collect()
+}
+
+/// What follows the prefix in the name of a folder.
+pub(super) fn suffix(path: &Path, prefix: &str) -> Option<String> {
+    Some(path.file_name()?.to_str()?.strip_prefix(prefix)?.to_owned())
+}
