@@ -12,10 +12,10 @@ use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
 use densify::backend::cpu::{CpuBackend, CpuOptions};
-use densify::backend::gpu::{
-    AdapterChoice, AdapterKind, GpuBackend, GpuDevice, GpuOptions, adapters,
+use densify::backend::gpu::{GpuBackend, GpuDevice, adapters};
+use densify::backend::{
+    AdapterChoice, AdapterKind, Backend, BackendError, BackendOptions, LearningRates, StepInput,
 };
-use densify::backend::{Backend, BackendError, LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
@@ -220,7 +220,8 @@ fn main() {
             if device.adapter().kind == AdapterKind::Software && rows > 50_000 {
                 continue;
             }
-            let options = GpuOptions { largest_image: (size, size), ..GpuOptions::new(rows) };
+            let options =
+                BackendOptions { largest_image: (size, size), ..BackendOptions::new(rows) };
             let backend = GpuBackend::new(&model, &options, device);
             let on = format!("adapter {i}");
             measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &on);

@@ -3,7 +3,7 @@
 // buffer that has rows is edited by itself.
 
 // Numbers per operation.
-const WORDS: u32 = 16u;
+const WORDS: u32 = 20u;
 
 @group(0) @binding(1) var<storage, read> ops: array<u32>;
 // Any buffer with rows.
@@ -44,10 +44,16 @@ fn longest(s: vec3<f32>) -> u32 {
     return best;
 }
 
-// Rule 0: all by ln(a); 1: the longest by ln(a), the others by ln(b). `terms` are the logarithms.
-fn scales_of(s: vec3<f32>, rule: u32, terms: vec2<f32>) -> vec3<f32> {
+// The rule at a place of `ops`, and the logarithms of three factors. 0: all by the first; 1: the longest by
+// the first, the others by the second; 2: each by its own.
+fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
+    let rule = ops[at];
+    let terms = vec3(real(at + 1u), real(at + 2u), real(at + 3u));
     if rule == 0u {
         return s + terms.x;
+    }
+    if rule == 2u {
+        return s + terms;
     }
     var changed = s + terms.y;
     let long = longest(s);
@@ -101,6 +107,15 @@ fn real(at: u32) -> f32 {
     return bitcast<f32>(ops[at]);
 }
 
+fn quaternion_at(at: u32) -> vec4<f32> {
+    return vec4(real(at), real(at + 1u), real(at + 2u), real(at + 3u));
+}
+
+// The product of quaternions (w, x, y, z).
+fn product(a: vec4<f32>, b: vec4<f32>) -> vec4<f32> {
+    return vec4(a.x * b.x - dot(a.yzw, b.yzw), a.x * b.yzw + b.x * a.yzw + cross(a.yzw, b.yzw));
+}
+
 fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: f32) {
     let base = 12u * row;
     for (var k = 0u; k < 3u; k++) {
@@ -115,8 +130,8 @@ fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: 
 
 // Families; now.a: how many, now.b: seed, now.c: step. An operation: parent, place of the first
 // child's slot in `ops`, children, number of the first, whether the parent becomes child 0,
-// placement (0: offset, 1: sampled, 2: along the longest axis), three numbers of it, scale rule, two
-// numbers of it, opacity rule, its number, unused ×2.
+// placement (0: offset, 1: sampled, 2: along the longest axis, 3: along all axes), three numbers of it, scale
+// rule, three numbers of it, opacity rule, its number, turn ×4, unused.
 @compute @workgroup_size(256)
 fn breed(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -132,16 +147,17 @@ fn breed(
     let mean = vec3(rows[base], rows[base + 1u], rows[base + 2u]);
     let log_scale = vec3(rows[base + 3u], rows[base + 4u], rows[base + 5u]);
     let quat = vec4(rows[base + 6u], rows[base + 7u], rows[base + 8u], rows[base + 9u]);
-    let scales = scales_of(log_scale, ops[op + 9u], vec2(real(op + 10u), real(op + 11u)));
-    let logit = logit_after(rows[base + 10u], ops[op + 12u], real(op + 13u));
+    let scales = scales_of(log_scale, op + 9u);
+    let logit = logit_after(rows[base + 10u], ops[op + 13u], real(op + 14u));
+    let turned = product(quat, quaternion_at(op + 15u));
     let children = ops[op + 2u];
     for (var k = 0u; k < children; k++) {
         let at = mean + offset_of(op, ops[op + 3u] + k, parent, log_scale, quat);
-        put(ops[ops[op + 1u] + k], at, scales, quat, logit);
+        put(ops[ops[op + 1u] + k], at, scales, turned, logit);
     }
     if ops[op + 4u] != 0u {
         let at = mean + offset_of(op, 0u, parent, log_scale, quat);
-        put(parent, at, scales, quat, logit);
+        put(parent, at, scales, turned, logit);
     }
 }
 
@@ -158,6 +174,11 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
             let scale = vec3(exp_exact(log_scale.x), exp_exact(log_scale.y), exp_exact(log_scale.z));
             return rotate(quat, scale * xi);
         }
+        case 3u: {
+            let scale = vec3(exp_exact(log_scale.x), exp_exact(log_scale.y), exp_exact(log_scale.z));
+            let sigmas = vec3(real(op + 6u), real(op + 7u), real(op + 8u));
+            return rotate(quat, select(-1.0, 1.0, child % 2u == 0u) * sigmas * scale);
+        }
         default: {
             let long = longest(log_scale);
             var local = vec3(0.0);
@@ -167,8 +188,8 @@ fn offset_of(op: u32, child: u32, parent: u32, log_scale: vec3<f32>, quat: vec4<
     }
 }
 
-// Updates; now.a: how many. An operation: row, scale rule, two numbers of it, opacity rule, its
-// number, unused ×10.
+// Updates; now.a: how many. An operation: row, scale rule, three numbers of it, opacity rule, its
+// number, whether there is a mean, the mean, whether there are coefficients of band 0, these, unused ×5.
 @compute @workgroup_size(256)
 fn rewrite(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -181,15 +202,21 @@ fn rewrite(
     let op = i * WORDS;
     let base = 12u * ops[op];
     let log_scale = vec3(rows[base + 3u], rows[base + 4u], rows[base + 5u]);
-    let scales = scales_of(log_scale, ops[op + 1u], vec2(real(op + 2u), real(op + 3u)));
+    let scales = scales_of(log_scale, op + 1u);
     for (var k = 0u; k < 3u; k++) {
         rows[base + 3u + k] = scales[k];
+        if ops[op + 7u] != 0u {
+            rows[base + k] = real(op + 8u + k);
+        }
+        if ops[op + 11u] != 0u {
+            sh0[3u * ops[op] + k] = real(op + 12u + k);
+        }
     }
-    rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 4u], real(op + 5u));
+    rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 5u], real(op + 6u));
 }
 
-// Seeds; now.a: how many. An operation: row, mean, log-scale, logit, three coefficients of band 0,
-// unused ×7. Their other coefficients were cleared before.
+// Seeds; now.a: how many. An operation: row, mean, log-scales, quaternion, logit, three coefficients of
+// band 0, unused ×5. Their other coefficients were cleared before.
 @compute @workgroup_size(256)
 fn sow(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -202,9 +229,10 @@ fn sow(
     let op = i * WORDS;
     let row = ops[op];
     let mean = vec3(real(op + 1u), real(op + 2u), real(op + 3u));
-    put(row, mean, vec3(real(op + 4u)), vec4(1.0, 0.0, 0.0, 0.0), real(op + 5u));
+    let log_scale = vec3(real(op + 4u), real(op + 5u), real(op + 6u));
+    put(row, mean, log_scale, quaternion_at(op + 7u), real(op + 11u));
     for (var k = 0u; k < 3u; k++) {
-        sh0[3u * row + k] = real(op + 6u + k);
+        sh0[3u * row + k] = real(op + 12u + k);
     }
 }
 

@@ -11,7 +11,7 @@
 @group(0) @binding(4) var<storage, read> mask: array<u32>;
 // Derivatives of SSIM by the window's mean of e, e² and e·y, per channel: nine planes.
 @group(0) @binding(5) var<storage, read_write> derivatives: array<f32>;
-// dL/dpixel: three planes.
+// dL/dpixel: three planes; and each pixel's part of the loss, where that is asked for.
 @group(0) @binding(6) var<storage, read_write> gradient: array<f32>;
 // Sums of |e| and of SSIM per tile.
 @group(0) @binding(7) var<storage, read_write> tile_sums: array<vec2<f32>>;
@@ -28,6 +28,7 @@ const SIDE: u32 = 26u;
 const HAS_ALPHA: u32 = 1u;
 const HAS_MASK: u32 = 2u;
 const WITH_ERROR: u32 = 4u;
+const BY_PIXEL: u32 = 8u;
 
 // Weights of the kth of eighteen values in a row, in the windows around the sixth to the thirteenth, from
 // those of the value before it: what a table of them would be asked for eight times, it is asked once.
@@ -178,6 +179,7 @@ fn similarity(
     let size = frame.image.x * frame.image.y;
     var sums = vec2(0.0);
     var wrong = mat2x4<f32>();
+    var lost = mat2x4<f32>();
     for (var channel = 0u; channel < 3u; channel++) {
         workgroupBarrier();
         for (var i = lane; i < SIDE * SIDE; i += GROUP) {
@@ -242,6 +244,9 @@ fn similarity(
                 sums += vec2(dot(counts, off), dot(counts, found.ssim));
                 wrong[half] +=
                     off * bitcast<f32>(now.a) + (1.0 - found.ssim) * bitcast<f32>(now.b);
+                if (frame.draw.w & BY_PIXEL) != 0u {
+                    lost[half] += off * (1.0 - SSIM_WEIGHT) + (1.0 - found.ssim) * SSIM_WEIGHT;
+                }
                 for (var p = 0u; p < 4u; p++) {
                     if n + p < eight.inside {
                         let to = 3u * channel * size + eight.place + n + p;
@@ -257,6 +262,12 @@ fn similarity(
         let eight = eight_of(corner, lane);
         for (var p = 0u; p < eight.inside; p++) {
             error[eight.place + p] = wrong[p / 4u][p % 4u] * (1.0 / 3.0);
+        }
+    }
+    if lane < LINES && (frame.draw.w & BY_PIXEL) != 0u {
+        let eight = eight_of(corner, lane);
+        for (var p = 0u; p < eight.inside; p++) {
+            gradient[3u * size + eight.place + p] = lost[p / 4u][p % 4u] * (1.0 / 3.0);
         }
     }
     reduced[lane] = sums;

@@ -26,6 +26,7 @@ override WEIGHT_MAX: u32;
 override FRESH_WEIGHT_MAX: u32;
 override WEIGHT_SUM: u32;
 override PIXEL_COUNT: u32;
+override WEIGHTED_ERROR: u32;
 override OPACITY: u32;
 override SCALE_MAX: u32;
 override SCALE_PRODUCT: u32;
@@ -90,6 +91,9 @@ fn accumulate(
     }
     if PIXEL_COUNT_AT > 0u {
         add(PIXEL_COUNT, row, row_sums[at + PIXEL_COUNT_AT]);
+    }
+    if ERROR_AT > 0u {
+        add(WEIGHTED_ERROR, row, row_sums[at + ERROR_AT]);
     }
     if WEIGHT_MAX_AT > 0u {
         raise(WEIGHT_MAX, row, row_sums[at + WEIGHT_MAX_AT]);

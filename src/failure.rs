@@ -72,16 +72,6 @@ impl<E: BadInput> From<E> for Failure {
     }
 }
 
-impl From<densify_scenegen::Error> for Failure {
-    fn from(error: densify_scenegen::Error) -> Self {
-        let code = match error {
-            densify_scenegen::Error::Write { .. } => OTHER,
-            _ => INPUT,
-        };
-        Self { code, message: error.to_string() }
-    }
-}
-
 impl From<BackendError> for Failure {
     fn from(error: BackendError) -> Self {
         let code = if is_input(&error) { INPUT } else { DEVICE };

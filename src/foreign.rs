@@ -5,6 +5,8 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
+/// What is wrong with a text in another encoding, often for a name in it, with the remedy.
+pub(crate) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
 /// Most bytes of a file of options.
 pub(crate) const MAX_OPTIONS: u64 = 4 << 20;
 
@@ -24,7 +26,7 @@ pub(crate) fn open(path: &Path) -> io::Result<File> {
     } else if kind.is_dir() {
         Err(io::ErrorKind::IsADirectory.into())
     } else {
-        Err(io::Error::other("it is a pipe, a socket or a device, not a file"))
+        Err(io::Error::other("it is a pipe, a socket or a device, not a file; name a file"))
     }
 }
 
@@ -36,12 +38,15 @@ pub(crate) fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let mut bytes = Vec::new();
     open(path)?.take(limit + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > limit {
-        return Err(io::Error::other(format!("it is larger than {} MiB", limit >> 20)));
+        return Err(io::Error::other(format!(
+            "it is larger than {} MiB; put the right file there",
+            limit >> 20
+        )));
     }
     if let Some(problem) = mistaken(&bytes) {
         return Err(io::Error::other(problem));
     }
-    let text = String::from_utf8(bytes).map_err(|_| io::Error::other("it is not text in UTF-8"))?;
+    let text = String::from_utf8(bytes).map_err(|_| io::Error::other(NOT_UTF8))?;
     Ok(match text.strip_prefix('\u{feff}') {
         Some(rest) => rest.to_owned(),
         None => text,

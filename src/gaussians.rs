@@ -135,3 +135,9 @@ pub fn logit(opacity: f32) -> f32 {
 pub fn rgb_to_dc(colour: f32) -> f32 {
     (colour - 0.5) / crate::sh::C0
 }
+
+/// The colour that a band-0 coefficient alone shows, not clamped: ½ + Y₀·c.
+#[must_use]
+pub fn dc_to_rgb(coefficient: f32) -> f32 {
+    0.5 + crate::sh::C0 * coefficient
+}

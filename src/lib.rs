@@ -23,6 +23,9 @@
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! Features, all on by default: `gpu` (the GPU backend), `scenegen` (built-in scenes and known surfaces),
+//! `study` (`compare` and `trade`).
 
 pub mod backend;
 pub mod camera;
@@ -46,7 +49,9 @@ pub mod run;
 pub mod schedule;
 pub mod sh;
 pub mod spread;
+#[cfg(feature = "study")]
 pub(crate) mod study;
 pub mod trainer;
 pub mod verify;
 pub mod views;
+mod without;

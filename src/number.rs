@@ -69,6 +69,11 @@ pub(crate) fn fraction(text: &str) -> Result<f64, String> {
     }
 }
 
+/// A fraction as a percentage; a dash where there is none.
+pub(crate) fn percent(value: f64) -> String {
+    if value.is_finite() { format!("{:.3} %", 100.0 * value) } else { "–".into() }
+}
+
 /// 1234567 as 1,234,567.
 pub(crate) fn grouped(number: usize) -> String {
     indicatif::HumanCount(number as u64).to_string()

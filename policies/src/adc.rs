@@ -7,7 +7,7 @@
 use std::ops::Bound::Excluded;
 
 use crate::parameters::in_range;
-use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
+use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, UNTURNED};
 use crate::policy::{PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::sample::top_k;
 
@@ -120,6 +120,7 @@ pub fn clone_at(offset: [f32; 3]) -> Offspring {
         parent: ParentFate::Stays,
         placement: Placement::Offset(offset),
         scale: ScaleRule::Uniform(1.0),
+        turn: UNTURNED,
         opacity: OpacityRule::Same,
     }
 }
@@ -132,6 +133,7 @@ pub fn split_by(factor: f32) -> Offspring {
         parent: ParentFate::BecomesChild,
         placement: Placement::Sampled,
         scale: ScaleRule::Uniform(1.0 / factor),
+        turn: UNTURNED,
         opacity: OpacityRule::Same,
     }
 }
@@ -148,6 +150,7 @@ pub fn split_long_axis(share: f32, opacity: f32) -> Offspring {
         parent: ParentFate::BecomesChild,
         placement: Placement::LongAxis { sigmas: 3.0 * share },
         scale: ScaleRule::LongAxis { long: 1.0 - share, other: (1.0 - share * share).sqrt() },
+        turn: UNTURNED,
         opacity: OpacityRule::Scaled(opacity),
     }
 }
@@ -254,7 +257,7 @@ mod tests {
         // √(1 − 0.45²) = 0.893.
         assert!((other - 0.893_029).abs() < 1e-6);
         assert_eq!((half.opacity, half.siblings()), (OpacityRule::Scaled(0.6), 2));
-        assert!(half.is_valid() && split_long_axis(0.0, 1.0).is_valid());
+        assert_eq!((half.bad_field(), split_long_axis(0.0, 1.0).bad_field()), (None, None));
     }
 
     #[test]

@@ -13,9 +13,15 @@ pub struct Offspring {
     pub placement: Placement,
     /// How the scales of children (and of a rewritten parent) follow from the parent's.
     pub scale: ScaleRule,
+    /// Rotation of the scaled children (and of a rewritten parent) about the parent's own axes, new =
+    /// old · turn: a quaternion (w, x, y, z) of any length but 0, or [`UNTURNED`].
+    pub turn: [f32; 4],
     /// How the opacities of children (and of a rewritten parent) follow from the parent's.
     pub opacity: OpacityRule,
 }
+
+/// No rotation.
+pub const UNTURNED: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
 
 /// What happens to the row that grows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -39,6 +45,9 @@ pub enum Placement {
         /// Distance from the parent's mean in standard deviations of its longest axis.
         sigmas: f32,
     },
+    /// Children at ±R·diag(s)·v, v this many standard deviations along the parent's three axes: even
+    /// children +, odd children −.
+    Axes([f32; 3]),
 }
 
 /// How scales follow from the parent's.
@@ -53,6 +62,8 @@ pub enum ScaleRule {
         /// Factor of the two others.
         other: f32,
     },
+    /// Each multiplied by its own factor, > 0.
+    Axes([f32; 3]),
 }
 
 /// How opacities follow from the parent's.
@@ -69,26 +80,37 @@ pub enum OpacityRule {
     Conserved,
 }
 
-/// A row rewritten in place.
+/// A row rewritten in place; see [`Update::NONE`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Update {
     /// New opacity.
     pub opacity: OpacityRule,
     /// New scales.
     pub scale: ScaleRule,
+    /// New mean `[scene units]`; `None`: it stays.
+    pub position: Option<[f32; 3]>,
+    /// New base colour, sRGB-encoded, between −[`COLOUR_MAX`] and `COLOUR_MAX`: what a row shows may lie
+    /// beyond `[0, 1]`. What depends on the direction stays. `None`: it stays.
+    pub colour: Option<[f32; 3]>,
     /// Whether the row keeps its moments and its age; otherwise both become zero.
     pub keep_moments: bool,
 }
 
-/// A new row without a parent: isotropic, unrotated, view-independent.
+/// Most that a base colour is off 0: more would not fit the narrowest storage.
+pub const COLOUR_MAX: f32 = 1e4;
+
+/// A new row without a parent, which looks the same from everywhere; see [`Seed::round`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Seed {
     /// Mean `[scene units]`.
     pub position: [f32; 3],
     /// Colour, sRGB-encoded in `[0, 1]`.
     pub colour: [f32; 3],
-    /// Standard deviation of all three axes `[scene units]`, > 0.
-    pub scale: f32,
+    /// Standard deviations along its axes `[scene units]`, > 0.
+    pub scales: [f32; 3],
+    /// Orientation of its axes, as [`Signal::Orientation`](crate::policy::Signal::Orientation): a
+    /// quaternion (w, x, y, z) of any length but 0, or [`UNTURNED`].
+    pub orientation: [f32; 4],
     /// Opacity, in (0, 1).
     pub opacity: f32,
 }
@@ -96,8 +118,8 @@ pub struct Seed {
 /// An accumulator that a plan resets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reset {
-    /// The sums of all [`Signal`](crate::signals::Signal)s; not `WeightMax` (kept per epoch) nor
-    /// current values (`Opacity`, `ScaleMax`, `Age`).
+    /// All [`Signal`](crate::signals::Signal)s that are sums or counts; not `WeightMax` (kept per epoch)
+    /// nor what a row is now (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
     /// The list of candidates.
     Candidates,
@@ -112,16 +134,44 @@ fn positive(value: f32) -> bool {
     value.is_finite() && value > 0.0
 }
 
+fn finite(values: &[f32]) -> bool {
+    values.iter().all(|v| v.is_finite())
+}
+
+/// Whether a quaternion has a direction.
+fn turns(quaternion: [f32; 4]) -> bool {
+    quaternion.iter().map(|v| v * v).sum::<f32>().is_normal()
+}
+
+/// The name of the first that does not hold.
+fn first_bad(checks: &[(bool, &'static str)]) -> Option<&'static str> {
+    checks.iter().find(|(holds, _)| !holds).map(|(_, name)| *name)
+}
+
 impl Offspring {
-    /// Whether every number is finite and in its range, and there is at least one child.
+    /// The field that is not finite or out of its range, if any.
     #[must_use]
-    pub fn is_valid(&self) -> bool {
+    pub fn bad_field(&self) -> Option<&'static str> {
         let placement = match self.placement {
-            Placement::Offset(offset) => offset.iter().all(|v| v.is_finite()),
+            Placement::Offset(v) | Placement::Axes(v) => finite(&v),
             Placement::Sampled => true,
             Placement::LongAxis { sigmas } => sigmas.is_finite() && sigmas >= 0.0,
         };
-        self.children >= 1 && placement && self.scale.is_valid() && self.opacity.is_valid()
+        first_bad(&[
+            (self.children >= 1, "children"),
+            (placement, "placement"),
+            (self.scale.is_valid(), "scale"),
+            (turns(self.turn), "turn"),
+            (self.opacity.is_valid(), "opacity"),
+        ])
+    }
+
+    /// Whether scales change by axis, or anything is turned: [`Needs::detailed_edits`](crate::policy::Needs)
+    /// declares it.
+    #[must_use]
+    pub fn is_detailed(&self) -> bool {
+        matches!(self.scale, ScaleRule::Axes(_))
+            || self.turn.map(f32::to_bits) != UNTURNED.map(f32::to_bits)
     }
 
     /// How many Gaussians share the parent's opacity: its children, and the parent if it becomes one.
@@ -138,6 +188,7 @@ impl ScaleRule {
         match *self {
             Self::Uniform(factor) => positive(factor),
             Self::LongAxis { long, other } => positive(long) && positive(other),
+            Self::Axes(factors) => factors.into_iter().all(positive),
         }
     }
 }
@@ -155,22 +206,47 @@ impl OpacityRule {
 }
 
 impl Update {
-    /// Whether its values are in range. [`OpacityRule::Conserved`] is not: there are no children to
-    /// share the opacity with.
+    /// Changes nothing; other updates are written as `Update { colour: …, ..Update::NONE }`.
+    pub const NONE: Self = Self {
+        opacity: OpacityRule::Same,
+        scale: ScaleRule::Uniform(1.0),
+        position: None,
+        colour: None,
+        keep_moments: true,
+    };
+
+    /// The field that is not finite or out of its range, if any. [`OpacityRule::Conserved`] is not in
+    /// range: there are no children to share the opacity with.
     #[must_use]
-    pub fn is_valid(&self) -> bool {
-        self.scale.is_valid() && self.opacity.is_valid() && self.opacity != OpacityRule::Conserved
+    pub fn bad_field(&self) -> Option<&'static str> {
+        let opacity = self.opacity.is_valid() && self.opacity != OpacityRule::Conserved;
+        let colour = |colour: [f32; 3]| colour.iter().all(|c| c.abs() <= COLOUR_MAX);
+        first_bad(&[
+            (opacity, "opacity"),
+            (self.scale.is_valid(), "scale"),
+            (self.position.is_none_or(|position| finite(&position)), "position"),
+            (self.colour.is_none_or(colour), "colour"),
+        ])
     }
 }
 
 impl Seed {
-    /// Whether every number is finite and in its range.
+    /// A seed of the same standard deviation `scale` along all axes.
     #[must_use]
-    pub fn is_valid(&self) -> bool {
-        self.position.iter().all(|v| v.is_finite())
-            && self.colour.iter().all(|v| (0.0..=1.0).contains(v))
-            && positive(self.scale)
-            && in_open_unit(self.opacity)
+    pub const fn round(position: [f32; 3], colour: [f32; 3], scale: f32, opacity: f32) -> Self {
+        Self { position, colour, scales: [scale; 3], orientation: UNTURNED, opacity }
+    }
+
+    /// The field that is not finite or out of its range, if any.
+    #[must_use]
+    pub fn bad_field(&self) -> Option<&'static str> {
+        first_bad(&[
+            (finite(&self.position), "position"),
+            (self.colour.iter().all(|v| (0.0..=1.0).contains(v)), "colour"),
+            (self.scales.into_iter().all(positive), "scales"),
+            (turns(self.orientation), "orientation"),
+            (in_open_unit(self.opacity), "opacity"),
+        ])
     }
 }
 
@@ -178,61 +254,85 @@ impl Seed {
 mod tests {
     use super::*;
 
-    const BAD: [f32; 4] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0];
+    const NOT_FINITE: [f32; 3] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
+    const SEED: Seed = Seed::round([0.0; 3], [0.0, 0.5, 1.0], 0.1, 0.1);
 
-    #[test]
-    fn numbers_out_of_range_are_invalid() {
-        let clone = Offspring {
-            children: 1,
-            parent: ParentFate::Stays,
-            placement: Placement::Offset([0.0; 3]),
-            scale: ScaleRule::Uniform(1.0),
-            opacity: OpacityRule::Same,
-        };
-        assert!(clone.is_valid());
-        assert!(!Offspring { children: 0, ..clone }.is_valid());
-        for bad in BAD.into_iter().chain([0.0]) {
-            assert!(!ScaleRule::Uniform(bad).is_valid(), "{bad}");
-            assert!(!ScaleRule::LongAxis { long: bad, other: 1.0 }.is_valid(), "{bad}");
-            assert!(!ScaleRule::LongAxis { long: 1.0, other: bad }.is_valid(), "{bad}");
-            assert!(!OpacityRule::Set(bad).is_valid(), "{bad}");
-            assert!(!OpacityRule::Scaled(bad).is_valid(), "{bad}");
-        }
-        for bad in BAD {
-            let placement = Placement::LongAxis { sigmas: bad };
-            assert!(!Offspring { placement, ..clone }.is_valid(), "{bad}");
-        }
-        for bad in [f32::NAN, f32::INFINITY] {
-            let placement = Placement::Offset([0.0, bad, 0.0]);
-            assert!(!Offspring { placement, ..clone }.is_valid(), "{bad}");
-        }
-        assert!(OpacityRule::Scaled(1.0).is_valid() && !OpacityRule::Set(1.0).is_valid());
+    fn not_positive() -> impl Iterator<Item = f32> {
+        NOT_FINITE.into_iter().chain([-1.0, 0.0])
     }
 
     #[test]
-    fn a_seed_must_be_a_gaussian() {
-        let seed = Seed { position: [0.0; 3], colour: [0.0, 0.5, 1.0], scale: 0.1, opacity: 0.1 };
-        assert!(seed.is_valid());
-        for bad in BAD {
-            assert!(!Seed { colour: [bad, 0.0, 0.0], ..seed }.is_valid(), "{bad}");
-            assert!(!Seed { scale: bad, ..seed }.is_valid(), "{bad}");
-            assert!(!Seed { opacity: bad, ..seed }.is_valid(), "{bad}");
+    fn a_bad_field_of_a_family_is_named() {
+        let clone = crate::adc::clone_at([0.0; 3]);
+        assert_eq!(clone.bad_field(), None);
+        assert_eq!(Offspring { children: 0, ..clone }.bad_field(), Some("children"));
+        let at = |placement| Offspring { placement, ..clone }.bad_field();
+        let scaled = |scale| Offspring { scale, ..clone }.bad_field();
+        let covering = |opacity| Offspring { opacity, ..clone }.bad_field();
+        for bad in not_positive() {
+            assert_eq!(scaled(ScaleRule::Uniform(bad)), Some("scale"), "{bad}");
+            assert_eq!(scaled(ScaleRule::LongAxis { long: bad, other: 1.0 }), Some("scale"));
+            assert_eq!(scaled(ScaleRule::LongAxis { long: 1.0, other: bad }), Some("scale"));
+            assert_eq!(scaled(ScaleRule::Axes([1.0, bad, 1.0])), Some("scale"), "{bad}");
+            assert_eq!(covering(OpacityRule::Set(bad)), Some("opacity"), "{bad}");
+            assert_eq!(covering(OpacityRule::Scaled(bad)), Some("opacity"), "{bad}");
         }
-        assert!(!Seed { position: [0.0, f32::NAN, 0.0], ..seed }.is_valid());
-        assert!(!Seed { colour: [1.1, 0.0, 0.0], ..seed }.is_valid());
-        assert!(!Seed { scale: 0.0, ..seed }.is_valid());
-        assert!(!Seed { opacity: 1.0, ..seed }.is_valid());
+        for bad in NOT_FINITE {
+            assert_eq!(at(Placement::LongAxis { sigmas: bad }), Some("placement"), "{bad}");
+            assert_eq!(at(Placement::Offset([0.0, bad, 0.0])), Some("placement"), "{bad}");
+            assert_eq!(at(Placement::Axes([0.0, 0.0, bad])), Some("placement"), "{bad}");
+            let turned = Offspring { turn: [1.0, bad, 0.0, 0.0], ..clone };
+            assert_eq!(turned.bad_field(), Some("turn"), "{bad}");
+        }
+        assert_eq!(Offspring { turn: [0.0; 4], ..clone }.bad_field(), Some("turn"));
+        assert_eq!(at(Placement::LongAxis { sigmas: -1.0 }), Some("placement"));
+        assert_eq!(covering(OpacityRule::Set(1.0)), Some("opacity"));
+        assert_eq!(covering(OpacityRule::Scaled(1.0)), None);
     }
 
     #[test]
-    fn an_update_conserves_no_opacity() {
-        let update = Update {
-            opacity: OpacityRule::Same,
-            scale: ScaleRule::Uniform(1.0),
-            keep_moments: true,
-        };
-        assert!(update.is_valid());
-        assert!(!Update { opacity: OpacityRule::Conserved, ..update }.is_valid());
-        assert!(!Update { scale: ScaleRule::Uniform(0.0), ..update }.is_valid());
+    fn a_bad_field_of_a_seed_is_named() {
+        assert_eq!(SEED.bad_field(), None);
+        for bad in not_positive() {
+            assert_eq!(
+                Seed { scales: [0.1, bad, 0.1], ..SEED }.bad_field(),
+                Some("scales"),
+                "{bad}"
+            );
+            assert_eq!(Seed { opacity: bad, ..SEED }.bad_field(), Some("opacity"), "{bad}");
+        }
+        for bad in NOT_FINITE {
+            assert_eq!(Seed { position: [0.0, bad, 0.0], ..SEED }.bad_field(), Some("position"));
+            let orientation = [1.0, 0.0, bad, 0.0];
+            assert_eq!(Seed { orientation, ..SEED }.bad_field(), Some("orientation"), "{bad}");
+        }
+        for bad in NOT_FINITE.into_iter().chain([-0.1, 1.1]) {
+            assert_eq!(Seed { colour: [bad, 0.0, 0.0], ..SEED }.bad_field(), Some("colour"));
+        }
+        assert_eq!(Seed { orientation: [0.0; 4], ..SEED }.bad_field(), Some("orientation"));
+        assert_eq!(Seed { opacity: 1.0, ..SEED }.bad_field(), Some("opacity"));
+    }
+
+    #[test]
+    fn a_bad_field_of_an_update_is_named() {
+        assert_eq!(Update::NONE.bad_field(), None);
+        let wrong = |update: Update| update.bad_field();
+        assert_eq!(
+            wrong(Update { opacity: OpacityRule::Conserved, ..Update::NONE }),
+            Some("opacity")
+        );
+        assert_eq!(wrong(Update { scale: ScaleRule::Uniform(0.0), ..Update::NONE }), Some("scale"));
+        for bad in NOT_FINITE {
+            let three = Some([0.0, 0.0, bad]);
+            assert_eq!(
+                wrong(Update { position: three, ..Update::NONE }),
+                Some("position"),
+                "{bad}"
+            );
+            assert_eq!(wrong(Update { colour: three, ..Update::NONE }), Some("colour"), "{bad}");
+        }
+        assert_eq!(wrong(Update { colour: Some([-1.5, 0.0, 2.0]), ..Update::NONE }), None);
+        let beyond = Some([0.0, 2.0 * COLOUR_MAX, 0.0]);
+        assert_eq!(wrong(Update { colour: beyond, ..Update::NONE }), Some("colour"));
     }
 }

@@ -1,7 +1,7 @@
 //! Hand-made events for the tests of policies: signals in, pruned and grown rows out.
 
 use crate::conformance::check_policy_with;
-use crate::plan::{EditPlan, ParentFate, RowOps};
+use crate::plan::{EditPlan, Offspring, ParentFate, RowOps};
 use crate::policy::{
     AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, SignalSet,
     Signals, Snapshot,
@@ -82,14 +82,14 @@ impl Event {
     }
 
     pub(crate) fn with(mut self, signal: Signal, values: &[f32]) -> Self {
-        assert_eq!(values.len(), self.rows);
+        assert_eq!(values.len(), self.rows * signal.width());
         self.signals.retain(|(given, _)| *given != signal);
         self.signals.push((signal, values.to_vec()));
         self
     }
 
     pub(crate) fn with_all(self, signal: Signal, value: f32) -> Self {
-        let values = vec![value; self.rows];
+        let values = vec![value; self.rows * signal.width()];
         self.with(signal, &values)
     }
 
@@ -130,16 +130,22 @@ impl Event {
             signals: &signals,
             candidates: &self.candidates,
         };
-        let mut plan = EditPlan::new(self.rows, self.budget);
+        let needs = policy.needs(&self.scene);
+        let mut plan = EditPlan::new(self.rows, self.budget).allowing(&needs);
         policy.plan(&now, &PolicyRng::new(1, self.step), &mut plan)?;
         Ok(Outcome::new(plan.compile()))
     }
 }
 
 impl Outcome {
+    /// Of all families, in the order of the plan.
+    pub(crate) fn offspring(&self) -> Vec<Offspring> {
+        self.ops.families.iter().map(|family| self.ops.offspring(family)).collect()
+    }
+
     fn new(ops: RowOps) -> Self {
         let grown = |fate| {
-            let families = ops.families.iter().filter(move |f| f.offspring.parent == fate);
+            let families = ops.families.iter().filter(move |f| f.fate() == fate);
             families.map(|family| family.parent).collect()
         };
         // Rows were pruned whose slots are overwritten, and rows of the tail that do not move.

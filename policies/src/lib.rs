@@ -16,11 +16,13 @@
 //! |---|---|
 //! | a subclass of `Strategy` | a type that implements [`DensityPolicy`](policy::DensityPolicy) |
 //! | `state["grad2d"]`, `state["count"]` | [`Signal::ScreenGradient`](policy::Signal::ScreenGradient), [`Signal::VisibleCount`](policy::Signal::VisibleCount), declared in [`Needs`](policy::Needs) and accumulated by the backend |
+//! | `params["means"]` | [`Signal::Position`](policy::Signal::Position), declared like the others and read with [`positions`](policy::Snapshot::positions) |
 //! | `step_post_backward(step, ...)` | [`plan`](policy::DensityPolicy::plan), called after the optimiser's step of every iteration for which [`is_due`](policy::DensityPolicy::is_due) |
 //! | `duplicate` | [`plan.grow`](plan::EditPlan::grow)`(row, `[`clone_at`](adc::clone_at)`([0.0; 3]))` |
 //! | `split` | `plan.grow(row, `[`split_by`](adc::split_by)`(1.6))` |
 //! | `remove` | [`plan.prune`](plan::EditPlan::prune)`(row)` |
 //! | `relocate`, `sample_add` | `prune`, and `grow` with [`OpacityRule::Conserved`](plan::OpacityRule::Conserved) |
+//! | writing to `params` | [`plan.update`](plan::EditPlan::update)`(row, `[`Update`](plan::Update)` { … })` |
 //! | `reset_opa` | [`plan.clamp_opacity`](plan::EditPlan::clamp_opacity)`(max)` |
 //! | `inject_noise_to_position` | [`Needs::noise`](policy::Needs::noise) |
 //! | `cap_max` | the budget of the run, the same for every policy |
@@ -168,7 +170,7 @@ mod event;
 pub mod igs;
 pub mod mcmc;
 mod needs;
-mod neighbours;
+pub mod neighbours;
 mod ops;
 pub mod parameters;
 pub mod plan;

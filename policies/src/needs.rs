@@ -39,6 +39,10 @@ pub struct Needs {
     pub rates: RateOverrides,
     /// Changes to the initial rows.
     pub start: StartRule,
+    /// Whether plans hold edits that take more memory: rows rewritten in place
+    /// ([`EditPlan::update`](crate::plan::EditPlan::update)), children that are turned, or whose scales
+    /// change by axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
+    pub detailed_edits: bool,
 }
 
 impl Needs {

@@ -18,6 +18,8 @@ pub enum SignalKind {
     FreshMaximum,
     /// Computed from the current parameters or age of the row; needs no memory.
     Present,
+    /// So many numbers of the row as it is now, copied at events only; needs no memory in between.
+    Attribute(usize),
 }
 
 /// What the backward pass must sum over the pixels of each row for a signal, beyond what training needs;
@@ -32,12 +34,17 @@ pub enum PixelSum {
     Count,
     /// The blend weight α·T; its maximum, not its sum.
     LargestWeight,
+    /// The blend weight α·T times the error of the pixel.
+    WeightedError,
 }
 
 /// Declares the table of signals, each an entry with name, kind, unit and pixel sums.
 macro_rules! signals {
-    ($($(#[$doc:meta])* $name:ident: $kind:ident $unit:literal [$($sum:ident),*];)*) => {
-        /// A per-row statistic that a policy may read: one `f32` per row.
+    ($(
+        $(#[$doc:meta])*
+        $name:ident: $kind:ident $(($width:literal))? $unit:literal [$($sum:ident),*];
+    )*) => {
+        /// What a policy may read of each row: one `f32`, or [a few](Self::width).
         #[derive(
             Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize,
         )]
@@ -54,7 +61,7 @@ macro_rules! signals {
             #[must_use]
             pub const fn kind(self) -> SignalKind {
                 match self {
-                    $(Self::$name => SignalKind::$kind,)*
+                    $(Self::$name => SignalKind::$kind $(($width))?,)*
                 }
             }
 
@@ -107,6 +114,11 @@ signals! {
     WeightSum: Sum "pixels" [Weight];
     /// Number of pixels the row was blended into, >= 0.
     PixelCount: Count "pixels" [Count];
+    /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
+    /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
+    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen. SSIM is then computed
+    /// in every step, so that the knob `ssim_every` saves nothing on the native backend.
+    WeightedError: Sum "pixels" [WeightedError];
     /// Opacity now, in (0, 1).
     Opacity: Present "1" [];
     /// Largest of the three standard deviations now `[scene units]`, > 0.
@@ -115,6 +127,30 @@ signals! {
     ScaleProduct: Present "scene units³" [];
     /// Optimiser steps since the row was created or rewritten, saturating at 65,535.
     Age: Present "steps" [];
+    /// Mean now `[scene units]`: world coordinates of the scene as it is trained on. Their origin is the
+    /// mean of the training cameras, the farthest of which is 1 away, but for a few that are far from all
+    /// others; if all are at one place, the median distance of the points is 1. They are not turned
+    /// against the dataset's. See [`Snapshot::positions`](crate::policy::Snapshot::positions).
+    Position: Attribute(3) "scene units" [];
+    /// Natural logarithms of the three standard deviations now `[ln scene units]`, along the axes of
+    /// [`Orientation`](Self::Orientation).
+    LogScale: Attribute(3) "ln scene units" [];
+    /// Orientation now: a quaternion q = (w, x, y, z) of any length but 0. R(q) takes the row's axes to
+    /// the scene's: its columns are the axes.
+    Orientation: Attribute(4) "1" [];
+    /// Base colour now (band 0): red, green and blue, sRGB-encoded; not bounded to `[0, 1]`.
+    Colour: Attribute(3) "1" [];
+}
+
+impl Signal {
+    /// Numbers per row.
+    #[must_use]
+    pub const fn width(self) -> usize {
+        match self.kind() {
+            SignalKind::Attribute(width) => width,
+            _ => 1,
+        }
+    }
 }
 
 /// A set of [`Signal`]s.
@@ -146,6 +182,12 @@ impl SignalSet {
         self.0.count_ones() as usize
     }
 
+    /// Numbers per row of all signals in the set.
+    #[must_use]
+    pub fn width(self) -> usize {
+        self.iter().map(Signal::width).sum()
+    }
+
     /// The signals in the set, in declaration order.
     pub fn iter(self) -> impl Iterator<Item = Signal> {
         Signal::ALL.into_iter().filter(move |&s| self.contains(s))
@@ -169,12 +211,12 @@ impl<const N: usize> From<[Signal; N]> for SignalSet {
 pub struct Signals {
     rows: usize,
     present: SignalSet,
-    /// Columns, one after another in declaration order. Shape: `[present, rows]`.
+    /// Columns, one after another in declaration order. Shape: `[present, rows, width]`.
     values: Vec<f32>,
 }
 
 impl Signals {
-    /// Columns for `set`, all zero. Each has `rows` values.
+    /// Columns for `set`, all zero. Each has `rows` values, or rows of [some](Signal::width).
     #[must_use]
     pub fn zeros(rows: usize, set: SignalSet) -> Self {
         Self::within(Vec::new(), rows, set)
@@ -184,7 +226,7 @@ impl Signals {
     #[must_use]
     pub fn within(mut values: Vec<f32>, rows: usize, set: SignalSet) -> Self {
         values.clear();
-        values.resize(rows * set.count(), 0.0);
+        values.resize(rows * set.width(), 0.0);
         Self { rows, present: set, values }
     }
 
@@ -200,20 +242,27 @@ impl Signals {
         self.rows
     }
 
-    /// The column of `signal`, if present. Shape: `[rows]`.
+    /// The column of `signal`, if present. Shape: `[rows, width]`.
     #[must_use]
     pub fn get(&self, signal: Signal) -> Option<&[f32]> {
         self.range(signal).map(|range| &self.values[range])
     }
 
-    /// The column of `signal` for writing, if present. Shape: `[rows]`.
+    /// The column of `signal` for writing, if present. Shape: `[rows, width]`.
     pub fn get_mut(&mut self, signal: Signal) -> Option<&mut [f32]> {
         self.range(signal).map(|range| &mut self.values[range])
     }
 
     fn range(&self, signal: Signal) -> Option<Range<usize>> {
-        let before = self.present.iter().position(|s| s == signal)?;
-        Some(before * self.rows..(before + 1) * self.rows)
+        let mut start = 0;
+        for present in self.present.iter() {
+            let end = start + present.width() * self.rows;
+            if present == signal {
+                return Some(start..end);
+            }
+            start = end;
+        }
+        None
     }
 }
 
@@ -269,5 +318,19 @@ mod tests {
         assert_eq!(set.without(Signal::Age), fewer);
         assert_eq!(set.without(Signal::WeightMax), set);
         assert!(!set.contains(Signal::WeightMax) && !SignalSet::default().contains(Signal::Age));
+    }
+
+    #[test]
+    fn columns_have_the_width_of_their_signal_and_do_not_overlap() {
+        let set =
+            SignalSet::from([Signal::Age, Signal::Orientation, Signal::Position, Signal::Colour]);
+        let mut signals = Signals::zeros(2, set);
+        for (signal, value) in set.iter().zip(1_u8..) {
+            signals.get_mut(signal).unwrap().fill(f32::from(value));
+        }
+        for (signal, value) in set.iter().zip(1_u8..) {
+            assert_eq!(signals.get(signal).unwrap(), vec![f32::from(value); 2 * signal.width()]);
+        }
+        assert_eq!((set.width(), signals.into_values().len()), (11, 22));
     }
 }

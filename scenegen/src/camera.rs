@@ -4,9 +4,10 @@
 //! the trainer's `Camera::project` tests both.
 
 use glam::{DMat3, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// A pinhole camera. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Image width `[px]`, >= 1.
     pub width: u32,

@@ -51,5 +51,5 @@ pub use shade::Ambient;
 pub use sky::Sky;
 pub use surface::{Surface, SurfaceHit};
 pub use trace::Frame;
-pub use truth::{GroundTruth, Sight};
-pub use write::{Written, check_target, contact_sheet, write, write_png};
+pub use truth::{GBuffer, GroundTruth};
+pub use write::{Written, check_target, contact_sheet, write};

@@ -121,8 +121,11 @@ impl Folder {
             return read(&literal);
         }
         let decoded = percent_decoded(uri).ok_or_else(|| {
-            let problem = "has a % without two hexadecimal digits of UTF-8 after it";
-            self.refused(element, uri, problem)
+            let uri: String = uri.chars().take(80).collect();
+            let problem =
+                format!("the URI {uri:?} has a % without two hexadecimal digits of UTF-8 after it");
+            let remedy = "give the file a name in UTF-8, and write a % in it as %25";
+            Error::malformed(&self.file, element, problem, remedy)
         })?;
         self.read(element, &self.resolve(element, &decoded)?)
     }
@@ -134,7 +137,11 @@ impl Folder {
         }
         let name = path.strip_prefix(&self.folder).unwrap_or(path);
         let problem = format!("there is no file {}", name.display());
-        let remedy = "put it where the mesh file says, or remove the reference";
+        // The mark that has taken the place of what could not be read.
+        let remedy = match name.to_string_lossy().contains(char::REPLACEMENT_CHARACTER) {
+            true => "its name is not UTF-8: rename it, and save the mesh file as UTF-8",
+            false => "put it where the mesh file says, or remove the reference",
+        };
         Err(Error::malformed(&self.file, element, problem, remedy))
     }
 }
@@ -266,9 +273,17 @@ mod tests {
             let error = here.resolve("buffer 0", bad).expect_err(bad).to_string();
             assert!(error.contains("keep all files"), "{error}");
         }
-        for bad in ["%2e%2e/b.bin", "%2Fetc/passwd", "%zz", "%", "%ff"] {
+        for (bad, remedy) in [
+            ("%2e%2e/b.bin", "keep all files"),
+            ("%2Fetc/passwd", "keep all files"),
+            ("%zz", "a name in UTF-8"),
+            ("%", "write a % in it as %25"),
+            ("caf%e9.bin", "a name in UTF-8"),
+            ("caf\u{fffd}.bin", "its name is not UTF-8: rename it"),
+            ("b.bin", "put it where the mesh file says"),
+        ] {
             let error = here.read_uri("buffer 0", bad).expect_err(bad).to_string();
-            assert!(error.contains("keep all files"), "{error}");
+            assert!(error.contains(remedy), "{error}");
         }
         std::fs::write(folder.path().join("a b.bin"), "seen").expect("write");
         assert_eq!(here.read_uri("buffer 0", "a%20b.bin").expect("read"), b"seen");

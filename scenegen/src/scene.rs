@@ -88,7 +88,7 @@ impl Default for Options {
 }
 
 /// A view's part in training.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Split {
     /// Trained on.
     Train,
@@ -97,7 +97,7 @@ pub enum Split {
 }
 
 /// A posed view, not yet rendered.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct View {
     /// Name without ending, as in file names: `train/r_000`.
     pub name: String,

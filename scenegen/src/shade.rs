@@ -74,7 +74,7 @@ pub(crate) struct Sampling {
 }
 
 /// A point as one of a pixel's subsamples sees it.
-pub(crate) struct Seen<'a> {
+pub(crate) struct VisiblePoint<'a> {
     /// Number of the subsample.
     pub(crate) index: u32,
     pub(crate) point: Point<'a>,
@@ -117,11 +117,11 @@ impl Lighting {
     pub(crate) fn radiance(
         &self,
         shaded: &ShadedSurface<'_>,
-        points: &[Seen<'_>],
+        points: &[VisiblePoint<'_>],
         sampling: &mut Sampling,
     ) -> [Vec3; LANES] {
         let mut total = [Vec3::ZERO; LANES];
-        for (total, Seen { point, .. }) in total.iter_mut().zip(points) {
+        for (total, VisiblePoint { point, .. }) in total.iter_mut().zip(points) {
             *total = if point.is_unlit() { point.base } else { point.emitted };
         }
         for light in &self.lights {
@@ -129,7 +129,7 @@ impl Lighting {
             // For each ray: its point's number and its light if it is not blocked.
             let mut contributions = [(0, Vec3::ZERO); LANES];
             let mut count = 0;
-            for (number, Seen { index, point, view }) in points.iter().enumerate() {
+            for (number, VisiblePoint { index, point, view }) in points.iter().enumerate() {
                 if point.is_unlit() {
                     continue;
                 }
@@ -181,10 +181,10 @@ impl Lighting {
     fn ambient(
         &self,
         shaded: &ShadedSurface<'_>,
-        seen: &Seen<'_>,
+        seen: &VisiblePoint<'_>,
         sampling: &mut Sampling,
     ) -> Vec3 {
-        let Seen { index, ref point, view } = *seen;
+        let VisiblePoint { index, ref point, view } = *seen;
         let shiny = point.material.reflection == Reflection::MetalRough;
         let diffuse_colour = point.diffuse_colour();
         let rays = match self.ambient {
@@ -272,10 +272,10 @@ impl Lighting {
     fn specular_bounce(
         &self,
         shaded: &ShadedSurface<'_>,
-        seen: &Seen<'_>,
+        seen: &VisiblePoint<'_>,
         sampling: &mut Sampling,
     ) -> Vec3 {
-        let Seen { index, ref point, view } = *seen;
+        let VisiblePoint { index, ref point, view } = *seen;
         let (tangent, bitangent) = frame(point.shading);
         let cos = view.dot(point.shading).max(1e-4);
         let local = Vec3::new(view.dot(tangent), view.dot(bitangent), cos).normalize();
@@ -517,7 +517,7 @@ impl TrianglePoint<'_> {
             },
         };
         let tangent = (tangent - normal * normal.dot(tangent)).normalize_or_zero();
-        // Seen from behind, the normal is turned but the image on the surface is not.
+        // VisiblePoint from behind, the normal is turned but the image on the surface is not.
         let bitangent = normal.cross(tangent) * handedness * side;
         (bump.x * tangent + bump.y * bitangent + bump.z * normal).normalize_or(normal)
     }

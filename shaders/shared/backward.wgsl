@@ -2,7 +2,8 @@
 // src/backend/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
-// dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set.
+// dL/dpixel, plane after plane: red, green, blue, and alpha and depth where MORE is set; or else the error
+// of the pixels where records have a sum of it.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
 // Whether alpha and depth have gradients.
@@ -14,7 +15,8 @@ struct Upstream {
     green: vec4<f32>,
     blue: vec4<f32>,
     alpha: vec4<f32>,
-    depth: vec4<f32>,
+    // By depth, or the error.
+    map: vec4<f32>,
 }
 
 // Pixels as they are behind the splat at hand: the light that is left there, and dL/d(what is seen);
@@ -40,7 +42,9 @@ fn upstream(quad: Quad) -> Upstream {
     var g = Upstream(plane(0u, quad), plane(1u, quad), plane(2u, quad), vec4(0.0), vec4(0.0));
     if MORE {
         g.alpha = plane(3u, quad);
-        g.depth = plane(4u, quad);
+        g.map = plane(4u, quad);
+    } else if ERROR_AT > 0u {
+        g.map = plane(3u, quad);
     }
     return g;
 }
@@ -93,7 +97,7 @@ fn differentiated(
     let rgb = splat.colour;
     var here = rgb.x * own.red + rgb.y * own.green + rgb.z * own.blue;
     if MORE {
-        here += own.alpha + splat.b.z * own.depth;
+        here += own.alpha + splat.b.z * own.map;
     }
     let ahead = here - (*pixels).seen;
     (*pixels).seen = select((*pixels).seen, (*pixels).seen + alpha * ahead, takes);
@@ -126,7 +130,10 @@ fn differentiated(
         (*sums)[PIXEL_COUNT_AT] = total(select(vec4(0.0), vec4(1.0), w > vec4(0.0)));
     }
     if DEPTH_AT > 0u {
-        (*sums)[DEPTH_AT] = total(w * own.depth);
+        (*sums)[DEPTH_AT] = total(w * own.map);
+    }
+    if ERROR_AT > 0u {
+        (*sums)[ERROR_AT] = total(w * own.map);
     }
     if WEIGHT_MAX_AT > 0u {
         (*sums)[WEIGHT_MAX_AT] = largest(w);

@@ -9,5 +9,6 @@ override ABS_Y_AT: u32;
 override WEIGHT_SUM_AT: u32;
 override PIXEL_COUNT_AT: u32;
 override DEPTH_AT: u32;
+override ERROR_AT: u32;
 // The largest of its values; all others are sums.
 override WEIGHT_MAX_AT: u32;

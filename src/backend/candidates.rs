@@ -110,6 +110,7 @@ impl Candidates {
 
     /// The same, where the pixels that may be among them are known, and their errors: at least
     /// [`ranked`] of the worst.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
     pub(super) fn worst_of(
         &mut self,
         size: [usize; 2],

@@ -6,11 +6,11 @@ use densify_policies::policy::Needs;
 use serde::{Deserialize, Serialize};
 
 use super::cpu::{CpuBackend, CpuOptions};
-use super::gpu::{
-    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, GpuBackend, GpuDevice, GpuOptions,
-    KeptPhotographs, adapters, may_be_present,
+use super::gpu::{GpuDevice, adapters, may_be_present};
+use super::{
+    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, Backend, BackendError, Shortcuts,
+    Storage,
 };
-use super::{Backend, BackendError, Shortcuts, Storage};
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 
@@ -100,15 +100,17 @@ pub struct BackendOptions {
     pub budget: usize,
     /// Near plane `[scene units]`, > 0.
     pub near: f32,
-    /// Most (row, tile) pairs held at a time; `None`: 16 per row, or as many as the device can hold.
+    /// Most (row, tile) pairs held at a time, beyond which an image is processed in bands; `None`: 16
+    /// per row, or as many as the device can hold.
     pub tile_cap: Option<usize>,
     /// Most gradient records held at a time (native backend).
     pub record_cap: usize,
     /// Processor threads; `None`: all cores.
     pub threads: Option<usize>,
-    /// Largest image that will be rendered (width, height) `[px]`.
+    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
+    /// memory than the ledger says.
     pub largest_image: (u32, u32),
-    /// Photographs that stay on a GPU.
+    /// Photographs that stay on a GPU instead of being uploaded at every step.
     pub photographs: KeptPhotographs,
     /// How parameters and moments are stored (native backend).
     pub storage: Storage,
@@ -150,17 +152,23 @@ impl BackendOptions {
             ..defaults
         }
     }
+}
 
-    fn gpu(&self) -> GpuOptions {
-        GpuOptions {
-            budget: self.budget,
-            near: self.near,
-            tile_cap: self.tile_cap,
-            largest_image: self.largest_image,
-            photographs: self.photographs,
-            needs: self.needs.clone(),
-            shortcuts: self.shortcuts,
-        }
+/// Photographs that may stay on the device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct KeptPhotographs {
+    /// How many.
+    pub count: usize,
+    /// Whether any of them has a mask.
+    pub with_masks: bool,
+}
+
+impl KeptPhotographs {
+    /// Bytes that one takes on the device, where the largest has this size: its pixels, and its mask.
+    #[must_use]
+    pub fn bytes((width, height): (u32, u32), with_masks: bool) -> [u64; 2] {
+        let pixels = u64::from(width) * u64::from(height);
+        [4 * pixels, if with_masks { pixels.next_multiple_of(4) } else { 0 }]
     }
 }
 
@@ -228,7 +236,10 @@ impl Device {
     #[must_use]
     pub fn describe(&self) -> String {
         match self {
-            Self::Processor => "processor (`densify devices` lists GPUs)".to_owned(),
+            Self::Processor if cfg!(feature = "gpu") => {
+                "processor (`densify devices` lists GPUs)".to_owned()
+            }
+            Self::Processor => "processor".to_owned(),
             Self::Gpu(device) => {
                 let adapter = device.adapter();
                 let note = match adapter.kind {
@@ -245,7 +256,7 @@ impl Device {
     pub fn largest_budget(&self, sh_degree: u8) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
-            Self::Gpu(device) => device.adapter().largest_budget(sh_degree) as usize,
+            Self::Gpu(device) => device.largest_budget(sh_degree) as usize,
         }
     }
 
@@ -254,7 +265,7 @@ impl Device {
     pub fn most_pairs(&self, needs: &Needs) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
-            Self::Gpu(device) => GpuBackend::most_pairs(needs, device) as usize,
+            Self::Gpu(device) => device.most_pairs(needs) as usize,
         }
     }
 
@@ -264,7 +275,7 @@ impl Device {
     pub fn promise(&self, sh_degree: u8, options: &BackendOptions, threads: usize) -> Ledger {
         match self {
             Self::Processor => CpuBackend::promise(sh_degree, &options.cpu(), threads),
-            Self::Gpu(device) => GpuBackend::promise(sh_degree, &options.gpu(), device),
+            Self::Gpu(device) => device.promise(sh_degree, options),
         }
     }
 
@@ -298,7 +309,7 @@ impl Device {
     ) -> Result<Box<dyn Backend>, BackendError> {
         Ok(match self {
             Self::Processor => Box::new(CpuBackend::new(model, &options.cpu())?),
-            Self::Gpu(device) => Box::new(GpuBackend::new(model, &options.gpu(), device)?),
+            Self::Gpu(device) => device.backend(model, options)?,
         })
     }
 }

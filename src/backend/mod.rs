@@ -3,11 +3,17 @@
 //! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
 //! Signals come down when a policy is due, row operations go up; parameters stay where they are.
 
+mod accumulation;
+mod adapter;
 mod audit;
 mod candidates;
 mod choice;
 pub mod cpu;
 mod differentiable;
+#[cfg(feature = "gpu")]
+pub mod gpu;
+#[cfg(not(feature = "gpu"))]
+#[path = "without_gpu.rs"]
 pub mod gpu;
 mod pixel_map;
 mod shortcuts;
@@ -25,8 +31,10 @@ use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
+pub use accumulation::Accumulation;
+pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
 pub use audit::{Attribute, Kept, Unsound};
-pub use choice::{BackendChoice, BackendKind, BackendOptions, Device};
+pub use choice::{BackendChoice, BackendKind, BackendOptions, Device, KeptPhotographs};
 pub use differentiable::{Differentiable, ImageGradient};
 pub use shortcuts::Shortcuts;
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};

@@ -4,7 +4,11 @@
 //! A signal is one entry in the policies' table ([`Signal`]); record layouts, strides, planes and the
 //! shaders' constants follow from it. Only requested signals have memory.
 
+use std::ops::Range;
+
 use densify_policies::policy::{Needs, PixelSum, Signal, SignalKind, SignalSet};
+
+use crate::gaussians::{ModelArray, dc_to_rgb};
 
 /// Numbers of a record that training itself needs: Σq, Σq·u, Σq·z, Σq·u², Σq·u·z, Σq·z² and the
 /// gradients by colour.
@@ -23,13 +27,22 @@ pub(super) enum Field {
     PixelCount,
     /// Σw·(gradient by depth): for given gradients of an image, never in training.
     Depth,
+    /// Σw·(error of the pixel): in training, and never beside [`Depth`](Self::Depth).
+    Error,
     /// max w; the last one, as it is the only one that is not a sum.
     WeightMax,
 }
 
 impl Field {
-    pub(super) const ALL: [Self; 6] =
-        [Self::AbsX, Self::AbsY, Self::WeightSum, Self::PixelCount, Self::Depth, Self::WeightMax];
+    pub(super) const ALL: [Self; 7] = [
+        Self::AbsX,
+        Self::AbsY,
+        Self::WeightSum,
+        Self::PixelCount,
+        Self::Depth,
+        Self::Error,
+        Self::WeightMax,
+    ];
 
     const fn of(sum: PixelSum) -> &'static [Self] {
         match sum {
@@ -37,15 +50,18 @@ impl Field {
             PixelSum::Weight => &[Self::WeightSum],
             PixelSum::Count => &[Self::PixelCount],
             PixelSum::LargestWeight => &[Self::WeightMax],
+            PixelSum::WeightedError => &[Self::Error],
         }
     }
 
-    /// The place of this number among all that a record can have.
+    /// The place of this number among all that a record can have; one place for depth and error.
     pub(super) const fn number(self) -> usize {
-        BASE + self as usize
+        let is_late = self as usize >= Self::Error as usize;
+        BASE + self as usize - is_late as usize
     }
 
     /// The shaders' constant for its place in a record.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
     pub(super) const fn constant(self) -> &'static str {
         match self {
             Self::AbsX => "ABS_X_AT",
@@ -53,6 +69,7 @@ impl Field {
             Self::WeightSum => "WEIGHT_SUM_AT",
             Self::PixelCount => "PIXEL_COUNT_AT",
             Self::Depth => "DEPTH_AT",
+            Self::Error => "ERROR_AT",
             Self::WeightMax => "WEIGHT_MAX_AT",
         }
     }
@@ -64,14 +81,15 @@ pub(super) struct RecordLayout {
     /// A bit per [`Field`].
     fields: u8,
     /// The optional fields by their place among all numbers that a record can have, in order.
-    extras: [u8; Field::ALL.len()],
+    extras: [u8; RecordLayout::MOST - BASE],
 }
 
 impl RecordLayout {
-    /// Every field: what [`Differentiable`](super::Differentiable) needs.
-    pub(super) const ALL: Self = Self::with((1 << Field::ALL.len()) - 1);
-    /// Numbers of a record that has every field.
-    pub(super) const MOST: usize = BASE + Field::ALL.len();
+    /// Every field but the error: what [`Differentiable`](super::Differentiable) needs.
+    pub(super) const ALL: Self =
+        Self::with(((1 << Field::ALL.len()) - 1) & !(1 << Field::Error as u8));
+    /// Most numbers of a record.
+    pub(super) const MOST: usize = Field::WeightMax.number() + 1;
 
     pub(super) fn new(signals: SignalSet) -> Self {
         let fields = signals.iter().flat_map(Signal::pixel_sums).flat_map(|&sum| Field::of(sum));
@@ -79,11 +97,11 @@ impl RecordLayout {
     }
 
     const fn with(fields: u8) -> Self {
-        let mut extras = [0; Field::ALL.len()];
+        let mut extras = [0; Self::MOST - BASE];
         let (mut field, mut place) = (0, 0);
         while field < Field::ALL.len() {
             if fields >> field & 1 == 1 {
-                extras[place] = (BASE + field) as u8;
+                extras[place] = Field::ALL[field].number() as u8;
                 place += 1;
             }
             field += 1;
@@ -131,7 +149,7 @@ const fn planes(kind: SignalKind) -> usize {
         SignalKind::Sum | SignalKind::Count | SignalKind::FreshMaximum => 1,
         // The previous epoch, and the current one.
         SignalKind::EpochMaximum => 2,
-        SignalKind::Present => 0,
+        SignalKind::Present | SignalKind::Attribute(_) => 0,
     }
 }
 
@@ -148,7 +166,7 @@ impl SignalPlanes {
     }
 
     /// The planes of a signal; its value is the largest of theirs.
-    pub(super) fn of(&self, signal: Signal) -> std::ops::Range<usize> {
+    pub(super) fn of(&self, signal: Signal) -> Range<usize> {
         self.first[signal as usize].map_or(0..0, |first| first..first + planes(signal.kind()))
     }
 
@@ -196,9 +214,65 @@ impl SignalPlanes {
                     kept.push((format!("{signal:?}.previous"), previous));
                     kept.push((format!("{signal:?}.current"), current));
                 }
-                SignalKind::FreshMaximum | SignalKind::Present => {}
+                SignalKind::FreshMaximum | SignalKind::Present | SignalKind::Attribute(_) => {}
             }
         }
         kept
+    }
+}
+
+/// A signal that some of the rows' parameters are: which ones, and what makes a parameter a number of the
+/// signal.
+pub(super) struct ParameterSignal {
+    pub(super) parameters: Range<usize>,
+    pub(super) shown: fn(f32) -> f32,
+}
+
+impl ParameterSignal {
+    /// `None` for signals that are computed.
+    pub(super) fn of(signal: Signal) -> Option<Self> {
+        let as_stored = |x| x;
+        let (array, shown): (_, fn(f32) -> f32) = match signal {
+            Signal::Position => (ModelArray::Means, as_stored),
+            Signal::LogScale => (ModelArray::LogScales, as_stored),
+            Signal::Orientation => (ModelArray::Quats, as_stored),
+            Signal::Colour => (ModelArray::Sh, dc_to_rgb),
+            Signal::VisibleCount
+            | Signal::ScreenGradient
+            | Signal::ScreenGradientAbs
+            | Signal::ColourGradient
+            | Signal::MeanGradientX
+            | Signal::MeanGradientY
+            | Signal::MeanGradientZ
+            | Signal::MeanGradientNorm
+            | Signal::WeightMax
+            | Signal::FreshWeightMax
+            | Signal::WeightSum
+            | Signal::PixelCount
+            | Signal::WeightedError
+            | Signal::Opacity
+            | Signal::ScaleMax
+            | Signal::ScaleProduct
+            | Signal::Age => return None,
+        };
+        // Of the coefficients, those of band 0.
+        Some(Self { parameters: array.parameters(0), shown })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attributes_and_no_others_are_parameters_as_many_as_they_are_wide() {
+        for signal in Signal::ALL {
+            let found = ParameterSignal::of(signal).map(|found| found.parameters.len());
+            let width = match signal.kind() {
+                SignalKind::Attribute(width) => Some(width),
+                _ => None,
+            };
+            assert_eq!(found, width, "{signal:?}");
+        }
     }
 }

@@ -45,7 +45,7 @@ pub fn newest(run: &Path) -> (Option<Checkpoint>, Vec<CheckpointError>) {
 
 /// Removes all but the two newest checkpoints up to `step`, which has just been written. Later ones,
 /// which may be damaged, stay until they are overwritten. Errors are ignored.
-pub fn tidy(run: &Path, step: u32) {
+pub fn remove_older(run: &Path, step: u32) {
     let past = list(run).into_iter().filter(|&(saved, _)| saved <= step);
     for (_, path) in past.skip(MAX_CHECKPOINTS) {
         let _ = fs::remove_file(path);

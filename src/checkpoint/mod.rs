@@ -25,7 +25,7 @@ mod read;
 mod write;
 
 pub use fingerprint::{Fingerprint, ViewsFingerprint};
-pub use folder::{checkpoint_path, newest, tidy};
+pub use folder::{checkpoint_path, newest, remove_older};
 pub use format::VERSION;
 pub use read::Checkpoint;
 pub use write::write;

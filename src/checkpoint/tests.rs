@@ -256,7 +256,7 @@ fn the_newest_sound_one_is_found_and_two_are_kept() {
     assert_eq!(found.unwrap().path(), checkpoint_path(run, 30));
     assert_eq!(rejected.len(), 1);
     assert!(rejected[0].to_string().contains("iteration_100"));
-    tidy(run, 30);
+    remove_older(run, 30);
     let mut left: Vec<String> = std::fs::read_dir(run.join("checkpoints"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())

@@ -5,7 +5,9 @@ use std::fmt;
 use std::io::{self, IsTerminal, Write};
 
 use indicatif::MultiProgress;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 use crate::failure::{Failure, OTHER};
 use crate::foreign;
@@ -27,20 +29,24 @@ impl Console {
     /// A console for this process; sets up the log. A quiet one shows only results and errors.
     pub(super) fn new(quiet: bool) -> Self {
         let bars = MultiProgress::new();
-        let filter = if quiet {
-            EnvFilter::new("error")
-        } else {
-            EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(LOG_FILTER))
+        let wanted = std::env::var("RUST_LOG").ok().filter(|_| !quiet);
+        let (wanted, mistake) = match wanted.map(|text| text.parse::<Targets>()) {
+            Some(Err(mistake)) => (None, Some(mistake)),
+            parsed => (parsed.and_then(Result::ok), None),
         };
+        let usual = if quiet { "error" } else { LOG_FILTER };
+        let filter = wanted.or_else(|| usual.parse().ok()).unwrap_or_default();
         let above = bars.clone();
-        // An outside program may have set up a log of its own; it stays.
-        let _ = tracing_subscriber::fmt()
-            .with_env_filter(filter)
+        let lines = tracing_subscriber::fmt::layer()
             .with_writer(move || LogLine(above.clone()))
             .with_ansi(io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())
             .with_target(false)
-            .without_time()
-            .try_init();
+            .without_time();
+        // An outside program may have set up a log of its own; it stays.
+        let _ = tracing_subscriber::registry().with(lines).with(filter).try_init();
+        if let Some(mistake) = mistake {
+            tracing::warn!("RUST_LOG is not used: {mistake}; write a level, or TARGET=LEVEL,…");
+        }
         Self { quiet, bars, broken: RefCell::new(None) }
     }
 

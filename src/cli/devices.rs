@@ -3,7 +3,8 @@
 use clap::Args;
 
 use super::console::Console;
-use crate::backend::gpu::{AdapterKind, adapters};
+use crate::backend::AdapterKind;
+use crate::backend::gpu::adapters;
 use crate::failure::Failure;
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::memory::Bytes;

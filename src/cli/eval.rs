@@ -10,8 +10,8 @@ use super::console::Console;
 use super::limits::{self, Limit};
 use crate::evaluate::{Mean, Split, evaluate};
 use crate::failure::Failure;
-use crate::metrics::geometry::{self, Geometry, KnownScene};
-use crate::number::grouped;
+use crate::metrics::geometry::{self, Geometry};
+use crate::number::{grouped, percent};
 use crate::output::{write_geometry, write_scores};
 use crate::run::finished::{Machine, iteration, open_run};
 use crate::run::{DeviceSpec, RunConfig};
@@ -63,6 +63,8 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let machine = Machine::open(&args.device, console)?;
     let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
     let views = opened.views(args.split)?;
+    let knows_geometry = opened.dataset.surface_bytes.is_some();
+    limits::check_keys(knows_geometry, &args.fail_below, &args.fail_above)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
@@ -77,19 +79,10 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let mean = Mean::of(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip);
     write_scores(run, args.split, iteration, &scores)?;
-    let mut geometry = None;
-    if let Some(truth) = opened.dataset.ground_truth()? {
-        let train = opened.views(Split::Train)?;
-        let ground = KnownScene {
-            truth: &truth,
-            normalisation: &opened.dataset.normalisation,
-            background,
-            sh_degree: opened.sh_degree,
-        };
-        let measured = geometry::measure(opened.backend.as_mut(), &ground, &train, &views)?;
-        console.result(table(&measured));
-        write_geometry(run, args.split, iteration, &measured)?;
-        geometry = Some(measured);
+    let geometry = opened.geometry(&views, &|| false)?;
+    if let Some(measured) = &geometry {
+        console.result(table(measured));
+        write_geometry(run, args.split, iteration, measured)?;
     }
     limits::check(&limits::values(&mean, geometry.as_ref()), &args.fail_below, &args.fail_above)
 }
@@ -97,9 +90,6 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
 /// The geometric measurements as lines; lengths as percentages of the diagonal.
 fn table(geometry: &Geometry) -> String {
     let Geometry { depth, normal_error, centres, floaters, thin, redundancy } = geometry;
-    let percent = |value: f64| {
-        if value.is_finite() { format!("{:.3} %", 100.0 * value) } else { "–".into() }
-    };
     let plain = |value: f64, unit: &str| {
         if value.is_finite() { format!("{value:.2}{unit}") } else { "–".into() }
     };

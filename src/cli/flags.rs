@@ -1,9 +1,7 @@
 //! The options of a run as flags: their defaults in the help, and which of them a call gives.
 
-use std::ffi::OsString;
-
 use clap::parser::ValueSource;
-use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
+use clap::{Arg, ArgMatches, Command};
 use toml::{Table, Value};
 
 use crate::failure::Failure;
@@ -32,18 +30,6 @@ pub(super) fn given(matches: &ArgMatches, spec: &RunSpec) -> Result<Partial, Fai
     Partial::given(spec, |name| matches.value_source(name) == Some(ValueSource::CommandLine))
 }
 
-/// The options of a run in words like those after `densify train`, but for the scene.
-pub(super) fn parsed(words: &[String], of: &'static str) -> Result<Partial, Failure> {
-    let command = Command::new(of).no_binary_name(true).disable_help_flag(true);
-    let command = with_defaults(RunSpec::augment_args(command));
-    let usage =
-        |error: clap::Error| Failure::input(error.to_string().trim().trim_start_matches("error: "));
-    let words = words.iter().map(OsString::from);
-    let matches = command.try_get_matches_from(words).map_err(usage)?;
-    let spec = RunSpec::from_arg_matches(&matches).map_err(usage)?;
-    given(&matches, &spec)
-}
-
 /// Fails where `--policy-set` among these flags names another policy than that of the run.
 pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failure> {
     let policy = &spec.density.policy;
@@ -61,6 +47,8 @@ pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failur
 #[cfg(test)]
 pub(super) fn markdown() -> String {
     use std::fmt::Write as _;
+
+    use clap::Args;
 
     use crate::run::{OPTIONS, OnResume};
 
@@ -122,15 +110,5 @@ mod tests {
             there == markdown(),
             "docs/options.md is out of date: DENSIFY_WRITE_DOCS=1 cargo test options_table"
         );
-    }
-
-    #[test]
-    fn only_what_is_given_is_given() {
-        let words = ["--near", "0.04", "--eval", "--knob", "alpha_min=1/64", "--lr=opacity=0.05"];
-        let found = parsed(&words.map(str::to_owned), "train").unwrap();
-        let names: Vec<&str> = found.iter().map(|(name, _)| name).collect();
-        assert_eq!(names, ["eval", "knob", "lr", "near"]);
-        let spec = found.describe().unwrap();
-        assert!(spec.data.eval && spec.schedule.iterations.0 == 24_000);
     }
 }

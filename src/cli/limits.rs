@@ -8,7 +8,8 @@ use serde_json::Value;
 
 use crate::evaluate::Mean;
 use crate::failure::{Failure, LIMIT};
-use crate::metrics::geometry::Geometry;
+use crate::metrics::geometry::{Geometry, ThinRecall};
+use crate::without::without;
 
 /// A bound on a measured value.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,6 +60,47 @@ fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
     }
 }
 
+/// Fails, before anything is measured, where a limit names what will not be.
+///
+/// # Errors
+/// Code 2 with the keys that there are.
+pub(super) fn check_keys(
+    knows_geometry: bool,
+    below: &[Limit],
+    above: &[Limit],
+) -> Result<(), Failure> {
+    let example = Geometry { thin: vec![ThinRecall::default()], ..Geometry::default() };
+    let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0 };
+    let known = values(&mean, knows_geometry.then_some(&example));
+    for (limits, flag) in [(below, "--fail-below"), (above, "--fail-above")] {
+        for Limit { key, .. } in limits {
+            // How many widths of thin structures there are is found by measuring.
+            let first = |part| if str::parse::<u32>(part).is_ok() { "0" } else { part };
+            let like = key.split('.').map(first).collect::<Vec<_>>().join(".");
+            if !known.contains_key(&like) {
+                return Err(unknown(flag, key, &known));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn unknown(flag: &str, key: &str, known: &BTreeMap<String, f64>) -> Failure {
+    let names: Vec<&str> = known.keys().map(String::as_str).collect();
+    let geometry = match known.contains_key("depth.rmse") {
+        true => String::new(),
+        false if cfg!(feature = "scenegen") => {
+            "; geometry is known of built-in scenes, and of those that `densify scenegen` wrote"
+                .into()
+        }
+        false => format!("; {}", without("scenegen", "geometry is not measured")),
+    };
+    let names = names.join(", ");
+    Failure::input(format!(
+        "{flag}: nothing called `{key}` is measured; there are {names}{geometry}"
+    ))
+}
+
 /// Fails where a value is beyond its limit, or was not measured.
 ///
 /// # Errors
@@ -74,11 +116,7 @@ pub(super) fn check(
     for (limits, flag, forbidden) in sides {
         for Limit { key, bound } in limits {
             let Some(&value) = values.get(key) else {
-                let known: Vec<&str> = values.keys().map(String::as_str).collect();
-                let known = known.join(", ");
-                return Err(Failure::input(format!(
-                    "{flag}: nothing called `{key}` was measured; there are {known}"
-                )));
+                return Err(unknown(flag, key, values));
             };
             // What is not a number compares with nothing, and is beyond every limit.
             if value.partial_cmp(bound).is_none_or(|order| order == forbidden) {
@@ -112,6 +150,15 @@ mod tests {
         assert_eq!(check("thin.0=0", "flip=1").unwrap_err().code, LIMIT);
         let unknown = check("PSNR=1", "flip=1").unwrap_err();
         assert!(unknown.code == 2 && unknown.message.contains("psnr, ssim"), "{unknown}");
+        let early = |knows, key: &str| check_keys(knows, &limit(&format!("{key}=1")), &[]);
+        for key in ["flip", "centres.f_score_one_percent", "thin.3.recall", "normal_error"] {
+            assert_eq!(early(true, key), Ok(()), "{key}");
+            let failure = early(false, key).err().map(|failure| failure.message);
+            let told = failure.is_some_and(|it| it.contains("flip") && it.contains("scenegen"));
+            assert_eq!(told, key != "flip", "{key}");
+        }
+        let typo = early(true, "depth.rsme").unwrap_err();
+        assert!(typo.code == 2 && typo.message.contains("depth.rmse"), "{typo}");
         for bad in ["psnr", "psnr=", "psnr=nan", "=x"] {
             assert!(bad.parse::<Limit>().is_err(), "{bad}");
         }

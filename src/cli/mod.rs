@@ -1,8 +1,9 @@
 //! The command line: arguments → validated options → run. The only place that prints.
 //!
 //! One file per subcommand. Exit codes: 0 for success, 2 for bad input or usage, 3 where device or
-//! memory do not suffice, 130 and 143 for a run that SIGINT or SIGTERM has ended, 1 for anything else. An error is one message that names file, field or
-//! flag and the remedy.
+//! memory do not suffice, 4 where `eval` has found a limit exceeded, 130 and 143 for a run that SIGINT or
+//! SIGTERM has ended, 1 for anything else. An error is one message that names file, field or flag and the
+//! remedy.
 //!
 //! A program that brings policies of its own is two lines:
 //!
@@ -14,6 +15,7 @@
 //! ```
 
 mod console;
+#[cfg(feature = "gpu")]
 mod devices;
 mod eval;
 mod export;
@@ -25,10 +27,14 @@ mod plan;
 mod policies;
 mod progress;
 mod render;
+#[cfg(feature = "scenegen")]
 mod scenegen;
 mod selftest;
+#[cfg(feature = "study")]
 mod study;
 mod train;
+#[cfg(not(all(feature = "gpu", feature = "scenegen", feature = "study")))]
+mod without;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -36,8 +42,13 @@ use std::process::ExitCode;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::failure;
-use crate::study::{Comparison, Trade};
 use console::Console;
+#[cfg(not(feature = "gpu"))]
+use without::devices;
+#[cfg(not(feature = "scenegen"))]
+use without::scenegen;
+#[cfg(not(feature = "study"))]
+use without::study;
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
 ///
@@ -88,13 +99,13 @@ enum Command {
     Eval(eval::EvalArgs),
     Export(export::ExportArgs),
     Render(Box<render::RenderArgs>),
-    Compare(Comparison),
+    Compare(study::Comparison),
     Devices(devices::DevicesArgs),
     Knobs(knobs::KnobsArgs),
     Policies(policies::PoliciesArgs),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
-    Trade(Trade),
+    Trade(study::Trade),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.

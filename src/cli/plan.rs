@@ -25,7 +25,6 @@ pub(super) fn run(
     for line in &plan.lines {
         console.result(line);
     }
-    console.result(format_args!("memory promised\n{}", plan.ledger));
     console.result(plan.alternatives);
     Ok(())
 }

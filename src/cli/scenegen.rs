@@ -4,22 +4,24 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use densify_scenegen::{
-    Ambient, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target, contact_sheet,
-    write, write_png,
+    Ambient, Error, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
+    contact_sheet, write,
 };
+use image::{DynamicImage, RgbaImage};
 
 use super::console::Console;
-use crate::failure::Failure;
+use crate::failure::{Failure, INPUT, OTHER};
 use crate::number;
-use crate::run::use_threads;
+use crate::pictures::write_png;
+use crate::run::{Threads, use_threads};
 
 /// Ray-traces a mesh into posed images of known geometry.
 ///
 /// INPUT is a .gltf, .glb or .obj file; --preset names a built-in scene instead. Writes images with
-/// alpha, depth and normals (EXR), cameras for NeRF-synthetic and nerfstudio readers
-/// (transforms_train.json, transforms_test.json) and for COLMAP's (sparse/0), initial points
-/// (points3d.ply), the mesh as traced (mesh.ply), and what was done (scene.json). Built-in scenes can be
-/// trained on without any file: densify train scene:NAME.
+/// alpha, depth and normals (EXR), cameras for NeRF-synthetic readers (transforms_train.json,
+/// transforms_test.json), for nerfstudio (transforms.json, with depth as .npy) and for COLMAP
+/// (sparse/0), initial points (points3d.ply), the mesh as traced (mesh.ply), and what was done
+/// (scene.json). Built-in scenes can be trained on without any file: densify train scene:NAME.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ScenegenArgs {
@@ -110,9 +112,9 @@ pub(super) struct ScenegenArgs {
     /// Everything random follows from this number
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Processor threads to use; the result does not depend on it `[default: all]`
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
-    threads: Option<u16>,
+    /// Processor threads to use, 1 to 256; the result does not depend on it `[default: all]`
+    #[arg(long, value_name = "N")]
+    threads: Option<Threads>,
 }
 
 const EXAMPLES: &str = "\
@@ -155,6 +157,16 @@ fn size(text: &str) -> Result<(u32, u32), String> {
     let wrong = |_| format!("`{text}` is no image size; write it as 400 or 640x480");
     let (width, height) = text.split_once('x').unwrap_or((text, text));
     Ok((width.parse().map_err(wrong)?, height.parse().map_err(wrong)?))
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Self {
+        let code = match error {
+            Error::Write { .. } => OTHER,
+            _ => INPUT,
+        };
+        Self { code, message: error.to_string() }
+    }
 }
 
 impl ScenegenArgs {
@@ -217,7 +229,8 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     describe(&scene, console);
     if let Some(path) = &args.contact_sheet {
         let (width, height, rgba) = contact_sheet(&scene);
-        write_png(path, width, height, &rgba)?;
+        let sheet = RgbaImage::from_raw(width, height, rgba).unwrap_or_default();
+        write_png(path, &DynamicImage::ImageRgba8(sheet))?;
         console.result(format_args!("eight views in {}", path.display()));
     }
     let Some(output) = &args.output else {
@@ -236,6 +249,16 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
         number::grouped(written.points),
         output.display()
     ));
+    let wanted = args.points as f64 * (1.0 - args.dropout);
+    if (written.points as f64) < 0.5 * wanted {
+        console.say(format_args!(
+            "note: of {} points wanted, {:.0} % were found where three views see the surface; to see more \
+             of it, add views (--train), widen --fov, or choose another --rig (inside for rooms); or place \
+             points anywhere with --random-points",
+            number::grouped(args.points),
+            100.0 * written.points as f64 / args.points as f64
+        ));
+    }
     Ok(())
 }
 
@@ -258,7 +281,37 @@ fn describe(scene: &Scene, console: &Console) {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+
+    use clap::FromArgMatches;
+
     use super::*;
+    use crate::failure::OTHER;
+    use crate::output::disk::{Fault, Operation, with_fault};
+
+    #[test]
+    fn a_contact_sheet_is_written_whole_or_not_at_all() {
+        let root = tempfile::tempdir().unwrap();
+        let sheet = root.path().join("sheet.png");
+        let words = ["scenegen", "--preset", "spheres", "--size", "8", "--samples", "1"];
+        let words = words.map(OsStr::new).into_iter();
+        let words = words.chain(["--contact-sheet".as_ref(), sheet.as_os_str()]);
+        let matches = ScenegenArgs::augment_args(clap::Command::new("")).get_matches_from(words);
+        let args = ScenegenArgs::from_arg_matches(&matches).unwrap();
+        for operation in [Operation::Create, Operation::Write, Operation::Sync] {
+            let (file, kind) = ("sheet.png", std::io::ErrorKind::StorageFull);
+            let fault = Fault { operation, file, spared: 0, kind };
+            let (done, met) = with_fault(Some(fault), || run(&args, &Console::new(true)));
+            let failure = done.unwrap_err();
+            assert!(
+                met > 0 && failure.code == OTHER && failure.message.contains(file),
+                "{failure}"
+            );
+            assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 0, "{operation:?}");
+        }
+        run(&args, &Console::new(true)).unwrap();
+        assert_eq!(image::open(sheet).unwrap().width(), 32);
+    }
 
     #[test]
     fn sizes_are_read() {

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::console::Console;
-use crate::backend::Device;
 use crate::backend::cpu::InstructionSet;
-use crate::backend::gpu::{Accumulation, AdapterChoice, GpuDevice, adapters};
+use crate::backend::gpu::{GpuDevice, adapters};
+use crate::backend::{Accumulation, AdapterChoice, Device};
 use crate::failure::{Failure, OTHER};
 use crate::output::write_atomically;
 use crate::run::DeviceSpec;
@@ -101,7 +101,7 @@ fn verdict(tested: &[Tested]) -> Result<usize, Failure> {
 fn subjects(args: &SelftestArgs) -> Result<Vec<Subject>, Failure> {
     let native = Subject::Native {
         instructions: InstructionSet::default(),
-        threads: args.device.threads.map(|threads| usize::from(threads.get())),
+        threads: args.device.threads.map(|threads| threads.0 as usize),
     };
     if !args.all {
         let device = Device::open_to_render(args.device.backend, args.device.gpu.as_deref())?;

@@ -15,11 +15,12 @@ impl DatasetError {
     /// A file cannot be opened or read.
     pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
         move |source| {
-            // What this program says of a file, rather than the system.
-            if source.raw_os_error().is_none() && source.kind() == std::io::ErrorKind::Other {
-                return Self::malformed(path, "the file", source, "put the right file there");
-            }
+            // What this program says of a file, with the remedy, rather than the system.
+            let is_ours = source.raw_os_error().is_none();
             let path = path.display();
+            if is_ours && source.kind() == std::io::ErrorKind::Other {
+                return Self(format!("{path}: the file: {source}"));
+            }
             Self(format!("cannot read {path}: {source}; check that it exists and is readable"))
         }
     }
@@ -67,12 +68,6 @@ impl DatasetError {
         let problem = format!("the file {} does not exist", image.display());
         let remedy = "restore it, or name the folder that holds the images with --images";
         Self::malformed(path, field, problem, remedy)
-    }
-}
-
-impl From<densify_scenegen::Error> for DatasetError {
-    fn from(error: densify_scenegen::Error) -> Self {
-        Self(error.to_string())
     }
 }
 

@@ -19,7 +19,6 @@ mod pixels;
 mod pose;
 mod prepare;
 mod resample;
-pub(crate) mod scene_cache;
 mod tracks;
 mod transforms;
 pub mod undistort;
@@ -34,11 +33,11 @@ pub(crate) mod tests;
 
 use std::path::{Path, PathBuf};
 
-use densify_scenegen::GroundTruth;
 use glam::{DMat3, DVec3};
 
 use crate::camera::Camera;
 pub use crate::import::PointCloud;
+pub use builtin::GroundTruth;
 pub use error::DatasetError;
 use folders::Folders;
 use normalise::Normalisation;
@@ -48,7 +47,7 @@ pub use tracks::{MIN_VIEWS, Tracks};
 use undistort::Lens;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Dataset {
     /// Folder of the dataset; no image lies outside it, except with `--images`.
     pub root: PathBuf,
@@ -62,6 +61,9 @@ pub struct Dataset {
     pub tracks: Tracks,
     /// From the dataset's own coordinates to the normalised ones used here.
     pub normalisation: Normalisation,
+    /// What [the surface](Self::ground_truth) that the images were rendered from takes at most while it is
+    /// made `[bytes]`; `None` where it is not known.
+    pub surface_bytes: Option<u64>,
     /// Notes for the user from loading (dropped points, missing frames).
     pub notes: Vec<String>,
 }
@@ -91,6 +93,8 @@ struct Scene {
     tracks: Tracks,
     /// Whether the dataset brings its own test split.
     own_split: bool,
+    /// As [`Dataset::surface_bytes`], where the reader knows.
+    surface_bytes: Option<u64>,
     notes: Vec<String>,
 }
 
@@ -137,18 +141,6 @@ impl Dataset {
             )));
         }
         prepare::prepare(path, scene, options)
-    }
-
-    /// The geometry that the images were rendered from, in the dataset's own coordinates. Known for
-    /// built-in scenes and for folders that `densify scenegen` wrote.
-    ///
-    /// # Errors
-    /// When it exists but cannot be read.
-    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
-        match builtin::name(&self.root) {
-            Some(name) => builtin::ground_truth(name).map(Some),
-            None => Ok(GroundTruth::open(&self.root)?),
-        }
     }
 
     /// The scene's extent `[scene units]`: 1.1 times the largest distance of a training camera from

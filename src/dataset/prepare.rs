@@ -49,12 +49,17 @@ pub(super) fn assemble(
     scene: Scene,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let Scene { listing, mut points, points_file, tracks, own_split, mut notes, .. } = scene;
+    let Scene {
+        listing, mut points, points_file, tracks, own_split, surface_bytes, mut notes, ..
+    } = scene;
+    let surface_bytes = surface_bytes.or_else(|| super::builtin::surface_bytes(path));
     let centres: Vec<_> = views.iter().map(|(view, ..)| view.camera.centre()).collect();
     let is_far = normalise::far(&centres);
     let far = views.iter().zip(&is_far).filter(|(_, is_far)| **is_far);
     let far: Vec<&str> = far.map(|((view, ..), _)| &*view.name).collect();
     notes.extend(far_note(&far, options.far_cameras));
+    #[cfg(not(feature = "scenegen"))]
+    notes.extend(super::builtin::left_out(path));
     let every = match options.split {
         Split::Every(every) => Some(every.get() as usize),
         Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
@@ -102,7 +107,8 @@ pub(super) fn assemble(
         p.as_vec3().is_finite()
     })?;
     let tracks = tracks.in_training_views(&normalisation, |id| number_of.get(&id).copied());
-    Ok(Dataset { root: path.to_owned(), train, test, points, tracks, normalisation, notes })
+    let root = path.to_owned();
+    Ok(Dataset { root, train, test, points, tracks, normalisation, surface_bytes, notes })
 }
 
 /// Names the views whose camera is far from all others.

@@ -6,11 +6,9 @@
 
 mod random;
 
-use std::num::NonZeroUsize;
-
+use densify_policies::neighbours::Neighbours;
 use densify_policies::policy::StartRule;
 use glam::DVec3;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
@@ -23,8 +21,6 @@ pub use random::random_points;
 
 /// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
 pub const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
-/// Number of neighbours that determine the scale.
-const NEIGHBOURS: usize = 3;
 /// Smallest root mean square distance used: points closer than 1e-4·D are one surface sample. (The
 /// absolute floor of the original would exceed a scene of a few millimetres.)
 const DISTANCE_FLOOR: f64 = 1e-4 * SCENE_DIAMETER;
@@ -158,20 +154,18 @@ fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
 /// Logarithm of the root mean square distance to the (up to) three nearest neighbours. The points are
 /// distinct.
 fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
-    let neighbours = NEIGHBOURS.min(positions.len() - 1);
-    if neighbours == 0 {
+    if u32::try_from(positions.len()).is_err() {
+        return Err(InitError::TooManyPoints(positions.len()));
+    }
+    if positions.len() == 1 {
         return Ok(vec![SINGLE_POINT_SCALE.ln() as f32]);
     }
-    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(positions)
-        .map_err(|_| InitError::TooManyPoints(positions.len()))?;
-    // One more, because each point finds itself.
-    let wanted = NonZeroUsize::MIN.saturating_add(neighbours);
-    let scale = |position: &[f64; 3]| {
-        let found = tree.query(position).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
-        let sum: f64 = found.iter().skip(1).map(|hit| hit.distance).sum();
-        (0.5 * (sum / neighbours as f64).max(DISTANCE_FLOOR * DISTANCE_FLOOR).ln()) as f32
+    let neighbours = Neighbours::new(positions);
+    let scale = |point: usize| {
+        let square = neighbours.mean_square_distance(point);
+        (0.5 * square.max(DISTANCE_FLOOR * DISTANCE_FLOOR).ln()) as f32
     };
-    Ok(positions.par_iter().map(scale).collect())
+    Ok((0..positions.len()).into_par_iter().map(scale).collect())
 }
 
 #[cfg(test)]

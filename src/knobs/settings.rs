@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 use super::{KNOBS, Knob, KnobError, find};
-use crate::backend::gpu::Accumulation;
+use crate::backend::Accumulation;
 use crate::backend::{Shortcuts, Storage};
 use crate::trainer::Savings;
 

@@ -2,7 +2,7 @@
 
 use super::Class::{Bounded, Exact, Heuristic};
 use super::{Domain, Knob, number};
-use crate::backend::gpu::Accumulation;
+use crate::backend::Accumulation;
 use crate::backend::{MomentStorage, ParameterStorage};
 
 /// All knobs: exact ones, then bounded ones, then heuristic ones.

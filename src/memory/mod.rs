@@ -10,8 +10,10 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-pub(crate) use fit::IMAGES;
+use crate::number::grouped;
+
 pub use fit::{Fit, PAIRS, RunSize, SizeRequest, fit, min_memory};
+pub(crate) use fit::{IMAGES, most_within};
 pub use grant::{MemoryLimit, grant};
 
 /// All buffers of a run.
@@ -60,6 +62,8 @@ pub enum Section {
     Passing,
     /// Held only while loading, and freed before any of the above is allocated.
     Before,
+    /// Held only once training has ended and all of the above is freed.
+    After,
     /// The program itself before any of the above.
     Process,
 }
@@ -75,6 +79,7 @@ impl Section {
             Self::Images => "images",
             Self::Passing => "in passing",
             Self::Before => "before",
+            Self::After => "after",
             Self::Process => "process",
         }
     }
@@ -99,42 +104,64 @@ impl Ledger {
         }
     }
 
-    /// The most memory held at a time `[bytes]`. Of [`Section::Passing`] and [`Section::Before`] only the
-    /// largest lines count, as they are never held together; beside [`Section::Before`] there is only
-    /// the process.
+    /// The most memory held at a time `[bytes]`: the sum of the lines held when the most is: of training,
+    /// loading and measuring at the end those of the largest, and always those of the process.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.most_at_a_time(|_| true)
+        most_at_a_time(&self.lines.iter().collect::<Vec<_>>())
     }
 
-    /// The same without the memory of a GPU `[bytes]`.
+    /// The same without the memory of a GPU, until training has ended `[bytes]`.
     #[must_use]
     pub fn on_host(&self) -> u64 {
-        self.most_at_a_time(|line| !line.on_device)
-    }
-
-    fn most_at_a_time(&self, counts: impl Fn(&LedgerLine) -> bool) -> u64 {
-        let (mut process, mut before, mut passing, mut lasting) = (0_u64, 0_u64, 0_u64, 0_u64);
-        for line in self.lines.iter().filter(|line| counts(line)) {
-            match line.section {
-                Section::Process => process = process.saturating_add(line.bytes),
-                Section::Before => before = before.max(line.bytes),
-                Section::Passing => passing = passing.max(line.bytes),
-                _ => lasting = lasting.saturating_add(line.bytes),
-            }
-        }
-        process.saturating_add(before.max(lasting.saturating_add(passing)))
+        let lines = self.lines.iter();
+        let lines = lines.filter(|line| !line.on_device && line.section != Section::After);
+        most_at_a_time(&lines.collect::<Vec<_>>())
     }
 
     /// Sum of the buffers in the memory of a GPU, which are all held throughout `[bytes]`.
     #[must_use]
     pub fn on_device(&self) -> u64 {
-        let lines = self.lines.iter().filter(|line| line.on_device);
-        lines.fold(0, |sum, line| sum.saturating_add(line.bytes))
+        sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
     }
 }
 
-/// A table: section, buffer, size; the total below.
+fn sum(bytes: impl Iterator<Item = u64>) -> u64 {
+    bytes.fold(0, u64::saturating_add)
+}
+
+fn most_at_a_time(lines: &[&LedgerLine]) -> u64 {
+    let counts = counted(lines).into_iter();
+    sum(lines.iter().zip(counts).filter(|(_, counts)| *counts).map(|(line, _)| line.bytes))
+}
+
+/// Which lines are held when the most is: of training, loading and measuring at the end, those of the one
+/// that takes most, and always those of the process. Of [`Section::Passing`], [`Section::Before`] and
+/// [`Section::After`] only the largest line counts, as they are never held together. A device's memory is
+/// held beside [`Section::After`], not beside [`Section::Before`].
+fn counted(lines: &[&LedgerLine]) -> Vec<bool> {
+    let largest = |section| {
+        let of = (0..lines.len()).filter(|&i| lines[i].section == section);
+        of.rev().max_by_key(|&i| lines[i].bytes)
+    };
+    let [passing, before, after] = [Section::Passing, Section::Before, Section::After].map(largest);
+    let is_lasting = |i: usize| lines[i].section < Section::Passing;
+    let held: [&dyn Fn(usize) -> bool; 3] = [
+        &|i| Some(i) == before,
+        &|i| after.is_some() && (Some(i) == after || lines[i].on_device),
+        &|i| Some(i) == passing || is_lasting(i),
+    ];
+    let bytes = |held: &&dyn Fn(usize) -> bool| {
+        sum((0..lines.len()).filter(|&i| held(i)).map(|i| lines[i].bytes))
+    };
+    // The last of equals: training.
+    let most = held.iter().copied().max_by_key(bytes);
+    let counts = |i: usize| lines[i].section == Section::Process || most.is_some_and(|it| it(i));
+    (0..lines.len()).map(counts).collect()
+}
+
+/// A table: section, buffer, size; the total below. In brackets is what is not held when the most is;
+/// the other lines add up to the total, to the last digit.
 impl fmt::Display for Ledger {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut lines: Vec<_> = self.lines.iter().collect();
@@ -142,23 +169,39 @@ impl fmt::Display for Ledger {
         let least = if self.on_device() > 0 { "on the device".len() } else { 5 };
         let what_width =
             lines.iter().map(|line| line.what.chars().count()).max().unwrap_or(0).max(least);
-        let mut previous = None;
-        for line in lines {
+        let (mut previous, mut sum) = (None, 0_u64);
+        for (line, counts) in lines.iter().zip(counted(&lines)) {
             let name = if previous == Some(line.section) { "" } else { line.section.name() };
             previous = Some(line.section);
-            let LedgerLine { what, bytes, .. } = line;
-            writeln!(f, "  {name:<11} {what:<what_width$} {:>12}", Bytes(*bytes).to_string())?;
+            let before = sum;
+            let size = if counts {
+                sum = sum.saturating_add(line.bytes);
+                // The difference of two rounded sums, so that the lines add up.
+                format!("{:>14}", mebibytes(tenths(sum) - tenths(before)))
+            } else {
+                format!("{:>15}", format!("({})", mebibytes(tenths(line.bytes))))
+            };
+            writeln!(f, "  {name:<11} {:<what_width$} {size}", line.what)?;
         }
-        let total = Bytes(self.total()).to_string();
-        write!(f, "  {:<11} {:<what_width$} {total:>12}", "total", "")?;
+        let row = |name: &str, what: &str, bytes| {
+            format!("  {name:<11} {what:<what_width$} {:>14}", mebibytes(tenths(bytes)))
+        };
+        f.write_str(&row("total", "", self.total()))?;
         match self.on_device() {
             0 => Ok(()),
-            bytes => {
-                let bytes = Bytes(bytes).to_string();
-                write!(f, "\n  {:<11} {:<what_width$} {bytes:>12}", "", "on the device")
-            }
+            bytes => write!(f, "\n{}", row("", "on the device", bytes)),
         }
     }
+}
+
+/// Tenths of a mebibyte, rounded.
+fn tenths(bytes: u64) -> u64 {
+    ((u128::from(bytes) * 10 + (1 << 19)) >> 20) as u64
+}
+
+fn mebibytes(tenths: u64) -> String {
+    let whole = usize::try_from(tenths / 10).unwrap_or(usize::MAX);
+    format!("{}.{} MiB", grouped(whole), tenths % 10)
 }
 
 /// A number of bytes, displayed with a binary unit.
@@ -238,6 +281,11 @@ mod tests {
         assert_eq!(ledger.total(), total);
         ledger.add_to(Section::Before, "measuring more", 38 << 20);
         assert_eq!(ledger.total(), 41 << 20);
+        // What comes after has a device's memory beside it.
+        ledger.add_to(Section::After, "measuring the model", 39 << 20);
+        assert_eq!(ledger.total(), 42 << 20);
+        ledger.add_on_device(Section::Renderer, "on the device", 2 << 20);
+        assert_eq!((ledger.total(), ledger.on_host()), (44 << 20, 41 << 20));
     }
 
     #[test]
@@ -252,16 +300,28 @@ mod tests {
     }
 
     #[test]
-    fn the_table_is_aligned_and_ordered() {
-        let table = sample().to_string();
-        let expected = "  model       parameters      10.0 MiB
-              moments         20.0 MiB
-  renderer    projections      1.5 KiB
-  in passing  evaluation       5.0 MiB
-              export           7.0 MiB
-  process     program          3.0 MiB
-  total                       40.0 MiB";
-        assert_eq!(table, expected);
+    fn the_table_is_aligned_and_adds_up() {
+        let mut ledger = sample();
+        // Each would be rounded down, and the sum up.
+        for what in ["a", "b", "c"] {
+            ledger.add_to(Section::Policy, what, 40 << 10);
+        }
+        let expected = "  model       parameters        10.0 MiB
+              moments           20.0 MiB
+  renderer    projections        0.0 MiB
+  policy      a                  0.0 MiB
+              b                  0.1 MiB
+              c                  0.0 MiB
+  in passing  evaluation        (5.0 MiB)
+              export             7.0 MiB
+  process     program            3.0 MiB
+  total                         40.1 MiB";
+        assert_eq!(ledger.to_string(), expected);
+        ledger.add_to(Section::Before, "loading", 1 << 30);
+        let table = ledger.to_string();
+        for words in ["(10.0 MiB)", "(7.0 MiB)", " 1,024.0 MiB", " 1,027.0 MiB"] {
+            assert!(table.contains(words), "{words}: {table}");
+        }
     }
 
     #[test]

@@ -16,16 +16,23 @@ pub use psnr::psnr;
 pub use ssim::ssim;
 
 use std::ops::Range;
+use std::sync::LazyLock;
 
 use rayon::prelude::*;
+use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use crate::dataset::images::Image8;
 
 /// Rows of pixels filtered together: few enough that their buffers take a few megabytes, and enough
 /// that rows filtered twice are less than half of the work.
 const BLOCK: usize = 32;
-/// Blocks filtered at a time, so that memory does not grow with the number of processor cores.
+/// Blocks filtered at a time, so that memory does not grow with the number of processor cores. They have
+/// threads of their own: of each thread that ever filtered one, the allocator would keep the buffers.
 const AT_ONCE: usize = 4;
+static THREADS: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {
+    let threads = rayon::current_num_threads().min(AT_ONCE);
+    ThreadPoolBuilder::new().num_threads(threads).build().ok()
+});
 
 /// Memory for scoring an image of this width with so many threads `[bytes]`: that of [`flip()`],
 /// which needs the most.
@@ -38,10 +45,10 @@ pub fn scratch_bytes(width: u32, threads: usize) -> u64 {
 fn by_blocks<T: Send>(height: usize, function: impl Fn(Range<usize>) -> T + Sync) -> Vec<T> {
     let block = |first: usize| first..(first + BLOCK).min(height);
     let blocks: Vec<_> = (0..height).step_by(BLOCK).map(block).collect();
-    let several = |blocks: &[Range<usize>]| -> Vec<T> {
-        blocks.par_iter().map(|rows| function(rows.clone())).collect()
-    };
-    blocks.chunks(AT_ONCE).flat_map(several).collect()
+    match &*THREADS {
+        Some(pool) => pool.install(|| blocks.into_par_iter().map(&function).collect()),
+        None => blocks.into_iter().map(function).collect(),
+    }
 }
 
 /// The sum of pairs of a weighted error and its weight, in order; the weight is above 0.

@@ -88,11 +88,25 @@ pub enum OutputError {
     },
     /// A run cannot replace the existing one.
     #[error(
-        "{source}; the new run is complete in {staging}, and the run it was to replace is unchanged"
+        "{source}; {}",
+        match aside {
+            None => format!(
+                "the new run is complete in {}, and the run it was to replace is unchanged",
+                staging.display()
+            ),
+            Some(aside) => format!(
+                "moving back failed too: files of the run that was to be replaced are in {}, and of the \
+                 new one in {}; leave them there, the next run in the folder ends or undoes the replacement",
+                aside.display(),
+                staging.display()
+            ),
+        }
     )]
     NotReplaced {
         /// Folder of the new run.
         staging: PathBuf,
+        /// Where the files of the old run are, if they could not be moved back.
+        aside: Option<PathBuf>,
         /// Which file could not be moved.
         source: Box<OutputError>,
     },

@@ -11,7 +11,7 @@ use super::observer::Observer;
 use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS, ignored, random_count};
 use super::resume::{self, Resumed};
 use super::spec::RunSpec;
-use super::values::{Assignment, ByteCount, InitChoice, Rows, ShDegree, assignments};
+use super::values::{Assignment, ImageCache, InitChoice, Rows, ShDegree, assignments};
 use crate::checkpoint::Fingerprint;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
@@ -47,8 +47,7 @@ pub(super) fn build(
         None => Size::choose(&inputs)?,
     };
     let setting = size.setting;
-    let threads = inputs.threads();
-    resolve::check_grant(&inputs, &inputs.ledger(&setting, &inputs.needs(setting.rows)?, threads))?;
+    resolve::check_grant(&inputs, &setting, resumed.is_some())?;
     let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
     let (mut model, init, init_points) = match checkpoint {
         None => first_model(&inputs, &setting, observer)?,
@@ -90,9 +89,10 @@ pub(super) fn build(
         observer.say(format_args!("steps    {}", steps.join(", ")));
     }
     let needs = inputs.backend_needs(needs(policy.as_ref(), &scene, inputs.sh_every()));
-    let ledger = inputs.ledger(&setting, &needs, threads);
-    resolve::check(&inputs, &ledger)?;
-    observer.say(format_args!("memory promised\n{ledger}"));
+    let ledger = inputs.ledger(&setting, &needs);
+    resolve::check(&inputs, &setting, &ledger)?;
+    observer.say(format_args!("{}", inputs.promise(&ledger)));
+    let measuring = inputs.measuring(&setting, inputs.threads());
     let backend = inputs.device.backend(&model, &inputs.backend_options(&setting, needs))?;
     let options = TrainOptions {
         iterations: spec.schedule.iterations.0,
@@ -117,7 +117,18 @@ pub(super) fn build(
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
     };
-    Ok(Run { config, output, trainer, test, dataset, ledger, fingerprint, last, session })
+    Ok(Run {
+        config,
+        output,
+        trainer,
+        test,
+        dataset,
+        ledger,
+        measuring,
+        fingerprint,
+        last,
+        session,
+    })
 }
 
 /// Everything that was open in the description of a run.
@@ -145,7 +156,7 @@ impl Decided {
         });
         // The knob says it otherwise.
         spec.size.tile_cap = inputs.knobs.pairs_per_row.is_none().then_some(Rows(setting.tile_cap));
-        spec.size.image_cache = Some(ByteCount(setting.image_cache));
+        spec.size.image_cache = Some(ImageCache::Bytes(setting.image_cache));
         spec.device.backend = inputs.device.kind().choice();
         spec.device.gpu = inputs.device.adapter().map(str::to_owned);
         spec.start.init = Some(init);
@@ -163,6 +174,8 @@ impl Decided {
         let resolved = Resolved {
             working_directory: std::env::current_dir()
                 .ok()
+                // A name that is not UTF-8 cannot be in the file.
+                .filter(|folder| folder.to_str().is_some())
                 .filter(|_| scene.is_some_and(|scene| scene.is_relative())),
             adapter: inputs.device.adapter().map(str::to_owned),
             accumulation: inputs.device.accumulation().map(|way| way.name().to_owned()),

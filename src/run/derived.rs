@@ -9,7 +9,7 @@ use toml::{Table, Value};
 
 use super::spec::{DataSpec, RunSpec};
 use super::values;
-use crate::dataset::{LoadOptions, Split, builtin, scene_cache};
+use crate::dataset::{LoadOptions, Split, builtin};
 use crate::failure::Failure;
 use crate::knobs::Knobs;
 use crate::schedule::RateOptions;
@@ -27,7 +27,7 @@ impl DataSpec {
                 None => Split::None,
             },
             far_cameras: self.far_cameras,
-            cache: scene_cache::folder().filter(|_| !self.no_cache),
+            cache: builtin::folder().filter(|_| !self.no_cache),
             tracks,
         }
     }
@@ -35,7 +35,21 @@ impl DataSpec {
 
 impl RunSpec {
     /// The options as the table of a file. Those that are `None` are not in it.
+    ///
+    /// # Errors
+    /// When a path is not UTF-8: such a file cannot hold it.
     pub fn table(&self) -> Result<Table, Failure> {
+        let Self { start, data, output, .. } = self;
+        for (option, path) in
+            [("SCENE", &start.scene), ("--images", &data.images), ("--output", &output.output)]
+        {
+            if let Some(path) = path.as_ref().filter(|path| path.to_str().is_none()) {
+                return Err(Failure::input(format!(
+                    "{option}: the name {path:?} is not UTF-8, as config.toml must be; rename the folder, \
+                     or name a link to it"
+                )));
+            }
+        }
         Table::try_from(self).map_err(|error| Failure::input(error.to_string().trim()))
     }
 
@@ -182,5 +196,21 @@ mod tests {
             assert_eq!(spec.output_folder().unwrap(), Path::new("output/garden-diet"));
         }
         assert!(RunSpec::default().output_folder().unwrap_err().message.contains("no scene"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn folders_whose_names_are_not_utf_8_are_named_with_their_option() {
+        use std::os::unix::ffi::OsStringExt;
+        let folder = || Some(std::ffi::OsString::from_vec(b"caf\xe9".to_vec()).into());
+        let [mut scene, mut images, mut output] = [(); 3].map(|()| RunSpec::default());
+        scene.start.scene = folder();
+        images.data.images = folder();
+        output.output.output = folder();
+        for (option, spec) in [("SCENE", scene), ("--images", images), ("--output", output)] {
+            let message = spec.table().unwrap_err().message;
+            let told = message.starts_with(option) && message.contains("rename the folder");
+            assert!(told, "{message}");
+        }
     }
 }

@@ -1,17 +1,17 @@
 //! A finished run or a bare PLY, opened for looking at it.
 
-use std::num::NonZeroU16;
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
 use crate::backend::{Backend, BackendOptions, Device};
-use crate::dataset::{Dataset, View};
+use crate::dataset::{Dataset, View, builtin};
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::import::ply::read_splats;
+use crate::metrics::geometry::{self, Geometry, KnownScene};
 use crate::output::{model_path, saved_iterations};
 use crate::views::DatasetViews;
 
@@ -28,8 +28,8 @@ impl Machine {
     pub(crate) fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
         observer.say(format_args!("device   {}", device.describe()));
-        use_threads(spec.threads.map(NonZeroU16::get));
-        Ok(Self { threads: spec.threads.map(|threads| usize::from(threads.get())), device })
+        use_threads(spec.threads);
+        Ok(Self { threads: spec.threads.map(|threads| threads.0 as usize), device })
     }
 }
 
@@ -75,7 +75,7 @@ pub(crate) fn open_run(
     let model = model_path(run, iteration);
     let near = config.spec.start.near.0;
     open(&model, &path, config.spec.data, (near, machine), needs, observer).map_err(|failure| {
-        if was_moved || path.is_dir() {
+        if was_moved || path.is_dir() || builtin::name(&path).is_some() {
             failure
         } else {
             failure.and("if the dataset has moved, say where it is with --scene")
@@ -133,6 +133,28 @@ pub(crate) fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussia
 }
 
 impl Opened {
+    /// Measures how the model sits on the known surface, as `views` show it; `None` where nothing is
+    /// known of it.
+    ///
+    /// # Errors
+    /// When the surface cannot be read, or as [`geometry::measure`], such as when `is_stopped`.
+    pub(crate) fn geometry(
+        &mut self,
+        views: &DatasetViews,
+        is_stopped: &dyn Fn() -> bool,
+    ) -> Result<Option<Geometry>, Failure> {
+        let Some(truth) = self.dataset.ground_truth()? else { return Ok(None) };
+        let train = self.views(Split::Train)?;
+        let ground = KnownScene {
+            truth: &truth,
+            normalisation: &self.dataset.normalisation,
+            background: self.data.background.fixed(),
+            sh_degree: self.sh_degree,
+            is_stopped,
+        };
+        Ok(Some(geometry::measure(self.backend.as_mut(), &ground, &train, views)?))
+    }
+
     /// The views of a split.
     pub(crate) fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
         let views: &[View] = match split {

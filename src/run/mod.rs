@@ -5,6 +5,7 @@ mod build;
 mod config;
 mod derived;
 pub(crate) mod finished;
+mod measuring;
 mod observer;
 mod overlay;
 mod records;
@@ -30,7 +31,9 @@ pub use spec::{
     DataSpec, DeviceSpec, OPTIONS, OnResume, OutputSpec, PolicySpec, RunOption, RunSpec,
     ScheduleSpec, SizeSpec, StartSpec,
 };
-pub use values::{Assignment, Budget, ByteCount, Fraction, InitChoice, Rows, ShDegree, Whole};
+pub use values::{
+    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree, Threads, Whole,
+};
 
 use crate::checkpoint::Fingerprint;
 use crate::dataset::Dataset;
@@ -38,6 +41,7 @@ use crate::failure::Failure;
 use crate::memory::Ledger;
 use crate::trainer::Trainer;
 use crate::views::DatasetViews;
+use measuring::Measuring;
 
 /// A run, ready to train.
 pub struct Run {
@@ -49,6 +53,8 @@ pub struct Run {
     /// Everything of the dataset but its points.
     dataset: Dataset,
     ledger: Ledger,
+    /// How the model is measured at the end, where the surface is known.
+    measuring: Option<Measuring>,
     /// What the dataset is, for checkpoints.
     fingerprint: Fingerprint,
     /// The step at which the run ends.

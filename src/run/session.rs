@@ -8,9 +8,10 @@ use std::time::Instant;
 use cpu_time::ProcessTime;
 
 use super::Run;
+use super::measuring::measure;
 use super::observer::{Interrupt, Observer};
 use super::records::{Logs, Totals};
-use crate::checkpoint::{CheckpointError, Header, checkpoint_path, tidy, write};
+use crate::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
 use crate::evaluate::{EvaluateError, Split, evaluate};
 use crate::export::{PLY, Shape};
 use crate::failure::{Failure, INPUT, OTHER};
@@ -99,6 +100,9 @@ pub(super) fn train(
         Ok(()) => {
             let path = folder.finish()?;
             session.report(&path);
+            measure(session, &path).map_err(|failure| {
+                failure.and(&format!("the run is complete in {} all the same", path.display()))
+            })?;
             Ok(path)
         }
         // Another run may be there now.
@@ -254,7 +258,7 @@ impl<'a> Session<'a> {
             session: self.logs.keep(&self.totals)?,
         };
         write(&checkpoint_path(&self.folder, step), &header, self.run.trainer.backend())?;
-        tidy(&self.folder, step);
+        remove_older(&self.folder, step);
         self.checkpoint = Some(step);
         Ok(())
     }
@@ -275,9 +279,10 @@ impl<'a> Session<'a> {
     }
 
     /// One iteration with its records. On a policy's error the model is saved first, and
-    /// where rows are unsound the run is kept.
+    /// where rows are unsound or a photograph can no longer be read the run is kept.
     fn step(&mut self) -> Result<StepReport, Failure> {
         let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
+        let train_views = self.run.dataset.train.len();
         let stepped = self.run.trainer.step();
         self.totals.time(wall, cpu);
         for &(stage, time) in self.run.trainer.backend().stage_times() {
@@ -299,6 +304,12 @@ impl<'a> Session<'a> {
                 Err(Failure::from(error).and(&saved))
             }
             Err(error @ TrainError::Unsound { .. }) => Err(self.kept(error.into())),
+            // A photograph that could be read before. In the first epoch little is lost.
+            Err(error @ TrainError::View { step, .. })
+                if step > self.run.trainer.steps_done() && step as usize > train_views =>
+            {
+                Err(self.kept(error.into()))
+            }
             Err(error) => Err(error.into()),
         }
     }

@@ -5,14 +5,15 @@
 //! [`RunSpec`]. The flags of `densify train` and their help, `config.toml`, `--config`, `--resume`, what
 //! `plan`, `compare` and `trade` pass on, and docs/options.md follow from this list.
 
-use std::num::{NonZeroU16, NonZeroU32};
+use std::num::NonZeroU32;
 use std::path::PathBuf;
 
 use clap::{ArgAction, Args};
 use serde::{Deserialize, Serialize};
 
 use super::values::{
-    Assignment, Budget, ByteCount, Fraction, InitChoice, Rows, ShDegree, Whole, as_table,
+    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree, Threads,
+    Whole, as_table,
 };
 use crate::backend::BackendChoice;
 use crate::dataset::{FarCameras, Resolution};
@@ -186,9 +187,10 @@ run_spec! {
         tile_cap: Option<Rows> = None, Free;
 
         /// Memory for decoded photographs, and on a GPU as much of its own; those beyond it are decoded,
-        /// and uploaded, again when their turn comes (default: 1GiB, or chosen for --memory)
+        /// and uploaded, again when their turn comes. auto: an eighth of all that the run takes, and what
+        /// --memory leaves free; 1GiB if --memory limits a GPU (default: 1GiB, or as auto for --memory)
         #[arg(long, value_name = "BYTES")]
-        image_cache: Option<ByteCount> = None, Free;
+        image_cache: Option<ImageCache> = None, Free;
 
         /// How colours may depend on the viewing direction: 0 not at all, 3 most; auto: as much as the
         /// scene requires (default: 3, or lower where --memory requires it)
@@ -278,9 +280,9 @@ run_spec! {
         #[arg(long, value_name = "NAME")]
         gpu: Option<String> = None, Free;
 
-        /// Processor threads to use; the result does not depend on it (default: all)
+        /// Processor threads to use, 1 to 256; the result does not depend on it (default: all)
         #[arg(long, value_name = "N")]
-        threads: Option<NonZeroU16> = None, Free;
+        threads: Option<Threads> = None, Free;
     }
 
     /// What is written, and when.

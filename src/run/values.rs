@@ -22,6 +22,15 @@ pub struct Rows(pub usize);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct ByteCount(pub u64);
 
+/// `--image-cache`: memory for decoded photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ImageCache {
+    /// So many bytes.
+    Bytes(u64),
+    /// An eighth of what the run takes, and what `--memory` leaves free.
+    Auto,
+}
+
 /// A number greater than 0 and less than 1.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
 pub struct Fraction(pub f64);
@@ -29,6 +38,9 @@ pub struct Fraction(pub f64);
 /// A whole number from `LEAST` to `MOST`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Whole<const LEAST: u32, const MOST: u32>(pub u32);
+
+/// A number of processor threads. More than a large machine has cores would only take their stacks.
+pub type Threads = Whole<1, 256>;
 
 /// `--budget`: the most Gaussians there may ever be, or `auto`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -112,6 +124,17 @@ impl FromStr for ByteCount {
     }
 }
 
+impl FromStr for ImageCache {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match after_auto(text) {
+            Some(None) => Ok(Self::Auto),
+            _ => number::bytes(text).map(Self::Bytes).map_err(|error| format!("{error}, or auto")),
+        }
+    }
+}
+
 impl FromStr for Fraction {
     type Err = String;
 
@@ -169,6 +192,15 @@ impl Serialize for Budget {
     }
 }
 
+impl Serialize for ImageCache {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::Bytes(bytes) => bytes.serialize(serializer),
+            Self::Auto => AUTO.serialize(serializer),
+        }
+    }
+}
+
 impl Serialize for ShDegree {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         match self {
@@ -207,6 +239,7 @@ number_or_text! {
     [] Background;
     [] Rows;
     [] ByteCount;
+    [] ImageCache;
     [] Fraction;
     [const LEAST: u32, const MOST: u32] Whole<LEAST, MOST>;
     [] Resolution;

@@ -82,8 +82,15 @@ impl Cell {
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
         let folder = self.path(output);
         let child = Child { spec: &self.spec, folder: &folder };
-        let measured = self.scores_without_shortcuts || has_geometry(&self.scene);
-        let done = child.train().and_then(|()| if measured { child.measure() } else { Ok(()) });
+        let measure = || {
+            let is_missing = || match has_geometry(&self.scene) {
+                true => geometry_of(&folder, self.iterations).map(|found| found.is_none()),
+                false => Ok(false),
+            };
+            let again = self.scores_without_shortcuts || is_missing()?;
+            if again { child.measure() } else { Ok(()) }
+        };
+        let done = child.train().and_then(|()| measure());
         done.map_err(|failure| in_run(self, failure))?;
         self.record(&folder)
     }

@@ -6,9 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use densify_scenegen::GroundTruth;
-
-use crate::dataset::builtin;
+use crate::dataset::{GroundTruth, builtin};
 use crate::failure::{Failure, OTHER};
 use crate::output::{Summary, write_atomically};
 use crate::run::{Partial, RunSpec};
@@ -43,7 +41,7 @@ impl Child<'_> {
             command.args(["--gpu", &name]);
         }
         if let Some(threads) = device.threads {
-            command.args(["--threads", &threads.to_string()]);
+            command.args(["--threads", &threads.0.to_string()]);
         }
         wait_for(&mut command)
     }

@@ -23,7 +23,7 @@ impl<V: ViewSource> Trainer<V> {
         let scene = SceneInfo { budget: limit, ..self.scene.clone() };
         let candidates = self.backend.candidates();
         let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
-        let mut plan = EditPlan::new(self.backend.rows(), limit);
+        let mut plan = EditPlan::new(self.backend.rows(), limit).allowing(&needs);
         let rng = PolicyRng::new(self.options.seed, step);
         let planned = call_policy(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         self.backend.give_back(signals);

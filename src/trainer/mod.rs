@@ -135,7 +135,11 @@ impl<V: ViewSource> Trainer<V> {
         self.views.shrink(schedule::divisor(step, iterations, savings.coarse_until));
         let view = self.next_view();
         let start = Instant::now();
+        // Until here nothing has changed that a checkpoint holds.
         let image = self.image(step, view)?;
+        if (self.step as usize).is_multiple_of(self.views.count()) {
+            self.backend.begin_epoch();
+        }
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
         let TrainOptions { seed, background, rates, .. } = self.options;
@@ -204,7 +208,7 @@ impl<V: ViewSource> Trainer<V> {
         TrainError::Policy { step, policy: self.policy_name.clone(), source }
     }
 
-    /// The view of the next step. Prefetches the views after it, and tells the backend of new epochs.
+    /// The view of the next step. Prefetches the views after it.
     fn next_view(&mut self) -> usize {
         let count = self.views.count();
         let place = self.step as usize % count;
@@ -212,7 +216,6 @@ impl<V: ViewSource> Trainer<V> {
             let epoch = self.step / count as u32;
             self.order = std::mem::take(&mut self.next_order);
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
-            self.backend.begin_epoch();
         }
         // Beyond the last iteration the end of the run is unknown.
         let left = self.options.iterations.checked_sub(self.step + 1);

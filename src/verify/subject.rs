@@ -4,8 +4,8 @@ use densify_policies::policy::Needs;
 
 use super::compare::Limits;
 use crate::backend::cpu::{CpuBackend, CpuOptions, InstructionSet};
-use crate::backend::gpu::{GpuBackend, GpuDevice, GpuOptions};
-use crate::backend::{BackendError, Differentiable, Shortcuts, Storage};
+use crate::backend::gpu::GpuDevice;
+use crate::backend::{BackendError, BackendOptions, Differentiable, Shortcuts, Storage};
 use crate::gaussians::Gaussians;
 
 /// What is tested.
@@ -96,15 +96,15 @@ impl Subject {
                 Ok(Box::new(CpuBackend::new(model, &options)?))
             }
             Self::Gpu(device) => {
-                let mut options = GpuOptions {
+                let mut options = BackendOptions {
                     tile_cap,
                     largest_image,
                     needs,
                     shortcuts,
-                    ..GpuOptions::new(budget)
+                    ..BackendOptions::new(budget)
                 };
                 options.near = near.unwrap_or(options.near);
-                Ok(Box::new(GpuBackend::new(model, &options, device)?))
+                device.backend(model, &options)
             }
         }
     }

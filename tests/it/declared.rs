@@ -12,7 +12,7 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
-use densify_policies::plan::{EditPlan, OpacityRule, ScaleRule, Update};
+use densify_policies::plan::{EditPlan, OpacityRule, Update};
 use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
 use glam::DVec3;
 
@@ -280,13 +280,14 @@ fn sums_move_with_their_rows_and_end_with_them() {
 fn a_row_that_starts_anew_steps_as_a_newborn() {
     on_each(repeatable(), |subject| {
         let cadence = Cadence { all: 1, sh_rest: 2 };
-        let mut backend = backend(subject, &model(20), Needs { cadence, ..Needs::default() });
+        let needs = Needs { cadence, detailed_edits: true, ..Needs::default() };
+        let mut backend = backend(subject, &model(20), needs.clone());
         for number in 1..=6 {
             step(&mut *backend, &view(number % 3), number, cadence);
         }
-        let mut plan = EditPlan::new(20, 20);
+        let mut plan = EditPlan::new(20, 20).allowing(&needs);
         let opacity = OpacityRule::Same;
-        let update = Update { opacity, scale: ScaleRule::Uniform(1.0), keep_moments: false };
+        let update = Update { opacity, keep_moments: false, ..Update::NONE };
         plan.update(11, update).expect("the row is free");
         backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
         let before = backend.download().expect("a model");

@@ -5,7 +5,8 @@
 //! holds it and the backends against stored float64 renders; `extremes` runs the cases of the selftest and
 //! says where every extreme is tested; `agreement` holds every backend to the native one; `properties` are
 //! of any scene; `sameness` and `resuming` compare bits; `edits` applies any plan to a backend and to a
-//! plain vector. `cli` runs the program on photographs of a small scene, and holds policies to surfaces that
+//! plain vector; `spatial` is a policy that reads and
+//! edits where rows are. `cli` runs the program on photographs of a small scene, and holds policies to surfaces that
 //! are known; `fuzz` damages files; `gpu` is what only the GPU backend has; `invariants` keeps
 //! the walls of ARCHITECTURE.md standing.
 
@@ -29,5 +30,6 @@ mod resuming;
 mod sameness;
 mod shortcuts;
 mod signals;
+mod spatial;
 mod storage;
 mod subject;

@@ -1,14 +1,17 @@
 //! The signals that training accumulates, against the reference's loss gradient.
 
-use densify::backend::{LearningRates, StepInput};
+use densify::backend::{LearningRates, StepInput, Storage};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
-use densify::gaussians::Gaussians;
+use densify::gaussians::{Gaussians, dc_to_rgb};
+use densify_policies::plan::EditPlan;
 use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet};
 
-use crate::subject::{all, make_with, normalised, repeatable, step_input};
+use crate::subject::{all, devices, make_with, normalised, repeatable, step_input, storages};
 use densify::verify::compare::{Table, relative_error};
+use densify::verify::reference::blend::each_blended;
 use densify::verify::reference::loss::loss;
+use densify::verify::reference::project::{by_depth, project};
 use densify::verify::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 
@@ -42,21 +45,36 @@ fn views() -> Views {
     // Rounded where training would round: a step of length zero normalises quaternions.
     let model = normalised(scenes::cloud(21, 2, &first, 62));
     let target = |camera: &Camera| scenes::noisy((camera.width, camera.height), 0.0, 63).1;
-    let targets = cameras.iter().map(target).collect();
+    let mut targets: Vec<_> = cameras.iter().map(target).collect();
+    targets[1].mask = Some((0..38 * 50).map(|i| (i * 37 % 256) as u8).collect());
     Views { model, cameras, targets }
 }
 
-/// The reference's gradient of the training loss of one view.
-fn reference(views: &Views, v: usize) -> Gradient {
-    let (camera, target) = (&views.cameras[v], &views.targets[v]);
-    let view = View { camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
-    let model = Model::of(&views.model);
+/// The reference's gradient of the training loss of one view, and each row's weighted error.
+pub(crate) fn reference(
+    model: &Gaussians,
+    view: View<'_>,
+    target: &Image8,
+) -> (Gradient, Vec<f64>) {
+    let model = Model::of(model);
     let image = render(&model, view, &Rules::STANDARD);
     let truth: Vec<f64> = target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
-    let rgb = loss(&image.rgb, &truth, camera.width as usize, camera.height as usize).gradient;
+    // What is masked agrees, so far as it is.
+    let mask = |i: usize| target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[i / 3]) / 255.0);
+    let pairs = image.rgb.iter().zip(&truth).enumerate();
+    let seen: Vec<f64> = pairs.map(|(i, (x, y))| y + mask(i) * (x - y)).collect();
+    let mut loss = loss(&seen, &truth, view.camera.width as usize, view.camera.height as usize);
+    for (i, gradient) in loss.gradient.iter_mut().enumerate() {
+        *gradient *= mask(i);
+    }
+    let splats = project(&model, view, &Rules::STANDARD);
+    let mut errors = vec![0.0; splats.len()];
+    each_blended(&splats, &by_depth(&splats), view, &Rules::STANDARD, |pixel, row, weight, _| {
+        errors[row] += weight * loss.by_pixel[pixel];
+    });
     let nothing = vec![0.0; image.alpha.len()];
-    let upstream = Upstream { rgb, alpha: nothing.clone(), depth: nothing };
-    differentiate(&model, view, &Rules::STANDARD, &upstream).1
+    let upstream = Upstream { rgb: loss.gradient, alpha: nothing.clone(), depth: nothing };
+    (differentiate(&model, view, &Rules::STANDARD, &upstream).1, errors)
 }
 
 fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
@@ -66,14 +84,14 @@ fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
 /// One view's contribution to a signal, where views count in full from a depth on. Shape: [rows].
 fn contribution(
     signal: Signal,
-    gradient: &Gradient,
+    (gradient, errors): &(Gradient, Vec<f64>),
     camera: &Camera,
     depths: &[f64],
     full_depth: f64,
 ) -> Vec<f64> {
     let ndc = [0.5 * f64::from(camera.width), 0.5 * f64::from(camera.height)];
-    let rows = gradient.screen.iter().zip(&gradient.model.means).zip(depths);
-    rows.map(|((s, mean), depth)| {
+    let rows = gradient.screen.iter().zip(&gradient.model.means).zip(depths).zip(errors);
+    rows.map(|(((s, mean), depth), &error)| {
         let near = if full_depth > 0.0 { (depth / full_depth).min(1.0).powi(2) } else { 1.0 };
         match signal {
             Signal::VisibleCount => f64::from(u8::from(s.pixels > 0)),
@@ -87,6 +105,7 @@ fn contribution(
             Signal::WeightMax => s.max_weight,
             Signal::WeightSum => s.sum_weight,
             Signal::PixelCount => f64::from(s.pixels),
+            Signal::WeightedError => error,
             other => panic!("{other:?} is no sum over views"),
         }
     })
@@ -117,9 +136,16 @@ fn collect(
 #[test]
 fn every_signal_whatever_else_is_asked_for() {
     let views = views();
-    let gradients: Vec<Gradient> = (0..views.cameras.len()).map(|v| reference(&views, v)).collect();
-    let is_accumulated =
-        |s: &Signal| !matches!(s.kind(), SignalKind::Present | SignalKind::FreshMaximum);
+    let seen = views.cameras.iter().zip(&views.targets);
+    let gradients: Vec<_> = seen
+        .map(|(camera, target)| {
+            let view = View { camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
+            reference(&views.model, view, target)
+        })
+        .collect();
+    let is_accumulated = |s: &Signal| {
+        matches!(s.kind(), SignalKind::Sum | SignalKind::Count | SignalKind::EpochMaximum)
+    };
     let everything: Vec<Signal> = Signal::ALL.into_iter().filter(is_accumulated).collect();
     let mut base = everything.clone();
     base.retain(|signal| signal.pixel_sums().is_empty());
@@ -181,6 +207,43 @@ fn the_largest_weight_lasts_until_the_end_of_the_next_epoch() {
         assert!(columns[0].iter().any(|&w| w > 0.1));
         assert!(now(true) == columns[0], "the previous epoch counts");
         assert!(now(true).iter().all(|&w| w.to_bits() == 0), "the one before does not");
+    }
+}
+
+/// To the last bit, however parameters are stored, and of rows that an edit has moved.
+#[test]
+fn attributes_are_the_parameters_of_the_rows() {
+    let views = views();
+    let wanted = SignalSet::from([
+        Signal::Age,
+        Signal::Position,
+        Signal::LogScale,
+        Signal::Orientation,
+        Signal::Colour,
+    ]);
+    let native = storages().map(|storage| (Subject::NATIVE, storage));
+    let gpus = devices().iter().cloned().map(|gpu| (Subject::Gpu(gpu), Storage::default()));
+    for (subject, storage) in native.into_iter().chain(gpus) {
+        let needs = Needs { signals: wanted, ..Needs::default() };
+        let setup = Setup { needs, storage, ..Setup::default() };
+        let mut backend = make_with(&subject, &views.model, setup);
+        let (camera, target) = (&views.cameras[0], &views.targets[0]);
+        backend.train_step(&step_input(1, camera, target, 2)).expect("a small image is rendered");
+        let mut plan = EditPlan::new(views.model.len(), backend.budget());
+        plan.prune_all([0, 3]);
+        backend.apply(&plan.compile(), 1, 1).expect("a plan is applied");
+        let signals = backend.take_signals(wanted).expect("signals can be taken");
+        let of = |signal| signals.get(signal).expect("it was declared");
+        let model = backend.download().expect("a model");
+        let what = format!("{}, {storage:?}", subject.name());
+        assert_eq!(model.len(), views.model.len() - 2);
+        assert!(of(Signal::Position) == model.means.as_flattened(), "positions: {what}");
+        assert!(of(Signal::LogScale) == model.log_scales.as_flattened(), "scales: {what}");
+        assert!(of(Signal::Orientation) == model.quats.as_flattened(), "orientations: {what}");
+        let dc = (0..model.len()).flat_map(|row| model.sh_of(row)[..3].to_vec());
+        assert!(dc.map(dc_to_rgb).eq(of(Signal::Colour).iter().copied()), "colours: {what}");
+        assert!(of(Signal::Age).iter().all(|&age| age > 0.5), "ages: {what}");
+        backend.give_back(signals);
     }
 }
 

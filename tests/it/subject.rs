@@ -7,7 +7,8 @@
 use std::sync::OnceLock;
 
 use densify::backend::cpu::InstructionSet;
-use densify::backend::gpu::{Accumulation, AdapterChoice, AdapterSummary, GpuDevice, adapters};
+use densify::backend::gpu::{GpuDevice, adapters};
+use densify::backend::{Accumulation, AdapterChoice, AdapterSummary};
 use densify::backend::{
     Backend, MomentStorage, ParameterStorage, Rendering, StateArray, StepInput, Storage, Tensor,
 };

@@ -52,6 +52,8 @@ pub enum Check {
     /// It requests fresh views if and only if it requests the signal measured in them, and auxiliary
     /// views only if its needs say what to measure there.
     RequestsConsistently,
+    /// It rewrites, turns or scales by axis only if its needs declare detailed edits.
+    DeclaresEdits,
     /// Every number in its needs is in its range, and at no step is its cadence longer than declared.
     DeclaresValidNumbers,
     /// It plans without error or panic, whatever the statistics hold and whatever the plan refuses.
@@ -79,6 +81,7 @@ impl fmt::Display for Check {
             Self::Builds => "can be built from its defaults",
             Self::ReadsOnlyDeclared => "reads only what it declares",
             Self::RequestsConsistently => "requests views together with what is measured in them",
+            Self::DeclaresEdits => "declares detailed edits",
             Self::DeclaresValidNumbers => "declares valid numbers",
             Self::NeverFails => "plans without error, whatever it is given",
             Self::KeepsPlan => "keeps the plan that it is given",

@@ -8,7 +8,7 @@ use toml::Table;
 use super::Check;
 use super::scenarios::Scenario;
 use super::synthetic::{Event, Model, View};
-use crate::plan::{EditPlan, RowOps};
+use crate::plan::{EditPlan, Refused, RowOps};
 use crate::policy::{
     AuxRequest, AuxView, DensityPolicy, Needs, PolicyError, PolicyState, Signal, Snapshot,
 };
@@ -176,7 +176,7 @@ fn plan(
     };
     let rows = now.rows();
     let budget = scenario.budget(rows);
-    let mut plan = EditPlan::new(rows, budget);
+    let mut plan = EditPlan::new(rows, budget).allowing(needs);
     let rng = PolicyRng::new(3, event.step);
     let planned = catch_panic(|| policy.plan(&now, &rng, &mut plan)).map_err(never_fails)?;
     planned.map_err(|error| match error {
@@ -185,6 +185,9 @@ fn plan(
         }
         error => never_fails(error.to_string()),
     })?;
+    if plan.was_undeclared() {
+        return Err((Check::DeclaresEdits, Refused::Undeclared.to_string()));
+    }
     let ops = plan.compile();
     if (ops.rows_before, ops.budget) != (rows, budget) || ops.rows_after > budget {
         let why = format!("budget {budget}, but the plan was made for {ops:?}");

@@ -70,6 +70,11 @@ fn plausible(signal: Signal, u: f32, scene: &SceneInfo) -> f32 {
         Signal::ScaleProduct => (0.15 * scene.extent * u.powi(3)).powi(3),
         Signal::ScaleMax => 0.15 * scene.extent * u.powi(3) + 1e-6,
         Signal::Age => (300.0 * u).floor(),
+        Signal::Position => 2.0 * scene.extent * (u - 0.5),
+        Signal::LogScale => (0.15 * scene.extent * u.powi(3) + 1e-6).ln(),
+        Signal::Orientation => u - 0.5,
+        // What a row shows may lie beyond 0 and 1.
+        Signal::Colour => 1.4 * u - 0.2,
         other => match other.kind() {
             SignalKind::Count => (1000.0 * u).floor(),
             SignalKind::Sum => 1e-3 * u.powi(3),

@@ -11,7 +11,7 @@ use super::*;
 use crate::adc::clone_at;
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
-use crate::plan::EditPlan;
+use crate::plan::{EditPlan, Refused, Update};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PolicyResult, PolicyState,
     Signal, SignalSet, Snapshot,
@@ -60,9 +60,12 @@ enum Fault {
     PanicsOnManyRows,
     /// Remembers rows beyond the thousandth, and does not save them.
     ForgetsManyRows,
+    /// Is sure that a row can be put where it is.
+    TrustsPositions,
+    UpdatesUndeclared,
 }
 
-const FAULTS: [(Fault, Option<Check>); 26] = [
+const FAULTS: [(Fault, Option<Check>); 28] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
     (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
@@ -89,6 +92,8 @@ const FAULTS: [(Fault, Option<Check>); 26] = [
     (Fault::ReadsTheClock, Some(Check::IsDeterministic)),
     (Fault::PanicsOnManyRows, Some(Check::NeverFails)),
     (Fault::ForgetsManyRows, Some(Check::RestoresState)),
+    (Fault::TrustsPositions, Some(Check::NeverFails)),
+    (Fault::UpdatesUndeclared, Some(Check::DeclaresEdits)),
 ];
 
 /// Shared state that makes policies nondeterministic.
@@ -106,7 +111,8 @@ struct Params {
 }
 
 /// A policy with a state: at every third event of its life it prunes the faintest row, at the
-/// others it clones two rows, one by gradient and one at random. It conforms but for its fault.
+/// others it clones two rows, one by gradient and one at random, and rewrites the first row. It conforms
+/// but for its fault.
 struct Faulty {
     fault: Fault,
     events: u64,
@@ -132,7 +138,8 @@ impl Faulty {
 
 impl DensityPolicy for Faulty {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let mut signals = SignalSet::from([Signal::Opacity, Signal::ScreenGradient]);
+        let mut signals =
+            SignalSet::from([Signal::Opacity, Signal::ScreenGradient, Signal::Position]);
         if self.has(Fault::HasRandomNeeds) && next_call().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
@@ -141,7 +148,8 @@ impl DensityPolicy for Faulty {
             signals = signals.with(Signal::FreshWeightMax);
         }
         let fresh_views = if fresh || self.has(Fault::RendersFreshWithoutReading) { 3 } else { 0 };
-        let mut needs = Needs { signals, fresh_views, ..Needs::default() };
+        let detailed_edits = !self.has(Fault::UpdatesUndeclared);
+        let mut needs = Needs { signals, fresh_views, detailed_edits, ..Needs::default() };
         if !self.has(Fault::WantsViewsUndeclared) {
             let columns = vec![AuxColumn::Depth];
             let points = if self.has(Fault::ReadsUndeclaredPoints) { 0 } else { 2 };
@@ -201,7 +209,8 @@ impl DensityPolicy for Faulty {
         let gradient = now.signal(Signal::ScreenGradient)?;
         let rows: Vec<u32> = (0..now.rows() as u32).collect();
         if self.has(Fault::ReplacesThePlan) {
-            *plan = EditPlan::new(now.rows(), plan.budget() + 1);
+            let needs = self.needs(now.scene);
+            *plan = EditPlan::new(now.rows(), plan.budget() + 1).allowing(&needs);
         }
         match self.fault {
             Fault::NeverEdits => return Ok(()),
@@ -254,6 +263,10 @@ impl DensityPolicy for Faulty {
             if self.has(Fault::FailsWhenRefused) {
                 grown.map_err(|refused| PolicyError::Other(refused.to_string()))?;
             }
+        }
+        let position = now.positions()?.first().copied();
+        if let Err(Refused::BadValue(field)) = plan.update(0, Update { position, ..Update::NONE }) {
+            assert!(field == "position" && !self.has(Fault::TrustsPositions), "a bad {field}");
         }
         Ok(())
     }

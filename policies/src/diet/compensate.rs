@@ -42,15 +42,13 @@ impl Diet {
             NewbornSize::Code => Some(squared_geometric_mean(now.signal(Signal::ScaleMax)?)),
         };
         let seeds = now.candidates.iter().map(|candidate| {
-            let seed = Seed {
-                position: candidate.position,
-                colour: candidate.colour,
-                scale: code_size.unwrap_or(self.params.size_pixels as f32 * candidate.pixel_size),
-                opacity: self.params.newborn_opacity as f32,
-            };
+            let scale = code_size.unwrap_or(self.params.size_pixels as f32 * candidate.pixel_size);
+            let opacity = self.params.newborn_opacity as f32;
+            let seed = Seed::round(candidate.position, candidate.colour, scale, opacity);
             (candidate.error, seed)
         });
-        let (valid, invalid): (Vec<_>, Vec<_>) = seeds.partition(|(_, seed)| seed.is_valid());
+        let (valid, invalid): (Vec<_>, Vec<_>) =
+            seeds.partition(|(_, seed)| seed.bad_field().is_none());
         // The plan refuses and counts these; no row is evicted for them.
         for (_, seed) in invalid {
             let _ = plan.append(seed);

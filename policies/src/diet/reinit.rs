@@ -5,7 +5,7 @@
 
 use super::Diet;
 use super::quota::rows_of_share;
-use crate::neighbours::mean_square_distances;
+use crate::neighbours::Neighbours;
 use crate::plan::{EditPlan, Reset, Seed};
 use crate::policy::{AuxRequest, Candidate, SceneInfo};
 
@@ -32,26 +32,24 @@ impl Diet {
     /// Prunes all rows and appends the surface points instead. Without any point the model is kept.
     pub(super) fn reinit(&mut self, extent: f32, plan: &mut EditPlan) {
         let opacity = self.params.newborn_opacity as f32;
-        let seed = |candidate: &Candidate| Seed {
-            position: candidate.position,
-            colour: candidate.colour,
-            // A valid size until the neighbours are known.
-            scale: 1.0,
-            opacity,
-        };
+        // A valid size until the neighbours are known.
+        let seed = |c: &Candidate| Seed::round(c.position, c.colour, 1.0, opacity);
         let surface = std::mem::take(&mut self.surface);
-        let mut seeds: Vec<Seed> = surface.iter().map(seed).filter(Seed::is_valid).collect();
+        let mut seeds: Vec<Seed> =
+            surface.iter().map(seed).filter(|s| s.bad_field().is_none()).collect();
         seeds.truncate(rows_of_share(self.params.reinit_share, plan.budget()));
         if seeds.is_empty() {
             return;
         }
-        let positions: Vec<[f32; 3]> = seeds.iter().map(|seed| seed.position).collect();
+        let positions: Vec<_> = seeds.iter().map(|seed| seed.position.map(f64::from)).collect();
+        let neighbours = Neighbours::new(&positions);
         let extent = f64::from(extent);
         let least = LEAST_DISTANCE * extent;
         let alone = seeds.len() == 1;
-        for (seed, square) in seeds.iter_mut().zip(mean_square_distances(&positions)) {
-            let size = if alone { LONE_SIZE * extent } else { square.sqrt().max(least) };
-            seed.scale = size as f32;
+        for (index, seed) in seeds.iter_mut().enumerate() {
+            let distance = neighbours.mean_square_distance(index).sqrt();
+            let size = if alone { LONE_SIZE * extent } else { distance.max(least) };
+            seed.scales = [size as f32; 3];
         }
         plan.cause("reinit");
         plan.prune_all(0..plan.rows() as u32);

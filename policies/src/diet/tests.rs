@@ -196,14 +196,14 @@ fn clones_shift_by_the_rule() {
         .with(Signal::MeanGradientZ, &[4e-4, 0.0, 1.0])
         .with(Signal::MeanGradientNorm, &[1e-3, 0.0, 3.0]);
     let shifts = |set: &str| -> Vec<[f32; 3]> {
-        let families = run(&event, set).ops.families;
-        let split = families[2].offspring.placement;
+        let offspring = run(&event, set).offspring();
+        let split = offspring[2].placement;
         assert!(matches!(split, Placement::LongAxis { .. }), "a split was shifted: {split:?}");
         let offset = |placement| match placement {
             Placement::Offset(offset) => offset,
             other => panic!("{other:?}"),
         };
-        families[..2].iter().map(|family| offset(family.offspring.placement)).collect()
+        offspring[..2].iter().map(|offspring| offset(offspring.placement)).collect()
     };
     let near = |found: &[[f32; 3]], expected: [f32; 3]| {
         for axis in 0..3 {
@@ -224,9 +224,7 @@ fn large_rows_split_and_small_ones_are_cloned() {
     let event = event(600, 2, 10)
         .with(Signal::ScreenGradient, &[2.0, 1.0])
         .with(Signal::ScaleMax, &[0.101, 0.1]);
-    let offspring = |set: &str| -> Vec<Offspring> {
-        run(&event, set).ops.families.iter().map(|family| family.offspring).collect()
-    };
+    let offspring = |set: &str| -> Vec<Offspring> { run(&event, set).offspring() };
     let [original, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
     assert_eq!((original, clone), (split_by(1.6), clone_at([0.0; 3])));
     assert_eq!(original.scale, ScaleRule::Uniform(0.625));
@@ -242,7 +240,7 @@ fn a_conserving_clone_shares_its_opacity() {
         .with(Signal::ScreenGradient, &[2.0, 0.0])
         .with(Signal::Opacity, &[0.75, 0.5]);
     let done = run(&event, "clone_opacity = \"conserve\"");
-    let offspring = done.ops.families[0].offspring;
+    let offspring = done.offspring()[0];
     assert_eq!(
         (offspring.parent, offspring.opacity),
         (ParentFate::BecomesChild, OpacityRule::Conserved)
@@ -293,12 +291,7 @@ fn the_worst_pixels_become_rows() {
     let done = run(&event, "rho_c = 0.45");
     assert_eq!(done.pruned, [0]);
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
-    let seed = |error, scale| Seed {
-        position: [error, 0.0, 0.0],
-        colour: [error, 0.5, 1.0],
-        scale,
-        opacity: 0.1,
-    };
+    let seed = |error, scale| Seed::round([error, 0.0, 0.0], [error, 0.5, 1.0], scale, 0.1);
     assert_eq!(seeds, [seed(0.3, 0.04), seed(0.2, 0.06)]);
     assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 2, updated: 0, denied: 0 });
     assert!(done.ops.reset_candidates && !done.ops.reset_signals);
@@ -324,7 +317,7 @@ fn no_row_is_evicted_for_a_pixel_without_a_point() {
 fn the_size_of_the_code_is_the_squared_geometric_mean() {
     let mut event = event(10_500, 3, 40).with(Signal::ScaleMax, &[0.1, 0.4, f32::NAN]);
     event.candidates = vec![candidate(0.1, 7.0)];
-    let scale = |set| run(&event, &format!("rho_c = 1\n{set}")).ops.seeds[0].1.scale;
+    let scale = |set| run(&event, &format!("rho_c = 1\n{set}")).ops.seeds[0].1.scales[0];
     assert!((scale("newborn_size = \"code\"") - 0.04).abs() < 1e-6);
     assert!((scale("size_pixels = 0.5") - 3.5).abs() < 1e-6);
 }
@@ -427,7 +420,7 @@ fn the_model_is_replaced_by_surface_points() {
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
     let sizes = [(14.0_f32 / 3.0).sqrt(), 2.0_f32.sqrt()];
     for (seed, size) in seeds.iter().zip(sizes) {
-        assert!((seed.scale - size).abs() < 1e-5, "{seed:?} {size}");
+        assert!((seed.scales[2] - size).abs() < 1e-5, "{seed:?} {size}");
     }
     assert_eq!((seeds[1].position, seeds[1].colour), ([1.0, 0.0, 0.0], [0.5, 0.5, 1.0]));
     assert!(seeds.iter().all(|seed| (seed.opacity - 0.1).abs() < 1e-6));
@@ -452,7 +445,7 @@ fn points_that_coincide_and_points_alone_have_a_size() {
     let scales = |points: Vec<Candidate>| -> Vec<f32> {
         let views = vec![View { points, ..View::default() }];
         let done = run(&Event { views, ..event.clone() }, "reinit_at = 5000");
-        done.ops.seeds.iter().map(|(_, seed)| seed.scale).collect()
+        done.ops.seeds.iter().map(|(_, seed)| seed.scales[1]).collect()
     };
     // The extent is 10.
     assert_eq!(scales(vec![twice, twice]), [2e-3, 2e-3]);

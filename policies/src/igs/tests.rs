@@ -56,7 +56,7 @@ fn only_candidates_with_edges_are_split() {
 #[test]
 fn rows_are_halved_along_their_longest_axis() {
     let done = run(&event(14_400, &[1.0], 100), "");
-    assert_eq!(done.ops.families[0].offspring, split_long_axis(0.45, 0.6));
+    assert_eq!(done.offspring()[0], split_long_axis(0.45, 0.6));
 }
 
 #[test]

@@ -68,7 +68,7 @@ use serde::{Deserialize, Serialize};
 use crate::adc::Window;
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
-use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule};
+use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, UNTURNED};
 use crate::policy::{
     DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyResult, SceneInfo, Signal, SignalSet,
     Snapshot, StartRule,
@@ -233,6 +233,7 @@ impl Mcmc {
             parent: ParentFate::BecomesChild,
             placement: Placement::Offset([0.0; 3]),
             scale: ScaleRule::Uniform(scale as f32),
+            turn: UNTURNED,
             opacity: if is_exact { OpacityRule::Conserved } else { OpacityRule::Set(share as f32) },
         }
     }

@@ -58,8 +58,8 @@ fn two_shares_by_hand() {
 fn the_dead_are_relocated_to_the_only_living_row() {
     let done = run(&event(&[0.005, 0.5, f32::NAN, 0.001], 4), "");
     // Three copies of row 1, in the slots of the dead.
-    assert_eq!((done.pruned, done.split), (vec![0, 2, 3], vec![1]));
-    let family = done.ops.families[0].offspring;
+    assert_eq!((&done.pruned, &done.split), (&vec![0, 2, 3], &vec![1]));
+    let family = done.offspring()[0];
     assert_eq!((family.children, family.siblings()), (3, 4));
     assert_eq!(
         (family.placement, family.opacity),
@@ -83,7 +83,7 @@ fn growth_is_five_percent_up_to_the_budget() {
     assert_eq!([after(39, 1000), after(20, 1000), after(19, 1000)], [40, 21, 19]);
     let both = run(&event(&[0.001, 0.5], 9), "growth = 0.5");
     assert_eq!(both.ops.cause, "relocate+grow");
-    assert_eq!((both.ops.rows_after, both.ops.families[0].offspring.children), (3, 2));
+    assert_eq!((both.ops.rows_after, both.offspring()[0].children), (3, 2));
     assert!(!run(&event(&opacity, 200), "growth = 0.0").ops.edits_rows());
     // A model that is too large loses its dead, and gets nothing for them.
     let over = run(&event(&[0.001, 0.5, 0.5, 0.001], 2), "");
@@ -99,7 +99,7 @@ fn the_opaque_are_drawn_more_often() {
     let (mut faint, mut strong) = (0, 0);
     for family in &done.ops.families {
         let copies = if family.parent % 2 == 0 { &mut faint } else { &mut strong };
-        *copies += family.offspring.children;
+        *copies += done.ops.offspring(family).children;
     }
     assert_eq!(faint + strong, 2000);
     // 400 of 2000, within five standard deviations (18 each).
@@ -110,7 +110,7 @@ fn the_opaque_are_drawn_more_often() {
 fn many_copies_count_as_most_shares() {
     let mut opacity = [0.001; 80];
     opacity[7] = 0.5;
-    let family = run(&event(&opacity, 80), "").ops.families[0].offspring;
+    let family = run(&event(&opacity, 80), "").offspring()[0];
     assert_eq!(family.children, 79);
     let (share, scale) = share(0.5, 51, 0.005);
     assert_eq!(family.opacity, OpacityRule::Set(share as f32));

@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::edit::{Offspring, ParentFate, Seed, Update, in_open_unit};
+use crate::edit::{
+    Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed, UNTURNED, Update, in_open_unit,
+};
 
 /// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it; no slot
 /// at or beyond the budget is ever written.
@@ -19,8 +21,10 @@ pub struct RowOps {
     pub rows_after: usize,
     /// The budget the plan was made for.
     pub budget: usize,
-    /// Parents and their offspring.
+    /// Parents; [`offspring`](Self::offspring) has how their children follow.
     pub families: Vec<Family>,
+    /// Scales and turns that are too large for a [`Family`].
+    pub shapes: Vec<(ScaleRule, [f32; 4])>,
     /// Slots of all children, family after family.
     pub child_slots: Vec<u32>,
     /// Rows rewritten in place.
@@ -42,15 +46,57 @@ pub struct RowOps {
     pub cause: String,
 }
 
-/// One parent and its children.
+/// One parent and its children. An [`Offspring`] in less memory: there may be millions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Family {
     /// The parent's row.
     pub parent: u32,
     /// Its first child's place in [`RowOps::child_slots`].
     pub first_child: u32,
-    /// How the children follow from the parent.
-    pub offspring: Offspring,
+    children: u32,
+    fate: ParentFate,
+    placement: Placement,
+    shape: Shape,
+    opacity: OpacityRule,
+}
+
+/// Scales and turn of a family.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Shape {
+    Uniform(f32),
+    LongAxis {
+        long: f32,
+        other: f32,
+    },
+    /// A place in [`RowOps::shapes`].
+    Listed(u32),
+}
+
+impl Family {
+    /// A family whose shape is appended to `shapes` if it is [detailed](Offspring::is_detailed).
+    pub(crate) fn new(
+        parent: u32,
+        first_child: u32,
+        offspring: Offspring,
+        shapes: &mut Vec<(ScaleRule, [f32; 4])>,
+    ) -> Self {
+        let Offspring { children, parent: fate, placement, scale, turn, opacity } = offspring;
+        let shape = match (scale, offspring.is_detailed()) {
+            (ScaleRule::Uniform(factor), false) => Shape::Uniform(factor),
+            (ScaleRule::LongAxis { long, other }, false) => Shape::LongAxis { long, other },
+            _ => {
+                shapes.push((scale, turn));
+                Shape::Listed(shapes.len() as u32 - 1)
+            }
+        };
+        Self { parent, first_child, children, fate, placement, shape, opacity }
+    }
+
+    /// What happens to the parent's own slot.
+    #[must_use]
+    pub fn fate(&self) -> ParentFate {
+        self.fate
+    }
 }
 
 /// How many rows an edit changed.
@@ -96,7 +142,26 @@ impl RowOps {
     /// When `family` does not belong to this plan.
     #[must_use]
     pub fn children(&self, family: &Family) -> &[u32] {
-        &self.child_slots[family.first_child as usize..][..family.offspring.children as usize]
+        &self.child_slots[family.first_child as usize..][..family.children as usize]
+    }
+
+    /// How `family`'s children follow from the parent.
+    ///
+    /// # Panics
+    /// When `family` does not belong to this plan.
+    #[must_use]
+    pub fn offspring(&self, family: &Family) -> Offspring {
+        self.find_offspring(family).expect("a family of this plan")
+    }
+
+    fn find_offspring(&self, family: &Family) -> Option<Offspring> {
+        let Family { children, fate: parent, placement, opacity, .. } = *family;
+        let (scale, turn) = match family.shape {
+            Shape::Uniform(factor) => (ScaleRule::Uniform(factor), UNTURNED),
+            Shape::LongAxis { long, other } => (ScaleRule::LongAxis { long, other }, UNTURNED),
+            Shape::Listed(place) => *self.shapes.get(place as usize)?,
+        };
+        Some(Offspring { children, parent, placement, scale, turn, opacity })
     }
 
     /// Panics if [`check`](Self::check) fails: executing the plan would exceed the budget or corrupt
@@ -122,12 +187,12 @@ impl RowOps {
         let mut claimed = Slots::new(slots);
         self.check_families(&mut claimed)?;
         for (row, update) in &self.updates {
-            require(update.is_valid(), || format!("update of row {row} has a bad value"))?;
+            sound(update.bad_field(), || format!("update of row {row}"))?;
             self.check_live("updated row", *row)?;
             claimed.claim("updated row", *row)?;
         }
         for (slot, seed) in &self.seeds {
-            require(seed.is_valid(), || format!("seed in slot {slot} has a bad value"))?;
+            sound(seed.bad_field(), || format!("seed in slot {slot}"))?;
             self.check_new_slot("seed", *slot)?;
             claimed.claim("seed", *slot)?;
         }
@@ -144,7 +209,7 @@ impl RowOps {
         require(expected == Some(*rows_after) && counts.added == added, || {
             format!("{rows_before} rows, {counts:?}, {added} added: not {rows_after} rows after")
         })?;
-        let is_child = |family: &&Family| family.offspring.parent == ParentFate::BecomesChild;
+        let is_child = |family: &&Family| family.fate == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
         require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {
@@ -156,11 +221,12 @@ impl RowOps {
         let mut first_child = 0;
         for family in &self.families {
             let parent = family.parent;
-            require(family.offspring.is_valid(), || format!("family of row {parent}: bad value"))?;
+            let bad_field = self.find_offspring(family).map_or(Some("shape"), |o| o.bad_field());
+            sound(bad_field, || format!("family of row {parent}"))?;
             require(family.first_child as usize == first_child, || {
                 format!("family of row {parent} starts at {}", family.first_child)
             })?;
-            first_child += family.offspring.children as usize;
+            first_child += family.children as usize;
             self.check_live("parent", parent)?;
             claimed.claim("parent", parent)?;
         }
@@ -212,6 +278,12 @@ impl RowOps {
             format!("{role} in slot {slot}, {} rows after, budget {}", self.rows_after, self.budget)
         })
     }
+}
+
+fn sound(bad_field: Option<&'static str>, what: impl Fn() -> String) -> Result<(), BrokenOps> {
+    require(bad_field.is_none(), || {
+        format!("{} has a bad {}", what(), bad_field.unwrap_or_default())
+    })
 }
 
 fn require(holds: bool, message: impl FnOnce() -> String) -> Result<(), BrokenOps> {

@@ -1,7 +1,7 @@
 //! Compiled edits that hold, and every way in which one may be corrupt.
 
 use super::*;
-use crate::edit::{OpacityRule, Placement, ScaleRule};
+use crate::needs::Needs;
 use crate::plan::EditPlan;
 
 const SPLIT: Offspring = Offspring {
@@ -9,15 +9,17 @@ const SPLIT: Offspring = Offspring {
     parent: ParentFate::BecomesChild,
     placement: Placement::Sampled,
     scale: ScaleRule::Uniform(0.5),
+    turn: UNTURNED,
     opacity: OpacityRule::Same,
 };
-const SEED: Seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 1.0, opacity: 0.1 };
+const SEED: Seed = Seed::round([0.0; 3], [0.5; 3], 1.0, 0.1);
 const UPDATE: Update =
-    Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(2.0), keep_moments: false };
+    Update { scale: ScaleRule::Uniform(2.0), keep_moments: false, ..Update::NONE };
 
 /// Ten rows: 1, 2, 3, 5 and 8 pruned, 9 split, 7 updated, one seed.
 fn shrinking() -> RowOps {
-    let mut plan = EditPlan::new(10, 10);
+    let needs = Needs { detailed_edits: true, ..Needs::default() };
+    let mut plan = EditPlan::new(10, 10).allowing(&needs);
     for row in [1, 2, 3, 5, 8] {
         plan.prune(row).unwrap();
     }
@@ -56,11 +58,18 @@ fn every_corruption_is_found() {
         ("parent is updated too", |ops| ops.families[0].parent = 7),
         ("parent not moved", |ops| ops.families[0].parent = 8),
         ("bad offspring", |ops| {
-            ops.families[0].offspring.scale = ScaleRule::Uniform(-1.0);
+            ops.families[0].shape = Shape::Uniform(-1.0);
+        }),
+        ("bad listed shape", |ops| {
+            ops.families[0].shape = Shape::Listed(0);
+            ops.shapes = vec![(ScaleRule::Axes([1.0, 0.0, 1.0]), UNTURNED)];
+        }),
+        ("a shape that is not listed", |ops| {
+            ops.families[0].shape = Shape::Listed(0);
         }),
         ("children elsewhere", |ops| ops.families[0].first_child = 1),
         ("a child without a slot", |ops| {
-            ops.families[0].offspring.children = 2;
+            ops.families[0].children = 2;
         }),
         ("child upon parent", |ops| ops.child_slots[0] = 9),
         ("child upon seed", |ops| ops.child_slots[0] = 2),
@@ -72,7 +81,7 @@ fn every_corruption_is_found() {
         }),
         ("seed upon child", |ops| ops.seeds[0].0 = 1),
         ("seed upon a moved row", |ops| ops.seeds[0].0 = 3),
-        ("bad seed", |ops| ops.seeds[0].1.scale = f32::NAN),
+        ("bad seed", |ops| ops.seeds[0].1.scales[1] = f32::NAN),
         ("move out of the middle", |ops| ops.moves[0].0 = 4),
         ("move of nothing", |ops| ops.moves[0].0 = 10),
         ("move twice", |ops| ops.moves[0].0 = 9),

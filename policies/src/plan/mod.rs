@@ -7,8 +7,10 @@
 
 use crate::edit::in_open_unit;
 pub use crate::edit::{
-    Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, Update,
+    COLOUR_MAX, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, UNTURNED,
+    Update,
 };
+use crate::needs::Needs;
 pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
 
 /// Why a plan refused an edit. Each refusal is counted.
@@ -23,9 +25,14 @@ pub enum Refused {
     /// The model has no such row.
     #[error("no such row")]
     NoSuchRow,
-    /// A number in the edit is not finite or out of its range.
-    #[error("a value is not finite or out of range")]
-    BadValue,
+    /// A number in this field of the edit is not finite or out of its range.
+    #[error("`{0}` is not finite or out of range")]
+    BadValue(&'static str),
+    /// The edit is one that only [`Needs::detailed_edits`] allows.
+    #[error(
+        "not declared: updates, scales by axis and turns need `detailed_edits` in the policy's needs"
+    )]
+    Undeclared,
 }
 
 /// The edit of a row; one byte, which is all that a plan stores for untouched rows.
@@ -37,13 +44,19 @@ enum RowEdit {
     Updated,
 }
 
-/// Most memory a plan takes per row, without seeds `[bytes]`: the edit's byte, and either an update of
-/// each row or, as each family has a child, a family with its child's slot for every second row.
-pub const BYTES_PER_ROW: usize = size_of::<RowEdit>() + {
-    let updates = size_of::<(u32, Update)>();
-    let families = (size_of::<Family>() + size_of::<u32>()).div_ceil(2);
-    if updates > families { updates } else { families }
-};
+/// Most memory a plan takes per row, without seeds `[bytes]`: the edit's byte, and, as each family has a
+/// child, a family with its child's slot for every second row, or an update of each row.
+#[must_use]
+pub fn bytes_per_row(needs: &Needs) -> usize {
+    let family = size_of::<Family>() + size_of::<u32>();
+    let rows = if needs.detailed_edits {
+        let shape = size_of::<(ScaleRule, [f32; 4])>();
+        size_of::<(u32, Update)>().max((family + shape).div_ceil(2))
+    } else {
+        family.div_ceil(2)
+    };
+    size_of::<RowEdit>() + rows
+}
 
 /// The edits of one event.
 ///
@@ -57,7 +70,10 @@ pub struct EditPlan {
     pruned: usize,
     added: usize,
     denied: usize,
+    detailed: bool,
+    was_undeclared: bool,
     families: Vec<Family>,
+    shapes: Vec<(ScaleRule, [f32; 4])>,
     updates: Vec<(u32, Update)>,
     seeds: Vec<Seed>,
     clamp_opacity: Option<f32>,
@@ -67,7 +83,7 @@ pub struct EditPlan {
 }
 
 impl EditPlan {
-    /// An empty plan for a model of `rows` rows with a limit of `budget` rows.
+    /// An empty plan for a model of `rows` rows with a limit of `budget` rows, without detailed edits.
     #[must_use]
     pub fn new(rows: usize, budget: usize) -> Self {
         Self {
@@ -76,7 +92,10 @@ impl EditPlan {
             pruned: 0,
             added: 0,
             denied: 0,
+            detailed: false,
+            was_undeclared: false,
             families: Vec::new(),
+            shapes: Vec::new(),
             updates: Vec::new(),
             seeds: Vec::new(),
             clamp_opacity: None,
@@ -84,6 +103,12 @@ impl EditPlan {
             reset_candidates: false,
             cause: String::new(),
         }
+    }
+
+    /// The plan, with detailed edits if `needs` declares them.
+    #[must_use]
+    pub fn allowing(self, needs: &Needs) -> Self {
+        Self { detailed: needs.detailed_edits, ..self }
     }
 
     /// Rows before the edit.
@@ -122,7 +147,7 @@ impl EditPlan {
     /// # Errors
     /// [`Refused::NoSuchRow`], [`Refused::Taken`].
     pub fn prune(&mut self, row: u32) -> Result<(), Refused> {
-        self.claim(row, true, 0, RowEdit::Pruned)?;
+        self.claim(row, None, 0, RowEdit::Pruned)?;
         self.pruned += 1;
         Ok(())
     }
@@ -137,28 +162,40 @@ impl EditPlan {
     /// Clones or splits `parent`.
     ///
     /// # Errors
-    /// [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`], and [`Refused::NoRoom`]
-    /// when there is not room for all the children.
+    /// [`Refused::Undeclared`], [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`], and
+    /// [`Refused::NoRoom`] when there is not room for all the children.
     pub fn grow(&mut self, parent: u32, offspring: Offspring) -> Result<(), Refused> {
         let children = offspring.children as usize;
-        self.claim(parent, offspring.is_valid(), children, RowEdit::Grown)?;
+        let is_detailed = offspring.is_detailed();
+        if is_detailed {
+            self.check_declared()?;
+        }
+        self.claim(parent, offspring.bad_field(), children, RowEdit::Grown)?;
+        // The most there can be, if no more rows are pruned: growing an array in steps would hold it
+        // twice while it is moved.
+        let most = (self.rows() - self.pruned).min(self.room());
         if self.families.is_empty() {
-            // The most there can be, if no more rows are pruned: growing the array in steps would
-            // hold it twice while it is moved.
-            self.families.reserve_exact((self.rows() - self.pruned).min(self.room()));
+            self.families.reserve_exact(most);
+        }
+        if is_detailed && self.shapes.is_empty() {
+            self.shapes.reserve_exact(most);
         }
         let first_child = self.children() as u32;
-        self.families.push(Family { parent, first_child, offspring });
+        self.families.push(Family::new(parent, first_child, offspring, &mut self.shapes));
         self.added += children;
         Ok(())
     }
 
-    /// Rewrites `row` in place.
+    /// Rewrites `row` in place, where [`Needs::detailed_edits`] allows it.
     ///
     /// # Errors
-    /// [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
+    /// [`Refused::Undeclared`], [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
     pub fn update(&mut self, row: u32, update: Update) -> Result<(), Refused> {
-        self.claim(row, update.is_valid(), 0, RowEdit::Updated)?;
+        self.check_declared()?;
+        self.claim(row, update.bad_field(), 0, RowEdit::Updated)?;
+        if self.updates.is_empty() {
+            self.updates.reserve_exact(self.rows() - self.pruned - self.families.len());
+        }
         self.updates.push((row, update));
         Ok(())
     }
@@ -168,7 +205,7 @@ impl EditPlan {
     /// # Errors
     /// [`Refused::BadValue`], [`Refused::NoRoom`].
     pub fn append(&mut self, seed: Seed) -> Result<(), Refused> {
-        self.check(seed.is_valid(), 1)?;
+        self.check(seed.bad_field(), 1)?;
         self.added += 1;
         self.seeds.push(seed);
         Ok(())
@@ -180,7 +217,7 @@ impl EditPlan {
     /// # Errors
     /// [`Refused::BadValue`] when `max` is not in (0, 1).
     pub fn clamp_opacity(&mut self, max: f32) -> Result<(), Refused> {
-        self.check(in_open_unit(max), 0)?;
+        self.check((!in_open_unit(max)).then_some("max"), 0)?;
         self.clamp_opacity = Some(self.clamp_opacity.map_or(max, |lowest| lowest.min(max)));
         Ok(())
     }
@@ -225,7 +262,7 @@ impl EditPlan {
         let live_tail = (rows_after..rows_before).filter(|slot| !is_pruned(slot));
         let moves: Vec<(u32, u32)> = live_tail.map(|s| s as u32).zip(holes).collect();
 
-        let rewritten = |f: &&Family| f.offspring.parent == ParentFate::BecomesChild;
+        let rewritten = |f: &&Family| f.fate() == ParentFate::BecomesChild;
         let counts = EditCounts {
             removed: self.pruned,
             added: self.added,
@@ -237,6 +274,7 @@ impl EditPlan {
             rows_after,
             budget: self.budget,
             families: self.families,
+            shapes: self.shapes,
             child_slots,
             updates: self.updates,
             seeds,
@@ -251,6 +289,19 @@ impl EditPlan {
         ops
     }
 
+    /// Whether an edit was refused that the policy had to declare.
+    pub(crate) fn was_undeclared(&self) -> bool {
+        self.was_undeclared
+    }
+
+    fn check_declared(&mut self) -> Result<(), Refused> {
+        if self.detailed {
+            return Ok(());
+        }
+        self.was_undeclared = true;
+        self.refuse(Refused::Undeclared)
+    }
+
     /// Rows added by families, without seeds.
     fn children(&self) -> usize {
         self.added - self.seeds.len()
@@ -260,24 +311,24 @@ impl EditPlan {
     fn claim(
         &mut self,
         row: u32,
-        valid: bool,
+        bad_field: Option<&'static str>,
         children: usize,
         edit: RowEdit,
     ) -> Result<(), Refused> {
         match self.edits.get(row as usize) {
             None => return self.refuse(Refused::NoSuchRow),
-            Some(RowEdit::None) => self.check(valid, children)?,
+            Some(RowEdit::None) => self.check(bad_field, children)?,
             Some(_) => return self.refuse(Refused::Taken),
         }
         self.edits[row as usize] = edit;
         Ok(())
     }
 
-    fn check(&mut self, valid: bool, new_rows: usize) -> Result<(), Refused> {
-        match (valid, new_rows <= self.room()) {
-            (false, _) => self.refuse(Refused::BadValue),
-            (true, false) => self.refuse(Refused::NoRoom),
-            (true, true) => Ok(()),
+    fn check(&mut self, bad_field: Option<&'static str>, new_rows: usize) -> Result<(), Refused> {
+        match bad_field {
+            Some(field) => self.refuse(Refused::BadValue(field)),
+            None if new_rows > self.room() => self.refuse(Refused::NoRoom),
+            None => Ok(()),
         }
     }
 

@@ -3,36 +3,39 @@
 use super::*;
 use proptest::prelude::*;
 
+fn detailed() -> Needs {
+    Needs { detailed_edits: true, ..Needs::default() }
+}
+
 fn family(children: u32, parent: ParentFate) -> Offspring {
     Offspring {
         children,
         parent,
         placement: Placement::Sampled,
         scale: ScaleRule::Uniform(0.625),
+        turn: UNTURNED,
         opacity: OpacityRule::Same,
     }
 }
 
-const SEED: Seed = Seed { position: [0.0; 3], colour: [0.5; 3], scale: 1.0, opacity: 0.1 };
-const UPDATE: Update =
-    Update { opacity: OpacityRule::Same, scale: ScaleRule::Uniform(1.0), keep_moments: true };
+const SEED: Seed = Seed::round([0.0; 3], [0.5; 3], 1.0, 0.1);
 
 #[test]
 fn a_row_has_one_edit() {
-    let mut plan = EditPlan::new(4, 8);
+    let mut plan = EditPlan::new(4, 8).allowing(&detailed());
     plan.prune(0).unwrap();
     plan.grow(1, family(1, ParentFate::Stays)).unwrap();
-    plan.update(2, UPDATE).unwrap();
+    plan.update(2, Update::NONE).unwrap();
     for row in 0..3 {
         assert!(!plan.is_free(row));
         assert_eq!(plan.prune(row), Err(Refused::Taken));
         assert_eq!(plan.grow(row, family(1, ParentFate::Stays)), Err(Refused::Taken));
-        assert_eq!(plan.update(row, UPDATE), Err(Refused::Taken));
+        assert_eq!(plan.update(row, Update::NONE), Err(Refused::Taken));
     }
     assert!(plan.is_free(3) && !plan.is_free(4));
     assert_eq!(plan.prune(4), Err(Refused::NoSuchRow));
     assert_eq!(plan.grow(4, family(1, ParentFate::Stays)), Err(Refused::NoSuchRow));
-    assert_eq!(plan.update(u32::MAX, UPDATE), Err(Refused::NoSuchRow));
+    assert_eq!(plan.update(u32::MAX, Update::NONE), Err(Refused::NoSuchRow));
     assert_eq!(plan.room(), 4);
     let counts = EditCounts { removed: 1, added: 1, updated: 1, denied: 12 };
     assert_eq!(plan.compile().counts, counts);
@@ -40,17 +43,43 @@ fn a_row_has_one_edit() {
 
 #[test]
 fn a_refused_value_changes_nothing() {
-    let mut plan = EditPlan::new(2, 8);
+    let mut plan = EditPlan::new(2, 8).allowing(&detailed());
     let lone = Offspring { children: 0, ..family(1, ParentFate::Stays) };
-    assert_eq!(plan.grow(0, lone), Err(Refused::BadValue));
-    let nowhere = Update { scale: ScaleRule::Uniform(f32::NAN), ..UPDATE };
-    assert_eq!(plan.update(0, nowhere), Err(Refused::BadValue));
-    assert_eq!(plan.append(Seed { opacity: 1.0, ..SEED }), Err(Refused::BadValue));
-    assert_eq!(plan.clamp_opacity(0.0), Err(Refused::BadValue));
+    assert_eq!(plan.grow(0, lone), Err(Refused::BadValue("children")));
+    let nowhere = Update { position: Some([0.0, f32::NAN, 0.0]), ..Update::NONE };
+    assert_eq!(plan.update(0, nowhere), Err(Refused::BadValue("position")));
+    assert_eq!(plan.append(Seed { opacity: 1.0, ..SEED }), Err(Refused::BadValue("opacity")));
+    assert_eq!(plan.clamp_opacity(0.0), Err(Refused::BadValue("max")));
     assert!(plan.is_free(0) && plan.room() == 6);
     let ops = plan.compile();
     assert!(ops.is_empty());
     assert_eq!(ops.counts.denied, 4);
+}
+
+/// A row takes little memory where little is declared; what is declared is held once.
+#[test]
+fn detailed_edits_are_declared_and_have_their_room() {
+    assert_eq!([Needs::default(), detailed()].map(|needs| bytes_per_row(&needs)), [29, 65]);
+    let plain = family(1, ParentFate::BecomesChild);
+    let by_axis = Offspring { scale: ScaleRule::Axes([1.0, 0.5, 2.0]), ..plain };
+    let turned = Offspring { turn: [0.0, 0.0, 0.0, 2.0], ..plain };
+    let mut plan = EditPlan::new(8, 16);
+    for refused in [plan.grow(0, by_axis), plan.grow(0, turned), plan.update(0, Update::NONE)] {
+        assert_eq!(refused, Err(Refused::Undeclared));
+    }
+    plan.grow(0, plain).unwrap();
+    assert_eq!(plan.compile().counts.denied, 3);
+    let mut plan = EditPlan::new(8, 16).allowing(&detailed());
+    let offspring = [plain, by_axis, turned, by_axis];
+    for (row, offspring) in (0..).zip(offspring) {
+        plan.grow(row, offspring).unwrap();
+    }
+    for row in 4..8 {
+        plan.update(row, Update::NONE).unwrap();
+    }
+    let ops = plan.compile();
+    assert_eq!((ops.families.capacity(), ops.shapes.capacity(), ops.updates.capacity()), (8, 7, 4));
+    assert!(ops.families.iter().map(|family| ops.offspring(family)).eq(offspring));
 }
 
 #[test]
@@ -145,7 +174,7 @@ fn execute(ops: &RowOps, pruned: &[u32], budget: usize) -> Vec<Occupant> {
 proptest! {
     #[test]
     fn any_plan_agrees_with_a_plain_vector((rows, budget, calls) in calls()) {
-        let mut plan = EditPlan::new(rows, budget);
+        let mut plan = EditPlan::new(rows, budget).allowing(&detailed());
         let mut pruned = Vec::new();
         let mut expected: Vec<Occupant> = (0..rows as u32).map(Occupant::Row).collect();
         let mut denied = 0;
@@ -163,7 +192,7 @@ proptest! {
                         expected.extend((1..=children).map(|number| Occupant::Child { parent: row, number }));
                     })
                 }
-                Call::Update(row) => plan.update(row, UPDATE),
+                Call::Update(row) => plan.update(row, Update::NONE),
                 Call::Append => plan.append(SEED).map(|()| {
                     expected.push(Occupant::Seed(seeds));
                     seeds += 1;

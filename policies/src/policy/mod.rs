@@ -94,7 +94,8 @@ pub type PolicyState = serde_json::Value;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneInfo {
     /// Size of the scene: 1.1 times the largest distance of a training camera from their mean
-    /// `[scene units]`, > 0. Size thresholds are fractions of it.
+    /// `[scene units]`, > 0, or what [`Signal::Position`] has as 1 in its place. Size thresholds are
+    /// fractions of it.
     pub extent: f32,
     /// Number of training views, >= 1; also the length of an epoch in steps.
     pub train_views: u32,
@@ -129,7 +130,7 @@ impl<'a> Snapshot<'a> {
         self.signals.rows()
     }
 
-    /// The values of `signal`. Shape: `[rows]`.
+    /// The values of `signal`. Shape: `[rows, width]`, where the [width](Signal::width) is mostly 1.
     ///
     /// # Errors
     /// [`PolicyError::Undeclared`] when the policy's needs do not list it, or when it is
@@ -137,6 +138,38 @@ impl<'a> Snapshot<'a> {
     /// this event.
     pub fn signal(&self, signal: Signal) -> PolicyResult<&'a [f32]> {
         self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
+    }
+
+    /// [`Signal::Position`] of each row.
+    ///
+    /// # Errors
+    /// As [`signal`](Self::signal).
+    pub fn positions(&self) -> PolicyResult<&'a [[f32; 3]]> {
+        Ok(self.signal(Signal::Position)?.as_chunks().0)
+    }
+
+    /// [`Signal::LogScale`] of each row.
+    ///
+    /// # Errors
+    /// As [`signal`](Self::signal).
+    pub fn log_scales(&self) -> PolicyResult<&'a [[f32; 3]]> {
+        Ok(self.signal(Signal::LogScale)?.as_chunks().0)
+    }
+
+    /// [`Signal::Orientation`] of each row.
+    ///
+    /// # Errors
+    /// As [`signal`](Self::signal).
+    pub fn orientations(&self) -> PolicyResult<&'a [[f32; 4]]> {
+        Ok(self.signal(Signal::Orientation)?.as_chunks().0)
+    }
+
+    /// [`Signal::Colour`] of each row.
+    ///
+    /// # Errors
+    /// As [`signal`](Self::signal).
+    pub fn colours(&self) -> PolicyResult<&'a [[f32; 3]]> {
+        Ok(self.signal(Signal::Colour)?.as_chunks().0)
     }
 }
 

@@ -127,7 +127,10 @@ fn small_and_large_rows_share_the_growth() {
     let done = run(&event(1000, 100, 942).with(Signal::ScaleMax, &scale), "");
     assert_eq!((done.cloned.len(), done.split.len()), (17, 39));
     assert!(done.cloned.iter().all(|row| *row < 30) && done.split.iter().all(|row| *row >= 30));
-    let offspring = |row| done.ops.families.iter().find(|f| f.parent == row).unwrap().offspring;
+    let offspring = |row| {
+        let family = done.ops.families.iter().find(|f| f.parent == row).unwrap();
+        done.ops.offspring(family)
+    };
     assert_eq!(offspring(done.cloned[0]), clone_at([0.0; 3]));
     assert_eq!(offspring(done.split[0]), split_by(1.6));
 }

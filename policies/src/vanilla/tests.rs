@@ -36,12 +36,12 @@ fn small_rows_are_cloned_and_large_ones_split() {
     let done = run(&event, "");
     assert_eq!(done.cloned, [0]);
     assert_eq!(done.split, [2, 1]);
-    let split = done.ops.families[0].offspring;
+    let split = done.offspring()[0];
     assert_eq!((split.children, split.parent), (1, ParentFate::BecomesChild));
     assert_eq!(split.placement, Placement::Sampled);
     assert_eq!(split.scale, ScaleRule::Uniform(0.625));
     assert_eq!(split.opacity, OpacityRule::Same);
-    let clone = done.ops.families[2].offspring;
+    let clone = done.offspring()[2];
     assert_eq!((clone.children, clone.parent), (1, ParentFate::Stays));
     assert_eq!(clone.placement, Placement::Offset([0.0; 3]));
     assert_eq!((clone.scale, clone.opacity), (ScaleRule::Uniform(1.0), OpacityRule::Same));

@@ -60,7 +60,11 @@ pub struct InitPoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
-    /// Numbers of the training views that see each, ascending. Shape: `[points]`.
+    /// Where on the surface each was found, in world coordinates: `positions` before noise, and for
+    /// an outlier what was mistaken for it. Shape: `[points]`; `[0]` for random points.
+    pub found_at: Vec<DVec3>,
+    /// Numbers of the training views that see each, ascending. An outlier lies in front of all of
+    /// them. Shape: `[points]`.
     pub seen_by: Vec<Vec<u32>>,
     /// Number of outliers among them.
     pub outliers: usize,
@@ -187,7 +191,8 @@ impl<'a> PointCollector<'a> {
                 break;
             }
         }
-        for position in &mut points.positions {
+        points.found_at = points.positions.clone();
+        for (position, seen) in points.positions.iter_mut().zip(&mut points.seen_by) {
             if draws.unit64() < outliers {
                 *position = anywhere(&mut draws, 0.1);
                 points.outliers += 1;
@@ -195,6 +200,8 @@ impl<'a> PointCollector<'a> {
                 let shift = DVec3::new(draws.normal(), draws.normal(), draws.normal());
                 *position += noise * diagonal * shift;
             }
+            // It may lie behind a camera now.
+            seen.retain(|&view| self.cameras[view as usize].project(*position).1 > 0.0);
         }
         points
     }

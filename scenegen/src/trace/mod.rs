@@ -10,7 +10,7 @@ use crate::intersect::Intersection;
 use crate::mesh::Model;
 use crate::packet::LANES;
 use crate::random::{Draws, stratum};
-use crate::shade::{Lighting, Point, Sampling, Seen, ShadedSurface, TriangleFlags};
+use crate::shade::{Lighting, Point, Sampling, ShadedSurface, TriangleFlags, VisiblePoint};
 use crate::surface::{LocalHit, LocalRay, Surface};
 use crate::texture::encode;
 
@@ -96,8 +96,8 @@ impl Rays {
         Point::read(shaded, &self.rays[lane], hit, width)
     }
 
-    fn seen<'a>(&self, lane: usize, point: Point<'a>) -> Seen<'a> {
-        Seen { index: self.index[lane], point, view: -self.rays[lane].direction }
+    fn seen<'a>(&self, lane: usize, point: Point<'a>) -> VisiblePoint<'a> {
+        VisiblePoint { index: self.index[lane], point, view: -self.rays[lane].direction }
     }
 }
 

@@ -40,9 +40,9 @@ enum Kind {
     Folder { root: PathBuf, surface: Box<Surface>, thin: Vec<bool> },
 }
 
-/// Depth and normals of a view.
+/// Depth and normals of a view: what renderers call a G-buffer.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Sight {
+pub struct GBuffer {
     /// Image width `[px]`.
     pub width: u32,
     /// Image height `[px]`.
@@ -104,7 +104,7 @@ impl GroundTruth {
     ///
     /// # Errors
     /// When a file is there but damaged.
-    pub fn sight(&self, view: &str, camera: &Camera) -> Result<Sight, Error> {
+    pub fn g_buffer(&self, view: &str, camera: &Camera) -> Result<GBuffer, Error> {
         match &self.kind {
             Kind::Scene(scene) => Ok(trace(camera, |ray| {
                 let (depth, normal, _) = scene.tracer().first_solid(camera.centre, ray, None)?;
@@ -168,7 +168,7 @@ impl std::fmt::Debug for GroundTruth {
 }
 
 /// Traces the rays through the pixels' centres.
-fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) -> Sight {
+fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) -> GBuffer {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let seen: Vec<(f32, [f32; 3])> = (0..width * height)
         .into_par_iter()
@@ -179,11 +179,11 @@ fn trace(camera: &Camera, first: impl Fn(DVec3) -> Option<(f64, DVec3)> + Sync) 
         })
         .collect();
     let (depth, normals) = seen.into_iter().unzip();
-    Sight { width: camera.width, height: camera.height, depth, normals }
+    GBuffer { width: camera.width, height: camera.height, depth, normals }
 }
 
 /// The depth and normals stored for a view, if there are files of its name and size.
-fn stored(root: &Path, view: &str, size: (u32, u32)) -> Result<Option<Sight>, Error> {
+fn stored(root: &Path, view: &str, size: (u32, u32)) -> Result<Option<GBuffer>, Error> {
     // Datasets name views by their image's path, with or without the images' folder.
     let name = view.trim_start_matches("./");
     let name = Path::new(name.strip_prefix("images/").unwrap_or(name)).with_extension("exr");
@@ -202,7 +202,7 @@ fn stored(root: &Path, view: &str, size: (u32, u32)) -> Result<Option<Sight>, Er
         return Ok(None);
     };
     let normals = x.into_iter().zip(y).zip(z).map(|((x, y), z)| [x, y, z]).collect();
-    Ok(Some(Sight { width: size.0, height: size.1, depth, normals }))
+    Ok(Some(GBuffer { width: size.0, height: size.1, depth, normals }))
 }
 
 #[cfg(test)]

@@ -32,26 +32,26 @@ fn folders_agree_with_their_scene() {
     assert!(a.iter().zip(&b).all(|(a, b)| a.distance(*b) < 1e-6), "another mesh");
     assert!(here.has_thin() && there.has_thin());
     let test = views.iter().find(|view| view.split == Split::Test).expect("a test view");
-    let sight = here.sight(&test.name, &test.camera).expect("traced");
-    assert!(sight.depth == frame.depth && sight.normals == frame.normals);
+    let g_buffer = here.g_buffer(&test.name, &test.camera).expect("traced");
+    assert!(g_buffer.depth == frame.depth && g_buffer.normals == frame.normals);
     for name in ["test/r_000.png", "images/test/r_000.png", "./images/test/r_000"] {
-        assert!(there.sight(name, &test.camera).expect("read") == sight, "{name}");
+        assert!(there.g_buffer(name, &test.camera).expect("read") == g_buffer, "{name}");
     }
     // Read, and not traced: what the files say counts.
     let (from, to) = (target.join("depth/train/r_000.exr"), target.join("depth/test/r_000.exr"));
     fs::copy(from, to).expect("copy");
-    let other = there.sight(&test.name, &test.camera).expect("read");
-    assert!(other.depth != sight.depth && other.normals == sight.normals);
+    let other = there.g_buffer(&test.name, &test.camera).expect("read");
+    assert!(other.depth != g_buffer.depth && other.normals == g_buffer.normals);
     // Without a file, and at another size, the mesh is traced.
-    let close = |a: &Sight, b: &Sight| {
+    let close = |a: &GBuffer, b: &GBuffer| {
         let apart = a.depth.iter().zip(&b.depth).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart < 1e-4, "{apart}");
     };
-    close(&there.sight("nothing.png", &test.camera).expect("traced"), &sight);
+    close(&there.g_buffer("nothing.png", &test.camera).expect("traced"), &g_buffer);
     let half = Camera { width: 20, height: 16, ..test.camera };
     close(
-        &there.sight(&test.name, &half).expect("traced"),
-        &here.sight("", &half).expect("traced"),
+        &there.g_buffer(&test.name, &half).expect("traced"),
+        &here.g_buffer("", &half).expect("traced"),
     );
     assert!(GroundTruth::open(root.path()).expect("no scene").is_none());
     // Another program's files of these names are not ours to read.
@@ -115,7 +115,7 @@ fn damaged_files_are_refused_and_nothing_panics() {
     let whole = fs::read(&file).expect("normals");
     for length in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
         fs::write(&file, &whole[..length]).expect("write");
-        let error = truth.sight("train/r_000.png", &camera).err();
+        let error = truth.g_buffer("train/r_000.png", &camera).err();
         let message = error.unwrap_or_else(|| panic!("{length} bytes accepted")).to_string();
         assert!(message.contains("r_000.exr"), "{message}");
     }
@@ -125,7 +125,7 @@ fn damaged_files_are_refused_and_nothing_panics() {
             let mut bytes = whole.clone();
             bytes[at] ^= flip;
             fs::write(&file, &bytes).expect("write");
-            let _ = truth.sight("train/r_000.png", &camera);
+            let _ = truth.g_buffer("train/r_000.png", &camera);
         }
     }
 }

@@ -1,4 +1,7 @@
 //! Writes COLMAP's text model under `sparse/0`; image names are relative to `images`.
+//!
+//! A view's features lie exactly where its points were found on the surface; the points carry the
+//! noise. So the reprojection errors are those of the noise.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -43,7 +46,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             q.w, q.x, q.y, q.z, t.x, t.y, t.z, view.name
         );
         let observations = seen[number].iter().map(|&point| {
-            let (pixel, _) = c.project(points.positions[point]);
+            let (pixel, _) = c.project(points.found_at[point]);
             format!("{} {} {}", pixel.x, pixel.y, point + 1)
         });
         images += &observations.collect::<Vec<_>>().join(" ");
@@ -52,7 +55,8 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     let mut cloud =
         String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
     for (point, (p, [r, g, b])) in points.positions.iter().zip(&points.colours).enumerate() {
-        let _ = write!(cloud, "{} {} {} {} {r} {g} {b} 0", point + 1, p.x, p.y, p.z);
+        let error = reprojection_error(scene, points, point);
+        let _ = write!(cloud, "{} {} {} {} {r} {g} {b} {error}", point + 1, p.x, p.y, p.z);
         for (view, place) in &tracks[point] {
             let _ = write!(cloud, " {} {place}", view + 1);
         }
@@ -61,4 +65,20 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     write_file(&folder.join("cameras.txt"), cameras.as_bytes())?;
     write_file(&folder.join("images.txt"), images.as_bytes())?;
     write_file(&folder.join("points3D.txt"), cloud.as_bytes())
+}
+
+/// Mean distance from where a point was found to where it is drawn, over the views that see it `[px]`;
+/// -1, as COLMAP has it, where none does.
+fn reprojection_error(scene: &Scene, points: &InitPoints, point: usize) -> f64 {
+    let views = &points.seen_by[point];
+    let error = |&view: &u32| {
+        let camera = &scene.views[view as usize].camera;
+        let [found, drawn] =
+            [&points.found_at, &points.positions].map(|p| camera.project(p[point]).0);
+        found.distance(drawn)
+    };
+    if views.is_empty() {
+        return -1.0;
+    }
+    views.iter().map(error).sum::<f64>() / views.len() as f64
 }

@@ -5,6 +5,7 @@
 
 mod colmap;
 mod exr;
+mod npy;
 mod ply;
 mod record;
 mod transforms;
@@ -66,21 +67,29 @@ pub fn write(
     let points = collector.finish();
     write_rest(scene, root, &points)?;
     readable(root)?;
-    let unused = folder.keep();
     if replaces {
         let old = tempfile::Builder::new()
             .prefix(".densify-old-")
             .tempdir_in(parent)
             .map_err(Error::write(parent))?;
-        fs::rename(target, old.path().join("scene")).map_err(Error::write(target))?;
-        fs::rename(&unused, target).map_err(Error::write(target))?;
+        let aside = old.path().join("scene");
+        fs::rename(target, &aside).map_err(Error::write(target))?;
+        if let Err(error) = fs::rename(folder.path(), target) {
+            if fs::rename(&aside, target).is_err() {
+                // The earlier scene stays there.
+                let _ = old.keep();
+            }
+            return Err(Error::write(target)(error));
+        }
     } else {
         // An empty folder is in a rename's way on some systems.
         if target.is_dir() {
             fs::remove_dir(target).map_err(Error::write(target))?;
         }
-        fs::rename(&unused, target).map_err(Error::write(target))?;
+        fs::rename(folder.path(), target).map_err(Error::write(target))?;
     }
+    // It has another name now.
+    let _ = folder.keep();
     Ok(Written { views: scene.views.len(), points: points.positions.len() })
 }
 
@@ -130,23 +139,19 @@ fn write_frame(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
     let path = root.join("images").join(format!("{name}.png"));
     write_png(&path, frame.width, frame.height, &frame.rgba)?;
     exr::write_depth(&root.join("depth").join(format!("{name}.exr")), frame)?;
+    npy::write_depth(&root.join("depth").join(format!("{name}.npy")), frame)?;
     exr::write_normals(&root.join("normals").join(format!("{name}.exr")), frame)
 }
 
 fn write_rest(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
-    transforms::write(scene, root, Split::Train)?;
-    transforms::write(scene, root, Split::Test)?;
+    transforms::write(scene, root)?;
     colmap::write(scene, root, points)?;
     ply::write_points(&root.join("points3d.ply"), points)?;
     ply::write_mesh(&root.join("mesh.ply"), scene)?;
     record::write(scene, root, points)
 }
 
-/// Writes RGBA pixels as a PNG.
-///
-/// # Errors
-/// When the file cannot be written.
-pub fn write_png(path: &Path, width: u32, height: u32, rgba: &[u8]) -> Result<(), Error> {
+fn write_png(path: &Path, width: u32, height: u32, rgba: &[u8]) -> Result<(), Error> {
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes)
         .write_image(rgba, width, height, ExtendedColorType::Rgba8)

@@ -42,7 +42,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
         "notes": model.notes,
         "files": {
             "images": "sRGB with straight alpha",
-            "depth": "camera z of the first surface with alpha >= 0.5 through the pixel's centre; 0 where there is none",
+            "depth": "camera z of the first surface with alpha >= 0.5 through the pixel's centre; 0 where there is none; in .npy times 1000",
             "normals": "its geometric normal in world space, towards the camera; 0 where there is none",
             "mesh.ply": "the triangles as traced; thin is 1 for those of thin structures",
             "points3d.ply": "initial points",

@@ -1,4 +1,9 @@
-//! Tests that scenes are written completely or not at all.
+//! Tests that scenes are written completely or not at all, and as other programs' readers ask for.
+
+use std::collections::{BTreeSet, HashMap};
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use serde_json::Value;
 
 use super::*;
 use crate::{Options, PointOptions, Source};
@@ -42,13 +47,14 @@ fn everything_is_written_and_nothing_else_stays() {
             "points3d.ply",
             "scene.json",
             "sparse",
+            "transforms.json",
             "transforms_test.json",
             "transforms_train.json"
         ]
     );
-    for kind in ["images", "depth", "normals"] {
-        assert_eq!(names(&target.join(kind).join("train")).len(), 4, "{kind}");
-        assert_eq!(names(&target.join(kind).join("test")).len(), 2, "{kind}");
+    for (kind, files) in [("images", 1), ("depth", 2), ("normals", 1)] {
+        assert_eq!(names(&target.join(kind).join("train")).len(), 4 * files, "{kind}");
+        assert_eq!(names(&target.join(kind).join("test")).len(), 2 * files, "{kind}");
     }
     // Depth comes back bit for bit.
     let frame = scene.render(4);
@@ -93,4 +99,167 @@ fn existing_files_stay_unless_they_are_a_scene_to_replace() {
     }
     assert_eq!(names(&other), ["thesis.txt"]);
     assert_eq!(names(root.path()), ["other", "scene"]);
+}
+
+/// A name and whether what it names is so.
+type Rule = (&'static str, fn(&Path, &Value, &[Value]) -> bool);
+
+/// What nerfstudio 1.1's `nerfstudio_dataparser.py` and `data_utils.py` ask of transforms.json: of the
+/// folder, the whole and its frames.
+const NERFSTUDIO: [Rule; 7] = [
+    ("the camera model is one it knows", |_, top, _| top["camera_model"] == "OPENCV"),
+    ("every image is there under its full name", |root, _, frames| {
+        frames.iter().all(|frame| image::open(root.join(text(&frame["file_path"]))).is_ok())
+    }),
+    ("every view has depth that NumPy reads, of the image's size", |root, top, frames| {
+        frames.iter().all(|frame| {
+            let bytes = fs::read(root.join(text(&frame["depth_file_path"]))).unwrap_or_default();
+            let length =
+                bytes.get(8..10).map_or(0, |b| usize::from(b[0]) + 256 * usize::from(b[1]));
+            let side = |key: &str| top.get(key).unwrap_or(&frame[key]).as_u64().unwrap_or(0);
+            let header = format!(
+                "{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {}), }}",
+                side("h"),
+                side("w")
+            );
+            bytes.starts_with(b"\x93NUMPY\x01\x00")
+                && (10 + length) % 64 == 0
+                && bytes[10..10 + length].trim_ascii_end() == header.as_bytes()
+                && bytes[9 + length] == b'\n'
+                && bytes.len() as u64 == 10 + length as u64 + 4 * side("w") * side("h")
+        })
+    }),
+    ("every pose is a rotation and a place", |_, _, frames| {
+        frames.iter().all(|frame| {
+            let at = |row: usize, column: usize| frame["transform_matrix"][row][column].as_f64();
+            let column = |c: usize| DVec3::from_array([0, 1, 2].map(|r| at(r, c).unwrap_or(9.0)));
+            let m = DMat3::from_cols(column(0), column(1), column(2));
+            (m * m.transpose()).abs_diff_eq(DMat3::IDENTITY, 1e-9)
+                && m.determinant() > 0.0
+                && [0, 1, 2, 3].map(|c| at(3, c)) == [0.0, 0.0, 0.0, 1.0].map(Some)
+        })
+    }),
+    ("each intrinsic is at the top, or else in every frame", |_, top, frames| {
+        ["fl_x", "fl_y", "cx", "cy", "w", "h"].iter().all(|key| {
+            let everywhere = frames.iter().all(|frame| frame[key].is_number());
+            top[key].is_number() && frames.iter().all(|frame| frame.get(key).is_none())
+                || everywhere
+        })
+    }),
+    ("the split is all three lists or none, of images that there are", |_, top, frames| {
+        let list = |key: &str| -> Option<BTreeSet<&str>> {
+            Some(top.get(key)?.as_array()?.iter().map(text).collect())
+        };
+        let all: BTreeSet<&str> = frames.iter().map(|frame| text(&frame["file_path"])).collect();
+        match ["train_filenames", "val_filenames", "test_filenames"].map(list) {
+            [Some(train), Some(val), Some(test)] => {
+                let held_out = |name: &&str| name.starts_with("images/test/");
+                val == test
+                    && train.is_disjoint(&val)
+                    && val.iter().all(held_out)
+                    && !val.is_empty()
+                    && &train | &val == all
+            }
+            [None, None, None] => !all.iter().any(|name| name.starts_with("images/test/")),
+            _ => false,
+        }
+    }),
+    ("the points are there", |root, top, _| root.join(text(&top["ply_file_path"])).is_file()),
+];
+
+fn text(value: &Value) -> &str {
+    value.as_str().unwrap_or("?")
+}
+
+#[test]
+fn nerfstudio_can_open_what_is_written() {
+    let root = tempfile::tempdir().expect("folder");
+    let mut zoomed = small();
+    zoomed.views[1].camera.fx *= 1.5;
+    let mut alone = small();
+    alone.views.truncate(4);
+    for (name, scene) in [("small", small()), ("zoomed", zoomed), ("alone", alone)] {
+        let folder = root.path().join(name);
+        write(&scene, &folder, false, |_| ()).expect("write");
+        let file = fs::read(folder.join("transforms.json")).expect("transforms.json");
+        let top: Value = serde_json::from_slice(&file).expect("JSON");
+        let frames = top["frames"].as_array().expect("frames");
+        assert_eq!(frames.len(), scene.views.len(), "{name}");
+        for (rule, holds) in NERFSTUDIO {
+            assert!(holds(&folder, &top, frames), "{name}: {rule}\n{top:#}");
+        }
+        let focal = |i: usize| frames[i].get("fl_x").unwrap_or(&top["fl_x"]).as_f64();
+        for (i, view) in scene.views.iter().enumerate() {
+            assert_eq!(focal(i), Some(view.camera.fx), "{name}: {}", view.name);
+        }
+    }
+    // Its default factor makes world units of what is stored.
+    let stored = fs::read(root.path().join("small/depth/test/r_000.npy")).expect("depth");
+    let depth = &small().render(4).depth;
+    let stored = stored[stored.len() - 4 * depth.len()..].as_chunks().0.iter();
+    let stored = stored.map(|&word| 1e-3 * f32::from_le_bytes(word));
+    let apart = stored.zip(depth).map(|(a, b)| (a - b).abs() / b.max(1.0)).fold(0.0, f32::max);
+    assert!(apart < 1e-6 && depth.iter().any(|&d| d > 0.0), "{apart}");
+}
+
+#[test]
+fn colmap_finds_every_point_where_its_track_says_and_as_wrong_as_it_says() {
+    let root = tempfile::tempdir().expect("folder");
+    let folder = root.path().join("scene");
+    // Inside, outliers come to lie behind cameras.
+    let options = Options {
+        size: Some((48, 48)),
+        train: Some(24),
+        test: Some(1),
+        grid: 1,
+        points: PointOptions { count: 300, outliers: 0.2, ..PointOptions::default() },
+        ..Options::default()
+    };
+    let scene = Scene::prepare(&Source::Preset("room".into()), &options).expect("preset");
+    write(&scene, &folder, false, |_| ()).expect("write");
+    let read = |name: &str| fs::read_to_string(folder.join("sparse/0").join(name)).expect(name);
+    let [cameras, images, points] = ["cameras.txt", "images.txt", "points3D.txt"].map(read);
+    let lines = |text: &str| -> Vec<Vec<String>> {
+        let lines = text.lines().filter(|line| !line.starts_with('#'));
+        lines.map(|line| line.split(' ').map(str::to_owned).collect()).collect()
+    };
+    let number = |word: &String| word.parse::<f64>().expect("a number");
+    let lenses: HashMap<String, Vec<f64>> = lines(&cameras)
+        .iter()
+        .map(|c| (c[0].clone(), c[4..].iter().map(number).collect()))
+        .collect();
+    let views: HashMap<String, (Vec<String>, Vec<String>)> =
+        lines(&images).chunks(2).map(|v| (v[0][0].clone(), (v[0].clone(), v[1].clone()))).collect();
+    assert_eq!((lenses.len(), views.len()), (25, 25));
+    let mut errors: Vec<f64> = Vec::new();
+    let mut observed = 0;
+    for point in lines(&points) {
+        let place = DVec3::new(number(&point[1]), number(&point[2]), number(&point[3]));
+        let distances = point[8..].chunks(2).map(|track| {
+            let (view, features) = &views[&track[0]];
+            let [w, x, y, z, tx, ty, tz] = [1, 2, 3, 4, 5, 6, 7].map(|i| number(&view[i]));
+            let local = DQuat::from_xyzw(x, y, z, w) * place + DVec3::new(tx, ty, tz);
+            let lens = &lenses[&view[8]];
+            let feature = &features[3 * track[1].parse::<usize>().expect("a place")..][..3];
+            assert_eq!(feature[2], point[0], "the feature is another point's");
+            assert!(local.z > 0.0, "{point:?} lies behind {}", view[9]);
+            let drawn = DVec2::new(lens[0] * local.x, lens[1] * local.y) / local.z
+                + DVec2::new(lens[2], lens[3]);
+            drawn.distance(DVec2::new(number(&feature[0]), number(&feature[1])))
+        });
+        let distances: Vec<f64> = distances.collect();
+        observed += distances.len();
+        let mean = distances.iter().sum::<f64>() / distances.len() as f64;
+        let expected = if distances.is_empty() { -1.0 } else { mean };
+        let told = number(&point[7]);
+        assert!((told - expected).abs() <= 1e-6 * (1.0 + expected), "{told}, not {expected}");
+        errors.push(told);
+    }
+    // Each feature belongs to one track.
+    let features: usize = views.values().map(|(_, features)| features.len() / 3).sum();
+    assert_eq!((errors.len(), features), (300, observed));
+    errors.sort_by(f64::total_cmp);
+    // The room is some 50 px wide in its views: noise of a thousandth moves points by less than a pixel,
+    // outliers by many.
+    assert!((0.01..1.0).contains(&errors[150]) && errors[290] > 5.0, "{errors:?}");
 }

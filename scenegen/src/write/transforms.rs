@@ -1,5 +1,5 @@
-//! Writes `transforms_train.json` and `transforms_test.json`: the fields of NeRF-synthetic
-//! (`camera_angle_x`, paths without ending) and those of nerfstudio (`fl_x` … `ply_file_path`).
+//! Writes `transforms_train.json` and `transforms_test.json` for readers of NeRF-synthetic (paths without
+//! ending), and `transforms.json` for nerfstudio (all views, files by their full names, depth).
 
 use std::path::Path;
 
@@ -8,38 +8,77 @@ use serde_json::{Value, json};
 use super::write_file;
 use crate::camera::Camera;
 use crate::error::Error;
-use crate::scene::{Scene, Split};
+use crate::scene::{Scene, Split, View};
 
-pub(super) fn write(scene: &Scene, root: &Path, split: Split) -> Result<(), Error> {
-    let name = match split {
-        Split::Train => "transforms_train.json",
-        Split::Test => "transforms_test.json",
-    };
-    let views: Vec<_> = scene.views.iter().filter(|view| view.split == split).collect();
-    let Some(first) = views.first().or(scene.views.first().as_ref()).map(|view| view.camera) else {
+const POINTS: &str = "points3d.ply";
+
+pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
+    let Some(first) = scene.views.first().map(|view| intrinsics(&view.camera)) else {
         return Ok(());
     };
-    let mut top = intrinsics(&first);
-    top["camera_model"] = json!("OPENCV");
-    for term in ["k1", "k2", "p1", "p2"] {
-        top[term] = json!(0.0);
+    for (name, value) in [
+        ("transforms_train.json", synthetic(scene, &first, Split::Train)),
+        ("transforms_test.json", synthetic(scene, &first, Split::Test)),
+        ("transforms.json", nerfstudio(scene, &first)),
+    ] {
+        write_file(&root.join(name), format!("{value:#}").as_bytes())?;
     }
-    top["ply_file_path"] = json!("points3d.ply");
-    let frames = views.iter().map(|view| {
-        let mut frame = json!({
-            "file_path": format!("./images/{}", view.name),
-            "transform_matrix": world_from_opengl(&view.camera),
-        });
-        // File cameras differ in their field of view.
-        if (view.camera.fx - first.fx).abs() > 0.0 {
-            for (key, value) in intrinsics(&view.camera).as_object().into_iter().flatten() {
-                frame[key] = value.clone();
-            }
-        }
+    Ok(())
+}
+
+/// The views of a split, with the fields of `first` at the top; views that differ repeat them.
+fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
+    let frame = |view: &View| {
+        let mut frame = posed(view, format!("./images/{}", view.name));
+        extend(&mut frame, &intrinsics(&view.camera), |key, value| first[key] != *value);
         frame
+    };
+    let frames = scene.views.iter().filter(|view| view.split == split).map(frame);
+    let mut top = json!({ "ply_file_path": POINTS, "frames": frames.collect::<Value>() });
+    extend(&mut top, first, |_, _| true);
+    top
+}
+
+/// All views. What nerfstudio finds at the top it takes for all of them, so intrinsics stand there
+/// only if all have the same.
+fn nerfstudio(scene: &Scene, first: &Value) -> Value {
+    let shared = scene.views.iter().all(|view| intrinsics(&view.camera) == *first);
+    let image = |view: &View| format!("images/{}.png", view.name);
+    let frame = |view: &View| {
+        let mut frame = posed(view, image(view));
+        frame["depth_file_path"] = json!(format!("depth/{}.npy", view.name));
+        extend(&mut frame, &intrinsics(&view.camera), |_, _| !shared);
+        frame
+    };
+    let mut top = json!({
+        "camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+        "ply_file_path": POINTS,
+        "frames": scene.views.iter().map(frame).collect::<Value>(),
     });
-    top["frames"] = frames.collect();
-    write_file(&root.join(name), format!("{top:#}").as_bytes())
+    extend(&mut top, first, |_, _| shared);
+    let files = |split: Split| -> Value {
+        scene.views.iter().filter(|view| view.split == split).map(image).collect()
+    };
+    // Without views held out nerfstudio chooses some itself; an empty list would stop it.
+    if scene.views.iter().any(|view| view.split == Split::Test) {
+        for (key, split) in [("train", Split::Train), ("val", Split::Test), ("test", Split::Test)] {
+            top[format!("{key}_filenames")] = files(split);
+        }
+    }
+    top
+}
+
+fn posed(view: &View, file: String) -> Value {
+    json!({ "file_path": file, "transform_matrix": world_from_opengl(&view.camera) })
+}
+
+/// Copies the fields that are `wanted`.
+fn extend(to: &mut Value, from: &Value, wanted: impl Fn(&str, &Value) -> bool) {
+    for (key, value) in from.as_object().into_iter().flatten() {
+        if wanted(key, value) {
+            to[key] = value.clone();
+        }
+    }
 }
 
 fn intrinsics(camera: &Camera) -> Value {

@@ -1,6 +1,8 @@
 //! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
 
-use densify_policies::plan::{Family, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed};
+use densify_policies::plan::{
+    Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed, UNTURNED,
+};
 use densify_policies::rng::{PolicyRng, Purpose};
 
 use super::blocks::plane;
@@ -22,15 +24,19 @@ pub(super) struct Model<'a> {
 /// Executes `ops`; the order and the invariants are those of [`RowOps`].
 pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
     for family in &ops.families {
-        let first = family.first_child as usize;
-        let children = &ops.child_slots[first..first + family.offspring.children as usize];
-        model.breed(family, children, rng);
+        model.breed(family.parent, &ops.offspring(family), ops.children(family), rng);
     }
     for &(row, update) in &ops.updates {
         let row = row as usize;
         let scales = scales_of(model.params.get_n(row, plane::LOG_SCALE), update.scale);
         model.params.set_n(row, plane::LOG_SCALE, scales);
         model.set_opacity(row, update.opacity, 1);
+        if let Some(position) = update.position {
+            model.params.set_n(row, plane::MEAN, position);
+        }
+        if let Some(colour) = update.colour {
+            model.params.set_n(row, plane::SH, colour.map(rgb_to_dc));
+        }
         if !update.keep_moments {
             model.reborn(row);
         }
@@ -56,20 +62,20 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
 
 impl Model<'_> {
     /// Writes a parent's children, then the parent itself.
-    fn breed(&mut self, family: &Family, children: &[u32], rng: &PolicyRng) {
-        let parent = family.parent as usize;
-        let offspring = family.offspring;
+    fn breed(&mut self, row: u32, offspring: &Offspring, children: &[u32], rng: &PolicyRng) {
+        let parent = row as usize;
         let mean: [f32; 3] = self.params.get_n(parent, plane::MEAN);
         let log_scale: [f32; 3] = self.params.get_n(parent, plane::LOG_SCALE);
         let quat: [f32; 4] = self.params.get_n(parent, plane::QUAT);
         let scales = scales_of(log_scale, offspring.scale);
-        let siblings = offspring.children + u32::from(offspring.parent == ParentFate::BecomesChild);
+        let turned = turned(quat, offspring.turn);
+        let siblings = offspring.siblings();
         let stand = |child: u32| -> [f32; 3] {
             let offset = match offspring.placement {
                 Placement::Offset(_) if child == 0 => [0.0; 3],
                 Placement::Offset(offset) => offset,
                 Placement::Sampled => {
-                    let xi = rng.normal3(family.parent, Purpose::Place, child);
+                    let xi = rng.normal3(row, Purpose::Place, child);
                     let local = [0, 1, 2].map(|i| log_scale[i].exp() * xi[i]);
                     rotate(quat, local)
                 }
@@ -80,6 +86,10 @@ impl Model<'_> {
                     local[long] = sign * sigmas * log_scale[long].exp();
                     rotate(quat, local)
                 }
+                Placement::Axes(sigmas) => {
+                    let sign = if child.is_multiple_of(2) { 1.0 } else { -1.0 };
+                    rotate(quat, [0, 1, 2].map(|i| sign * sigmas[i] * log_scale[i].exp()))
+                }
             };
             [0, 1, 2].map(|i| mean[i] + offset[i])
         };
@@ -88,12 +98,14 @@ impl Model<'_> {
             self.params.copy_row(parent, slot);
             self.params.set_n(slot, plane::MEAN, stand(i as u32 + 1));
             self.params.set_n(slot, plane::LOG_SCALE, scales);
+            self.params.set_n(slot, plane::QUAT, turned);
             self.set_opacity(slot, offspring.opacity, siblings);
             self.reborn(slot);
         }
         if offspring.parent == ParentFate::BecomesChild {
             self.params.set_n(parent, plane::MEAN, stand(0));
             self.params.set_n(parent, plane::LOG_SCALE, scales);
+            self.params.set_n(parent, plane::QUAT, turned);
             self.set_opacity(parent, offspring.opacity, siblings);
             self.reborn(parent);
         }
@@ -102,8 +114,8 @@ impl Model<'_> {
     fn sow(&mut self, row: usize, seed: &Seed) {
         self.params.clear_row(row);
         self.params.set_n(row, plane::MEAN, seed.position);
-        self.params.set_n(row, plane::LOG_SCALE, [seed.scale.ln(); 3]);
-        self.params.set_n(row, plane::QUAT, [1.0, 0.0, 0.0, 0.0]);
+        self.params.set_n(row, plane::LOG_SCALE, seed.scales.map(f32::ln));
+        self.params.set_n(row, plane::QUAT, turned(UNTURNED, seed.orientation));
         self.params.set(row, plane::OPACITY, logit(seed.opacity));
         self.params.set_n(row, plane::SH, seed.colour.map(rgb_to_dc));
         self.reborn(row);
@@ -153,12 +165,25 @@ fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {
             scales[longest] = log_scale[longest] + long.ln();
             scales
         }
+        ScaleRule::Axes(factors) => [0, 1, 2].map(|i| log_scale[i] + factors[i].ln()),
     }
+}
+
+fn quaternion([w, x, y, z]: [f32; 4]) -> glam::Quat {
+    glam::Quat::from_xyzw(x, y, z, w)
+}
+
+/// The orientation that is turned about its own axes; it keeps its length.
+fn turned(quat: [f32; 4], turn: [f32; 4]) -> [f32; 4] {
+    // No turn must not change a bit.
+    if turn.map(f32::to_bits) == UNTURNED.map(f32::to_bits) {
+        return quat;
+    }
+    let [x, y, z, w] = (quaternion(quat) * quaternion(turn).normalize()).to_array();
+    [w, x, y, z]
 }
 
 /// R(q)·v for a quaternion (w, x, y, z) of any length but 0.
 fn rotate(quat: [f32; 4], v: [f32; 3]) -> [f32; 3] {
-    let [w, x, y, z] = quat;
-    let q = glam::Quat::from_xyzw(x, y, z, w).normalize();
-    (q * glam::Vec3::from(v)).to_array()
+    (quaternion(quat).normalize() * glam::Vec3::from(v)).to_array()
 }

@@ -9,13 +9,14 @@ use super::observe;
 use super::parameters::Parameters;
 use super::project::Splat;
 use super::rasterize::TileCanvas;
-use super::rasterize_bwd::TileGradient;
+use super::rasterize_bwd::{Blended, TileGradient};
 use super::signals::Accumulators;
 use super::simd::WIDTH;
 use super::summed::Summed;
 use super::tiles::{Grid, TileLists};
 use crate::backend::BackendError;
 use crate::backend::candidates::Candidates;
+use crate::backend::signals::Field;
 use crate::memory::{Ledger, Section};
 
 /// A single tile's list holds each row at most once, so that the budget is always enough.
@@ -74,9 +75,13 @@ pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Led
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
     let records = record_cap(options) as u64 * stride as u64 * float;
     ledger.add_to(Section::Tiles, "gradients per entry", records);
+    let by_pixel = signals.layout().has(Field::Error);
+    let loss = LossBuffers::bytes(grid.width, grid.height, threads, by_pixel);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);
-    ledger.add_to(Section::Renderer, "loss", LossBuffers::bytes(grid.width, grid.height, threads));
+    let of_threads = loss + (threads * size_of::<Blended>()) as u64;
+    let what = format!("loss and backward pass, for up to {threads} threads");
+    ledger.add_to(Section::Renderer, what, of_threads);
     ledger
 }
 

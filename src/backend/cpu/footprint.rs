@@ -1,12 +1,16 @@
 //! Which tiles a splat's ellipse (where alpha is at least what is blended, 1/255 by default) touches.
 //!
 //! Per row of tiles, the ellipse's leftmost and rightmost points within that row bound the tiles: no
-//! tile is listed whose pixels it does not come near. The answer is kept as a few bits, since it is
-//! needed twice, to count the entries and to emit them.
+//! tile is listed whose pixels it does not come near. The answer is kept as a few bits, which the
+//! projection finds for a vector of rows at a time. Only of rows that reach farther than the bits do,
+//! the tiles are found one by one: by the same function, on one lane.
 
 use std::ops::Range;
 
+use pulp::{Scalar, Simd};
+
 use super::project::Splat;
+use super::simd::{Mask, V};
 use super::tiles::{Grid, TILE};
 
 /// Slack for the bounds of an ellipse [px]: their rounding errors, f32's at 16,384 px, are far less
@@ -20,6 +24,7 @@ pub(super) struct Footprint(pub(super) [u32; 2]);
 
 const REACH_X: usize = 8;
 const REACH_Y: usize = 4;
+const _: () = assert!(REACH_X * REACH_Y == 32, "bits of a footprint");
 
 impl Footprint {
     /// The row reaches farther than the bits do: its ellipse must be evaluated again.
@@ -32,19 +37,26 @@ impl Footprint {
         splat: &Splat,
         grid: &Grid,
         band: &Range<usize>,
-        mut f: impl FnMut(usize),
+        f: impl FnMut(usize),
     ) -> Self {
-        let reach = Reach::new(splat, grid, band);
-        let fits = reach.x1 - reach.x0 < REACH_X && reach.y1 - reach.y0 <= REACH_Y;
-        let corner = reach.y0 * grid.columns + reach.x0;
-        let mut bits = 0_u32;
-        reach.for_each_tile(splat, grid, band, |tx, ty| {
-            if fits {
-                bits |= 1 << ((ty - reach.y0) * REACH_X + tx - reach.x0);
+        if splat.tiles == 0 {
+            far_tiles(splat, grid, band, f);
+            return Self::FAR;
+        }
+        let [x, y] =
+            Ellipse::<Scalar>::of(splat).first_tile(grid).map(|first| first.lane() as usize);
+        let corner = y * grid.columns + x;
+        let mut bits = splat.tiles;
+        if band.len() < grid.tiles() {
+            for bit in 0..u32::BITS as usize {
+                if !band.contains(&(corner + bit / REACH_X * grid.columns + bit % REACH_X)) {
+                    bits &= !(1 << bit);
+                }
             }
-            f(ty * grid.columns + tx - band.start);
-        });
-        if fits { Self([corner as u32, bits]) } else { Self::FAR }
+        }
+        let footprint = Self([corner as u32, bits]);
+        footprint.for_each_tile(splat, grid, band, f);
+        footprint
     }
 
     /// Does the same again.
@@ -57,7 +69,7 @@ impl Footprint {
         mut f: impl FnMut(usize),
     ) {
         if self == Self::FAR {
-            Self::new(splat, grid, band, f);
+            far_tiles(splat, grid, band, f);
             return;
         }
         let Self([corner, mut bits]) = self;
@@ -69,77 +81,282 @@ impl Footprint {
     }
 }
 
-/// The rectangle of tiles around a splat's ellipse: columns `x0..=x1`, and rows `y0..y1` of those
-/// that the band has.
-struct Reach {
-    x0: usize,
-    x1: usize,
-    y0: usize,
-    y1: usize,
-    /// Whether the rectangle is one tile wide or high, and so without corners to cut.
-    narrow: bool,
-}
-
-impl Reach {
-    #[inline]
-    fn new(splat: &Splat, grid: &Grid, band: &Range<usize>) -> Self {
-        let [mx, my] = splat.mean;
-        let [hw, hh] = half_sides(splat);
-        let (x0, x1) = (tile_of(mx - hw - 0.5, grid.columns), tile_of(mx + hw - 0.5, grid.columns));
-        let (y0, y1) = (tile_of(my - hh - 0.5, grid.rows), tile_of(my + hh - 0.5, grid.rows));
-        let (first_row, last_row) = (band.start / grid.columns, band.end.div_ceil(grid.columns));
-        let narrow = x0 == x1 || y0 == y1;
-        let y0 = y0.max(first_row);
-        Self { x0, x1, y0, y1: (y1 + 1).min(last_row).max(y0), narrow }
-    }
-
-    /// Calls `f` with column and row of every tile of the band that the ellipse touches, row by row.
-    #[inline]
-    fn for_each_tile(
-        &self,
-        splat: &Splat,
-        grid: &Grid,
-        band: &Range<usize>,
-        mut f: impl FnMut(usize, usize),
-    ) {
-        let Self { x0, x1, y0, y1, narrow } = *self;
-        // In folded units the ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy. Its
-        // rightmost point is at dy = peak, its leftmost at dy = −peak.
-        let Splat { mean: [mx, my], shear, l3, inv_l1, peak, reach, .. } = *splat;
-        let [hw, hh] = half_sides(splat);
-        for ty in y0..y1 {
-            let (mut from, mut to) = (x0, x1);
-            if !narrow {
-                let top = ((ty * TILE) as f32 + 0.5 - my).max(-hh);
-                let bottom = ((ty * TILE + TILE) as f32 - 0.5 - my).min(hh);
-                let half = |dy: f32| (reach - (l3 * dy) * (l3 * dy)).max(0.0).sqrt() * inv_l1;
-                let right_at = peak.max(top).min(bottom);
-                let left_at = (-peak).max(top).min(bottom);
-                let right = (shear * right_at + half(right_at)).min(hw);
-                let left = (shear * left_at - half(left_at)).max(-hw);
-                let (right, left) =
-                    (right + 1e-4 * right.abs() + SLACK, left - 1e-4 * left.abs() - SLACK);
-                from = tile_of(mx + left - 0.5, grid.columns).max(x0);
-                to = tile_of(mx + right - 0.5, grid.columns).min(x1);
-            }
-            for tx in from..=to {
-                if band.contains(&(ty * grid.columns + tx)) {
-                    f(tx, ty);
-                }
+/// The tiles of a row that reaches farther than the bits of a footprint do.
+#[inline(never)]
+fn far_tiles(splat: &Splat, grid: &Grid, band: &Range<usize>, mut f: impl FnMut(usize)) {
+    let ellipse = Ellipse::<Scalar>::of(splat);
+    let around = ellipse.around(grid);
+    let (first, last) = (band.start / grid.columns, band.end.div_ceil(grid.columns));
+    let [_, [y0, y1]] = around.sides;
+    for ty in first.max(y0.lane() as usize)..last.min(y1.lane() as usize + 1) {
+        let [from, to] = ellipse.columns_in(&around, V::splat(Scalar, ty as f32), grid);
+        for tx in from.lane() as usize..=to.lane() as usize {
+            let tile = ty * grid.columns + tx;
+            if band.contains(&tile) {
+                f(tile - band.start);
             }
         }
     }
 }
 
-/// Half the sides of the rectangle around a splat's ellipse [px], with slack.
-#[inline(always)]
-fn half_sides(splat: &Splat) -> [f32; 2] {
-    [splat.half_width * 1.0001 + SLACK, splat.half_height * 1.0001 + SLACK]
+/// The ellipses of some rows. In folded units one is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy.
+/// Its rightmost point is at dy = peak, its leftmost at dy = −peak. See [`Splat`].
+pub(super) struct Ellipse<S: Simd> {
+    pub(super) s: S,
+    pub(super) mean: [V<S>; 2],
+    pub(super) half_sides: [V<S>; 2],
+    pub(super) shear: V<S>,
+    pub(super) l3: V<S>,
+    pub(super) inv_l1: V<S>,
+    pub(super) peak: V<S>,
+    pub(super) reach: V<S>,
+}
+
+/// The rectangle of tiles around an ellipse.
+struct Around<S: Simd> {
+    /// Columns from and to, rows from and to, inclusive: whole numbers.
+    sides: [[V<S>; 2]; 2],
+    /// Whether the rectangle is more than one tile wide and high, and so has corners to cut.
+    wide: Mask<S>,
+}
+
+impl Ellipse<Scalar> {
+    #[inline(always)]
+    fn of(splat: &Splat) -> Self {
+        let c = |x| V::splat(Scalar, x);
+        Self {
+            s: Scalar,
+            mean: [c(splat.mean[0]), c(splat.mean[1])],
+            half_sides: [c(splat.half_width), c(splat.half_height)],
+            shear: c(splat.shear),
+            l3: c(splat.l3),
+            inv_l1: c(splat.inv_l1),
+            peak: c(splat.peak),
+            reach: c(splat.reach),
+        }
+    }
+}
+
+impl<S: Simd> Ellipse<S> {
+    /// Half the sides of the rectangle around the ellipse [px], with slack.
+    #[inline(always)]
+    fn half(&self) -> [V<S>; 2] {
+        let [w, h] = self.half_sides;
+        [w * 1.0001 + SLACK, h * 1.0001 + SLACK]
+    }
+
+    /// Column and row of the first tile of the rectangle around the ellipse.
+    #[inline(always)]
+    fn first_tile(&self, grid: &Grid) -> [V<S>; 2] {
+        let ([x, y], [hw, hh]) = (self.mean, self.half());
+        [tile_of(x - hw - 0.5, grid.columns), tile_of(y - hh - 0.5, grid.rows)]
+    }
+
+    #[inline(always)]
+    fn around(&self, grid: &Grid) -> Around<S> {
+        let ([x, y], [hw, hh]) = (self.mean, self.half());
+        let [x0, y0] = self.first_tile(grid);
+        let x1 = tile_of(x + hw - 0.5, grid.columns);
+        let y1 = tile_of(y + hh - 0.5, grid.rows);
+        Around { sides: [[x0, x1], [y0, y1]], wide: x0.lt(x1).and(y0.lt(y1)) }
+    }
+
+    /// First and last tile that the ellipse touches in row `ty` of tiles: none if the first is later.
+    #[inline(always)]
+    fn columns_in(&self, around: &Around<S>, ty: V<S>, grid: &Grid) -> [V<S>; 2] {
+        let Self { mean: [mx, my], shear, peak, .. } = *self;
+        let Around { sides: [[x0, x1], _], wide } = *around;
+        let [hw, hh] = self.half();
+        let top = (ty * TILE as f32 + 0.5 - my).max(-hh);
+        let bottom = (ty * TILE as f32 + (TILE as f32 - 0.5) - my).min(hh);
+        let right_at = peak.max(top).min(bottom);
+        let left_at = (-peak).max(top).min(bottom);
+        let right = (shear * right_at + self.half_width_at(right_at)).min(hw);
+        let left = (shear * left_at - self.half_width_at(left_at)).max(-hw);
+        let right = right + right.abs() * 1e-4 + SLACK;
+        let left = left - left.abs() * 1e-4 - SLACK;
+        let from = tile_of(mx + left - 0.5, grid.columns).max(x0);
+        let to = tile_of(mx + right - 0.5, grid.columns).min(x1);
+        [wide.select(from, x0), wide.select(to, x1)]
+    }
+
+    #[inline(always)]
+    fn half_width_at(&self, dy: V<S>) -> V<S> {
+        let z = self.l3 * dy;
+        (self.reach - z * z).max(V::zero(self.s)).sqrt() * self.inv_l1
+    }
+
+    /// For each lane the bits of a [`Footprint`]; 0 where they do not reach.
+    #[inline(always)]
+    pub(super) fn tiles(&self, grid: &Grid) -> S::u32s {
+        let s = self.s;
+        let around = self.around(grid);
+        let [[x0, x1], [y0, y1]] = around.sides;
+        let fits = (x1 - x0).lt(V::splat(s, REACH_X as f32));
+        let fits = fits.and((y1 - y0).lt(V::splat(s, REACH_Y as f32)));
+        let mut bits = s.splat_u32s(0);
+        for row in 0..REACH_Y {
+            let ty = y0 + row as f32;
+            let within = fits.and(ty.le(y1));
+            if !within.any() {
+                break;
+            }
+            let [from, to] = self.columns_in(&around, ty, grid);
+            let touched = within.and(from.le(to));
+            // As many ones as there are tiles, at the place of the first.
+            let above = s.wrapping_dyn_shl_u32s(s.splat_u32s(2), (to - x0).whole());
+            let below = s.wrapping_dyn_shl_u32s(s.splat_u32s(1), (from - x0).whole());
+            let ones = s.sub_u32s(above, below);
+            let ones = s.wrapping_dyn_shl_u32s(ones, s.splat_u32s((row * REACH_X) as u32));
+            bits = s.or_u32s(bits, touched.select_u32s(ones, s.splat_u32s(0)));
+        }
+        bits
+    }
 }
 
 /// Index of the tile whose pixel centres are the first at or after (last at or before) a bound.
-/// `as` saturates, and makes NaN 0.
+///
+/// Rounded down by adding 2²³, above which f32 has whole numbers only.
 #[inline(always)]
-fn tile_of(x: f32, most: usize) -> usize {
-    ((x * (1.0 / TILE as f32)).max(0.0) as usize).min(most - 1)
+fn tile_of<S: Simd>(x: V<S>, most: usize) -> V<S> {
+    let c = |number| V::splat_like(x, number);
+    let x = (x * (1.0 / TILE as f32)).max(c(0.0)).min(c((most - 1) as f32));
+    let nearest = (x + 8_388_608.0) - 8_388_608.0;
+    x.lt(nearest).select(nearest - 1.0, nearest)
+}
+
+#[cfg(test)]
+mod tests {
+    use pulp::WithSimd;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::super::InstructionSet;
+    use super::super::simd::WIDTH;
+    use super::*;
+
+    /// Bits of sixteen splats.
+    struct Tiles<'a>(&'a [Splat], &'a Grid);
+
+    impl WithSimd for Tiles<'_> {
+        type Output = [u32; WIDTH];
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, s: S) -> [u32; WIDTH] {
+            let Self(splats, grid) = self;
+            let of = |at: usize, field: fn(&Splat) -> f32| {
+                let lanes: Vec<f32> = splats.iter().map(field).collect();
+                V::load(s, &lanes[at..])
+            };
+            let mut bits = [0.0; WIDTH];
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let ellipse = Ellipse {
+                    s,
+                    mean: [of(at, |splat| splat.mean[0]), of(at, |splat| splat.mean[1])],
+                    half_sides: [
+                        of(at, |splat| splat.half_width),
+                        of(at, |splat| splat.half_height),
+                    ],
+                    shear: of(at, |splat| splat.shear),
+                    l3: of(at, |splat| splat.l3),
+                    inv_l1: of(at, |splat| splat.inv_l1),
+                    peak: of(at, |splat| splat.peak),
+                    reach: of(at, |splat| splat.reach),
+                };
+                V::of_bits(s, ellipse.tiles(grid)).store(&mut bits[at..]);
+            }
+            bits.map(f32::to_bits)
+        }
+    }
+
+    /// A needle or a disc somewhere near the image, of up to some `size` [px].
+    fn splat(rng: &mut ChaCha8Rng, grid: &Grid, size: f32) -> Splat {
+        let mut between = |from: f32, to: f32| rng.random_range(from..to);
+        let mean = [grid.width, grid.height].map(|side| between(-40.0, side as f32 + 40.0));
+        let (long, short) = (between(0.5, size), between(0.5, 0.3 * size));
+        let (sin, cos) = between(0.0, 6.3).sin_cos();
+        let a = (long * cos).powi(2) + (short * sin).powi(2);
+        let b = (long * long - short * short) * sin * cos;
+        let d = (long * sin).powi(2) + (short * cos).powi(2);
+        let reach = between(0.1, 8.0);
+        let (l1, half_width) = ((d / (a * d - b * b)).sqrt(), (reach * a).sqrt());
+        Splat {
+            mean,
+            l1,
+            shear: b / d,
+            l3: 1.0 / d.sqrt(),
+            half_height: (reach * d).sqrt(),
+            half_width,
+            inv_l1: 1.0 / l1,
+            peak: b / a * half_width,
+            reach,
+            ..Splat::default()
+        }
+    }
+
+    fn listed(splat: &Splat, grid: &Grid, band: Range<usize>) -> Vec<usize> {
+        let (mut once, mut again) = (Vec::new(), Vec::new());
+        let footprint = Footprint::new(splat, grid, &band, |tile| once.push(tile + band.start));
+        footprint.for_each_tile(splat, grid, &band, |tile| again.push(tile + band.start));
+        assert_eq!(once, again, "{splat:?}");
+        once
+    }
+
+    #[test]
+    fn bits_are_the_tiles_that_are_found_one_by_one() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let (mut far, mut cut) = (0, 0);
+        for (width, height, size) in
+            [(200, 300, 12.0), (200, 300, 60.0), (17, 3, 30.0), (900, 40, 20.0)]
+        {
+            let grid = Grid::new(width, height);
+            for _ in 0..200 {
+                let mut splats: Vec<Splat> =
+                    (0..WIDTH).map(|_| splat(&mut rng, &grid, size)).collect();
+                let bits = InstructionSet::Scalar.arch().dispatch(Tiles(&splats, &grid));
+                for set in InstructionSet::available() {
+                    assert_eq!(set.arch().dispatch(Tiles(&splats, &grid)), bits, "{set}");
+                }
+                for (splat, bits) in splats.iter_mut().zip(bits) {
+                    let one_by_one = listed(splat, &grid, 0..grid.tiles());
+                    splat.tiles = bits;
+                    assert_eq!(listed(splat, &grid, 0..grid.tiles()), one_by_one, "{splat:?}");
+                    far += usize::from(bits == 0 && !one_by_one.is_empty());
+                    let Around { sides: [[x0, x1], [y0, y1]], .. } =
+                        Ellipse::<Scalar>::of(splat).around(&grid);
+                    let rectangle = (x1.lane() - x0.lane() + 1.0) * (y1.lane() - y0.lane() + 1.0);
+                    cut += usize::from(one_by_one.len() < rectangle as usize);
+                    // Bands that begin and end within rows of tiles.
+                    let (a, b) = (grid.tiles() / 3, grid.tiles() / 2);
+                    let parts = [0..a, a..b, b..grid.tiles()];
+                    let of_bands = parts.map(|band| listed(splat, &grid, band)).concat();
+                    assert_eq!(of_bands, one_by_one, "{splat:?}");
+                }
+            }
+        }
+        assert!(far > 100 && cut > 1000, "{far} far, {cut} with corners cut");
+    }
+
+    /// No tile with a pixel inside the ellipse is left out.
+    #[test]
+    fn every_tile_with_a_pixel_of_the_ellipse_is_listed() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let grid = Grid::new(130, 100);
+        for size in [5.0, 50.0] {
+            for _ in 0..200 {
+                let splat = splat(&mut rng, &grid, size);
+                let tiles = listed(&splat, &grid, 0..grid.tiles());
+                for y in 0..grid.height {
+                    for x in 0..grid.width {
+                        let dx = x as f32 + 0.5 - splat.mean[0];
+                        let dy = y as f32 + 0.5 - splat.mean[1];
+                        let (u, z) = (splat.l1 * (dx - splat.shear * dy), splat.l3 * dy);
+                        let tile = y / TILE * grid.columns + x / TILE;
+                        let inside = u * u + z * z <= splat.reach;
+                        assert!(!inside || tiles.contains(&tile), "pixel {x}, {y} of {splat:?}");
+                    }
+                }
+            }
+        }
+    }
 }

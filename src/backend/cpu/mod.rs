@@ -9,6 +9,7 @@
 mod adam;
 mod apply;
 mod audit;
+mod batch;
 mod blocks;
 mod budget;
 mod candidates;
@@ -47,6 +48,7 @@ use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
 use super::candidates::{Candidates, error_weights};
+use super::signals::Field;
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
     StepInput, StepOutput, Tensor, Unsound,
@@ -217,7 +219,8 @@ impl Backend for CpuBackend {
         let frame = self.forward(camera, background, input.sh_degree, false)?;
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let terms = ImageTerms { ssim: input.ssim_weight, error: weights };
+        let by_pixel = self.signals.layout().has(Field::Error);
+        let terms = ImageTerms { ssim: input.ssim_weight, error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);

@@ -11,13 +11,11 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, Pixe
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::batch::{BATCH, Batch, CORNER_X, CORNER_Y, LANE_X, LANE_Y};
 use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
-use super::rasterize::{
-    ALPHA_MAX, Blending, CORNER_X, CORNER_Y, DARK, LANE_X, LANE_Y, PATCHES, Patches, Plane,
-    TRANSMITTANCE, TilePlace, Within,
-};
+use super::rasterize::{ALPHA_MAX, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace};
 use super::records::{TileRecords, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
@@ -184,46 +182,46 @@ impl WithSimd for Replay<'_> {
         let zero = V::zero(s);
         // Transmittance while a pixel takes light; 0 once it has stopped, and outside the image.
         let (mut light, mut alive) = place.inside();
-        let mut patches = Patches::EMPTY;
-        for (i, entry) in list.iter().enumerate() {
-            let entry = Entry::load(entry);
-            let splat = &splats[entry.row];
-            let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
-            patches.set(s, splat, &place);
-            let within = Within::new(s, splat);
-            let mut todo = patches.mask & alive;
-            let mut sums = [zero; STRIDE];
-            while todo != 0 {
-                let p = todo.trailing_zeros() as usize % PATCHES;
-                todo &= todo - 1;
-                let (to_u, to_z) = (c(patches.u[p]), c(patches.z[p]));
-                for at in (0..WIDTH).step_by(S::F32_LANES) {
-                    let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
-                    let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                    let seen = c(-blending.log2_reach).le(e);
-                    let alpha = e.exp2().min(c(ALPHA_MAX));
-                    let t = V::load(s, &light[p][at..]);
-                    let next = alpha.neg_mul_add(t, t);
-                    let blends = least_light.lt(next).and(seen);
-                    let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
-                    let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
-                    let distance = (dx * dx + dy * dy).sqrt();
-                    sums[0] = sums[0] + blends.keep(V::load(s, &map[p][at..]));
-                    sums[1] = sums[1] + blends.keep(c(1.0));
-                    sums[2] = sums[2] + blends.keep(alpha * t);
-                    sums[3] = sums[3] + blends.keep(distance);
-                    let stopped = next.le(least_light).and(seen);
-                    let left = stopped.select(zero, blends.select(next, t));
-                    left.store(&mut light[p][at..]);
+        let mut batch = Batch::new();
+        for (n, chunk) in list.chunks(BATCH).enumerate() {
+            batch.set(s, splats, chunk, &place);
+            for (i, entry) in chunk.iter().enumerate() {
+                let splat = &batch.splats[i];
+                let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
+                let mut todo = batch.patches_of[i] & alive;
+                let mut sums = [zero; STRIDE];
+                while todo != 0 {
+                    let p = todo.trailing_zeros() as usize % PATCHES;
+                    todo &= todo - 1;
+                    for at in (0..WIDTH).step_by(S::F32_LANES) {
+                        let [u, z] = batch.u_and_z(s, i, p, at);
+                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                        let seen = c(-blending.log2_reach).le(e);
+                        let alpha = e.exp2().min(c(ALPHA_MAX));
+                        let t = V::load(s, &light[p][at..]);
+                        let next = alpha.neg_mul_add(t, t);
+                        let blends = least_light.lt(next).and(seen);
+                        let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
+                        let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
+                        let distance = (dx * dx + dy * dy).sqrt();
+                        sums[0] = sums[0] + blends.keep(V::load(s, &map[p][at..]));
+                        sums[1] = sums[1] + blends.keep(c(1.0));
+                        sums[2] = sums[2] + blends.keep(alpha * t);
+                        sums[3] = sums[3] + blends.keep(distance);
+                        let stopped = next.le(least_light).and(seen);
+                        let left = stopped.select(zero, blends.select(next, t));
+                        left.store(&mut light[p][at..]);
+                    }
+                    #[expect(clippy::float_cmp, reason = "who has stopped has exactly none")]
+                    let all_stopped = light[p] == [0.0; WIDTH];
+                    if all_stopped {
+                        alive &= !(1 << p);
+                    }
                 }
-                #[expect(clippy::float_cmp, reason = "who has stopped has exactly none")]
-                let all_stopped = light[p] == [0.0; WIDTH];
-                if all_stopped {
-                    alive &= !(1 << p);
+                let record = records.of(Entry::load(entry), n * BATCH + i);
+                for (to, sum) in record.into_iter().flatten().zip(sums) {
+                    to.store(sum.sum().to_bits(), Relaxed);
                 }
-            }
-            for (to, sum) in records.of(entry, i).into_iter().flatten().zip(sums) {
-                to.store(sum.sum().to_bits(), Relaxed);
             }
         }
     }

@@ -15,13 +15,13 @@ use super::project::{Project, ViewParams};
 use super::rasterize::{
     Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
-use super::rasterize_bwd::{RasterizeBwd, TileGradient, gather};
+use super::rasterize_bwd::{Blended, RasterizeBwd, TileGradient, gather};
 use super::records::parts as parts_of_records;
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
 use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
-use crate::backend::signals::{Field, RecordLayout};
+use crate::backend::signals::RecordLayout;
 use crate::backend::{BackendError, Rendering, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -144,9 +144,9 @@ impl CpuBackend {
                 }
                 let mut fresh = band.start == 0;
                 for part in parts_of_records(lists, band.len(), records.len() / stride) {
-                    part.tiles.clone().into_par_iter().for_each(|i| {
+                    let tiles = part.tiles.clone().into_par_iter();
+                    tiles.for_each_init(Blended::boxed, |blended, i| {
                         let tile = band.start + i;
-                        let [r, g, b, alpha, depth] = &gradient[tile].planes;
                         arch.dispatch(RasterizeBwd {
                             splats,
                             list: lists.of_tile(i),
@@ -154,10 +154,10 @@ impl CpuBackend {
                             background: *background,
                             blending,
                             canvas: &canvas[tile],
-                            upstream: [r, g, b],
-                            upstream_more: layout.has(Field::Depth).then_some([alpha, depth]),
+                            upstream: &gradient[tile],
                             layout,
                             records: part.records(lists, i, records, stride),
+                            blended,
                         });
                     });
                     clock.lap("rasterize_bwd");

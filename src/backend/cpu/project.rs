@@ -13,8 +13,10 @@ use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};
 
 use super::blocks::{Scratch, plane, planes};
+use super::footprint::Ellipse;
 use super::parameters::ParameterView;
 use super::simd::{Mask, V, WIDTH, each};
+use super::tiles::Grid;
 use crate::camera::Camera;
 use crate::gaussians::sh_coefficients;
 use crate::sh;
@@ -98,8 +100,9 @@ pub(super) struct Splat {
     pub(super) peak: f32,
     /// How far the exponent may fall from the centre to the region's edge.
     pub(super) reach: f32,
-    /// A splat fills one cache line.
-    pub(super) unused: f32,
+    /// Bits of the [`Footprint`](super::footprint::Footprint); 0 where it is larger. With them, a splat
+    /// fills one cache line.
+    pub(super) tiles: u32,
 }
 
 /// Numbers of a [`Splat`].
@@ -300,6 +303,7 @@ impl WithSimd for Project<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let view = self.view;
         let degree = view.sh_degree;
+        let grid = Grid::new(view.width, view.height);
         let mut scratch = Scratch::ZERO;
         for b in 0..self.params.blocks() {
             let block = self.params.open(b, planes(degree), &mut scratch);
@@ -345,12 +349,22 @@ impl WithSimd for Project<'_> {
                 let colour = each!(i in 3 => raw[i].max(V::zero(s)));
                 let sound = each!(i in 3 => below(raw[i], COLOUR_MAX));
                 let alive = alive.and(sound[0]).and(sound[1]).and(sound[2]);
+                let ellipse = Ellipse {
+                    s,
+                    mean: [u, v],
+                    half_sides: [half_width, half_height],
+                    shear,
+                    l3: l3 * FOLD,
+                    inv_l1: V::splat(s, 1.0 / FOLD) / l1,
+                    peak: g.cov[1] / g.cov[0] * half_width,
+                    reach,
+                };
                 let fields = [
                     u,
                     v,
                     l1 * FOLD,
                     shear,
-                    l3 * FOLD,
+                    ellipse.l3,
                     log2_opacity,
                     colour[0],
                     colour[1],
@@ -358,9 +372,10 @@ impl WithSimd for Project<'_> {
                     g.p[2],
                     half_height,
                     half_width,
-                    V::splat(s, 1.0 / FOLD) / l1,
-                    g.cov[1] / g.cov[0] * half_width,
+                    ellipse.inv_l1,
+                    ellipse.peak,
                     reach,
+                    V::of_bits(s, ellipse.tiles(&grid)),
                 ];
                 for (line, field) in out.iter_mut().zip(fields) {
                     field.store(&mut line[at..]);

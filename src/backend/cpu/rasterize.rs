@@ -2,19 +2,21 @@
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255; a pixel stops, without that
 //! splat, where its transmittance would fall to 1e-4 or below. Both limits are knobs ([`Blending`]).
 //!
-//! One tile at a time, and within it one patch of 4×4 pixels per splat at a time: a vector. Most
-//! splats are a few pixels wide, and patches cover them with a third fewer vectors than rows of
-//! sixteen pixels do. In the coordinates (u, z) = Lᵀ·d the exponent is e = log₂o − u² − z²; from
-//! patch to patch u and z only move by a constant each. A bit per patch says whether the splat
-//! reaches it, another whether any of its pixels still takes light.
+//! One tile at a time, one batch of its splats at a time, and of these one patch of 4×4 pixels at a
+//! time: a vector, which stays in registers while the batch is blended into it. Most splats are a few
+//! pixels wide, and patches cover them with a third fewer vectors than rows of sixteen pixels do. In
+//! the coordinates (u, z) = Lᵀ·d the exponent is e = log₂o − u² − z²; from patch to patch u and z only
+//! move by a constant each. A bit per patch says whether the splat reaches it, another whether any of
+//! its pixels still takes light.
 
 use std::sync::atomic::AtomicU64;
 
 use pulp::{Simd, WithSimd};
 
+use super::batch::{BATCH, Batch};
 use super::project::Splat;
 use super::simd::{V, WIDTH, each};
-use super::tiles::{Entry, Grid, TILE};
+use super::tiles::{Grid, TILE};
 use crate::backend::Shortcuts;
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
@@ -35,16 +37,13 @@ impl From<Shortcuts> for Blending {
     }
 }
 
-/// Splats copied side by side before use, so that their cache misses overlap.
-pub(super) const BATCH: usize = 32;
-
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth.
 pub(super) const CANVAS_PLANES: usize = 5;
 pub(super) const TRANSMITTANCE: usize = 3;
 pub(super) const DEPTH: usize = 4;
 
 /// Side of a patch `[px]`: its pixels are one vector, row by row.
-const PATCH: usize = 4;
+pub(super) const PATCH: usize = 4;
 /// Patches along a tile's side, and, as it happens, in a vector: a tile has as many patches as a
 /// patch has pixels.
 const ACROSS: usize = TILE / PATCH;
@@ -138,90 +137,6 @@ impl TilePlace {
     }
 }
 
-/// A splat in one tile: everything that is constant over a patch.
-#[repr(align(64))]
-pub(super) struct Patches {
-    /// Bit per patch: whether it may hold a pixel that the splat is blended into.
-    pub(super) mask: u32,
-    /// What to add to [`Within::u`] and [`Within::z`], per patch.
-    pub(super) u: [f32; PATCHES],
-    pub(super) z: [f32; PATCHES],
-}
-
-/// u and z of a patch's pixels relative to its upper left corner.
-pub(super) struct Within<S: Simd> {
-    l1: V<S>,
-    /// Derivative of u by y.
-    u_by_y: V<S>,
-    l3: V<S>,
-}
-
-impl<S: Simd> Within<S> {
-    #[inline(always)]
-    pub(super) fn new(s: S, splat: &Splat) -> Self {
-        let c = |x: f32| V::splat(s, x);
-        Self { l1: c(splat.l1), u_by_y: c(-splat.l1 * splat.shear), l3: c(splat.l3) }
-    }
-
-    #[inline(always)]
-    pub(super) fn u(&self, s: S, at: usize) -> V<S> {
-        self.l1.mul_add(V::load(s, &LANE_X[at..]), self.u_by_y * V::load(s, &LANE_Y[at..]))
-    }
-
-    #[inline(always)]
-    pub(super) fn z(&self, s: S, at: usize) -> V<S> {
-        self.l3 * V::load(s, &LANE_Y[at..])
-    }
-}
-
-impl Patches {
-    pub(super) const EMPTY: Self = Self { mask: 0, u: [0.0; PATCHES], z: [0.0; PATCHES] };
-
-    #[inline(always)]
-    pub(super) fn set<S: Simd>(&mut self, s: S, splat: &Splat, place: &TilePlace) {
-        let c = |x: f32| V::splat(s, x);
-        let Splat { l1, shear, l3, .. } = *splat;
-        let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
-        // From a patch's corner to the middle of its pixels' centres, and on to the outermost.
-        let (middle, half) = (0.5 * PATCH as f32, 0.5 * (PATCH - 1) as f32);
-        let (u_middle, z_middle) = (c(l1 * (1.0 - shear) * middle), c(l3 * middle));
-        // With slack for rounding.
-        let u_half = c(l1 * (1.0 + shear.abs()) * half * 1.0001 + 1e-3);
-        let z_half = c(l3 * half * 1.0001 + 1e-3);
-        self.mask = 0;
-        for at in (0..WIDTH).step_by(S::F32_LANES) {
-            let dy = V::load(s, &CORNER_Y[at..]) - my;
-            let dx = c(shear).neg_mul_add(dy, V::load(s, &CORNER_X[at..]) - mx);
-            let (u, z) = (dx * l1, dy * l3);
-            u.store(&mut self.u[at..]);
-            z.store(&mut self.z[at..]);
-            // The least |u| and |z| of the patch.
-            let u = ((u + u_middle).abs() - u_half).max(V::zero(s));
-            let z = ((z + z_middle).abs() - z_half).max(V::zero(s));
-            let reached = u.mul_add(u, z * z).le(c(splat.reach + 1e-3));
-            self.mask |= reached.bits() << at;
-        }
-    }
-}
-
-/// Pixel centres within a patch, and corners of a tile's patches.
-pub(super) const LANE_X: [f32; WIDTH] = grid(true, 1.0, 0.5);
-pub(super) const LANE_Y: [f32; WIDTH] = grid(false, 1.0, 0.5);
-pub(super) const CORNER_X: [f32; PATCHES] = grid(true, PATCH as f32, 0.0);
-pub(super) const CORNER_Y: [f32; PATCHES] = grid(false, PATCH as f32, 0.0);
-
-/// One coordinate of the points of a 4×4 grid, row by row.
-const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
-    let mut values = [0.0; WIDTH];
-    let mut i = 0;
-    while i < WIDTH {
-        let index = if x { i % PATCH } else { i / PATCH };
-        values[i] = index as f32 * step + first;
-        i += 1;
-    }
-    values
-}
-
 /// Renders one tile.
 pub(super) struct Rasterize<'a> {
     pub(super) splats: &'a [Splat],
@@ -252,6 +167,7 @@ impl Rasterize<'_> {
         let Self { splats, list, place, background, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
+        let (zero, never) = (V::zero(s), c(-1.0));
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
@@ -265,64 +181,70 @@ impl Rasterize<'_> {
         for (stop, light) in stop.as_flattened_mut().iter_mut().zip(light.as_flattened()) {
             *stop = if *light > 0.0 { u32::MAX } else { 0 };
         }
-        let mut batch = [Splat::default(); BATCH];
-        let mut patches = Patches::EMPTY;
-
-        'list: for (n, chunk) in list.chunks(BATCH).enumerate() {
-            for (splat, entry) in batch.iter_mut().zip(chunk) {
-                *splat = splats[Entry::load(entry).row];
+        let mut batch = Batch::new();
+        for (n, chunk) in list.chunks(BATCH).enumerate() {
+            if alive == 0 {
+                break;
             }
-            for (i, splat) in batch[..chunk.len()].iter().enumerate() {
-                patches.set(s, splat, &place);
-                let mut todo = patches.mask & alive;
-                let within = Within::new(s, splat);
-                let log2_opacity = c(splat.log2_opacity);
-                let colour = each!(i in 3 => c(splat.colour[i]));
-                let at_depth = c(splat.depth);
-                while todo != 0 {
-                    // The mask has sixteen bits; saying so again spares every load its bounds check.
-                    let p = todo.trailing_zeros() as usize % PATCHES;
-                    todo &= todo - 1;
-                    let (to_u, to_z) = (c(patches.u[p]), c(patches.z[p]));
-                    for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
-                        let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
-                        let seen = faintest.le(e);
-                        let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &light[p][at..]);
-                        let next = alpha.neg_mul_add(t, t);
-                        let goes_on = least_light.lt(next).and(seen);
-                        let w = goes_on.keep(alpha * t);
-                        blend(s, w, colour[0], &mut red[p][at..]);
-                        blend(s, w, colour[1], &mut green[p][at..]);
-                        blend(s, w, colour[2], &mut blue[p][at..]);
-                        if WITH_DEPTH {
-                            blend(s, w, at_depth, &mut depth[p][at..]);
-                        }
-                        goes_on.select(next, t).store(&mut light[p][at..]);
-                        let stops = next.le(least_light).and(seen).and(V::zero(s).lt(t));
+            batch.set(s, splats, chunk, &place);
+            for p in 0..PATCHES {
+                let reached = batch.splats_of[p];
+                if alive >> p & 1 == 0 || reached == 0 {
+                    continue;
+                }
+                let mut takes_light = false;
+                for at in (0..WIDTH).step_by(S::F32_LANES) {
+                    let mut t = V::load(s, &light[p][at..]);
+                    // Pixels without light have stopped, and must not do so again.
+                    let mut least = zero.lt(t).select(least_light, never);
+                    let mut colour = [
+                        V::load(s, &red[p][at..]),
+                        V::load(s, &green[p][at..]),
+                        V::load(s, &blue[p][at..]),
+                    ];
+                    let mut at_depth = V::load(s, &depth[p][at..]);
+                    let mut todo = reached;
+                    while todo != 0 {
+                        // 32 bits; saying so again spares every load its bounds check.
+                        let i = todo.trailing_zeros() as usize % BATCH;
+                        todo &= todo - 1;
+                        let splat = &batch.splats[i];
+                        let [u, z] = batch.u_and_z(s, i, p, at);
+                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                        let alpha = faintest.le(e).keep(e.exp2().min(c(ALPHA_MAX)));
+                        let mut next = alpha.neg_mul_add(t, t);
+                        let stops = next.le(least);
                         if stops.any() {
-                            let place_in_list = (n * BATCH + i) as u32;
-                            stop_pixels(
-                                &mut light[p][at..at + S::F32_LANES],
-                                &mut finished[p][at..],
-                                &mut stop[p][at..],
-                                stops.keep(c(1.0)),
-                                place_in_list,
-                            );
-                            #[expect(
-                                clippy::float_cmp,
-                                reason = "who has stopped has exactly none"
-                            )]
-                            let all_stopped = light[p] == [0.0; WIDTH];
-                            if all_stopped {
-                                alive &= !(1 << p);
+                            let here = s.splat_u32s((n * BATCH + i) as u32);
+                            let finished = &mut finished[p][at..];
+                            stops.select(t, V::load(s, finished)).store(finished);
+                            let stop = &mut S::as_mut_simd_u32s(&mut stop[p][at..]).0[0];
+                            *stop = stops.select_u32s(here, *stop);
+                            t = stops.select(zero, t);
+                            least = stops.select(never, least);
+                            next = alpha.neg_mul_add(t, t);
+                            if !zero.lt(t).any() {
+                                todo = 0;
                             }
                         }
+                        let w = alpha * t;
+                        colour = each!(k in 3 => w.mul_add(c(splat.colour[k]), colour[k]));
+                        if WITH_DEPTH {
+                            at_depth = w.mul_add(c(splat.depth), at_depth);
+                        }
+                        t = next;
                     }
+                    t.store(&mut light[p][at..]);
+                    colour[0].store(&mut red[p][at..]);
+                    colour[1].store(&mut green[p][at..]);
+                    colour[2].store(&mut blue[p][at..]);
+                    if WITH_DEPTH {
+                        at_depth.store(&mut depth[p][at..]);
+                    }
+                    takes_light |= zero.lt(t).any();
                 }
-                if alive == 0 {
-                    break 'list;
+                if !takes_light {
+                    alive &= !(1 << p);
                 }
             }
         }
@@ -346,34 +268,3 @@ fn blend<S: Simd>(s: S, w: V<S>, x: V<S>, plane: &mut [f32]) {
 
 #[repr(align(64))]
 pub(super) struct Aligned(pub(super) Plane);
-
-/// Takes the pixels marked in `stops` out of the light: at most once per pixel, so a plain loop.
-#[cold]
-#[inline(never)]
-fn stop_pixels_cold(
-    light: &mut [f32],
-    finished: &mut [f32],
-    stop: &mut [u32],
-    stops: &[f32; WIDTH],
-    place_in_list: u32,
-) {
-    for (lane, t) in light.iter_mut().enumerate() {
-        if stops[lane] != 0.0 {
-            finished[lane] = std::mem::take(t);
-            stop[lane] = place_in_list;
-        }
-    }
-}
-
-#[inline(always)]
-fn stop_pixels<S: Simd>(
-    light: &mut [f32],
-    finished: &mut [f32],
-    stop: &mut [u32],
-    stops: V<S>,
-    place_in_list: u32,
-) {
-    let mut lanes = [0.0; WIDTH];
-    stops.store(&mut lanes);
-    stop_pixels_cold(light, finished, stop, &lanes, place_in_list);
-}

@@ -4,8 +4,12 @@
 //! the derivative of Σ g·C is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
 //! everything behind the splat, background included, normalised by the transmittance there. b is
 //! a running convex combination, b ← b + α(c·g − b): nothing is subtracted from a total, so that
-//! nothing cancels however little light is left. T comes back from the final transmittance as
-//! T ← T/(1 − α), exact to one rounding per splat because α <= 0.99.
+//! nothing cancels however little light is left.
+//!
+//! A batch of splats is walked twice. Front to back, one patch at a time as in the forward pass: each
+//! alpha, its weight as if nothing were in front of the batch, and at last the product of all 1 − α, by
+//! which the light behind the batch is divided to have that in front of it. Back to front, one splat at
+//! a time: what depends on the gradient, whose sums so stay in registers.
 //!
 //! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, all that the parameters need of
 //! a tile are sums of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα (and of w·g for the colour):
@@ -16,12 +20,13 @@
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
+use bytemuck::Zeroable;
 use pulp::{Simd, WithSimd};
 
+use super::batch::{BATCH, Batch};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Aligned, BATCH, Blending, DARK, Patches, Plane, TRANSMITTANCE, TileCanvas,
-    TilePlace, Within,
+    ALPHA_MAX, Aligned, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
 };
 use super::records::TileRecords;
 use super::simd::{V, WIDTH, each, sums_of_four};
@@ -47,12 +52,15 @@ mod extra {
     pub(super) const WEIGHTS: u8 = 2;
     /// The largest weight.
     pub(super) const LARGEST: u8 = 4;
-    /// Everything, with the gradients of alpha and depth.
-    pub(super) const ALL: u8 = 15;
+    /// The sum of the weighted error, beside the two above.
+    pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
+    pub(super) const ERROR_ABS: u8 = ERROR | ABS;
+    /// Everything but the error, with the gradients of alpha and depth.
+    pub(super) const ALL: u8 = 16 | ABS | WEIGHTS | LARGEST;
 }
 
 /// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are read for records with
-/// [`Field::Depth`] only.
+/// [`Field::Depth`] only; with [`Field::Error`], the last one is the error of the pixels.
 #[derive(Debug, Clone)]
 #[repr(C, align(64))]
 pub(super) struct TileGradient {
@@ -69,12 +77,12 @@ pub(super) struct RasterizeBwd<'a> {
     /// Those of the forward pass.
     pub(super) blending: Blending,
     pub(super) canvas: &'a TileCanvas,
-    pub(super) upstream: [&'a Plane; 3],
-    /// Alpha and depth, for records with every field.
-    pub(super) upstream_more: Option<[&'a Plane; 2]>,
+    pub(super) upstream: &'a TileGradient,
     pub(super) layout: RecordLayout,
     /// This tile writes the records of its own entries, those that are held.
     pub(super) records: TileRecords<'a>,
+    /// Scratch.
+    pub(super) blended: &'a mut Blended,
 }
 
 impl WithSimd for RasterizeBwd<'_> {
@@ -93,7 +101,10 @@ impl WithSimd for RasterizeBwd<'_> {
         if has(Field::WeightMax) {
             extras |= extra::LARGEST;
         }
-        if self.upstream_more.is_some() {
+        if has(Field::Error) {
+            extras |= extra::ERROR;
+        }
+        if has(Field::Depth) {
             extras = extra::ALL;
         }
         match extras {
@@ -105,8 +116,28 @@ impl WithSimd for RasterizeBwd<'_> {
             5 => self.run::<S, 5>(s),
             6 => self.run::<S, 6>(s),
             7 => self.run::<S, 7>(s),
+            extra::ERROR => self.run::<S, { extra::ERROR }>(s),
+            extra::ERROR_ABS => self.run::<S, { extra::ERROR_ABS }>(s),
             _ => self.run::<S, { extra::ALL }>(s),
         }
+    }
+}
+
+/// Pairs of a splat and a patch in a batch, at most.
+const PAIRS: usize = BATCH * PATCHES;
+
+/// What the first walk over a batch leaves for the second: pair after pair, patch by patch.
+#[derive(Zeroable)]
+#[repr(C, align(64))]
+pub(super) struct Blended {
+    alpha: [[f32; WIDTH]; PAIRS],
+    /// α·Π(1 − α) over the splats of the batch in front.
+    weight: [[f32; WIDTH]; PAIRS],
+}
+
+impl Blended {
+    pub(super) fn boxed() -> Box<Self> {
+        bytemuck::zeroed_box()
     }
 }
 
@@ -116,19 +147,67 @@ struct Sums<S: Simd> {
     abs: [V<S>; 2],
     weight: V<S>,
     pixels: V<S>,
-    depth: V<S>,
+    /// Of weights times the last plane of the gradient.
+    map: V<S>,
     weight_max: V<S>,
 }
 
 impl RasterizeBwd<'_> {
+    /// The first walk over a batch, whose first splat is entry `first` of the list. `light` is moved from
+    /// behind the batch to its front. Returns the end of each patch's pairs.
+    #[inline(always)]
+    fn blend_again<S: Simd>(
+        &mut self,
+        s: S,
+        batch: &Batch,
+        first: usize,
+        light: &mut Plane,
+    ) -> [usize; PATCHES] {
+        let c = |x: f32| V::splat(s, x);
+        let faintest = c(-self.blending.log2_reach);
+        let Blended { alpha: alphas, weight: weights } = &mut *self.blended;
+        let mut ends = [0; PATCHES];
+        let mut start = 0;
+        for p in 0..PATCHES {
+            let reached = batch.splats_of[p];
+            if reached == 0 {
+                continue;
+            }
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let stop = S::as_simd_u32s(&self.canvas.stop[p][at..]).0[0];
+                let mut product = c(1.0);
+                let (mut pair, mut todo) = (start, reached);
+                while todo != 0 {
+                    // The mask has 32 bits; saying so again spares every load its bounds check.
+                    let i = todo.trailing_zeros() as usize % BATCH;
+                    todo &= todo - 1;
+                    let [u, z] = batch.u_and_z(s, i, p, at);
+                    let log2_opacity = c(batch.splats[i].log2_opacity);
+                    let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
+                    let here = s.splat_u32s((first + i) as u32);
+                    let seen = faintest.le(e).and(super::simd::before(s, here, stop));
+                    let alpha = seen.keep(e.exp2().min(c(ALPHA_MAX)));
+                    alpha.store(&mut alphas[pair % PAIRS][at..]);
+                    (alpha * product).store(&mut weights[pair % PAIRS][at..]);
+                    product = alpha.neg_mul_add(product, product);
+                    pair += 1;
+                }
+                // Where the product leaves f32, the light behind has done so, too.
+                let light = &mut light[p][at..];
+                (V::load(s, light) / product.max(c(f32::MIN_POSITIVE))).store(light);
+            }
+            start += reached.count_ones() as usize;
+            ends[p] = start;
+        }
+        ends
+    }
+
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn run<S: Simd, const EXTRAS: u8>(self, s: S) {
+    fn run<S: Simd, const EXTRAS: u8>(mut self, s: S) {
         let Self { splats, list, place, background, canvas, upstream, layout, records, .. } = self;
-        let faintest = V::splat(s, -self.blending.log2_reach);
         let c = |x: f32| V::splat(s, x);
-        let [gr, gg, gb] = upstream;
-        let [ga, gd] = self.upstream_more.unwrap_or([&DARK, &DARK]);
+        let [gr, gg, gb, ga, map] = &upstream.planes;
 
         // State per pixel, as it is behind the splat at hand.
         let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
@@ -151,27 +230,20 @@ impl RasterizeBwd<'_> {
             write(record, &[0.0; RecordLayout::MOST], layout);
         }
 
-        let mut batch = [Splat::default(); BATCH];
-        let mut patches = Patches::EMPTY;
+        let mut batch = Batch::new();
         let batches = list_end.div_ceil(BATCH);
         for n in (0..batches).rev() {
             let first = n * BATCH;
             let chunk = &list[first..list_end.min(first + BATCH)];
-            for (splat, entry) in batch.iter_mut().zip(chunk) {
-                *splat = splats[Entry::load(entry).row];
-            }
-            let mut alive = 0_u32;
+            batch.set(s, splats, chunk, &place);
             for (p, &end) in patch_end.iter().enumerate() {
-                alive |= u32::from(end as usize > first) << p;
+                batch.cut(p, (end as usize).saturating_sub(first));
             }
-            for (i, splat) in batch[..chunk.len()].iter().enumerate().rev() {
-                patches.set(s, splat, &place);
-                let mut todo = patches.mask & alive;
-                let within = Within::new(s, splat);
-                let log2_opacity = c(splat.log2_opacity);
+            let mut ends = self.blend_again(s, &batch, first, light);
+            for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
+                let mut todo = batch.patches_of[i];
                 let colour = each!(i in 3 => c(splat.colour[i]));
                 let at_depth = c(splat.depth);
-                let here = s.splat_u32s((first + i) as u32);
                 let y2_u = c(-splat.l1 * splat.shear);
                 let zero = V::zero(s);
                 let mut sums = Sums {
@@ -179,40 +251,38 @@ impl RasterizeBwd<'_> {
                     abs: [zero; 2],
                     weight: zero,
                     pixels: zero,
-                    depth: zero,
+                    map: zero,
                     weight_max: zero,
                 };
                 while todo != 0 {
                     // The mask has sixteen bits; saying so again spares every load its bounds check.
                     let p = todo.trailing_zeros() as usize % WIDTH;
                     todo &= todo - 1;
-                    let (to_u, to_z) = (c(patches.u[p]), c(patches.z[p]));
+                    ends[p] -= 1;
+                    let pair = ends[p] % PAIRS;
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let (u, z) = (within.u(s, at) + to_u, within.z(s, at) + to_z);
-                        let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
-                        let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
-                        let seen = faintest.le(e).and(super::simd::before(s, here, stop));
-                        let unclamped = e.exp2();
-                        let alpha = seen.keep(unclamped.min(c(ALPHA_MAX)));
-                        let t = V::load(s, &light[p][at..]) / (c(1.0) - alpha);
-                        t.store(&mut light[p][at..]);
-                        let w = alpha * t;
+                        let [u, z] = batch.u_and_z(s, i, p, at);
+                        let alpha = V::load(s, &self.blended.alpha[pair][at..]);
+                        let part = V::load(s, &self.blended.weight[pair][at..]);
+                        let w = part * V::load(s, &light[p][at..]);
                         let (r, g, b) = (
                             V::load(s, &gr[p][at..]),
                             V::load(s, &gg[p][at..]),
                             V::load(s, &gb[p][at..]),
                         );
                         let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
-                        if EXTRAS == extra::ALL {
-                            let d = V::load(s, &gd[p][at..]);
-                            own = at_depth.mul_add(d, own + V::load(s, &ga[p][at..]));
-                            sums.depth = w.mul_add(d, sums.depth);
+                        if EXTRAS >= extra::ERROR {
+                            let m = V::load(s, &map[p][at..]);
+                            sums.map = w.mul_add(m, sums.map);
+                            if EXTRAS == extra::ALL {
+                                own = at_depth.mul_add(m, own + V::load(s, &ga[p][at..]));
+                            }
                         }
                         let was = V::load(s, &behind[p][at..]);
                         let ahead = own - was;
                         alpha.mul_add(ahead, was).store(&mut behind[p][at..]);
                         // No gradient where alpha is at its clamp.
-                        let q = unclamped.le(c(ALPHA_MAX)).keep(w * ahead);
+                        let q = alpha.lt(c(ALPHA_MAX)).keep(w * ahead);
                         let qu = q * u;
                         let qz = q * z;
                         let base = &mut sums.base;
@@ -252,8 +322,8 @@ impl RasterizeBwd<'_> {
                     record[Field::WeightSum.number()] = sums.weight.sum();
                     record[Field::PixelCount.number()] = sums.pixels.sum();
                 }
-                if EXTRAS == extra::ALL {
-                    record[Field::Depth.number()] = sums.depth.sum();
+                if EXTRAS >= extra::ERROR {
+                    record[Field::Error.number()] = sums.map.sum();
                 }
                 if EXTRAS & extra::LARGEST != 0 {
                     record[Field::WeightMax.number()] = sums.weight_max.max_lane();
@@ -306,3 +376,4 @@ fn gather_all<const STRIDE: usize>(sums: &mut [f32], maximum: bool, records: &[A
 }
 
 const _: () = assert!(BASE == 9 && RecordLayout::MOST == 15, "`gather` knows each length");
+const _: () = assert!(Field::Error.number() == Field::Depth.number(), "one sum for both");

@@ -10,7 +10,7 @@ use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
-use crate::backend::signals::{Field, RecordLayout, SignalPlanes};
+use crate::backend::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes};
 
 /// The accumulators of the requested signals.
 #[derive(Debug)]
@@ -78,12 +78,17 @@ impl SignalPlanes {
                     Signal::WeightMax => sum!(Field::WeightMax.number()),
                     Signal::WeightSum => sum!(Field::WeightSum.number()),
                     Signal::PixelCount => sum!(Field::PixelCount.number()),
+                    Signal::WeightedError => sum!(Field::Error.number()),
                     // Of views that are rendered for it, and of the row as it is when it is read.
                     Signal::FreshWeightMax
                     | Signal::Opacity
                     | Signal::ScaleMax
                     | Signal::ScaleProduct
-                    | Signal::Age => continue,
+                    | Signal::Age
+                    | Signal::Position
+                    | Signal::LogScale
+                    | Signal::Orientation
+                    | Signal::Colour => continue,
                 };
                 let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
                 let was = V::load(s, to);
@@ -116,7 +121,7 @@ impl Accumulators {
     /// Numbers per row where gradients of splats are summed in a step, and the requested signals lie
     /// while they are read.
     pub(super) fn sums(&self) -> usize {
-        self.layout().stride().max(self.requested.count())
+        self.layout().stride().max(self.requested.width())
     }
 
     /// Whether views are to be measured.
@@ -182,6 +187,16 @@ impl Accumulators {
         ages: &[u16],
     ) {
         for signal in wanted.iter() {
+            if let (Some(attribute), Some(column)) =
+                (ParameterSignal::of(signal), signals.get_mut(signal))
+            {
+                for (row, numbers) in column.chunks_exact_mut(signal.width()).enumerate() {
+                    for (number, plane) in numbers.iter_mut().zip(attribute.parameters.clone()) {
+                        *number = (attribute.shown)(params.get(row, plane));
+                    }
+                }
+                continue;
+            }
             let planes = self.planes.of(signal);
             let value = |row: usize| -> f32 {
                 if signal.kind() == SignalKind::Present {

@@ -14,10 +14,9 @@
 //! consecutive tiles whose lists fit. Tiles are independent, and each row's gradients are summed in
 //! order of tile number, so bands change no bit of the result.
 //!
-//! Counting notes the tiles of a row as bits where its slots will stand, so that its ellipse is
-//! evaluated once. Only of rows that reach farther than the bits do, it is evaluated again when
-//! entries are emitted: by the same function on the same values, and Rust never contracts
-//! floating-point expressions; so the two passes agree.
+//! Counting notes the tiles of a row as bits where its slots will stand. Only of rows that reach farther
+//! than the bits do, the ellipse is evaluated again when entries are emitted: by the same function on the
+//! same values, and Rust never contracts floating-point expressions; so the two passes agree.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
@@ -33,6 +32,8 @@ pub(super) const TILE: usize = WIDTH;
 /// Bound for (chunks of rows) × (tiles) counters: 4 MiB of them.
 const MOST_COUNTERS: usize = 1 << 20;
 const MOST_CHUNKS: usize = 64;
+/// Tiles whose counters are added up by one task.
+const RUN: usize = 256;
 
 /// An image as a grid of tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -105,8 +106,10 @@ pub(super) struct TileLists {
     slots: Vec<[u32; 2]>,
     /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
-    /// Entries per (chunk of rows, tile).
+    /// Entries per (chunk of rows, tile). While entries are emitted: their places in the tile's list.
     counters: Vec<u32>,
+    /// Entries per chunk of rows.
+    lengths: Vec<u64>,
 }
 
 impl TileLists {
@@ -118,6 +121,7 @@ impl TileLists {
             slots: vec![[0; 2]; budget],
             starts: Vec::new(),
             counters: Vec::new(),
+            lengths: Vec::new(),
         }
     }
 
@@ -139,11 +143,17 @@ impl TileLists {
     pub(super) fn bands(&mut self, visible: Visible<'_>, grid: &Grid) -> (Vec<Range<usize>>, u64) {
         let tiles = grid.tiles();
         self.count(visible, grid, 0..tiles);
-        let entries = (0..tiles).map(|tile| {
-            let counters = self.counters[tile..].iter().step_by(tiles);
-            counters.map(|&n| u64::from(n)).sum()
-        });
-        cut(entries, self.cap() as u64)
+        let (cap, entries) = (self.cap() as u64, self.lengths.iter().sum());
+        if entries <= cap {
+            return (std::iter::once(0..tiles).collect(), entries);
+        }
+        let mut of_tiles = vec![0_u64; tiles];
+        for counters in self.counters.chunks_exact(tiles) {
+            for (sum, &n) in of_tiles.iter_mut().zip(counters) {
+                *sum += u64::from(n);
+            }
+        }
+        cut(of_tiles.into_iter(), cap)
     }
 
     /// Fills the lists for one band. `counted` says that the counters already hold this band.
@@ -158,36 +168,22 @@ impl TileLists {
             self.count(visible, grid, band.clone());
         }
         let tiles = band.len();
+        self.find_places(tiles);
         let chunk = chunk_rows(visible.splats.len(), tiles);
         // Each chunk's slots lie side by side.
         let mut rest = &mut self.row_of_slot[..];
         let mut first = 0;
         let mut work = Vec::new();
-        for (counters, slots) in self
-            .counters
-            .chunks_mut(tiles.max(1))
-            .zip(self.slots[..visible.splats.len()].chunks_mut(chunk))
-        {
-            let length = counters.iter().map(|&n| n as usize).sum();
-            let (mine, tail) = rest.split_at_mut(length);
+        let slots = self.slots[..visible.splats.len()].chunks_mut(chunk);
+        for (&length, slots) in self.lengths.iter().zip(slots) {
+            let (mine, tail) = rest.split_at_mut(length as usize);
             rest = tail;
             work.push((first, mine, slots));
-            first += length;
+            first += length as usize;
         }
-        // Counts become first places: all of a tile's chunks, then the next tile.
-        self.starts.clear();
-        self.starts.resize(tiles + 1, 0);
-        let mut next = 0;
-        for tile in 0..tiles {
-            self.starts[tile] = next;
-            for counter in self.counters[tile..].iter_mut().step_by(tiles) {
-                next += std::mem::replace(counter, next);
-            }
-        }
-        self.starts[tiles] = next;
-        let entries = &self.entries;
+        let (entries, starts) = (&self.entries, &self.starts);
         work.into_par_iter().zip(self.counters.par_chunks_mut(tiles.max(1))).enumerate().for_each(
-            |(i, ((first, row_of_slot, slots), cursors))| {
+            |(i, ((first, row_of_slot, slots), places))| {
                 let mut filled = 0;
                 let rows = i * chunk..i * chunk + slots.len();
                 visible.each(rows.clone(), |row, splat| {
@@ -196,8 +192,8 @@ impl TileLists {
                     let footprint = Footprint(slots[row - rows.start]);
                     footprint.for_each_tile(splat, grid, &band, |tile| {
                         let key = depth | (first + filled) as u64;
-                        entries[cursors[tile] as usize].store(key, Relaxed);
-                        cursors[tile] += 1;
+                        entries[(starts[tile] + places[tile]) as usize].store(key, Relaxed);
+                        places[tile] += 1;
                         *row_of_slot[filled].get_mut() = row as u32;
                         filled += 1;
                     });
@@ -205,6 +201,40 @@ impl TileLists {
                 });
             },
         );
+    }
+
+    /// From the counters of so many tiles, where each list starts, and in their stead where in each list
+    /// the entries of each chunk do: after those of the chunks before. Walked in the order of memory; down
+    /// the chunks of one tile, each number would be a cache miss.
+    fn find_places(&mut self, tiles: usize) {
+        let mut runs: Vec<Vec<&mut [u32]>> = Vec::new();
+        runs.resize_with(tiles.div_ceil(RUN), Vec::new);
+        for counters in self.counters.chunks_exact_mut(tiles.max(1)) {
+            for (run, counters) in runs.iter_mut().zip(counters.chunks_mut(RUN)) {
+                run.push(counters);
+            }
+        }
+        self.starts.clear();
+        self.starts.resize(tiles + 1, 0);
+        let (starts, end) = self.starts.split_at_mut(tiles);
+        let count = |(chunks, starts): (Vec<&mut [u32]>, &mut [u32])| {
+            for counters in chunks {
+                for (n, start) in counters.iter_mut().zip(&mut *starts) {
+                    *start += std::mem::replace(n, *start);
+                }
+            }
+            starts.iter().sum()
+        };
+        let mut lengths: Vec<u32> =
+            runs.into_par_iter().zip(starts.par_chunks_mut(RUN)).map(count).collect();
+        for length in &mut lengths {
+            end[0] += std::mem::replace(length, end[0]);
+        }
+        starts.par_chunks_mut(RUN).zip(lengths).for_each(|(starts, mut next)| {
+            for start in starts {
+                next += std::mem::replace(start, next);
+            }
+        });
     }
 
     /// Fills and sorts the lists of a band again, after other bands were in their place.
@@ -218,17 +248,22 @@ impl TileLists {
         let tiles = band.len();
         let rows = visible.splats.len();
         let chunk = chunk_rows(rows, tiles);
-        self.counters.clear();
-        self.counters.resize(rows.div_ceil(chunk).max(1) * tiles, 0);
+        self.counters.resize(rows.div_ceil(chunk) * tiles, 0);
         let counters = self.counters.par_chunks_mut(tiles.max(1));
         let work = counters.zip(self.slots[..rows].par_chunks_mut(chunk)).enumerate();
-        work.for_each(|(i, (counters, slots))| {
-            let first = i * chunk;
+        let lengths = work.map(|(i, (counters, slots))| {
+            let (first, mut length) = (i * chunk, 0);
+            counters.fill(0);
             visible.each(first..first + slots.len(), |row, splat| {
-                let footprint = Footprint::new(splat, grid, &band, |tile| counters[tile] += 1);
+                let footprint = Footprint::new(splat, grid, &band, |tile| {
+                    counters[tile] += 1;
+                    length += 1;
+                });
                 slots[row - first] = footprint.0;
             });
+            length
         });
+        lengths.collect_into_vec(&mut self.lengths);
     }
 
     /// Brings the list of tile `tile` of the band into its final order, front to back. Positive
@@ -338,6 +373,27 @@ mod tests {
                 let chunks = rows.div_ceil(chunk);
                 assert!(chunks <= MOST_CHUNKS && chunks * tiles <= MOST_COUNTERS.max(tiles));
             }
+        }
+    }
+
+    /// Of fewer tiles than a run has, of whole runs, and of more.
+    #[test]
+    fn places_are_sums_of_all_that_comes_before() {
+        for tiles in [1, RUN - 1, RUN, 2 * RUN, 2 * RUN + 7] {
+            let chunks = 5;
+            let counters: Vec<u32> = (0..chunks * tiles).map(|i| (i * 7 % 11) as u32).collect();
+            let mut lists = TileLists::new(1, 1);
+            lists.counters.clone_from(&counters);
+            lists.find_places(tiles);
+            let mut next = 0;
+            for tile in 0..tiles {
+                for chunk in 0..chunks {
+                    let place = lists.starts[tile] + lists.counters[chunk * tiles + tile];
+                    assert_eq!(place, next, "tile {tile} of {tiles}, chunk {chunk}");
+                    next += counters[chunk * tiles + tile];
+                }
+            }
+            assert_eq!(lists.starts[tiles], next);
         }
     }
 }

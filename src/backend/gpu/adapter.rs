@@ -4,45 +4,29 @@ use wgpu::{
     Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
 };
 
-use super::accumulation::Accumulation;
 use super::rows::widest_row;
 use super::wait::wait;
-use crate::backend::BackendError;
+use crate::backend::{Accumulation, AdapterChoice, AdapterKind, AdapterSummary, BackendError};
 
-/// What an adapter is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AdapterKind {
-    /// A graphics card.
-    Discrete,
-    /// Graphics that share the processor's memory.
-    Integrated,
-    /// A card that a virtual machine is lent.
-    Virtual,
-    /// A program on the processor.
-    Software,
-    /// The driver does not say.
-    Unknown,
-}
+impl Accumulation {
+    /// What a device must have for it, beside what all kernels need.
+    pub(super) fn features(self) -> Features {
+        match self {
+            Self::Slots => Features::empty(),
+            Self::SubgroupCas => Features::SUBGROUP,
+            Self::SubgroupAtomics => Features::SUBGROUP | Features::SHADER_FLOAT32_ATOMIC,
+        }
+    }
 
-/// An adapter and the limits that matter.
-#[derive(Debug, Clone, PartialEq)]
-pub struct AdapterSummary {
-    /// As the driver names it.
-    pub name: String,
-    /// The interface: vulkan, metal, dx12.
-    pub interface: String,
-    /// The driver and its version.
-    pub driver: String,
-    /// What it is.
-    pub kind: AdapterKind,
-    /// Largest buffer that a kernel can use `[bytes]`.
-    pub largest_binding: u64,
-    /// Largest buffer `[bytes]`.
-    pub largest_buffer: u64,
-    /// What it lacks to be usable; empty if it is.
-    pub missing: Vec<String>,
-    /// The ways of adding up gradients that it has, the fastest last; always [`Accumulation::Slots`].
-    pub accumulations: Vec<Accumulation>,
+    /// The features that an adapter lacks for it, in words.
+    pub(super) fn missing(self, there: Features) -> Vec<&'static str> {
+        let lacking = self.features().difference(there);
+        let names = [
+            (Features::SUBGROUP, "subgroup operations (SUBGROUP)"),
+            (Features::SHADER_FLOAT32_ATOMIC, "atomic addition of f32 (SHADER_FLOAT32_ATOMIC)"),
+        ];
+        names.into_iter().filter(|(one, _)| lacking.contains(*one)).map(|(_, name)| name).collect()
+    }
 }
 
 impl AdapterSummary {
@@ -74,18 +58,6 @@ impl AdapterSummary {
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         let largest = self.largest_binding.min(self.largest_buffer);
         (largest / widest_row(sh_degree)).min(MOST_ROWS)
-    }
-
-    /// How it adds up gradients by default: the fastest way it supports.
-    #[must_use]
-    pub fn accumulation(&self) -> Accumulation {
-        self.accumulations.last().copied().unwrap_or(Accumulation::Slots)
-    }
-
-    /// Whether `auto` may take it: a GPU that lacks nothing.
-    #[must_use]
-    pub fn is_gpu(&self) -> bool {
-        self.kind != AdapterKind::Software && self.missing.is_empty()
     }
 }
 
@@ -153,15 +125,6 @@ pub(super) fn enumerate() -> Vec<(Adapter, AdapterSummary)> {
 #[must_use]
 pub fn adapters() -> Vec<AdapterSummary> {
     enumerate().into_iter().map(|(_, summary)| summary).collect()
-}
-
-/// Which adapter to take, and how it adds up gradients.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct AdapterChoice {
-    /// Part of its name or its driver's, in upper or lower case; `None` takes the best.
-    pub name: Option<String>,
-    /// How it adds up gradients; [its own choice](AdapterSummary::accumulation) without one.
-    pub accumulation: Option<Accumulation>,
 }
 
 impl AdapterChoice {

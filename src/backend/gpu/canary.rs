@@ -5,10 +5,10 @@ use densify_policies::policy::{Cadence, Needs};
 use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DMat3, DVec3};
 
-use super::{GpuBackend, GpuDevice, GpuOptions};
+use super::{GpuBackend, GpuDevice};
 use crate::backend::cpu::{CpuBackend, CpuOptions};
 use crate::backend::signals::RecordLayout;
-use crate::backend::{Backend, BackendError, LearningRates, StepInput, StepOutput};
+use crate::backend::{Backend, BackendError, BackendOptions, LearningRates, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, sh_coefficients};
@@ -98,7 +98,7 @@ impl GpuBackend {
     /// When the model has more rows than the budget: the caller subsamples before.
     pub fn new(
         model: &Gaussians,
-        options: &GpuOptions,
+        options: &BackendOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let records = RecordLayout::new(options.needs.signals);
@@ -118,8 +118,11 @@ fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
     let mut cpu = CpuOptions::new(rows);
     cpu.threads = Some(1);
     let mut cpu = CpuBackend::new(&model, &cpu)?;
-    let options =
-        GpuOptions { largest_image: (camera.width, camera.height), needs, ..GpuOptions::new(rows) };
+    let options = BackendOptions {
+        largest_image: (camera.width, camera.height),
+        needs,
+        ..BackendOptions::new(rows)
+    };
     let mut gpu = GpuBackend::without_canary(&model, &options, device)?;
     let (expected, image) = run(&mut cpu, &camera, &target)?;
     let (found, rendered) = run(&mut gpu, &camera, &target)?;

@@ -2,14 +2,19 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use densify_policies::policy::Needs;
 use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
-use super::accumulation::Accumulation;
-use super::adapter::{AdapterChoice, AdapterSummary, choose, enumerate};
+use super::adapter::{choose, enumerate};
 use super::pipelines::{Pipelines, Variant};
 use super::wait::wait;
-use crate::backend::BackendError;
+use super::{GpuBackend, promise};
 use crate::backend::signals::RecordLayout;
+use crate::backend::{
+    Accumulation, AdapterChoice, AdapterSummary, BackendError, BackendOptions, Differentiable,
+};
+use crate::gaussians::Gaussians;
+use crate::memory::Ledger;
 
 /// Errors that a device reports outside of any call.
 #[derive(Debug, Default)]
@@ -42,6 +47,36 @@ impl GpuDevice {
     #[must_use]
     pub fn accumulation(&self) -> Accumulation {
         self.0.accumulation
+    }
+
+    /// Most rows that a backend on it can hold at a degree.
+    #[must_use]
+    pub fn largest_budget(&self, sh_degree: u8) -> u64 {
+        self.0.summary.largest_budget(sh_degree)
+    }
+
+    /// Most (row, tile) pairs that a backend on it can hold at a time for such needs.
+    #[must_use]
+    pub fn most_pairs(&self, needs: &Needs) -> u64 {
+        promise::most_pairs(&self.0, needs)
+    }
+
+    /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
+    #[must_use]
+    pub fn promise(&self, sh_degree: u8, options: &BackendOptions) -> Ledger {
+        promise::ledger(&promise::sizes(&self.0, sh_degree, options), &options.needs)
+    }
+
+    /// A backend that holds the model; see [`GpuBackend::new`].
+    ///
+    /// # Errors
+    /// As it.
+    pub fn backend(
+        &self,
+        model: &Gaussians,
+        options: &BackendOptions,
+    ) -> Result<Box<dyn Differentiable>, BackendError> {
+        Ok(Box::new(GpuBackend::new(model, options, self)?))
     }
 }
 

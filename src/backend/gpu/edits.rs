@@ -14,15 +14,30 @@ use crate::gaussians::{logit, rgb_to_dc};
 /// Numbers that fit one chunk.
 const CHUNK: usize = (OPS_BYTES / 4) as usize;
 /// Numbers per operation.
-const WORDS: usize = 16;
+const WORDS: usize = 20;
 /// In place of a source: clear the row.
 const NOTHING: u32 = u32::MAX;
 
-fn scale_words(rule: ScaleRule) -> [u32; 3] {
-    match rule {
-        ScaleRule::Uniform(factor) => [0, factor.ln().to_bits(), 0],
-        ScaleRule::LongAxis { long, other } => [1, long.ln().to_bits(), other.ln().to_bits()],
-    }
+fn scale_words(rule: ScaleRule) -> [u32; 4] {
+    let (rule, factors) = match rule {
+        ScaleRule::Uniform(factor) => (0, [factor, 1.0, 1.0]),
+        ScaleRule::LongAxis { long, other } => (1, [long, other, 1.0]),
+        ScaleRule::Axes(factors) => (2, factors),
+    };
+    let [a, b, c] = factors.map(|factor| factor.ln().to_bits());
+    [rule, a, b, c]
+}
+
+/// Whether there are three numbers, and which.
+fn maybe_words(numbers: Option<[f32; 3]>) -> [u32; 4] {
+    let [a, b, c] = numbers.unwrap_or_default().map(f32::to_bits);
+    [u32::from(numbers.is_some()), a, b, c]
+}
+
+/// A quaternion at length 1.
+fn turn_words(quaternion: [f32; 4]) -> [u32; 4] {
+    let length = quaternion.iter().map(|v| v * v).sum::<f32>().sqrt();
+    quaternion.map(|v| (v / length).to_bits())
 }
 
 fn opacity_words(rule: OpacityRule, siblings: u32) -> [u32; 2] {
@@ -55,16 +70,18 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
         heads.clear();
     };
     for family in &ops.families {
-        let offspring = family.offspring;
+        let offspring = ops.offspring(family);
         let mut children = ops.children(family);
         let mut number = 1;
         let (placement, of) = match offspring.placement {
             Placement::Offset(offset) => (0, offset.map(f32::to_bits)),
             Placement::Sampled => (1, [0; 3]),
             Placement::LongAxis { sigmas } => (2, [sigmas.to_bits(), 0, 0]),
+            Placement::Axes(sigmas) => (3, sigmas.map(f32::to_bits)),
         };
-        let [scale, a, b] = scale_words(offspring.scale);
+        let [scale, a, b, c] = scale_words(offspring.scale);
         let [opacity, value] = opacity_words(offspring.opacity, offspring.siblings());
+        let [w, x, y, z] = turn_words(offspring.turn);
         loop {
             let used = heads.len() * WORDS + slots.len();
             if used + WORDS >= room {
@@ -88,9 +105,13 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
                 scale,
                 a,
                 b,
+                c,
                 opacity,
                 value,
-                0,
+                w,
+                x,
+                y,
+                z,
                 0,
             ]);
             slots.extend_from_slice(&children[..now]);
@@ -145,7 +166,9 @@ impl GpuBackend {
         let clear = |row: u32| [NOTHING, row];
         for (count, words) in family_chunks(ops, CHUNK) {
             let now = [count as u32, folded_seed(seed), step, 0];
-            self.execute(&words, |to| to.run(&launches.breed, now, (count as u32).div_ceil(256)));
+            self.execute(&words, |to| {
+                to.run(launches.get("breed"), now, (count as u32).div_ceil(256));
+            });
         }
         let mut births: Vec<[u32; 2]> = Vec::new();
         let mut reborn: Vec<[u32; 2]> = Vec::new();
@@ -153,7 +176,7 @@ impl GpuBackend {
             let children = ops.children(family);
             births.extend(children.iter().map(|&slot| [family.parent, slot]));
             reborn.extend(children.iter().map(|&slot| clear(slot)));
-            if family.offspring.parent == ParentFate::BecomesChild {
+            if family.fate() == ParentFate::BecomesChild {
                 reborn.push(clear(family.parent));
             }
         }
@@ -164,12 +187,15 @@ impl GpuBackend {
             .map(|&(row, update)| {
                 let mut words = [0; WORDS];
                 words[0] = row;
-                words[1..4].copy_from_slice(&scale_words(update.scale));
-                words[4..6].copy_from_slice(&opacity_words(update.opacity, 1));
+                words[1..5].copy_from_slice(&scale_words(update.scale));
+                words[5..7].copy_from_slice(&opacity_words(update.opacity, 1));
+                words[7..11].copy_from_slice(&maybe_words(update.position));
+                let colour = update.colour.map(|colour| colour.map(rgb_to_dc));
+                words[11..15].copy_from_slice(&maybe_words(colour));
                 words
             })
             .collect();
-        self.run_ops(&launches.rewrite, &updates);
+        self.run_ops(launches.get("rewrite"), &updates);
         reborn.extend(ops.updates.iter().filter(|(_, u)| !u.keep_moments).map(|u| clear(u.0)));
         let seeded: Vec<_> = ops.seeds.iter().map(|&(row, _)| clear(row)).collect();
         self.copy_rows(&seeded, &[Edited::Inherited]);
@@ -180,13 +206,14 @@ impl GpuBackend {
                 let mut words = [0; WORDS];
                 words[0] = row;
                 words[1..4].copy_from_slice(&seed.position.map(f32::to_bits));
-                words[4] = seed.scale.ln().to_bits();
-                words[5] = logit(seed.opacity).to_bits();
-                words[6..9].copy_from_slice(&seed.colour.map(|c| rgb_to_dc(c).to_bits()));
+                words[4..7].copy_from_slice(&seed.scales.map(|scale| scale.ln().to_bits()));
+                words[7..11].copy_from_slice(&turn_words(seed.orientation));
+                words[11] = logit(seed.opacity).to_bits();
+                words[12..15].copy_from_slice(&seed.colour.map(|c| rgb_to_dc(c).to_bits()));
                 words
             })
             .collect();
-        self.run_ops(&launches.sow, &seeds);
+        self.run_ops(launches.get("sow"), &seeds);
         reborn.extend(seeded);
         self.copy_rows(&reborn, &[Edited::Cleared]);
         let moves: Vec<_> = ops.moves.iter().map(|&(from, to)| [from, to]).collect();
@@ -195,7 +222,7 @@ impl GpuBackend {
             let rows = ops.rows_after as u32;
             let waits = u32::from(self.sizes.waits()[0]);
             let now = [rows, logit(most).to_bits(), waits, 0];
-            self.execute(&[0], |to| to.run(&launches.clamp_opacity, now, rows.div_ceil(256)));
+            self.execute(&[0], |to| to.run(launches.get("clamp_opacity"), now, rows.div_ceil(256)));
         }
         if ops.reset_signals {
             self.clear_planes(&self.planes.sums());
@@ -217,7 +244,7 @@ impl GpuBackend {
 
 #[cfg(test)]
 mod tests {
-    use densify_policies::plan::{EditPlan, Offspring};
+    use densify_policies::plan::{EditPlan, Offspring, UNTURNED};
 
     use super::*;
 
@@ -230,6 +257,7 @@ mod tests {
                 parent: if row % 2 == 0 { ParentFate::BecomesChild } else { ParentFate::Stays },
                 placement: Placement::Sampled,
                 scale: ScaleRule::Uniform(0.5),
+                turn: UNTURNED,
                 opacity: OpacityRule::Conserved,
             };
             let _ = plan.grow(row, offspring);
@@ -261,7 +289,7 @@ mod tests {
                 .families
                 .iter()
                 .map(|family| {
-                    let becomes = family.offspring.parent == ParentFate::BecomesChild;
+                    let becomes = family.fate() == ParentFate::BecomesChild;
                     (family.parent, ops.children(family).to_vec(), u32::from(becomes))
                 })
                 .collect();

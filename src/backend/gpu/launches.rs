@@ -3,14 +3,15 @@
 //! A kernel's variable is bound to the buffer of its own name. Where one kernel works on several
 //! buffers, or on one that is only borrowed, the pairs here say which.
 
+use std::collections::HashMap;
+
 use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, ComputePipeline, Device};
 
-use super::accumulation::Accumulation;
 use super::buffers::Buffers;
 use super::pipelines::{Compiled, Pipelines};
 use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
-use crate::backend::Kept;
+use crate::backend::{Accumulation, Kept};
 
 /// What errors are read from: the loss's error per pixel, or its gradient.
 const MAPS: [&str; 2] = ["error", "pixel gradient"];
@@ -27,54 +28,19 @@ pub(super) struct Launch {
     pub(super) bindings: BindGroup,
 }
 
-/// All dispatches. Of pairs, the first reads `keys 0` and `values 0`.
+/// All dispatches.
 #[derive(Debug)]
 pub(super) struct Launches<L = Launch> {
-    pub(super) project: L,
-    pub(super) scan_blocks: L,
-    pub(super) scan_sums: L,
-    pub(super) compact: L,
-    pub(super) count_digits: [L; 2],
-    pub(super) scatter: [L; 2],
-    pub(super) scatter_order: L,
-    pub(super) count_entries: L,
-    pub(super) emit_entries: L,
-    pub(super) count_tiles: L,
-    pub(super) cut_bands: L,
-    pub(super) find_tiles: [L; 2],
-    pub(super) rasterize: [L; 2],
-    pub(super) similarity: L,
-    pub(super) pixel_gradient: L,
-    pub(super) loss_total: L,
-    pub(super) rasterize_bwd: [L; 2],
-    pub(super) project_bwd: L,
-    pub(super) adam_bands: [L; 4],
-    pub(super) adam_geometry: L,
-    pub(super) accumulate: L,
-    pub(super) measure: L,
-    pub(super) present: L,
-    pub(super) surface: [L; 2],
-    pub(super) count_errors: [L; 2],
-    pub(super) narrow: L,
-    pub(super) write_worst: [L; 2],
-    pub(super) replay: [L; 2],
-    pub(super) sums: Sums<L>,
+    /// By kernel: one, or as many as [`rebound`] has. Of kernels that differ by how a device adds up,
+    /// a device has one, whose name here is without `_atomic`.
+    by_kernel: HashMap<String, Vec<L>>,
+    /// Numbers of a record, whose sums atomics add to.
+    pub(super) record: u32,
+    /// Whether the device adds up in slots: it gathers, and has no sums to clear.
+    pub(super) in_slots: bool,
     /// Copies or clears rows, for every array that an edit touches.
     pub(super) copy_rows: Vec<RowLaunch<L>>,
-    pub(super) breed: L,
-    pub(super) rewrite: L,
-    pub(super) sow: L,
-    pub(super) clamp_opacity: L,
     pub(super) audits: Vec<Audit<L>>,
-}
-
-/// What comes before or after a tile kernel, so that its sums are those of rows.
-#[derive(Debug)]
-pub(super) enum Sums<L> {
-    /// After each band: of the backward pass, and of an auxiliary view.
-    Slots { gather: L, gather_columns: L },
-    /// Before the first one, the sums being of so many numbers per row.
-    Atomics { clear: L, numbers: u32 },
 }
 
 /// A kernel for one array of rows: how many numbers a row has, how far apart rows are, and a row's
@@ -106,7 +72,10 @@ impl Launches {
         buffers: &Buffers,
         sizes: &Sizes,
     ) -> Self {
-        Self::new(&|kernel, instead| launch(device, pipelines.get(kernel), buffers, instead), sizes)
+        let bind = |kernel: &str, instead: &[Instead]| {
+            launch(device, pipelines.get(kernel), buffers, instead)
+        };
+        Self::new(pipelines.names(), &bind, sizes)
     }
 }
 
@@ -131,89 +100,112 @@ fn launch(device: &Device, kernel: &Compiled, buffers: &Buffers, instead: &[Inst
     Launch { pipeline: kernel.pipeline.clone(), bindings }
 }
 
+/// What binds a kernel.
+type Bind<'a, L> = &'a dyn Fn(&str, &[Instead]) -> L;
+
 impl<L> Launches<L> {
-    /// Binds each kernel by name, with the buffers that are not those of its variables' names.
-    pub(super) fn new(bind: &dyn Fn(&'static str, &[Instead]) -> L, sizes: &Sizes) -> Self {
-        let both = |kernel, instead: &dyn Fn(usize) -> Vec<Instead>| {
-            [bind(kernel, &instead(0)), bind(kernel, &instead(1))]
+    /// Binds each kernel by name, and those of [`rebound`] to the buffers that it has for them.
+    pub(super) fn new<'k>(
+        kernels: impl Iterator<Item = &'k str>,
+        bind: Bind<'_, L>,
+        sizes: &Sizes,
+    ) -> Self {
+        let rebound = rebound();
+        let launches = |kernel: &str| match rebound.get(plain(kernel)) {
+            None => vec![bind(kernel, &[])],
+            Some(several) => several.iter().map(|instead| bind(kernel, instead)).collect(),
         };
-        let list = |i: usize| vec![("list", VALUES[i])];
-        let in_slots = sizes.accumulation == Accumulation::Slots;
-        let scatter = |i: usize, values_to| {
-            let from = [("keys in", KEYS[i]), ("values in", VALUES[i])];
-            [&from[..], &[("keys out", KEYS[1 - i]), ("values out", values_to)]].concat()
-        };
-        let replay = if in_slots { "replay" } else { "replay_atomic" };
-        let adam = |part: usize| {
-            let moments = [("first", FIRST[part]), ("second", SECOND[part])];
-            [&[("params", PARAMETERS[part]), ("waiting", WAITING[part])], &moments[..]].concat()
-        };
-        let row_launch = |array: &RowArray| RowLaunch {
-            launch: bind("copy_rows", &[("buffer", array.name)]),
-            edited: array.holds.traits().edited,
-            numbers: array.numbers as u32,
-            pitch: array.pitch(sizes.budget),
-        };
-        let mut edited = sizes.row_arrays();
-        edited.retain(|array| array.holds.traits().edited != Edited::Untouched);
+        let of_array = |kernel: &&str| !["copy_rows", "audit"].contains(kernel);
         Self {
-            project: bind("project", &[]),
-            scan_blocks: bind("scan_blocks", &[]),
-            scan_sums: bind("scan_sums", &[]),
-            compact: bind("compact", &[("keys out", KEYS[0]), ("values out", VALUES[0])]),
-            count_digits: both("count_digits", &|i| vec![("keys in", KEYS[i])]),
-            scatter: both("scatter", &|i| scatter(i, VALUES[1 - i])),
-            scatter_order: bind("scatter", &scatter(1, "order")),
-            count_entries: bind("count_entries", &[]),
-            emit_entries: bind("emit_entries", &[("keys out", KEYS[0])]),
-            count_tiles: bind("count_tiles", &[]),
-            cut_bands: bind("cut_bands", &[]),
-            find_tiles: both("find_tiles", &|i| vec![("keys in", KEYS[i])]),
-            rasterize: both("rasterize", &list),
-            similarity: bind("similarity", &[]),
-            pixel_gradient: bind("pixel_gradient", &[("gradient", "pixel gradient")]),
-            loss_total: bind("total", &[]),
-            rasterize_bwd: match in_slots {
-                true => both("rasterize_bwd", &list),
-                false => both("rasterize_bwd_atomic", &list),
-            },
-            project_bwd: bind("project_bwd", &[]),
-            adam_bands: std::array::from_fn(|band| bind("adam_band", &adam(1 + band))),
-            adam_geometry: bind("adam_geometry", &adam(0)),
-            accumulate: bind("accumulate", &[]),
-            measure: bind("measure", &[]),
-            // Borrows the sums of the sorts, which are not needed then and are long enough.
-            present: bind("present", &[("signals", "sums")]),
-            // Borrows the gradients of the rows, which are not needed between two steps.
-            surface: both("surface", &|i| {
-                [list(i), vec![("pixels", "ops"), ("points", "gradient")]].concat()
-            }),
-            count_errors: both("count_errors", &|i| vec![("map", MAPS[i])]),
-            narrow: bind("narrow", &[("worst", "gradient")]),
-            write_worst: both("write_worst", &|i| vec![("map", MAPS[i]), ("worst", "gradient")]),
-            replay: both(replay, &|i| [list(i), vec![("map", "pixel gradient")]].concat()),
-            sums: match in_slots {
-                true => Sums::Slots {
-                    gather: bind("gather", &[("all records", "records")]),
-                    gather_columns: bind("gather_columns", &[("all records", "records")]),
-                },
-                false => Sums::Atomics {
-                    clear: bind("clear_sums", &[]),
-                    numbers: sizes.records.stride() as u32,
-                },
-            },
-            copy_rows: edited.iter().map(row_launch).collect(),
-            breed: bind("breed", &[]),
-            rewrite: bind("rewrite", &[]),
-            sow: bind("sow", &[]),
-            clamp_opacity: bind("clamp_opacity", &[]),
+            by_kernel: kernels
+                .filter(of_array)
+                .map(|k| (plain(k).to_owned(), launches(k)))
+                .collect(),
+            record: sizes.records.stride() as u32,
+            in_slots: sizes.accumulation == Accumulation::Slots,
+            copy_rows: copies(bind, sizes),
             audits: audits(bind, sizes),
         }
     }
+
+    /// The dispatch of a kernel with this number.
+    ///
+    /// # Panics
+    /// When the device does not have it: a bug in the caller.
+    pub(super) fn nth(&self, kernel: &str, number: usize) -> &L {
+        let found = self.by_kernel.get(kernel).and_then(|launches| launches.get(number));
+        found.unwrap_or_else(|| panic!("this device has no launch {number} of `{kernel}`"))
+    }
+
+    /// The first dispatch of a kernel.
+    ///
+    /// # Panics
+    /// As [`nth`](Self::nth).
+    pub(super) fn get(&self, kernel: &str) -> &L {
+        self.nth(kernel, 0)
+    }
+}
+
+/// A kernel's name without the way of adding up.
+pub(super) fn plain(kernel: &str) -> &str {
+    kernel.strip_suffix("_atomic").unwrap_or(kernel)
+}
+
+/// The dispatches of the kernels whose variables are not all bound to buffers of their names: for each,
+/// the variables that are bound to others. Of pairs, the first reads `keys 0` and `values 0`.
+pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Instead>>> {
+    let both = |instead: &dyn Fn(usize) -> Vec<Instead>| vec![instead(0), instead(1)];
+    let list = |i: usize| ("list", VALUES[i]);
+    let scatter = |i: usize, values_to| {
+        let from = [("keys in", KEYS[i]), ("values in", VALUES[i])];
+        [&from[..], &[("keys out", KEYS[1 - i]), ("values out", values_to)]].concat()
+    };
+    let adam = |part: usize| {
+        let moments = [("first", FIRST[part]), ("second", SECOND[part])];
+        [&[("params", PARAMETERS[part]), ("waiting", WAITING[part])], &moments[..]].concat()
+    };
+    let keys_in = both(&|i| vec![("keys in", KEYS[i])]);
+    HashMap::from([
+        ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
+        ("count_digits", keys_in.clone()),
+        ("find_tiles", keys_in),
+        // The last writes the order of rows.
+        ("scatter", vec![scatter(0, VALUES[1]), scatter(1, VALUES[0]), scatter(1, "order")]),
+        ("emit_entries", vec![vec![("keys out", KEYS[0])]]),
+        ("rasterize", both(&|i| vec![list(i)])),
+        ("rasterize_bwd", both(&|i| vec![list(i)])),
+        ("similarity", vec![vec![("gradient", "pixel gradient")]]),
+        ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
+        ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
+        ("adam_geometry", vec![adam(0)]),
+        // Borrows the sums of the sorts, which are not needed then and are long enough.
+        ("present", vec![vec![("signals", "sums")]]),
+        // Borrows the gradients of the rows, which are not needed between two steps.
+        ("surface", both(&|i| vec![list(i), ("pixels", "ops"), ("points", "gradient")])),
+        ("count_errors", both(&|i| vec![("map", MAPS[i])])),
+        ("narrow", vec![vec![("worst", "gradient")]]),
+        ("write_worst", both(&|i| vec![("map", MAPS[i]), ("worst", "gradient")])),
+        ("replay", both(&|i| vec![list(i), ("map", "pixel gradient")])),
+        ("gather", vec![vec![("all records", "records")]]),
+        ("gather_columns", vec![vec![("all records", "records")]]),
+    ])
+}
+
+/// One dispatch for each array that an edit touches.
+fn copies<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
+    let copy = |array: &RowArray| RowLaunch {
+        launch: bind("copy_rows", &[("buffer", array.name)]),
+        edited: array.holds.traits().edited,
+        numbers: array.numbers as u32,
+        pitch: array.pitch(sizes.budget),
+    };
+    let arrays = sizes.row_arrays();
+    let edited = arrays.iter().filter(|array| array.holds.traits().edited != Edited::Untouched);
+    edited.map(copy).collect()
 }
 
 /// The marks borrow the sums of the sorts, which are not needed between two steps.
-fn audits<L>(bind: &dyn Fn(&'static str, &[Instead]) -> L, sizes: &Sizes) -> Vec<Audit<L>> {
+fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
     let arrays = sizes.row_arrays();
     let audit = |array: &RowArray| {
         let first = array.parameters.start as u32;

@@ -6,10 +6,10 @@
 //! processed in bands. As many are encoded as the step before needed; a step that needs more changes
 //! nothing, reports it, and is repeated with enough.
 //!
-//! With [`Accumulation::Slots`] every sum has a fixed order, so that runs on the same device are
-//! reproducible byte for byte. Otherwise the order of a row's sums over tiles varies.
+//! With [`Accumulation::Slots`](super::Accumulation::Slots) every sum has a fixed order, so that runs
+//! on the same device are reproducible byte for byte. Otherwise the order of a row's sums over tiles
+//! varies.
 
-mod accumulation;
 mod adapter;
 mod audit;
 mod buffers;
@@ -20,7 +20,6 @@ mod edits;
 mod frame;
 mod launches;
 mod observe;
-mod options;
 mod passes;
 mod photographs;
 mod pipelines;
@@ -41,21 +40,20 @@ use std::time::Duration;
 
 use densify_policies::plan::RowOps;
 use densify_policies::policy::{
-    Cadence, Candidate, LossTerms, Needs, NoiseTerm, SignalKind, SignalSet, Signals,
+    Cadence, Candidate, LossTerms, NoiseTerm, SignalKind, SignalSet, Signals,
 };
 
 use super::candidates::Candidates;
-use super::signals::SignalPlanes;
+use super::signals::{ParameterSignal, SignalPlanes};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
-    StepInput, StepOutput, Tensor, Unsound,
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, BackendOptions, Rendering,
+    Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 
-pub use accumulation::Accumulation;
-pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary, adapters, may_be_present};
+pub use adapter::{adapters, may_be_present};
 use buffers::{Buffers, bias_table};
 use device::Device;
 pub use device::GpuDevice;
@@ -63,11 +61,9 @@ pub use device::GpuDevice;
 pub(crate) use device::faults::with_device_lost_after;
 use frame::Frame;
 use launches::Launches;
-pub use options::GpuOptions;
-use options::MAX_SIDE;
-pub use photographs::KeptPhotographs;
 use photographs::PhotographPlaces;
 use pipelines::Variant;
+use promise::MAX_SIDE;
 use sizes::Sizes;
 
 /// Whether gradients wait for an optimiser step: of bands 1–3, and of all else.
@@ -102,22 +98,9 @@ pub struct GpuBackend {
 }
 
 impl GpuBackend {
-    /// Bytes per buffer of a backend made with these options for models of this degree; nothing is
-    /// allocated.
-    #[must_use]
-    pub fn promise(sh_degree: u8, options: &GpuOptions, device: &GpuDevice) -> Ledger {
-        promise::ledger(&promise::sizes(&device.0, sh_degree, options), &options.needs)
-    }
-
-    /// Most (row, tile) pairs that this device can hold at a time for such needs.
-    #[must_use]
-    pub fn most_pairs(needs: &Needs, device: &GpuDevice) -> u64 {
-        promise::most_pairs(&device.0, needs)
-    }
-
     fn without_canary(
         model: &Gaussians,
-        options: &GpuOptions,
+        options: &BackendOptions,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let shortcuts = options.shortcuts;
@@ -272,6 +255,10 @@ impl Backend for GpuBackend {
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
         let mut signals = Signals::zeros(self.rows, wanted);
         for signal in wanted.iter() {
+            if let Some(attribute) = ParameterSignal::of(signal) {
+                self.read_attribute(&attribute, signals.get_mut(signal).unwrap_or_default())?;
+                continue;
+            }
             let values = if signal.kind() == SignalKind::Present {
                 self.present(signal)?
             } else {
@@ -333,7 +320,7 @@ impl Backend for GpuBackend {
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
         assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
-        self.model_array(array, rows)
+        self.parameters_of(&array.parameters(self.sizes.sh_degree), rows)
     }
 
     fn upload_array(

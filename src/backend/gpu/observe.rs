@@ -20,7 +20,7 @@ use crate::dataset::images::Image8;
 const FOLD: f32 = 0.849_321_8;
 
 /// A view whose passes have run, so that its lists and its image are on the device.
-pub(super) struct Seen<'a> {
+pub(super) struct DrawnView<'a> {
     pub(super) frame: Frame,
     pub(super) shape: Shape,
     pub(super) target: &'a Image8,
@@ -53,7 +53,7 @@ impl GpuBackend {
     /// Adds the worst pixels of the view to the candidates; `search` is what was looked for, if it was.
     pub(super) fn collect_candidates(
         &mut self,
-        seen: &Seen<'_>,
+        drawn: &DrawnView<'_>,
         request: &CandidateRequest,
         count: usize,
         search: Option<Search>,
@@ -64,12 +64,12 @@ impl GpuBackend {
         };
         let worst = match found {
             Some(found) => {
-                let [width, height, ..] = seen.frame.image.map(|n| n as usize);
+                let [width, height, ..] = drawn.frame.image.map(|n| n as usize);
                 self.candidates.worst_of([width, height], count, request.spaced, found)
             }
-            None => self.worst_of_all(seen, request, count)?,
+            None => self.worst_of_all(drawn, request, count)?,
         };
-        for candidate in self.surface_points(seen, &worst, request.depth)? {
+        for candidate in self.surface_points(drawn, &worst, request.depth)? {
             self.candidates.push(candidate);
         }
         Ok(())
@@ -95,11 +95,11 @@ impl GpuBackend {
     /// The worst pixels, chosen on the host from a copy of all errors.
     fn worst_of_all(
         &mut self,
-        seen: &Seen<'_>,
+        drawn: &DrawnView<'_>,
         request: &CandidateRequest,
         count: usize,
     ) -> Result<Vec<(usize, usize, f32)>, BackendError> {
-        let [width, height, ..] = seen.frame.image.map(|n| n as usize);
+        let [width, height, ..] = drawn.frame.image.map(|n| n as usize);
         let pixels = width * height;
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
         let error: Vec<f32> = match request.error {
@@ -123,11 +123,11 @@ impl GpuBackend {
     /// that shows no surface.
     fn surface_points(
         &self,
-        seen: &Seen<'_>,
+        drawn: &DrawnView<'_>,
         pixels: &[(usize, usize, f32)],
         mode: DepthMode,
     ) -> Result<Vec<Candidate>, BackendError> {
-        let Seen { frame, shape, target } = seen;
+        let DrawnView { frame, shape, target } = drawn;
         let [width, ..] = frame.image;
         let [r, g, b, _] = frame.background;
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
@@ -174,12 +174,12 @@ impl GpuBackend {
         })?;
         let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height)?;
-        let seen = Seen { frame, shape, target };
+        let drawn = DrawnView { frame, shape, target };
         let points = if request.points == 0 {
             Vec::new()
         } else {
             let pixels = draw_pixels(&image.alpha, camera.width as usize, input);
-            self.surface_points(&seen, &pixels, DepthMode::MaxWeight)?
+            self.surface_points(&drawn, &pixels, DepthMode::MaxWeight)?
         };
         let columns = if request.columns.is_empty() {
             Vec::new()

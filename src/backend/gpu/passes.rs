@@ -3,7 +3,7 @@
 
 use wgpu::ComputePass;
 
-use super::launches::{Launch, Launches, Sums};
+use super::launches::{Launch, Launches};
 use super::sizes::BLOCK;
 
 /// Workgroups in the first of two dimensions; see `shaders/shared/view.wgsl`.
@@ -23,6 +23,8 @@ const COUNTS_BAND: u32 = 2;
 const COUNTS_AGAIN: u32 = 3;
 const DIGITS_OF_ROWS: u32 = 4;
 const DIGITS_OF_ENTRIES: u32 = 5;
+/// The launch of `scatter` that writes the order of rows.
+const TO_ORDER: usize = 2;
 /// In place of a band: the whole image.
 const WHOLE: u32 = u32::MAX;
 
@@ -104,9 +106,9 @@ impl Passes<'_> {
             (args::ROW_BLOCKS, args::ROW_DIGITS, DIGITS_OF_ROWS)
         };
         let now = [4 * pass, items, u32::from(items == 1 && pass == 0), 0];
-        to.run_counted(&l.count_digits[source], now, self.groups, blocks);
-        to.run_counted(&l.scan_blocks, [what, 0, 0, 0], self.groups, digits);
-        to.run(&l.scan_sums, [what, 0, 0, 0], 1);
+        to.run_counted(l.nth("count_digits", source), now, self.groups, blocks);
+        to.run_counted(l.get("scan_blocks"), [what, 0, 0, 0], self.groups, digits);
+        to.run(l.get("scan_sums"), [what, 0, 0, 0], 1);
         to.run_counted(scatter, now, self.groups, blocks);
     }
 
@@ -115,31 +117,30 @@ impl Passes<'_> {
     pub(super) fn forward(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let Shape { rows, bands, .. } = self.shape;
-        to.run(&l.project, [0; 4], rows.div_ceil(256));
-        to.run(&l.scan_blocks, [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
-        to.run(&l.scan_sums, [FLAGS, bands, 0, 0], 1);
-        to.run(&l.compact, [0; 4], rows.div_ceil(256));
+        to.run(l.get("project"), [0; 4], rows.div_ceil(256));
+        to.run(l.get("scan_blocks"), [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
+        to.run(l.get("scan_sums"), [FLAGS, bands, 0, 0], 1);
+        to.run(l.get("compact"), [0; 4], rows.div_ceil(256));
         for pass in 0..8 {
-            let scatter =
-                if pass == 7 { &l.scatter_order } else { &l.scatter[(pass % 2) as usize] };
-            self.sort_digit(to, pass, 0, scatter);
+            let number = if pass == 7 { TO_ORDER } else { pass as usize % 2 };
+            self.sort_digit(to, pass, 0, l.nth("scatter", number));
         }
         self.count(to, WHOLE, COUNTS_ALL);
         if bands > 1 {
-            to.run_counted(&l.count_tiles, [0; 4], self.groups, args::ROWS);
-            to.run(&l.cut_bands, [0, bands, 0, 0], 1);
+            to.run_counted(l.get("count_tiles"), [0; 4], self.groups, args::ROWS);
+            to.run(l.get("cut_bands"), [0, bands, 0, 0], 1);
         }
         for band in 0..bands {
             self.lists(to, band, COUNTS_BAND);
-            to.run(&l.rasterize[self.sorted()], [band, 0, 0, 0], self.shape.tiles);
+            to.run(l.nth("rasterize", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
         }
     }
 
     fn count(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
         let l = self.launches;
-        to.run_counted(&l.count_entries, [band, 0, 0, 0], self.groups, args::ROWS);
-        to.run_counted(&l.scan_blocks, [what, 0, 0, 0], self.groups, args::ROW_BLOCKS);
-        to.run(&l.scan_sums, [what, self.shape.bands, 0, 0], 1);
+        to.run_counted(l.get("count_entries"), [band, 0, 0, 0], self.groups, args::ROWS);
+        to.run_counted(l.get("scan_blocks"), [what, 0, 0, 0], self.groups, args::ROW_BLOCKS);
+        to.run(l.get("scan_sums"), [what, self.shape.bands, 0, 0], 1);
     }
 
     /// Which of the two key buffers holds the sorted entries.
@@ -155,21 +156,21 @@ impl Passes<'_> {
             self.count(to, band, what);
         }
         let tiles = if several { band } else { WHOLE };
-        to.run_counted(&l.emit_entries, [tiles, 0, 0, 0], self.groups, args::ROWS);
+        to.run_counted(l.get("emit_entries"), [tiles, 0, 0, 0], self.groups, args::ROWS);
         for pass in 0..self.shape.tile_passes() {
-            self.sort_digit(to, pass, 1, &l.scatter[(pass % 2) as usize]);
+            self.sort_digit(to, pass, 1, l.nth("scatter", pass as usize % 2));
         }
         let groups = (self.shape.tiles + 1).div_ceil(256);
-        to.run(&l.find_tiles[self.sorted()], [0; 4], groups);
+        to.run(l.nth("find_tiles", self.sorted()), [0; 4], groups);
     }
 
     /// Stage 4, with the weights of |e| and 1 − SSIM in the error per pixel.
     pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [f32; 2]) {
         let l = self.launches;
         let [a, b] = error_weights.map(f32::to_bits);
-        to.run(&l.similarity, [a, b, 0, 0], self.shape.tiles);
-        to.run(&l.pixel_gradient, [0; 4], self.shape.tiles);
-        to.run(&l.loss_total, [0; 4], 1);
+        to.run(l.get("similarity"), [a, b, 0, 0], self.shape.tiles);
+        to.run(l.get("pixel_gradient"), [0; 4], self.shape.tiles);
+        to.run(l.get("total"), [0; 4], 1);
     }
 
     /// Stage 5: from the pixels' gradients to one sum per row.
@@ -177,23 +178,23 @@ impl Passes<'_> {
         let l = self.launches;
         let Shape { rows, tiles, bands } = self.shape;
         let groups = rows.div_ceil(256);
-        if let Sums::Atomics { clear, numbers } = &l.sums {
-            to.run(clear, [*numbers, 0, 0, 0], groups);
+        if !l.in_slots {
+            to.run(l.get("clear_sums"), [l.record, 0, 0, 0], groups);
         }
         for band in 0..bands {
             if bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
             }
-            to.run(&l.rasterize_bwd[self.sorted()], [band, 0, 0, 0], tiles);
-            if let Sums::Slots { gather, .. } = &l.sums {
-                to.run(gather, [band, 0, 0, 0], groups);
+            to.run(l.nth("rasterize_bwd", self.sorted()), [band, 0, 0, 0], tiles);
+            if l.in_slots {
+                to.run(l.get("gather"), [band, 0, 0, 0], groups);
             }
         }
     }
 
     /// Stage 6.
     pub(super) fn differentiate(&self, to: &mut Recorder<'_>) {
-        to.run(&self.launches.project_bwd, [0; 4], self.shape.rows.div_ceil(256));
+        to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
     }
 
     /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends.
@@ -202,13 +203,13 @@ impl Passes<'_> {
         let groups = self.shape.rows.div_ceil(256);
         self.differentiate(to);
         if signals {
-            to.run(&l.accumulate, [0; 4], groups);
+            to.run(l.get("accumulate"), [0; 4], groups);
         }
         for band in 0..=usize::from(sh_degree) {
             let now = [(band * band) as u32, (2 * band + 1) as u32, 0, 0];
-            to.run(&l.adam_bands[band], now, groups);
+            to.run(l.nth("adam_band", band), now, groups);
         }
-        to.run(&l.adam_geometry, [0; 4], groups);
+        to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
     /// Writes the `wanted` worst pixels, and those as bad as the last of them, to the gradients of the
@@ -219,13 +220,13 @@ impl Passes<'_> {
         let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
         let of_pixel = [min_alpha.to_bits(), u32::from(of_gradient)];
         let now = |a, b| [a, b, of_pixel[0], of_pixel[1]];
-        to.run(&l.narrow, [0, wanted, 0, 0], 1);
+        to.run(l.get("narrow"), [0, wanted, 0, 0], 1);
         for shift in [24, 16, 8, 0] {
-            to.run(&l.count_errors[map], now(shift, u32::from(shift == 24)), groups);
-            to.run(&l.narrow, [1, 0, 0, 0], 1);
+            to.run(l.nth("count_errors", map), now(shift, u32::from(shift == 24)), groups);
+            to.run(l.get("narrow"), [1, 0, 0, 0], 1);
         }
-        to.run(&l.write_worst[map], now(0, room), groups);
-        to.run(&l.narrow, [2, 0, 0, 0], 1);
+        to.run(l.nth("write_worst", map), now(0, room), groups);
+        to.run(l.get("narrow"), [2, 0, 0, 0], 1);
     }
 
     /// Surface points of the pixels whose numbers are uploaded, from place `first` on.
@@ -235,7 +236,7 @@ impl Passes<'_> {
                 self.lists(to, band, COUNTS_AGAIN);
             }
             let now = [band, pixels, mode, first];
-            to.run(&self.launches.surface[self.sorted()], now, pixels.div_ceil(256));
+            to.run(self.launches.nth("surface", self.sorted()), now, pixels.div_ceil(256));
         }
     }
 
@@ -243,22 +244,22 @@ impl Passes<'_> {
     pub(super) fn columns(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);
-        if let Sums::Atomics { clear, .. } = &l.sums {
-            to.run(clear, [COLUMNS, 0, 0, 0], groups);
+        if !l.in_slots {
+            to.run(l.get("clear_sums"), [COLUMNS, 0, 0, 0], groups);
         }
         for band in 0..self.shape.bands {
             if self.shape.bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
             }
-            to.run(&l.replay[self.sorted()], [band, 0, 0, 0], self.shape.tiles);
-            if let Sums::Slots { gather_columns, .. } = &l.sums {
-                to.run(gather_columns, [band, 0, 0, 0], groups);
+            to.run(l.nth("replay", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
+            if l.in_slots {
+                to.run(l.get("gather_columns"), [band, 0, 0, 0], groups);
             }
         }
     }
 
     /// Counts the view for the largest weight of fresh views.
     pub(super) fn measure(&self, to: &mut Recorder<'_>) {
-        to.run(&self.launches.measure, [0; 4], self.shape.rows.div_ceil(256));
+        to.run(self.launches.get("measure"), [0; 4], self.shape.rows.div_ceil(256));
     }
 }

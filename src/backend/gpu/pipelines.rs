@@ -5,10 +5,10 @@ use std::collections::HashMap;
 use densify_policies::policy::Signal;
 use wgpu::{ComputePipeline, Device, ShaderModule};
 
-use super::accumulation::Accumulation;
 use super::shaders::{Binding, STAGES};
+use crate::backend::Accumulation;
 use crate::backend::Shortcuts;
-use crate::backend::signals::{Field, RecordLayout};
+use crate::backend::signals::{Field, ParameterSignal, RecordLayout};
 
 /// What kernels are compiled for.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,7 +32,9 @@ impl Variant {
         ];
         let place = |field| self.records.at(field).unwrap_or(0) as f64;
         all.extend(Field::ALL.map(|field| (field.constant().to_owned(), place(field))));
-        all.extend(Signal::ALL.map(|signal| (constant(signal), f64::from(signal as u32))));
+        let is_computed = |signal: &Signal| ParameterSignal::of(*signal).is_none();
+        let computed = Signal::ALL.into_iter().filter(is_computed);
+        all.extend(computed.map(|signal| (constant(signal), f64::from(signal as u32))));
         all
     }
 }
@@ -66,7 +68,7 @@ impl Pipelines {
     /// Builds every kernel of the variant.
     pub(super) fn new(device: &Device, variant: Variant) -> Self {
         let mut kernels = HashMap::new();
-        for stage in &STAGES {
+        for stage in STAGES {
             let Some(text) = stage.text(variant.accumulation) else { continue };
             let parsed = stage.parse(&text);
             let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -84,6 +86,10 @@ impl Pipelines {
             }
         }
         Self { kernels }
+    }
+
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.kernels.keys().map(String::as_str)
     }
 
     /// # Panics

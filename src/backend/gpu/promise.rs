@@ -2,13 +2,16 @@
 
 use densify_policies::policy::{AuxRequest, Candidate, Needs};
 
-use super::accumulation::Accumulation;
 use super::device::Device;
-use super::options::{GpuOptions, MAX_SIDE};
 use super::sizes::{MOST_ENTRIES, Sizes};
+use crate::backend::Accumulation;
+use crate::backend::BackendOptions;
 use crate::backend::candidates::Candidates;
 use crate::backend::signals::RecordLayout;
 use crate::memory::{Ledger, Section};
+
+/// Largest image side `[px]`; at this size every index of the stages still fits its type.
+pub(super) const MAX_SIDE: u32 = 16_384;
 
 /// Most (row, tile) pairs that this device can hold at a time for such needs.
 pub(super) fn most_pairs(device: &Device, needs: &Needs) -> u64 {
@@ -20,7 +23,7 @@ pub(super) fn most_pairs(device: &Device, needs: &Needs) -> u64 {
     (device.largest_binding() / (4 * numbers)).min(MOST_ENTRIES)
 }
 
-pub(super) fn sizes(device: &Device, sh_degree: u8, options: &GpuOptions) -> Sizes {
+pub(super) fn sizes(device: &Device, sh_degree: u8, options: &BackendOptions) -> Sizes {
     let budget = options.budget.max(1);
     let cap = match options.tile_cap {
         Some(cap) => cap as u64,

@@ -3,11 +3,11 @@
 use densify_policies::policy::{Cadence, ErrorMode, Needs};
 use wgpu::BufferUsages;
 
-use super::accumulation::Accumulation;
 use super::frame::{Frame, State, grid};
-use super::photographs::KeptPhotographs;
 use super::rows::{Holds, RowArray, row_arrays};
-use crate::backend::signals::{RecordLayout, SignalPlanes};
+use crate::backend::Accumulation;
+use crate::backend::KeptPhotographs;
+use crate::backend::signals::{Field, RecordLayout, SignalPlanes};
 use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, Section};
 
@@ -126,7 +126,7 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
-        let channels = if self.more { 5 } else { 3 };
+        let channels = if self.more { 5 } else { 3 + u64::from(self.records.has(Field::Error)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
         add(Section::Renderer, "loss", "derivatives", 36 * pixels);
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);

@@ -3,10 +3,11 @@
 use std::time::Instant;
 
 use super::frame::{due, target as of_target};
-use super::observe::Seen;
+use super::observe::DrawnView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
 use crate::backend::candidates::error_weights;
+use crate::backend::signals::Field;
 use crate::backend::{BackendError, StepInput, StepOutput};
 
 impl GpuBackend {
@@ -45,6 +46,9 @@ impl GpuBackend {
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.bring_photograph(input.view, target);
         frame.for_step(input, due, (self.terms, self.noise), &self.planes);
+        if self.sizes.records.has(Field::Error) {
+            frame.draw[3] |= of_target::BY_PIXEL;
+        }
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.backward(to);
@@ -63,8 +67,8 @@ impl GpuBackend {
                     passes.worst(to, search);
                 }
             })?;
-            let seen = Seen { frame, shape, target };
-            self.collect_candidates(&seen, &request, count, search)?;
+            let drawn = DrawnView { frame, shape, target };
+            self.collect_candidates(&drawn, &request, count, search)?;
             self.go_on(shape, step);
             state
         } else {

@@ -1,9 +1,9 @@
 //! Submits a view's passes, and again with more bands where there were too few.
 
-use super::accumulation::Accumulation;
 use super::frame::{Frame, State};
 use super::passes::{Passes, Recorder, Shape};
 use super::{GpuBackend, readback};
+use crate::backend::Accumulation;
 use crate::backend::BackendError;
 
 impl GpuBackend {

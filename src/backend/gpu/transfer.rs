@@ -8,7 +8,8 @@ use super::frame::target;
 use super::passes::Recorder;
 use super::rows::{Holds, RowArray};
 use super::{GpuBackend, readback};
-use crate::backend::{BackendError, Rendering};
+use crate::backend::signals::ParameterSignal;
+use crate::backend::{BackendError, Rendering, pieces};
 use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, ModelArray};
 
@@ -140,16 +141,15 @@ impl GpuBackend {
         self.read(array.name, bytes * rows.start as u64, bytes * rows.len() as u64)
     }
 
-    /// Some rows of one of the model's arrays.
-    pub(super) fn model_array(
+    /// Some parameters of some rows, row after row.
+    pub(super) fn parameters_of(
         &self,
-        array: ModelArray,
+        wanted: &Range<usize>,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let wanted = array.parameters(self.sizes.sh_degree);
         let mut all = vec![0.0; wanted.len() * rows.len()];
         for from in self.sizes.parameters() {
-            if let Some((here, there)) = shared(&wanted, &from.parameters) {
+            if let Some((here, there)) = shared(wanted, &from.parameters) {
                 let read = self.read_rows(&from, rows.clone())?;
                 let to = all.chunks_exact_mut(wanted.len());
                 for (to, from) in to.zip(read.chunks_exact(from.numbers)) {
@@ -160,7 +160,23 @@ impl GpuBackend {
         Ok(all)
     }
 
-    /// Writes what [`model_array`](Self::model_array) returned for the same rows.
+    /// Reads an attribute of all rows, some at a time.
+    pub(super) fn read_attribute(
+        &self,
+        attribute: &ParameterSignal,
+        column: &mut [f32],
+    ) -> Result<(), BackendError> {
+        let width = attribute.parameters.len();
+        for rows in pieces(self.rows) {
+            let values = self.parameters_of(&attribute.parameters, rows.clone())?;
+            for (to, from) in column[width * rows.start..].iter_mut().zip(values) {
+                *to = (attribute.shown)(from);
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes what [`parameters_of`](Self::parameters_of) returned of one of the model's arrays.
     pub(super) fn set_model_array(
         &self,
         array: ModelArray,
@@ -200,7 +216,7 @@ impl GpuBackend {
         let pass = encoder.begin_compute_pass(&Default::default());
         let mut to = Recorder { pass };
         let rows = self.rows as u32;
-        to.run(&self.launches.present, [signal as u32, rows, 0, 0], rows.div_ceil(256));
+        to.run(self.launches.get("present"), [signal as u32, rows, 0, 0], rows.div_ceil(256));
         drop(to);
         self.device.queue.submit([encoder.finish()]);
         self.read("sums", 0, 4 * self.rows as u64)

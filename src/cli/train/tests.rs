@@ -7,7 +7,8 @@ use clap::FromArgMatches;
 use tempfile::TempDir;
 
 use super::*;
-use crate::backend::gpu::{AdapterKind, adapters, with_device_lost_after};
+use crate::backend::AdapterKind;
+use crate::backend::gpu::{adapters, with_device_lost_after};
 use crate::dataset::tests::write::Made;
 use crate::failure::{DEVICE, INPUT, OTHER};
 use crate::output::disk::{Fault, Operation, with_fault};

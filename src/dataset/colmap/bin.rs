@@ -16,7 +16,7 @@ use super::super::tracks::{MAX_VIEWS, TrackSampler};
 use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
-use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, checked_size};
+use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME, checked_size};
 use crate::foreign;
 
 /// A file and the number of bytes left.
@@ -35,8 +35,12 @@ impl<'a> Reader<'a> {
     }
 
     fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
+        self.mended_by(REMEDY, field, problem)
+    }
+
+    fn mended_by(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
         let place = format!("byte {}: {field}", self.length - self.left);
-        DatasetError::malformed(self.path, place, problem, REMEDY)
+        DatasetError::malformed(self.path, place, problem, remedy)
     }
 
     /// Counts bytes as read; an error if the file has fewer.
@@ -111,9 +115,8 @@ impl<'a> Reader<'a> {
                 _ => return Err(self.fault(field, "the name is longer than 4 KiB")),
             }
         }
-        String::from_utf8(name).map_err(|_| {
-            self.fault(field, "the name is not UTF-8; rename the image, and make the model again")
-        })
+        let text = String::from_utf8(name);
+        text.map_err(|_| self.mended_by(RENAME, field, "the name is not UTF-8"))
     }
 
     fn end(&self, what: &str, count: u64) -> Result<(), DatasetError> {

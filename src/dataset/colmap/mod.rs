@@ -20,6 +20,8 @@ use super::undistort::Lens;
 use super::{Frame, PointCloud, Scene};
 
 const REMEDY: &str = "export the model again with COLMAP";
+/// The remedy for names of images that are not UTF-8.
+const RENAME: &str = "rename the image, and make the model again";
 
 /// Most records accepted.
 const MAX_IMAGES: u64 = 1_000_000;
@@ -120,12 +122,11 @@ pub(super) fn read(
     Ok(Scene {
         listing: images,
         frames,
-        first_missing: None,
         points: model.points,
         points_file: Some(points),
         tracks: model.tracks,
-        own_split: false,
         notes,
+        ..Scene::default()
     })
 }
 

@@ -15,7 +15,7 @@ use super::super::tracks::TrackSampler;
 use super::super::undistort::Lens;
 use super::super::{PointCloud, pose};
 use super::model::Model;
-use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, checked_size};
+use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME, checked_size};
 use crate::foreign;
 
 /// Longest line accepted: the observations of one image, about 40 bytes each.
@@ -35,12 +35,12 @@ impl<'a> Lines<'a> {
     }
 
     fn fault(&self, field: &str, problem: impl Display) -> DatasetError {
-        DatasetError::malformed(
-            self.path,
-            format!("line {}: {field}", self.number),
-            problem,
-            REMEDY,
-        )
+        self.mended_by(REMEDY, field, problem)
+    }
+
+    fn mended_by(&self, remedy: &str, field: &str, problem: impl Display) -> DatasetError {
+        let place = format!("line {}: {field}", self.number);
+        DatasetError::malformed(self.path, place, problem, remedy)
     }
 
     /// Reads the next line, comment or not; false at the end.
@@ -75,7 +75,8 @@ impl<'a> Lines<'a> {
     }
 
     fn text(&self) -> Result<&str, DatasetError> {
-        std::str::from_utf8(&self.line).map_err(|_| self.fault("the line", "it is not UTF-8"))
+        let text = std::str::from_utf8(&self.line);
+        text.map_err(|_| self.mended_by(RENAME, "the line", "a name in it is not UTF-8"))
     }
 
     /// The next word of the line as a number.

@@ -65,7 +65,7 @@ fn colmap_text() {
         }
     }
     type Edit = (&'static str, fn(&Made), &'static str);
-    let cases: [Edit; 10] = [
+    let cases: [Edit; 11] = [
         ("no cameras", |m| m.remove("sparse/0/cameras.txt"), "cameras.txt, check that it exists"),
         ("no points", |m| m.remove("sparse/0/points3D.txt"), "points3D.txt"),
         ("zero images", |m| m.write("sparse/0/images.txt", "# none\n"), "images.txt, no image"),
@@ -88,6 +88,15 @@ fn colmap_text() {
         ("bad points", |m| three_points(m, ["nan", "-inf", "inf"]), "points3D.txt, 3 of 200"),
         ("far points", |m| three_points(m, ["1e300", "1e300", "-1e300"]), "points3D.txt, 3 of 200"),
         ("not UTF-8", |m| m.patch("sparse/0/points3D.txt", |b| b[20] = 0xff), "points3D.txt"),
+        (
+            "a name",
+            |m| {
+                m.patch("sparse/0/images.txt", |b| {
+                    *b.iter_mut().rfind(|b| **b == b'p').unwrap() = 0xff
+                })
+            },
+            "images.txt, UTF-8, rename the image",
+        ),
     ];
     for (case, edit, words) in cases {
         let made = Made::colmap_txt();
@@ -121,7 +130,7 @@ const COLMAP_BINARY: &[Patch] = &[
     ("images", |b| b[..8].fill(0xff), "images.bin, number of images"),
     ("images", |b| b[78..86].fill(0xff), "images.bin, truncated"),
     ("images", |b| *b = [&b[..72], &[b'x'; 9000]].concat(), "images.bin, 4 KiB"),
-    ("images", |b| b[72] = 0xff, "images.bin, UTF-8"),
+    ("images", |b| b[72] = 0xff, "images.bin, UTF-8, rename the image"),
     ("images", |b| b[44..52].fill(0xff), "images.bin, image a.png, not finite"),
     ("points3D", |b| b[4] = 1, "points3D.bin, number of points"),
     ("points3D", |b| b.truncate(b.len() - 1), "points3D.bin"),
@@ -218,6 +227,9 @@ fn transforms() {
         set(json, "/camera_angle_x", "4.0");
     });
     refused("angle", &made, &options, "intrinsics, fx");
+    let made = Made::transforms(|_| ());
+    made.patch("transforms.json", |b| *b.iter_mut().find(|b| **b == b'a').unwrap() = 0xff);
+    refused("not UTF-8", &made, &options, "transforms.json, save it as UTF-8");
     let made = Made::transforms(|_| ());
     made.replace("transforms.json", "15.0", "NaN");
     refused("NaN", &made, &options, "transforms.json, line 1");

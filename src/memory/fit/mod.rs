@@ -17,6 +17,8 @@ pub struct RunSize {
     pub tile_cap: usize,
     /// Bytes of decoded images held at a time.
     pub image_cache: u64,
+    /// Bytes of training images that stay on a GPU, at most.
+    pub images_on_gpu: u64,
 }
 
 /// The limit, the wanted size, and what may be chosen.
@@ -41,6 +43,8 @@ pub struct SizeRequest {
     pub most_pairs: usize,
     /// Bytes of decoded images; `None`: to be chosen.
     pub image_cache: Option<u64>,
+    /// Most bytes of decoded images that are chosen at the expense of rows.
+    pub most_images: u64,
     /// Bytes of all images decoded.
     pub all_images: u64,
 }
@@ -67,14 +71,16 @@ impl SizeRequest {
     fn setting(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
         let most = self.most_pairs.max(rows);
         let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
-        let images = || self.all_images.min(self.memory / IMAGES);
+        let share = self.memory / IMAGES;
+        let images = || self.all_images.min(share).min(self.most_images);
         let image_cache = self.image_cache.unwrap_or_else(images);
-        RunSize { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache }
+        let images_on_gpu = image_cache.min(share);
+        RunSize { rows, sh_degree, tile_cap: tile_cap.max(rows), image_cache, images_on_gpu }
     }
 }
 
-/// Finds the largest setting. `bytes` returns what a setting takes; it must not shrink as rows, pairs
-/// or images grow, and images must take at most their cache and a fixed part. `None`: not even the
+/// Finds the largest setting. `bytes` returns what a setting takes; once above the memory it must stay
+/// above it as rows, pairs or images grow, and images must take at most their cache and a fixed part. `None`: not even the
 /// fewest rows fit.
 ///
 /// The degree is the highest at which enough rows fit, or else the lowest. Rows are as many as fit; if
@@ -141,7 +147,7 @@ pub fn min_memory<E>(
 
 /// The largest number in `least..=most` for which `holds` is true; it must be true up to some number
 /// and false above.
-fn most_within<E>(
+pub(crate) fn most_within<E>(
     least: usize,
     most: usize,
     mut holds: impl FnMut(usize) -> Result<bool, E>,

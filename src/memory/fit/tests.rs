@@ -19,7 +19,7 @@ struct Model {
 
 impl Model {
     fn bytes(&self, setting: &RunSize) -> u64 {
-        let RunSize { rows, sh_degree, tile_cap, image_cache } = *setting;
+        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = *setting;
         let coefficients = (u64::from(sh_degree) + 1).pow(2);
         let rows = rows.next_multiple_of(16) as u64;
         let held = image_cache.max(2 * self.largest_image) + self.largest_image;
@@ -55,6 +55,7 @@ fn request(model: &Model, memory: u64) -> SizeRequest {
         pairs: PAIRS,
         most_pairs: u32::MAX as usize,
         image_cache: None,
+        most_images: 1 << 30,
         all_images: model.all_images,
     }
 }

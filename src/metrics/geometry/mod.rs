@@ -5,27 +5,22 @@
 //! bounding box. The weight of a row, w, is the sum of its blend weights α·T over all pixels of all
 //! training views. Samples have a fixed seed, so that results can be repeated.
 
-mod centres;
-mod pixels;
-mod rows;
-mod visibility;
+#[cfg(feature = "scenegen")]
+mod measure;
+#[cfg(not(feature = "scenegen"))]
+#[path = "without_scenegen.rs"]
+mod measure;
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, Signal, SignalSet};
-use densify_scenegen::{GroundTruth, Sight};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::backend::Backend;
-use crate::camera::Camera;
+use crate::dataset::GroundTruth;
 use crate::dataset::normalise::Normalisation;
-use crate::evaluate::EvaluateError;
-use crate::views::ViewSource;
-use pixels::Pixels;
-use rows::Rows;
-use visibility::Visibility;
+pub use measure::measure;
 
 /// The results. Values without data (no centre, no pixel, no thin structure) are NaN, or `null` in
 /// JSON.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Geometry {
     /// Depth on the views measured.
     pub depth: DepthErrors,
@@ -47,7 +42,7 @@ pub struct Geometry {
 
 /// Rendered depth, Σ α·T·z / Σ α·T, against that of the first surface, over the pixels that show a
 /// surface and have a rendered alpha above 0.5.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct DepthErrors {
     /// Root mean square error `[diagonals]`.
     #[serde(deserialize_with = "or_nan")]
@@ -61,7 +56,7 @@ pub struct DepthErrors {
 }
 
 /// Distances between centres and surface. Large Gaussians may well have their centres off it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct CentreErrors {
     /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
     #[serde(deserialize_with = "or_nan")]
@@ -88,7 +83,7 @@ pub struct CentreErrors {
 /// Rows of opacity above 0.05 whose distance from the mesh exceeds 1 % of the diagonal and twice their
 /// largest standard deviation, at a place that is empty in at least two training views: their first
 /// surface is farther away, or there is none.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Floaters {
     /// Their number.
     pub count: usize,
@@ -103,7 +98,7 @@ pub struct Floaters {
 /// Pixels that show a thin structure of about this width. They count as found if alpha is above 0.5,
 /// the depth error is below the thickness plus 1 % of the depth, and the colour error, mean over
 /// channels, is below 0.1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ThinRecall {
     /// Width in the image, to the nearest power of two `[px]`.
     pub width: f64,
@@ -114,7 +109,7 @@ pub struct ThinRecall {
 }
 
 /// How much rows contribute to the training views.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Redundancy {
     /// Mean number of rows blended per pixel.
     #[serde(deserialize_with = "or_nan")]
@@ -125,7 +120,7 @@ pub struct Redundancy {
 }
 
 /// The scene that a model is measured in.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct KnownScene<'a> {
     /// The surface.
     pub truth: &'a GroundTruth,
@@ -135,6 +130,8 @@ pub struct KnownScene<'a> {
     pub background: [f32; 3],
     /// Spherical-harmonic degree evaluated, <= the model's.
     pub sh_degree: u8,
+    /// Asked before each view; measuring ends with an error once it is true.
+    pub is_stopped: &'a dyn Fn() -> bool,
 }
 
 /// The needs with which the backend for [`measure`] is made.
@@ -149,69 +146,17 @@ pub fn needs() -> Needs {
     }
 }
 
-/// Measures the model in `backend`, which was made for [`needs`]: weights and visibility in the views
-/// trained on; depth, normals and thin structures in `views`.
-pub fn measure(
-    backend: &mut dyn Backend,
-    ground: &KnownScene<'_>,
-    train: &impl ViewSource,
-    views: &impl ViewSource,
-) -> Result<Geometry, EvaluateError> {
-    let rows = Rows::new(&backend.download()?, ground);
-    let visibility = Visibility::measure(backend, ground, &rows, train)?;
-    let mut pixels = Pixels::new(&rows, ground)?;
-    for view in 0..views.count() {
-        pixels.add(backend, views, view)?;
-    }
-    Ok(Geometry {
-        depth: pixels.depth(),
-        normal_error: pixels.normal_error(),
-        centres: centres::errors(&rows, &visibility, ground)?,
-        floaters: visibility.floaters(&rows, ground.diagonal()),
-        thin: pixels.thin(),
-        redundancy: visibility.redundancy(),
-    })
-}
-
-impl KnownScene<'_> {
-    /// Diagonal of the mesh's bounding box `[world units]`.
-    fn diagonal(&self) -> f64 {
-        self.truth.surface().diagonal()
-    }
-
-    /// A view's camera in world coordinates, for projecting and for casting rays.
-    fn cameras(&self, scene: &Camera) -> (Camera, densify_scenegen::Camera) {
-        let world = self.normalisation.world_from_scene_camera(scene);
-        let caster = densify_scenegen::Camera {
-            width: world.width,
-            height: world.height,
-            fx: world.fx,
-            fy: world.fy,
-            cx: world.cx,
-            cy: world.cy,
-            world_from_camera: world.rotation.transpose(),
-            centre: world.centre(),
-        };
-        (world, caster)
-    }
-
-    fn sight(&self, name: &str, caster: &densify_scenegen::Camera) -> Result<Sight, EvaluateError> {
-        let sight = self.truth.sight(name, caster);
-        sight.map_err(|e| EvaluateError::View { view: name.to_owned(), source: e.into() })
-    }
-}
-
-/// `sum / count`; NaN if `count` is 0.
-fn ratio(sum: f64, count: f64) -> f64 {
-    // An empty sum is −0.
-    if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
+/// Memory for [`measure`] beside the backend and the surface, at most `[bytes]`: of each row two copies
+/// of the model (as it is read, or on its way from the backend), its place, axes and sums, two search
+/// trees; of each pixel the renders, the surface's depth and normals and their files; samples and angles.
+#[must_use]
+pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64 {
+    let row = 2 * 4 * (11 + 3 * crate::gaussians::sh_coefficients(sh_degree) as u64) + 512;
+    let pixels = u64::from(image.0) * u64::from(image.1);
+    rows as u64 * row + pixels * 128 + views as u64 * (16 << 10) + (4 << 20)
 }
 
 /// JSON has no NaN, and writes it as null.
 fn or_nan<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(from)?.unwrap_or(f64::NAN))
 }
-
-#[cfg(test)]
-#[allow(clippy::float_cmp, reason = "exact values")]
-mod tests;

@@ -12,7 +12,7 @@ use super::disk::{Operation, attempt};
 use super::lock::FolderLock;
 use super::tensorboard::PREFIX as EVENTS_PREFIX;
 use super::{CONFIG_FILE, OutputError};
-use replacement::{NEW, OLD, REPLACED, hidden, recover, replace, suffix};
+use replacement::{NEW, OLD, REPLACED, Stuck, hidden, recover, replace, suffix};
 
 /// Files and folders of a run. Everything else in its folder belongs to the user and is left alone.
 const OWNED: [&str; 11] = [
@@ -209,13 +209,15 @@ impl RunFolder {
         let Some(suffix) = &self.staged else {
             return Ok(self.target.clone());
         };
-        match self.lock.confirm().and_then(|()| replace(&self.target, suffix)) {
+        let confirmed = self.lock.confirm().map_err(|source| Stuck { source, aside: None });
+        match confirmed.and_then(|()| replace(&self.target, suffix)) {
             Ok(()) => {
                 remove_all(Self::staged(&self.target));
                 Ok(self.target.clone())
             }
-            Err(source) => {
-                Err(OutputError::NotReplaced { staging: self.path(), source: Box::new(source) })
+            Err(Stuck { source, aside }) => {
+                let source = Box::new(source);
+                Err(OutputError::NotReplaced { staging: self.path(), aside, source })
             }
         }
     }

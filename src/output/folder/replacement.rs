@@ -4,8 +4,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::{move_run, remove_all};
+use super::{attempt, move_run, remove_all};
 use crate::output::OutputError;
+use crate::output::disk::Operation;
 
 /// Hidden folder of a run that is to replace another, with a suffix of its own.
 pub(super) const NEW: &str = ".densify-new-";
@@ -15,25 +16,37 @@ pub(super) const OLD: &str = ".densify-old-";
 /// What [`OLD`] is called once all of the old run is in it: from then on the new run counts.
 pub(super) const REPLACED: &str = ".densify-replaced-";
 
-/// Replaces the run in `target` by that in the hidden folder of this suffix, or leaves both unchanged.
-/// Killed within, it is ended by [`recover`].
-pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), OutputError> {
+/// Why a run could not take the place of another.
+pub(super) struct Stuck {
+    pub(super) source: OutputError,
+    /// Where (part of) the old run lies, if it could not be moved back either.
+    pub(super) aside: Option<PathBuf>,
+}
+
+/// Replaces the run in `target` by that in the hidden folder of this suffix, or leaves both unchanged as
+/// far as possible. Killed or stuck within, it is ended by [`recover`].
+pub(super) fn replace(target: &Path, suffix: &str) -> Result<(), Stuck> {
     let [new, old, replaced] =
         [NEW, OLD, REPLACED].map(|prefix| target.join(format!("{prefix}{suffix}")));
-    fs::create_dir(&old).map_err(OutputError::io("create the folder", &old))?;
-    let out_of_the_way = move_run(target, &old)
-        .and_then(|()| fs::rename(&old, &replaced).map_err(OutputError::io("rename", &old)));
-    if let Err(error) = out_of_the_way {
-        // What cannot be moved back stays where it is, for `recover`.
-        let _ = move_run(&old, target).map(|()| fs::remove_dir(&old));
-        return Err(error);
-    }
-    if let Err(error) = move_run(&new, target) {
-        let _ = move_run(target, &new)
-            .and_then(|()| move_run(&replaced, target))
-            .map(|()| fs::remove_dir(&replaced));
-        return Err(error);
-    }
+    // What cannot be moved back stays where it is, for `recover`.
+    let stuck = |source, aside: &Path, moved_back: Result<(), OutputError>| {
+        if moved_back.is_ok() {
+            let _ = fs::remove_dir(aside);
+        }
+        Stuck { source, aside: moved_back.err().map(|_| aside.to_owned()) }
+    };
+    let created = attempt(Operation::Create, &old).and_then(|()| fs::create_dir(&old));
+    created
+        .map_err(OutputError::io("create the folder", &old))
+        .map_err(|source| Stuck { source, aside: None })?;
+    let rename = || attempt(Operation::Rename, &old).and_then(|()| fs::rename(&old, &replaced));
+    move_run(target, &old)
+        .and_then(|()| rename().map_err(OutputError::io("rename", &old)))
+        .map_err(|source| stuck(source, &old, move_run(&old, target)))?;
+    move_run(&new, target).map_err(|source| {
+        let back = move_run(target, &new).and_then(|()| move_run(&replaced, target));
+        stuck(source, &replaced, back)
+    })?;
     remove_all([new, replaced]);
     Ok(())
 }

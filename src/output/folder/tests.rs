@@ -82,6 +82,40 @@ fn a_run_that_cannot_take_its_place_leaves_the_old_one_there() {
     }
 }
 
+/// Whatever fails, and moving back with it: it is said where the files lie, and they are all there for the
+/// next run.
+#[test]
+fn a_run_that_is_stuck_on_its_way_is_said_to_be_there() {
+    // An operation fails from the so many-th on; whether the old run lies aside; which run counts then.
+    for (operation, file, spared, aside, counts) in [
+        (Operation::Create, "", 0, None, "old"),
+        (Operation::Rename, "", 1, Some(OLD), "old"),
+        (Operation::Rename, "", 2, Some(OLD), "old"),
+        (Operation::Rename, "", 3, Some(REPLACED), "new"),
+        (Operation::Rename, "", 4, Some(REPLACED), "new"),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["cameras.json", "config.toml"] {
+            write(&root.path().join(name), "old");
+        }
+        let run = RunFolder::create(root.path(), true).unwrap();
+        for name in ["config.toml", "results.json"] {
+            write(&run.path().join(name), "new");
+        }
+        let fault = Fault { operation, file, spared, kind: std::io::ErrorKind::Other };
+        let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
+        let what = format!("{operation:?} {spared}: {error}");
+        let lies =
+            tree(root.path()).into_iter().find(|name| aside.is_some_and(|it| name.starts_with(it)));
+        assert_eq!(lies.is_some(), aside.is_some(), "{what}");
+        assert_eq!(error.contains("is unchanged"), aside.is_none(), "{what}");
+        assert!(lies.is_none_or(|name| error.contains(&name)), "{what}");
+        RunFolder::settle(root.path()).unwrap();
+        assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), counts, "{what}");
+        assert_eq!(root.path().join("cameras.json").exists(), counts == "old", "{what}");
+    }
+}
+
 #[test]
 fn a_run_that_goes_on_finds_nothing_half_written() {
     let root = tempfile::tempdir().unwrap();

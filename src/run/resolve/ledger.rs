@@ -1,18 +1,20 @@
 //! What a run takes, buffer by buffer, for any size of it, before anything of it is allocated. A run, the
 //! solver for `--memory` and `densify plan` read this ledger, so they cannot disagree.
 
-use densify_policies::plan::BYTES_PER_ROW;
+use densify_policies::plan::bytes_per_row;
 use densify_policies::policy::Needs;
 use glam::DVec3;
 
 use super::{DECODERS, Inputs};
-use crate::backend::gpu::KeptPhotographs;
-use crate::backend::{BackendOptions, ROWS_AT_A_TIME};
+use crate::backend::{
+    BackendOptions, KeptPhotographs, MomentStorage, ROWS_AT_A_TIME, Shortcuts, Storage,
+};
 use crate::dataset::{Dataset, View};
 use crate::export::{PLY, Shape};
 use crate::gaussians::sh_coefficients;
-use crate::memory::{IMAGES, Ledger, RunSize, Section};
-use crate::metrics::scratch_bytes;
+use crate::memory::{Ledger, RunSize, Section};
+use crate::metrics::{geometry, scratch_bytes};
+use crate::run::measuring::Measuring;
 use crate::trainer::AutoChoices;
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
@@ -26,6 +28,11 @@ const KEPT: u64 = 6 << 20;
 /// What a policy makes of its signals for each row before it plans: means, orders, sums of weights
 /// and draws. Those that make more of auxiliary views' columns have these counted twice.
 const PLANNING: u64 = 20;
+/// What a thread of either pool takes: what it touches of its stack and keeps of its buffers. Measured at
+/// 44 to 52 KiB for both together, from 64 to 256 threads.
+const THREAD: u64 = 64 << 10;
+/// What is promised holds for any number of threads up to this, so that it does not depend on them.
+pub(super) const THREADS: usize = 64;
 /// A point with its colour.
 const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
 
@@ -40,7 +47,7 @@ impl Inputs<'_> {
             near: (self.spec.start.near.0 * self.dataset.extent()) as f32,
             tile_cap: Some(setting.tile_cap),
             record_cap: self.record_cap(setting),
-            threads: self.spec.device.threads.map(|threads| usize::from(threads.get())),
+            threads: self.spec.device.threads.map(|threads| threads.0 as usize),
             largest_image: self.dataset.largest_image(),
             photographs: self.kept_photographs(setting),
             storage: self.knobs.storage,
@@ -58,25 +65,20 @@ impl Inputs<'_> {
         }
     }
 
-    /// What of the training images stays on a GPU: as much as decoded images may take on the host, and
-    /// no more than their share of the device's memory.
+    /// What of the training images stays on a GPU.
     fn kept_photographs(&self, setting: &RunSize) -> KeptPhotographs {
         let train = &self.dataset.train;
         let with_masks = train.iter().any(|view| view.source.mask.is_some());
         let one = KeptPhotographs::bytes(self.dataset.largest_image(), with_masks);
-        let room = self.spec.size.memory.map_or(u64::MAX, |memory| memory.0 / IMAGES);
-        let room = room.min(setting.image_cache);
-        let count = usize::try_from(room / one.iter().sum::<u64>().max(1)).unwrap_or(usize::MAX);
+        let count = setting.images_on_gpu / one.iter().sum::<u64>().max(1);
+        let count = usize::try_from(count).unwrap_or(usize::MAX);
         KeptPhotographs { count: count.min(train.len()), with_masks }
     }
 
-    /// Everything that a run takes with these needs, on so many threads.
-    pub(in crate::run) fn ledger(
-        &self,
-        setting: &RunSize,
-        needs: &Needs,
-        threads: usize,
-    ) -> Ledger {
+    /// Everything that a run takes with these needs: the one function that tells the bytes of a size,
+    /// to which the solver finds the largest size.
+    pub(in crate::run) fn ledger(&self, setting: &RunSize, needs: &Needs) -> Ledger {
+        let threads = self.threads().max(THREADS);
         let degree = setting.sh_degree;
         let options = self.backend_options(setting, needs.clone());
         let mut ledger = self.device.promise(degree, &options, threads);
@@ -110,7 +112,7 @@ impl Inputs<'_> {
             let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
             // While it is asked which rows are missed: their order, and their opacities twice or, when
             // that is done, a plan.
-            let row = float + (2 * float).max(BYTES_PER_ROW as u64);
+            let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
             let asked = if self.required.rows { budget * row } else { 0 };
             pass("measuring a view", rendering + image + scratch_bytes(width, threads) + asked);
         }
@@ -119,7 +121,29 @@ impl Inputs<'_> {
             ledger.add_to(Section::Before, "loading the scene", beyond);
         }
         ledger.add_to(Section::Process, "program and dataset", process);
-        ledger
+        let stacks = threads as u64 * THREAD;
+        ledger.add_to(Section::Process, format!("up to {threads} threads"), stacks);
+        let Some(measuring) = self.measuring(setting, threads) else { return ledger };
+        let counted = measuring.counted(&ledger, setting.rows, degree);
+        // It does not lower the number of rows: where memory is given and too little, it is left out.
+        match self.memory() {
+            Some(memory) if self.device.limited_bytes(&counted) > memory => ledger,
+            _ => counted,
+        }
+    }
+
+    /// How the model is measured at the end, where views are held out and the surface is known.
+    pub(in crate::run) fn measuring(&self, setting: &RunSize, threads: usize) -> Option<Measuring> {
+        let surface = self.dataset.surface_bytes.filter(|_| !self.dataset.test.is_empty())?;
+        let options = BackendOptions {
+            photographs: KeptPhotographs::default(),
+            // Nothing is trained, so moments may be small.
+            storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
+            shortcuts: Shortcuts::default(),
+            ..self.backend_options(setting, geometry::needs())
+        };
+        let (device, views) = (self.device.clone(), self.dataset.test.len());
+        Some(Measuring { device, options, threads, surface, views })
     }
 
     /// Signals on the host, the plan, and what the policy makes of the former.
@@ -128,13 +152,14 @@ impl Inputs<'_> {
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
         // The native backend has room for them.
-        let signals = self.device.columns_on_host(needs.signals.count()) as u64;
+        let signals = self.device.columns_on_host(needs.signals.width()) as u64;
         // One auxiliary view's columns, and as many that a policy makes of them; all views' points.
         let aux = needs.aux.as_ref();
         let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
         let points = aux.map_or(0, |request| u64::from(request.points));
         // A point is kept by the policy, becomes a seed, and is compiled.
-        setting.rows as u64 * ((signals + columns) * float + BYTES_PER_ROW as u64 + PLANNING)
+        let plan = bytes_per_row(needs) as u64;
+        setting.rows as u64 * ((signals + columns) * float + plan + PLANNING)
             + points * self.dataset.train.len() as u64 * (candidate + 3 * seed)
     }
 

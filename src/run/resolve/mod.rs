@@ -4,7 +4,10 @@
 mod degree;
 mod ledger;
 mod plan;
+mod remedy;
 mod size;
+#[cfg(test)]
+mod tests;
 
 use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::PolicyEntry;
@@ -16,12 +19,12 @@ pub(super) use size::{Size, check, check_grant};
 
 use super::config::RunConfig;
 use super::observer::Observer;
-use super::spec::{DataSpec, RunSpec};
-use super::values::{Budget, InitChoice, ShDegree};
-use crate::backend::gpu::Accumulation;
+use super::spec::RunSpec;
+use super::values::{Budget, InitChoice, ShDegree, Threads};
+use crate::backend::Accumulation;
 use crate::backend::{BackendKind, Device};
 use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, Resolution, Tracks, View};
+use crate::dataset::{Dataset, Tracks, View};
 use crate::failure::Failure;
 use crate::init::usable_points;
 use crate::knobs::Knobs;
@@ -46,8 +49,6 @@ pub(super) struct Inputs<'a> {
     pub(super) parameters: Table,
     pub(super) knobs: Knobs,
     pub(super) device: Device,
-    /// How the dataset was read.
-    pub(super) data: DataSpec,
     pub(super) dataset: Dataset,
     pub(super) degree: Degree,
     /// What the run is to find out by itself.
@@ -72,7 +73,7 @@ impl<'a> Inputs<'a> {
         let mut knobs = spec.knobs()?;
         check_full(spec)?;
         let device = open(spec, &mut knobs, observer)?;
-        use_threads(spec.device.threads.map(std::num::NonZeroU16::get));
+        use_threads(spec.device.threads);
         let scene = spec.scene()?;
         let with_tracks = saved.is_none() && spec.size.sh_degree == Some(ShDegree::Auto(None));
         let mut dataset = Dataset::load(scene, &spec.data.load_options(with_tracks))?;
@@ -82,21 +83,21 @@ impl<'a> Inputs<'a> {
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
         let usable = usable_points(&dataset.points);
         let images = images(&dataset);
-        let (resident, peak) = (resident(), peak_resident());
+        // Tracks have a line of their own, and are given back.
+        let resident = resident().map(|now| now.saturating_sub(dataset.tracks.bytes()));
+        let peak = peak_resident();
         let degree = Degree::decide(spec, saved, &dataset)?;
         dataset.tracks = Tracks::default();
         let required = AutoChoices {
             rows: spec.size.budget.is_some_and(Budget::is_auto),
             scored_views: !spec.size.full,
         };
-        let data = spec.data.clone();
         Ok(Self {
             spec,
             entry,
             parameters,
             knobs,
             device,
-            data,
             dataset,
             degree,
             required,
@@ -107,13 +108,24 @@ impl<'a> Inputs<'a> {
         })
     }
 
-    /// The same with images of another size; `None` where there are none of it.
-    fn at_resolution(&self, resolution: Resolution) -> Option<Self> {
-        let data = DataSpec { resolution: Some(resolution), ..self.data.clone() };
-        let dataset = Dataset::load(self.spec.scene().ok()?, &data.load_options(false)).ok()?;
-        let (parameters, knobs) = (self.parameters.clone(), self.knobs.clone());
-        let (device, degree, images) = (self.device.clone(), self.degree.clone(), images(&dataset));
-        Some(Self { dataset, images, data, parameters, knobs, device, degree, ..*self })
+    /// The same scene on the same device, with other options of size, policy, knobs or resolution.
+    fn with(&self, spec: &'a RunSpec) -> Result<Self, Failure> {
+        let is_same = spec.data.resolution == self.spec.data.resolution;
+        let dataset = match is_same {
+            true => self.dataset.clone(),
+            false => Dataset::load(spec.scene()?, &spec.data.load_options(false))?,
+        };
+        let degree = match spec.size.sh_degree == self.spec.size.sh_degree {
+            true => self.degree.clone(),
+            false => Degree::decide(spec, None, &dataset)?,
+        };
+        let knobs = match spec.schedule.knob == self.spec.schedule.knob {
+            true => self.knobs.clone(),
+            false => spec.knobs()?,
+        };
+        let (entry, parameters) = spec.policy()?;
+        let (images, device) = (images(&dataset), self.device.clone());
+        Ok(Self { spec, entry, parameters, knobs, dataset, degree, images, device, ..*self })
     }
 
     /// How the first rows are placed.
@@ -149,7 +161,7 @@ impl<'a> Inputs<'a> {
             budget,
             initial_rows,
             iterations: self.spec.schedule.iterations.0,
-            white_background: self.data.background == Background::White,
+            white_background: self.spec.data.background == Background::White,
         })
     }
 
@@ -179,7 +191,7 @@ impl<'a> Inputs<'a> {
         self.spec
             .device
             .threads
-            .map_or_else(rayon::current_num_threads, |threads| usize::from(threads.get()))
+            .map_or_else(rayon::current_num_threads, |threads| threads.0 as usize)
     }
 }
 
@@ -189,10 +201,10 @@ pub(super) fn random_count(budget: usize) -> usize {
 }
 
 /// Limits rayon's common pool, which measuring uses, to the threads the user grants.
-pub(crate) fn use_threads(threads: Option<u16>) {
+pub(crate) fn use_threads(threads: Option<Threads>) {
     if let Some(threads) = threads {
         // It fails only if the pool is in use already; then its size is what it is.
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads));
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.0 as usize);
         let _ = pool.build_global();
     }
 }

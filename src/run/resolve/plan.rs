@@ -2,20 +2,21 @@
 
 use std::fmt;
 
-use super::size::{self, RESOLUTIONS, Size};
+use super::size::{self, MIB, RESOLUTIONS, Size};
 use super::{Inputs, RunSpec};
 use crate::dataset::Resolution;
 use crate::failure::Failure;
-use crate::memory::{Bytes, Ledger};
+use crate::memory::Ledger;
 use crate::number::grouped;
 use crate::run::observer::Observer;
+use crate::run::values::ByteCount;
 
 /// How large a run would be, and what it would take.
 #[derive(Debug, Clone)]
 pub struct Plan {
     /// Bytes per buffer.
     pub ledger: Ledger,
-    /// Why the size is what it is, a line each.
+    /// Why the size is what it is, a line each, and the ledger.
     pub lines: Vec<String>,
     /// What else the same memory holds.
     pub alternatives: Alternatives,
@@ -36,29 +37,41 @@ pub struct Alternatives {
 pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     let inputs = Inputs::load(spec, None, observer)?;
     let size = Size::choose(&inputs)?;
-    let lines = inputs.degree.line().into_iter().chain(size.lines(&inputs)).collect();
-    let needs = inputs.needs(size.setting.rows)?;
-    let ledger = inputs.ledger(&size.setting, &needs, inputs.threads());
-    size::check(&inputs, &ledger)?;
-    let memory = spec.size.memory.map_or_else(|| inputs.device.limited_bytes(&ledger), |it| it.0);
-    let alternatives = alternatives(inputs, memory)?;
+    let rows = size.setting.rows;
+    let ledger = inputs.ledger(&size.setting, &inputs.needs(rows)?);
+    let lines = inputs.degree.line().into_iter().chain(size.lines(&inputs));
+    let lines = lines.chain([inputs.promise(&ledger)]).collect();
+    let limited = inputs.device.limited_bytes(&ledger);
+    let memory = spec.size.memory.map_or(limited.next_multiple_of(MIB), |it| it.0);
+    let alternatives = alternatives(&inputs, memory, rows)?;
     Ok(Plan { ledger, lines, alternatives })
 }
 
-fn alternatives(inputs: Inputs<'_>, memory: u64) -> Result<Alternatives, Failure> {
-    let own = inputs.data.resolution.unwrap_or(Resolution::Divisor(1));
-    let mut all: Vec<(Resolution, Inputs<'_>)> = RESOLUTIONS
-        .into_iter()
-        .filter(|&resolution| resolution != own)
-        .filter_map(|resolution| Some((resolution, inputs.at_resolution(resolution)?)))
-        .collect();
-    all.push((own, inputs));
-    all.sort_by_key(|(resolution, _)| match resolution {
+/// What `memory` holds, as the solver finds it for such a run without `--budget`; `planned` rows are a model.
+fn alternatives(inputs: &Inputs<'_>, memory: u64, planned: usize) -> Result<Alternatives, Failure> {
+    let own = inputs.spec.data.resolution.unwrap_or(Resolution::Divisor(1));
+    let mut resolutions = vec![own];
+    resolutions.extend(RESOLUTIONS.into_iter().filter(|&other| other != own));
+    resolutions.sort_by_key(|resolution| match resolution {
         Resolution::Width(_) => 0,
         Resolution::Divisor(divisor) => *divisor,
     });
-    let rows_at =
-        |degree| all.iter().map(|(_, inputs)| size::rows_at(inputs, memory, degree)).collect();
+    let specs = resolutions.into_iter().map(|resolution| {
+        let mut spec = inputs.spec.clone();
+        spec.size.memory = Some(ByteCount(memory));
+        spec.data.resolution =
+            Some(resolution).filter(|_| resolution != own).or(spec.data.resolution);
+        (resolution, spec)
+    });
+    let specs: Vec<(Resolution, RunSpec)> = specs.collect();
+    // Where there are no images of a size, it is left out.
+    let at = |(resolution, spec)| Some((resolution, inputs.with(spec).ok()?));
+    let all: Vec<(&Resolution, Inputs<'_>)> =
+        specs.iter().filter_map(|(resolution, spec)| at((resolution, spec))).collect();
+    let rows_at = |degree| {
+        let at = |(_, inputs): &(_, Inputs<'_>)| size::rows_at(inputs, memory, degree, planned);
+        all.iter().map(at).collect()
+    };
     Ok(Alternatives {
         memory,
         images: all
@@ -71,7 +84,12 @@ fn alternatives(inputs: Inputs<'_>, memory: u64) -> Result<Alternatives, Failure
 
 impl fmt::Display for Alternatives {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Gaussians that --memory {} holds\n  {:<11}", Bytes(self.memory), "")?;
+        // As it can be typed, and nothing rounded.
+        let memory = match self.memory % MIB {
+            0 => format!("{}MiB", self.memory / MIB),
+            _ => self.memory.to_string(),
+        };
+        write!(f, "Gaussians that --memory {memory} holds\n  {:<11}", "")?;
         for (resolution, (width, height)) in &self.images {
             write!(f, "{:>22}", format!("-r {resolution} ({width}x{height})"))?;
         }

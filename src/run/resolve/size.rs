@@ -1,14 +1,16 @@
 //! How large a run is: as the options say, or solved for `--memory`.
 
+use super::remedy::{Change, any_of, remedies};
 use super::{DECODERS, Inputs, TEST_DECODERS};
 use crate::backend::BackendKind;
 use crate::dataset::Resolution;
 use crate::failure::{DEVICE, Failure};
 use crate::memory::{
-    Bytes, Fit, Ledger, MemoryLimit, PAIRS, RunSize, SizeRequest, fit, grant, min_memory, resident,
+    Bytes, Fit, IMAGES, Ledger, MemoryLimit, PAIRS, RunSize, SizeRequest, fit, grant, min_memory,
+    most_within, resident,
 };
 use crate::number::grouped;
-use crate::run::values::Budget;
+use crate::run::values::{Budget, ByteCount, ImageCache};
 
 /// Most rows, where `--budget` is not given: trains on a laptop in well under 2 GiB, and carries a room or
 /// an object; large outdoor scenes want more.
@@ -19,10 +21,8 @@ const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 const PAIRS_PER_ROW: usize = 16;
 /// Fewer rows are no model of a scene, unless fewer are asked for.
 const LEAST_ROWS: usize = 1_000;
-/// The solution holds for any number of threads up to this, so that it does not depend on them.
-const THREADS: usize = 64;
 /// What "give --memory" is rounded up to.
-const MIB: u64 = 1 << 20;
+pub(super) const MIB: u64 = 1 << 20;
 /// Divisors of the images' sides that are alternatives.
 pub(super) const RESOLUTIONS: [Resolution; 3] =
     [Resolution::Divisor(1), Resolution::Divisor(2), Resolution::Divisor(4)];
@@ -41,12 +41,24 @@ impl Size {
         let most = most_pairs(inputs, rows)?;
         let per_row = inputs.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
         let pairs = rows.saturating_mul(per_row).min(most);
-        let setting = RunSize {
+        let mut setting = RunSize {
             rows,
             sh_degree: inputs.degree.highest(),
             tile_cap: inputs.tile_cap().unwrap_or(pairs).max(rows),
-            image_cache: inputs.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE),
+            image_cache: 0,
+            images_on_gpu: 0,
         };
+        setting.image_cache = match inputs.spec.size.image_cache {
+            None => DEFAULT_IMAGE_CACHE,
+            Some(ImageCache::Bytes(bytes)) => bytes,
+            // With the rest these are an eighth.
+            Some(ImageCache::Auto) => {
+                let rest = inputs.ledger(&setting, &inputs.needs(rows)?).on_host();
+                (rest / (IMAGES - 1)).min(DEFAULT_IMAGE_CACHE).min(inputs.all_images())
+            }
+        };
+        let share = inputs.memory().map_or(u64::MAX, |memory| memory / IMAGES);
+        setting.images_on_gpu = inputs.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE).min(share);
         Ok(Self { setting, solved: None })
     }
 
@@ -55,19 +67,9 @@ impl Size {
     /// # Errors
     /// When nothing fits, with what would.
     pub(in crate::run) fn choose(inputs: &Inputs<'_>) -> Result<Self, Failure> {
-        if let (Some(cap), Some(pairs)) = (inputs.tile_cap(), inputs.knobs.pairs_per_row) {
-            return Err(Failure::input(format!(
-                "--tile-cap {cap} and --knob pairs_per_row={pairs} contradict each other; give one of \
-                 them, such as --tile-cap {cap} with pairs_per_row=auto"
-            )));
-        }
-        let Some(memory) = inputs.memory() else {
-            return Self::as_given(inputs);
-        };
-        let request = request(inputs, memory)?;
-        match fit(&request, |setting| bytes(inputs, setting))? {
-            Some(fit) => Ok(Self { setting: fit.setting, solved: Some((memory, fit)) }),
-            None => Err(too_little(inputs, &request)?),
+        match (solve(inputs)?, inputs.memory()) {
+            (Some(size), _) => Ok(size),
+            (None, memory) => Err(too_little(inputs, &request(inputs, memory.unwrap_or(0))?)?),
         }
     }
 
@@ -78,7 +80,7 @@ impl Size {
 
     /// What there is to say about it, a line each.
     pub(in crate::run) fn lines(&self, inputs: &Inputs<'_>) -> Vec<String> {
-        let RunSize { rows, sh_degree, tile_cap, image_cache } = self.setting;
+        let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.setting;
         let said = grouped(rows);
         let Some((memory, fit)) = &self.solved else {
             let default = match inputs.spec.size.budget {
@@ -129,12 +131,21 @@ impl Size {
 }
 
 impl Inputs<'_> {
+    /// The ledger, and what it leaves of `--memory`.
+    pub(in crate::run) fn promise(&self, ledger: &Ledger) -> String {
+        let left = self.memory().map(|it| it.saturating_sub(self.device.limited_bytes(ledger)));
+        let left = left.map_or_else(String::new, |left| {
+            format!("\n  {:<11} {} of --memory", "left", Bytes(left))
+        });
+        format!("memory promised\n{ledger}{left}")
+    }
+
     /// Most rows, where a number is given.
     fn budget(&self) -> Option<usize> {
         self.spec.size.budget.and_then(Budget::most)
     }
 
-    fn memory(&self) -> Option<u64> {
+    pub(super) fn memory(&self) -> Option<u64> {
         self.spec.size.memory.map(|bytes| bytes.0)
     }
 
@@ -142,53 +153,125 @@ impl Inputs<'_> {
         self.spec.size.tile_cap.map(|pairs| pairs.0)
     }
 
+    /// Bytes of decoded photographs, where a number is given.
     fn image_cache(&self) -> Option<u64> {
-        self.spec.size.image_cache.map(|bytes| bytes.0)
+        match self.spec.size.image_cache? {
+            ImageCache::Bytes(bytes) => Some(bytes),
+            ImageCache::Auto => None,
+        }
     }
 }
 
-/// Fails where a run would take more than `--memory`. Where that was solved for, it cannot be.
-pub(in crate::run) fn check(inputs: &Inputs<'_>, ledger: &Ledger) -> Result<(), Failure> {
+/// Fails where a run would take more than `--memory`. Where that was solved for, it cannot be: of a run
+/// that goes on, tile lists and photographs may have been given anew.
+pub(in crate::run) fn check(
+    inputs: &Inputs<'_>,
+    setting: &RunSize,
+    ledger: &Ledger,
+) -> Result<(), Failure> {
     let needed = inputs.device.limited_bytes(ledger);
-    match inputs.memory() {
-        Some(memory) if needed > memory => Err(Failure::input(format!(
-            "--memory {}: this run takes {}; lower --tile-cap, --image-cache or --threads",
-            Bytes(memory),
-            Bytes(needed)
-        ))),
-        _ => Ok(()),
-    }
+    let Some(memory) = inputs.memory().filter(|memory| needed > *memory) else { return Ok(()) };
+    let fits = |pairs: usize| {
+        let size = RunSize { tile_cap: pairs, ..*setting };
+        Ok::<_, Failure>(bytes(inputs, &size)? <= memory)
+    };
+    let pairs = most_within(setting.rows, setting.tile_cap, fits)?.unwrap_or(setting.rows);
+    let changes = [Change::NoImages, Change::TileCap(pairs)];
+    let found = remedies(inputs, inputs.spec, &changes, |inputs| {
+        Ok(bytes(inputs, &Size::as_given(inputs)?.setting)? <= memory)
+    });
+    let remedy = match &found[..] {
+        [] => "leave out --tile-cap, --image-cache and --threads".to_owned(),
+        found => format!("give {}", any_of(found)),
+    };
+    Err(Failure::input(format!(
+        "--memory {}: this run takes {}; {remedy}",
+        Bytes(memory),
+        Bytes(needed)
+    )))
 }
 
 /// Fails where the system does not grant this process what a run takes.
-pub(in crate::run) fn check_grant(inputs: &Inputs<'_>, ledger: &Ledger) -> Result<(), Failure> {
+pub(in crate::run) fn check_grant(
+    inputs: &Inputs<'_>,
+    setting: &RunSize,
+    is_resumed: bool,
+) -> Result<(), Failure> {
+    let ledger = inputs.ledger(setting, &inputs.needs(setting.rows)?);
     let granted = grant(inputs.threads() + DECODERS + TEST_DECODERS);
     let (Some(MemoryLimit { left, by }), Some(now)) = (granted, resident()) else { return Ok(()) };
     let more = ledger.on_host().saturating_sub(now);
     if more <= left {
         return Ok(());
     }
+    // Not all: what is granted varies from call to call.
+    let most = (now + left) / 64 * 63;
+    let on_host = |inputs: &Inputs<'_>| {
+        let Some(Size { setting, .. }) = solve(inputs)? else { return Ok(false) };
+        let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows)?);
+        Ok::<_, Failure>(ledger.on_host() <= most)
+    };
+    let mut base = inputs.spec.clone();
+    let mut found = Vec::new();
+    if !is_resumed && inputs.device.kind() == BackendKind::Cpu {
+        // On a GPU it would limit the device's memory.
+        let words = format!("--memory {}MiB", most / MIB);
+        base.size.memory = Some(ByteCount(most / MIB * MIB));
+        found = match inputs.with(&base).and_then(|inputs| on_host(&inputs)).unwrap_or(false) {
+            true => vec![words],
+            false => remedies(inputs, &base, &Change::NEW, on_host)
+                .into_iter()
+                .map(|more| format!("{words} {more}"))
+                .collect(),
+        };
+    } else if !is_resumed {
+        found = remedies(inputs, &base, &Change::NEW, on_host);
+    }
+    let remedy = match &found[..] {
+        [] => "free memory, or raise that limit".to_owned(),
+        found => format!("give {}, or free memory", any_of(found)),
+    };
     Err(Failure {
         code: DEVICE,
         message: format!(
             "this run takes {} of the host's memory, of which the process has {}; {by} leaves it {}; \
-             give --memory {}MiB, or lower --budget",
+             {remedy}",
             Bytes(ledger.on_host()),
             Bytes(now),
             Bytes(left),
-            (now + left) / MIB
         ),
     })
 }
 
-/// The rows that fit in `memory` at a degree, where nothing else limits them.
+/// The size of a run as the options say, or as large as `--memory` allows; `None` where nothing fits.
+///
+/// # Errors
+/// When options contradict each other.
+pub(super) fn solve(inputs: &Inputs<'_>) -> Result<Option<Size>, Failure> {
+    if let (Some(cap), Some(pairs)) = (inputs.tile_cap(), inputs.knobs.pairs_per_row) {
+        return Err(Failure::input(format!(
+            "--tile-cap {cap} and --knob pairs_per_row={pairs} contradict each other; give one of \
+             them, such as --tile-cap {cap} with pairs_per_row=auto"
+        )));
+    }
+    let Some(memory) = inputs.memory() else {
+        return Size::as_given(inputs).map(Some);
+    };
+    let fit = fit(&request(inputs, memory)?, |setting| bytes(inputs, setting))?;
+    Ok(fit.map(|fit| Size { setting: fit.setting, solved: Some((memory, fit)) }))
+}
+
+/// The rows that fit in `memory` at a degree, where nothing else limits them; fewer than
+/// [`LEAST_ROWS`] only where as few were planned.
 pub(super) fn rows_at(
     inputs: &Inputs<'_>,
     memory: u64,
     sh_degree: u8,
+    planned: usize,
 ) -> Result<Option<usize>, Failure> {
     let request = SizeRequest {
         sh_degree: sh_degree..=sh_degree,
+        least_rows: LEAST_ROWS.min(planned),
         most_rows: inputs.device.largest_budget(sh_degree),
         ..request(inputs, memory)?
     };
@@ -196,10 +279,10 @@ pub(super) fn rows_at(
     Ok(fit.map(|fit| fit.setting.rows))
 }
 
+/// Bytes of a size that `--memory` limits.
 fn bytes(inputs: &Inputs<'_>, setting: &RunSize) -> Result<u64, Failure> {
     let needs = inputs.needs(setting.rows)?;
-    let threads = inputs.threads().max(THREADS);
-    Ok(inputs.device.limited_bytes(&inputs.ledger(setting, &needs, threads)))
+    Ok(inputs.device.limited_bytes(&inputs.ledger(setting, &needs)))
 }
 
 fn request(inputs: &Inputs<'_>, memory: u64) -> Result<SizeRequest, Failure> {
@@ -219,6 +302,7 @@ fn request(inputs: &Inputs<'_>, memory: u64) -> Result<SizeRequest, Failure> {
             BackendKind::Gpu => Some(inputs.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE)),
             BackendKind::Cpu => inputs.image_cache(),
         },
+        most_images: DEFAULT_IMAGE_CACHE,
         all_images: inputs.all_images(),
     })
 }
@@ -228,46 +312,24 @@ fn most_pairs(inputs: &Inputs<'_>, rows: usize) -> Result<usize, Failure> {
     Ok(inputs.device.most_pairs(&inputs.needs(rows)?))
 }
 
-/// What to say where not even the least model fits: what it would take, and what would help.
+/// What to say where not even the least model fits: what it would take, and what fits, each tried.
 fn too_little(inputs: &Inputs<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
-    let least_of = |inputs: &Inputs<'_>, request: &SizeRequest| {
-        min_memory(request, MIB, |setting| bytes(inputs, setting))
-    };
     let rows = LEAST_ROWS.min(request.most_rows);
     let degree = *request.sh_degree.start();
     let given = Bytes(request.memory);
-    let Some(least) = least_of(inputs, request)? else {
+    let Some(least) = min_memory(request, MIB, |setting| bytes(inputs, setting))? else {
         return Ok(Failure::input(format!("--memory {given}: no size of a run can be computed")));
     };
-    let mut message = format!(
-        "--memory {given} holds no model of this scene: {} rows at degree {degree} take {} MiB; give \
-         --memory {}MiB",
+    let mut found = remedies(inputs, inputs.spec, &Change::NEW, |it| Ok(solve(it)?.is_some()));
+    let fewer = SizeRequest { least_rows: 1, ..request.clone() };
+    if let Some(fewer) = fit(&fewer, |setting| bytes(inputs, setting))? {
+        found.push(format!("--budget {}", fewer.setting.rows));
+    }
+    found.push(format!("--memory {}MiB", least / MIB));
+    Ok(Failure::input(format!(
+        "--memory {given} holds no model of this scene: {} rows at degree {degree} take {} MiB; give {}",
         grouped(rows),
         least / MIB,
-        least / MIB
-    );
-    // Options that were given and take more than they must.
-    let fixed = [
-        (inputs.tile_cap().is_some_and(|cap| cap > rows), "--tile-cap"),
-        (inputs.image_cache().is_some_and(|cache| cache > 0), "--image-cache"),
-        (degree > 0, "--sh-degree"),
-    ];
-    let free =
-        SizeRequest { tile_cap: None, image_cache: None, sh_degree: 0..=degree, ..request.clone() };
-    let free_least = least_of(inputs, &free)?.unwrap_or(least);
-    if free_least < least {
-        let names: Vec<&str> = fixed.iter().filter(|(is, _)| *is).map(|(_, name)| *name).collect();
-        message += &format!(", or {}MiB without {}", free_least / MIB, names.join(" and "));
-    }
-    let smaller = RESOLUTIONS.iter().filter_map(|&resolution| {
-        let smaller = inputs.at_resolution(resolution)?;
-        let request = super::size::request(&smaller, request.memory).ok()?;
-        Some((resolution.number(), least_of(&smaller, &request).ok()??))
-    });
-    let smaller: Vec<(u32, u64)> = smaller.filter(|&(_, bytes)| bytes < least).collect();
-    let fits = smaller.iter().find(|(_, bytes)| *bytes <= request.memory);
-    if let Some((divisor, bytes)) = fits.or(smaller.last()) {
-        message += &format!(", or {}MiB with images shrunk by -r {divisor}", bytes / MIB);
-    }
-    Ok(Failure::input(message))
+        any_of(&found)
+    )))
 }

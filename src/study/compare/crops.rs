@@ -1,7 +1,7 @@
 //! Crops at equal budget: the same window of the same view, by every policy.
 //!
 //! The window is chosen by a rule and not by hand: of all windows of a quarter of the picture's
-//! sides, over all views held out, the one whose photograph has the most edges.
+//! sides, and at most 160 px, over all views held out, the one whose photograph has the most edges.
 
 use std::path::Path;
 
@@ -20,8 +20,10 @@ use crate::run::{Observer, Silent};
 use crate::study::Picture;
 use crate::views::{DatasetViews, ViewSource};
 
-/// Width of a crop in the picture `[px]`; small ones are enlarged by whole numbers.
-const SHOWN: u32 = 240;
+/// Least width of a crop in the picture `[px]`, to which windows are enlarged by whole numbers.
+const SHOWN: u32 = 480;
+/// Longest side of a window `[px]`: more would be too small to be told apart.
+const LONGEST: u32 = 160;
 /// Space between crops `[px]`.
 const GAP: u32 = 6;
 
@@ -118,7 +120,8 @@ fn richest_window(
 fn most_edges(image: &Image8, background: [f32; 3]) -> (u64, Window) {
     let picture = photograph(image, background);
     let (width, height) = picture.dimensions();
-    let window = |x, y| Window { x, y, width: (width / 4).max(1), height: (height / 4).max(1) };
+    let side = |of: u32| (of / 4).clamp(1, LONGEST);
+    let window = |x, y| Window { x, y, width: side(width), height: side(height) };
     let Window { width: w, height: h, .. } = window(0, 0);
     // Sums over the rectangle from the corner, so that a window's sum takes four of them.
     let columns = width as usize + 1;
@@ -150,7 +153,7 @@ fn most_edges(image: &Image8, background: [f32; 3]) -> (u64, Window) {
 
 fn cut(picture: &RgbImage, Window { x, y, width, height }: Window) -> RgbImage {
     let crop = imageops::crop_imm(picture, x, y, width, height).to_image();
-    let times = (SHOWN / width).max(1);
+    let times = SHOWN.div_ceil(width);
     imageops::resize(&crop, width * times, height * times, imageops::FilterType::Nearest)
 }
 
@@ -174,7 +177,14 @@ mod tests {
         assert!((22..=23).contains(&window.x) && (10..=11).contains(&window.y), "{window:?}");
         assert_eq!((window.width, window.height), (10, 6));
         let crop = cut(&photograph(&image, [0.0; 3]), window);
-        assert_eq!(crop.dimensions(), (240, 144));
-        assert_eq!(side_by_side(&[crop.clone(), crop], GAP).dimensions(), (486, 144));
+        assert_eq!(crop.dimensions(), (480, 288));
+        assert_eq!(side_by_side(&[crop.clone(), crop], GAP).dimensions(), (966, 288));
+        // Of large photographs too.
+        let rgb = vec![0; 3 * 2000 * 700];
+        let image = Image8 { width: 2000, height: 700, rgb, alpha: None, mask: None };
+        let (_, window) = most_edges(&image, [0.0; 3]);
+        assert_eq!((window.width, window.height), (160, 160));
+        let crop = cut(&photograph(&image, [0.0; 3]), window);
+        assert_eq!(crop.dimensions(), (480, 480));
     }
 }

@@ -14,7 +14,7 @@ use toml::Value;
 
 use super::cell::Cell;
 use super::child::shared_options;
-use super::difference::Difference;
+use super::difference::{Difference, Pair};
 use super::record::Outcome;
 use super::{Finished, Study, distinct, labels};
 use crate::failure::Failure;
@@ -45,8 +45,8 @@ Examples:
 /// runs themselves.
 ///
 /// Quality is measured on views held out. Differences are taken between runs of the same scene,
-/// budget and seed, against the first policy named, with 95 % bootstrap intervals of their mean. A
-/// run whose peak exceeded its budget is marked, and takes no part in the ranking. Where the geometry
+/// budget and seed, against the first policy named, with 95 % intervals of their mean from three
+/// seeds on. A run whose peak exceeded its budget is marked, and takes no part in the ranking. Where the geometry
 /// is known (built-in scenes, and those that `densify scenegen` wrote), the tables also say how well
 /// the Gaussians sit on it.
 #[derive(Debug, Clone, Args)]
@@ -121,6 +121,7 @@ impl Comparison {
             let caption = picture.caption;
             text += &format!("\n![{caption}]({})\n\n{caption}.\n", picture.file);
         }
+        text += &report::options(&outcomes)?;
         study.finish("compare", &text, report::summary(&outcomes, &self.policies))
     }
 
@@ -225,9 +226,9 @@ fn difference<'a>(
     let pairs = runs(policy).filter_map(|run| {
         let key = |r: &'a Outcome| (&r.scene, r.budget, r.seed);
         let other = runs(base).find(|other| key(other) == key(run))?;
-        Some(score(run) - score(other))
+        Some(Pair { scene: &run.scene, seed: run.seed, difference: score(run) - score(other) })
     });
-    Difference::new(&pairs.collect::<Vec<f64>>())
+    Difference::new(&pairs.collect::<Vec<_>>())
 }
 
 #[cfg(test)]

@@ -173,11 +173,15 @@ fn draw_panel(
         .margin_right(28)
         .x_label_area_size(42)
         .y_label_area_size(70);
-    let ticks = if panel.log_x { ticks_at_points(panel) } else { even_ticks(x1) };
-    let mut chart = builder.build_cartesian_2d(Axis { range: x0..x1, ticks }, y0..y1)?;
+    let ticks = if panel.log_x { ticks_at_points(panel) } else { even_ticks(x0, x1) };
+    let y_ticks = even_ticks(y0, y1);
+    let digits = digits(&y_ticks);
+    let y_axis = Axis { range: y0..y1, ticks: y_ticks };
+    let mut chart = builder.build_cartesian_2d(Axis { range: x0..x1, ticks }, y_axis)?;
     let whole = |x: &f64| grouped(if panel.log_x { x.exp() } else { *x }.round() as usize);
-    let number = |y: &f64| {
-        if y1 > 1000.0 { grouped(y.max(0.0).round() as usize) } else { format!("{y:.3}") }
+    let number = |y: &f64| match digits {
+        0 if *y >= 0.0 => grouped(y.round() as usize),
+        _ => format!("{y:.digits$}"),
     };
     chart
         .configure_mesh()
@@ -242,12 +246,22 @@ fn ticks_at_points(panel: &Panel) -> Vec<f64> {
     ticks
 }
 
-/// Ticks from zero to `most` in steps of 1, 2 or 5 times a power of ten, at most eleven.
-fn even_ticks(most: f64) -> Vec<f64> {
-    let decade = 10_f64.powf((most / 10.0).log10().floor());
+/// Ticks from `least` to `most` in steps of 1, 2 or 5 times a power of ten, at most eleven.
+fn even_ticks(least: f64, most: f64) -> Vec<f64> {
+    let decade = 10_f64.powf(((most - least) / 10.0).log10().floor());
     let steps = [1.0, 2.0, 5.0, 10.0].map(|n| n * decade);
-    let step = steps.into_iter().find(|step| most / step <= 10.0).unwrap_or(most);
-    (0..=(most / step) as u32).map(|i| f64::from(i) * step).collect()
+    let step = steps.into_iter().find(|step| (most - least) / step <= 10.0).unwrap_or(most);
+    let (first, last) = ((least / step).ceil() as i32, (most / step).floor() as i32);
+    (first..=last).map(|i| f64::from(i) * step).collect()
+}
+
+/// The fewest digits after the point that write every tick without loss.
+fn digits(ticks: &[f64]) -> usize {
+    let is_exact = |digits: &i32| {
+        let scaled = |tick: &f64| tick * 10_f64.powi(*digits);
+        ticks.iter().map(scaled).all(|tick| (tick - tick.round()).abs() < 1e-6)
+    };
+    (0..6).find(is_exact).unwrap_or(6) as usize
 }
 
 #[cfg(test)]
@@ -277,8 +291,17 @@ mod tests {
                 assert!(text.contains(name), "{name} is not in {text}");
             }
         }
-        assert_eq!(even_ticks(300.0), [0.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0]);
-        assert_eq!(even_ticks(7000.0).len(), 8);
+        assert_eq!(even_ticks(0.0, 300.0), [0.0, 50.0, 100.0, 150.0, 200.0, 250.0, 300.0]);
+        assert_eq!(even_ticks(0.0, 7000.0).len(), 8);
+        // From 29 to 33 dB, with margins, in half dB; no label says more than it must.
+        let text = svg(&[panel(false)]).unwrap();
+        for (label, is_there) in [("30.5", true), ("30.0", true), ("30.000", false)] {
+            let lines = text.lines().filter(|line| line.trim() == label);
+            assert_eq!(lines.count() > 0, is_there, "{label} in {text}");
+        }
+        for (least, most, expected) in [(29.0, 36.0, 0), (0.9, 0.93, 3), (12.0, 90_000.0, 0)] {
+            assert_eq!(digits(&even_ticks(least, most)), expected, "{least} to {most}");
+        }
         let empty = Panel { curves: Vec::new(), ..panel(false) };
         assert!(svg(&[empty]).unwrap().starts_with("<svg"));
     }

@@ -1,11 +1,16 @@
 //! The comparison as text: Markdown for the file, a few lines for the terminal.
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
 
+use toml::{Table, Value};
+
 use super::{Outcome, at, difference, scenes_and_budgets};
+use crate::failure::Failure;
 use crate::metrics::geometry::Geometry;
 use crate::number::grouped;
-use crate::study::difference::mean;
+use crate::run::Partial;
+use crate::study::difference::{INTERVALS, mean};
 use crate::study::distinct;
 use crate::study::markdown::{MarkdownTable, number_or_dash};
 
@@ -24,7 +29,7 @@ pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
     let _ = write!(
         text,
         "\n{} iterations, {seeds} {}. Means over seeds; differences from `{first}` are paired by \
-         scene, budget and seed, with 95 % bootstrap intervals.\n",
+         scene, budget and seed. {INTERVALS}. All options are at the end.\n",
         grouped(run.iterations as usize),
         if seeds == 1 { "seed" } else { "seeds" },
     );
@@ -53,10 +58,42 @@ pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
     text
 }
 
+/// Every option that all runs had, those by default too, as a file for `--config` has them.
+pub(super) fn options(outcomes: &[Outcome]) -> Result<String, Failure> {
+    let mut shared: Option<Table> = None;
+    for run in outcomes {
+        let spec = Partial::new(run.spec.clone(), "options")?.describe()?;
+        let mut all = Partial::all(&spec)?.into_table();
+        if let Some(others) = &shared {
+            keep_common(&mut all, others);
+        }
+        shared = Some(all);
+    }
+    let shared = toml::to_string(&shared.unwrap_or_default()).map_err(Failure::input)?;
+    let versions: BTreeSet<&str> = outcomes.iter().map(|run| &*run.densify).collect();
+    let versions = Vec::from_iter(versions).join(", ");
+    Ok(format!(
+        "\n## Options\n\nOf every run, with densify {versions}, defaults included; the tables above name what \
+         differs. What is not here differs between runs or was chosen by each, and stands in its \
+         config.toml.\n\n```toml\n{shared}```\n"
+    ))
+}
+
+/// Keeps what another table has too.
+fn keep_common(table: &mut Table, other: &Table) {
+    table.retain(|name, value| match (value, other.get(name)) {
+        (Value::Table(inner), Some(Value::Table(other))) => {
+            keep_common(inner, other);
+            true
+        }
+        (value, other) => Some(&*value) == other,
+    });
+}
+
 /// Every policy against the first.
 fn ranking(outcomes: &[Outcome], first: &str, others: &[String]) -> MarkdownTable {
     let mut table =
-        MarkdownTable::new("policy | PSNR | better in | SSIM | better in | FLIP | better in");
+        MarkdownTable::new("policy | PSNR [dB] | better in | SSIM | better in | FLIP | better in");
     for policy in others {
         let versus = |score: fn(&Outcome) -> f64| difference(outcomes.iter(), policy, first, score);
         let all = (versus(|r| r.psnr), versus(|r| r.ssim), versus(|r| r.flip));
@@ -69,7 +106,7 @@ fn ranking(outcomes: &[Outcome], first: &str, others: &[String]) -> MarkdownTabl
         };
         table.row(&[
             policy.clone(),
-            format!("{} dB", psnr.show(2)),
+            psnr.show(2),
             format!("{} of {}", psnr.above, psnr.pairs),
             ssim.show(4),
             format!("{} of {}", ssim.above, ssim.pairs),
@@ -185,13 +222,36 @@ mod tests {
         ];
         let policies = ["a", "b", "c"].map(String::from);
         let text = markdown(&all, &policies);
-        assert!(text.contains("| b | +0.50 [+0.50, +0.50] dB | 2 of 2 | +0.0050 [+0.0050, +0.0050] | 2 of 2 | -0.0050 [-0.0050, -0.0050] | 2 of 2 |"), "{text}");
+        assert!(text.contains("| b | +0.50, two runs | 2 of 2 |"), "{text}");
+        assert!(text.contains("| b | 31.50 (+0.50, two runs) |"), "{text}");
+        let more = [record("a", 2, 30.0, 1000), record("b", 2, 31.5, 1000)];
+        let text = markdown(&[&all[..], &more].concat(), &policies);
+        // Student's t of two degrees of freedom, 4.303, times √(1/3)/√3.
+        assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 |"), "{text}");
         assert!(text.contains("| c | not ranked"), "{text}");
-        assert!(text.contains("| a | 31.00 | 0.3100 | 0.6900 | 900 | 1,000 | – |"), "{text}");
+        assert!(text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | – |"), "{text}");
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
         let said = summary(&all, &policies);
         assert!(said.contains("c               –       –       –     0  (2 more over"), "{said}");
+    }
+
+    #[test]
+    fn options_are_those_of_all_runs_with_their_defaults() {
+        let run = |policy: &str, set: &str| Outcome {
+            spec: format!("iterations = 9\npolicy = '{policy}'\nknob.alpha_min = '1/64'\n{set}")
+                .parse()
+                .expect("TOML"),
+            ..record(policy, 0, 30.0, 1000)
+        };
+        let set = "policy_set.diet = { rho = 0.5 }";
+        let text = options(&[run("diet", set), run("mcmc", set)]).expect("options");
+        for words in ["iterations = 9\n", "near = 0.04", "alpha_min = \"1/64\"", "rho = 0.5"] {
+            assert!(text.contains(words), "{words}: {text}");
+        }
+        assert!(!text.contains("\npolicy = "), "{text}");
+        let text = options(&[run("diet", set), run("diet", "")]).expect("options");
+        assert!(text.contains("policy = \"diet\"") && !text.contains("rho"), "{text}");
     }
 
     #[test]

@@ -2,22 +2,12 @@
 //! dominate, which are free, and what knobs do among each other.
 
 use crate::study::difference::Difference;
+use crate::study::standard_error;
 
 /// Runs of a factorial.
 pub(super) const RUNS: usize = 12;
 /// Knobs that it has room for.
 pub(super) const FACTORS: usize = RUNS - 1;
-
-/// Standard error of the mean; `None` for fewer than two values.
-pub(super) fn standard_error(values: &[f64]) -> Option<f64> {
-    let n = values.len() as f64;
-    if values.len() < 2 {
-        return None;
-    }
-    let mean = values.iter().sum::<f64>() / n;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    Some((squares / (n - 1.0) / n).sqrt())
-}
 
 /// Whether the mean is more than two standard errors from zero.
 pub(super) fn stands_out(differences: &[f64]) -> bool {
@@ -119,13 +109,9 @@ mod tests {
 
     #[test]
     fn free_is_said_by_the_rule_only() {
-        let of = |low: f64, high: f64| Difference {
-            mean: 0.5 * (low + high),
-            interval: Some([low, high]),
-            pairs: 5,
-            above: 0,
-            below: 0,
-        };
+        let pair = crate::study::difference::Pair { scene: "room", seed: 0, difference: 0.0 };
+        let any = Difference::new(&[pair]).unwrap();
+        let of = |low: f64, high: f64| Difference { interval: Some([low, high]), ..any };
         let (psnr, ssim, depth) = (of(-0.04, 0.1), of(-0.0009, 0.1), of(-0.1, 0.019));
         assert!(is_free(&psnr, &ssim, Some(&depth), Some(60.0)));
         assert!(is_free(&psnr, &ssim, None, None));

@@ -241,6 +241,6 @@ mod tests {
         assert_eq!(changes("alpha_min", "1/64", 600), [pair("alpha_min", "1/64")]);
         assert_eq!(changes("preset", "fast", 600), [pair("iterations", "300")]);
         assert_eq!(changes("preset", "fast", 1), [pair("iterations", "1")]);
-        assert_eq!(changes("preset", "tiny-memory", 600)[0], pair("image_cache", "0"));
+        assert_eq!(changes("preset", "tiny-memory", 600)[0], pair("image_cache", "auto"));
     }
 }

@@ -6,7 +6,7 @@ use super::effects::{
 use super::levels::Factor;
 use super::{BASE, ImageError, Outcome, Trade};
 use crate::knobs::Class;
-use crate::study::difference::{Difference, mean};
+use crate::study::difference::{Difference, Pair, mean};
 use crate::study::distinct;
 
 /// A study's results.
@@ -112,9 +112,13 @@ impl Report {
         self.runs(knob, level).filter_map(|run| Some((run, base(run)?))).collect()
     }
 
-    fn differences(&self, knob: &str, level: &str, of: Measure) -> Vec<f64> {
-        let difference = |(run, base): (&Outcome, &Outcome)| Some(of(run)? - of(base)?);
-        self.pairs(knob, level).into_iter().filter_map(difference).collect()
+    fn differences(&self, knob: &str, level: &str, of: Measure) -> Vec<Pair<'_>> {
+        let all = self.pairs(knob, level).into_iter();
+        all.filter_map(|(run, base)| {
+            let difference = of(run)? - of(base)?;
+            Some(Pair { scene: &run.scene, seed: run.seed, difference })
+        })
+        .collect()
     }
 
     fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
@@ -125,7 +129,10 @@ impl Report {
         let same = pairs.iter().filter(|(run, base)| run.model == base.model).count();
         let numerical = self.numerical(name, level);
         let free = is_free(&psnr, &ssim, depth.as_ref(), numerical);
-        let stand_out = [PSNR, SECONDS].map(|of| stands_out(&self.differences(name, level, of)));
+        let stand_out = [PSNR, SECONDS].map(|of| {
+            let all = self.differences(name, level, of).into_iter();
+            stands_out(&all.map(|pair| pair.difference).collect::<Vec<_>>())
+        });
         Some(Effect {
             factor: factor.clone(),
             level: level.to_owned(),

@@ -9,7 +9,7 @@ use super::Trade;
 use super::report::{Effect, PSNR, Report, SECONDS};
 use crate::knobs::Class;
 use crate::number::grouped;
-use crate::study::difference::Difference;
+use crate::study::difference::{Difference, INTERVALS};
 use crate::study::markdown::{MarkdownTable, number_or_dash};
 
 /// The whole study.
@@ -23,9 +23,8 @@ pub(super) fn markdown(report: &Report) -> String {
     let _ = writeln!(
         text,
         "densify {}; scenes: {}; {} iterations, at most {} rows, {seeds} {} per level.{options} \
-         Differences are from `exact` with the same scene and seed, with 95 % bootstrap \
-         intervals of their mean; ratios are geometric means. Scores are of views held out, rendered \
-         without any shortcut.",
+         Differences are from `exact` with the same scene and seed; ratios are \
+         geometric means. {INTERVALS}. Scores are of views held out, rendered without any shortcut.",
         env!("CARGO_PKG_VERSION"),
         report.scenes.join(", "),
         grouped(*iterations as usize),
@@ -100,11 +99,8 @@ fn outcomes(report: &Report) -> String {
 
 fn row(effect: &Effect) -> Vec<String> {
     let ratio = |d: &Difference| {
-        let mean = format!("{:.3}", d.mean.exp());
-        match d.interval {
-            Some([low, high]) => format!("{mean} [{:.3}, {:.3}]", low.exp(), high.exp()),
-            None => mean,
-        }
+        let low_and_high = |[low, high]: [f64; 2]| format!("{:.3}, {:.3}", low.exp(), high.exp());
+        format!("{:.3}{}", d.mean.exp(), d.within(low_and_high))
     };
     let maybe = |d: &Option<Difference>| d.as_ref().map_or_else(|| "–".to_owned(), ratio);
     let mut verdict: Vec<String> = Vec::new();

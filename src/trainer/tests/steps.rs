@@ -58,6 +58,10 @@ fn errors_name_the_view() {
     assert!(!calls.contains(&"apply 4".to_owned()), "{calls:?}");
     let (message, ..) = failure(&Case { unreadable: Some(1), ..CASE });
     assert!(message.contains("view `b.png`: file is gone"), "{message}");
+    // Nothing has begun that a checkpoint of the step before would have to know of, not even an epoch.
+    let first = schedule::view_order(3, 7, 0)[0];
+    let (_, _, calls) = failure(&Case { unreadable: Some(first), ..CASE });
+    assert_eq!(calls, [""; 0]);
 }
 
 #[test]

@@ -295,13 +295,13 @@ fn active(view: View<'_>) -> impl Iterator<Item = (usize, &'static [Monomial])> 
 }
 
 /// From the camera to the row's mean, not normalised.
-fn sight(model: &Model, row: usize, view: View<'_>) -> DVec3 {
+fn from_camera(model: &Model, row: usize, view: View<'_>) -> DVec3 {
     let centre = -(view.camera.rotation.transpose() * view.camera.translation);
     DVec3::from(model.means[row]) - centre
 }
 
 fn colour(model: &Model, row: usize, view: View<'_>) -> [f64; 3] {
-    let direction = sight(model, row, view).normalize();
+    let direction = from_camera(model, row, view).normalize();
     let mut colour = [0.5; 3];
     for (k, harmonic) in active(view) {
         let value = evaluate(harmonic, direction);
@@ -320,8 +320,8 @@ fn colour_backward(
     upstream: &ScreenGradient,
     gradient: &mut Model,
 ) -> DVec3 {
-    let sight = sight(model, row, view);
-    let direction = sight.normalize();
+    let from_camera = from_camera(model, row, view);
+    let direction = from_camera.normalize();
     let d_colour = [0, 1, 2].map(|c| if splat.colour[c] > 0.0 { upstream.colour[c] } else { 0.0 });
     let mut d_direction = DVec3::ZERO;
     for (k, harmonic) in active(view) {
@@ -333,5 +333,5 @@ fn colour_backward(
             d_direction += slope * (d * model.sh[index]);
         }
     }
-    (d_direction - direction * direction.dot(d_direction)) / sight.length()
+    (d_direction - direction * direction.dot(d_direction)) / from_camera.length()
 }

@@ -31,7 +31,15 @@ fn every_run_is_there_once_and_in_the_table() {
     let psnr = |i: usize| all[i]["psnr"].as_f64().expect("a number");
     assert_ne!(psnr(0).to_bits(), psnr(4).to_bits(), "the seeds do nothing");
     let table = read_text(&output.join("compare.md"));
-    for word in ["| vanilla |", "| diet |", "250 rows", "320 rows", " of 4 |"] {
+    for word in [
+        "| vanilla |",
+        "| diet |",
+        "250 rows",
+        ", two seeds",
+        " of 4 |",
+        "\nsh_degree = 0\n",
+        "\nnear = 0.04\n",
+    ] {
         assert!(table.contains(word), "{word} is not in {table}");
     }
     assert!(!table.contains("Chamfer") && all.iter().all(|r| r.get("geometry").is_none()));

@@ -1,6 +1,7 @@
 //! Runs described by a file: what it may say, what wins over it, and what is refused.
 
 use std::path::Path;
+use std::process::Command;
 
 use densify::run::{OPTIONS, Occupied, Partial, Run, Silent};
 
@@ -92,4 +93,13 @@ fn files_that_say_what_cannot_be_are_refused_by_key() {
     }
     call("train --config no.toml").refused("no file", &["no.toml"]);
     call("train -o run").refused("no scene", &["no scene", "scene:spheres"]);
+}
+
+#[test]
+fn a_log_filter_that_is_not_understood_is_named() {
+    let mut program = Command::new(env!("CARGO_BIN_EXE_densify"));
+    let said = program.arg("knobs").env("RUST_LOG", "densify[step{view=3}]=debug").output();
+    let said = said.expect("it starts");
+    let log = String::from_utf8_lossy(&said.stderr);
+    assert!(said.status.success() && log.contains("RUST_LOG is not used"), "{log}");
 }

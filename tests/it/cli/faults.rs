@@ -2,7 +2,11 @@
 //! nothing left behind. What is wrong with data files is in `src/dataset/tests/bad_input.rs`, case by
 //! case.
 
-use super::{call, files, json, model, scratch, text, train};
+use std::path::Path;
+
+use densify::run::{Budget, ImageCache, Observer, Occupied, Run, RunSpec, Whole};
+
+use super::{call, files, json, model, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
 /// Trains with more flags, which must be refused with these words.
@@ -29,7 +33,7 @@ fn flags_out_of_range_are_refused() {
         ("--budget 5000M", &["--budget", "4 billion"]),
         ("--test-every 1", &["no view is left", "--test-every"]),
         ("--test-every 0", &["--test-every"]),
-        ("--image-cache much", &["--image-cache", "1GiB"]),
+        ("--image-cache much", &["--image-cache", "1GiB", "auto"]),
         ("--background mauve", &["--background", "mauve", "#808080"]),
         ("--lr opacity=x", &["--lr", "NAME=RATE"]),
         ("--lr colour=1", &["--lr", "colour"]),
@@ -41,6 +45,8 @@ fn flags_out_of_range_are_refused() {
         ("--near 1", &["--near", "less than 1"]),
         ("--policy-config /no/such/file", &["--policy-config", "/no/such"]),
         ("--full --budget auto", &["--full", "--budget auto"]),
+        ("--threads 1000", &["--threads", "`1000`", "from 1 to 256"]),
+        ("--threads 0", &["--threads", "from 1 to 256"]),
         ("--budget none", &["--budget", "auto"]),
     ];
     for (flags, words) in faults {
@@ -98,4 +104,47 @@ fn scenes_and_outputs_that_are_not_there_are_refused() {
         .refused("no splats", &["model.ply"]);
     assert!(!pictures.exists());
     assert_eq!(files(root.path()).len(), 2, "something was left behind");
+}
+
+/// Cuts a photograph short once a step is done.
+struct Cutter<'a>(&'a Photographs, u32);
+
+impl Observer for Cutter<'_> {
+    fn step(&self, step: u32, _: f32, _: usize) {
+        if step == self.1 {
+            self.0.truncate("images/view_03.png", 600);
+        }
+    }
+}
+
+#[test]
+fn a_photograph_lost_late_in_a_run_costs_no_step() {
+    let scene = Photographs::colmap_text();
+    let whole_file = std::fs::read(scene.file("images/view_03.png")).expect("a view");
+    let (root, whole) = scratch();
+    let train = |run: &Path, cut_after: u32| {
+        let mut spec = RunSpec::default();
+        spec.start.scene = Some(scene.path().into());
+        spec.output.output = Some(run.into());
+        spec.size.budget = Some(Budget::Rows(400));
+        spec.size.image_cache = Some(ImageCache::Bytes(0));
+        spec.schedule.iterations = Whole(48);
+        let run = Run::prepare(&spec).expect("a run");
+        run.train(Occupied::Refuse, &Cutter(&scene, cut_after))
+    };
+    train(&whole, 0).expect("the whole run");
+    // Decoded ahead are at most the next few views of the fourteen.
+    for cut_after in [16, 28] {
+        let part = root.path().join(format!("part{cut_after}"));
+        let failure = train(&part, cut_after).expect_err("a photograph is cut short");
+        let message = &failure.message;
+        let step = message.strip_prefix("step ").and_then(|rest| rest.split(':').next());
+        let step: u32 = step.and_then(|step| step.parse().ok()).expect(message);
+        assert!(step > cut_after && message.contains("--resume"), "{message}");
+        let checkpoint = format!("iteration_{}.safetensors", step - 1);
+        assert!(failure.code == 2 && message.contains(&checkpoint), "{message}");
+        scene.write("images/view_03.png", &whole_file);
+        resume(scene.path(), &part, "").ok();
+        assert!(model(&part, 48) == model(&whole, 48), "cut after {cut_after}");
+    }
 }

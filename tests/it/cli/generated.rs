@@ -25,7 +25,7 @@ fn assert_same(a: &Dataset, b: &Dataset, what: &str) {
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
-fn written_scenes_load_as_the_built_in_ones_through_both_formats() {
+fn written_scenes_load_as_the_built_in_ones_through_all_formats() {
     let (_root, folder) = scratch();
     call(&format!("scenegen --preset spheres -o {}", text(&folder))).ok();
     let built_in = load(Path::new("scene:spheres"));
@@ -37,6 +37,10 @@ fn written_scenes_load_as_the_built_in_ones_through_both_formats() {
         std::fs::remove_file(folder.join(name)).expect("it is there");
     }
     let colmap = load(&folder);
+    std::fs::rename(folder.join("sparse"), folder.join("colmap")).expect("it is there");
+    let nerfstudio = load(&folder);
+    assert_same(&built_in, &nerfstudio, "transforms.json");
+    assert_eq!((nerfstudio.test.len(), nerfstudio.points.len()), (10, built_in.points.len()));
     assert_eq!((colmap.train.len(), colmap.points.len()), (40, built_in.points.len()));
     // Its unit is that of all forty cameras.
     let find = |name: &str| colmap.train.iter().find(|v| v.name.ends_with(name)).expect(name);
@@ -59,6 +63,13 @@ fn built_in_scenes_are_trained_on_and_measured_by_name() {
     let said = call(&format!("eval {}", text(&run))).ok();
     assert!(said.stdout.contains("PSNR") && said.stdout.contains("Chamfer"), "{}", said.stdout);
     assert!(json(&run.join("geometry.json"))["ours_4"]["depth"]["rmse"].is_f64());
+    // A cut model has nothing to do with where the scene is.
+    let model = run.join("point_cloud/iteration_4/point_cloud.ply");
+    let whole = std::fs::read(&model).expect("the model");
+    std::fs::write(&model, &whole[..5000]).expect("write");
+    let outcome = call(&format!("eval {}", text(&run)));
+    outcome.refused("a cut model", &["point_cloud.ply", "export the file again"]);
+    assert_eq!(outcome.stderr.trim().lines().count(), 1, "{}", outcome.stderr);
 }
 
 /// `thin`, small, in a folder.
@@ -72,16 +83,29 @@ fn written_scenes_are_measured_against_their_files() {
     let (root, run) = scratch();
     let folder = root.path().join("wires");
     wires(&folder);
-    train(&folder, &run, 6, "--budget 400 --eval").ok();
+    let said = train(&folder, &run, 6, "--budget 400 --eval").ok().stdout;
+    assert!(said.contains("geometry depth RMSE") && said.contains("measuring geometry"), "{said}");
+    let peak = said.split("; peak ").nth(1).and_then(|rest| rest.split(" MiB").next());
+    if let Some(peak) = peak {
+        let promised = json(&run.join("stats/summary.json"))["ledger_bytes"].as_f64();
+        let peak: f64 = peak.parse().expect("a size");
+        assert!(Some(peak * f64::from(1 << 20)) <= promised, "{peak} MiB of {promised:?}");
+    }
+    // What training measures at its end is what `eval` measures.
+    let trained = std::fs::read(run.join("geometry.json")).expect("geometry.json");
+    std::fs::remove_file(run.join("geometry.json")).expect("it is there");
     let said = call(&format!("eval {}", text(&run))).ok().stdout;
+    assert!(trained == std::fs::read(run.join("geometry.json")).expect("geometry.json"));
     for word in ["mean", "depth RMSE", "F-score", "floaters", "thin structures found, 1 px wide"] {
         assert!(said.contains(word), "{word} is not in {said}");
     }
     let measured = json(&run.join("geometry.json"))["ours_6"].clone();
     assert!(measured["centres"]["chamfer"].as_f64() > Some(0.0), "{measured}");
     // A new run takes the place of the old one with all that was measured of it.
+    std::fs::write(run.join("geometry.json"), r#"{"ours_1": {}}"#).expect("write");
     train(&folder, &run, 6, "--budget 400 --eval --overwrite").ok();
-    assert!(!run.join("geometry.json").exists());
+    let measured = json(&run.join("geometry.json"));
+    assert!(measured["ours_1"].is_null() && measured["ours_6"].is_object(), "{measured}");
     // At half the size files are of no use; the mesh is.
     train(&folder, &run, 6, "--budget 400 --eval --overwrite -r 2").ok();
     call(&format!("eval {} --split train", text(&run))).ok();
@@ -90,12 +114,42 @@ fn written_scenes_are_measured_against_their_files() {
     // What is damaged is named.
     std::fs::write(folder.join("mesh.ply"), "ply\n").expect("write");
     call(&format!("eval {}", text(&run))).refused("a damaged mesh", &["mesh.ply", "--overwrite"]);
+    // The run is none the worse for it.
+    let other = root.path().join("other");
+    train(&folder, &other, 6, "--budget 400 --eval --quiet")
+        .refused("a damaged mesh", &["mesh.ply", "the run is complete"]);
+    assert_eq!(json(&other.join("stats/summary.json"))["finished"], true);
     // Without a known surface there is nothing to measure.
     std::fs::remove_file(folder.join("scene.json")).expect("it is there");
-    std::fs::remove_file(run.join("geometry_train.json")).expect("it is there");
+    for name in ["geometry.json", "geometry_train.json"] {
+        std::fs::remove_file(run.join(name)).expect("it is there");
+    }
     let said = call(&format!("eval {}", text(&run))).ok().stdout;
     assert!(said.contains("PSNR") && !said.contains("Chamfer"), "{said}");
     assert!(!run.join("geometry.json").exists() && !run.join("geometry_train.json").exists());
+}
+
+#[test]
+fn limits_on_what_is_not_measured_are_refused_at_once() {
+    let (root, run) = scratch();
+    let folder = root.path().join("wires");
+    wires(&folder);
+    train(&folder, &run, 2, "--budget 400").ok();
+    let said = call(&format!("eval {} --split train --fail-above depth.rsme=1", text(&run)));
+    said.refused("a typo", &["--fail-above", "depth.rsme", "depth.rmse", "thin.0.recall"]);
+    assert!(!said.stdout.contains("PSNR"), "{}", said.stdout);
+    assert!(!run.join("results_train.json").exists());
+}
+
+#[test]
+fn a_surface_that_few_views_see_is_told_of() {
+    let (_root, folder) = scratch();
+    let small = "--size 24 --test 0 --samples 1 --points 400 --fov 25";
+    let room = format!("scenegen --preset room -o {} --overwrite {small}", text(&folder));
+    let said = call(&format!("{room} --train 4")).ok().stdout;
+    assert!(said.contains("note: of 400 points wanted, ") && said.contains("--rig"), "{said}");
+    let said = call(&format!("{room} --train 60").replace("--fov 25", "--fov 80")).ok().stdout;
+    assert!(!said.contains("points wanted"), "{said}");
 }
 
 #[test]

@@ -64,6 +64,11 @@ fn options_that_are_given_win_over_a_preset() {
     assert_eq!(config["image_cache"].as_integer(), Some(1 << 20));
     let knob = |name: &str| config["knob"][name].as_str();
     assert_eq!([knob("param_storage"), knob("moment_storage")], [Some("f32"), Some("both8")]);
+    // By itself the preset keeps photographs in an eighth of the run, if they fit.
+    let (_root, output) = scratch();
+    short(scene.path(), &output, "--preset tiny-memory").ok();
+    let kept = self::config(&output)["image_cache"].as_integer();
+    assert_eq!(kept, Some(9 * 48 * 40 * 3), "all that are trained on");
 }
 
 #[test]

@@ -55,6 +55,16 @@ fn plan_says_what_train_promises_and_writes_nothing() {
         assert!(files(root.path()).is_empty(), "{flags}: {:?}", files(root.path()).keys());
         let trained = train(scene.path(), &run, &flags).ok();
         assert_eq!(ledger(&planned), ledger(&trained), "{flags}");
+        let tenths = |line: &str| -> u64 {
+            let size = line.trim_end().trim_end_matches(" MiB").rsplit(' ').next().expect("a size");
+            size.replace([',', '.'], "").parse().unwrap_or_else(|e| panic!("{line}: {e}"))
+        };
+        let lines: Vec<&str> =
+            ledger(&planned).lines().skip(1).filter(|it| !it.ends_with(')')).collect();
+        let (total, lines) = lines.split_last().expect("a total");
+        assert_eq!(lines.iter().map(|line| tenths(line)).sum::<u64>(), tenths(total), "{flags}");
+        let left = planned.stdout.contains("of --memory\n");
+        assert_eq!(left, flags.contains("--memory"), "{flags}: {}", planned.stdout);
         assert_eq!(budget(&planned), budget(&trained), "{flags}");
         let summary = json(&run.join("stats/summary.json"));
         let rows = format!("budget   {}", grouped(count(&summary, "budget")));
@@ -178,28 +188,94 @@ fn the_smaller_of_two_limits_holds() {
     assert!(kept.contains("degree 3,") && !kept.contains("instead"), "{kept}");
 }
 
+/// The remedies of a refusal, in their order.
+fn remedies(outcome: &Outcome) -> Vec<String> {
+    let told = outcome.stderr.split("; give ").nth(1).expect("a remedy").trim();
+    told.split(", or ").map(str::to_owned).collect()
+}
+
+/// The flags of a call after a remedy: `--flag value` is new or in place of another, `no --flag` is gone.
+fn followed(flags: &str, remedy: &str) -> String {
+    let mut all: Vec<(&str, &str)> = Vec::new();
+    let mut words = flags.split_whitespace().chain(remedy.split_whitespace());
+    while let Some(word) = words.next() {
+        let value = words.next().expect("a value");
+        let flag = if word == "no" { value } else { word };
+        all.retain(|(other, _)| *other != flag);
+        if word != "no" {
+            all.push((flag, value));
+        }
+    }
+    all.iter().map(|(flag, value)| format!("{flag} {value} ")).collect()
+}
+
 #[test]
-fn a_memory_that_holds_no_model_is_refused_with_one_that_does() {
+fn a_memory_that_holds_no_model_is_refused_with_what_fits_and_the_cheapest_comes_first() {
     let scene = Photographs::colmap_text();
-    for flags in
-        ["", "--eval --sh-degree 3", "--tile-cap 100k", "--policy taming --image-cache 1MiB"]
-    {
+    let plan = |flags: &str| plan(scene.path(), flags);
+    // Photographs cost only time to decode again.
+    for (flags, second) in [
+        ("", "--preset tiny-memory"),
+        ("--test-every 5 --sh-degree 3", "--preset tiny-memory"),
+        ("--tile-cap 100k", "no --tile-cap"),
+        ("--policy taming --image-cache 1MiB", "--preset tiny-memory"),
+        ("--policy taming --preset tiny-memory", "-r 2"),
+    ] {
         let (root, run) = scratch();
         let outcome = train(scene.path(), &run, &format!("--memory 1MiB {flags}"));
         outcome.refused(flags, &["--memory 1.0 MiB", "1,000 rows", "give --memory"]);
         assert!(files(root.path()).is_empty(), "{flags}");
-        let told = outcome.stderr.split("give --memory ").nth(1).expect("a remedy");
-        let mib = told.split("MiB").next().expect("a number");
-        let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{told}: {e}"));
-        let plan = |mib: u64| plan(scene.path(), &format!("--memory {mib}MiB {flags}"));
-        plan(mib).ok();
-        plan(mib - 1).refused(flags, &["give --memory"]);
+        let [least] = &remedies(&outcome)[..] else { panic!("the program takes more") };
+        plan(&followed(flags, least)).ok();
+        let mib = least.trim_start_matches("--memory ").trim_end_matches("MiB");
+        let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{least}: {e}"));
+        // The most that is too little, to the kibibyte: what is missing is little, whatever a step holds.
+        let (mut little, mut enough) = ((mib - 1) << 10, mib << 10);
+        while enough - little > 1 {
+            let middle = (little + enough) / 2;
+            let fits = plan(&format!("--memory {middle}KiB {flags}")).code == Some(0);
+            *(if fits { &mut enough } else { &mut little }) = middle;
+        }
+        let flags = format!("--memory {little}KiB {flags}");
+        let outcome = plan(&flags);
+        outcome.refused(&flags, &[least]);
+        let all = remedies(&outcome);
+        assert_eq!(all[..2], ["--image-cache 0", second], "{flags}: {all:?}");
+        for remedy in all {
+            plan(&followed(&flags, &remedy)).ok();
+        }
     }
-    let refused = |flags: &str, words| plan(scene.path(), flags).refused(flags, words);
-    refused("--memory 1MiB --tile-cap 900k", &["without --tile-cap"]);
+    let refused = |flags: &str, words| plan(flags).refused(flags, words);
     refused("--memory 0", &["--memory 0 B"]);
     refused("--memory plenty", &["--memory", "plenty", "512MiB"]);
     refused("--resume", &["--resume"]);
+}
+
+/// Without `--memory` the table is of what was planned, in whole mebibytes.
+#[test]
+fn what_the_table_says_a_memory_holds_it_holds() {
+    let photographs = Photographs::colmap_text();
+    let (photographs, known) = (photographs.path(), Path::new("scene:spheres"));
+    // Rendering a scene for the first time leaves the process larger.
+    plan(known, "").ok();
+    for (scene, flags) in [
+        (photographs, "--budget 20k"),
+        (photographs, "--budget 20k --preset tiny-memory --policy taming"),
+        (photographs, ""),
+        // Measuring the geometry takes more than training.
+        (known, "--budget 20k --preset tiny-memory --eval"),
+    ] {
+        let planned = plan(scene, flags).ok();
+        let said = planned.stdout.split("Gaussians that --memory ").nth(1).expect("a table");
+        let (memory, table) = said.split_once("MiB").expect("a size");
+        let row = table.lines().find(|line| line.starts_with("  degree 3")).expect("a row");
+        let rows = row.split_whitespace().nth(2).expect("rows at full size");
+        let flags = flags.replace("--budget 20k", "") + &format!(" --memory {memory}MiB");
+        let again = plan(scene, &flags).ok();
+        assert!(budget(&again).starts_with(&format!("budget   {rows} rows")), "{rows}: {again:?}");
+        let number: usize = rows.replace(',', "").parse().expect("a number");
+        assert!(number >= 20_000, "{flags}: {number}");
+    }
 }
 
 #[test]
@@ -220,7 +296,7 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
         ("--budget 300", ["--budget: 300 now", "in that run"]),
         ("--sh-degree 2", ["--sh-degree: 2 now", "3 in that run"]),
         // It changes no byte of the result, but is more than was allowed.
-        ("--tile-cap 10M", ["--memory 48.0 MiB", "lower --tile-cap"]),
+        ("--tile-cap 10M", ["--memory 48.0 MiB", "give --tile-cap"]),
     ] {
         train(scene.path(), &run, &format!("--resume {flags}")).refused(flags, &words);
         assert!(files(&run) == before, "{flags} touched the run");
@@ -230,6 +306,12 @@ fn a_run_for_a_memory_goes_on_with_what_was_chosen() {
     train(scene.path(), &part, "--resume --memory 48MiB --checkpoint-every 3").ok();
     assert!(model(&part, 6) == model(&run, 6));
     assert!(files(&part)["config.toml"] == before["config.toml"]);
+    let part = root.path().join("remedy");
+    copy_unfinished(&run, &part, 6);
+    for remedy in remedies(&train(scene.path(), &part, "--resume --tile-cap 10M")) {
+        train(scene.path(), &part, &format!("--resume {remedy}")).ok();
+    }
+    assert!(model(&part, 6) == model(&run, 6));
 }
 
 /// What is set aside for rows and pairs that never come is not resident.
@@ -266,21 +348,27 @@ fn limited(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
 #[test]
 #[cfg(target_os = "linux")]
 fn a_system_that_grants_too_little_is_named_and_nothing_is_written() {
-    let mut refused = 0;
-    let mut trained = 0;
+    let (mut refused, mut trained, mut remedies) = (0, 0, 0);
     for limit in (150_000..=1_350_000).step_by(100_000) {
         let flags = "--budget 150k --init random --threads 2 --backend cpu";
         match limited(limit, flags) {
             (Some(0), _, true) => trained += 1,
             (Some(3), said, false) => {
                 assert!(said.starts_with("error: "), "{limit}: {said}");
-                let by_limit = said.contains("ulimit -v") && said.contains("give --memory");
-                refused += usize::from(by_limit);
+                refused += usize::from(said.contains("ulimit -v"));
+                for remedy in said.split("; give ").nth(1).iter().flat_map(|it| it.split(", or ")) {
+                    if remedy.starts_with("--") {
+                        let (code, said, _) = limited(limit, &followed(flags, remedy));
+                        assert_eq!(code, Some(0), "{limit}: {remedy}: {said}");
+                        remedies += 1;
+                    }
+                }
             }
             other => panic!("{limit} KiB end in {other:?}"),
         }
     }
     assert!(refused >= 3 && trained >= 2, "{refused} refused, {trained} trained");
+    assert!(remedies >= 2, "{remedies} remedies");
 }
 
 /// llvmpipe's device memory is the process's own, so that it can be made to run out where the device's

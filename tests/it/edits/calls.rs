@@ -1,7 +1,8 @@
 //! Any calls of a plan, sensible or not.
 
 use densify_policies::plan::{
-    EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, Update,
+    EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, UNTURNED,
+    Update,
 };
 use proptest::prelude::*;
 
@@ -32,7 +33,13 @@ fn scale_rule() -> impl Strategy<Value = ScaleRule> {
     prop_oneof![
         factor().prop_map(ScaleRule::Uniform),
         (factor(), factor()).prop_map(|(long, other)| ScaleRule::LongAxis { long, other }),
+        prop::array::uniform3(factor()).prop_map(ScaleRule::Axes),
     ]
+}
+
+fn quaternion() -> impl Strategy<Value = [f32; 4]> {
+    let any = (0.2_f32..2.0, prop::array::uniform3(-1.0_f32..1.0));
+    prop_oneof![Just(UNTURNED), any.prop_map(|(w, [x, y, z])| [w, x, y, z])]
 }
 
 fn offspring() -> impl Strategy<Value = Offspring> {
@@ -40,14 +47,16 @@ fn offspring() -> impl Strategy<Value = Offspring> {
         prop::array::uniform3(-0.3_f32..0.3).prop_map(Placement::Offset),
         Just(Placement::Sampled),
         (0.0_f32..2.0).prop_map(|sigmas| Placement::LongAxis { sigmas }),
+        prop::array::uniform3(-1.5_f32..1.5).prop_map(Placement::Axes),
     ];
     let parent = prop_oneof![Just(ParentFate::Stays), Just(ParentFate::BecomesChild)];
-    (0..4_u32, parent, placement, scale_rule(), opacity_rule()).prop_map(
-        |(children, parent, placement, scale, opacity)| Offspring {
+    (0..4_u32, parent, placement, scale_rule(), quaternion(), opacity_rule()).prop_map(
+        |(children, parent, placement, scale, turn, opacity)| Offspring {
             children,
             parent,
             placement,
             scale,
+            turn,
             opacity,
         },
     )
@@ -56,11 +65,27 @@ fn offspring() -> impl Strategy<Value = Offspring> {
 pub(super) fn call() -> impl Strategy<Value = Call> {
     // Some beyond the last row, whatever the plan before has left.
     let row = || 0..ROWS as u32 + 12;
-    let update = (opacity_rule(), scale_rule(), any::<bool>())
-        .prop_map(|(opacity, scale, keep_moments)| Update { opacity, scale, keep_moments });
+    let maybe = || prop::option::of(prop::array::uniform3(-0.5_f32..1.5));
+    let update = (opacity_rule(), scale_rule(), maybe(), maybe(), any::<bool>()).prop_map(
+        |(opacity, scale, position, colour, keep_moments)| Update {
+            opacity,
+            scale,
+            position,
+            colour,
+            keep_moments,
+        },
+    );
     let unit = || prop::array::uniform3(0.0_f32..1.0);
-    let seed = (unit(), unit(), 0.01_f32..0.3, 0.01_f32..0.99)
-        .prop_map(|(position, colour, scale, opacity)| Seed { position, colour, scale, opacity });
+    let scales = prop::array::uniform3(0.01_f32..0.3);
+    let seed = (unit(), unit(), scales, quaternion(), 0.01_f32..0.99).prop_map(
+        |(position, colour, scales, orientation, opacity)| Seed {
+            position,
+            colour,
+            scales,
+            orientation,
+            opacity,
+        },
+    );
     prop_oneof![
         8 => row().prop_map(Call::Prune),
         8 => (row(), offspring()).prop_map(|(row, how)| Call::Grow(row, how)),

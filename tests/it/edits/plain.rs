@@ -34,6 +34,15 @@ fn longest(log_scale: [f32; 3]) -> usize {
     (1..3).fold(0, |best, axis| if log_scale[axis] > log_scale[best] { axis } else { best })
 }
 
+fn wide(quat: [f32; 4]) -> DQuat {
+    let [w, x, y, z] = quat.map(f64::from);
+    DQuat::from_xyzw(x, y, z, w)
+}
+
+fn unfold(quat: DQuat) -> [f32; 4] {
+    [quat.w, quat.x, quat.y, quat.z].map(|v| v as f32)
+}
+
 impl Row {
     fn rescale(&mut self, rule: ScaleRule) {
         let long_axis = longest(self.log_scale);
@@ -42,6 +51,7 @@ impl Row {
                 ScaleRule::Uniform(factor) => factor,
                 ScaleRule::LongAxis { long, .. } if axis == long_axis => long,
                 ScaleRule::LongAxis { other, .. } => other,
+                ScaleRule::Axes(factors) => factors[axis],
             };
             *scale = (f64::from(*scale) + f64::from(factor).ln()) as f32;
         }
@@ -83,32 +93,40 @@ impl Row {
                 local[axis] = sign * f64::from(sigmas) * f64::from(self.log_scale[axis]).exp();
                 self.turned(local)
             }
+            Placement::Axes(sigmas) => {
+                let sign = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
+                let scale = |i: usize| f64::from(self.log_scale[i]).exp();
+                self.turned([0, 1, 2].map(|i| sign * f64::from(sigmas[i]) * scale(i)))
+            }
         };
         child.mean = [0, 1, 2].map(|i| (f64::from(self.mean[i]) + offset[i]) as f32);
         child.rescale(how.scale);
+        child.quat = unfold(wide(self.quat) * wide(how.turn).normalize());
         child.cover(how.opacity, how.siblings());
         child
     }
 
     fn turned(&self, local: [f64; 3]) -> DVec3 {
-        let [w, x, y, z] = self.quat.map(f64::from);
-        DQuat::from_xyzw(x, y, z, w).normalize() * DVec3::from(local)
+        wide(self.quat).normalize() * DVec3::from(local)
+    }
+
+    fn paint(&mut self, colour: [f32; 3]) {
+        self.sh[..3].copy_from_slice(&colour.map(|c| (c - 0.5) / densify::sh::C0));
     }
 
     fn sown(seed: &Seed) -> Self {
-        let dc = |colour: f32| (colour - 0.5) / densify::sh::C0;
-        let mut sh = vec![0.0; 12];
-        sh[..3].copy_from_slice(&seed.colour.map(dc));
-        Self {
+        let mut sown = Self {
             mean: seed.position,
-            log_scale: [seed.scale.ln(); 3],
-            quat: [1.0, 0.0, 0.0, 0.0],
+            log_scale: seed.scales.map(f32::ln),
+            quat: unfold(wide(seed.orientation).normalize()),
             logit: logit(f64::from(seed.opacity)),
-            sh,
+            sh: vec![0.0; 12],
             signals: [0.0; SIGNALS.len()],
             moments: None,
             opacity_rests: false,
-        }
+        };
+        sown.paint(seed.colour);
+        sown
     }
 }
 
@@ -133,6 +151,10 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
                 let mut updated = before[*row as usize].clone();
                 updated.rescale(how.scale);
                 updated.cover(how.opacity, 1);
+                updated.mean = how.position.unwrap_or(updated.mean);
+                if let Some(colour) = how.colour {
+                    updated.paint(colour);
+                }
                 slots[*row as usize] =
                     Some(if how.keep_moments { updated } else { updated.reborn() });
             }

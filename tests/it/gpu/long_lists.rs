@@ -1,9 +1,8 @@
 //! Tiles with so many splats that some drivers do not go through all of them: llvmpipe ends all loops of an
 //! invocation after 65,535 rounds together, without a word. What comes then must be an error, not a model.
 
-use densify::backend::ImageGradient;
-use densify::backend::gpu::{Accumulation, GpuDevice};
-use densify::backend::{BackendError, Shortcuts};
+use densify::backend::gpu::GpuDevice;
+use densify::backend::{Accumulation, BackendError, ImageGradient, Shortcuts};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 

@@ -7,54 +7,46 @@
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight.
 //!
-//! The file is one piece because the passes share their window, their planes and their strips. Each
-//! pass runs over strips of rows, which write nothing that others of the same pass read. A row of the
-//! image is convolved vertically straight from the planes, into a few lines that stay in the cache,
-//! and these horizontally: nothing is computed twice, however the image is cut.
+//! The file is one piece because the passes share their planes and their strips. Each pass runs over
+//! strips of rows, which write nothing that others of the same pass read. Rows of the image are
+//! convolved vertically straight from the planes, into a few lines that stay in the cache, and these
+//! horizontally: nothing is computed twice, however the image is cut.
+
+mod window;
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
+use super::blocks::parts;
 use super::rasterize::{DARK, TileCanvas, row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
 use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
+use window::{
+    LinePerRow, Near, ROWS, horizontal, vertical, vertical_of_product, vertical_with_square,
+};
 
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
 const SSIM_WEIGHT: f32 = 0.2;
-/// Half the window.
-const REACH: usize = 5;
-/// The Gaussian window, normalised: exp(−k²/(2·1.5²))/Σ for k = −5..=5.
-const WINDOW: [f32; 2 * REACH + 1] = [
-    0.001_028_380_2,
-    0.007_598_758,
-    0.036_000_773,
-    0.109_360_69,
-    0.213_005_53,
-    0.266_011_74,
-    0.213_005_53,
-    0.109_360_69,
-    0.036_000_773,
-    0.007_598_758,
-    0.001_028_380_2,
-];
-/// Rows per strip: two rows of tiles.
-const STRIP: usize = 2 * TILE;
+/// Rows per strip: a row of tiles.
+const STRIP: usize = TILE;
 /// Zeros left of a line's first pixel, so that loads stay aligned; as many or more on the right.
 const PAD: usize = WIDTH;
-/// Lines of scratch of a pass: e, y, e², y² and e·y, convolved vertically.
-const MOST_LINES: usize = 5;
+/// Lines that are convolved vertically for each row: of e, y, e², y² and e·y.
+const CONVOLVED: usize = 5;
+/// Lines of scratch of a pass: those, and zeros.
+const MOST_LINES: usize = CONVOLVED * ROWS + 1;
 
 /// Planes of image size that the loss keeps between its passes: e, y, and three derivatives.
 #[derive(Debug)]
 pub(super) struct LossBuffers {
     /// Shape: `[rows, stride]` each.
     planes: [Vec<f32>; 5],
-    /// Error per pixel, summed over channels, if asked for. Shape: `[rows, stride]`.
-    error: Vec<f32>,
+    /// Errors per pixel, the mean over channels, if asked for. Shape: `[rows, stride]` each.
+    errors: [Vec<f32>; 2],
     stride: usize,
 }
 
@@ -65,11 +57,13 @@ pub(super) struct ImageTerms {
     pub(super) ssim: f32,
     /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
     pub(super) error: Option<[f32; 2]>,
+    /// Whether each pixel's part of the loss goes to the last plane of the gradient.
+    pub(super) by_pixel: bool,
 }
 
 impl Default for ImageTerms {
     fn default() -> Self {
-        Self { ssim: 1.0, error: None }
+        Self { ssim: 1.0, error: None, by_pixel: false }
     }
 }
 
@@ -95,25 +89,27 @@ fn line(width: usize) -> usize {
 
 impl LossBuffers {
     /// Bytes for an image of this size, and for the strips of so many threads.
-    pub(super) fn bytes(width: usize, height: usize, threads: usize) -> u64 {
-        let planes = 6 * line(width) * height;
+    pub(super) fn bytes(width: usize, height: usize, threads: usize, by_pixel: bool) -> u64 {
+        let planes = (6 + usize::from(by_pixel)) * line(width) * height;
         let lines = threads * MOST_LINES * line(width);
         ((planes + lines) * size_of::<f32>()) as u64
     }
 
     pub(super) fn new() -> Self {
-        Self { planes: Default::default(), error: Vec::new(), stride: 0 }
+        Self { planes: Default::default(), errors: Default::default(), stride: 0 }
     }
 
     /// Makes room for an image. Images of one size, or smaller ones, allocate nothing more.
-    fn resize(&mut self, grid: &Grid, with_error: bool) {
+    fn resize(&mut self, grid: &Grid, asked: [bool; 2]) {
         self.stride = line(grid.width);
         for plane in &mut self.planes {
             plane.resize(self.stride * grid.height, 0.0);
         }
-        self.error.clear();
-        if with_error {
-            self.error.resize(self.stride * grid.height, 0.0);
+        for (error, asked) in self.errors.iter_mut().zip(asked) {
+            error.clear();
+            if asked {
+                error.resize(self.stride * grid.height, 0.0);
+            }
         }
     }
 
@@ -131,21 +127,20 @@ impl LossBuffers {
         gradient: &mut [TileGradient],
         terms: ImageTerms,
     ) -> LossValue {
-        let ImageTerms { ssim: ssim_weight, error: error_weights } = terms;
-        let with_error = error_weights.is_some();
-        let l1_alone = ssim_weight == 0.0 && !with_error;
-        self.resize(grid, with_error);
+        let ImageTerms { ssim: ssim_weight, error: error_weights, by_pixel } = terms;
+        let l1_alone = ssim_weight == 0.0 && error_weights.is_none() && !by_pixel;
+        self.resize(grid, [error_weights.is_some(), by_pixel]);
+        let error_weights = [error_weights.unwrap_or_default(), [1.0 - SSIM_WEIGHT, SSIM_WEIGHT]];
         let stride = self.stride;
         let samples = (3 * grid.width * grid.height) as f64;
         let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
         for channel in 0..3 {
             let [e, y, p1, p2, p3] = &mut self.planes;
             let strip = STRIP * stride;
-            let error_strips: Vec<&mut [f32]> = if with_error {
-                self.error.chunks_mut(strip).collect()
-            } else {
-                (0..grid.height.div_ceil(STRIP)).map(|_| Default::default()).collect()
-            };
+            let strips = grid.height.div_ceil(STRIP);
+            let [ranking, by_pixel] = &mut self.errors;
+            let error_strips = [parts(ranking, strip, strips), parts(by_pixel, strip, strips)];
+            let [mut ranking, mut by_pixel] = error_strips;
             let source = Source { grid, canvas, target, background, channel };
             (e.par_chunks_mut(strip), y.par_chunks_mut(strip))
                 .into_par_iter()
@@ -156,7 +151,7 @@ impl LossBuffers {
             if l1_alone {
                 let scale = (1.0 - SSIM_WEIGHT) * (1.0 / samples as f32);
                 let parts: Vec<f64> = gradient
-                    .par_chunks_mut(grid.columns * STRIP / TILE)
+                    .par_chunks_mut(grid.columns)
                     .zip(e.par_chunks_mut(strip))
                     .enumerate()
                     .map(|(i, (tiles, e))| {
@@ -177,15 +172,16 @@ impl LossBuffers {
                 l1 += parts.into_iter().sum::<f64>();
                 continue;
             }
-            let parts: Vec<LossValue> = (
+            let sums: Vec<LossValue> = (
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),
                 p3.par_chunks_mut(strip),
-                error_strips,
+                ranking.par_iter_mut(),
+                by_pixel.par_iter_mut(),
             )
                 .into_par_iter()
                 .enumerate()
-                .map_init(Vec::new, |scratch, (i, (p1, p2, p3, error))| {
+                .map_init(Vec::new, |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
                     arch.dispatch(Similarity {
                         grid,
                         first: i * STRIP,
@@ -194,17 +190,17 @@ impl LossBuffers {
                         e,
                         y,
                         derivatives: [p1, p2, p3],
-                        error,
-                        error_weights: error_weights.unwrap_or_default().map(|w| w / 3.0),
+                        errors: [ranking, by_pixel],
+                        error_weights: error_weights.map(|weights| weights.map(|w| w / 3.0)),
                     })
                 })
                 .collect();
-            for part in parts {
+            for part in sums {
                 l1 += part.l1;
                 ssim += part.ssim;
             }
             let [e, y, p1, p2, p3] = &self.planes;
-            gradient.par_chunks_mut(grid.columns * STRIP / TILE).enumerate().for_each_init(
+            gradient.par_chunks_mut(grid.columns).enumerate().for_each_init(
                 Vec::new,
                 |scratch, (i, tiles)| {
                     arch.dispatch(Gradient {
@@ -224,13 +220,32 @@ impl LossBuffers {
                 },
             );
         }
+        if by_pixel {
+            self.spread_over_tiles(grid, gradient);
+        }
         let ssim = if ssim_weight == 0.0 { f64::NAN } else { ssim / samples };
         LossValue { l1: l1 / samples, ssim }
     }
 
+    /// Writes the second error to the last plane of the gradient.
+    fn spread_over_tiles(&self, grid: &Grid, gradient: &mut [TileGradient]) {
+        let stride = self.stride;
+        gradient.par_chunks_mut(grid.columns).enumerate().for_each(|(i, tiles)| {
+            for tile in tiles.iter_mut() {
+                tile.planes[4] = DARK;
+            }
+            let lines = self.errors[1][i * TILE * stride..].chunks_exact(stride);
+            for (row, line) in lines.take(TILE).enumerate() {
+                for (tile, errors) in tiles.iter_mut().zip(line[PAD..].as_chunks::<TILE>().0) {
+                    set_row_of_plane(&mut tile.planes[4], row, errors);
+                }
+            }
+        });
+    }
+
     /// Error of a pixel after a run with error weights.
     pub(super) fn error_at(&self, x: usize, y: usize) -> f32 {
-        self.error[y * self.stride + PAD + x]
+        self.errors[0][y * self.stride + PAD + x]
     }
 }
 
@@ -303,48 +318,16 @@ impl WithSimd for Lines<'_> {
     }
 }
 
-/// Σ_k WINDOW[k]·line[at + k − 5], for one vector. The window is cut out once, so that its eleven
-/// loads need no bounds check each.
-#[inline(always)]
-fn horizontal<S: Simd>(s: S, line: &[f32], at: usize) -> V<S> {
-    let around = &line[at - REACH..at + S::F32_LANES + REACH];
-    let mut sum = V::zero(s);
-    for (k, &w) in WINDOW.iter().enumerate() {
-        sum = V::splat(s, w).mul_add(V::load(s, &around[k..k + S::F32_LANES]), sum);
-    }
-    sum
-}
-
-/// A line of each of `N` planes, and its weight in the window.
-type Weighted<'a, const N: usize> = ([&'a [f32]; N], f32);
-
-/// The lines of `N` planes within reach of `row`, with the row's weights, and how many there are.
-/// They are cut out once per row of the image, so that a load in the inner loop has little to check.
-#[inline(always)]
-fn within_reach<const N: usize>(
-    planes: [&[f32]; N],
+/// `A` lines of scratch of `stride` numbers, and `B` for each of some rows: zero where nothing was
+/// written since the first call.
+fn scratch_lines<const A: usize, const B: usize>(
+    scratch: &mut Vec<f32>,
     stride: usize,
-    row: usize,
-    height: usize,
-) -> ([Weighted<'_, N>; WINDOW.len()], usize) {
-    let from = row.saturating_sub(REACH);
-    let to = (row + REACH + 1).min(height);
-    let mut lines = [([&[][..]; N], 0.0); WINDOW.len()];
-    for (i, (cut, weight)) in lines[..to - from].iter_mut().enumerate() {
-        let line = (from + i) * stride..(from + i + 1) * stride;
-        for (cut, plane) in cut.iter_mut().zip(planes) {
-            *cut = &plane[line.clone()];
-        }
-        *weight = WINDOW[from + i + REACH - row];
-    }
-    (lines, to - from)
-}
-
-/// `N` lines of scratch of `stride` numbers, zero where nothing was written since the first call.
-fn lines_of<const N: usize>(scratch: &mut Vec<f32>, stride: usize) -> [&mut [f32]; N] {
-    scratch.resize(N * stride, 0.0);
+) -> ([&mut [f32]; A], [LinePerRow<'_>; B]) {
+    scratch.resize((A + B * ROWS) * stride, 0.0);
     let mut lines = scratch.chunks_exact_mut(stride);
-    std::array::from_fn(|_| lines.next().unwrap_or_default())
+    let mut next = || lines.next().unwrap_or_default();
+    (std::array::from_fn(|_| next()), std::array::from_fn(|_| std::array::from_fn(|_| next())))
 }
 
 /// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
@@ -358,9 +341,9 @@ struct Similarity<'a> {
     /// The strip's lines.
     derivatives: [&'a mut [f32]; 3],
     /// The strip's lines; empty unless asked for.
-    error: &'a mut [f32],
-    /// Weights of |e| and of 1 − SSIM in it.
-    error_weights: [f32; 2],
+    errors: [&'a mut [f32]; 2],
+    /// Weights of |e| and of 1 − SSIM in each of them.
+    error_weights: [[f32; 2]; 2],
 }
 
 impl WithSimd for Similarity<'_> {
@@ -369,45 +352,40 @@ impl WithSimd for Similarity<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> LossValue {
-        let Self { grid, first, stride, scratch, e, y, derivatives, error, error_weights } = self;
+        let Self { grid, first, stride, scratch, e, y, derivatives, .. } = self;
+        let Self { mut errors, error_weights, .. } = self;
         let [p1, p2, p3] = derivatives;
-        let (width, height) = (grid.width, grid.height);
+        let width = grid.width;
         let rows = p1.len() / stride;
-        let lines: [&mut [f32]; MOST_LINES] = lines_of(scratch, stride);
+        let ([zeros], [mut of_e, mut of_y, mut of_ee, mut of_yy, mut of_ey]) =
+            scratch_lines::<1, CONVOLVED>(scratch, stride);
         let columns = (PAD..PAD + width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         let c = |x: f32| V::splat(s, x);
         let mut total = LossValue::default();
         for row in 0..rows {
-            let (near, count) = within_reach([e, y], stride, first + row, height);
-            for at in columns.clone() {
-                let mut sums = [V::zero(s); MOST_LINES];
-                for ([e, y], w) in &near[..count] {
-                    let (w, e, y) = (V::splat(s, *w), V::load(s, &e[at..]), V::load(s, &y[at..]));
-                    let (we, wy) = (w * e, w * y);
-                    sums[0] = sums[0] + we;
-                    sums[1] = sums[1] + wy;
-                    sums[2] = we.mul_add(e, sums[2]);
-                    sums[3] = wy.mul_add(y, sums[3]);
-                    sums[4] = we.mul_add(y, sums[4]);
-                }
-                for k in 0..MOST_LINES {
-                    sums[k].store(&mut lines[k][at..]);
-                }
+            if row % ROWS == 0 {
+                let near_e = Near::new(e, zeros, first + row);
+                let near_y = Near::new(y, zeros, first + row);
+                // One after the other: all five sums of four rows would not stay in the registers.
+                vertical_with_square(s, &near_e, columns.clone(), [&mut of_e, &mut of_ee]);
+                vertical_with_square(s, &near_y, columns.clone(), [&mut of_y, &mut of_yy]);
+                vertical_of_product(s, [&near_e, &near_y], columns.clone(), &mut of_ey);
             }
             let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
             for at in columns.clone() {
-                let mut means = [V::zero(s); MOST_LINES];
-                for k in 0..MOST_LINES {
-                    means[k] = horizontal(s, lines[k], at);
-                }
-                let [mu_e, mu_y, mean_ee, mean_yy, mean_ey] = means;
+                let n = row % ROWS;
+                let (mu_e, mu_y) = (horizontal(s, of_e[n], at), horizontal(s, of_y[n], at));
+                let (mean_ee, mean_yy) = (horizontal(s, of_ee[n], at), horizontal(s, of_yy[n], at));
+                let mean_ey = horizontal(s, of_ey[n], at);
                 let mu_x = mu_e + mu_y;
                 let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
                 let var_y = (mean_yy - mu_y * mu_y).max(V::zero(s));
                 let cov = mean_ey - mu_e * mu_y;
                 let var_x = (var_y + cov * 2.0 + var_e).max(V::zero(s));
-                let inv_a = c(1.0) / (mu_x * mu_x + mu_y * mu_y + C1);
-                let inv_b = c(1.0) / (var_x + var_y + C2);
+                // One division for both inverses: at least C₁·C₂ = 9e-8 is far from f32's least.
+                let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, var_x + var_y + C2);
+                let inv_ab = c(1.0) / (a * b);
+                let (inv_a, inv_b) = (inv_ab * b, inv_ab * a);
                 let luminance = c(1.0) - mu_e * mu_e * inv_a;
                 let contrast = c(1.0) - var_e * inv_b;
                 let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
@@ -422,10 +400,12 @@ impl WithSimd for Similarity<'_> {
                 let ssim = inside.keep(luminance * contrast);
                 row_l1 = row_l1 + abs;
                 row_ssim = row_ssim + ssim;
-                if !error.is_empty() {
-                    let dssim = inside.keep(c(1.0) - ssim);
-                    let add = abs * error_weights[0] + dssim * error_weights[1];
-                    (V::load(s, &error[to..]) + add).store(&mut error[to..]);
+                for (error, [by_abs, by_dssim]) in errors.iter_mut().zip(error_weights) {
+                    if !error.is_empty() {
+                        let dssim = inside.keep(c(1.0) - ssim);
+                        let add = abs * by_abs + dssim * by_dssim;
+                        (V::load(s, &error[to..]) + add).store(&mut error[to..]);
+                    }
                 }
             }
             total.l1 += f64::from(row_l1.sum());
@@ -523,7 +503,7 @@ impl WithSimd for Gradient<'_> {
         let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, .. } = self;
         let Self { ssim_weight, mask, tiles, .. } = self;
         let rows = STRIP.min(grid.height - first);
-        let lines: [&mut [f32]; 4] = lines_of(scratch, stride);
+        let ([zeros, out], mut lines) = scratch_lines::<2, 3>(scratch, stride);
         let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
         let l1_scale = (1.0 - SSIM_WEIGHT) * scale;
         let ssim_scale = -SSIM_WEIGHT * scale * ssim_weight;
@@ -532,36 +512,30 @@ impl WithSimd for Gradient<'_> {
             tile.planes[channel] = DARK;
         }
         for row in 0..rows {
-            let (near, count) = within_reach(derivatives, stride, first + row, grid.height);
-            for at in columns.clone() {
-                let mut sums = [zero; 3];
-                for (lines, w) in &near[..count] {
-                    let w = V::splat(s, *w);
-                    for k in 0..3 {
-                        sums[k] = w.mul_add(V::load(s, &lines[k][at..]), sums[k]);
-                    }
-                }
-                for k in 0..3 {
-                    sums[k].store(&mut lines[k][at..]);
+            if row % ROWS == 0 {
+                for (plane, lines) in derivatives.into_iter().zip(&mut lines) {
+                    let near = Near::new(plane, zeros, first + row);
+                    vertical(s, &near, columns.clone(), lines);
                 }
             }
             for at in columns.clone() {
-                let [by_mu_e, by_ee, by_ey] = each!(k in 3 => horizontal(s, lines[k], at));
+                let [by_mu_e, by_ee, by_ey] =
+                    each!(k in 3 => horizontal(s, lines[k][row % ROWS], at));
                 let from = (first + row) * stride + at;
                 let (e, y) = (V::load(s, &e[from..]), V::load(s, &y[from..]));
                 let by_ssim = by_mu_e + e * 2.0 * by_ee + y * by_ey;
                 let positive = zero.lt(e).keep(V::splat(s, l1_scale));
                 let negative = e.lt(zero).keep(V::splat(s, l1_scale));
                 let g = by_ssim * ssim_scale + (positive - negative);
-                g.store(&mut lines[3][at..]);
+                g.store(&mut out[at..]);
             }
             // The loss sees e·mask, so the chain rule has the mask once more.
             if let Some(mask) = mask {
                 let mask = &mask[(first + row) * grid.width..][..grid.width];
-                masked(&mut lines[3][PAD..PAD + grid.width], mask);
+                masked(&mut out[PAD..PAD + grid.width], mask);
             }
             let tiles = &mut tiles[row / TILE * grid.columns..][..grid.columns];
-            for (tile, g) in tiles.iter_mut().zip(lines[3][PAD..].as_chunks::<TILE>().0) {
+            for (tile, g) in tiles.iter_mut().zip(out[PAD..].as_chunks::<TILE>().0) {
                 set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
             }
         }

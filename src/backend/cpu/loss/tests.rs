@@ -1,11 +1,13 @@
 //! Tests of the optional parts of the loss; the selftest compares its values and gradients with the
 //! reference.
 
+use std::ops::Range;
+
 use super::super::tiles::Grid;
 use super::*;
 
-/// dL/dpixel and the scalars, of an image with structure against another.
-fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>) {
+/// The scalars, dL/dpixel and each pixel's part of the loss, of an image with structure against another.
+fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
     let grid = Grid::new(37, 50);
     let mut canvas = vec![TileCanvas::EMPTY; grid.tiles()];
     for (tile, canvas) in canvas.iter_mut().enumerate() {
@@ -26,20 +28,32 @@ fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>) {
     let mut gradient = vec![TileGradient { planes: [DARK; 5] }; grid.tiles()];
     let mut buffers = LossBuffers::new();
     let value = buffers.run(Arch::new(), &grid, &canvas, &target, [0.0; 3], &mut gradient, terms);
-    let planes = gradient.iter().flat_map(|tile| tile.planes[..3].iter());
-    (value, planes.flat_map(|plane| plane.as_flattened().iter().copied()).collect())
+    let of = |planes: Range<usize>| -> Vec<f32> {
+        let planes = gradient.iter().flat_map(|tile| &tile.planes[planes.clone()]);
+        planes.flat_map(|plane| plane.as_flattened().iter().copied()).collect()
+    };
+    (value, of(0..3), of(4..5))
 }
 
 #[test]
 fn ssim_is_left_out_or_weighs_more() {
     for mask in [false, true] {
-        let of = |ssim| run(ImageTerms { ssim, error: None }, mask);
-        let ((full, once), (alone, none), (_, thrice)) = (of(1.0), of(0.0), of(3.0));
+        let of = |ssim| run(ImageTerms { ssim, ..ImageTerms::default() }, mask);
+        let ((full, once, _), (alone, none, _), (_, thrice, _)) = (of(1.0), of(0.0), of(3.0));
         assert!(alone.ssim.is_nan() && (alone.l1 - full.l1).abs() < 1e-9, "{alone:?} {full:?}");
         assert!((alone.loss() - alone.l1).abs() < 1e-12);
         // With the error of each pixel asked for, the same comes from the other path.
-        let with_error = run(ImageTerms { ssim: 0.0, error: Some([1.0, 1.0]) }, mask);
+        let with_error =
+            run(ImageTerms { ssim: 0.0, error: Some([1.0, 1.0]), by_pixel: false }, mask);
         assert!(with_error.0.ssim.is_nan() && with_error.1 == none);
+        // As where each pixel's part is asked for, which always has that of SSIM.
+        for (ssim, gradient) in [(1.0, &once), (0.0, &none)] {
+            let (value, by, parts) = run(ImageTerms { ssim, error: None, by_pixel: true }, mask);
+            assert!((value.l1 - full.l1).abs() < 1e-9 && value.ssim.is_nan() == (ssim == 0.0));
+            assert!(by == *gradient);
+            let mean = parts.into_iter().map(f64::from).sum::<f64>() / (37.0 * 50.0);
+            assert!((mean - full.loss()).abs() < 1e-6, "{mean} {full:?}");
+        }
         let (mut most, mut ssim_part) = (0.0_f32, 0.0_f32);
         for ((none, once), thrice) in none.iter().zip(&once).zip(&thrice) {
             let part = once - none;

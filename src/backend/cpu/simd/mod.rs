@@ -7,7 +7,7 @@
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use pulp::Simd;
+use pulp::{Scalar, Simd};
 
 /// Rows per block, and pixels per tile row: every lane count divides it.
 pub(super) const WIDTH: usize = 16;
@@ -117,6 +117,19 @@ impl<S: Simd> V<S> {
         Mask { s: self.s, m: self.s.less_than_or_equal_f32s(self.v, b.v) }
     }
 
+    /// The numbers with these bits.
+    #[inline(always)]
+    pub(super) fn of_bits(s: S, bits: S::u32s) -> Self {
+        Self { s, v: s.transmute_f32s_u32s(bits) }
+    }
+
+    /// As integers; only for whole numbers in `[0, 2²³)`, which stand in the last bits after adding 2²³.
+    #[inline(always)]
+    pub(super) fn whole(self) -> S::u32s {
+        let bits = self.s.transmute_u32s_f32s((self + 8_388_608.0).v);
+        self.s.sub_u32s(bits, self.s.splat_u32s(8_388_608.0_f32.to_bits()))
+    }
+
     #[inline(always)]
     pub(super) fn sum(self) -> f32 {
         self.s.reduce_sum_f32s(self.v)
@@ -196,11 +209,19 @@ impl<S: Simd> V<S> {
     }
 }
 
-/// The sums over the lanes of each of four vectors. With sixteen lanes, the four are added up
+impl V<Scalar> {
+    /// The only lane.
+    #[inline(always)]
+    pub(super) fn lane(self) -> f32 {
+        self.v
+    }
+}
+
+/// The sums over the lanes of each of four vectors. With four lanes or more, the four are added up
 /// together, which takes half the operations of one after the other.
 #[inline(always)]
 pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
-    if S::F32_LANES != WIDTH {
+    if S::F32_LANES < 4 {
         return [a.sum(), b.sum(), c.sum(), d.sum()];
     }
     let s = a.s;
@@ -210,7 +231,11 @@ pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
     V { s, v: s.add_f32s(even, odd) }.store(&mut lanes);
     let mut sums = [0.0; 4];
     for (k, sum) in sums.iter_mut().enumerate() {
-        *sum = (lanes[k] + lanes[4 + k]) + (lanes[8 + k] + lanes[12 + k]);
+        *sum = match S::F32_LANES {
+            16 => (lanes[k] + lanes[4 + k]) + (lanes[8 + k] + lanes[12 + k]),
+            8 => lanes[k] + lanes[4 + k],
+            _ => lanes[k],
+        };
     }
     sums
 }
@@ -256,6 +281,18 @@ impl<S: Simd> Mask<S> {
             bits |= u32::from(bytes[0] & 1) << lane;
         }
         bits
+    }
+
+    /// `yes` where true, `no` elsewhere.
+    #[inline(always)]
+    pub(super) fn select_u32s(self, yes: S::u32s, no: S::u32s) -> S::u32s {
+        self.s.select_u32s(self.m, yes, no)
+    }
+
+    /// `to`, with `bits` set where true.
+    #[inline(always)]
+    pub(super) fn or_bits(self, to: S::u32s, bits: u32) -> S::u32s {
+        self.s.or_u32s(to, self.select_u32s(self.s.splat_u32s(bits), self.s.splat_u32s(0)))
     }
 
     #[inline(always)]

@@ -3,6 +3,7 @@
 
 use pulp::{Arch, WithSimd};
 
+use super::super::InstructionSet;
 use super::*;
 
 struct Each<'a>(&'a [f32], fn(f32) -> f64, Function, f64);
@@ -53,4 +54,28 @@ fn elementary_functions_are_accurate() {
     assert!(arch.dispatch(exp) < 2e-7);
     let log2 = Each(&grid(1.0, 2.0), |x| f64::from(x).log2(), Function::Log2, 1.0);
     assert!(arch.dispatch(log2) < 3e-7);
+}
+
+struct SumsOfFour;
+
+impl WithSimd for SumsOfFour {
+    type Output = ([f32; 4], usize);
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> ([f32; 4], usize) {
+        let lanes = |first: f32| -> V<S> {
+            let lanes: [f32; WIDTH] = std::array::from_fn(|i| first + (i * i) as f32);
+            V::load(s, &lanes)
+        };
+        (sums_of_four([lanes(1.0), lanes(20.0), lanes(300.0), lanes(4000.0)]), S::F32_LANES)
+    }
+}
+
+#[test]
+fn sums_of_four_are_four_sums() {
+    for set in InstructionSet::available() {
+        let (sums, lanes) = set.arch().dispatch(SumsOfFour);
+        let squares: usize = (0..lanes).map(|i| i * i).sum();
+        let expected = [1, 20, 300, 4000].map(|first| (first * lanes + squares) as f32);
+        assert_eq!(sums, expected, "{set}");
+    }
 }

@@ -2,14 +2,14 @@
 //! from them.
 //!
 //! A stage is registered in [`STAGES`]. A binding stands once, in the WGSL: a kernel is given the
-//! buffer that has the variable's name (`row_of_slot`: "row of slot"), unless
-//! [`Launches`](super::launches::Launches) names another for that variable.
+//! buffer that has the variable's name (`row_of_slot`: "row of slot"), unless `rebound` in
+//! `launches.rs` names another for that variable.
 
 use wgpu::naga::Module;
 use wgpu::naga::front::wgsl;
 use wgpu::naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 
-use super::accumulation::Accumulation;
+use crate::backend::Accumulation;
 
 macro_rules! shader {
     ($name:literal) => {
@@ -55,7 +55,7 @@ const fn stage(name: &'static str, on: On, texts: &'static [&'static str]) -> St
 }
 
 /// All stages; [`Stage::text`] adds what depends on the device.
-pub(super) const STAGES: [Stage; 14] = [
+pub(super) const STAGES: &[Stage] = &[
     stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")]),
     stage("tiles", On::All, &[VIEW, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),

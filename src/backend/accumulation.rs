@@ -3,8 +3,6 @@
 
 use std::fmt;
 
-use wgpu::Features;
-
 /// How the gradients that a row gets from its tiles are added up.
 ///
 /// On a device that adds by atomics the last bits of a sum depend on chance, and so does what training
@@ -43,25 +41,6 @@ impl Accumulation {
     #[must_use]
     pub const fn is_deterministic(self) -> bool {
         matches!(self, Self::Slots)
-    }
-
-    /// What a device must have for it, beside what all kernels need.
-    pub(super) fn features(self) -> Features {
-        match self {
-            Self::Slots => Features::empty(),
-            Self::SubgroupCas => Features::SUBGROUP,
-            Self::SubgroupAtomics => Features::SUBGROUP | Features::SHADER_FLOAT32_ATOMIC,
-        }
-    }
-
-    /// The features that an adapter lacks for it, in words.
-    pub(super) fn missing(self, there: Features) -> Vec<&'static str> {
-        let lacking = self.features().difference(there);
-        let names = [
-            (Features::SUBGROUP, "subgroup operations (SUBGROUP)"),
-            (Features::SHADER_FLOAT32_ATOMIC, "atomic addition of f32 (SHADER_FLOAT32_ATOMIC)"),
-        ];
-        names.into_iter().filter(|(one, _)| lacking.contains(*one)).map(|(_, name)| name).collect()
     }
 }
 

@@ -1,33 +1,52 @@
-//! Built-in scenes as datasets: `scene:spheres` is rendered in memory, or taken from the cache. The images are those that `densify scenegen --preset NAME` writes by default.
+//! Renders built-in scenes in memory, or takes them from the cache.
+
+mod scene_cache;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+pub use densify_scenegen::GroundTruth;
 use densify_scenegen::{
-    Frame, Generated, GroundTruth, InitPoints, Options, PRESETS, Scene, Source, generate,
+    Frame, Generated, InitPoints, Options, PRESETS, Scene, Source, View as RenderedView, generate,
 };
+use serde::{Deserialize, Serialize};
 
-use super::images::{Image8, ImageHeader, ImageSource, SourceFile};
-use super::prepare::{assemble, target_size};
-use super::scene_cache::Entry;
-use super::tracks::TrackSampler;
-use super::{Dataset, DatasetError, LoadOptions, PointCloud, View};
+use super::PREFIX;
 use crate::camera::Camera;
+use crate::dataset::images::{Image8, ImageHeader, ImageSource, SourceFile};
+use crate::dataset::prepare::{assemble, target_size};
+use crate::dataset::tracks::TrackSampler;
+use crate::dataset::{self, Dataset, DatasetError, LoadOptions, PointCloud, View};
+use scene_cache::Entry;
+pub(crate) use scene_cache::folder;
 
-/// Prefix of the path of a built-in scene.
-pub const PREFIX: &str = "scene:";
+/// Bytes of a scene's surface while its tree is built, for each byte of it in the end or in a file: a
+/// triangle takes 86 bytes in the file, up to 200 while its tree is built, and 100 in the end.
+const BUILDING: u64 = 4;
 
-/// The name of a built-in scene, if the path is one.
-#[must_use]
-pub fn name(path: &Path) -> Option<&str> {
-    path.to_str()?.strip_prefix(PREFIX)
+/// A built-in scene as it was rendered.
+#[derive(Debug, PartialEq)]
+struct Rendered {
+    about: About,
+    /// The images of all views, in order.
+    frames: Vec<Frame>,
+    points: InitPoints,
+}
+
+/// What there is to know of a scene without building it.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct About {
+    views: Vec<RenderedView>,
+    notes: Vec<String>,
+    /// As [`Dataset::surface_bytes`].
+    surface_bytes: u64,
 }
 
 /// Renders a built-in scene, or takes it from the cache.
 ///
 /// # Errors
 /// When there is no such scene, or the options leave no view to train on.
-pub(super) fn load(
+pub(in crate::dataset) fn load(
     path: &Path,
     name: &str,
     options: &LoadOptions,
@@ -36,39 +55,57 @@ pub(super) fn load(
     let is_known = PRESETS.iter().any(|preset| preset.name == name);
     let entry = options.cache.as_deref().filter(|_| is_known);
     let entry = entry.and_then(|folder| Entry::of(folder, name, &parameters));
-    if let Some((frames, points)) = entry.as_ref().and_then(Entry::read) {
-        let scene = Scene::prepare(&source, &parameters)?;
-        // A scene has as many images as views, unless somebody else has made the entry.
-        if frames.len() == scene.views.len() {
-            return dataset(path, &scene, frames, points, options);
-        }
+    let kept = entry.as_ref().and_then(Entry::read);
+    // A scene has as many images as views, unless somebody else has made the entry.
+    if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
+        return dataset(path, kept, options);
     }
     let Generated { scene, frames, points } = generate(&source, &parameters)?;
+    let surface_bytes = BUILDING * scene.surface.bytes() as u64;
+    let about = About { views: scene.views, notes: scene.model.notes, surface_bytes };
+    let rendered = Rendered { about, frames, points };
     if let Some(entry) = entry {
-        entry.write(&frames, &points);
+        entry.write(&rendered);
     }
-    dataset(path, &scene, frames, points, options)
+    dataset(path, rendered, options)
 }
 
-/// The geometry of a built-in scene, as [`load`] renders it.
-pub(super) fn ground_truth(name: &str) -> Result<GroundTruth, DatasetError> {
-    let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
-    Ok(GroundTruth::of_scene(scene))
+impl Dataset {
+    /// The geometry that the images were rendered from, in the dataset's own coordinates. Known for
+    /// built-in scenes and for folders that `densify scenegen` wrote.
+    ///
+    /// # Errors
+    /// When it exists but cannot be read.
+    pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
+        let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
+        let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
+        Ok(Some(GroundTruth::of_scene(scene)))
+    }
 }
 
-/// A rendered scene as a dataset named `path`. `frames` are the images of all its views, in order.
+/// What the surface in a folder takes at most while it is read `[bytes]`; `None` where there is none.
+pub(in crate::dataset) fn surface_bytes(root: &Path) -> Option<u64> {
+    let mesh = std::fs::metadata(root.join("mesh.ply"));
+    GroundTruth::is_in(root).then(|| BUILDING * mesh.map_or(0, |mesh| mesh.len()))
+}
+
+impl From<densify_scenegen::Error> for DatasetError {
+    fn from(error: densify_scenegen::Error) -> Self {
+        Self(error.to_string())
+    }
+}
+
+/// A rendered scene as a dataset named `path`.
 ///
 /// # Errors
 /// When the options leave no view to train on.
-pub fn dataset(
+fn dataset(
     path: &Path,
-    scene: &Scene,
-    frames: Vec<Frame>,
-    points: InitPoints,
+    Rendered { about, frames, points }: Rendered,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
     let mut views: Vec<(View, bool, Option<u32>)> = (0..)
-        .zip(&scene.views)
+        .zip(&about.views)
         .zip(frames)
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
@@ -84,12 +121,13 @@ pub fn dataset(
             sampler.add(position, colour, seen_by.iter().copied());
         }
     }
-    let read = super::Scene {
+    let read = dataset::Scene {
         points: PointCloud { positions: points.positions, colours: points.colours },
         tracks: sampler.finish(),
         own_split: true,
-        notes: scene.model.notes.clone(),
-        ..super::Scene::default()
+        surface_bytes: Some(about.surface_bytes),
+        notes: about.notes,
+        ..dataset::Scene::default()
     };
     assemble(path, views, read, options)
 }

@@ -7,7 +7,9 @@ use glam::{DMat3, DQuat, DVec3};
 
 use super::*;
 use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::dataset::GroundTruth;
 use crate::dataset::images::{Image8, SharedImage};
+use crate::dataset::normalise::Normalisation;
 use crate::gaussians::{Gaussians, logit, rgb_to_dc};
 use crate::views::ViewError;
 
@@ -134,7 +136,13 @@ fn measured(truth: &GroundTruth, world: &Gaussians) -> Geometry {
     let model = WORLD.model_from_world(world.clone());
     let options = CpuOptions { needs: needs(), ..CpuOptions::new(model.len().max(1)) };
     let mut backend = CpuBackend::new(&model, &options).unwrap();
-    let ground = KnownScene { truth, normalisation: &WORLD, background: [0.0; 3], sh_degree: 0 };
+    let ground = KnownScene {
+        truth,
+        normalisation: &WORLD,
+        background: [0.0; 3],
+        sh_degree: 0,
+        is_stopped: &|| false,
+    };
     measure(&mut backend, &ground, &Pair::new(), &Pair::new()).unwrap()
 }
 

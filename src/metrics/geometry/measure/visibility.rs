@@ -1,7 +1,7 @@
 //! Measures rows in the training views: their weight, and whether their place is empty.
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Signal};
-use densify_scenegen::{Camera as RayCamera, Sight};
+use densify_scenegen::{Camera as RayCamera, GBuffer};
 use glam::DVec3;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -65,10 +65,10 @@ impl Visibility {
             let camera = views.camera(number);
             visibility.weigh(backend, ground, camera, &request).map_err(failed)?;
             let (world, ray_camera) = ground.cameras(camera);
-            let sight = ground.sight(name, &ray_camera)?;
+            let g_buffer = ground.g_buffer(name, &ray_camera)?;
             let places = visibility.empty.par_iter_mut().zip(&rows.centres);
             places.for_each(|(empty, &place)| {
-                *empty += u32::from(sees_through(&world, &sight, place));
+                *empty += u32::from(sees_through(&world, &g_buffer, place));
             });
             let surface = ground.truth.surface();
             samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS).for_each(
@@ -159,14 +159,14 @@ impl Visibility {
 }
 
 /// Whether a view shows a surface behind a point, or none.
-fn sees_through(camera: &Camera, sight: &Sight, place: DVec3) -> bool {
+fn sees_through(camera: &Camera, g_buffer: &GBuffer, place: DVec3) -> bool {
     let (pixel, depth) = camera.project(place);
-    let (width, height) = (f64::from(sight.width), f64::from(sight.height));
+    let (width, height) = (f64::from(g_buffer.width), f64::from(g_buffer.height));
     let on_image = (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y);
     if !(depth > 0.0 && on_image) {
         return false;
     }
-    let shown = sight.depth[pixel.y as usize * sight.width as usize + pixel.x as usize];
+    let shown = g_buffer.depth[pixel.y as usize * g_buffer.width as usize + pixel.x as usize];
     shown <= 0.0 || depth < f64::from(shown)
 }
 

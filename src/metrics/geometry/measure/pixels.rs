@@ -61,17 +61,18 @@ impl<'a> Pixels<'a> {
         let ground = self.ground;
         let name = views.name(view);
         let (_, caster) = ground.cameras(views.camera(view));
-        let sight = ground.sight(name, &caster)?;
+        let g_buffer = ground.g_buffer(name, &caster)?;
         let rendering = backend
             .render(views.camera(view), ground.background, ground.sh_degree)
             .map_err(|source| EvaluateError::Backend { view: name.to_owned(), source })?;
-        let width = sight.width as usize;
+        let width = g_buffer.width as usize;
         let at = |i: usize| DVec2::new((i % width) as f64, (i / width) as f64) + 0.5;
-        let shown: Vec<usize> = (0..sight.depth.len()).filter(|&i| sight.depth[i] > 0.0).collect();
+        let shown: Vec<usize> =
+            (0..g_buffer.depth.len()).filter(|&i| g_buffer.depth[i] > 0.0).collect();
         self.surface += shown.len();
         for &i in &shown {
             if let Some(depth) = depth_at(&rendering, i, ground.normalisation.scale) {
-                let truth = f64::from(sight.depth[i]);
+                let truth = f64::from(g_buffer.depth[i]);
                 self.covered += 1;
                 self.squares += (depth - truth) * (depth - truth);
                 self.relative += (depth - truth).abs() / truth;
@@ -82,8 +83,8 @@ impl<'a> Pixels<'a> {
         let step = covered.len().div_ceil(NORMALS).max(1);
         let (rows, finder) = (self.rows, &self.finder);
         let angles = covered.par_iter().step_by(step).filter_map(|&i| {
-            let place = caster.centre + f64::from(sight.depth[i]) * caster.direction(at(i));
-            let truth = Vec3::from(sight.normals[i]).as_dvec3();
+            let place = caster.centre + f64::from(g_buffer.depth[i]) * caster.direction(at(i));
+            let truth = Vec3::from(g_buffer.normals[i]).as_dvec3();
             let normal = finder.normal(rows, place)?;
             Some(angle(normal, truth))
         });
@@ -92,18 +93,19 @@ impl<'a> Pixels<'a> {
         if ground.truth.has_thin() {
             let source = |source| EvaluateError::View { view: name.to_owned(), source };
             let image = views.image(view).map_err(source)?;
+            let KnownScene { truth, normalisation, background, .. } = *ground;
             let thin_pixels: Vec<(i32, bool)> = shown
                 .par_iter()
                 .filter_map(|&i| {
-                    let depth = f64::from(sight.depth[i]);
+                    let depth = f64::from(g_buffer.depth[i]);
                     let thickness =
-                        ground.truth.thickness(caster.centre, caster.direction(at(i)), depth)?;
+                        truth.thickness(caster.centre, caster.direction(at(i)), depth)?;
                     let octave = (thickness * caster.fx / depth).log2().round() as i32;
                     let slack = thickness + DEPTH_SLACK * depth;
-                    let right = depth_at(&rendering, i, ground.normalisation.scale)
+                    let right = depth_at(&rendering, i, normalisation.scale)
                         .is_some_and(|rendered| (rendered - depth).abs() < slack);
-                    let found = right
-                        && colour_error(&rendering, &image, i, ground.background) < COLOUR_SLACK;
+                    let found =
+                        right && colour_error(&rendering, &image, i, background) < COLOUR_SLACK;
                     Some((octave, found))
                 })
                 .collect();

@@ -13,6 +13,7 @@ use glam::DVec3;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 
+use super::{About, Rendered};
 use crate::output::write_atomically;
 
 /// Most bytes of all entries. The longest unused go first.
@@ -40,8 +41,8 @@ impl Entry {
         Some(Self { path: folder.join(name) })
     }
 
-    /// The images and points of the scene, if they are there and whole.
-    pub(super) fn read(&self) -> Option<(Vec<Frame>, InitPoints)> {
+    /// The scene, if it is there and whole.
+    pub(super) fn read(&self) -> Option<Rendered> {
         let mut bytes = Vec::new();
         File::open(&self.path).ok()?.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
         // It has been used just now. A cache that others share may be read only.
@@ -54,17 +55,17 @@ impl Entry {
     }
 
     /// Writes it. A cache that cannot be written is none; the run goes on.
-    pub(super) fn write(&self, frames: &[Frame], points: &InitPoints) {
-        if let Err(error) = self.try_write(frames, points) {
+    pub(super) fn write(&self, scene: &Rendered) {
+        if let Err(error) = self.try_write(scene) {
             tracing::debug!(%error, "the scene is not kept");
         }
     }
 
     fn try_write(
         &self,
-        frames: &[Frame],
-        points: &InitPoints,
+        Rendered { about, frames, points }: &Rendered,
     ) -> Result<(), Box<dyn std::error::Error>> {
+        let about = serde_json::to_vec(about)?;
         let flat: Vec<f64> = points.positions.iter().flat_map(DVec3::to_array).collect();
         let counts: Vec<u32> = points.seen_by.iter().map(|views| views.len() as u32).collect();
         let seen_by = points.seen_by.concat();
@@ -75,6 +76,7 @@ impl Entry {
             tensors.push((image_name(index), TensorView::new(Dtype::U8, shape, &frame.rgba)?));
         }
         for (name, kind, shape, bytes) in [
+            ("about", Dtype::U8, vec![about.len()], &about[..]),
             ("positions", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&flat)),
             ("colours", Dtype::U8, vec![number, 3], points.colours.as_flattened()),
             ("views", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
@@ -105,7 +107,7 @@ fn checksum_of(mut tensors: Vec<(String, TensorView<'_>)>) -> String {
 }
 
 /// The contents of an entry whose checksum is right.
-fn decode(tensors: &SafeTensors<'_>) -> Option<(Vec<Frame>, InitPoints)> {
+fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
     let frames = (0..).map_while(|index| tensors.tensor(&image_name(index)).ok());
     let frames: Option<Vec<Frame>> = frames.map(|image| frame(&image)).collect();
     let bytes = |name: &str| Some(tensors.tensor(name).ok()?.data());
@@ -120,8 +122,10 @@ fn decode(tensors: &SafeTensors<'_>) -> Option<(Vec<Frame>, InitPoints)> {
     let mut seen = u32s("seen_by")?.into_iter();
     let views = u32s("views")?.into_iter();
     let seen_by = views.map(|count| seen.by_ref().take(count as usize).collect()).collect();
-    // A dataset does not tell how many outliers there are.
-    Some((frames?, InitPoints { positions, colours, seen_by, outliers: 0 }))
+    // A dataset tells neither where points were found nor how many outliers there are.
+    let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
+    let about: About = serde_json::from_slice(bytes("about")?).ok()?;
+    Some(Rendered { about, frames: frames?, points })
 }
 
 fn frame(image: &TensorView<'_>) -> Option<Frame> {
@@ -175,9 +179,11 @@ fn bound(folder: &Path, most: u64) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use densify_scenegen::{Camera, Split, View};
+
     use super::*;
 
-    fn sample() -> (Vec<Frame>, InitPoints) {
+    fn sample() -> Rendered {
         let frame = |value: u8| Frame {
             width: 2,
             height: 1,
@@ -190,22 +196,17 @@ mod tests {
             positions: vec![DVec3::new(1.0, -0.1, 1e-9), DVec3::splat(7.25)],
             colours: vec![[1, 2, 3], [4, 5, 6]],
             seen_by: vec![vec![0, 2], vec![1]],
-            outliers: 0,
+            ..InitPoints::default()
         };
-        (vec![frame(3), frame(250)], points)
+        let camera = Camera::looking(DVec3::new(0.1, 0.2, 0.3), DVec3::X, DVec3::Y, 0.7, (2, 1));
+        let view = |name: &str, split| View { name: name.to_owned(), split, camera };
+        let views = vec![view("train/r_000", Split::Train), view("test/r_000", Split::Test)];
+        let about = About { views, notes: vec!["a note".to_owned()], surface_bytes: 5 };
+        Rendered { about, frames: vec![frame(3), frame(250)], points }
     }
 
-    fn same(read: Option<(Vec<Frame>, InitPoints)>) -> bool {
-        let (frames, points) = sample();
-        read.is_some_and(|(found, cloud)| {
-            let pixels = |frames: &[Frame]| -> Vec<(u32, u32, Vec<u8>)> {
-                frames.iter().map(|it| (it.width, it.height, it.rgba.clone())).collect()
-            };
-            pixels(&found) == pixels(&frames)
-                && cloud.positions == points.positions
-                && cloud.colours == points.colours
-                && cloud.seen_by == points.seen_by
-        })
+    fn same(read: Option<Rendered>) -> bool {
+        read.is_some_and(|read| read == sample())
     }
 
     #[test]
@@ -214,8 +215,7 @@ mod tests {
         let entry = |options: &Options| Entry::of(folder.path(), "spheres", options).unwrap();
         let default = entry(&Options::default());
         assert!(default.read().is_none());
-        let (frames, points) = sample();
-        default.write(&frames, &points);
+        default.write(&sample());
         assert!(same(default.read()));
         // Other parameters are another scene.
         assert!(entry(&Options { seed: 9, ..Options::default() }).read().is_none());

@@ -1,0 +1,26 @@
+//! Writes depth as a NumPy array for nerfstudio, in its default unit: thousandths of a world unit.
+//!
+//! Not as the 16-bit PNG that it also reads: that has too few steps, or too small a range, for scenes
+//! that are not some metres large. Format: numpy.org/doc/stable/reference/generated/numpy.lib.format.html
+
+use std::path::Path;
+
+use super::write_file;
+use crate::error::Error;
+use crate::trace::Frame;
+
+/// Depth `[world units / 1000]`, 0 where there is no surface. Shape: `[height, width]`.
+pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
+    // Magic, version and length.
+    const PREFIX: usize = 10;
+    let (height, width) = (frame.height, frame.width);
+    let header =
+        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
+    // With its line end the header is padded to a multiple of 64 bytes.
+    let padded = (PREFIX + header.len() + 1).next_multiple_of(64) - PREFIX;
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((padded as u16).to_le_bytes());
+    bytes.extend(format!("{header:0$}\n", padded - 1).bytes());
+    bytes.extend(frame.depth.iter().flat_map(|depth| (1000.0 * depth).to_le_bytes()));
+    write_file(path, &bytes)
+}

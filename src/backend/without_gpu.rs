@@ -1,0 +1,62 @@
+//! In place of the GPU backend where a program is built without the feature `gpu`: there is no adapter.
+
+use densify_policies::policy::Needs;
+
+use super::{
+    Accumulation, AdapterChoice, AdapterSummary, BackendError, BackendOptions, Differentiable,
+};
+use crate::gaussians::Gaussians;
+use crate::memory::Ledger;
+use crate::without::without;
+
+/// An open device, of which there is none.
+#[derive(Debug, Clone)]
+pub enum GpuDevice {}
+
+#[expect(missing_docs, clippy::missing_errors_doc, reason = "as with the feature `gpu`")]
+impl GpuDevice {
+    pub fn open(_: &AdapterChoice) -> Result<Self, BackendError> {
+        Err(BackendError::OverLimit(without("gpu", "--backend gpu and --gpu NAME")))
+    }
+
+    #[must_use]
+    pub fn adapter(&self) -> &AdapterSummary {
+        match *self {}
+    }
+
+    #[must_use]
+    pub fn accumulation(&self) -> Accumulation {
+        match *self {}
+    }
+
+    pub(super) fn largest_budget(&self, _: u8) -> u64 {
+        match *self {}
+    }
+
+    pub(super) fn most_pairs(&self, _: &Needs) -> u64 {
+        match *self {}
+    }
+
+    pub(super) fn promise(&self, _: u8, _: &BackendOptions) -> Ledger {
+        match *self {}
+    }
+
+    pub(crate) fn backend(
+        &self,
+        _: &Gaussians,
+        _: &BackendOptions,
+    ) -> Result<Box<dyn Differentiable>, BackendError> {
+        match *self {}
+    }
+}
+
+/// All adapters: none.
+#[must_use]
+pub fn adapters() -> Vec<AdapterSummary> {
+    Vec::new()
+}
+
+/// Whether there may be a GPU.
+pub(super) fn may_be_present() -> bool {
+    false
+}

@@ -1,0 +1,40 @@
+//! In place of the commands that need a feature which this program was built without: their refusals.
+
+use std::ffi::OsString;
+
+use clap::Args;
+
+use super::console::Console;
+use crate::failure::Failure;
+use crate::without::without;
+
+/// Not in this program, which was built without the feature that it needs.
+#[derive(Debug, Args)]
+pub(super) struct Absent {
+    /// Whatever is given
+    #[arg(hide = true, trailing_var_arg = true, allow_hyphen_values = true)]
+    words: Vec<OsString>,
+}
+
+/// Defines what `cli` calls of a module whose commands need a feature.
+macro_rules! absent {
+    ($module:ident, $feature:literal, $($run:ident($args:ident) $command:literal),*) => {
+        #[cfg(not(feature = $feature))]
+        pub(super) mod $module {
+            $(
+                pub(in crate::cli) use super::Absent as $args;
+
+                pub(in crate::cli) fn $run(
+                    _: &$args,
+                    _: &super::Console,
+                ) -> Result<(), super::Failure> {
+                    Err(super::Failure::input(super::without($feature, $command)))
+                }
+            )*
+        }
+    };
+}
+
+absent!(devices, "gpu", run(DevicesArgs) "densify devices");
+absent!(scenegen, "scenegen", run(ScenegenArgs) "densify scenegen");
+absent!(study, "study", compare(Comparison) "densify compare", trade(Trade) "densify trade");

@@ -1,0 +1,25 @@
+//! Built-in scenes as datasets: `scene:spheres` is rendered in memory, or taken from the cache. The images
+//! are those that `densify scenegen --preset NAME` writes by default.
+
+#[cfg(feature = "scenegen")]
+mod rendered;
+#[cfg(not(feature = "scenegen"))]
+#[path = "without_scenegen.rs"]
+mod rendered;
+
+use std::path::Path;
+
+pub use rendered::GroundTruth;
+pub(crate) use rendered::folder;
+#[cfg(not(feature = "scenegen"))]
+pub(super) use rendered::left_out;
+pub(super) use rendered::{load, surface_bytes};
+
+/// Prefix of the path of a built-in scene.
+pub const PREFIX: &str = "scene:";
+
+/// The name of a built-in scene, if the path is one.
+#[must_use]
+pub fn name(path: &Path) -> Option<&str> {
+    path.to_str()?.strip_prefix(PREFIX)
+}

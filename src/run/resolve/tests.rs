@@ -1,0 +1,111 @@
+//! Sizes and bytes are one function in both directions: what a number of rows takes holds as many, and what
+//! a memory holds takes no more.
+
+use densify_policies::plan::bytes_per_row;
+use proptest::prelude::*;
+
+use super::*;
+use crate::backend::gpu::adapters;
+use crate::dataset::tests::write::Made;
+use crate::knobs::{PRESETS, Preset};
+use crate::run::{ByteCount, Partial, Silent};
+
+/// A run of these options.
+fn described(options: &[(&str, toml::Value)]) -> RunSpec {
+    let lay = |all: Partial, (name, value): &(&str, toml::Value)| {
+        Partial::option(name, value.clone()).over(all)
+    };
+    options.iter().fold(Partial::default(), lay).describe().expect("a run")
+}
+
+/// Rows of a run, and its bytes that `--memory` limits.
+fn sized(inputs: &Inputs<'_>) -> (usize, u64) {
+    let setting = size::solve(inputs).expect("it is solved").expect("it fits").setting;
+    let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows).expect("needs"));
+    (setting.rows, inputs.device.limited_bytes(&ledger))
+}
+
+fn check(inputs: &Inputs<'_>, rows: usize) -> Result<(), TestCaseError> {
+    let rows = rows.min(inputs.device.largest_budget(inputs.degree.highest()));
+    let of = |budget, memory| {
+        let mut spec = inputs.spec.clone();
+        spec.size.budget = Some(Budget::Rows(budget));
+        spec.size.memory = memory;
+        sized(&inputs.with(&spec).expect("a scene"))
+    };
+    let (_, bytes) = of(rows, None);
+    for degree in 0..=inputs.degree.highest() {
+        let held = size::rows_at(inputs, bytes, degree, rows).expect("it is solved");
+        prop_assert!(held >= Some(rows), "{rows} rows take {bytes}, which hold {held:?}");
+    }
+    for memory in [bytes, bytes + bytes / 3] {
+        let open = size::rows_at(inputs, memory, 3, rows).expect("it is solved").expect("it fits");
+        for asked in [rows, open] {
+            let (found, taken) = of(asked, Some(ByteCount(memory)));
+            prop_assert!(taken <= memory, "{found} rows take {taken} of {memory}");
+            prop_assert_eq!(found, asked, "{} bytes", memory);
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn detailed_edits_are_counted_where_they_are_declared() {
+    let made = Made::colmap_txt();
+    let scene = made.path().to_str().expect("UTF-8");
+    let spec = described(&[("scene", scene.into()), ("backend", "cpu".into())]);
+    let inputs = Inputs::load(&spec, None, &Silent).expect("a scene");
+    let setting = size::solve(&inputs).expect("it is solved").expect("it fits").setting;
+    let declared = [false, true].map(|detailed_edits| {
+        let needs = inputs.needs(setting.rows).expect("needs");
+        let needs = Needs { detailed_edits, ..needs };
+        let ledger = inputs.ledger(&setting, &needs);
+        let event = ledger.lines.iter().find(|line| line.what == "a policy's event");
+        let event = event.expect("a line").bytes;
+        (event, bytes_per_row(&needs) as u64 * setting.rows as u64)
+    });
+    let [(plain, plain_plan), (detailed, detailed_plan)] = declared;
+    assert!(plain_plan < detailed_plan);
+    assert_eq!(detailed - plain, detailed_plan - plain_plan);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, cases: 4, ..Default::default() })]
+
+    #[test]
+    fn what_rows_take_holds_them_and_what_is_held_takes_no_more(
+        rows in prop_oneof![1..1_000_usize, 1_000..50_000_usize, 50_000..20_000_000_usize],
+        given in prop_oneof![Just(None), Just(Some("tile_cap")), Just(Some("image_cache"))],
+        policy: prop::sample::Index,
+        is_built_in: bool,
+        eval: bool,
+    ) {
+        let made = Made::colmap_txt();
+        let scene = if is_built_in { "scene:spheres" } else { made.path().to_str().expect("UTF-8") };
+        let policies = densify_policies::registry::policies().expect("the registry is sound");
+        let policy = policy.get(&policies).name;
+        let mut backends = vec![("cpu", PRESETS)];
+        // On a GPU only a preset without knobs of the native backend.
+        backends.extend((!adapters().is_empty()).then_some(("gpu", &PRESETS[1..2])));
+        for (backend, presets) in backends {
+            let mut shared: Vec<(&str, toml::Value)> = vec![
+                ("scene", scene.into()),
+                ("backend", backend.into()),
+                ("policy", policy.into()),
+                ("eval", eval.into()),
+            ];
+            shared.extend(given.map(|name| (name, 90_000.into())));
+            let spec = described(&shared);
+            let inputs = Inputs::load(&spec, None, &Silent).expect("a scene");
+            // Both say how long tile lists are.
+            let contradicts = |preset: &&Preset| {
+                let sets_pairs = preset.levels.iter().any(|(knob, _)| *knob == "pairs_per_row");
+                given == Some("tile_cap") && sets_pairs
+            };
+            for preset in presets.iter().filter(|preset| !contradicts(preset)) {
+                let spec = described(&[&shared[..], &[("preset", preset.name.into())]].concat());
+                check(&inputs.with(&spec).expect("a scene"), rows)?;
+            }
+        }
+    }
+}

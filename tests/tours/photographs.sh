@@ -1,0 +1,23 @@
+#!/usr/bin/env bash
+# A newcomer with photographs: the README's way from a dataset to a model that is looked at.
+#
+# tests/tours/photographs.sh PROGRAM DATASET [FOLDER]: FOLDER, new, keeps the pictures.
+set -euo pipefail
+here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
+. "$here/guide.sh"
+[ $# -ge 2 ] || fail 'usage: photographs.sh PROGRAM DATASET [FOLDER]'
+program="$(realpath "$1")" dataset="$(realpath "$2")"
+folder="${3:-$(mktemp -d)}"
+[ $# -ge 3 ] || trap 'rm -rf "$folder"' EXIT
+
+mkdir -p "$folder/data"
+cp -r "$dataset" "$folder/data/garden"
+cd "$folder"
+walk "$here/../../README.md" 'Train on your photographs' "$program" | tee said.txt
+
+# The model shows the scene, and its pictures are there to be looked at.
+psnr="$(sed -n 's/^test *PSNR \([0-9.]*\) dB.*/\1/p' said.txt)"
+awk -v psnr="$psnr" 'BEGIN { exit !(psnr > 20) }' || fail "the model has a PSNR of ${psnr:-none} dB"
+mapfile -t pictures < <(find pictures -name "*.pair.png" -size +0)
+[ "${#pictures[@]}" -gt 0 ] || fail "there is no picture"
+echo "passed: ${#pictures[@]} pictures at $psnr dB in $folder/pictures"
