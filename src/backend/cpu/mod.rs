@@ -23,6 +23,7 @@ mod narrow;
 mod observe;
 mod optimise;
 mod options;
+mod order;
 mod parameters;
 mod passes;
 mod project;
@@ -220,7 +221,7 @@ impl Backend for CpuBackend {
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel = self.signals.layout().has(Field::Error);
-        let terms = ImageTerms { ssim: input.ssim_weight, error: weights, by_pixel };
+        let terms = ImageTerms { error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);
@@ -287,6 +288,13 @@ impl Backend for CpuBackend {
             self.candidates.clear();
         }
         Ok(())
+    }
+
+    fn sort_rows(&mut self) {
+        self.have_sums(self.signals.layout());
+        let Self { pool, params, moments, ages, signals, summed, sums, rows, .. } = self;
+        let mut model = apply::Model { params, moments, ages, signals, summed };
+        pool.install(|| order::sort(&mut model, *rows, sums));
     }
 
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {

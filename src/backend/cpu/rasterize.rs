@@ -59,15 +59,14 @@ pub(super) const fn in_plane(x: usize, y: usize) -> (usize, usize) {
     (y / PATCH * ACROSS + x / PATCH, y % PATCH * PATCH + x % PATCH)
 }
 
-/// Copies row `y` of a tile out of its plane.
+/// Copies row `y` of a tile out of its plane. Patch by patch, straight to where it is wanted: loading it
+/// whole right afterwards would wait for all four stores.
 #[inline(always)]
-pub(super) fn row_of_plane(plane: &Plane, y: usize) -> [f32; TILE] {
-    let mut row = [0.0; TILE];
+pub(super) fn copy_row_of_plane(plane: &Plane, y: usize, row: &mut [f32; TILE]) {
     for (x, pixels) in (0..TILE).step_by(PATCH).zip(row.as_chunks_mut::<PATCH>().0) {
         let (patch, lane) = in_plane(x, y);
         pixels.copy_from_slice(&plane[patch][lane..lane + PATCH]);
     }
-    row
 }
 
 /// Copies row `y` of a tile into its plane.

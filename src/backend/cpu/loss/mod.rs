@@ -7,10 +7,14 @@
 //! its gradient is noise. The identity holds for any linear window, also where zero padding takes
 //! part of the window's weight.
 //!
+//! Variances do not change when a constant is taken from y, if it is taken from the padding, too. With
+//! y − ½ they lose two bits less to rounding.
+//!
 //! The file is one piece because the passes share their planes and their strips. Each pass runs over
 //! strips of rows, which write nothing that others of the same pass read. Rows of the image are
 //! convolved vertically straight from the planes, into a few lines that stay in the cache, and these
-//! horizontally: nothing is computed twice, however the image is cut.
+//! horizontally: nothing is computed twice, however the image is cut. How the pixels of a line are arranged
+//! for that, [`Segments`] says.
 
 mod window;
 
@@ -18,56 +22,51 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::blocks::parts;
-use super::rasterize::{DARK, TileCanvas, row_of_plane, set_row_of_plane};
+use super::rasterize::{DARK, TileCanvas, copy_row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
 use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
 use window::{
-    LinePerRow, Near, ROWS, horizontal, vertical, vertical_of_product, vertical_with_square,
+    Line, LinePerRow, Near, Segments, TOGETHER, horizontal, vertical, vertical_of_product,
+    vertical_with_square,
 };
 
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
 const SSIM_WEIGHT: f32 = 0.2;
-/// Rows per strip: a row of tiles.
+/// What is taken from y.
+const MIDDLE: f32 = 0.5;
+/// Rows per strip where tiles are read or written: a row of tiles.
 const STRIP: usize = TILE;
-/// Zeros left of a line's first pixel, so that loads stay aligned; as many or more on the right.
-const PAD: usize = WIDTH;
+/// Rows per strip elsewhere.
+const SHORT_STRIP: usize = 2 * TOGETHER;
 /// Lines that are convolved vertically for each row: of e, y, e², y² and e·y.
 const CONVOLVED: usize = 5;
-/// Lines of scratch of a pass: those, and zeros.
-const MOST_LINES: usize = CONVOLVED * ROWS + 1;
+/// Lines of scratch of a pass, at most: those, and what is outside the image of e and of y.
+const MOST_LINES: usize = CONVOLVED * TOGETHER + 2;
 
-/// Planes of image size that the loss keeps between its passes: e, y, and three derivatives.
+/// Planes of image size that the loss keeps between its passes: e, y − ½, and three derivatives.
 #[derive(Debug)]
 pub(super) struct LossBuffers {
-    /// Shape: `[rows, stride]` each.
-    planes: [Vec<f32>; 5],
-    /// Errors per pixel, the mean over channels, if asked for. Shape: `[rows, stride]` each.
-    errors: [Vec<f32>; 2],
-    stride: usize,
+    /// Shape: `[rows, pitch]` each.
+    planes: [Vec<[f32; WIDTH]>; 5],
+    /// Errors per pixel, the mean over channels, if asked for. Same shape.
+    errors: [Vec<[f32; WIDTH]>; 2],
+    segments: Segments,
 }
 
 /// What of a loss is asked for.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ImageTerms {
-    /// See [`StepInput::ssim_weight`](crate::backend::StepInput::ssim_weight).
-    pub(super) ssim: f32,
     /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
     pub(super) error: Option<[f32; 2]>,
     /// Whether each pixel's part of the loss goes to the last plane of the gradient.
     pub(super) by_pixel: bool,
 }
 
-impl Default for ImageTerms {
-    fn default() -> Self {
-        Self { ssim: 1.0, error: None, by_pixel: false }
-    }
-}
-
-/// The scalars of a loss; without SSIM that is NaN.
+/// The scalars of a loss.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct LossValue {
     pub(super) l1: f64,
@@ -76,46 +75,41 @@ pub(super) struct LossValue {
 
 impl LossValue {
     pub(super) fn loss(self) -> f64 {
-        if self.ssim.is_nan() {
-            return self.l1;
-        }
         (1.0 - f64::from(SSIM_WEIGHT)) * self.l1 + f64::from(SSIM_WEIGHT) * (1.0 - self.ssim)
     }
-}
-
-fn line(width: usize) -> usize {
-    width.next_multiple_of(WIDTH) + 2 * PAD
 }
 
 impl LossBuffers {
     /// Bytes for an image of this size, and for the strips of so many threads.
     pub(super) fn bytes(width: usize, height: usize, threads: usize, by_pixel: bool) -> u64 {
-        let planes = (6 + usize::from(by_pixel)) * line(width) * height;
-        let lines = threads * MOST_LINES * line(width);
+        let segments = Segments::of(width);
+        let planes = (6 + usize::from(by_pixel)) * segments.pitch() * WIDTH * height;
+        let lines = threads * MOST_LINES * segments.padded() * WIDTH;
         ((planes + lines) * size_of::<f32>()) as u64
     }
 
     pub(super) fn new() -> Self {
-        Self { planes: Default::default(), errors: Default::default(), stride: 0 }
+        Self { planes: Default::default(), errors: Default::default(), segments: Segments::of(0) }
     }
 
     /// Makes room for an image. Images of one size, or smaller ones, allocate nothing more.
     fn resize(&mut self, grid: &Grid, asked: [bool; 2]) {
-        self.stride = line(grid.width);
+        self.segments = Segments::of(grid.width);
+        let vectors = self.segments.pitch() * grid.height;
         for plane in &mut self.planes {
-            plane.resize(self.stride * grid.height, 0.0);
+            plane.resize(vectors, [0.0; WIDTH]);
         }
         for (error, asked) in self.errors.iter_mut().zip(asked) {
             error.clear();
             if asked {
-                error.resize(self.stride * grid.height, 0.0);
+                error.resize(vectors, [0.0; WIDTH]);
             }
         }
     }
 
     /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
     /// also the error of each pixel, as the mean over channels of their combination of |e| and
-    /// 1 − SSIM. Nothing of SSIM is computed where neither asks for it.
+    /// 1 − SSIM.
     #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
@@ -127,55 +121,30 @@ impl LossBuffers {
         gradient: &mut [TileGradient],
         terms: ImageTerms,
     ) -> LossValue {
-        let ImageTerms { ssim: ssim_weight, error: error_weights, by_pixel } = terms;
-        let l1_alone = ssim_weight == 0.0 && error_weights.is_none() && !by_pixel;
+        let ImageTerms { error: error_weights, by_pixel } = terms;
         self.resize(grid, [error_weights.is_some(), by_pixel]);
         let error_weights = [error_weights.unwrap_or_default(), [1.0 - SSIM_WEIGHT, SSIM_WEIGHT]];
-        let stride = self.stride;
+        let segments = self.segments;
+        let (strip, short) = (STRIP * segments.pitch(), SHORT_STRIP * segments.pitch());
         let samples = (3 * grid.width * grid.height) as f64;
         let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
         for channel in 0..3 {
             let [e, y, p1, p2, p3] = &mut self.planes;
-            let strip = STRIP * stride;
-            let strips = grid.height.div_ceil(STRIP);
-            let [ranking, by_pixel] = &mut self.errors;
-            let error_strips = [parts(ranking, strip, strips), parts(by_pixel, strip, strips)];
-            let [mut ranking, mut by_pixel] = error_strips;
             let source = Source { grid, canvas, target, background, channel };
             (e.par_chunks_mut(strip), y.par_chunks_mut(strip))
                 .into_par_iter()
                 .enumerate()
-                .for_each(|(i, (e, y))| {
-                    arch.dispatch(Lines { source, first: i * STRIP, stride, e, y });
+                .for_each_init(Vec::new, |scratch, (i, (e, y))| {
+                    arch.dispatch(Lines { source, segments, first: i * STRIP, scratch, e, y });
                 });
-            if l1_alone {
-                let scale = (1.0 - SSIM_WEIGHT) * (1.0 / samples as f32);
-                let parts: Vec<f64> = gradient
-                    .par_chunks_mut(grid.columns)
-                    .zip(e.par_chunks_mut(strip))
-                    .enumerate()
-                    .map(|(i, (tiles, e))| {
-                        let mask = target.mask.as_deref();
-                        let first = i * STRIP;
-                        arch.dispatch(Absolute {
-                            grid,
-                            channel,
-                            first,
-                            stride,
-                            e,
-                            scale,
-                            mask,
-                            tiles,
-                        })
-                    })
-                    .collect();
-                l1 += parts.into_iter().sum::<f64>();
-                continue;
-            }
+            let strips = grid.height.div_ceil(SHORT_STRIP);
+            let [ranking, by_pixel] = &mut self.errors;
+            let (mut ranking, mut by_pixel) =
+                (parts(ranking, short, strips), parts(by_pixel, short, strips));
             let sums: Vec<LossValue> = (
-                p1.par_chunks_mut(strip),
-                p2.par_chunks_mut(strip),
-                p3.par_chunks_mut(strip),
+                p1.par_chunks_mut(short),
+                p2.par_chunks_mut(short),
+                p3.par_chunks_mut(short),
                 ranking.par_iter_mut(),
                 by_pixel.par_iter_mut(),
             )
@@ -183,9 +152,9 @@ impl LossBuffers {
                 .enumerate()
                 .map_init(Vec::new, |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
                     arch.dispatch(Similarity {
-                        grid,
-                        first: i * STRIP,
-                        stride,
+                        width: grid.width,
+                        segments,
+                        first: i * SHORT_STRIP,
                         scratch,
                         e,
                         y,
@@ -205,15 +174,14 @@ impl LossBuffers {
                 |scratch, (i, tiles)| {
                     arch.dispatch(Gradient {
                         grid,
+                        segments,
                         channel,
                         first: i * STRIP,
-                        stride,
                         scratch,
                         e,
                         y,
                         derivatives: [p1, p2, p3],
                         scale: 1.0 / samples as f32,
-                        ssim_weight,
                         mask: target.mask.as_deref(),
                         tiles,
                     });
@@ -223,29 +191,33 @@ impl LossBuffers {
         if by_pixel {
             self.spread_over_tiles(grid, gradient);
         }
-        let ssim = if ssim_weight == 0.0 { f64::NAN } else { ssim / samples };
-        LossValue { l1: l1 / samples, ssim }
+        LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
     /// Writes the second error to the last plane of the gradient.
     fn spread_over_tiles(&self, grid: &Grid, gradient: &mut [TileGradient]) {
-        let stride = self.stride;
-        gradient.par_chunks_mut(grid.columns).enumerate().for_each(|(i, tiles)| {
-            for tile in tiles.iter_mut() {
-                tile.planes[4] = DARK;
-            }
-            let lines = self.errors[1][i * TILE * stride..].chunks_exact(stride);
-            for (row, line) in lines.take(TILE).enumerate() {
-                for (tile, errors) in tiles.iter_mut().zip(line[PAD..].as_chunks::<TILE>().0) {
-                    set_row_of_plane(&mut tile.planes[4], row, errors);
+        let segments = self.segments;
+        gradient.par_chunks_mut(grid.columns).enumerate().for_each_init(
+            || vec![0.0; segments.stride()],
+            |pixels, (i, tiles)| {
+                for tile in tiles.iter_mut() {
+                    tile.planes[4] = DARK;
                 }
-            }
-        });
+                let rows = TILE.min(grid.height - i * TILE);
+                for row in 0..rows {
+                    segments.restore(segments.line(&self.errors[1], i * TILE + row), pixels);
+                    for (tile, errors) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
+                        set_row_of_plane(&mut tile.planes[4], row, errors);
+                    }
+                }
+            },
+        );
     }
 
     /// Error of a pixel after a run with error weights.
     pub(super) fn error_at(&self, x: usize, y: usize) -> f32 {
-        self.errors[0][y * self.stride + PAD + x]
+        let [vector, lane] = self.segments.place(x);
+        self.segments.line(&self.errors[0], y)[vector][lane]
     }
 }
 
@@ -267,15 +239,16 @@ struct Source<'a> {
     channel: usize,
 }
 
-/// The planes' lines of one strip of one channel: e = rendering − target and y = target, 0 where
-/// masked and in the pads.
+/// The planes' lines of one strip of one channel: e = rendering − target, 0 where masked, and y − ½ of the
+/// target; right of the image as outside of it.
 struct Lines<'a> {
     source: Source<'a>,
+    segments: Segments,
     first: usize,
-    stride: usize,
+    scratch: &'a mut Vec<f32>,
     /// The strip's lines.
-    e: &'a mut [f32],
-    y: &'a mut [f32],
+    e: &'a mut Line,
+    y: &'a mut Line,
 }
 
 impl WithSimd for Lines<'_> {
@@ -284,64 +257,73 @@ impl WithSimd for Lines<'_> {
     /// Plain loops, which the compiler turns into vectors of the dispatched instruction set.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
-        let Self { source, first, stride, e, y } = self;
+        let Self { source, segments, first, scratch, e: to_e, y: to_y } = self;
         let Source { grid, canvas, target, background, channel } = source;
-        let width = grid.width;
-        let inner = PAD..PAD + width;
-        let lines = e.chunks_exact_mut(stride).zip(y.chunks_exact_mut(stride));
-        for (row, (e, y)) in (first..).zip(lines) {
-            e.fill(0.0);
-            y.fill(0.0);
+        let (width, stride, length) = (grid.width, segments.stride(), segments.length());
+        let pitch = segments.pitch();
+        scratch.resize(2 * stride, 0.0);
+        let (e, y) = scratch.split_at_mut(stride);
+        let lines = to_e.chunks_exact_mut(pitch).zip(to_y.chunks_exact_mut(pitch));
+        for (row, (to_e, to_y)) in (first..).zip(lines) {
             let pixels = row * width..(row + 1) * width;
             let bytes = &target.rgb[3 * pixels.start..3 * pixels.end];
-            for (y, rgb) in y[inner.clone()].iter_mut().zip(bytes.as_chunks::<3>().0) {
+            for (y, rgb) in y.iter_mut().zip(bytes.as_chunks::<3>().0) {
                 *y = f32::from(rgb[channel]) * (1.0 / 255.0);
             }
             if let Some(alpha) = &target.alpha {
-                for (y, &a) in y[inner.clone()].iter_mut().zip(&alpha[pixels.clone()]) {
+                for (y, &a) in y.iter_mut().zip(&alpha[pixels.clone()]) {
                     let a = f32::from(a) * (1.0 / 255.0);
                     *y = a * *y + (1.0 - a) * background[channel];
                 }
             }
             let tiles = &canvas[row / TILE * grid.columns..][..grid.columns];
-            for (tile, e) in tiles.iter().zip(e[PAD..].as_chunks_mut::<TILE>().0) {
-                *e = row_of_plane(&tile.planes[channel], row % TILE);
+            for (tile, e) in tiles.iter().zip(e.as_chunks_mut::<TILE>().0) {
+                copy_row_of_plane(&tile.planes[channel], row % TILE, e);
             }
-            e[PAD + width..].fill(0.0);
-            for (e, &y) in e[inner.clone()].iter_mut().zip(&y[inner.clone()]) {
-                *e -= y;
+            for (e, y) in e.iter_mut().zip(&mut *y).take(width) {
+                *e -= *y;
+                *y -= MIDDLE;
             }
+            e[width..].fill(0.0);
+            y[width..].fill(-MIDDLE);
             if let Some(mask) = &target.mask {
-                masked(&mut e[inner.clone()], &mask[pixels]);
+                masked(&mut e[..width], &mask[pixels]);
             }
+            segments.arrange(e, &mut to_e[..length]);
+            segments.arrange(y, &mut to_y[..length]);
         }
     }
 }
 
-/// `A` lines of scratch of `stride` numbers, and `B` for each of some rows: zero where nothing was
-/// written since the first call.
+/// `A` lines of scratch, and `B` padded ones for each of some rows.
 fn scratch_lines<const A: usize, const B: usize>(
-    scratch: &mut Vec<f32>,
-    stride: usize,
-) -> ([&mut [f32]; A], [LinePerRow<'_>; B]) {
-    scratch.resize((A + B * ROWS) * stride, 0.0);
-    let mut lines = scratch.chunks_exact_mut(stride);
-    let mut next = || lines.next().unwrap_or_default();
-    (std::array::from_fn(|_| next()), std::array::from_fn(|_| std::array::from_fn(|_| next())))
+    scratch: &mut Vec<[f32; WIDTH]>,
+    segments: Segments,
+) -> ([&mut Line; A], [LinePerRow<'_>; B]) {
+    let (length, padded) = (segments.length(), segments.padded());
+    scratch.resize(A * length + B * TOGETHER * padded, [0.0; WIDTH]);
+    let (lines, per_row) = scratch.split_at_mut(A * length);
+    let mut lines = lines.chunks_exact_mut(length);
+    let mut per_row = per_row.chunks_exact_mut(padded);
+    let mut next = || per_row.next().unwrap_or_default();
+    (
+        std::array::from_fn(|_| lines.next().unwrap_or_default()),
+        std::array::from_fn(|_| std::array::from_fn(|_| next())),
+    )
 }
 
-/// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·y].
+/// First pass over one strip of one channel: SSIM and its derivatives by μₑ, E[e²] and E[e·(y − ½)].
 struct Similarity<'a> {
-    grid: &'a Grid,
+    width: usize,
+    segments: Segments,
     first: usize,
-    stride: usize,
-    scratch: &'a mut Vec<f32>,
-    e: &'a [f32],
-    y: &'a [f32],
+    scratch: &'a mut Vec<[f32; WIDTH]>,
+    e: &'a Line,
+    y: &'a Line,
     /// The strip's lines.
-    derivatives: [&'a mut [f32]; 3],
+    derivatives: [&'a mut Line; 3],
     /// The strip's lines; empty unless asked for.
-    errors: [&'a mut [f32]; 2],
+    errors: [&'a mut Line; 2],
     /// Weights of |e| and of 1 − SSIM in each of them.
     error_weights: [[f32; 2]; 2],
 }
@@ -352,59 +334,65 @@ impl WithSimd for Similarity<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> LossValue {
-        let Self { grid, first, stride, scratch, e, y, derivatives, .. } = self;
+        let Self { width, segments, first, scratch, e, y, derivatives, .. } = self;
         let Self { mut errors, error_weights, .. } = self;
         let [p1, p2, p3] = derivatives;
-        let width = grid.width;
-        let rows = p1.len() / stride;
-        let ([zeros], [mut of_e, mut of_y, mut of_ee, mut of_yy, mut of_ey]) =
-            scratch_lines::<1, CONVOLVED>(scratch, stride);
-        let columns = (PAD..PAD + width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
-        let c = |x: f32| V::splat(s, x);
+        let (length, pitch) = (segments.length(), segments.pitch());
+        let rows = p1.len() / pitch;
+        let ([no_e, no_y], [mut of_e, mut of_y, mut of_ee, mut of_yy, mut of_ey]) =
+            scratch_lines::<2, CONVOLVED>(scratch, segments);
+        no_e.fill([0.0; WIDTH]);
+        no_y.fill([-MIDDLE; WIDTH]);
+        let (firsts, width) = (segments.firsts(), V::splat(s, width as f32));
         let mut total = LossValue::default();
         for row in 0..rows {
-            if row % ROWS == 0 {
-                let near_e = Near::new(e, zeros, first + row);
-                let near_y = Near::new(y, zeros, first + row);
+            if row % TOGETHER == 0 {
+                let near_e = Near::new(segments, e, no_e, first + row);
+                let near_y = Near::new(segments, y, no_y, first + row);
                 // One after the other: all five sums of four rows would not stay in the registers.
-                vertical_with_square(s, &near_e, columns.clone(), [&mut of_e, &mut of_ee]);
-                vertical_with_square(s, &near_y, columns.clone(), [&mut of_y, &mut of_yy]);
-                vertical_of_product(s, [&near_e, &near_y], columns.clone(), &mut of_ey);
+                vertical_with_square(s, &near_e, [&mut of_e, &mut of_ee]);
+                vertical_with_square(s, &near_y, [&mut of_y, &mut of_yy]);
+                vertical_of_product(s, [&near_e, &near_y], &mut of_ey);
+                for row in 0..TOGETHER {
+                    segments.pad(of_e[row], 0.0);
+                    segments.pad(of_y[row], -MIDDLE);
+                    segments.pad(of_ee[row], 0.0);
+                    segments.pad(of_yy[row], MIDDLE * MIDDLE);
+                    segments.pad(of_ey[row], 0.0);
+                }
             }
+            let n = row % TOGETHER;
+            let lines: [&Line; CONVOLVED] = [of_e[n], of_y[n], of_ee[n], of_yy[n], of_ey[n]];
+            let here = row * pitch;
+            let of_row = p1[here..here + length].as_chunks_mut::<2>().0.iter_mut();
+            let of_row = of_row.zip(p2[here..here + length].as_chunks_mut::<2>().0);
+            let of_row = of_row.zip(p3[here..here + length].as_chunks_mut::<2>().0);
+            let of_row = of_row.zip(segments.line(e, first + row).as_chunks::<2>().0);
             let (mut row_l1, mut row_ssim) = (V::zero(s), V::zero(s));
-            for at in columns.clone() {
-                let n = row % ROWS;
-                let (mu_e, mu_y) = (horizontal(s, of_e[n], at), horizontal(s, of_y[n], at));
-                let (mean_ee, mean_yy) = (horizontal(s, of_ee[n], at), horizontal(s, of_yy[n], at));
-                let mean_ey = horizontal(s, of_ey[n], at);
-                let mu_x = mu_e + mu_y;
-                let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
-                let var_y = (mean_yy - mu_y * mu_y).max(V::zero(s));
-                let cov = mean_ey - mu_e * mu_y;
-                let var_x = (var_y + cov * 2.0 + var_e).max(V::zero(s));
-                // One division for both inverses: at least C₁·C₂ = 9e-8 is far from f32's least.
-                let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, var_x + var_y + C2);
-                let inv_ab = c(1.0) / (a * b);
-                let (inv_a, inv_b) = (inv_ab * b, inv_ab * a);
-                let luminance = c(1.0) - mu_e * mu_e * inv_a;
-                let contrast = c(1.0) - var_e * inv_b;
-                let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
-                let two_ve_bb = var_e * inv_b * inv_b * 2.0;
-                let by_contrast = mu_e * contrast * inv_b * 2.0 - mu_y * two_ve_bb;
-                let inside = V::load(s, &LANES[..]).lt(c((PAD + width).saturating_sub(at) as f32));
-                let to = row * stride + at;
-                inside.keep(contrast * by_luminance + luminance * by_contrast).store(&mut p1[to..]);
-                inside.keep(-(luminance * contrast * inv_b)).store(&mut p2[to..]);
-                inside.keep(luminance * two_ve_bb).store(&mut p3[to..]);
-                let abs = V::load(s, &e[first * stride + to..]).abs();
-                let ssim = inside.keep(luminance * contrast);
-                row_l1 = row_l1 + abs;
-                row_ssim = row_ssim + ssim;
-                for (error, [by_abs, by_dssim]) in errors.iter_mut().zip(error_weights) {
-                    if !error.is_empty() {
-                        let dssim = inside.keep(c(1.0) - ssim);
-                        let add = abs * by_abs + dssim * by_dssim;
-                        (V::load(s, &error[to..]) + add).store(&mut error[to..]);
+            for (pair, (((p1, p2), p3), e)) in of_row.enumerate() {
+                for lane in (0..WIDTH).step_by(S::F32_LANES) {
+                    let [mu_e, mu_y, ee, yy, ey] = each!(k in 5 => {
+                        horizontal::<S, 2, 12>(s, around(lines[k], 2 * pair), lane)
+                    });
+                    for n in 0..2 {
+                        let means = [mu_e[n], mu_y[n], ee[n], yy[n], ey[n]];
+                        let Similar { ssim, by_mu_e, by_ee, by_ey } = Similar::of(s, means);
+                        let i = 2 * pair + n;
+                        let inside = (V::load(s, &firsts[lane..]) + i as f32).lt(width);
+                        inside.keep(by_mu_e).store(&mut p1[n][lane..]);
+                        inside.keep(by_ee).store(&mut p2[n][lane..]);
+                        inside.keep(by_ey).store(&mut p3[n][lane..]);
+                        let abs = V::load(s, &e[n][lane..]).abs();
+                        let ssim = inside.keep(ssim);
+                        row_l1 = row_l1 + abs;
+                        row_ssim = row_ssim + ssim;
+                        for (error, [by_abs, by_dssim]) in errors.iter_mut().zip(error_weights) {
+                            if let Some(error) = error.get_mut(here + i) {
+                                let dssim = inside.keep(V::splat(s, 1.0) - ssim);
+                                let add = abs * by_abs + dssim * by_dssim;
+                                (V::load(s, &error[lane..]) + add).store(&mut error[lane..]);
+                            }
+                        }
                     }
                 }
             }
@@ -415,81 +403,61 @@ impl WithSimd for Similarity<'_> {
     }
 }
 
-/// 0, 1, 2, …
-const LANES: [f32; WIDTH] = {
-    let mut lanes = [0.0; WIDTH];
-    let mut i = 0;
-    while i < WIDTH {
-        lanes[i] = i as f32;
-        i += 1;
-    }
-    lanes
-};
-
-/// One strip of one channel, of L1 alone: its sum, and dL/dpixel.
-struct Absolute<'a> {
-    grid: &'a Grid,
-    channel: usize,
-    first: usize,
-    stride: usize,
-    /// The strip's lines; they are used up.
-    e: &'a mut [f32],
-    /// L1's weight / number of samples.
-    scale: f32,
-    mask: Option<&'a [u8]>,
-    /// The strip's tiles.
-    tiles: &'a mut [TileGradient],
+/// SSIM of some pixels, and its derivatives by μₑ, E[e²] and E[e·(y − ½)].
+struct Similar<S: Simd> {
+    ssim: V<S>,
+    by_mu_e: V<S>,
+    by_ee: V<S>,
+    by_ey: V<S>,
 }
 
-impl WithSimd for Absolute<'_> {
-    /// Σ|e| over the strip's pixels.
-    type Output = f64;
-
+impl<S: Simd> Similar<S> {
+    /// From μₑ, the mean of y − ½, and those of e², (y − ½)² and e·(y − ½).
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) -> f64 {
-        let Self { grid, channel, first, stride, e, scale, mask, tiles } = self;
-        let zero = V::zero(s);
-        let mut total = 0.0;
-        for tile in tiles.iter_mut() {
-            tile.planes[channel] = DARK;
+    fn of(s: S, [mu_e, middle, mean_ee, mean_yy, mean_ey]: [V<S>; 5]) -> Self {
+        let c = |x: f32| V::splat(s, x);
+        let mu_y = middle + MIDDLE;
+        let mu_x = mu_e + mu_y;
+        let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
+        let var_y = (mean_yy - middle * middle).max(V::zero(s));
+        let cov = mean_ey - mu_e * middle;
+        let var_x = (var_y + cov * 2.0 + var_e).max(V::zero(s));
+        // One division for both inverses: at least C₁·C₂ = 9e-8 is far from f32's least.
+        let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, var_x + var_y + C2);
+        let inv_ab = c(1.0) / (a * b);
+        let (inv_a, inv_b) = (inv_ab * b, inv_ab * a);
+        let luminance = c(1.0) - mu_e * mu_e * inv_a;
+        let contrast = c(1.0) - var_e * inv_b;
+        let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
+        let two_ve_bb = var_e * inv_b * inv_b * 2.0;
+        let by_contrast = mu_e * contrast * inv_b * 2.0 - middle * two_ve_bb;
+        Self {
+            ssim: luminance * contrast,
+            by_mu_e: contrast * by_luminance + luminance * by_contrast,
+            by_ee: -(luminance * contrast * inv_b),
+            by_ey: luminance * two_ve_bb,
         }
-        for (row, line) in e.chunks_exact_mut(stride).enumerate() {
-            let mut sum = zero;
-            for at in (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES) {
-                let e = V::load(s, &line[at..]);
-                sum = sum + e.abs();
-                let positive = zero.lt(e).keep(V::splat(s, scale));
-                let negative = e.lt(zero).keep(V::splat(s, scale));
-                (positive - negative).store(&mut line[at..]);
-            }
-            total += f64::from(sum.sum());
-            // The loss sees e·mask, so the chain rule has the mask once more.
-            if let Some(mask) = mask {
-                let mask = &mask[(first + row) * grid.width..][..grid.width];
-                masked(&mut line[PAD..PAD + grid.width], mask);
-            }
-            let tiles = &mut tiles[row / TILE * grid.columns..][..grid.columns];
-            for (tile, g) in tiles.iter_mut().zip(line[PAD..].as_chunks::<TILE>().0) {
-                set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
-            }
-        }
-        total
     }
+}
+
+/// What the window reaches from some vectors of a padded line, from one on.
+#[inline(always)]
+fn around<const M: usize>(line: &Line, first: usize) -> &[[f32; WIDTH]; M] {
+    line[first..].first_chunk().expect("a padded line")
 }
 
 /// Second pass over one strip of one channel: dL/dpixel.
 struct Gradient<'a> {
     grid: &'a Grid,
+    segments: Segments,
     channel: usize,
     first: usize,
-    stride: usize,
-    scratch: &'a mut Vec<f32>,
-    e: &'a [f32],
-    y: &'a [f32],
-    derivatives: [&'a [f32]; 3],
+    scratch: &'a mut Vec<[f32; WIDTH]>,
+    e: &'a Line,
+    y: &'a Line,
+    derivatives: [&'a Line; 3],
     /// 1 / number of samples.
     scale: f32,
-    ssim_weight: f32,
     mask: Option<&'a [u8]>,
     /// The strip's tiles.
     tiles: &'a mut [TileGradient],
@@ -500,42 +468,54 @@ impl WithSimd for Gradient<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { grid, channel, first, stride, scratch, e, y, derivatives, scale, .. } = self;
-        let Self { ssim_weight, mask, tiles, .. } = self;
+        let Self { grid, segments, channel, first, scratch, e, y, derivatives, scale, .. } = self;
+        let Self { mask, tiles, .. } = self;
         let rows = STRIP.min(grid.height - first);
-        let ([zeros, out], mut lines) = scratch_lines::<2, 3>(scratch, stride);
-        let columns = (PAD..PAD + grid.width.next_multiple_of(WIDTH)).step_by(S::F32_LANES);
+        let ([zeros, out, pixels], mut lines) = scratch_lines::<3, 3>(scratch, segments);
+        zeros.fill([0.0; WIDTH]);
+        let pixels = pixels.as_flattened_mut();
         let l1_scale = (1.0 - SSIM_WEIGHT) * scale;
-        let ssim_scale = -SSIM_WEIGHT * scale * ssim_weight;
+        let ssim_scale = -SSIM_WEIGHT * scale;
         let zero = V::zero(s);
-        for tile in tiles.iter_mut() {
-            tile.planes[channel] = DARK;
+        if rows < STRIP {
+            for tile in tiles.iter_mut() {
+                tile.planes[channel] = DARK;
+            }
         }
         for row in 0..rows {
-            if row % ROWS == 0 {
+            if row % TOGETHER == 0 {
                 for (plane, lines) in derivatives.into_iter().zip(&mut lines) {
-                    let near = Near::new(plane, zeros, first + row);
-                    vertical(s, &near, columns.clone(), lines);
+                    vertical(s, &Near::new(segments, plane, zeros, first + row), lines);
+                    for line in lines {
+                        segments.pad(line, 0.0);
+                    }
                 }
             }
-            for at in columns.clone() {
-                let [by_mu_e, by_ee, by_ey] =
-                    each!(k in 3 => horizontal(s, lines[k][row % ROWS], at));
-                let from = (first + row) * stride + at;
-                let (e, y) = (V::load(s, &e[from..]), V::load(s, &y[from..]));
-                let by_ssim = by_mu_e + e * 2.0 * by_ee + y * by_ey;
-                let positive = zero.lt(e).keep(V::splat(s, l1_scale));
-                let negative = e.lt(zero).keep(V::splat(s, l1_scale));
-                let g = by_ssim * ssim_scale + (positive - negative);
-                g.store(&mut out[at..]);
+            let of_row = out.as_chunks_mut::<TOGETHER>().0.iter_mut();
+            let of_row = of_row.zip(segments.line(e, first + row).as_chunks::<TOGETHER>().0);
+            let of_row = of_row.zip(segments.line(y, first + row).as_chunks::<TOGETHER>().0);
+            for (group, ((out, e), y)) in of_row.enumerate() {
+                for lane in (0..WIDTH).step_by(S::F32_LANES) {
+                    let [by_mu_e, by_ee, by_ey] = each!(k in 3 => {
+                        let line = &*lines[k][row % TOGETHER];
+                        horizontal::<S, TOGETHER, 14>(s, around(line, TOGETHER * group), lane)
+                    });
+                    for n in 0..TOGETHER {
+                        let (e, y) = (V::load(s, &e[n][lane..]), V::load(s, &y[n][lane..]));
+                        let by_ssim = by_mu_e[n] + e * 2.0 * by_ee[n] + y * by_ey[n];
+                        let positive = zero.lt(e).keep(V::splat(s, l1_scale));
+                        let negative = e.lt(zero).keep(V::splat(s, l1_scale));
+                        let g = by_ssim * ssim_scale + (positive - negative);
+                        g.store(&mut out[n][lane..]);
+                    }
+                }
             }
+            segments.restore(out, pixels);
             // The loss sees e·mask, so the chain rule has the mask once more.
             if let Some(mask) = mask {
-                let mask = &mask[(first + row) * grid.width..][..grid.width];
-                masked(&mut out[PAD..PAD + grid.width], mask);
+                masked(pixels, &mask[(first + row) * grid.width..][..grid.width]);
             }
-            let tiles = &mut tiles[row / TILE * grid.columns..][..grid.columns];
-            for (tile, g) in tiles.iter_mut().zip(out[PAD..].as_chunks::<TILE>().0) {
+            for (tile, g) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
                 set_row_of_plane(&mut tile.planes[channel], row % TILE, g);
             }
         }

@@ -1,11 +1,12 @@
-//! The window of SSIM: down the columns for a few rows of the image together, then along each row.
-
-use std::iter::StepBy;
-use std::ops::Range;
+//! The window of SSIM: down the columns for a few rows of the image together, then along the rows for a
+//! few vectors together. It is symmetric, so pairs are added first.
+//!
+//! A line of the image is kept in sixteen segments side by side, one in each lane, so that the pixels left
+//! and right of a vector's are vectors, too, and no load is unaligned.
 
 use pulp::Simd;
 
-use super::super::simd::V;
+use super::super::simd::{V, WIDTH, each};
 
 /// Half the window.
 pub(super) const REACH: usize = 5;
@@ -23,77 +24,206 @@ const WINDOW: [f32; 2 * REACH + 1] = [
     0.007_598_758,
     0.001_028_380_2,
 ];
-/// Rows convolved vertically together: they share most of the lines within their reach, so that each
-/// line is loaded 3.5 times in all, not eleven. More rows would not stay in the registers.
-pub(super) const ROWS: usize = 4;
-/// Lines within reach of so many rows.
-const NEAR: usize = ROWS + 2 * REACH;
+/// Rows, or vectors of a row, that are convolved together: they share most of what is within their reach,
+/// so that it is loaded 3.5 times in all, not eleven. More would not stay in the registers.
+pub(super) const TOGETHER: usize = 4;
+/// Rows or vectors within reach of so many.
+const NEAR: usize = TOGETHER + 2 * REACH;
+/// Runs of pixels that a segment consists of.
+const RUN: usize = 4;
 
-/// The columns of a line that are convolved, one vector after the other.
-pub(super) type Columns = StepBy<Range<usize>>;
-/// A line of scratch for each of the rows.
-pub(super) type LinePerRow<'a> = [&'a mut [f32]; ROWS];
+/// How the pixels of a line are arranged: vector i has in lane l the pixel i of segment l.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Segments {
+    /// Pixels of a segment.
+    length: usize,
+}
 
-/// The lines of a plane within reach of `ROWS` rows; `zeros` outside the image.
-pub(super) struct Near<'a>([&'a [f32]; NEAR]);
+impl Segments {
+    /// Of lines of so many pixels. Whole runs, and longer than the window reaches, so that it never
+    /// reaches beyond the next lane.
+    pub(super) const fn of(width: usize) -> Self {
+        let length = width.div_ceil(WIDTH).next_multiple_of(RUN);
+        Self { length: if length < 2 * RUN { 2 * RUN } else { length } }
+    }
+
+    /// Pixels of a segment, which are the vectors of a line.
+    pub(super) const fn length(self) -> usize {
+        self.length
+    }
+
+    /// Numbers of a line.
+    pub(super) const fn stride(self) -> usize {
+        self.length * WIDTH
+    }
+
+    /// Vectors from a plane's line to the next: an odd number, as lines that are a power of two apart
+    /// drive each other out of the cache.
+    pub(super) const fn pitch(self) -> usize {
+        self.length + 1
+    }
+
+    /// Row `row` of a plane.
+    pub(super) fn line(self, plane: &Line, row: usize) -> &Line {
+        &plane[row * self.pitch()..][..self.length]
+    }
+
+    /// Vectors of a line that is convolved along the row: with those within reach of its ends.
+    pub(super) const fn padded(self) -> usize {
+        self.length + 2 * REACH
+    }
+
+    /// Vector and lane of a pixel.
+    pub(super) fn place(self, x: usize) -> [usize; 2] {
+        [x % self.length, x / self.length]
+    }
+
+    /// The first pixel of the segment in each lane.
+    pub(super) fn firsts(self) -> [f32; WIDTH] {
+        std::array::from_fn(|lane| (lane * self.length) as f32)
+    }
+
+    /// From pixel after pixel to segments side by side. Both have [`stride`](Self::stride) numbers.
+    #[inline(always)]
+    pub(super) fn arrange(self, pixels: &[f32], line: &mut Line) {
+        for lane in (0..WIDTH).step_by(RUN) {
+            let segments = |l: usize| &pixels[(lane + l) * self.length..][..self.length];
+            let segments = [segments(0), segments(1), segments(2), segments(3)];
+            let segments = segments.map(|segment| segment.as_chunks::<RUN>().0);
+            for (run, vectors) in line.as_chunks_mut::<RUN>().0.iter_mut().enumerate() {
+                let block = turned(segments.map(|segment| segment[run]));
+                for (vector, part) in vectors.iter_mut().zip(block) {
+                    vector[lane..lane + RUN].copy_from_slice(&part);
+                }
+            }
+        }
+    }
+
+    /// The opposite of [`arrange`](Self::arrange).
+    #[inline(always)]
+    pub(super) fn restore(self, line: &Line, pixels: &mut [f32]) {
+        let pixels = pixels.as_chunks_mut::<RUN>().0;
+        let runs = self.length / RUN;
+        for lane in (0..WIDTH).step_by(RUN) {
+            for (run, vectors) in line.as_chunks::<RUN>().0.iter().enumerate() {
+                let part =
+                    |i: usize| -> [f32; RUN] { std::array::from_fn(|l| vectors[i][lane + l]) };
+                let block = turned([part(0), part(1), part(2), part(3)]);
+                for (l, part) in block.into_iter().enumerate() {
+                    pixels[(lane + l) * runs + run] = part;
+                }
+            }
+        }
+    }
+
+    /// Fills the vectors within reach of a padded line's ends: what stands in the next lane, and
+    /// `outside` beyond the line.
+    #[inline(always)]
+    pub(super) fn pad(self, line: &mut Line, outside: f32) {
+        let line = line.as_flattened_mut();
+        for i in 0..REACH {
+            // A vector of neighbours is a number to the left, or to the right.
+            let before = (self.length + i) * WIDTH - 1;
+            copy_vector(line, before, i * WIDTH);
+            line[i * WIDTH] = outside;
+            let (after, to) = ((REACH + i) * WIDTH + 1, (REACH + self.length + i) * WIDTH);
+            copy_vector(line, after, to);
+            line[to + WIDTH - 1] = outside;
+        }
+    }
+}
+
+#[inline(always)]
+fn copy_vector(line: &mut [f32], from: usize, to: usize) {
+    if let Some(&vector) = line[from..].first_chunk::<WIDTH>() {
+        line[to..to + WIDTH].copy_from_slice(&vector);
+    }
+}
+
+/// Rows and columns exchanged.
+#[inline(always)]
+fn turned(rows: [[f32; RUN]; RUN]) -> [[f32; RUN]; RUN] {
+    let mut columns = [[0.0; RUN]; RUN];
+    for (i, row) in rows.into_iter().enumerate() {
+        for (column, x) in columns.iter_mut().zip(row) {
+            column[i] = x;
+        }
+    }
+    columns
+}
+
+/// A line of the image, vector after vector.
+pub(super) type Line = [[f32; WIDTH]];
+/// A padded line of scratch for each of the rows.
+pub(super) type LinePerRow<'a> = [&'a mut Line; TOGETHER];
+
+/// The lines of a plane within reach of a few rows; another line outside the image.
+pub(super) struct Near<'a>([&'a Line; NEAR]);
 
 impl<'a> Near<'a> {
     /// The rows from `row` on.
     #[inline(always)]
-    pub(super) fn new(plane: &'a [f32], zeros: &'a [f32], row: usize) -> Self {
-        let stride = zeros.len();
-        let mut lines = [zeros; NEAR];
+    pub(super) fn new(segments: Segments, plane: &'a Line, outside: &'a Line, row: usize) -> Self {
+        let rows = plane.len() / segments.pitch();
+        let mut lines = [outside; NEAR];
         for (i, line) in lines.iter_mut().enumerate() {
-            let from = (row + i).checked_sub(REACH).map(|y| y * stride);
-            if let Some(inside) = from.and_then(|from| plane.get(from..from + stride)) {
-                *line = inside;
+            if let Some(row) = (row + i).checked_sub(REACH).filter(|row| *row < rows) {
+                *line = segments.line(plane, row);
             }
         }
         Self(lines)
     }
 }
 
-/// Does the same for each line within reach, with its number as a constant.
-macro_rules! for_each_line {
-    ($d:ident => $body:block) => {
-        for_each_line!(@ $d 0 1 2 3 4 5 6 7 8 9 10 11 12 13 => $body)
+/// An array of an expression for each row or vector within reach.
+macro_rules! near {
+    ($d:ident => $e:expr) => {
+        near!(@ $d 0 1 2 3 4 5 6 7 8 9 10 11 12 13 => $e)
     };
-    (@ $d:ident $($value:literal)* => $body:block) => { $({ const $d: usize = $value; $body })* };
+    (@ $d:ident $($value:literal)* => $e:expr) => { [$({ let $d: usize = $value; $e }),*] };
 }
-const _: () = assert!(NEAR == 14, "`for_each_line` has them all");
+const _: () = assert!(NEAR == 14 && TOGETHER == 4, "`near`, `cut` and `convolved` have them all");
 
-/// The weight of a line for a row; `None` beyond its reach.
-const fn weight(line: usize, row: usize) -> Option<f32> {
-    match line.checked_sub(row) {
-        Some(at) if at < WINDOW.len() => Some(WINDOW[at]),
-        _ => None,
-    }
-}
-
-/// Adds `x` of line `D` to the sums of those rows that reach it.
+/// Convolves what is within reach, for one row or vector after the other.
 #[inline(always)]
-fn add<S: Simd, const D: usize>(s: S, sums: &mut [V<S>; ROWS], x: V<S>) {
-    for (row, sum) in sums.iter_mut().enumerate() {
-        if let Some(weight) = weight(D, row) {
-            *sum = V::splat(s, weight).mul_add(x, *sum);
-        }
-    }
+fn convolved<S: Simd>(s: S, x: &[V<S>; NEAR]) -> [V<S>; TOGETHER] {
+    each!(n in 4 => at(s, x, n))
 }
 
 #[inline(always)]
-fn store<S: Simd>(sums: [V<S>; ROWS], to: &mut LinePerRow<'_>, at: usize) {
-    for row in 0..ROWS {
-        sums[row].store(&mut to[row][at..]);
+fn at<S: Simd>(s: S, x: &[V<S>; NEAR], n: usize) -> V<S> {
+    let mut sum = x[n + REACH] * WINDOW[REACH];
+    for k in 0..REACH {
+        sum = V::splat(s, WINDOW[k]).mul_add(x[n + k] + x[n + 2 * REACH - k], sum);
     }
+    sum
+}
+
+/// Lines of the same length, cut to it once, so that their loads and stores need no bounds check each.
+macro_rules! cut {
+    ($near:expr, $length:expr) => {
+        near!(d => &$near.0[d][..$length])
+    };
+    (mut $lines:expr, $length:expr) => {{
+        let [a, b, c, d] = $lines;
+        [a, b, c, d].map(|line| &mut line[REACH..][..$length])
+    }};
 }
 
 /// Convolves a plane vertically.
 #[inline(always)]
-pub(super) fn vertical<S: Simd>(s: S, plane: &Near<'_>, columns: Columns, to: &mut LinePerRow<'_>) {
-    for at in columns {
-        let mut sums = [V::zero(s); ROWS];
-        for_each_line!(D => { add::<S, D>(s, &mut sums, V::load(s, &plane.0[D][at..])) });
-        store(sums, to, at);
+pub(super) fn vertical<S: Simd>(s: S, plane: &Near<'_>, to: &mut LinePerRow<'_>) {
+    let length = plane.0[0].len();
+    let plane = cut!(plane, length);
+    let to = cut!(mut to, length);
+    for i in 0..length {
+        for lane in (0..WIDTH).step_by(S::F32_LANES) {
+            let x = near!(d => V::load(s, &plane[d][i][lane..]));
+            let sums = convolved(s, &x);
+            for row in 0..TOGETHER {
+                sums[row].store(&mut to[row][i][lane..]);
+            }
+        }
     }
 }
 
@@ -102,56 +232,91 @@ pub(super) fn vertical<S: Simd>(s: S, plane: &Near<'_>, columns: Columns, to: &m
 pub(super) fn vertical_with_square<S: Simd>(
     s: S,
     plane: &Near<'_>,
-    columns: Columns,
     [to, square]: [&mut LinePerRow<'_>; 2],
 ) {
-    for at in columns {
-        let mut sums = [V::zero(s); ROWS];
-        let mut squares = [V::zero(s); ROWS];
-        for_each_line!(D => {
-            let x = V::load(s, &plane.0[D][at..]);
-            for (row, (sum, square)) in sums.iter_mut().zip(&mut squares).enumerate() {
-                if let Some(weight) = weight(D, row) {
-                    // Not w·(x·x): in a flat image that product would be off by the same at every line.
-                    let weighted = x * weight;
-                    *sum = *sum + weighted;
-                    *square = weighted.mul_add(x, *square);
-                }
+    let length = plane.0[0].len();
+    let plane = cut!(plane, length);
+    let (to, square) = (cut!(mut to, length), cut!(mut square, length));
+    for i in 0..length {
+        for lane in (0..WIDTH).step_by(S::F32_LANES) {
+            let x = near!(d => V::load(s, &plane[d][i][lane..]));
+            let sums = convolved(s, &x);
+            let x = near!(d => x[d] * x[d]);
+            let squares = convolved(s, &x);
+            for row in 0..TOGETHER {
+                sums[row].store(&mut to[row][i][lane..]);
+                squares[row].store(&mut square[row][i][lane..]);
             }
-        });
-        store(sums, to, at);
-        store(squares, square, at);
+        }
     }
 }
 
 /// Convolves the product of two planes vertically.
 #[inline(always)]
-pub(super) fn vertical_of_product<S: Simd>(
-    s: S,
-    [a, b]: [&Near<'_>; 2],
-    columns: Columns,
-    to: &mut LinePerRow<'_>,
-) {
-    for at in columns {
-        let mut sums = [V::zero(s); ROWS];
-        for_each_line!(D => {
-            let x = V::load(s, &a.0[D][at..]) * V::load(s, &b.0[D][at..]);
-            add::<S, D>(s, &mut sums, x);
-        });
-        store(sums, to, at);
+pub(super) fn vertical_of_product<S: Simd>(s: S, [a, b]: [&Near<'_>; 2], to: &mut LinePerRow<'_>) {
+    let length = a.0[0].len();
+    let (a, b) = (cut!(a, length), cut!(b, length));
+    let to = cut!(mut to, length);
+    for i in 0..length {
+        for lane in (0..WIDTH).step_by(S::F32_LANES) {
+            let x = near!(d => V::load(s, &a[d][i][lane..]) * V::load(s, &b[d][i][lane..]));
+            let sums = convolved(s, &x);
+            for row in 0..TOGETHER {
+                sums[row].store(&mut to[row][i][lane..]);
+            }
+        }
     }
 }
 
-/// Σ_k WINDOW[k]·line[at + k − 5], for one vector. The window is symmetric: pairs are added first. It is
-/// cut out once, so that its eleven loads need no bounds check each.
+/// Convolves a padded line horizontally: `N` vectors of it, at most [`TOGETHER`], and of each the lanes from
+/// `lane` on. `around` is what is within their reach, `M` = `N` + 2·[`REACH`] vectors.
 #[inline(always)]
-pub(super) fn horizontal<S: Simd>(s: S, line: &[f32], at: usize) -> V<S> {
-    let around = &line[at - REACH..at + S::F32_LANES + REACH];
-    let mut sum = V::load(s, &around[REACH..REACH + S::F32_LANES]) * WINDOW[REACH];
-    for k in 0..REACH {
-        let left = V::load(s, &around[k..k + S::F32_LANES]);
-        let right = V::load(s, &around[2 * REACH - k..2 * REACH - k + S::F32_LANES]);
-        sum = V::splat(s, WINDOW[k]).mul_add(left + right, sum);
+pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
+    s: S,
+    around: &[[f32; WIDTH]; M],
+    lane: usize,
+) -> [V<S>; N] {
+    const { assert!(N <= TOGETHER && M == N + 2 * REACH) };
+    // Those beyond are in no one's reach.
+    let x = near!(d => V::load(s, &around[if d < M { d } else { 0 }][lane..]));
+    let mut sums = [V::zero(s); N];
+    for (n, sum) in sums.iter_mut().enumerate() {
+        *sum = at(s, &x, n);
     }
-    sum
+    sums
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_are_arranged_and_restored() {
+        for width in [1, 17, 64, 100, 128, 200, 256, 257, 1000] {
+            let segments = Segments::of(width);
+            let stride = segments.stride();
+            assert!(stride >= width.next_multiple_of(WIDTH) && segments.length() > REACH);
+            let pixels: Vec<f32> = (0..stride).map(|i| i as f32).collect();
+            let mut line = vec![[-1.0; WIDTH]; segments.padded()];
+            segments.arrange(&pixels, &mut line[REACH..][..segments.length()]);
+            let inner = line[REACH..][..segments.length()].to_vec();
+            for (x, &pixel) in pixels.iter().enumerate() {
+                let [vector, lane] = segments.place(x);
+                assert_eq!(inner[vector][lane], pixel);
+            }
+            let mut again = vec![-1.0; stride];
+            segments.restore(&inner, &mut again);
+            assert_eq!(again, pixels);
+            // The vector `d` farther has every lane's pixel `d` to the right.
+            segments.pad(&mut line, 0.5);
+            for d in 0..2 * REACH + segments.length() {
+                for (lane, first) in segments.firsts().into_iter().enumerate() {
+                    let x = first + d as f32 - REACH as f32;
+                    let inside = x >= 0.0 && x < stride as f32;
+                    let expected = if inside { x } else { 0.5 };
+                    assert_eq!(line[d][lane], expected, "{width} px: {d}, lane {lane}");
+                }
+            }
+        }
+    }
 }

@@ -26,6 +26,9 @@ macro_rules! each {
     ($k:ident in 4 => $e:expr) => {
         [each!(@ $k 0 $e), each!(@ $k 1 $e), each!(@ $k 2 $e), each!(@ $k 3 $e)]
     };
+    ($k:ident in 5 => $e:expr) => {
+        [each!(@ $k 0 $e), each!(@ $k 1 $e), each!(@ $k 2 $e), each!(@ $k 3 $e), each!(@ $k 4 $e)]
+    };
     (@ $k:ident $value:literal $e:expr) => {{
         let $k: usize = $value;
         $e
