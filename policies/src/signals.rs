@@ -116,8 +116,7 @@ signals! {
     PixelCount: Count "pixels" [Count];
     /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
     /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
-    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen. SSIM is then computed
-    /// in every step, so that the knob `ssim_every` saves nothing on the native backend.
+    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen.
     WeightedError: Sum "pixels" [WeightedError];
     /// Opacity now, in (0, 1).
     Opacity: Present "1" [];

@@ -79,9 +79,6 @@ pub struct StepInput<'a> {
     pub cadence: Cadence,
     /// Seed of the run, for noise on the means.
     pub seed: u64,
-    /// Factor of the SSIM term's gradient: 1 in the loss as published; 0 where it is left out, and
-    /// then nothing of it is computed.
-    pub ssim_weight: f32,
 }
 
 /// A training view to be measured for a policy's event.
@@ -123,7 +120,7 @@ pub struct StepOutput {
     pub loss: f32,
     /// Mean over pixels and channels of |I − G|.
     pub l1: f32,
-    /// Mean structural similarity; NaN where it is left out.
+    /// Mean structural similarity.
     pub ssim: f32,
     /// Rows whose projection is on screen.
     pub visible: usize,

@@ -1,4 +1,4 @@
-//! What a study leaves on disk for everything that it did: a record per run and per image comparison.
+//! What a study leaves on disk of every run: a line in its file of records.
 
 use std::collections::BTreeMap;
 
@@ -6,14 +6,6 @@ use serde::{Deserialize, Serialize};
 use toml::Table;
 
 use crate::metrics::geometry::Geometry;
-
-/// A line of a study's file of records.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "kebab-case")]
-pub(super) enum Record {
-    Run(Box<Outcome>),
-    Image(ImageError),
-}
 
 /// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -67,26 +59,6 @@ impl Outcome {
     pub(super) fn kept_its_budget(&self) -> bool {
         self.peak_rows <= self.budget
     }
-}
-
-/// How far off a model's images are with a knob at a level.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct ImageError {
-    /// Version of densify.
-    pub(super) densify: String,
-    /// Label of the scene.
-    pub(super) scene: String,
-    pub(super) knob: String,
-    pub(super) level: String,
-    /// The description of the run that made the model.
-    pub(super) spec: Table,
-    /// Against the float64 renderer with the standard rules: alpha from 1/255, transmittance to 1e-4
-    /// `[dB]`.
-    pub(super) standard: f64,
-    /// Against the float64 renderer that blends everything `[dB]`.
-    pub(super) everything: f64,
-    /// Largest error of a channel against the standard rules, in 0..=1.
-    pub(super) worst: f64,
 }
 
 /// A run for tests of what shows results.

@@ -220,7 +220,7 @@ impl Backend for CpuBackend {
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel = self.signals.layout().has(Field::Error);
-        let terms = ImageTerms { ssim: input.ssim_weight, error: weights, by_pixel };
+        let terms = ImageTerms { ssim: 1.0, error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
         if let Some((request, count)) = picks {
             self.collect_candidates(&frame, target, &request, count);

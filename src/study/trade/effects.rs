@@ -1,19 +1,7 @@
-//! What is learned from the runs, as pure functions of numbers: which effects stand out, which levels others
-//! dominate, which are free, and what knobs do among each other.
+//! What is learned from the runs, as pure functions of numbers: which levels others dominate, and which are
+//! free.
 
 use crate::study::difference::Difference;
-use crate::study::standard_error;
-
-/// Runs of a factorial.
-pub(super) const RUNS: usize = 12;
-/// Knobs that it has room for.
-pub(super) const FACTORS: usize = RUNS - 1;
-
-/// Whether the mean is more than two standard errors from zero.
-pub(super) fn stands_out(differences: &[f64]) -> bool {
-    let mean = differences.iter().sum::<f64>() / differences.len() as f64;
-    standard_error(differences).is_some_and(|error| mean.abs() > 2.0 * error)
-}
 
 /// What a level costs and buys: less is better in each but the first.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -35,62 +23,22 @@ pub(super) fn dominated_by(prices: &[Price], of: usize) -> Option<usize> {
 
 /// Whether a level costs nothing, by the rule of docs/tradeoffs.md: nowhere in their 95 %
 /// intervals do PSNR and SSIM fall by 0.05 dB and 0.001 or depth errors grow to 1.02 of what they
-/// were, and the same model looks the same to 60 dB. What has no interval is not known to be free.
+/// were. What has no interval is not known to be free.
 pub(super) fn is_free(
     psnr: &Difference,
     ssim: &Difference,
     depth_ln_ratio: Option<&Difference>,
-    numerical_psnr: Option<f64>,
 ) -> bool {
     let low = |d: &Difference| d.interval.map_or(f64::NEG_INFINITY, |[low, _]| low);
     let high = |d: &Difference| d.interval.map_or(f64::INFINITY, |[_, high]| high);
     low(psnr) > -0.05
         && low(ssim) > -0.001
         && depth_ln_ratio.is_none_or(|depth| high(depth) < 1.02_f64.ln())
-        && numerical_psnr.is_none_or(|psnr| psnr >= 60.0)
-}
-
-/// The design of Plackett and Burman 1946 for 12 runs: whether factor `k` of run `i` is at its high
-/// level. Eleven cyclic shifts of one row, and a row of low levels.
-pub(super) fn plackett_burman() -> [[bool; FACTORS]; RUNS] {
-    const FIRST: [bool; FACTORS] =
-        [true, true, false, true, true, true, false, false, false, true, false];
-    std::array::from_fn(|i| {
-        std::array::from_fn(|k| i < FACTORS && FIRST[(k + FACTORS - i) % FACTORS])
-    })
-}
-
-/// Mean of the responses at a factor's high level minus that at its low one, for every factor.
-pub(super) fn main_effects(responses: &[f64; RUNS]) -> [f64; FACTORS] {
-    let design = plackett_burman();
-    std::array::from_fn(|k| {
-        let signed = design.iter().zip(responses).map(|(run, y)| if run[k] { *y } else { -*y });
-        signed.sum::<f64>() / (RUNS as f64 / 2.0)
-    })
-}
-
-/// Standard error of an effect, from those of the columns that no knob has: nothing was varied there.
-/// `None` where all are taken.
-pub(super) fn error_of_effects(idle: &[f64]) -> Option<f64> {
-    let squares: f64 = idle.iter().map(|effect| effect * effect).sum();
-    (!idle.is_empty()).then(|| (squares / idle.len() as f64).sqrt())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn standard_errors_of_known_values() {
-        // Variance 2.5 of five values: √(2.5/5).
-        let error = standard_error(&[1.0, 2.0, 3.0, 4.0, 5.0]).unwrap();
-        assert!((error - 0.5_f64.sqrt()).abs() < 1e-12);
-        assert_eq!(standard_error(&[1.0]), None);
-        assert!(stands_out(&[1.0, 2.0, 3.0, 4.0, 5.0]));
-        assert!(!stands_out(&[-1.0, 2.0, -3.0, 4.0, 0.0]));
-        assert!(!stands_out(&[0.0, 0.0, 0.0]) && !stands_out(&[9.0]) && !stands_out(&[]));
-        assert!(stands_out(&[-0.1, -0.1]));
-    }
 
     #[test]
     fn what_is_nowhere_better_is_dominated() {
@@ -113,40 +61,12 @@ mod tests {
         let any = Difference::new(&[pair]).unwrap();
         let of = |low: f64, high: f64| Difference { interval: Some([low, high]), ..any };
         let (psnr, ssim, depth) = (of(-0.04, 0.1), of(-0.0009, 0.1), of(-0.1, 0.019));
-        assert!(is_free(&psnr, &ssim, Some(&depth), Some(60.0)));
-        assert!(is_free(&psnr, &ssim, None, None));
-        assert!(!is_free(&of(-0.06, 0.5), &ssim, None, None));
-        assert!(!is_free(&psnr, &of(-0.002, 0.0), None, None));
-        assert!(!is_free(&psnr, &ssim, Some(&of(-0.1, 0.021)), None));
-        assert!(!is_free(&psnr, &ssim, Some(&depth), Some(59.9)));
+        assert!(is_free(&psnr, &ssim, Some(&depth)));
+        assert!(is_free(&psnr, &ssim, None));
+        assert!(!is_free(&of(-0.06, 0.5), &ssim, None));
+        assert!(!is_free(&psnr, &of(-0.002, 0.0), None));
+        assert!(!is_free(&psnr, &ssim, Some(&of(-0.1, 0.021))));
         let single = Difference { interval: None, ..psnr };
-        assert!(!is_free(&single, &ssim, None, None));
-    }
-
-    #[test]
-    fn the_design_is_balanced_and_orthogonal() {
-        let design = plackett_burman();
-        let sign = |on: bool| if on { 1 } else { -1 };
-        for j in 0..FACTORS {
-            assert_eq!(design.iter().map(|run| sign(run[j])).sum::<i32>(), 0, "column {j}");
-            for k in 0..j {
-                let dot: i32 = design.iter().map(|run| sign(run[j]) * sign(run[k])).sum();
-                assert_eq!(dot, 0, "columns {j} and {k}");
-            }
-        }
-        assert_eq!(design[RUNS - 1], [false; FACTORS]);
-    }
-
-    #[test]
-    fn effects_that_add_up_are_found() {
-        let effects: [f64; FACTORS] = std::array::from_fn(|k| k as f64 - 3.0);
-        let responses = plackett_burman().map(|run| {
-            30.0 + run.iter().zip(effects).map(|(on, e)| if *on { e } else { 0.0 }).sum::<f64>()
-        });
-        for (found, expected) in main_effects(&responses).into_iter().zip(effects) {
-            assert!((found - expected).abs() < 1e-12, "{found} {expected}");
-        }
-        assert!((error_of_effects(&[3.0, -4.0]).unwrap() - 12.5_f64.sqrt()).abs() < 1e-12);
-        assert_eq!(error_of_effects(&[]), None);
+        assert!(!is_free(&single, &ssim, None));
     }
 }

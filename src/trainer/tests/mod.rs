@@ -307,10 +307,8 @@ const OPTIONS: TrainOptions = TrainOptions {
         sh_dc: 1.0,
         sh_rest: 1.0,
     },
-    sh_every: None,
     prefetch: 2,
     on_nan: OnNan::Prune,
-    savings: Savings::NONE,
 };
 
 fn build(

@@ -37,7 +37,6 @@ fn flags_out_of_range_are_refused() {
         ("--background mauve", &["--background", "mauve", "#808080"]),
         ("--lr opacity=x", &["--lr", "NAME=RATE"]),
         ("--lr colour=1", &["--lr", "colour"]),
-        ("--sh-every 0", &["--sh-every", "from 1 to 1000"]),
         ("--save-iterations 21", &["--save-iterations", "1 to 20"]),
         ("--test-iterations 5", &["--test-iterations", "--eval"]),
         ("--images photos", &["photos"]),
