@@ -220,15 +220,6 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError>;
 
-    /// Renders a view as the model is now and takes note of the largest blend weight of each row:
-    /// that over the views measured since signals were last taken is their `FreshWeightMax`. Does
-    /// nothing where this signal is not among those that the backend was made for. Changes nothing
-    /// of the model, of the optimiser, or of the other signals.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError>;
-
     /// Renders a view as the model is now and measures what is asked for. Changes nothing of the
     /// model, of the optimiser, or of the signals.
     ///
@@ -236,8 +227,7 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError>;
 
-    /// Copies these signals to the host. `FreshWeightMax` starts anew, whether it is one of them or
-    /// not.
+    /// Copies these signals to the host.
     ///
     /// # Errors
     /// See [`BackendError`].
