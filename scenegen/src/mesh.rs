@@ -257,19 +257,6 @@ impl Model {
         let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         used.fold(empty, |(lo, hi), p| (lo.min(p), hi.max(p)))
     }
-
-    /// Whether everything looks the same from every side: then colour depends on place only.
-    #[must_use]
-    pub fn view_independent(&self) -> bool {
-        let mut used = vec![false; self.materials.len()];
-        for &m in &self.triangle_materials {
-            used[m as usize] = true;
-        }
-        let shiny = |m: &Material| m.reflection == Reflection::MetalRough;
-        // A one-sided face is there or not, depending on the side it is seen from, and a blended
-        // one mixes with what is behind it; neither changes a surface's own colour.
-        !self.materials.iter().zip(&used).any(|(m, &used)| used && shiny(m))
-    }
 }
 
 /// Appends the values of the `count` vertices after the first `before`, if there are any, to a list

@@ -266,16 +266,15 @@ fn describe(scene: &Scene, console: &Console) {
     for note in &scene.model.notes {
         console.say(format_args!("note: {note}"));
     }
-    let (rig, needs) = (&scene.rig, &scene.requirements);
+    let rig = &scene.rig;
     console.say(format_args!(
-        "scene    {}: {} triangles, {}",
+        "scene    {}: {} triangles",
         scene.name,
-        number::grouped(scene.model.triangles.len()),
-        if needs.view_independent { "view-independent" } else { "view-dependent" }
+        number::grouped(scene.model.triangles.len())
     ));
     console.say(format_args!(
-        "views    {} to train on, {} held out, {}x{} px, finest feature {:.1} px",
-        rig.train, rig.test, rig.width, rig.height, needs.finest_feature_px
+        "views    {} to train on, {} held out, {}x{} px",
+        rig.train, rig.test, rig.width, rig.height
     ));
 }
 
