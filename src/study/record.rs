@@ -1,7 +1,5 @@
 //! What a study leaves on disk of every run: a line in its file of records.
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 use toml::Table;
 
@@ -43,8 +41,6 @@ pub(super) struct Outcome {
     pub(super) seconds: f64,
     /// Processor time of the steps.
     pub(super) cpu_seconds: Option<f64>,
-    /// Wall time by stage.
-    pub(super) stage_seconds: BTreeMap<String, f64>,
     /// Views rendered for the policy's decisions.
     pub(super) extra_forwards: u64,
     /// (iteration, PSNR) along the run.
@@ -84,7 +80,6 @@ pub(super) fn sample(factor: &str, level: &str, seed: u32, psnr: f64) -> Outcome
         ledger_bytes: 1,
         seconds: 1.25,
         cpu_seconds: None,
-        stage_seconds: BTreeMap::new(),
         extra_forwards: 0,
         curve: Vec::new(),
         geometry: None,

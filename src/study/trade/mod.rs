@@ -1,6 +1,5 @@
 //! The study behind `densify trade`: what each knob costs and buys.
 
-mod effects;
 mod levels;
 mod plots;
 mod report;
@@ -38,13 +37,12 @@ Examples:
 /// Measures what each shortcut costs and buys.
 ///
 /// For every knob (`densify knobs`) and each of its levels: what training with it arrives at, on views
-/// held out, with time by stage and memory at its peak. One knob at a time from the preset `exact`, with
+/// held out, with time and memory at its peak. One knob at a time from the preset `exact`, with
 /// the same seeds.
 ///
 /// A run that is finished is not run again: call the same command to go on after an interruption. The
 /// folder then holds trade.md (tables and plots), trade.jsonl (a record per line), plots as SVG, and
-/// the runs themselves. "Free" is said only of what costs less than can be seen, by all of its
-/// intervals.
+/// the runs themselves.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Trade {

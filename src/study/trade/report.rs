@@ -1,6 +1,5 @@
 //! What the records of a study say, level by level.
 
-use super::effects::{Price, dominated_by, is_free};
 use super::levels::Factor;
 use super::{BASE, Outcome, Trade};
 use crate::study::difference::{Difference, Pair, mean};
@@ -21,19 +20,13 @@ pub(super) struct Effect {
     pub(super) level: String,
     pub(super) psnr: Difference,
     pub(super) ssim: Difference,
-    pub(super) flip: Difference,
-    /// Logarithms of ratios, as the next four.
-    pub(super) depth: Option<Difference>,
-    pub(super) chamfer: Option<Difference>,
+    /// Logarithms of ratios, as the next two.
     pub(super) seconds: Difference,
     /// Of processor time, which other programs disturb less.
     pub(super) cpu: Option<Difference>,
     pub(super) peak: Difference,
     /// Runs whose model is that of `exact` to the bit.
     pub(super) same: usize,
-    pub(super) free: bool,
-    /// Which other level is nowhere worse, and somewhere better.
-    pub(super) dominated: Option<String>,
 }
 
 /// A number of a run; none where it was not measured.
@@ -41,9 +34,6 @@ type Measure = fn(&Outcome) -> Option<f64>;
 
 pub(super) const PSNR: Measure = |r| Some(r.psnr);
 const SSIM: Measure = |r| Some(r.ssim);
-const FLIP: Measure = |r| Some(r.flip);
-const DEPTH: Measure = |r| positive(r.geometry.as_ref()?.depth.abs_rel).map(f64::ln);
-const CHAMFER: Measure = |r| positive(r.geometry.as_ref()?.centres.chamfer).map(f64::ln);
 pub(super) const SECONDS: Measure = |r| positive(r.seconds).map(f64::ln);
 const CPU: Measure = |r| positive(r.cpu_seconds?).map(f64::ln);
 /// Where the system does not say, what was promised.
@@ -62,7 +52,6 @@ impl Report {
                 report.effects.extend(report.effect(one, level));
             }
         }
-        report.rank();
         report
     }
 
@@ -92,42 +81,18 @@ impl Report {
     fn effect(&self, factor: &Factor, level: &str) -> Option<Effect> {
         let name = &*factor.name;
         let of = |measure: Measure| Difference::new(&self.differences(name, level, measure));
-        let (psnr, ssim, depth) = (of(PSNR)?, of(SSIM)?, of(DEPTH));
         let pairs = self.pairs(name, level);
         let same = pairs.iter().filter(|(run, base)| run.model == base.model).count();
         Some(Effect {
             factor: factor.clone(),
             level: level.to_owned(),
-            free: is_free(&psnr, &ssim, depth.as_ref()),
-            psnr,
-            ssim,
-            flip: of(FLIP)?,
-            depth,
-            chamfer: of(CHAMFER),
+            psnr: of(PSNR)?,
+            ssim: of(SSIM)?,
             seconds: of(SECONDS)?,
             cpu: of(CPU),
             peak: of(PEAK)?,
             same,
-            dominated: None,
         })
-    }
-
-    /// Says which levels are dominated, by others or by `exact`.
-    fn rank(&mut self) {
-        let price = |effect: &Effect| Price {
-            psnr: effect.psnr.mean,
-            seconds: effect.seconds.mean.exp(),
-            peak: effect.peak.mean.exp(),
-        };
-        let exact = Price { psnr: 0.0, seconds: 1.0, peak: 1.0 };
-        let prices: Vec<Price> =
-            std::iter::once(exact).chain(self.effects.iter().map(price)).collect();
-        let names: Vec<String> = std::iter::once("exact".to_owned())
-            .chain(self.effects.iter().map(|e| format!("{}={}", e.factor.name, e.level)))
-            .collect();
-        for (i, effect) in self.effects.iter_mut().enumerate() {
-            effect.dominated = dominated_by(&prices, i + 1).map(|by| names[by].clone());
-        }
     }
 
     /// Mean over the runs with a knob at a level in a scene.
@@ -149,7 +114,6 @@ pub(super) fn sample() -> Report {
     let outcome = |knob: &str, level: &str, seed, psnr: f64, seconds: f64| Outcome {
         peak_bytes: Some(64 << 20),
         seconds,
-        stage_seconds: [("rasterize".to_owned(), 0.5 * seconds)].into(),
         ..crate::study::record::sample(knob, level, seed, psnr)
     };
     let outcomes = (0..3).flat_map(|seed| {
@@ -187,15 +151,10 @@ mod tests {
     fn effects_are_paired_with_the_exact_one_of_the_same_seed() {
         let report = sample();
         let of = |level: &str| report.effects.iter().find(|e| e.level == level).expect("there");
-        let free = of("1/64");
-        assert!(free.psnr.mean.abs() < 1e-12 && free.same == 3 && free.free);
-        assert!((free.seconds.mean.exp() - 0.9).abs() < 1e-12);
+        let equal = of("1/64");
+        assert!(equal.psnr.mean.abs() < 1e-12 && equal.same == 3);
+        assert!((equal.seconds.mean.exp() - 0.9).abs() < 1e-12);
         let bad = of("1/32");
-        assert!((bad.psnr.mean + 0.9).abs() < 1e-12 && bad.same == 0 && !bad.free);
-        assert_eq!(bad.dominated.as_deref(), Some("alpha_min=1/64"));
-        // Faster and better than all others.
-        let best = of("0");
-        assert!(best.free && best.dominated.is_none());
-        assert_eq!(free.dominated.as_deref(), Some("sh_degree=0"));
+        assert!((bad.psnr.mean + 0.9).abs() < 1e-12 && bad.same == 0);
     }
 }

@@ -1,8 +1,5 @@
 //! The study as text: Markdown for the file, a few lines for the terminal.
-//!
-//! Markdown has no grey: rows that others dominate are set in italics, and say by what.
 
-use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use super::Trade;
@@ -32,7 +29,6 @@ pub(super) fn markdown(report: &Report) -> String {
     );
     text += &exact(report);
     text += &outcomes(report);
-    text += &stages(report);
     text
 }
 
@@ -48,29 +44,14 @@ fn exact(report: &Report) -> String {
     format!("\n## exact\n\n{table}")
 }
 
-fn knob_or_exact(knob: &str) -> &str {
-    if knob.is_empty() { "(exact)" } else { knob }
-}
-
 fn outcomes(report: &Report) -> String {
     let mut table = MarkdownTable::new(
-        "knob | level | ΔPSNR [dB] | ΔSSIM | ΔFLIP | depth error × | Chamfer × | time × | \
-         processor time × | peak × | same bits | verdict",
+        "knob | level | ΔPSNR [dB] | ΔSSIM | time × | processor time × | peak × | same bits",
     );
     for effect in &report.effects {
-        let mut cells = row(effect);
-        if effect.dominated.is_some() {
-            for cell in cells.iter_mut().filter(|cell| !cell.is_empty()) {
-                *cell = format!("*{cell}*");
-            }
-        }
-        table.row(&cells);
+        table.row(&row(effect));
     }
-    format!(
-        "\n## Outcome of training\n\nItalics: dominated, another level is nowhere worse and somewhere \
-         better in PSNR, time and memory. Free: the interval of PSNR lies above −0.05 dB, that of SSIM \
-         above −0.001, and that of depth error below 1.02.\n\n{table}"
-    )
+    format!("\n## Outcome of training\n\n{table}")
 }
 
 fn row(effect: &Effect) -> Vec<String> {
@@ -78,55 +59,18 @@ fn row(effect: &Effect) -> Vec<String> {
         let low_and_high = |[low, high]: [f64; 2]| format!("{:.3}, {:.3}", low.exp(), high.exp());
         format!("{:.3}{}", d.mean.exp(), d.within(low_and_high))
     };
-    let maybe = |d: &Option<Difference>| d.as_ref().map_or_else(|| "–".to_owned(), ratio);
-    let mut verdict: Vec<String> = Vec::new();
-    if effect.free {
-        verdict.push("free".into());
-    }
-    if effect.factor.is_exact && effect.same < effect.psnr.pairs {
-        verdict.push("**not the same bits**".into());
-    }
-    if let Some(by) = &effect.dominated {
-        verdict.push(format!("dominated by {by}"));
-    }
+    let broken = effect.factor.is_exact && effect.same < effect.psnr.pairs;
+    let broken = if broken { ": **not exact**" } else { "" };
     vec![
         effect.factor.name.clone(),
         effect.level.clone(),
         effect.psnr.show(2),
         effect.ssim.show(4),
-        effect.flip.show(4),
-        maybe(&effect.depth),
-        maybe(&effect.chamfer),
         ratio(&effect.seconds),
-        maybe(&effect.cpu),
+        effect.cpu.as_ref().map_or_else(|| "–".to_owned(), ratio),
         ratio(&effect.peak),
-        format!("{} of {}", effect.same, effect.psnr.pairs),
-        verdict.join(", "),
+        format!("{} of {}{broken}", effect.same, effect.psnr.pairs),
     ]
-}
-
-/// Seconds by stage of `exact` and of every level, as a mean over all runs.
-fn stages(report: &Report) -> String {
-    let mean = |knob: &str, level: &str| -> BTreeMap<String, f64> {
-        let runs: Vec<_> = report.runs(knob, level).collect();
-        let mut sums: BTreeMap<String, f64> = BTreeMap::new();
-        for (stage, seconds) in runs.iter().flat_map(|run| &run.stage_seconds) {
-            *sums.entry(stage.clone()).or_default() += seconds / runs.len() as f64;
-        }
-        sums
-    };
-    let base = mean("", "");
-    let names: Vec<&String> = base.keys().collect();
-    let titles = ["knob", "level"].into_iter().chain(names.iter().map(|name| &***name));
-    let mut table = MarkdownTable::new(&titles.collect::<Vec<_>>().join(" | "));
-    let levels = report.effects.iter().map(|e| (&*e.factor.name, &*e.level));
-    for (knob, level) in std::iter::once(("", "")).chain(levels) {
-        let seconds = mean(knob, level);
-        let cell = |name: &&String| number_or_dash(seconds.get(*name).copied(), 2);
-        let first = [knob_or_exact(knob).to_owned(), level.to_owned()];
-        table.row(&first.into_iter().chain(names.iter().map(cell)).collect::<Vec<_>>());
-    }
-    format!("\n## Time by stage\n\nSeconds, means over all scenes and seeds.\n\n{table}")
 }
 
 /// A line per level.
@@ -134,10 +78,9 @@ pub(super) fn summary(report: &Report) -> String {
     let mut text = format!("{:<28}  dPSNR [dB]  time x  peak x", "knob");
     for effect in &report.effects {
         let name = format!("{}={}", effect.factor.name, effect.level);
-        let free = if effect.free { "  free" } else { "" };
         let _ = write!(
             text,
-            "\n{name:<28}  {:>+10.2}  {:>6.3}  {:>6.3}{free}",
+            "\n{name:<28}  {:>+10.2}  {:>6.3}  {:>6.3}",
             effect.psnr.mean,
             effect.seconds.mean.exp(),
             effect.peak.mean.exp()
@@ -152,21 +95,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_level_has_its_row_and_the_dominated_are_grey() {
+    fn every_level_has_its_row() {
         let report = sample();
         let text = markdown(&report);
         for words in [
             "| room | 31.00 | 100.0 | 64 |",
             "| sh_degree | 0 | +0.20 [+0.20, +0.20] |",
-            "| *alpha_min* | *1/32* | *-0.90 [",
-            "*dominated by alpha_min=1/64*",
-            "| 0 of 3 | free |",
+            "| alpha_min | 1/32 | -0.90 [",
+            "| 0 of 3 |",
             "--policy=diet",
-            "| (exact) |  | 50.00 |",
         ] {
             assert!(text.contains(words), "{words:?} is not in {text}");
         }
         let said = summary(&report);
-        assert!(said.contains("sh_degree=0") && said.contains("0.500   1.000  free"), "{said}");
+        assert!(said.contains("sh_degree=0") && said.contains("0.500   1.000"), "{said}");
     }
 }
