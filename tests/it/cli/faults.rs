@@ -42,7 +42,7 @@ fn flags_out_of_range_are_refused() {
         ("--images photos", &["photos"]),
         ("--init points --init-points 5", &["--init-points"]),
         ("--near 1", &["--near", "less than 1"]),
-        ("--policy-config /no/such/file", &["--policy-config", "/no/such"]),
+        ("--config /no/such/file", &["--config", "/no/such"]),
         ("--full --budget auto", &["--full", "--budget auto"]),
         ("--threads 1000", &["--threads", "`1000`", "from 1 to 256"]),
         ("--threads 0", &["--threads", "from 1 to 256"]),
