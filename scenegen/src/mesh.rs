@@ -223,7 +223,7 @@ impl Model {
     /// Named after the file that it was read from; an error if there is nothing to render.
     pub(crate) fn of_file(mut self, path: &Path) -> Result<Self, Error> {
         if self.triangles.is_empty() {
-            return Err(Error::Empty { name: path.display().to_string() });
+            return Err(Error::empty(path.display()));
         }
         let has_area = |triangle: &[u32; 3]| {
             let [a, b, c] = triangle.map(|i| self.positions[i as usize]);

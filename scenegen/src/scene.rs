@@ -287,7 +287,9 @@ fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
         Source::Preset(name) => {
             let Some(preset) = PRESETS.iter().find(|preset| preset.name == name) else {
                 let known = PRESETS.map(|preset| preset.name).join(", ");
-                return Err(Error::UnknownPreset { name: name.clone(), known });
+                return Err(Error::Input(format!(
+                    "there is no preset {name:?}; the presets are {known}"
+                )));
             };
             let mut staging = (preset.build)();
             staging.model.name = name.clone();
@@ -299,9 +301,12 @@ fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
                 Some("gltf" | "glb") => gltf::load(path)?,
                 Some("obj") => obj::load(path)?,
                 _ => {
-                    let feature = "a file that is neither .gltf, .glb nor .obj".to_owned();
-                    let remedy = "export the mesh to one of them".to_owned();
-                    return Err(Error::Unsupported { path: path.clone(), feature, remedy });
+                    let feature = "a file that is neither .gltf, .glb nor .obj";
+                    return Err(Error::unsupported(
+                        path,
+                        feature,
+                        "export the mesh to one of them",
+                    ));
                 }
             };
             let cameras = model.cameras.clone();
