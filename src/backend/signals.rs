@@ -119,6 +119,7 @@ impl RecordLayout {
     }
 
     /// Where in a record the field is.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
     pub(super) fn at(self, field: Field) -> Option<usize> {
         let before = self.fields & ((1 << field as u8) - 1);
         self.has(field).then(|| BASE + before.count_ones() as usize)
