@@ -233,7 +233,7 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
 }
 
 /// `count` of the training views, or all of them if there are fewer, drawn at random without
-/// replacement from (seed, step), for policies that request fresh views.
+/// replacement from (seed, step), for policies that look at views of their own.
 #[must_use]
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
