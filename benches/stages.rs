@@ -145,7 +145,6 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
             rates: RATES,
             cadence: Cadence::default(),
             seed: 1,
-            ssim_weight: 1.0,
         };
         let (start, cpu_start) = (Instant::now(), ProcessTime::now());
         match backend.train_step(&input) {

@@ -3,7 +3,7 @@
 
 // The pixel map.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
-// Per slot: sums of the map, of pixels, of weights, of distances.
+// Per slot: the columns of `blended`.
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;
 
 // What an invocation finds of splat i at hand; k: of those at a time.
@@ -16,7 +16,7 @@ fn put(
     map_here: vec4<f32>,
     pixels: ptr<function, Open>,
 ) {
-    var sums = vec4(0.0);
+    var sums = array<f32, COLUMNS>();
     if i < count {
         sums = blended(held(i), quad, map_here, pixels);
     }
@@ -56,7 +56,8 @@ fn replay(
             // One invocation per column of each splat.
             let which = base + lane / COLUMNS;
             if lane < SPLATS * COLUMNS && which < count {
-                records[slots[which] * COLUMNS + lane % COLUMNS] = summed(lane, false);
+                records[slots[which] * COLUMNS + lane % COLUMNS] =
+                    summed(lane, lane % COLUMNS == MAXIMUM);
             }
             meet();
         }
@@ -67,8 +68,8 @@ fn replay(
 
 @group(0) @binding(8) var<storage, read> depths: array<u32>;
 @group(0) @binding(9) var<storage, read> slots_of_row: array<vec2<u32>>;
-@group(0) @binding(10) var<storage, read> all_records: array<vec4<f32>>;
-@group(0) @binding(11) var<storage, read_write> row_sums: array<vec4<f32>>;
+@group(0) @binding(10) var<storage, read> all_records: array<f32>;
+@group(0) @binding(11) var<storage, read_write> row_sums: array<f32>;
 
 // Adds a row's records in order; now.a: the band.
 @compute @workgroup_size(256)
@@ -80,15 +81,22 @@ fn gather_columns(
     if row >= frame.model.x {
         return;
     }
-    var total = vec4(0.0);
+    var totals = array<f32, COLUMNS>();
     if now.a > 0u {
-        total = row_sums[row];
+        for (var f = 0u; f < COLUMNS; f++) {
+            totals[f] = row_sums[row * COLUMNS + f];
+        }
     }
     if depths[row] != NONE {
         let slots = slots_of_row[row];
         for (var i = 0u; i < slots.y; i++) {
-            total += all_records[slots.x + i];
+            for (var f = 0u; f < COLUMNS; f++) {
+                let x = all_records[(slots.x + i) * COLUMNS + f];
+                totals[f] = select(totals[f] + x, max(totals[f], x), f == MAXIMUM);
+            }
         }
     }
-    row_sums[row] = total;
+    for (var f = 0u; f < COLUMNS; f++) {
+        row_sums[row * COLUMNS + f] = totals[f];
+    }
 }

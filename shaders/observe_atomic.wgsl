@@ -16,14 +16,14 @@ fn find(
     if i >= count {
         return;
     }
-    let columns = blended(held(i), quad, map_here, pixels);
+    var columns = blended(held(i), quad, map_here, pixels);
     // The second counts pixels.
-    if subgroupAny(columns.y > 0.0) {
+    if subgroupAny(columns[1] > 0.0) {
         var sums = array<f32, FIELDS>();
         for (var f = 0u; f < COLUMNS; f++) {
             sums[f] = columns[f];
         }
-        deliver(m, i, sums, COLUMNS, NONE);
+        deliver(m, i, sums, COLUMNS, MAXIMUM);
     }
 }
 

@@ -23,7 +23,6 @@ override MEAN_GRADIENT_Y: u32;
 override MEAN_GRADIENT_Z: u32;
 override MEAN_GRADIENT_NORM: u32;
 override WEIGHT_MAX: u32;
-override FRESH_WEIGHT_MAX: u32;
 override WEIGHT_SUM: u32;
 override PIXEL_COUNT: u32;
 override WEIGHTED_ERROR: u32;
@@ -117,18 +116,6 @@ fn norm3(v: vec3<f32>) -> f32 {
     }
     let scaled = v / most;
     return most * sqrt(dot(scaled, scaled));
-}
-
-// Counts one more view for the largest weight of fresh views.
-@compute @workgroup_size(256)
-fn measure(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = group_of(id) * GROUP + lane;
-    if WEIGHT_MAX_AT > 0u && row < frame.model.x && state.short == 0u && depths[row] != NONE {
-        raise(FRESH_WEIGHT_MAX, row, row_sums[row * RECORD + WEIGHT_MAX_AT]);
-    }
 }
 
 // Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal,

@@ -9,8 +9,8 @@ pub type PolicyResult<T = ()> = Result<T, PolicyError>;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PolicyError {
     /// The policy read a signal that its [`needs`](crate::policy::DensityPolicy::needs) do not
-    /// list, or that it did not [want](crate::policy::DensityPolicy::wants_fresh) at this event.
-    #[error("signal {signal:?} was read but not declared; list it in `needs`{}", fresh_hint(*.signal))]
+    /// list.
+    #[error("signal {signal:?} was read but not declared; list it in `needs`")]
     Undeclared {
         /// The signal in question.
         signal: Signal,
@@ -66,13 +66,6 @@ pub enum PolicyError {
     /// Any other reason to stop.
     #[error("{0}")]
     Other(String),
-}
-
-fn fresh_hint(signal: Signal) -> &'static str {
-    match signal {
-        Signal::FreshWeightMax => " with `fresh_views`, and want it at this event (`wants_fresh`)",
-        _ => "",
-    }
 }
 
 fn did_you_mean(nearest: Option<&str>) -> String {

@@ -3,8 +3,8 @@
 use crate::conformance::check_policy_with;
 use crate::plan::{EditPlan, Offspring, ParentFate, RowOps};
 use crate::policy::{
-    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, SignalSet,
-    Signals, Snapshot,
+    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, Signals,
+    Snapshot,
 };
 use crate::registry::find;
 use crate::rng::PolicyRng;
@@ -114,11 +114,7 @@ impl Event {
                 points: &view.points[..view.points.len().min(request.points as usize)],
             })?;
         }
-        let mut set: SignalSet = policy.needs(&self.scene).signals;
-        if !policy.wants_fresh(self.step, self.rows, self.budget) {
-            set = set.without(Signal::FreshWeightMax);
-        }
-        let mut signals = Signals::zeros(self.rows, set);
+        let mut signals = Signals::zeros(self.rows, policy.needs(&self.scene).signals);
         for (signal, values) in &self.signals {
             if let Some(column) = signals.get_mut(*signal) {
                 column.copy_from_slice(values);

@@ -40,11 +40,9 @@
 //!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS) scale with the length
 //!    of the run, and say whether they are a step or an interval.
 //! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and reading
-//!    another is an error. Signals measured in training cost little.
-//!    [`Signal::FreshWeightMax`](policy::Signal::FreshWeightMax) and auxiliary views
+//!    another is an error. Signals measured in training cost little. Auxiliary views
 //!    ([`Needs::aux`](policy::Needs::aux)) cost extra renders, so the policy says at which events it
-//!    needs them ([`wants_fresh`](policy::DensityPolicy::wants_fresh),
-//!    [`aux_views`](policy::DensityPolicy::aux_views)). Loss terms, noise, learning rates, the interval
+//!    needs them ([`aux_views`](policy::DensityPolicy::aux_views)). Loss terms, noise, learning rates, the interval
 //!    of optimiser steps and changes to the initial model are declared here too.
 //! 4. **A plan**: at the steps at which it is due, the policy reads the
 //!    [`Snapshot`](policy::Snapshot) and adds edits to the [`EditPlan`](plan::EditPlan).

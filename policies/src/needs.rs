@@ -22,10 +22,6 @@ pub struct Needs {
     pub full_depth: f32,
     /// Pixels to collect as candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
-    /// Training views, drawn at random without replacement, that are rendered for each event that
-    /// [wants them](crate::policy::DensityPolicy::wants_fresh); all of them if there are fewer.
-    /// Required by [`Signal::FreshWeightMax`](crate::policy::Signal::FreshWeightMax); 0 without it.
-    pub fresh_views: u32,
     /// What is measured in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
     pub aux: Option<AuxRequest>,
     /// Terms added to the training loss.

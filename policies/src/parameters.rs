@@ -1,6 +1,5 @@
 //! Parameters of policies: names, ranges, overrides, and scaling with the length of a run.
 
-use std::collections::BTreeMap;
 use std::ops::{Bound, RangeBounds};
 
 use serde::de::{DeserializeOwned, Deserializer, Error, Visitor, value};
@@ -52,30 +51,6 @@ pub fn bad_parameter(parameter: &str, reason: impl Into<String>) -> PolicyError 
         parameter: parameter.to_owned(),
         reason: reason.into(),
     }
-}
-
-/// Parses settings of the form `policy.parameter=value` into one table per policy.
-///
-/// The value is TOML (`0.2`, `true`, `"text"`); anything that is not valid TOML is taken as text, so
-/// words need no quotes. Of several settings of one parameter the last one counts.
-///
-/// # Errors
-/// [`PolicyError::Other`] naming a setting of another form.
-pub fn parse_overrides(settings: &[impl AsRef<str>]) -> PolicyResult<BTreeMap<String, Table>> {
-    let mut tables: BTreeMap<String, Table> = BTreeMap::new();
-    for setting in settings.iter().map(AsRef::as_ref) {
-        let (key, value) = setting.split_once('=').unwrap_or((setting, ""));
-        let (policy, parameter) = key.split_once('.').unwrap_or((key, ""));
-        let [policy, parameter, value] = [policy, parameter, value].map(str::trim);
-        if policy.is_empty() || parameter.is_empty() || value.is_empty() {
-            return Err(PolicyError::Other(format!(
-                "`{setting}` is not of the form policy.parameter=value, such as diet.rho=0.2"
-            )));
-        }
-        let table = tables.entry(policy.to_owned()).or_default();
-        table.insert(parameter.to_owned(), parse_value(value));
-    }
-    Ok(tables)
 }
 
 /// A value as it is written on a command line: TOML where it is some, else text.
@@ -198,33 +173,17 @@ mod tests {
     }
 
     #[test]
-    fn overrides_are_toml_or_plain_text() {
-        let settings = [
-            "diet.rho=0.2",
-            "vanilla.governor=true",
-            "diet.shift=none",
-            "diet.rho = 0.3",
-            "diet.a=\"x=y\"",
-            "diet.b=1\nc=2",
-            "diet.d=x=y",
-            "diet.e=1e-4",
-        ];
-        let tables = parse_overrides(&settings).unwrap();
-        assert_eq!(tables.keys().collect::<Vec<_>>(), ["diet", "vanilla"]);
-        let diet = &tables["diet"];
-        assert_eq!(diet["rho"], Value::Float(0.3));
-        assert_eq!(diet["shift"], Value::String("none".into()));
-        assert_eq!(diet["a"], Value::String("x=y".into()));
-        assert_eq!(diet["b"], Value::String("1\nc=2".into()));
-        assert_eq!(diet["d"], Value::String("x=y".into()));
-        assert_eq!(diet["e"], Value::Float(1e-4));
-        assert_eq!(tables["vanilla"]["governor"], Value::Boolean(true));
-        assert!(parse_overrides(&[""; 0]).unwrap().is_empty());
-        for broken in
-            ["", "diet", "diet.rho", "diet=0.2", ".rho=1", "diet.=1", "diet.rho=", "=", "."]
-        {
-            let error = parse_overrides(&[broken]).unwrap_err().to_string();
-            assert!(error.contains(&format!("`{broken}`")), "{error}");
+    fn values_are_toml_or_plain_text() {
+        for (text, value) in [
+            ("0.3", Value::Float(0.3)),
+            ("1e-4", Value::Float(1e-4)),
+            ("true", Value::Boolean(true)),
+            ("none", Value::String("none".into())),
+            ("\"x=y\"", Value::String("x=y".into())),
+            ("x=y", Value::String("x=y".into())),
+            ("1\nc=2", Value::String("1\nc=2".into())),
+        ] {
+            assert_eq!(parse_value(text), value, "{text}");
         }
     }
 

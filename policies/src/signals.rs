@@ -14,8 +14,6 @@ pub enum SignalKind {
     Count,
     /// The largest value of the previous and the current epoch.
     EpochMaximum,
-    /// The largest value in views rendered for the event.
-    FreshMaximum,
     /// Computed from the current parameters or age of the row; needs no memory.
     Present,
     /// So many numbers of the row as it is now, copied at events only; needs no memory in between.
@@ -106,18 +104,13 @@ signals! {
     MeanGradientNorm: Sum "1 / scene units" [];
     /// Largest blend weight α·T over all pixels of the previous and the current epoch, in `[0, 1]`.
     WeightMax: EpochMaximum "1" [LargestWeight];
-    /// Largest blend weight α·T over all pixels of training views rendered for this event, in
-    /// `[0, 1]`; [`Needs::fresh_views`](crate::policy::Needs::fresh_views) of them, chosen at
-    /// random. 0 for a row that none of them shows.
-    FreshWeightMax: FreshMaximum "1" [LargestWeight];
     /// Sum of the blend weights α·T over all pixels, >= 0.
     WeightSum: Sum "pixels" [Weight];
     /// Number of pixels the row was blended into, >= 0.
     PixelCount: Count "pixels" [Count];
     /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
     /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
-    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen. SSIM is then computed
-    /// in every step, so that the knob `ssim_every` saves nothing on the native backend.
+    /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen.
     WeightedError: Sum "pixels" [WeightedError];
     /// Opacity now, in (0, 1).
     Opacity: Present "1" [];
@@ -162,12 +155,6 @@ impl SignalSet {
     #[must_use]
     pub fn with(self, signal: Signal) -> Self {
         Self(self.0 | 1 << signal as u32)
-    }
-
-    /// This set without `signal`.
-    #[must_use]
-    pub fn without(self, signal: Signal) -> Self {
-        Self(self.0 & !(1 << signal as u32))
     }
 
     /// Whether `signal` is in the set.
@@ -266,8 +253,8 @@ impl Signals {
     }
 }
 
-/// A per-row statistic of one auxiliary view. Sums run over the pixels that the row was blended
-/// into; all columns are 0 for rows that are not on screen.
+/// A per-row statistic of one auxiliary view. Sums and maxima run over the pixels that the row was
+/// blended into; all columns are 0 for rows that are not on screen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum AuxColumn {
     /// Sum of the pixel map, not weighted by alpha, >= 0.
@@ -278,6 +265,8 @@ pub enum AuxColumn {
     WeightSum,
     /// Sum of the distances from the pixel's centre to the projected mean `[px]`, >= 0.
     DistanceSum,
+    /// Largest blend weight α·T, in `[0, 1]`.
+    WeightMax,
     /// Camera z of the mean `[scene units]`.
     Depth,
     /// Radius on screen, three standard deviations along the longer axis, rounded up `[px]`.
@@ -286,11 +275,12 @@ pub enum AuxColumn {
 
 impl AuxColumn {
     /// All columns, in declaration order.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::MapSum,
         Self::PixelCount,
         Self::WeightSum,
         Self::DistanceSum,
+        Self::WeightMax,
         Self::Depth,
         Self::Radius,
     ];
@@ -314,9 +304,6 @@ mod tests {
         let listed: Vec<Signal> = set.iter().collect();
         assert_eq!(listed, [Signal::VisibleCount, Signal::Opacity, Signal::Age]);
         assert_eq!(set.with(Signal::Age), set);
-        let fewer = SignalSet::from([Signal::VisibleCount, Signal::Opacity]);
-        assert_eq!(set.without(Signal::Age), fewer);
-        assert_eq!(set.without(Signal::WeightMax), set);
         assert!(!set.contains(Signal::WeightMax) && !SignalSet::default().contains(Signal::Age));
     }
 

@@ -46,7 +46,7 @@ pub use panorama::Panorama;
 pub use points::{InitPoints, PointCollector, PointOptions};
 pub use presets::{PRESETS, Preset};
 pub use rig::{Rig, RigKind};
-pub use scene::{Generated, Options, Requirements, Scene, Source, Split, View, generate};
+pub use scene::{Generated, Options, Scene, Source, Split, View, generate};
 pub use shade::Ambient;
 pub use sky::Sky;
 pub use surface::{Surface, SurfaceHit};

@@ -223,7 +223,7 @@ impl Model {
     /// Named after the file that it was read from; an error if there is nothing to render.
     pub(crate) fn of_file(mut self, path: &Path) -> Result<Self, Error> {
         if self.triangles.is_empty() {
-            return Err(Error::Empty { name: path.display().to_string() });
+            return Err(Error::empty(path.display()));
         }
         let has_area = |triangle: &[u32; 3]| {
             let [a, b, c] = triangle.map(|i| self.positions[i as usize]);
@@ -256,19 +256,6 @@ impl Model {
         let used = self.triangles.iter().flatten().map(|&i| self.positions[i as usize]);
         let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         used.fold(empty, |(lo, hi), p| (lo.min(p), hi.max(p)))
-    }
-
-    /// Whether everything looks the same from every side: then colour depends on place only.
-    #[must_use]
-    pub fn view_independent(&self) -> bool {
-        let mut used = vec![false; self.materials.len()];
-        for &m in &self.triangle_materials {
-            used[m as usize] = true;
-        }
-        let shiny = |m: &Material| m.reflection == Reflection::MetalRough;
-        // A one-sided face is there or not, depending on the side it is seen from, and a blended
-        // one mixes with what is behind it; neither changes a surface's own colour.
-        !self.materials.iter().zip(&used).any(|(m, &used)| used && shiny(m))
     }
 }
 

@@ -172,7 +172,10 @@ impl Rig {
                 return Ok(self.looking(place, target, file, i));
             }
         }
-        Err(Error::NoPlace { view: i as usize })
+        Err(Error::Input(format!(
+            "view {i}: no place for the camera outside the geometry was found; choose another --rig or a \
+             larger --radius"
+        )))
     }
 
     fn size(&self) -> (u32, u32) {

@@ -107,22 +107,6 @@ pub struct View {
     pub camera: Camera,
 }
 
-/// What a trainer needs to know of a scene.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Requirements {
-    /// Whether every surface looks the same from all sides: colours of degree 0 suffice then.
-    pub view_independent: bool,
-    /// Smallest and largest coordinates.
-    pub bounds: [[f64; 3]; 2],
-    /// Length of the bounding box's diagonal.
-    pub diagonal: f64,
-    /// Size of the finest feature at the median viewing distance `[px]`: as a preset states it, or
-    /// a mesh's median edge.
-    pub finest_feature_px: f64,
-    /// Share of views' centre pixels that show no surface: how much of the images is background.
-    pub open_share: f64,
-}
-
 /// Geometry, light and cameras; nothing is rendered yet.
 pub struct Scene {
     /// Preset's or file's name.
@@ -143,8 +127,6 @@ pub struct Scene {
     pub sky: Sky,
     /// [`Options::exposure`], or the one chosen.
     pub exposure: f32,
-    /// What a trainer needs to know of it.
-    pub requirements: Requirements,
     train_cameras: Vec<Camera>,
     lighting: Lighting,
     flags: Vec<TriangleFlags>,
@@ -188,7 +170,7 @@ impl Scene {
     pub fn prepare(source: &Source, options: &Options) -> Result<Self, Error> {
         check(options)?;
         let (name, staging, cameras) = stage(source)?;
-        let Staging { mut model, mut sky, rig, ambient, finest } = staging;
+        let Staging { mut model, mut sky, rig, ambient } = staging;
         if options.lambert {
             for material in &mut model.materials {
                 if material.reflection == Reflection::MetalRough {
@@ -229,7 +211,6 @@ impl Scene {
             }
         }
         let lighting = light(sky.clone(), options.grid);
-        let requirements = requirements(&model, &surface, &train, finest);
         let name_of = |split: &str, i: usize| format!("{split}/r_{i:03}");
         let views = |cameras: &[Camera], split: Split, folder: &str| {
             let view =
@@ -247,7 +228,6 @@ impl Scene {
             ambient,
             sky,
             exposure,
-            requirements,
             train_cameras: train,
             lighting,
             flags,
@@ -307,7 +287,9 @@ fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
         Source::Preset(name) => {
             let Some(preset) = PRESETS.iter().find(|preset| preset.name == name) else {
                 let known = PRESETS.map(|preset| preset.name).join(", ");
-                return Err(Error::UnknownPreset { name: name.clone(), known });
+                return Err(Error::Input(format!(
+                    "there is no preset {name:?}; the presets are {known}"
+                )));
             };
             let mut staging = (preset.build)();
             staging.model.name = name.clone();
@@ -319,18 +301,19 @@ fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
                 Some("gltf" | "glb") => gltf::load(path)?,
                 Some("obj") => obj::load(path)?,
                 _ => {
-                    let feature = "a file that is neither .gltf, .glb nor .obj".to_owned();
-                    let remedy = "export the mesh to one of them".to_owned();
-                    return Err(Error::Unsupported { path: path.clone(), feature, remedy });
+                    let feature = "a file that is neither .gltf, .glb nor .obj";
+                    return Err(Error::unsupported(
+                        path,
+                        feature,
+                        "export the mesh to one of them",
+                    ));
                 }
             };
             let cameras = model.cameras.clone();
-            let finest = median_edge(&model);
             let staging = Staging {
                 sky: open_sky(),
                 rig: Rig { elevation: [-15.0, 70.0], ..Rig::default() },
                 ambient: Ambient::Open,
-                finest,
                 model,
             };
             let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
@@ -383,42 +366,4 @@ fn exposure_for(tracer: &Tracer<'_>, cameras: &[Camera]) -> f32 {
         Some(&bright) => (0.9 / bright).clamp(1e-9, 1e9),
         None => 1.0,
     }
-}
-
-fn requirements(model: &Model, surface: &Surface, cameras: &[Camera], finest: f64) -> Requirements {
-    let (lo, hi) = surface.bounds();
-    let middle = 0.5 * (lo + hi);
-    let seen = |c: &Camera| surface.cast(c.centre, c.forward(), f64::INFINITY).map(|hit| hit.t);
-    let met: Vec<Option<f64>> = cameras.iter().map(seen).collect();
-    let open = met.iter().filter(|t| t.is_none()).count();
-    let mut scales: Vec<f64> = cameras
-        .iter()
-        .zip(&met)
-        .map(|(camera, met)| camera.fx / met.unwrap_or(camera.centre.distance(middle)))
-        .collect();
-    scales.sort_by(f64::total_cmp);
-    let scale = scales.get(scales.len() / 2).copied().unwrap_or(0.0);
-    Requirements {
-        view_independent: model.view_independent(),
-        bounds: [lo.to_array(), hi.to_array()],
-        diagonal: surface.diagonal(),
-        finest_feature_px: finest * scale,
-        open_share: open as f64 / cameras.len().max(1) as f64,
-    }
-}
-
-fn median_edge(model: &Model) -> f64 {
-    // A sample of the triangles is enough.
-    let step = (model.triangles.len() / 10_000).max(1);
-    let at = |i: u32| model.positions[i as usize];
-    let mut edges: Vec<f64> = model
-        .triangles
-        .iter()
-        .step_by(step)
-        .flat_map(|&[a, b, c]| {
-            [at(a).distance(at(b)), at(b).distance(at(c)), at(c).distance(at(a))]
-        })
-        .collect();
-    edges.sort_by(f64::total_cmp);
-    edges.get(edges.len() / 2).copied().unwrap_or(0.0)
 }

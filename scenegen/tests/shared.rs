@@ -66,7 +66,7 @@ fn shared_meshes_that_need_other_software_are_refused_by_name() {
     assert!(all.len() >= 7);
     for path in &all {
         let error = prepare(path).err().unwrap_or_else(|| panic!("{}", path.display()));
-        assert!(matches!(error, Error::Unsupported { .. }), "{}: {error}", path.display());
+        assert!(error.to_string().contains("is not supported"), "{}: {error}", path.display());
         let name = path.to_string_lossy();
         let expected = [
             ("EXT_meshopt", ["EXT_meshopt_compression", "without meshopt"]),

@@ -1,7 +1,9 @@
 // A splat's sums over the pixels of an auxiliary view, for observe.wgsl and observe_atomic.wgsl.
 
-// Sums of the map, of pixels, of weights, of distances.
-const COLUMNS: u32 = 4u;
+// Sums of the map, of pixels, of weights, of distances; the largest weight.
+const COLUMNS: u32 = 5u;
+// The one that is no sum.
+const MAXIMUM: u32 = 4u;
 
 // The pixel map at an invocation's pixels; 0 outside of the image.
 fn map_at(quad: Quad) -> vec4<f32> {
@@ -14,16 +16,17 @@ fn map_at(quad: Quad) -> vec4<f32> {
     return here;
 }
 
-// The columns of a splat, summed over the pixels.
+// The columns of a splat, over the pixels.
 fn blended(
     splat: Splat,
     quad: Quad,
     map_here: vec4<f32>,
     pixels: ptr<function, Open>,
-) -> vec4<f32> {
+) -> array<f32, COLUMNS> {
     let w = taken(falloff(splat, quad).exponent, pixels);
     let x = quad.x - splat.a.x;
     let y = quad.y - splat.a.y;
     let one = select(vec4(0.0), vec4(1.0), w > vec4(0.0));
-    return vec4(total(one * map_here), total(one), total(w), total(one * sqrt(x * x + y * y)));
+    let distance = total(one * sqrt(x * x + y * y));
+    return array(total(one * map_here), total(one), total(w), distance, largest(w));
 }

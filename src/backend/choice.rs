@@ -49,9 +49,8 @@ pub enum BackendKind {
 }
 
 /// Knobs that only one backend has; all others work on both.
-const KNOBS_OF_ONE: [(&str, BackendKind); 5] = [
+const KNOBS_OF_ONE: [(&str, BackendKind); 4] = [
     ("pairs_per_row", BackendKind::Cpu),
-    ("ssim_every", BackendKind::Cpu),
     ("param_storage", BackendKind::Cpu),
     ("moment_storage", BackendKind::Cpu),
     ("accumulation", BackendKind::Gpu),

@@ -79,9 +79,6 @@ pub struct StepInput<'a> {
     pub cadence: Cadence,
     /// Seed of the run, for noise on the means.
     pub seed: u64,
-    /// Factor of the SSIM term's gradient: 1 in the loss as published; 0 where it is left out, and
-    /// then nothing of it is computed.
-    pub ssim_weight: f32,
 }
 
 /// A training view to be measured for a policy's event.
@@ -123,7 +120,7 @@ pub struct StepOutput {
     pub loss: f32,
     /// Mean over pixels and channels of |I − G|.
     pub l1: f32,
-    /// Mean structural similarity; NaN where it is left out.
+    /// Mean structural similarity.
     pub ssim: f32,
     /// Rows whose projection is on screen.
     pub visible: usize,
@@ -223,15 +220,6 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError>;
 
-    /// Renders a view as the model is now and takes note of the largest blend weight of each row:
-    /// that over the views measured since signals were last taken is their `FreshWeightMax`. Does
-    /// nothing where this signal is not among those that the backend was made for. Changes nothing
-    /// of the model, of the optimiser, or of the other signals.
-    ///
-    /// # Errors
-    /// See [`BackendError`].
-    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError>;
-
     /// Renders a view as the model is now and measures what is asked for. Changes nothing of the
     /// model, of the optimiser, or of the signals.
     ///
@@ -239,8 +227,7 @@ pub trait Backend: Send {
     /// See [`BackendError`].
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError>;
 
-    /// Copies these signals to the host. `FreshWeightMax` starts anew, whether it is one of them or
-    /// not.
+    /// Copies these signals to the host.
     ///
     /// # Errors
     /// See [`BackendError`].

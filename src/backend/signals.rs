@@ -119,6 +119,7 @@ impl RecordLayout {
     }
 
     /// Where in a record the field is.
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
     pub(super) fn at(self, field: Field) -> Option<usize> {
         let before = self.fields & ((1 << field as u8) - 1);
         self.has(field).then(|| BASE + before.count_ones() as usize)
@@ -146,7 +147,7 @@ pub(super) struct SignalPlanes {
 /// How many planes a signal has.
 const fn planes(kind: SignalKind) -> usize {
     match kind {
-        SignalKind::Sum | SignalKind::Count | SignalKind::FreshMaximum => 1,
+        SignalKind::Sum | SignalKind::Count => 1,
         // The previous epoch, and the current one.
         SignalKind::EpochMaximum => 2,
         SignalKind::Present | SignalKind::Attribute(_) => 0,
@@ -188,11 +189,6 @@ impl SignalPlanes {
         self.of_kinds(&[SignalKind::Sum, SignalKind::Count])
     }
 
-    /// Those that start anew when signals have been taken.
-    pub(super) fn fresh(&self) -> Vec<usize> {
-        self.of_kinds(&[SignalKind::FreshMaximum])
-    }
-
     /// The current epoch becomes the previous one: planes change places. Returns those to clear.
     pub(super) fn begin_epoch(&mut self) -> Vec<usize> {
         self.swapped = !self.swapped;
@@ -200,8 +196,7 @@ impl SignalPlanes {
         Signal::ALL.into_iter().filter(by_epoch).filter_map(|s| self.current(s)).collect()
     }
 
-    /// The planes that checkpoints save, by name. Those of fresh views are not: they are measured and
-    /// taken within one event.
+    /// The planes that checkpoints save, by name.
     pub(super) fn kept(&self) -> Vec<(String, usize)> {
         let mut kept = Vec::new();
         for signal in Signal::ALL {
@@ -214,7 +209,7 @@ impl SignalPlanes {
                     kept.push((format!("{signal:?}.previous"), previous));
                     kept.push((format!("{signal:?}.current"), current));
                 }
-                SignalKind::FreshMaximum | SignalKind::Present | SignalKind::Attribute(_) => {}
+                SignalKind::Present | SignalKind::Attribute(_) => {}
             }
         }
         kept
@@ -246,7 +241,6 @@ impl ParameterSignal {
             | Signal::MeanGradientZ
             | Signal::MeanGradientNorm
             | Signal::WeightMax
-            | Signal::FreshWeightMax
             | Signal::WeightSum
             | Signal::PixelCount
             | Signal::WeightedError

@@ -10,17 +10,15 @@ use crate::knobs::{Class, KNOBS, Knob, Measured, PRESETS};
 /// Lists the knobs: every setting that trades speed or memory for accuracy.
 ///
 /// Set one with `densify train --knob NAME=VALUE`. An exact knob changes no bit of the
-/// result, a bounded one makes a numerical error only, a heuristic one changes what training arrives
-/// at.
+/// result, a bounded one makes a numerical error.
 #[derive(Debug, Args)]
 pub(super) struct KnobsArgs {}
 
 pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
-    for class in [Class::Exact, Class::Bounded, Class::Heuristic] {
+    for class in [Class::Exact, Class::Bounded] {
         let promise = match class {
             Class::Exact => "the same bits",
-            Class::Bounded => "a numerical error only",
-            Class::Heuristic => "another outcome of training",
+            Class::Bounded => "a numerical error",
         };
         console.result(format_args!("{class}: {promise}"));
         for knob in KNOBS.iter().filter(|knob| knob.class == class) {

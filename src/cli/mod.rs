@@ -75,7 +75,7 @@ Examples:
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
   densify knobs                                            what trades speed or memory for accuracy
-  densify trade data/garden --knobs alpha_min,sh_every     what these cost and buy here
+  densify trade data/garden --knobs alpha_min,sh_degree    what these cost and buy here
   densify scenegen mesh.glb -o data/mesh                   posed images of a mesh, with depth and normals
   densify selftest                                         whether this machine computes what it should
 

@@ -93,9 +93,6 @@ pub(super) struct ScenegenArgs {
     /// Initial points to make: on surfaces with detail that at least three views see
     #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
     points: usize,
-    /// Place them anywhere instead
-    #[arg(long, help_heading = "Points")]
-    random_points: bool,
     /// Standard deviation of their coordinates, as a share of the scene's diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.001)]
     point_noise: f64,
@@ -192,7 +189,6 @@ impl ScenegenArgs {
             exposure: self.exposure,
             points: PointOptions {
                 count: self.points,
-                random: self.random_points,
                 noise: self.point_noise,
                 outliers: self.outliers,
                 dropout: self.dropout,
@@ -253,8 +249,8 @@ pub(super) fn run(args: &ScenegenArgs, console: &Console) -> Result<(), Failure>
     if (written.points as f64) < 0.5 * wanted {
         console.say(format_args!(
             "note: of {} points wanted, {:.0} % were found where three views see the surface; to see more \
-             of it, add views (--train), widen --fov, or choose another --rig (inside for rooms); or place \
-             points anywhere with --random-points",
+             of it, add views (--train), widen --fov, or choose another --rig (inside for rooms); or train \
+             with --init random",
             number::grouped(args.points),
             100.0 * written.points as f64 / args.points as f64
         ));
@@ -266,16 +262,15 @@ fn describe(scene: &Scene, console: &Console) {
     for note in &scene.model.notes {
         console.say(format_args!("note: {note}"));
     }
-    let (rig, needs) = (&scene.rig, &scene.requirements);
+    let rig = &scene.rig;
     console.say(format_args!(
-        "scene    {}: {} triangles, {}",
+        "scene    {}: {} triangles",
         scene.name,
-        number::grouped(scene.model.triangles.len()),
-        if needs.view_independent { "view-independent" } else { "view-dependent" }
+        number::grouped(scene.model.triangles.len())
     ));
     console.say(format_args!(
-        "views    {} to train on, {} held out, {}x{} px, finest feature {:.1} px",
-        rig.train, rig.test, rig.width, rig.height, needs.finest_feature_px
+        "views    {} to train on, {} held out, {}x{} px",
+        rig.train, rig.test, rig.width, rig.height
     ));
 }
 

@@ -56,8 +56,6 @@ pub enum Class {
     Exact,
     /// A numerical error: the same model looks a little different.
     Bounded,
-    /// Another outcome of training.
-    Heuristic,
 }
 
 /// A rejected knob or value, with the nearest valid one.
@@ -165,7 +163,6 @@ impl fmt::Display for Class {
         f.pad(match self {
             Self::Exact => "exact",
             Self::Bounded => "bounded",
-            Self::Heuristic => "heuristic",
         })
     }
 }

@@ -7,7 +7,6 @@ use toml::{Table, Value};
 use super::{KNOBS, Knob, KnobError, find};
 use crate::backend::Accumulation;
 use crate::backend::{Shortcuts, Storage};
-use crate::trainer::Savings;
 
 /// All knobs, each set.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,8 +15,6 @@ pub struct Knobs {
     pub shortcuts: Shortcuts,
     /// How parameters and moments are stored.
     pub storage: Storage,
-    /// Where the trainer computes less than it could.
-    pub savings: Savings,
     /// (Row, tile) pairs held per row of the budget; `None`: as `--tile-cap` and `--memory` say.
     pub pairs_per_row: Option<usize>,
     /// How a GPU adds up gradients; `None`: the fastest way that it has.
@@ -31,7 +28,6 @@ impl Default for Knobs {
         let mut knobs = Self {
             shortcuts: Shortcuts::default(),
             storage: Storage::default(),
-            savings: Savings::NONE,
             pairs_per_row: None,
             accumulation: None,
             values: BTreeMap::new(),

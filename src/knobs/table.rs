@@ -1,11 +1,11 @@
 //! The knobs. `densify trade` measures what they cost and gain; docs/tradeoffs.md has the figures.
 
-use super::Class::{Bounded, Exact, Heuristic};
+use super::Class::{Bounded, Exact};
 use super::{Domain, Knob, number};
 use crate::backend::Accumulation;
 use crate::backend::{MomentStorage, ParameterStorage};
 
-/// All knobs: exact ones, then bounded ones, then heuristic ones.
+/// All knobs: exact ones, then bounded ones.
 pub static KNOBS: &[Knob] = &[
     Knob {
         name: "pairs_per_row",
@@ -46,36 +46,6 @@ pub static KNOBS: &[Knob] = &[
         effect: "how gradients are added up: slots in one order; cas and atomics in any, so that runs differ slightly",
         levels: &["slots", "cas", "atomics"],
         set: |knobs, value| knobs.accumulation = Accumulation::of_name(value),
-    },
-    Knob {
-        name: "ssim_every",
-        default: "1",
-        domain: Domain::Choice(&["1", "2", "5", "10"]),
-        unit: "iterations",
-        class: Heuristic,
-        effect: "SSIM in every so many-th step with as many times its weight, L1 in all; saves most of the loss",
-        levels: &["2", "5", "10"],
-        set: |knobs, value| knobs.savings.ssim_every = value.parse().unwrap_or(1),
-    },
-    Knob {
-        name: "coarse_until",
-        default: "0",
-        domain: Domain::Number { least: 0.0, most: 0.9 },
-        unit: "of the run",
-        class: Heuristic,
-        effect: "share of the run, from its start, that is trained on images of half the size",
-        levels: &["0.2", "0.4", "0.6"],
-        set: |knobs, value| knobs.savings.coarse_until = real(value),
-    },
-    Knob {
-        name: "budget_share",
-        default: "1",
-        domain: Domain::Number { least: 0.05, most: 1.0 },
-        unit: "of the budget",
-        class: Heuristic,
-        effect: "Gaussians may grow up to this share of the budget; the rest is neither touched nor computed",
-        levels: &["0.25", "0.5", "0.75"],
-        set: |knobs, value| knobs.savings.budget_share = real(value),
     },
     Knob {
         name: "param_storage",

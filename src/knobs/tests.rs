@@ -34,7 +34,7 @@ fn equal_values_are_equal_texts() {
         ("alpha_min= 0.0078125", "1/128"),
         ("alpha_min=0.005", "5e-3"),
         ("transmittance_stop=0.0001", "1e-4"),
-        ("ssim_every=5", "5"),
+        ("pairs_per_row=2", "2"),
     ] {
         assert_eq!(canonical(setting).unwrap(), value, "{setting}");
     }
@@ -48,7 +48,7 @@ fn values_out_of_range_are_refused_with_the_nearest_that_works() {
         ("alpha_min=-1/0", ["alpha_min", "1/1024 to 1/32", "works is 1/255"]),
         ("alpha_min=NaN", ["alpha_min", "NaN", "works is 1/255"]),
         ("transmittance_stop=1", ["transmittance_stop", "1e-5 to 1e-2", "works is 1e-2"]),
-        ("ssim_every=4", ["ssim_every", "1|2|5|10", "works is 5"]),
+        ("pairs_per_row=3", ["pairs_per_row", "auto|4|2|1", "works is 4"]),
         ("moment_storage=bf16", ["moment_storage", "f32|both8", "works is"]),
         ("alpha_mim=1/64", ["alpha_mim", "alpha_min", "densify knobs"]),
     ] {
@@ -62,8 +62,8 @@ fn values_out_of_range_are_refused_with_the_nearest_that_works() {
 #[test]
 fn each_level_of_each_knob_does_something() {
     let effect = |knobs: &Knobs| {
-        let Knobs { shortcuts, storage, savings, pairs_per_row, accumulation, .. } = knobs;
-        format!("{shortcuts:?}{storage:?}{savings:?}{pairs_per_row:?}{accumulation:?}")
+        let Knobs { shortcuts, storage, pairs_per_row, accumulation, .. } = knobs;
+        format!("{shortcuts:?}{storage:?}{pairs_per_row:?}{accumulation:?}")
     };
     let defaults = Knobs::default();
     assert_eq!(defaults.changed().count(), 0);

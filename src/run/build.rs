@@ -19,7 +19,7 @@ use crate::init::{initialise, random_points, restart};
 use crate::memory::RunSize;
 use crate::number::grouped;
 use crate::schedule::RateOptions;
-use crate::trainer::{TrainOptions, Trainer, needs};
+use crate::trainer::{TrainOptions, Trainer};
 use crate::views::DatasetViews;
 
 /// Views announced ahead: enough that each decoder has one at work and one waiting.
@@ -88,7 +88,7 @@ pub(super) fn build(
     if !steps.is_empty() {
         observer.say(format_args!("steps    {}", steps.join(", ")));
     }
-    let needs = inputs.backend_needs(needs(policy.as_ref(), &scene, inputs.sh_every()));
+    let needs = inputs.backend_needs(policy.needs(&scene));
     let ledger = inputs.ledger(&setting, &needs);
     resolve::check(&inputs, &setting, &ledger)?;
     observer.say(format_args!("{}", inputs.promise(&ledger)));
@@ -100,10 +100,8 @@ pub(super) fn build(
         sh_degree: setting.sh_degree,
         background: spec.data.background,
         rates,
-        sh_every: inputs.sh_every(),
         prefetch: AHEAD,
         on_nan: spec.schedule.on_nan,
-        savings: inputs.knobs.savings,
     };
     let (name, required) = (inputs.entry.name, inputs.required);
     let mut dataset = inputs.dataset;

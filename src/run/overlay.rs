@@ -49,15 +49,13 @@ impl Partial {
     /// Reads a TOML file that holds any of the options. The `config.toml` of a run is one; what was found
     /// out about that run is passed over.
     pub fn read(path: &Path) -> Result<Self, Failure> {
-        let (mut table, origin) = read_table("--config", path)?;
+        let origin = format!("--config {}", path.display());
+        let text = foreign::read_text(path, foreign::MAX_OPTIONS)
+            .map_err(|e| Failure::input(e).within(&origin))?;
+        let table = text.parse::<Table>();
+        let mut table = table.map_err(|e| Failure::input(e.to_string().trim()).within(&origin))?;
         table.retain(|key, _| !FOUND_OUT.contains(&key));
         Self::new(table, &origin)
-    }
-
-    /// Reads a TOML file with a table of parameters for each policy.
-    pub fn read_policies(path: &Path) -> Result<Self, Failure> {
-        let (table, origin) = read_table("--policy-config", path)?;
-        Self::new([("policy_set".to_owned(), table.into())].into_iter().collect(), &origin)
     }
 
     /// Those options of a description that `is_given` names.
@@ -145,16 +143,6 @@ impl Partial {
     pub(super) fn spec(self) -> Result<RunSpec, Failure> {
         RunSpec::deserialize(self.0).map_err(Failure::input)
     }
-}
-
-/// The table in the TOML file that a flag names, and what messages call it.
-fn read_table(flag: &str, path: &Path) -> Result<(Table, String), Failure> {
-    let origin = format!("{flag} {}", path.display());
-    let text = foreign::read_text(path, foreign::MAX_OPTIONS)
-        .map_err(|e| Failure::input(e).within(&origin))?;
-    let table = text.parse::<Table>();
-    let table = table.map_err(|e| Failure::input(e.to_string().trim()).within(&origin))?;
-    Ok((table, origin))
 }
 
 fn lay(upper: Table, lower: &mut Table) {

@@ -40,12 +40,6 @@ struct Window {
     loss: f32,
     l1: f32,
     ssim: f32,
-    /// Steps without SSIM; `loss` and `ssim` are of the others.
-    #[serde(default)]
-    without_ssim: u32,
-    /// Mean similarity of the last record that had any.
-    #[serde(default)]
-    last_ssim: f32,
 }
 
 impl Totals {
@@ -73,33 +67,22 @@ impl Totals {
         while self.drawn.len() > views {
             self.drawn.pop_front();
         }
-        let Window { steps, loss, l1, ssim, without_ssim, .. } = &mut self.window;
+        let Window { steps, loss, l1, ssim } = &mut self.window;
         *steps = steps.saturating_add(1);
-        *l1 += output.l1;
-        if output.ssim.is_nan() && output.loss.is_finite() {
-            *without_ssim = without_ssim.saturating_add(1);
-            return;
-        }
         *loss += output.loss;
+        *l1 += output.l1;
         *ssim += output.ssim;
     }
 
     /// The means since the last record.
     pub(super) fn record(&mut self, step: u32, rows: usize) -> StepRecord {
-        let Window { steps, loss, l1, ssim, without_ssim, last_ssim } =
-            std::mem::take(&mut self.window);
-        let (l1, measured) = (l1 / steps as f32, steps - without_ssim);
-        let (loss, ssim) = if measured > 0 {
-            (loss / measured as f32, ssim / measured as f32)
-        } else {
-            (0.8 * l1 + 0.2 * (1.0 - last_ssim), last_ssim)
-        };
-        self.window.last_ssim = ssim;
+        let Window { steps, loss, l1, ssim } = std::mem::take(&mut self.window);
+        let steps = steps as f32;
         StepRecord {
             step,
-            loss,
-            l1,
-            ssim,
+            loss: loss / steps,
+            l1: l1 / steps,
+            ssim: ssim / steps,
             rows,
             seconds: self.wall.as_secs_f64(),
             resident_bytes: resident(),

@@ -239,11 +239,6 @@ run_spec! {
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed;
 
-        /// Iterations per optimiser step of view-dependent colour; gradients are summed in between
-        /// (default: the policy's choice, mostly 1)
-        #[arg(long, value_name = "N")]
-        sh_every: Option<Whole<1, 1000>> = None, Fixed;
-
         /// Settings that go together: exact, balanced, fast or tiny-memory. Options that are given
         /// win over it (default: balanced)
         #[arg(long, value_name = "NAME")]

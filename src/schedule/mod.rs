@@ -143,16 +143,6 @@ pub fn sh_degree(step: u32, iterations: u32, highest: u8) -> u8 {
     u8::try_from(reached).unwrap_or(u8::MAX).min(highest).min(MAX_SH_DEGREE)
 }
 
-/// Divisor of both sides of the images at iteration `step`, where the first `coarse_until` (a
-/// fraction) of the run trains on smaller images: 2, then 1. (Chen et al. 2025,
-/// *DashGaussian*, raises the resolution along the run according to the images' spectra; one step
-/// stands in for that. Starting with a divisor of 4 saved little more and cost 0.5 dB or more.)
-#[must_use]
-pub fn divisor(step: u32, iterations: u32, coarse_until: f64) -> u32 {
-    let done = f64::from(step.saturating_sub(1)) / f64::from(iterations.max(1));
-    if done < coarse_until { 2 } else { 1 }
-}
-
 /// What lies behind the Gaussians. As text: `black`, `white`, `random` or `#rrggbb`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Background {
@@ -243,7 +233,7 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
 }
 
 /// `count` of the training views, or all of them if there are fewer, drawn at random without
-/// replacement from (seed, step), for policies that request fresh views.
+/// replacement from (seed, step), for policies that look at views of their own.
 #[must_use]
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();

@@ -128,15 +128,3 @@ fn backgrounds() {
     // Uniform: deviation of the mean 0.29 / √3,000 = 0.005.
     assert!((mean - 0.5).abs() < 0.025, "{mean}");
 }
-
-#[test]
-fn images_grow_along_the_coarse_share_of_a_run() {
-    let all = |coarse_until: f64| -> Vec<u32> {
-        (1..=10).map(|step| divisor(step, 10, coarse_until)).collect()
-    };
-    assert_eq!(all(0.0), [1; 10]);
-    assert_eq!(all(0.6), [2, 2, 2, 2, 2, 2, 1, 1, 1, 1]);
-    assert_eq!(all(0.9), [2, 2, 2, 2, 2, 2, 2, 2, 2, 1]);
-    // Beyond the end of a run that is extended, and where there is none.
-    assert_eq!((divisor(99, 10, 0.9), divisor(0, 0, 0.5), divisor(1, 0, 0.0)), (1, 2, 1));
-}

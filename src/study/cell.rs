@@ -129,7 +129,6 @@ impl Cell {
             ledger_bytes: summary.ledger_bytes,
             seconds: summary.seconds,
             cpu_seconds: summary.cpu_seconds,
-            stage_seconds: summary.stage_seconds,
             extra_forwards: summary.extra_forwards,
             curve: summary.test.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),
             geometry: geometry_of(folder, iterations)?,

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::record::{ImageError, Outcome, Record};
+use super::record::Outcome;
 use crate::failure::Failure;
 use crate::output::{OutputError, write_atomically};
 use crate::run::Partial;
@@ -11,7 +11,7 @@ use crate::run::Partial;
 /// The records in a file.
 pub(super) struct Journal {
     path: PathBuf,
-    records: Vec<Record>,
+    records: Vec<Outcome>,
 }
 
 impl Journal {
@@ -38,28 +38,12 @@ impl Journal {
 
     /// The outcome of the run with this description, by this version of densify.
     pub(super) fn outcome(&self, spec: &Partial) -> Option<&Outcome> {
-        self.records.iter().rev().find_map(|record| match record {
-            Record::Run(run) if spec.is_table(&run.spec) && is_ours(&run.densify) => Some(&**run),
-            _ => None,
-        })
-    }
-
-    /// The image errors of that run's model with a knob at a level.
-    pub(super) fn image(&self, spec: &Partial, knob: &str, level: &str) -> Option<&ImageError> {
-        self.records.iter().rev().find_map(|record| match record {
-            Record::Image(image)
-                if (&*image.knob, &*image.level) == (knob, level)
-                    && spec.is_table(&image.spec)
-                    && is_ours(&image.densify) =>
-            {
-                Some(image)
-            }
-            _ => None,
-        })
+        let is_ours = |run: &&Outcome| run.densify == env!("CARGO_PKG_VERSION");
+        self.records.iter().rev().filter(is_ours).find(|run| spec.is_table(&run.spec))
     }
 
     /// Adds a record and writes them all.
-    pub(super) fn add(&mut self, record: Record) -> Result<(), OutputError> {
+    pub(super) fn add(&mut self, record: Outcome) -> Result<(), OutputError> {
         self.records.push(record);
         let lines = self.records.iter().map(|r| serde_json::to_string(r).map(|line| line + "\n"));
         write_atomically(&self.path, |out| {
@@ -69,8 +53,4 @@ impl Journal {
             Ok(())
         })
     }
-}
-
-fn is_ours(version: &str) -> bool {
-    version == env!("CARGO_PKG_VERSION")
 }

@@ -26,7 +26,7 @@ use crate::output::write_atomically;
 use crate::run::Observer;
 use cell::Cell;
 use journal::Journal;
-use record::{Outcome, Record};
+use record::Outcome;
 
 /// What a finished study leaves.
 #[derive(Debug)]
@@ -71,7 +71,7 @@ impl<'a> Study<'a> {
                 Some(outcome) => outcome,
                 None => {
                     let outcome = cell.train(self.output)?;
-                    self.journal.add(Record::Run(Box::new(outcome.clone())))?;
+                    self.journal.add(outcome.clone())?;
                     outcome
                 }
             };

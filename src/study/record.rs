@@ -1,19 +1,9 @@
-//! What a study leaves on disk for everything that it did: a record per run and per image comparison.
-
-use std::collections::BTreeMap;
+//! What a study leaves on disk of every run: a line in its file of records.
 
 use serde::{Deserialize, Serialize};
 use toml::Table;
 
 use crate::metrics::geometry::Geometry;
-
-/// A line of a study's file of records.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "kebab-case")]
-pub(super) enum Record {
-    Run(Box<Outcome>),
-    Image(ImageError),
-}
 
 /// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,8 +41,6 @@ pub(super) struct Outcome {
     pub(super) seconds: f64,
     /// Processor time of the steps.
     pub(super) cpu_seconds: Option<f64>,
-    /// Wall time by stage.
-    pub(super) stage_seconds: BTreeMap<String, f64>,
     /// Views rendered for the policy's decisions.
     pub(super) extra_forwards: u64,
     /// (iteration, PSNR) along the run.
@@ -67,26 +55,6 @@ impl Outcome {
     pub(super) fn kept_its_budget(&self) -> bool {
         self.peak_rows <= self.budget
     }
-}
-
-/// How far off a model's images are with a knob at a level.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct ImageError {
-    /// Version of densify.
-    pub(super) densify: String,
-    /// Label of the scene.
-    pub(super) scene: String,
-    pub(super) knob: String,
-    pub(super) level: String,
-    /// The description of the run that made the model.
-    pub(super) spec: Table,
-    /// Against the float64 renderer with the standard rules: alpha from 1/255, transmittance to 1e-4
-    /// `[dB]`.
-    pub(super) standard: f64,
-    /// Against the float64 renderer that blends everything `[dB]`.
-    pub(super) everything: f64,
-    /// Largest error of a channel against the standard rules, in 0..=1.
-    pub(super) worst: f64,
 }
 
 /// A run for tests of what shows results.
@@ -112,7 +80,6 @@ pub(super) fn sample(factor: &str, level: &str, seed: u32, psnr: f64) -> Outcome
         ledger_bytes: 1,
         seconds: 1.25,
         cpu_seconds: None,
-        stage_seconds: BTreeMap::new(),
         extra_forwards: 0,
         curve: Vec::new(),
         geometry: None,

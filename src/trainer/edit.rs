@@ -14,16 +14,15 @@ impl<V: ViewSource> Trainer<V> {
     /// Lets the policy plan and executes the plan. `None` if there was nothing to do.
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
-        let needs = self.measure_fresh_views(step)?;
         self.show_aux_views(step)?;
         self.views_time = self.views_time.saturating_add(start.elapsed());
-        let signals =
-            self.backend.take_signals(needs.signals).map_err(|e| self.backend_error(step, e))?;
+        let signals = self.backend.take_signals(self.needs.signals);
+        let signals = signals.map_err(|e| self.backend_error(step, e))?;
         let limit = self.row_limit();
         let scene = SceneInfo { budget: limit, ..self.scene.clone() };
         let candidates = self.backend.candidates();
         let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
-        let mut plan = EditPlan::new(self.backend.rows(), limit).allowing(&needs);
+        let mut plan = EditPlan::new(self.backend.rows(), limit).allowing(&self.needs);
         let rng = PolicyRng::new(self.options.seed, step);
         let planned = call_policy(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         self.backend.give_back(signals);

@@ -31,22 +31,11 @@ pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth
 use distinct_views::distinct_views;
 pub use error::TrainError;
 use nonfinite::AUDIT_EVERY;
-pub use options::{AutoChoices, OnNan, Savings, TrainOptions};
+pub use options::{AutoChoices, OnNan, TrainOptions};
 use policy_calls::call_policy;
 pub use report::{EditEvent, StepReport};
 pub use state::TrainerState;
 use validate::{check_options, checked_needs};
-
-/// The needs of a run with this policy: the policy's own, with [`TrainOptions::sh_every`] in place of its
-/// cadence.
-#[must_use]
-pub fn needs(policy: &dyn DensityPolicy, scene: &SceneInfo, sh_every: Option<u32>) -> Needs {
-    let mut needs = policy.needs(scene);
-    if let Some(every) = sh_every {
-        needs.cadence.sh_rest = every;
-    }
-    needs
-}
 
 /// A run in progress.
 pub struct Trainer<V> {
@@ -87,7 +76,7 @@ impl<V: ViewSource> Trainer<V> {
         backend.sort_rows();
         check_options(&scene, &options, count, backend.as_ref())?;
         Ok(Self {
-            needs: checked_needs(policy_name, policy.as_ref(), &scene, &options)?,
+            needs: checked_needs(policy_name, policy.as_ref(), &scene)?,
             policy_name: policy_name.to_owned(),
             order: Vec::new(),
             next_order: schedule::view_order(count, options.seed, 0),
@@ -132,8 +121,6 @@ impl<V: ViewSource> Trainer<V> {
     /// [`TrainError`]. After an error the run is over; the model can still be read.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let step = self.step + 1;
-        let TrainOptions { iterations, savings, .. } = self.options;
-        self.views.shrink(schedule::divisor(step, iterations, savings.coarse_until));
         let view = self.next_view();
         let start = Instant::now();
         // Until here nothing has changed that a checkpoint holds.
@@ -143,7 +130,7 @@ impl<V: ViewSource> Trainer<V> {
         }
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
-        let TrainOptions { seed, background, rates, .. } = self.options;
+        let TrainOptions { iterations, seed, background, rates, .. } = self.options;
         let input = StepInput {
             step,
             view,
@@ -154,7 +141,6 @@ impl<V: ViewSource> Trainer<V> {
             rates: rates.at(step, iterations, self.scene.extent),
             cadence,
             seed,
-            ssim_weight: savings.ssim_weight(step, iterations),
         };
         let output = self.backend.train_step(&input).map_err(|e| self.backend_error(step, e))?;
         self.step = step;
@@ -191,12 +177,10 @@ impl<V: ViewSource> Trainer<V> {
         })
     }
 
-    /// How often the optimiser steps now: by the options, else by the policy.
+    /// How often the policy lets the optimiser step now.
     fn cadence(&self, step: u32) -> Result<Cadence, TrainError> {
-        let wanted =
-            call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
         let cadence =
-            Cadence { sh_rest: self.options.sh_every.unwrap_or(wanted.sh_rest), ..wanted };
+            call_policy(|| self.policy.cadence(step)).map_err(|e| self.policy_error(step, e))?;
         let declared = self.needs.cadence;
         if cadence.is_within(declared) {
             return Ok(cadence);

@@ -1,6 +1,6 @@
-//! Renders training views for a decision of the policy: fresh signals and auxiliary views.
+//! Renders training views for a decision of the policy.
 
-use densify_policies::policy::{AuxView, Needs, Signal};
+use densify_policies::policy::AuxView;
 
 use super::policy_calls::call_policy;
 use super::{TrainError, Trainer};
@@ -8,27 +8,6 @@ use crate::backend::AuxInput;
 use crate::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Measures fresh signals for the policy's event after `step`, if it wants them. Returns the needs of
-    /// this event: without fresh signals if it does not.
-    pub(super) fn measure_fresh_views(&mut self, step: u32) -> Result<Needs, TrainError> {
-        let mut needs = self.needs.clone();
-        let (rows, budget) = (self.backend.rows(), self.row_limit());
-        let declared = needs.signals.contains(Signal::FreshWeightMax) && needs.fresh_views > 0;
-        let wants = || declared && self.policy.wants_fresh(step, rows, budget);
-        if !call_policy(wants).map_err(|e| self.policy_error(step, e))? {
-            needs.signals = needs.signals.without(Signal::FreshWeightMax);
-            return Ok(needs);
-        }
-        let degree = self.sh_degree(step);
-        let count = needs.fresh_views as usize;
-        for view in self.draw_scored(count, step) {
-            let measured = self.backend.measure_weights(self.views.camera(view), degree);
-            measured.map_err(|e| self.backend_error(step, e))?;
-            self.extra_forwards += 1;
-        }
-        Ok(needs)
-    }
-
     /// Renders the auxiliary views for the policy's event after `step`, one by one.
     pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
         let (rows, budget) = (self.backend.rows(), self.row_limit());

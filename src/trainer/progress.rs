@@ -18,8 +18,7 @@ impl<V: ViewSource> Trainer<V> {
     /// same; 0 if the policy renders none.
     #[must_use]
     pub fn unscored_views(&self) -> usize {
-        let scores = self.needs.fresh_views > 0 || self.needs.aux.is_some();
-        if scores { self.views.count() - self.scored.len() } else { 0 }
+        if self.needs.aux.is_some() { self.views.count() - self.scored.len() } else { 0 }
     }
 
     /// Steps done so far.

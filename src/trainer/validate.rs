@@ -2,7 +2,7 @@
 
 use densify_policies::policy::{DensityPolicy, Needs, SceneInfo};
 
-use super::{Savings, TrainError, TrainOptions, needs};
+use super::{TrainError, TrainOptions};
 use crate::backend::Backend;
 
 /// Checks that scene, options, views and backend agree.
@@ -26,14 +26,6 @@ pub(super) fn check_options(
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
     }
-    let Savings { ssim_every, coarse_until, budget_share } = options.savings;
-    let is_share = budget_share > 0.0 && budget_share <= 1.0;
-    if ssim_every == 0 || !(0.0..1.0).contains(&coarse_until) || !is_share {
-        return bad(format!(
-            "ssim_every {ssim_every} must be >= 1, coarse_until {coarse_until} in [0, 1), \
-             budget_share {budget_share} in (0, 1]"
-        ));
-    }
     if let Some(rate) = options.rates.invalid() {
         return bad(format!("learning rate `{rate}` must be a positive number"));
     }
@@ -49,9 +41,8 @@ pub(super) fn checked_needs(
     name: &str,
     policy: &dyn DensityPolicy,
     scene: &SceneInfo,
-    options: &TrainOptions,
 ) -> Result<Needs, TrainError> {
-    let needs = needs(policy, scene, options.sh_every);
+    let needs = policy.needs(scene);
     let bad = |why| TrainError::BadOption(format!("the needs of policy `{name}`: {why}"));
     needs.check().map_err(bad)?;
     Ok(needs)

@@ -197,7 +197,6 @@ pub(super) fn step(
         rates: RATES,
         cadence: Cadence::default(),
         seed: 7,
-        ssim_weight: 1.0,
     })
 }
 

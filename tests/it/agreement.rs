@@ -141,8 +141,6 @@ fn steps_are_those_of_the_native_backend() {
                 let entries = (found.entries as f64 / expected.entries as f64 - 1.0).abs();
                 table.check(what, "entries", entries, 0.02);
             }
-            native.measure_weights(&camera, 3).expect("weights");
-            backend.measure_weights(&camera, 3).expect("weights");
             let (found, expected) = (backend.download(), native.download());
             compare_models(&mut table, what, &found.expect("a model"), &expected.expect("a model"));
             for ((signal, found), (_, expected)) in

@@ -140,11 +140,12 @@ fn every_column_is_that_of_the_reference() {
     // The smaller cap takes several bands.
     for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
         let pixels = map(&scene, &image, weights);
-        let mut sums = vec![[0.0; 4]; scene.model.len()];
+        let mut sums = vec![[0.0_f64; 5]; scene.model.len()];
         each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, distance| {
             for (sum, x) in sums[row].iter_mut().zip([pixels[p], 1.0, weight, distance]) {
                 *sum += x;
             }
+            sums[row][4] = sums[row][4].max(weight);
         });
         // A row may be on screen without being blended anywhere.
         let shown: Vec<usize> = (0..sums.len()).filter(|&row| sums[row][1] > 0.0).collect();
@@ -154,6 +155,7 @@ fn every_column_is_that_of_the_reference() {
             AuxColumn::PixelCount => sums[row][1],
             AuxColumn::WeightSum => sums[row][2],
             AuxColumn::DistanceSum => sums[row][3],
+            AuxColumn::WeightMax => sums[row][4],
             AuxColumn::Depth => splats[row].depth,
             AuxColumn::Radius => {
                 let [a, b, c] = splats[row].covariance;

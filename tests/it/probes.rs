@@ -7,7 +7,7 @@ use densify::dataset::{Dataset, LoadOptions};
 use densify::gaussians::Gaussians;
 use densify::init::initialise;
 use densify::schedule::{Background, RateOptions};
-use densify::trainer::{AutoChoices, OnNan, Savings, TrainOptions, Trainer, growth_signals};
+use densify::trainer::{AutoChoices, OnNan, TrainOptions, Trainer, growth_signals};
 use densify::verify::{Setup, Subject};
 use densify::views::DatasetViews;
 use densify_policies::plan::EditPlan;
@@ -57,10 +57,8 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
         sh_degree: 1,
         background: Background::Black,
         rates: RateOptions::default(),
-        sh_every: None,
         prefetch: 0,
         on_nan: OnNan::Stop,
-        savings: Savings::NONE,
     };
     let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
     let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);

@@ -247,46 +247,8 @@ fn attributes_are_the_parameters_of_the_rows() {
     }
 }
 
-/// Of the views measured since it was last taken.
-#[test]
-fn the_fresh_weight_is_the_largest_over_the_views_measured() {
-    let views = views();
-    let signals = SignalSet::from([Signal::FreshWeightMax, Signal::WeightMax]);
-    for subject in all() {
-        let [first, last] = [0, 1].map(|view| {
-            let camera = &views.cameras[view];
-            let upstream = scenes::narrowed(&scenes::upstream(camera, 3));
-            let mut backend = make_with(&subject, &views.model, Setup::default());
-            let outcome = backend.differentiate(camera, BACKGROUND, 2, &upstream);
-            outcome.expect("a small image is rendered").1.max_weight
-        });
-        let both: Vec<f32> = first.iter().zip(&last).map(|(a, b)| a.max(*b)).collect();
-        // The smaller cap takes several bands.
-        for cap in [10_000, 1] {
-            let needs = Needs { signals, ..Needs::default() };
-            let setup = Setup { tile_cap: Some(cap), needs, ..Setup::default() };
-            let mut backend = make_with(&subject, &views.model, setup);
-            let mut measured = |cameras: &[Camera]| {
-                for camera in cameras {
-                    backend.measure_weights(camera, 2).expect("a small image is rendered");
-                }
-                let taken = backend.take_signals(signals).expect("signals can be taken");
-                taken.get(Signal::FreshWeightMax).expect("it was asked for").to_vec()
-            };
-            let near = |found: &[f32], expected: &[f32]| {
-                found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6)
-            };
-            let what = format!("{}, {cap} entries", subject.name());
-            assert!(both != last && near(&measured(&views.cameras), &both), "{what}");
-            assert!(near(&measured(&views.cameras[1..]), &last), "{what}: not forgotten");
-            assert!(measured(&[]).iter().all(|weight| weight.to_bits() == 0), "{what}");
-        }
-    }
-}
-
 /// Signals lie where a step sums gradients: whether they are given back or not, and however many they
-/// are, the steps after them and an image beside them are the same to the bit; so they are where fresh
-/// weights are measured.
+/// are, the steps after them and an image beside them are the same to the bit.
 #[test]
 fn what_is_lent_for_signals_changes_nothing() {
     let views = views();
@@ -295,7 +257,7 @@ fn what_is_lent_for_signals_changes_nothing() {
     // More columns than a step has sums.
     let many = SignalSet::from(Signal::ALL);
     let run = |subject: &Subject, read: Option<SignalSet>, gives_back: bool| {
-        let needs = Needs { signals: declared.with(Signal::FreshWeightMax), ..Needs::default() };
+        let needs = Needs { signals: declared, ..Needs::default() };
         let setup = Setup { needs, ..Setup::default() };
         let mut backend = make_with(subject, &views.model, setup);
         let mut image = None;
@@ -303,9 +265,6 @@ fn what_is_lent_for_signals_changes_nothing() {
             let (camera, target) = (&views.cameras[0], &views.targets[0]);
             let input = StepInput { background: BACKGROUND, ..step_input(step, camera, target, 2) };
             backend.train_step(&input).expect("a small image is rendered");
-            if read.is_some() {
-                backend.measure_weights(camera, 2).expect("a small image is rendered");
-            }
             let taken = read.map(|wanted| backend.take_signals(wanted).expect("signals"));
             image = Some(backend.render(camera, BACKGROUND, 2).expect("a small image"));
             if let Some(signals) = taken.filter(|_| gives_back) {

@@ -10,7 +10,7 @@ use densify::camera::Camera;
 use densify::dataset::images::SharedImage;
 use densify::gaussians::{Gaussians, dc_to_rgb};
 use densify::schedule::{Background, RateOptions};
-use densify::trainer::{OnNan, Savings, TrainOptions, Trainer};
+use densify::trainer::{OnNan, TrainOptions, Trainer};
 use densify::verify::reference::View;
 use densify::verify::{Setup, scenes};
 use densify::views::{ViewError, ViewSource};
@@ -137,10 +137,8 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
         sh_degree: 1,
         background: Background::Black,
         rates,
-        sh_every: None,
         prefetch: 0,
         on_nan: OnNan::Stop,
-        savings: Savings::NONE,
     };
     let views = One(*camera, Arc::new(scenes::target(camera)));
     let policy: Box<dyn DensityPolicy> = Box::new(policy);

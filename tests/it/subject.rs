@@ -159,7 +159,6 @@ pub(crate) fn step_input<'a>(
         rates: RATES,
         cadence: Cadence::default(),
         seed: 1,
-        ssim_weight: 1.0,
     }
 }
 

@@ -49,8 +49,7 @@ pub enum Check {
     /// It reads no signal, no candidates, and no column or point of an auxiliary view that its needs
     /// do not list, not even if they are present.
     ReadsOnlyDeclared,
-    /// It requests fresh views if and only if it requests the signal measured in them, and auxiliary
-    /// views only if its needs say what to measure there.
+    /// It requests auxiliary views only if its needs say what to measure there.
     RequestsConsistently,
     /// It rewrites, turns or scales by axis only if its needs declare detailed edits.
     DeclaresEdits,

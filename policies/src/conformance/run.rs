@@ -10,7 +10,7 @@ use super::scenarios::Scenario;
 use super::synthetic::{Event, Model, View};
 use crate::plan::{EditPlan, Refused, RowOps};
 use crate::policy::{
-    AuxRequest, AuxView, DensityPolicy, Needs, PolicyError, PolicyState, Signal, Snapshot,
+    AuxRequest, AuxView, DensityPolicy, Needs, PolicyError, PolicyState, Snapshot,
 };
 use crate::registry::PolicyEntry;
 use crate::rng::PolicyRng;
@@ -65,13 +65,6 @@ fn check_needs(
 ) -> Result<(), Failure> {
     let out_of_range = |why| (Check::DeclaresValidNumbers, why);
     needs.check().map_err(out_of_range)?;
-    let has_fresh_signal = needs.signals.contains(Signal::FreshWeightMax);
-    if has_fresh_signal != (needs.fresh_views > 0) {
-        let (views, verb) =
-            (needs.fresh_views, if has_fresh_signal { "asks" } else { "does not ask" });
-        let why = format!("it {verb} for FreshWeightMax, but for {views} fresh views");
-        return Err((Check::RequestsConsistently, why));
-    }
     let mut steps = 1..=scenario.scene.iterations;
     match steps.find(|&step| !policy.cadence(step).is_within(needs.cadence)) {
         None => Ok(()),
@@ -92,9 +85,8 @@ fn run_event(
     step: u32,
 ) -> Result<RowOps, Failure> {
     let (rows, budget) = (model.rows, scenario.budget(model.rows));
-    let fresh = policy.wants_fresh(step, rows, budget);
     let (pattern, scene) = (scenario.pattern_at(step), &scenario.scene);
-    let event = model.event(pattern, scene, step, needs, fresh);
+    let event = model.event(pattern, scene, step, needs);
     let aux = policy.aux_views(step, rows, budget);
     if aux > 0 && needs.aux.is_none() {
         let why = "it wants auxiliary views, but its needs do not say what to measure there";
@@ -110,9 +102,6 @@ fn run_event(
         let differs = |how: &str| (*check, format!("a copy {how}"));
         if !copy.is_due(step) {
             return Err(differs("is not due at this step"));
-        }
-        if copy.wants_fresh(step, rows, budget) != fresh {
-            return Err(differs("does not agree on fresh views"));
         }
         if copy.aux_views(step, rows, budget) != aux || copy.cadence(step) != policy.cadence(step) {
             return Err(differs("wants other views or another cadence"));

@@ -112,7 +112,6 @@ impl Model {
         scene: &SceneInfo,
         step: u32,
         needs: &Needs,
-        fresh: bool,
     ) -> Event {
         let rng = PolicyRng::new(7, step);
         let fill = |set: SignalSet| {
@@ -125,8 +124,7 @@ impl Model {
             }
             signals
         };
-        let without_fresh = needs.signals.without(Signal::FreshWeightMax);
-        let declared = fill(if fresh { needs.signals } else { without_fresh });
+        let declared = fill(needs.signals);
         let all = fill(Signal::ALL.into());
         let capacity = needs.candidates.map_or(5, |request| request.capacity);
         for index in 0..capacity.saturating_sub(self.candidates.len()).min(5) as u32 {

@@ -44,10 +44,7 @@ enum Fault {
     PrunesAll,
     ReplacesThePlan,
     HasRandomNeeds,
-    ReadsFreshUnwanted,
-    ReadsFreshWithoutViews,
-    RendersFreshWithoutReading,
-    WantsFreshAtRandom,
+    WantsViewsAtRandom,
     WantsViewsUndeclared,
     ReadsUndeclaredColumn,
     ReadsUndeclaredPoints,
@@ -65,7 +62,7 @@ enum Fault {
     UpdatesUndeclared,
 }
 
-const FAULTS: [(Fault, Option<Check>); 28] = [
+const FAULTS: [(Fault, Option<Check>); 25] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
     (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
@@ -78,10 +75,7 @@ const FAULTS: [(Fault, Option<Check>); 28] = [
     (Fault::PrunesAll, Some(Check::LeavesARow)),
     (Fault::ReplacesThePlan, Some(Check::KeepsPlan)),
     (Fault::HasRandomNeeds, Some(Check::IsDeterministic)),
-    (Fault::ReadsFreshUnwanted, Some(Check::ReadsOnlyDeclared)),
-    (Fault::ReadsFreshWithoutViews, Some(Check::RequestsConsistently)),
-    (Fault::RendersFreshWithoutReading, Some(Check::RequestsConsistently)),
-    (Fault::WantsFreshAtRandom, Some(Check::IsDeterministic)),
+    (Fault::WantsViewsAtRandom, Some(Check::IsDeterministic)),
     (Fault::WantsViewsUndeclared, Some(Check::RequestsConsistently)),
     (Fault::ReadsUndeclaredColumn, Some(Check::ReadsOnlyDeclared)),
     (Fault::ReadsUndeclaredPoints, Some(Check::ReadsOnlyDeclared)),
@@ -143,13 +137,8 @@ impl DensityPolicy for Faulty {
         if self.has(Fault::HasRandomNeeds) && next_call().is_multiple_of(2) {
             signals = signals.with(Signal::Age);
         }
-        let fresh = [Fault::None, Fault::ReadsFreshUnwanted].contains(&self.fault);
-        if fresh || self.has(Fault::ReadsFreshWithoutViews) {
-            signals = signals.with(Signal::FreshWeightMax);
-        }
-        let fresh_views = if fresh || self.has(Fault::RendersFreshWithoutReading) { 3 } else { 0 };
         let detailed_edits = !self.has(Fault::UpdatesUndeclared);
-        let mut needs = Needs { signals, fresh_views, detailed_edits, ..Needs::default() };
+        let mut needs = Needs { signals, detailed_edits, ..Needs::default() };
         if !self.has(Fault::WantsViewsUndeclared) {
             let columns = vec![AuxColumn::Depth];
             let points = if self.has(Fault::ReadsUndeclaredPoints) { 0 } else { 2 };
@@ -173,7 +162,8 @@ impl DensityPolicy for Faulty {
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
-        u32::from(step.is_multiple_of(10)) * 2
+        let at_random = self.has(Fault::WantsViewsAtRandom) && next_call().is_multiple_of(2);
+        if at_random || step.is_multiple_of(10) { 2 } else { 0 }
     }
 
     fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
@@ -190,22 +180,9 @@ impl DensityPolicy for Faulty {
         Ok(())
     }
 
-    fn wants_fresh(&self, step: u32, _rows: usize, _budget: usize) -> bool {
-        let at_random = self.has(Fault::WantsFreshAtRandom) && next_call().is_multiple_of(2);
-        at_random || step.is_multiple_of(15)
-    }
-
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         self.events += 1;
         let opacity = now.signal(Signal::Opacity)?;
-        let reads_fresh = match self.fault {
-            Fault::None => now.step.is_multiple_of(15),
-            Fault::ReadsFreshUnwanted => now.step.is_multiple_of(10),
-            _ => false,
-        };
-        if reads_fresh {
-            now.signal(Signal::FreshWeightMax)?;
-        }
         let gradient = now.signal(Signal::ScreenGradient)?;
         let rows: Vec<u32> = (0..now.rows() as u32).collect();
         if self.has(Fault::ReplacesThePlan) {

@@ -35,6 +35,7 @@ impl Diet {
         &self,
         now: &Snapshot<'_>,
         plan: &mut EditPlan,
+        importance: &[f32],
         exempt: &dyn Fn(u32) -> bool,
     ) -> PolicyResult {
         let code_size = match self.params.newborn_size {
@@ -56,7 +57,8 @@ impl Diet {
         let errors: Vec<f32> = valid.iter().map(|(error, _)| *error).collect();
         let most = rows_of_event(self.params.rho_c, self.insert, now.step, plan.budget());
         let worst = top_k(&errors, most);
-        self.evict(now, plan, worst.len().saturating_sub(plan.room()), exempt)?;
+        let missing = worst.len().saturating_sub(plan.room());
+        self.evict(now, plan, importance, (missing, exempt))?;
         for index in worst {
             let _ = plan.append(valid[index as usize].1);
         }

@@ -1,32 +1,23 @@
 //! Eviction: pruning the least important rows to make room for others.
 
-use super::{Diet, Importance};
+use super::Diet;
 use crate::plan::EditPlan;
 use crate::policy::{PolicyResult, Signal, Snapshot};
 use crate::sample::smallest;
 
 impl Diet {
-    /// The signal that measures the importance of a row.
-    pub(super) fn importance(&self) -> Signal {
-        match self.params.importance {
-            Importance::Epochs => Signal::WeightMax,
-            Importance::Fresh => Signal::FreshWeightMax,
-        }
-    }
-
     /// Prunes the `count` least important rows that have no edit yet and are not `exempt`; all of
     /// them if there are fewer. New rows are protected while there are enough others.
     pub(super) fn evict(
         &self,
         now: &Snapshot<'_>,
         plan: &mut EditPlan,
-        count: usize,
-        exempt: &dyn Fn(u32) -> bool,
+        importance: &[f32],
+        (count, exempt): (usize, &dyn Fn(u32) -> bool),
     ) -> PolicyResult {
         if count == 0 {
             return Ok(());
         }
-        let importance = now.signal(self.importance())?;
         let protects = self.protected_age > 0.0;
         let age = if protects { now.signal(Signal::Age)? } else { &[] };
         let eligible = (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !exempt(row));

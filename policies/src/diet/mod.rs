@@ -149,7 +149,8 @@ use crate::adc::{PruneLimits, Window, mean_over_views, spare_one};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
+    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo,
+    Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -184,6 +185,8 @@ pub struct Diet {
     protected_age: f32,
     /// Surface points of the current re-initialisation. They are not saved: the event uses them up.
     surface: Vec<Candidate>,
+    /// Largest blend weights in the auxiliary views of the current event, which uses them up.
+    fresh: Vec<f32>,
 }
 
 impl ConfiguredPolicy for Diet {
@@ -222,6 +225,7 @@ impl ConfiguredPolicy for Diet {
             },
             protected_age: params.protect.min(scene.train_views) as f32,
             surface: Vec::new(),
+            fresh: Vec::new(),
             params,
         })
     }
@@ -234,8 +238,10 @@ impl DensityPolicy for Diet {
             Signal::ScreenGradient,
             Signal::Opacity,
             Signal::ScaleMax,
-            self.importance(),
         ]);
+        if self.params.importance == Importance::Epochs {
+            signals = signals.with(Signal::WeightMax);
+        }
         if self.params.mixed_gradient {
             signals = signals.with(Signal::ColourGradient);
         }
@@ -250,16 +256,11 @@ impl DensityPolicy for Diet {
         if self.protected_age > 0.0 {
             signals = signals.with(Signal::Age);
         }
-        let fresh_views = match self.params.importance {
-            Importance::Epochs => 0,
-            Importance::Fresh => self.params.fresh_views,
-        };
         Needs {
             signals,
             candidates: self.candidate_request(scene),
-            fresh_views,
             full_depth: self.scene_units(self.params.full_depth, scene),
-            aux: self.surface_request(scene),
+            aux: self.aux_request(scene),
             ..Needs::default()
         }
     }
@@ -269,23 +270,31 @@ impl DensityPolicy for Diet {
             || self.is_reinit(step)
     }
 
-    /// Rows are evicted only if there could be more of them than the budget after growth and
-    /// insertion.
-    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
+    fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
         if self.is_reinit(step) {
-            return false;
+            return u32::MAX;
         }
+        // Rows are evicted only if there could be more of them than the budget after growth and
+        // insertion.
         let grown = if self.grow.is_due(step) { rows } else { 0 };
         let inserted = rows_of_event(self.params.rho_c, self.insert, step, budget);
-        rows + grown + inserted > budget
-    }
-
-    fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
-        if self.is_reinit(step) { u32::MAX } else { 0 }
+        let evicts = rows + grown + inserted > budget;
+        if evicts && self.params.importance == Importance::Fresh {
+            self.params.fresh_views
+        } else {
+            0
+        }
     }
 
     fn observe(&mut self, view: &AuxView<'_>) -> PolicyResult {
-        self.surface.extend_from_slice(view.points);
+        if self.is_reinit(view.step) {
+            self.surface.extend_from_slice(view.points);
+            return Ok(());
+        }
+        self.fresh.resize(view.rows, 0.0);
+        for (most, &weight) in self.fresh.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
+            *most = most.max(weight);
+        }
         Ok(())
     }
 
@@ -294,6 +303,14 @@ impl DensityPolicy for Diet {
             self.reinit(now.scene.extent, plan);
             return Ok(());
         }
+        let mut fresh = std::mem::take(&mut self.fresh);
+        let importance = match self.params.importance {
+            Importance::Epochs => now.signal(Signal::WeightMax)?,
+            Importance::Fresh => {
+                fresh.resize(now.rows(), 0.0);
+                &fresh
+            }
+        };
         let grows = self.grow.is_due(now.step);
         let gradient = if grows { self.gradient(now)? } else { vec![0.0; now.rows()] };
         let mut candidates = Vec::new();
@@ -307,7 +324,7 @@ impl DensityPolicy for Diet {
         if rows_left > plan.budget() {
             plan.cause("prune");
             let excess = rows_left - plan.budget();
-            self.evict(now, plan, excess, &|_| false)?;
+            self.evict(now, plan, importance, (excess, &|_| false))?;
             candidates.retain(|&row| plan.is_free(row));
         }
         let is_candidate = |row: u32| grows && gradient[row as usize] >= self.params.tau as f32;
@@ -319,7 +336,7 @@ impl DensityPolicy for Diet {
                 }
                 Growth::All => usize::MAX,
             };
-            self.evict(now, plan, without_room.min(most), &is_candidate)?;
+            self.evict(now, plan, importance, (without_room.min(most), &is_candidate))?;
             for row in candidates {
                 // A refusal is counted by the plan.
                 let _ = plan.grow(row, self.offspring(now, row as usize)?);
@@ -328,7 +345,7 @@ impl DensityPolicy for Diet {
         }
         if self.insert.is_due(now.step) {
             plan.cause("insert");
-            self.insert(now, plan, &is_candidate)?;
+            self.insert(now, plan, importance, &is_candidate)?;
             plan.reset(Reset::Candidates);
         }
         Ok(())
@@ -339,6 +356,17 @@ const MEAN_GRADIENT: [Signal; 3] =
     [Signal::MeanGradientX, Signal::MeanGradientY, Signal::MeanGradientZ];
 
 impl Diet {
+    /// What to measure in auxiliary views: surface points, weights, both or none.
+    fn aux_request(&self, scene: &SceneInfo) -> Option<AuxRequest> {
+        let points = self.surface_points(scene);
+        let columns = match self.params.importance {
+            Importance::Epochs => Vec::new(),
+            Importance::Fresh => vec![AuxColumn::WeightMax],
+        };
+        let asks = points > 0 || !columns.is_empty();
+        asks.then(|| AuxRequest { points, columns, ..AuxRequest::default() })
+    }
+
     /// The gradient g of every row. Shape: `[rows]`.
     fn gradient(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<f32>> {
         let views = now.signal(Signal::VisibleCount)?;

@@ -7,7 +7,7 @@ use super::Diet;
 use super::quota::rows_of_share;
 use crate::neighbours::Neighbours;
 use crate::plan::{EditPlan, Reset, Seed};
-use crate::policy::{AuxRequest, Candidate, SceneInfo};
+use crate::policy::{Candidate, SceneInfo};
 
 /// Smallest size of a point, in extents: nearer points sample the surface at the same place (as in the
 /// initialisation).
@@ -21,12 +21,14 @@ impl Diet {
         step > 0 && step == self.params.reinit_at
     }
 
-    /// What to measure in the views, if the model is ever replaced.
-    pub(super) fn surface_request(&self, scene: &SceneInfo) -> Option<AuxRequest> {
+    /// How many surface points of a view to measure, if the model is ever replaced.
+    pub(super) fn surface_points(&self, scene: &SceneInfo) -> u32 {
+        if self.params.reinit_at == 0 {
+            return 0;
+        }
         let most = rows_of_share(self.params.reinit_share, scene.budget);
         let per_view = (most / scene.train_views.max(1) as usize).max(1);
-        let points = u32::try_from(per_view).unwrap_or(u32::MAX);
-        (self.params.reinit_at > 0).then(|| AuxRequest { points, ..AuxRequest::default() })
+        u32::try_from(per_view).unwrap_or(u32::MAX)
     }
 
     /// Prunes all rows and appends the surface points instead. Without any point the model is kept.

@@ -128,9 +128,14 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
 fn importance_may_be_that_of_fresh_views() {
     // By epochs rows 0 and 1 matter least; in the fresh views row 4, a candidate, then 6 and 2.
     let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
-    let event = event(600, 8, 8)
-        .with(Signal::ScreenGradient, &wanting(8, &[4, 7]))
-        .with(Signal::FreshWeightMax, &fresh);
+    let mut event = event(600, 8, 8).with(Signal::ScreenGradient, &wanting(8, &[4, 7]));
+    // Each row is in one of two views.
+    let of = |parity: usize| -> Vec<f32> {
+        (0..8).map(|row| if row % 2 == parity { fresh[row] } else { 0.0 }).collect()
+    };
+    let view =
+        |parity| View { columns: vec![(AuxColumn::WeightMax, of(parity))], ..View::default() };
+    event.views = vec![view(0), view(1)];
     assert_eq!(run(&event, "rho = 23.5").pruned, [0, 1]);
     assert_eq!(run(&event, "rho = 23.5\nimportance = \"fresh\"").pruned, [2, 6]);
     let over = Event { budget: 5, ..event.clone() };
@@ -141,10 +146,10 @@ fn importance_may_be_that_of_fresh_views() {
 }
 
 #[test]
-fn fresh_views_are_wanted_where_rows_may_be_evicted() {
+fn fresh_views_are_rendered_where_rows_may_be_evicted() {
     let scene = Event::new(1, 1, 100).scene;
     let policy = build("diet", "importance = \"fresh\"\nrho_c = 0.45", &scene);
-    let wants = |step, rows| policy.wants_fresh(step, rows, 100);
+    let wants = |step, rows| policy.aux_views(step, rows, 100) == 100;
     // Growth may double the rows.
     assert_eq!([50, 51, 100].map(|rows| wants(600, rows)), [false, true, true]);
     // An insertion adds up to 5.
@@ -152,10 +157,10 @@ fn fresh_views_are_wanted_where_rows_may_be_evicted() {
     // Pruning is for models that are too large.
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
     let both = build("diet", "importance = \"fresh\"\nrho_c = 1.4\ncompensate_from = 500", &scene);
-    assert_eq!([47, 48].map(|rows| both.wants_fresh(1000, rows, 100)), [false, true]);
-    // Where all rows are replaced, none is evicted.
+    assert_eq!([47, 48].map(|rows| both.aux_views(1000, rows, 100)), [0, 100]);
+    // Where all rows are replaced, all views are looked at.
     let replaces = build("diet", "importance = \"fresh\"\nreinit_at = 600", &scene);
-    assert!(!replaces.wants_fresh(600, 100, 100) && replaces.wants_fresh(700, 100, 100));
+    assert_eq!([600, 700].map(|step| replaces.aux_views(step, 100, 100)), [u32::MAX, 100]);
 }
 
 #[test]
@@ -375,15 +380,14 @@ fn only_what_is_used_is_asked_for() {
     use Signal::{Opacity, ScaleMax, ScreenGradient, VisibleCount, WeightMax};
     assert_eq!(listed, [VisibleCount, ScreenGradient, WeightMax, Opacity, ScaleMax]);
     assert_eq!(lean.candidates, None);
-    let fresh = |needs: &Needs| (needs.fresh_views, needs.signals.contains(Signal::FreshWeightMax));
-    assert_eq!(fresh(&full), (0, false));
     let renders = needs("importance = \"fresh\"");
-    assert_eq!(fresh(&renders), (100, true));
-    assert!(!renders.signals.contains(WeightMax));
-    assert_eq!(fresh(&needs("importance = \"fresh\"\nfresh_views = 7")), (7, true));
+    assert_eq!(renders.aux.unwrap().columns, [AuxColumn::WeightMax]);
+    assert!(full.aux.is_none() && !renders.signals.contains(WeightMax));
     // Views are no steps: a shorter run renders as many.
     let short = SceneInfo { iterations: 3000, ..scene.clone() };
-    assert_eq!(fresh(&build("diet", "importance = \"fresh\"", &short).needs(&short)), (100, true));
+    let rendered = |set| build("diet", set, &short).aux_views(100, 1, 0);
+    assert_eq!(rendered("importance = \"fresh\""), 100);
+    assert_eq!(rendered("importance = \"fresh\"\nfresh_views = 7"), 7);
     assert!(!needs("shift = \"paper\"").signals.contains(Signal::MeanGradientNorm));
     let switched = needs(
         "error = \"grad\"\ndepth = \"median\"\nnms = false\nrows_per_candidate = 1\nmin_alpha = 0",

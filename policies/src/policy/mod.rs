@@ -26,15 +26,6 @@ pub trait DensityPolicy: Send {
     /// Whether this policy edits after the optimiser step of iteration `step` (1-based).
     fn is_due(&self, step: u32) -> bool;
 
-    /// Whether the plan of iteration `step`, at which the policy is due, reads
-    /// [`Signal::FreshWeightMax`], given the current number of rows and the budget. If not, no view
-    /// is rendered for it, and reading it is a [`PolicyError::Undeclared`]. Only asked of policies
-    /// that declare [`Needs::fresh_views`].
-    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
-        let _ = (step, rows, budget);
-        true
-    }
-
     /// How often the optimiser steps at iteration `step`; at most as rarely as
     /// [declared](Needs::cadence). Gradients still summed when it changes are used at the next step.
     fn cadence(&self, step: u32) -> Cadence {
@@ -133,9 +124,7 @@ impl<'a> Snapshot<'a> {
     /// The values of `signal`. Shape: `[rows, width]`, where the [width](Signal::width) is mostly 1.
     ///
     /// # Errors
-    /// [`PolicyError::Undeclared`] when the policy's needs do not list it, or when it is
-    /// [`Signal::FreshWeightMax`] and the policy [did not want it](DensityPolicy::wants_fresh) at
-    /// this event.
+    /// [`PolicyError::Undeclared`] when the policy's needs do not list it.
     pub fn signal(&self, signal: Signal) -> PolicyResult<&'a [f32]> {
         self.signals.get(signal).ok_or(PolicyError::Undeclared { signal })
     }

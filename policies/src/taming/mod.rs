@@ -28,7 +28,7 @@
 //! 4. The gradient statistics are reset.
 //!
 //! Opacities are reset as in `vanilla`. SH bands 1–3 have the learning rate `sh_rest` and step once per
-//! `sh_every` iterations, on the summed gradients (`--lr` and `--sh-every` override these).
+//! `sh_every` iterations, on the summed gradients (`--lr` overrides these).
 //!
 //! With `multiplier` m > 0, the curve ends at ⌊m · S⌋ instead, but never above the budget.
 //!

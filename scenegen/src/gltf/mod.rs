@@ -14,6 +14,7 @@ mod accessors;
 mod materials;
 
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DMat4, DQuat, DVec3, Vec2, Vec3, Vec4};
@@ -106,7 +107,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     reader.model.of_file(path)
 }
 
-pub(super) fn fault(path: &Path, element: impl Into<String>, problem: impl Into<String>) -> Error {
+pub(super) fn fault(path: &Path, element: impl Display, problem: impl Display) -> Error {
     Error::malformed(path, element, problem, REMEDY)
 }
 
@@ -206,14 +207,13 @@ fn refuse_required(path: &Path, text: &[u8]) -> Result<(), Error> {
     }
     let head: Head =
         serde_json::from_slice(text).map_err(|e| fault(path, "JSON", e.to_string()))?;
-    let unsupported = |feature: String, remedy: &str| Error::Unsupported {
-        path: path.to_owned(),
-        feature,
-        remedy: remedy.to_owned(),
-    };
     if head.asset.version.split('.').next() != Some("2") {
         let version: String = head.asset.version.chars().take(20).collect();
-        return Err(unsupported(format!("glTF version {version}"), "export it as glTF 2.0"));
+        return Err(Error::unsupported(
+            path,
+            &format!("glTF version {version}"),
+            "export it as glTF 2.0",
+        ));
     }
     let known = |name: &str| SUPPORTED.contains(&name) || APPEARANCE.contains(&name);
     if let Some(name) = head.extensions_required.iter().find(|name| !known(name)) {
@@ -227,13 +227,14 @@ fn refuse_required(path: &Path, text: &[u8]) -> Result<(), Error> {
             _ => "export the file without it",
         };
         let name: String = name.chars().take(80).collect();
-        return Err(unsupported(format!("the extension {name}, which the file requires,"), remedy));
+        let feature = format!("the extension {name}, which the file requires,");
+        return Err(Error::unsupported(path, &feature, remedy));
     }
     Ok(())
 }
 
 impl Reader<'_> {
-    fn fault(&self, element: impl Into<String>, problem: impl Into<String>) -> Error {
+    fn fault(&self, element: impl Display, problem: impl Display) -> Error {
         fault(self.path, element, problem)
     }
 

@@ -1,5 +1,6 @@
 //! Reads OBJ and MTL files statement by statement.
 
+use std::fmt::Display;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
@@ -48,7 +49,7 @@ impl<'a> Statement<'a> {
     }
 
     /// An error in this statement.
-    pub(super) fn fault(&self, problem: impl Into<String>) -> Error {
+    pub(super) fn fault(&self, problem: impl Display) -> Error {
         fault(self.path, self.line, problem)
     }
 }
@@ -89,7 +90,7 @@ pub(super) fn each(
     }
 }
 
-fn fault(path: &Path, line: usize, problem: impl Into<String>) -> Error {
+fn fault(path: &Path, line: usize, problem: impl Display) -> Error {
     let remedy = "correct the file or export it again";
     Error::malformed(path, format!("line {line}"), problem, remedy)
 }

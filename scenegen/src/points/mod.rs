@@ -28,8 +28,6 @@ const SAME_DEPTH: f64 = 1e-3;
 pub struct PointOptions {
     /// Points wanted; fewer where the views see fewer.
     pub count: usize,
-    /// Whether points lie uniformly in the bounding box instead of on surfaces.
-    pub random: bool,
     /// Standard deviation of each coordinate, as a share of the diagonal.
     pub noise: f64,
     /// Share of points that lie anywhere in the bounding box enlarged by a fifth.
@@ -42,14 +40,7 @@ pub struct PointOptions {
 
 impl Default for PointOptions {
     fn default() -> Self {
-        Self {
-            count: 5000,
-            random: false,
-            noise: 1e-3,
-            outliers: 0.02,
-            dropout: 0.0,
-            without_thin: false,
-        }
+        Self { count: 5000, noise: 1e-3, outliers: 0.02, dropout: 0.0, without_thin: false }
     }
 }
 
@@ -61,7 +52,7 @@ pub struct InitPoints {
     /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
     /// Where on the surface each was found, in world coordinates: `positions` before noise, and for
-    /// an outlier what was mistaken for it. Shape: `[points]`; `[0]` for random points.
+    /// an outlier what was mistaken for it. Shape: `[points]`.
     pub found_at: Vec<DVec3>,
     /// Numbers of the training views that see each, ascending. An outlier lies in front of all of
     /// them. Shape: `[points]`.
@@ -94,7 +85,7 @@ impl<'a> PointCollector<'a> {
 
     /// Draws candidates from training view number `view`.
     pub fn observe(&mut self, view: usize, frame: &Frame) {
-        if self.options.random || self.options.count == 0 {
+        if self.options.count == 0 {
             return;
         }
         let camera = &self.cameras[view];
@@ -154,24 +145,11 @@ impl<'a> PointCollector<'a> {
     /// The points of all views observed.
     #[must_use]
     pub fn finish(mut self) -> InitPoints {
-        let PointOptions { count, random, noise, outliers, .. } = self.options;
+        let PointOptions { count, noise, outliers, .. } = self.options;
         let mut draws = Draws::new(self.tracer.seed, &[0x006e_6f69_7365]);
         let (lo, hi) = self.bounds;
         let diagonal = (hi - lo).length();
         let mut points = InitPoints::default();
-        let anywhere = |draws: &mut Draws, margin: f64| {
-            let share = DVec3::new(draws.unit64(), draws.unit64(), draws.unit64());
-            let (lo, hi) = (lo - margin * (hi - lo), hi + margin * (hi - lo));
-            lo + share * (hi - lo)
-        };
-        if random {
-            for _ in 0..count {
-                points.positions.push(anywhere(&mut draws, 0.0));
-                points.colours.push([0; 3].map(|_: u8| (draws.bits() >> 56) as u8));
-                points.seen_by.push(Vec::new());
-            }
-            return points;
-        }
         self.candidates.sort_by_key(|candidate| candidate.order);
         let needed = MIN_VIEWS.min(self.cameras.len());
         // In blocks: visibility is tested only until there are enough points.
@@ -194,7 +172,9 @@ impl<'a> PointCollector<'a> {
         points.found_at = points.positions.clone();
         for (position, seen) in points.positions.iter_mut().zip(&mut points.seen_by) {
             if draws.unit64() < outliers {
-                *position = anywhere(&mut draws, 0.1);
+                let share = DVec3::new(draws.unit64(), draws.unit64(), draws.unit64());
+                let (lo, hi) = (lo - 0.1 * (hi - lo), hi + 0.1 * (hi - lo));
+                *position = lo + share * (hi - lo);
                 points.outliers += 1;
             } else if noise > 0.0 {
                 let shift = DVec3::new(draws.normal(), draws.normal(), draws.normal());

@@ -16,14 +16,8 @@ fn points(name: &str, size: u32, options: PointOptions) -> (Scene, InitPoints) {
     (made.scene, made.points)
 }
 
-const EXACT: PointOptions = PointOptions {
-    count: 800,
-    random: false,
-    noise: 0.0,
-    outliers: 0.0,
-    dropout: 0.0,
-    without_thin: false,
-};
+const EXACT: PointOptions =
+    PointOptions { count: 800, noise: 0.0, outliers: 0.0, dropout: 0.0, without_thin: false };
 
 #[test]
 fn exact_points_lie_on_surfaces_that_three_views_see() {
@@ -88,13 +82,4 @@ fn thin_structures_and_patches_are_left_out_on_request() {
     let (_, all) = points("spheres", 48, PointOptions { dropout: 0.0, ..half });
     let (_, dropped) = points("spheres", 48, PointOptions { count: all.positions.len(), ..half });
     assert!(dropped.positions.len() < all.positions.len());
-}
-
-#[test]
-fn random_points_fill_the_bounds() {
-    let (scene, points) = points("spheres", 16, PointOptions { random: true, ..EXACT });
-    let (lo, hi) = scene.surface.bounds();
-    let mean = points.positions.iter().sum::<DVec3>() / 800.0;
-    assert!(points.positions.iter().all(|p| p.cmpge(lo).all() && p.cmple(hi).all()));
-    assert!((mean - 0.5 * (lo + hi)).abs().max_element() < 0.15);
 }

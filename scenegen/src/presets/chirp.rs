@@ -51,5 +51,5 @@ fn build() -> Staging {
         focus: Some(1.5),
         ..Rig::default()
     };
-    Staging { rig, ..Staging::outdoors(model, 0.01) }
+    Staging { rig, ..Staging::outdoors(model) }
 }

@@ -55,5 +55,5 @@ fn build() -> Staging {
         focus: Some(1.45),
         ..Rig::default()
     };
-    Staging { model, sky: Sky::uniform(0.0), rig, ambient: Ambient::Bounce(64), finest: 0.1 }
+    Staging { model, sky: Sky::uniform(0.0), rig, ambient: Ambient::Bounce(64) }
 }

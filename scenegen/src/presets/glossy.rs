@@ -47,5 +47,5 @@ fn build() -> Staging {
         elevation: [10.0, 70.0],
         ..Rig::default()
     };
-    Staging { rig, ..Staging::outdoors(model, 0.02) }
+    Staging { rig, ..Staging::outdoors(model) }
 }

@@ -87,7 +87,7 @@ fn build() -> Staging {
         ..Rig::default()
     };
     // The sky's light is in the closed form; the dome is only its picture.
-    let mut staging = Staging { rig, ..Staging::outdoors(model, 0.05) };
+    let mut staging = Staging { rig, ..Staging::outdoors(model) };
     // The sun is inside the dome: its rays start there and not beyond it.
     staging.model.lights = vec![inside_sun()];
     staging

@@ -86,7 +86,7 @@ fn build() -> Staging {
         target: Some([0.0, 1.35, 0.0]),
         ..Rig::default()
     };
-    Staging { model, sky: Sky::uniform(0.42), rig, ambient: Ambient::Open, finest: 0.006 }
+    Staging { model, sky: Sky::uniform(0.42), rig, ambient: Ambient::Open }
 }
 
 fn poster(at: DVec2) -> Vec3 {

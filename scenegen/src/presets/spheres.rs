@@ -42,7 +42,7 @@ fn build() -> Staging {
         let ball = model.painted("sphere", 256, |at| marbled(at, 6, seed, from, to));
         model.sphere(DVec3::new(x, radius, z), radius, 4, ball);
     }
-    let staging = Staging::outdoors(model, 0.02);
+    let staging = Staging::outdoors(model);
     let rig = Rig {
         train: 30,
         test: 10,

@@ -70,5 +70,5 @@ fn build() -> Staging {
         elevation: [5.0, 60.0],
         ..Rig::default()
     };
-    Staging { rig, ..Staging::outdoors(model, 0.01) }
+    Staging { rig, ..Staging::outdoors(model) }
 }

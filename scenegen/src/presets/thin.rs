@@ -51,5 +51,5 @@ fn build() -> Staging {
         focus: Some(1.4),
         ..Rig::default()
     };
-    Staging { rig, ..Staging::outdoors(model, 2.0 * RADII[0]) }
+    Staging { rig, ..Staging::outdoors(model) }
 }

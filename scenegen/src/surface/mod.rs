@@ -92,7 +92,7 @@ impl Surface {
     /// When the model has no triangles.
     pub fn new(model: &Model) -> Result<Self, Error> {
         if model.triangles.is_empty() {
-            return Err(Error::Empty { name: model.name.clone() });
+            return Err(Error::empty(&model.name));
         }
         let bounds = model.bounds();
         let centre = 0.5 * (bounds.0 + bounds.1);

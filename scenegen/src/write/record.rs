@@ -31,7 +31,6 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             "lights": model.lights.len(),
             "bytes": scene.surface.bytes(),
         },
-        "scene_requirements": scene.requirements,
         "points": { "count": points.positions.len(), "outliers": points.outliers },
         "thin_materials": model
             .materials

@@ -86,7 +86,7 @@ fn existing_files_stay_unless_they_are_a_scene_to_replace() {
     fs::create_dir(&target).expect("folder");
     // An empty folder may be used.
     write(&scene, &target, false, |_| ()).expect("write");
-    assert!(matches!(write(&scene, &target, false, |_| ()), Err(Error::Option { .. })));
+    assert!(matches!(write(&scene, &target, false, |_| ()), Err(Error::Input(_))));
     fs::write(target.join("old"), "old").expect("write");
     write(&scene, &target, true, |_| ()).expect("write");
     assert!(!target.join("old").exists() && target.join("scene.json").exists());
@@ -95,7 +95,7 @@ fn existing_files_stay_unless_they_are_a_scene_to_replace() {
     fs::create_dir(&other).expect("folder");
     fs::write(other.join("thesis.txt"), "words").expect("write");
     for overwrite in [false, true] {
-        assert!(matches!(write(&scene, &other, overwrite, |_| ()), Err(Error::Option { .. })));
+        assert!(matches!(write(&scene, &other, overwrite, |_| ()), Err(Error::Input(_))));
     }
     assert_eq!(names(&other), ["thesis.txt"]);
     assert_eq!(names(root.path()), ["other", "scene"]);

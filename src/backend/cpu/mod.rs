@@ -15,7 +15,6 @@ mod budget;
 mod candidates;
 mod differentiate;
 mod footprint;
-mod fresh;
 mod instructions;
 mod loss;
 mod moments;
@@ -240,10 +239,6 @@ impl Backend for CpuBackend {
         Ok(output)
     }
 
-    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
-        self.measure(camera, sh_degree)
-    }
-
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         self.observe_view(input)
     }
@@ -253,7 +248,6 @@ impl Backend for CpuBackend {
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::within(memory, self.rows, wanted);
         self.signals.read(&mut signals, wanted, &self.params, &self.ages);
-        self.signals.forget_measured(self.rows);
         Ok(signals)
     }
 

@@ -1,7 +1,7 @@
 //! Auxiliary views: training views that are rendered for a policy's event, and measured row by row.
 //!
 //! Blending is replayed front to back, with the arithmetic of the forward pass, and each row's sums
-//! over the pixels that it is blended into are written to one record per (row, tile); these are
+//! over the pixels that it is blended into, and its largest weight, are written to one record per (row, tile); these are
 //! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
 //! map the plane of the image gradient that belongs to alpha.
 
@@ -23,8 +23,10 @@ use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::dataset::images::Image8;
 
-/// Numbers per record: sums of the map, of pixels, of weights, of distances.
-const STRIDE: usize = 4;
+/// Numbers per record: sums of the map, of pixels, of weights, of distances; the largest weight.
+const STRIDE: usize = 5;
+/// The one that is no sum.
+const MAXIMUM: usize = 4;
 /// The plane of a tile's gradient that holds the pixel map meanwhile.
 const MAP: usize = 3;
 
@@ -131,8 +133,9 @@ impl CpuBackend {
                     });
                     part.gather(lists, records, sums, visible, (STRIDE, false), |sums, records| {
                         for record in records.chunks_exact(STRIDE) {
-                            for (sum, x) in sums.iter_mut().zip(record) {
-                                *sum += f32::from_bits(x.load(Relaxed));
+                            for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
+                                let x = f32::from_bits(x.load(Relaxed));
+                                *sum = if i == MAXIMUM { sum.max(x) } else { *sum + x };
                             }
                         }
                     });
@@ -145,6 +148,7 @@ impl CpuBackend {
             AuxColumn::PixelCount => sums[row * STRIDE + 1],
             AuxColumn::WeightSum => sums[row * STRIDE + 2],
             AuxColumn::DistanceSum => sums[row * STRIDE + 3],
+            AuxColumn::WeightMax => sums[row * STRIDE + MAXIMUM],
             AuxColumn::Depth => splats[row].depth,
             AuxColumn::Radius => radius(&splats[row]),
         };
@@ -206,8 +210,10 @@ impl WithSimd for Replay<'_> {
                         let distance = (dx * dx + dy * dy).sqrt();
                         sums[0] = sums[0] + blends.keep(V::load(s, &map[p][at..]));
                         sums[1] = sums[1] + blends.keep(c(1.0));
-                        sums[2] = sums[2] + blends.keep(alpha * t);
+                        let weight = blends.keep(alpha * t);
+                        sums[2] = sums[2] + weight;
                         sums[3] = sums[3] + blends.keep(distance);
+                        sums[MAXIMUM] = sums[MAXIMUM].max(weight);
                         let stopped = next.le(least_light).and(seen);
                         let left = stopped.select(zero, blends.select(next, t));
                         left.store(&mut light[p][at..]);
@@ -219,8 +225,9 @@ impl WithSimd for Replay<'_> {
                     }
                 }
                 let record = records.of(Entry::load(entry), n * BATCH + i);
-                for (to, sum) in record.into_iter().flatten().zip(sums) {
-                    to.store(sum.sum().to_bits(), Relaxed);
+                for (i, (to, sum)) in record.into_iter().flatten().zip(sums).enumerate() {
+                    let total = if i == MAXIMUM { sum.max_lane() } else { sum.sum() };
+                    to.store(total.to_bits(), Relaxed);
                 }
             }
         }

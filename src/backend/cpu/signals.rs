@@ -2,7 +2,6 @@
 
 use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet, Signals};
 use pulp::Simd;
-use rayon::prelude::*;
 
 use super::blocks::{Blocks, plane};
 use super::parameters::Parameters;
@@ -79,9 +78,8 @@ impl SignalPlanes {
                     Signal::WeightSum => sum!(Field::WeightSum.number()),
                     Signal::PixelCount => sum!(Field::PixelCount.number()),
                     Signal::WeightedError => sum!(Field::Error.number()),
-                    // Of views that are rendered for it, and of the row as it is when it is read.
-                    Signal::FreshWeightMax
-                    | Signal::Opacity
+                    // Of the row as it is when it is read.
+                    Signal::Opacity
                     | Signal::ScaleMax
                     | Signal::ScaleProduct
                     | Signal::Age
@@ -122,41 +120,6 @@ impl Accumulators {
     /// while they are read.
     pub(super) fn sums(&self) -> usize {
         self.layout().stride().max(self.requested.width())
-    }
-
-    /// Whether views are to be measured.
-    pub(super) fn measures(&self) -> bool {
-        !self.planes.fresh().is_empty()
-    }
-
-    /// Counts one more view for the largest weight of fresh views.
-    ///
-    /// `sums` has one record per row. Shape: `[rows, self.layout().stride()]`.
-    pub(super) fn measure(&mut self, rows: usize, sums: &[f32], visible: &[u16]) {
-        let layout = self.layout();
-        let plane = self.planes.current(Signal::FreshWeightMax);
-        let (Some(plane), Some(field)) = (plane, layout.at(Field::WeightMax)) else { return };
-        let per_block = self.blocks.stride();
-        (
-            self.blocks.of_rows_mut(rows).par_chunks_mut(per_block),
-            sums.par_chunks(WIDTH * layout.stride()),
-            visible,
-        )
-            .into_par_iter()
-            .for_each(|(block, sums, &seen)| {
-                let line = &mut block[plane * WIDTH..(plane + 1) * WIDTH];
-                let records = sums.chunks_exact(layout.stride());
-                for (lane, (most, record)) in line.iter_mut().zip(records).enumerate() {
-                    if seen >> lane & 1 == 1 {
-                        *most = most.max(record[field]);
-                    }
-                }
-            });
-    }
-
-    /// Forgets the views measured so far.
-    pub(super) fn forget_measured(&mut self, rows: usize) {
-        self.clear(&self.planes.fresh(), rows);
     }
 
     /// The current epoch's largest weights become the previous one's.

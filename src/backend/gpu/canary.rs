@@ -81,7 +81,6 @@ fn run(
             rates,
             cadence: Cadence::default(),
             seed: 1,
-            ssim_weight: 1.0,
         })?);
     }
     Ok((outputs, backend.render(camera, BACKGROUND, 1)?.rgb))

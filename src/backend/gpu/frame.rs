@@ -153,12 +153,8 @@ impl Frame {
         let adds = (if terms.is_none() { 0 } else { due::TERMS })
             | (if noise.is_some() { due::NOISE } else { 0 });
         self.draw = [folded_seed(input.seed), input.step, due | adds, self.draw[3]];
-        self.add_to(planes);
         self.background[3] = planes.full_depth;
-    }
-
-    /// Says to which planes the view adds.
-    pub(super) fn add_to(&mut self, planes: &SignalPlanes) {
+        // To which planes the view adds.
         for (signal, plane) in Signal::ALL.into_iter().zip(self.planes.as_flattened_mut()) {
             *plane = planes.current(signal).map_or(u32::MAX, |plane| plane as u32);
         }

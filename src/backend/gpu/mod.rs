@@ -230,24 +230,6 @@ impl Backend for GpuBackend {
         self.step(input)
     }
 
-    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
-        if self.planes.fresh().is_empty() {
-            return Ok(());
-        }
-        self.fit_image(camera.width, camera.height)?;
-        let mut frame = self.frame(camera, [0.0; 3], sh_degree);
-        frame.add_to(&self.planes);
-        let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        encoder.clear_buffer(self.buffers.get("pixel gradient"), 0, None);
-        self.device.queue.submit([encoder.finish()]);
-        self.run(&frame, |passes, to| {
-            passes.forward(to);
-            passes.backward(to);
-            passes.measure(to);
-        })?;
-        Ok(())
-    }
-
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         self.observe_view(input)
     }
@@ -273,7 +255,6 @@ impl Backend for GpuBackend {
                 column.copy_from_slice(&values);
             }
         }
-        self.clear_planes(&self.planes.fresh());
         Ok(signals)
     }
 

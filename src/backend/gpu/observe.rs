@@ -197,7 +197,7 @@ impl GpuBackend {
     /// The columns that the last passes have left.
     fn columns(&self, request: &AuxRequest) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
         let n = self.rows as u64;
-        let sums = self.read("row sums", 0, 16 * n)?;
+        let sums = self.read("row sums", 0, 20 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
         let value = |column: AuxColumn, row: usize| {
@@ -205,10 +205,11 @@ impl GpuBackend {
                 return 0.0;
             }
             match column {
-                AuxColumn::MapSum => sums[4 * row],
-                AuxColumn::PixelCount => sums[4 * row + 1],
-                AuxColumn::WeightSum => sums[4 * row + 2],
-                AuxColumn::DistanceSum => sums[4 * row + 3],
+                AuxColumn::MapSum => sums[5 * row],
+                AuxColumn::PixelCount => sums[5 * row + 1],
+                AuxColumn::WeightSum => sums[5 * row + 2],
+                AuxColumn::DistanceSum => sums[5 * row + 3],
+                AuxColumn::WeightMax => sums[5 * row + 4],
                 AuxColumn::Depth => depths[row],
                 AuxColumn::Radius => {
                     let [_, _, l1, shear, l3] = [0, 1, 2, 3, 4].map(|i| splats[12 * row + i]);

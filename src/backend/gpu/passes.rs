@@ -29,7 +29,7 @@ const TO_ORDER: usize = 2;
 const WHOLE: u32 = u32::MAX;
 
 /// Numbers per row of an auxiliary view.
-const COLUMNS: u32 = 4;
+const COLUMNS: u32 = 5;
 
 /// What decides which commands are encoded.
 #[derive(Debug, Clone, Copy)]
@@ -256,10 +256,5 @@ impl Passes<'_> {
                 to.run(l.get("gather_columns"), [band, 0, 0, 0], groups);
             }
         }
-    }
-
-    /// Counts the view for the largest weight of fresh views.
-    pub(super) fn measure(&self, to: &mut Recorder<'_>) {
-        to.run(self.launches.get("measure"), [0; 4], self.shape.rows.div_ceil(256));
     }
 }

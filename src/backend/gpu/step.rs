@@ -36,10 +36,6 @@ impl GpuBackend {
             (target.width, target.height),
             "camera and image differ in size"
         );
-        assert!(
-            input.ssim_weight.to_bits() == 1.0_f32.to_bits(),
-            "this backend always has the whole loss"
-        );
         let start = Instant::now();
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);

@@ -24,9 +24,6 @@ use crate::run::{self, Interrupt, Observer, Occupied, Partial, Resumed, Run, Run
 pub(super) struct TrainArgs {
     #[command(flatten)]
     run: RunSpec,
-    /// TOML file with parameters in a table per policy; --policy-set wins over it
-    #[arg(long, value_name = "FILE", help_heading = "Policy")]
-    policy_config: Option<PathBuf>,
     /// TOML file with any of these options, such as the config.toml of a run; flags win over it
     #[arg(long, value_name = "FILE", help_heading = "Scene")]
     config: Option<PathBuf>,
@@ -63,11 +60,8 @@ impl TrainArgs {
         follower: &Follower<'_>,
     ) -> Result<(RunSpec, Option<Resumed>), Failure> {
         let flags = flags::given(matches, &self.run)?;
-        let mut given = self.config.as_deref().map(Partial::read).transpose()?.unwrap_or_default();
-        if let Some(path) = &self.policy_config {
-            given = Partial::read_policies(path)?.over(given);
-        }
-        let given = flags.clone().over(given);
+        let file = self.config.as_deref().map(Partial::read).transpose()?.unwrap_or_default();
+        let given = flags.clone().over(file);
         let (spec, resumed) = match self.resume {
             true => run::start(given, follower)?,
             false => (given.describe()?, None),

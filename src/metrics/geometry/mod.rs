@@ -11,7 +11,7 @@ mod measure;
 #[path = "without_scenegen.rs"]
 mod measure;
 
-use densify_policies::policy::{AuxColumn, AuxRequest, Needs, Signal, SignalSet};
+use densify_policies::policy::{AuxColumn, AuxRequest, Needs};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::dataset::GroundTruth;
@@ -137,13 +137,8 @@ pub struct KnownScene<'a> {
 /// The needs with which the backend for [`measure`] is made.
 #[must_use]
 pub fn needs() -> Needs {
-    let columns = vec![AuxColumn::WeightSum, AuxColumn::PixelCount];
-    Needs {
-        signals: SignalSet::default().with(Signal::FreshWeightMax),
-        fresh_views: 1,
-        aux: Some(AuxRequest { columns, ..AuxRequest::default() }),
-        ..Needs::default()
-    }
+    let columns = vec![AuxColumn::WeightSum, AuxColumn::WeightMax, AuxColumn::PixelCount];
+    Needs { aux: Some(AuxRequest { columns, ..AuxRequest::default() }), ..Needs::default() }
 }
 
 /// Memory for [`measure`] beside the backend and the surface, at most `[bytes]`: of each row two copies

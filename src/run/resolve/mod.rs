@@ -31,7 +31,7 @@ use crate::knobs::Knobs;
 use crate::memory::{peak_resident, resident};
 use crate::number::grouped;
 use crate::schedule::Background;
-use crate::trainer::{AutoChoices, growth_signals, needs};
+use crate::trainer::{AutoChoices, growth_signals};
 use degree::Degree;
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
@@ -169,7 +169,7 @@ impl<'a> Inputs<'a> {
     pub(super) fn needs(&self, rows: usize) -> Result<Needs, Failure> {
         let scene = self.info(rows, self.initial_rows(rows))?;
         let policy = self.entry.build(&self.parameters, &scene)?;
-        Ok(self.backend_needs(needs(policy.as_ref(), &scene, self.sh_every())))
+        Ok(self.backend_needs(policy.needs(&scene)))
     }
 
     /// The needs of a policy, and what the trainer needs beside them.
@@ -179,11 +179,6 @@ impl<'a> Inputs<'a> {
             false => needs.signals,
         };
         Needs { signals, ..needs }
-    }
-
-    /// Iterations per optimiser step of view-dependent colour, where the options say.
-    pub(super) fn sh_every(&self) -> Option<u32> {
-        self.spec.schedule.sh_every.map(|every| every.0)
     }
 
     /// Threads that train and measure.

@@ -1,13 +1,12 @@
 //! Who competes: a policy, or a policy with parameters of its own.
 
-use densify_policies::parameters::parse_overrides;
 use densify_policies::policy::SceneInfo;
 use densify_policies::registry::find;
 
 use toml::Table;
 
 use crate::failure::Failure;
-use crate::run::Partial;
+use crate::run::{Assignment, Partial};
 
 /// A policy as it is named on the command line: `NAME`, or `NAME:PARAMETER=VALUE`, with as many
 /// parameters as wanted.
@@ -23,15 +22,26 @@ impl<'a> Contender<'a> {
         Self { name: parts.next().unwrap_or_default(), settings: parts.collect() }
     }
 
-    /// Values of `--policy-set`.
-    fn overrides(&self) -> Vec<String> {
-        self.settings.iter().map(|setting| format!("{}.{setting}", self.name)).collect()
+    /// Its parameters by name.
+    fn parameters(&self) -> Result<Table, Failure> {
+        let mut parameters = Table::new();
+        for setting in &self.settings {
+            let text = format!("{}.{setting}", self.name);
+            let set: Result<Assignment, String> = text.parse();
+            let Assignment { path, value } =
+                set.map_err(|error| Failure::input(format!("--policies: {error}")))?;
+            parameters.insert(path[1..].join("."), value);
+        }
+        Ok(parameters)
     }
 
     /// Its options of a run.
     pub(super) fn options(&self) -> Partial {
-        let tables = parse_overrides(&self.overrides()).unwrap_or_default();
-        let set: Table = tables.into_iter().map(|(name, set)| (name, set.into())).collect();
+        let own = self.parameters().unwrap_or_default();
+        let mut set = Table::new();
+        if !own.is_empty() {
+            set.insert(self.name.to_owned(), own.into());
+        }
         Partial::option("policy_set", set).over(Partial::option("policy", self.name))
     }
 
@@ -47,8 +57,7 @@ impl<'a> Contender<'a> {
     /// iterations.
     pub(super) fn check(&self, budget: usize, iterations: u32) -> Result<(), Failure> {
         let entry = find(self.name)?;
-        let tables = parse_overrides(&self.overrides())
-            .map_err(|error| Failure::input(format!("--policies: {error}")))?;
+        let parameters = self.parameters()?;
         // Of a scene parameters only have to fit the length and the budget.
         let scene = SceneInfo {
             extent: 1.0,
@@ -58,7 +67,7 @@ impl<'a> Contender<'a> {
             iterations,
             white_background: false,
         };
-        entry.build(&tables.get(self.name).cloned().unwrap_or_default(), &scene)?;
+        entry.build(&parameters, &scene)?;
         Ok(())
     }
 }

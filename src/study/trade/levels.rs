@@ -10,9 +10,8 @@ use crate::run::{Observer, Partial, RunOption};
 #[derive(Debug, Clone)]
 pub(super) struct Factor {
     pub(super) name: String,
-    pub(super) class: Class,
-    /// Whether it says how large a run is: its levels follow the run's size.
-    pub(super) is_size: bool,
+    /// Whether it may change no bit of a model.
+    pub(super) is_exact: bool,
     /// Its levels besides that of `exact`.
     pub(super) levels: Vec<String>,
 }
@@ -24,15 +23,14 @@ enum Levels {
     TimesIterations(&'static [f64]),
 }
 
-/// Options that are varied unless knobs are named.
-const OPTIONS: [(&str, Class, Levels); 7] = [
-    ("tile_cap", Class::Exact, Levels::TimesBudget(&[1.0, 4.0, 32.0])),
-    ("image_cache", Class::Exact, Levels::These(&["0", "16777216"])),
-    ("preset", Class::Heuristic, Levels::These(&["balanced", "fast", "tiny-memory"])),
-    ("sh_degree", Class::Heuristic, Levels::These(&["0", "1", "2"])),
-    ("sh_every", Class::Heuristic, Levels::These(&["4", "8", "16"])),
-    ("iterations", Class::Heuristic, Levels::TimesIterations(&[0.25, 0.5, 2.0])),
-    ("budget", Class::Heuristic, Levels::TimesBudget(&[0.25, 0.5, 2.0])),
+/// Options that are varied unless knobs are named, and whether they may change no bit of a model.
+const OPTIONS: [(&str, bool, Levels); 6] = [
+    ("tile_cap", true, Levels::TimesBudget(&[1.0, 4.0, 32.0])),
+    ("image_cache", true, Levels::These(&["0", "16777216"])),
+    ("preset", false, Levels::These(&["balanced", "fast", "tiny-memory"])),
+    ("sh_degree", false, Levels::These(&["0", "1", "2"])),
+    ("iterations", false, Levels::TimesIterations(&[0.25, 0.5, 2.0])),
+    ("budget", false, Levels::TimesBudget(&[0.25, 0.5, 2.0])),
 ];
 
 /// The factors that are asked for, or all that these runs have.
@@ -84,38 +82,36 @@ pub(super) fn factors(
 fn factor(study: &Trade, name: &str, levels: &[&str]) -> Result<Factor, Failure> {
     let given = levels.iter().map(|level| (*level).to_owned()).collect::<Vec<_>>();
     let of_option = OPTIONS.iter().find(|(option, ..)| *option == name);
-    let (class, is_size, own) = match (of_option, RunOption::find(name), find(name)) {
-        (Some((_, class, levels)), ..) => {
-            let (is_size, own) = sized(study, levels);
-            (*class, is_size, own)
-        }
+    let (is_exact, own) = match (of_option, RunOption::find(name), find(name)) {
+        (Some((_, is_exact, levels)), ..) => (*is_exact, sized(study, levels)),
         (None, Some(_), _) if given.is_empty() => {
             return Err(Failure::input(format!("say at which levels, as {name}:VALUE:VALUE")));
         }
-        (None, Some(_), _) => (Class::Heuristic, false, Vec::new()),
+        (None, Some(_), _) => (false, Vec::new()),
         (None, None, Ok(knob)) => {
             let canonical = |level: &String| knob.canonical(level).map_err(Failure::input);
             let given = given.iter().map(canonical).collect::<Result<Vec<_>, _>>()?;
             let own = knob.levels.iter().map(|level| (*level).to_owned()).collect();
             let levels = if given.is_empty() { own } else { given };
-            return Ok(Factor { name: name.to_owned(), class: knob.class, is_size: false, levels });
+            let is_exact = knob.class == Class::Exact;
+            return Ok(Factor { name: name.to_owned(), is_exact, levels });
         }
         (None, None, Err(error)) => return Err(Failure::input(error)),
     };
     let levels = if given.is_empty() { own } else { given };
-    Ok(Factor { name: name.to_owned(), class, is_size, levels })
+    Ok(Factor { name: name.to_owned(), is_exact, levels })
 }
 
-/// Whether the levels follow the size of the runs, and the levels for runs of this size.
-fn sized(study: &Trade, levels: &Levels) -> (bool, Vec<String>) {
+/// The levels for runs of this size.
+fn sized(study: &Trade, levels: &Levels) -> Vec<String> {
     let times = |factors: &[f64], base: f64| {
         let level = |factor: &f64| ((base * factor).round().max(1.0) as u64).to_string();
         factors.iter().map(level).collect()
     };
     match levels {
-        Levels::These(values) => (false, values.iter().map(|v| (*v).to_owned()).collect()),
-        Levels::TimesBudget(factors) => (true, times(factors, study.budget as f64)),
-        Levels::TimesIterations(factors) => (true, times(factors, f64::from(study.iterations))),
+        Levels::These(values) => values.iter().map(|v| (*v).to_owned()).collect(),
+        Levels::TimesBudget(factors) => times(factors, study.budget as f64),
+        Levels::TimesIterations(factors) => times(factors, f64::from(study.iterations)),
     }
 }
 

@@ -1,8 +1,6 @@
-//! The study behind `densify trade`: what each knob costs and buys, alone and among others.
+//! The study behind `densify trade`: what each knob costs and buys.
 
-mod effects;
 mod levels;
-mod numerical;
 mod plots;
 mod report;
 mod table;
@@ -13,43 +11,38 @@ use clap::Args;
 
 use super::cell::Cell;
 use super::child::shared_options;
-use super::record::{ImageError, Outcome, Record};
+use super::record::Outcome;
 use super::{Finished, Study, labels};
 use crate::failure::Failure;
-use crate::knobs::{Class, EXACT, preset};
+use crate::knobs::{EXACT, preset};
 use crate::number;
 use crate::run::{DEFAULT_BUDGET, Observer, Partial};
 use crate::schedule::REFERENCE_ITERATIONS;
 use levels::{Factor, factors};
-use numerical::Subject;
 use report::Report;
 
 /// Options of a run that are the study's to set.
 const OWN_OPTIONS: [&str; 7] =
     ["scene", "budget", "seed", "iterations", "output", "knob", "preset"];
 
-/// The factor of a run in which no knob is changed, which is one with the preset `exact`, and that of a
-/// run of the factorial.
+/// The factor of a run in which no knob is changed, which is one with the preset `exact`.
 const BASE: &str = "";
-const FACTORIAL: &str = "factorial";
 
 const EXAMPLES: &str = "\
 Examples:
   densify trade scene:room -i 2000 -b 20k
-  densify trade data/garden --knobs alpha_min,ssim_every,sh_every --seeds 5 -- -r 4
-  densify trade scene:spheres --knobs coarse_until:0.3:0.5 -i 1000 -b 5k -- --policy taming";
+  densify trade data/garden --knobs alpha_min,sh_degree --seeds 5 -- -r 4
+  densify trade scene:spheres --knobs alpha_min:1/96:1/48 -i 1000 -b 5k -- --policy taming";
 
 /// Measures what each shortcut costs and buys.
 ///
-/// For every knob (`densify knobs`) and each of its levels: how far off the same model's images are,
-/// against a renderer in float64; and what training with it arrives at, on views held out, with time
-/// by stage and memory at its peak. One knob at a time from the preset `exact`, with the same seeds; then
-/// those that stand out together, in a design of twelve runs.
+/// For every knob (`densify knobs`) and each of its levels: what training with it arrives at, on views
+/// held out, with time and memory at its peak. One knob at a time from the preset `exact`, with
+/// the same seeds.
 ///
 /// A run that is finished is not run again: call the same command to go on after an interruption. The
 /// folder then holds trade.md (tables and plots), trade.jsonl (a record per line), plots as SVG, and
-/// the runs themselves. "Free" is said only of what costs less than can be seen, by all of its
-/// intervals.
+/// the runs themselves.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Trade {
@@ -69,9 +62,6 @@ pub(crate) struct Trade {
     /// Most Gaussians of each run
     #[arg(short, long, value_name = "ROWS", default_value_t = DEFAULT_BUDGET, value_parser = number::rows)]
     pub budget: usize,
-    /// Leave out the runs in which several knobs are changed together
-    #[arg(long)]
-    pub no_factorial: bool,
     /// Folder for the results
     #[arg(short, long, value_name = "DIR", default_value = "trade")]
     pub output: PathBuf,
@@ -88,15 +78,7 @@ impl Trade {
         let cells = self.cells(&factors, &shared)?;
         let mut study = Study::open(&self.output, "trade", observer)?;
         let outcomes = study.run(&cells)?;
-        let images = measure_images(&mut study, &cells, &factors)?;
-        let mut report = Report::new(self, &factors, outcomes, images);
-        let together = if self.no_factorial { Vec::new() } else { report.knobs_that_stand_out() };
-        if together.len() > 1 {
-            let runs = factorial(&cells, &together);
-            observer.say(format_args!("{} knobs stand out; together:", together.len()));
-            let outcomes = study.run(&runs)?;
-            report.add_factorial(together, outcomes);
-        }
+        let report = Report::new(self, &factors, outcomes);
         let mut text = table::markdown(&report);
         text += "\n## Plots\n";
         for picture in plots::draw(&self.output, &report)? {
@@ -123,11 +105,8 @@ impl Trade {
                 };
                 cells.push(base.clone());
                 for factor in factors {
-                    cells.extend(factor.levels.iter().map(|level| {
-                        let name = &factor.name;
-                        let changes = changes(name, level, self.iterations);
-                        changed(&base, name, level, format!("{name}={level}"), changes)
-                    }));
+                    let levels = factor.levels.iter();
+                    cells.extend(levels.map(|level| changed(&base, &factor.name, level)));
                 }
             }
         }
@@ -135,23 +114,17 @@ impl Trade {
     }
 }
 
-/// The base run with options and knobs changed.
-fn changed(
-    base: &Cell,
-    factor: &str,
-    level: &str,
-    title: String,
-    changes: impl IntoIterator<Item = (String, String)>,
-) -> Cell {
+/// The base run with a knob at a level.
+fn changed(base: &Cell, factor: &str, level: &str) -> Cell {
     let plain = |c: char| c.is_ascii_alphanumeric() || "._".contains(c);
     let mut spec = base.spec.clone();
-    for (name, value) in changes {
+    for (name, value) in changes(factor, level, base.iterations) {
         spec = Partial::setting(&name, &value).over(spec);
     }
     Cell {
         factor: factor.to_owned(),
         level: level.to_owned(),
-        title,
+        title: format!("{factor}={level}"),
         folder: format!("{factor}-{level}").replace(|c| !plain(c), "-"),
         spec,
         ..base.clone()
@@ -176,59 +149,6 @@ fn changes(knob: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
         ("preset", Ok(preset)) => preset.levels.iter().map(change).collect(),
         _ => vec![(knob.to_owned(), level.to_owned())],
     }
-}
-
-/// The runs of the factorial over these knobs at these levels, with the first seed.
-fn factorial(cells: &[Cell], together: &[(String, String)]) -> Vec<Cell> {
-    let design = effects::plackett_burman();
-    let runs = |base: &Cell| -> Vec<Cell> {
-        let run = |(i, run): (usize, &[bool; effects::FACTORS])| {
-            let high = together.iter().zip(run).filter(|(_, high)| **high);
-            let number = (i + 1).to_string();
-            let title = format!("run {number} of the factorial");
-            changed(base, FACTORIAL, &number, title, high.map(|(setting, _)| setting.clone()))
-        };
-        design.iter().enumerate().map(run).collect()
-    };
-    first_bases(cells).flat_map(runs).collect()
-}
-
-/// The unchanged run of every scene at the first seed.
-fn first_bases(cells: &[Cell]) -> impl Iterator<Item = &Cell> {
-    cells.iter().filter(|cell| cell.factor == BASE && cell.seed == 0)
-}
-
-/// How far off images of the models of the first seed are, as they are and with every knob that changes
-/// images.
-fn measure_images(
-    study: &mut Study<'_>,
-    cells: &[Cell],
-    factors: &[Factor],
-) -> Result<Vec<ImageError>, Failure> {
-    let in_images = factors.iter().filter(|factor| factor.class != Class::Heuristic);
-    let levels: Vec<(&str, &str)> = std::iter::once((BASE, ""))
-        .chain(in_images.flat_map(|one| one.levels.iter().map(|level| (&*one.name, &**level))))
-        .collect();
-    let mut images = Vec::new();
-    for cell in first_bases(cells) {
-        let mut subject = None;
-        for &(knob, level) in &levels {
-            if let Some(image) = study.journal.image(&cell.spec, knob, level) {
-                images.push(image.clone());
-                continue;
-            }
-            if subject.is_none() {
-                study.observer.say(format_args!("{}: images against float64", cell.label));
-                subject = Some(Subject::read(&cell.path(study.output), study.observer)?);
-            }
-            if let Some(subject) = &subject {
-                let image = subject.measure(cell, knob, level)?;
-                study.journal.add(Record::Image(image.clone()))?;
-                images.push(image);
-            }
-        }
-    }
-    Ok(images)
 }
 
 #[cfg(test)]

@@ -147,11 +147,11 @@ mod tests {
             ("exact", false),
             ("alpha_min=1/64", false),
             ("alpha_min=1/32", false),
-            ("ssim_every=5", true),
+            ("sh_degree=0", true),
         ];
         assert_eq!(front, expected);
         let text = plot::svg(SIZE, |area| draw_points("title", &points, area)).unwrap();
-        for words in ["title", "alpha_min=1/64", "ssim_every=5", "peak memory", "logarithmic"] {
+        for words in ["title", "alpha_min=1/64", "sh_degree=0", "peak memory", "logarithmic"] {
             assert!(text.contains(words), "{words} is not in {text}");
         }
         assert_eq!(text.matches("<circle").count(), 4);

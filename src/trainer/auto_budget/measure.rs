@@ -14,8 +14,8 @@ impl<V: ViewSource> Trainer<V> {
     /// Most rows that a plan may lead to now; at least as many as there are, so that a model that starts
     /// with more is not cut.
     pub(in crate::trainer) fn row_limit(&self) -> usize {
-        let usable = self.options.savings.rows(self.backend.budget());
-        let limit = self.auto_budget.as_ref().map_or(usable, |auto| auto.limit.min(usable));
+        let budget = self.backend.budget();
+        let limit = self.auto_budget.as_ref().map_or(budget, |auto| auto.limit.min(budget));
         limit.max(self.backend.rows())
     }
 
@@ -39,7 +39,7 @@ impl<V: ViewSource> Trainer<V> {
         let psnr = mean(&self.probe(step, self.sh_degree(step))?);
         let settled = auto.record(step, rows, psnr);
         if settled && grows {
-            auto.update_limit(self.options.savings.rows(self.backend.budget()));
+            auto.update_limit(self.backend.budget());
         }
         let (gain, limit) = (auto.intervals.last().and_then(|last| last.gain), auto.limit);
         tracing::info!(step, rows, psnr, settled, gain, limit, "automatic budget");

@@ -68,10 +68,6 @@ impl Backend for CountingBackend {
         let loss = if input.step == self.nan_loss_at { f32::NAN } else { 0.5 };
         Ok(StepOutput { loss, ..StepOutput::default() })
     }
-    fn measure_weights(&mut self, camera: &Camera, sh_degree: u8) -> Result<(), BackendError> {
-        note(&self.log, format!("measure {} at degree {sh_degree}", camera.translation.x));
-        Ok(())
-    }
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let (x, degree) = (input.camera.translation.x, input.sh_degree);
         note(&self.log, format!("observe {x}, pixel {}, degree {degree}", input.target.rgb[0]));
@@ -140,7 +136,6 @@ impl Backend for CountingBackend {
 /// A policy that is due at the multiples of `every`, with one fixed behaviour.
 struct ScriptedPolicy {
     every: u32,
-    fresh_views: u32,
     aux_views: u32,
     cadence: Cadence,
     seen: Vec<f32>,
@@ -155,21 +150,15 @@ enum Behaviour {
     Fail,
     Panic,
     ReadUndeclared,
-    ReadFresh,
 }
 
 impl DensityPolicy for ScriptedPolicy {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
-        let (signals, fresh_views) = (SignalSet::from([Signal::Opacity]), self.fresh_views);
-        let fresh = if fresh_views > 0 { signals.with(Signal::FreshWeightMax) } else { signals };
+        let signals = SignalSet::from([Signal::Opacity]);
         let aux = (self.aux_views > 0)
             .then(|| AuxRequest { columns: vec![AuxColumn::Depth], ..AuxRequest::default() });
         let cadence = Cadence { all: 4, sh_rest: 1 };
-        Needs { signals: fresh, fresh_views, aux, cadence, ..Needs::default() }
-    }
-    fn wants_fresh(&self, step: u32, rows: usize, budget: usize) -> bool {
-        assert!(self.is_due(step) && rows <= budget);
-        2 * rows > budget
+        Needs { signals, aux, cadence, ..Needs::default() }
     }
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.every)
@@ -219,9 +208,6 @@ impl DensityPolicy for ScriptedPolicy {
             Behaviour::ReadUndeclared => {
                 now.signal(Signal::Age)?;
             }
-            Behaviour::ReadFresh => {
-                now.signal(Signal::FreshWeightMax)?;
-            }
         }
         Ok(())
     }
@@ -260,7 +246,6 @@ struct Case {
     budget: usize,
     behaviour: Behaviour,
     every: u32,
-    fresh_views: u32,
     aux_views: u32,
     cadence: Cadence,
     nan_loss_at: u32,
@@ -273,7 +258,6 @@ const CASE: Case = Case {
     budget: 10,
     behaviour: Behaviour::Split,
     every: 2,
-    fresh_views: 0,
     aux_views: 0,
     cadence: Cadence { all: 1, sh_rest: 1 },
     nan_loss_at: 0,
@@ -307,10 +291,8 @@ const OPTIONS: TrainOptions = TrainOptions {
         sh_dc: 1.0,
         sh_rest: 1.0,
     },
-    sh_every: None,
     prefetch: 2,
     on_nan: OnNan::Prune,
-    savings: Savings::NONE,
 };
 
 fn build(
@@ -336,9 +318,8 @@ fn build(
         unreadable: case.unreadable,
         prefetched: prefetched.clone(),
     };
-    let Case { every, fresh_views, aux_views, cadence, behaviour, .. } = *case;
-    let policy =
-        ScriptedPolicy { every, fresh_views, aux_views, cadence, seen: Vec::new(), behaviour };
+    let Case { every, aux_views, cadence, behaviour, .. } = *case;
+    let policy = ScriptedPolicy { every, aux_views, cadence, seen: Vec::new(), behaviour };
     let policy = ("scripted", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, log, prefetched))

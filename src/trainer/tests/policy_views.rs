@@ -1,49 +1,6 @@
-//! Tests of the views rendered for a policy: fresh signals, near-duplicates, auxiliary views.
+//! Tests of the views rendered for a policy, and of near-duplicates among them.
 
 use super::*;
-
-#[test]
-fn fresh_views_are_measured_where_they_are_wanted() {
-    let run = |fresh_views: u32, seed: u64| {
-        let case = Case { fresh_views, ..CASE };
-        let options = TrainOptions { seed, ..OPTIONS };
-        let (mut trainer, log, _) = build(&case, 3, scene(&case, 3), options).unwrap();
-        for _ in 0..9 {
-            trainer.step().unwrap();
-        }
-        let log = log.lock().unwrap().clone();
-        let is_edit = |d: &String| d.starts_with("measure") || d.starts_with("apply");
-        (log.into_iter().filter(is_edit).collect::<Vec<_>>(), trainer.extra_forwards())
-    };
-    // 3 rows of 10 at step 2, where none is wanted, then 6, 10, 10.
-    let expected = |count: usize, seed: u64| -> Vec<String> {
-        let event = |step: u32| {
-            let count = if step == 2 { 0 } else { count };
-            let degree = schedule::sh_degree(step, 9, 3);
-            let views = schedule::fresh_views(3, count, seed, step).into_iter();
-            let measured = views.map(move |view| format!("measure {view} at degree {degree}"));
-            measured.chain([format!("apply {step}")])
-        };
-        [2, 4, 6, 8].into_iter().flat_map(event).collect()
-    };
-    assert_eq!(run(2, 7), (expected(2, 7), 6));
-    assert_eq!(run(2, 7), run(2, 7));
-    assert_eq!(run(2, 8), (expected(2, 8), 6));
-    assert_ne!(run(2, 7), run(2, 8));
-    // There are no more than three.
-    assert_eq!(run(100, 7), (expected(3, 7), 9));
-    assert_eq!(run(0, 7), (expected(0, 7), 0));
-}
-
-#[test]
-fn fresh_signals_can_be_read_only_where_they_are_wanted() {
-    let case = Case { behaviour: Behaviour::ReadFresh, fresh_views: 2, ..CASE };
-    let (message, ..) = failure(&case);
-    assert!(message.contains("FreshWeightMax was read but not declared"), "{message}");
-    assert!(message.starts_with("step 2") && message.contains("`wants_fresh`"), "{message}");
-    let (mut trainer, ..) = trainer(&Case { rows: 6, ..case });
-    assert!((0..9).all(|_| trainer.step().is_ok()));
-}
 
 #[test]
 fn the_first_of_near_duplicates_is_kept() {
@@ -68,7 +25,7 @@ fn the_first_of_near_duplicates_is_kept() {
 #[test]
 fn near_duplicates_are_not_scored() {
     // Cameras one apart: with an extent of 150, the second is the first, and the third is not.
-    let case = Case { fresh_views: 100, ..CASE };
+    let case = Case { aux_views: 100, ..CASE };
     let info = SceneInfo { extent: 150.0, ..scene(&case, 3) };
     let (trainer, log, _) = build(&case, 3, info, OPTIONS).unwrap();
     let mut trainer =
@@ -77,10 +34,8 @@ fn near_duplicates_are_not_scored() {
         trainer.step().unwrap();
     }
     let log = log.lock().unwrap().clone();
-    let measured: Vec<&str> =
-        log.iter().filter(|d| d.starts_with("measure")).map(|d| &d[..9]).collect();
-    assert!(measured.contains(&"measure 0") && measured.contains(&"measure 2"), "{log:?}");
-    assert!(!measured.contains(&"measure 1"), "{log:?}");
+    let observed = |view| log.iter().any(|d| d.starts_with(&format!("observe {view},")));
+    assert_eq!([0, 1, 2].map(observed), [true, false, true], "{log:?}");
     assert_eq!(trainer.unscored_views(), 1);
     // All are trained on.
     assert!((0..3).all(|view| log.iter().any(|d| d.contains(&format!("view {view}")))), "{log:?}");

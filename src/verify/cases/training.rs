@@ -14,7 +14,7 @@ use crate::dataset::images::{Image8, SharedImage};
 use crate::gaussians::Gaussians;
 use crate::init::initialise;
 use crate::schedule::{Background, RateOptions};
-use crate::trainer::{OnNan, Savings, TrainOptions, Trainer, needs};
+use crate::trainer::{OnNan, TrainOptions, Trainer};
 use crate::verify::scenes;
 use crate::verify::subject::{Setup, Subject};
 use crate::verify::trial::{Trial, count_broken};
@@ -139,13 +139,11 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         sh_degree: 3,
         background: Background::Black,
         rates: RateOptions::for_run(iterations),
-        sh_every: None,
         prefetch: 1,
         on_nan: OnNan::Stop,
-        savings: Savings::NONE,
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
-    let needs = needs(policy.as_ref(), &scene, options.sh_every);
+    let needs = policy.needs(&scene);
     let room = Setup { budget: BUDGET, needs, ..Setup::default() };
     let backend = trial.subject.with(&model, room)?;
     let mut trainer = Trainer::new(photographs()?, backend, (name, policy), scene, options)?;

@@ -254,11 +254,3 @@ pub fn differentiate(
     let model = project::backward(model, view, &splats, &screen);
     (image, Gradient { model, screen })
 }
-
-/// Colours of some pixels (x, y) of a view, background included, not clamped.
-#[must_use]
-pub fn pixels(model: &Model, view: View<'_>, rules: &Rules, pixels: &[[u32; 2]]) -> Vec<[f64; 3]> {
-    let splats = project::project(model, view, rules);
-    let order = project::by_depth(&splats);
-    pixels.iter().map(|&at| blend::sample(&splats, &order, view, rules, at).rgb).collect()
-}

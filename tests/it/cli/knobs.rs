@@ -5,16 +5,13 @@ use std::path::Path;
 use densify::backend::BackendKind;
 use densify::knobs::{Class, KNOBS, PRESETS};
 
-use super::{
-    Outcome, call, config, copy_unfinished, densify, model, records, resume, scratch, text, train,
-};
+use super::{Outcome, call, config, copy_unfinished, densify, model, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
 const ITERATIONS: u32 = 24;
 
 /// Knobs that are not as they are by default.
-const CHANGED: &str = "--knob alpha_min=1/64 --knob transmittance_stop=1e-3 --knob ssim_every=5 \
-                       --knob coarse_until=0.8 --knob param_storage=f16 \
+const CHANGED: &str = "--knob alpha_min=1/64 --knob transmittance_stop=1e-3 --knob param_storage=f16 \
                        --knob moment_storage=both8 --knob pairs_per_row=2";
 
 fn short(scene: &Path, output: &Path, flags: &str) -> Outcome {
@@ -122,7 +119,7 @@ fn every_level_does_what_its_class_says() {
             assert_eq!(config(&run)["knob"][knob.name].as_str(), Some(*level), "{what}");
         }
     }
-    assert!(changed >= 12, "only {changed} levels change anything");
+    assert!(changed >= 9, "only {changed} levels change anything");
 }
 
 #[test]
@@ -138,9 +135,6 @@ fn knobs_survive_a_stop_and_cannot_change_in_between() {
     resume("--knob alpha_min=1/32").refused("another value", &["--knob alpha_min", "1/32", "1/64"]);
     resume("--preset exact").refused("a preset", &["--knob alpha_min", "1/255", "1/64"]);
     // Not given, or given again.
-    resume("--knob ssim_every=5 --knob alpha_min=0.015625").ok();
+    resume("--knob param_storage=f16 --knob alpha_min=0.015625").ok();
     assert!(model(&whole, ITERATIONS) == model(&part, ITERATIONS), "another model");
-    // SSIM is in every fifth step, and in every record.
-    let log = records(&whole.join("stats/train.jsonl"));
-    assert!(log.iter().all(|record| record["ssim"].is_f64()), "{log:?}");
 }

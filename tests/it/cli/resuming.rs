@@ -108,14 +108,15 @@ fn whatever_outlives_a_step_is_kept() {
     let scene = Photographs::colmap_text();
     // Gradients summed until the very next step; bands; a background of its own at every step; a later degree.
     for flags in [
-        "--policy mcmc --policy-set mcmc.grow_every=7 --sh-every 17",
+        "--policy mcmc --policy-set mcmc.grow_every=7",
+        "--policy taming --policy-set taming.sh_every=17",
         "--policy taming --policy-set taming.grow_every=7 --background random --threads 2",
         "--policy vanilla --policy-set vanilla.grow_every=9 --tile-cap 400 --seed 5",
         "--policy diet --policy-set diet.grow_every=9 --save-iterations 50,150 --eval \
          --test-iterations 30,101,160",
         // Candidates wait at the checkpoint.
         "--policy vanilla --policy-set vanilla.grow_every=9",
-        "--policy mcmc --policy-set mcmc.grow_every=7 --sh-every 4 --threads 2",
+        "--policy mcmc --policy-set mcmc.grow_every=7 --threads 2",
         "--policy diet --policy-set diet.grow_every=9 --policy-set diet.insert_every=19 \
          --policy-set diet.rows_per_candidate=20 --policy-set diet.compensate_from=60 \
          --policy-set diet.rho_c=0.1",
@@ -210,15 +211,14 @@ fn a_damaged_checkpoint_is_named_and_the_one_before_is_taken() {
 fn options_that_contradict_the_checkpoint_are_refused_by_name() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    short_run(&scene, &run, "--sh-every 3");
+    short_run(&scene, &run, "");
     let before = files(&run);
-    let cases: [(&str, &[&str]); 13] = [
+    let cases: [(&str, &[&str]); 12] = [
         ("--budget 400", &["--budget: 400 now, 330 in that run", "iteration_40"]),
         ("--policy vanilla", &["--policy: \"vanilla\" now, \"diet\" in that run"]),
         ("--policy-set diet.rho=0.5", &["--policy-set diet.rho: 0.5 now, 0.25 in"]),
         ("--lr opacity=0.5", &["--lr opacity: 0.5 now"]),
         ("--seed 3 --sh-degree 2", &["--seed: 3 now, 0 in", "--sh-degree: 2 now, 1 in"]),
-        ("--sh-every 4", &["--sh-every: 4 now, 3 in"]),
         ("--background white", &["--background: \"white\" now, \"black\" in"]),
         ("--eval", &["--eval: true now, false in"]),
         ("--test-every 3", &["--test-every: 3 now, not set in"]),
@@ -232,12 +232,7 @@ fn options_that_contradict_the_checkpoint_are_refused_by_name() {
         assert!(files(&run) == before, "{flags}: something was written");
     }
     // The same call, or what changes nothing in the result, is no contradiction.
-    resume(
-        scene.path(),
-        &run,
-        "--budget 330 --sh-every 3 --policy diet --policy-set diet.rho=0.25",
-    )
-    .ok();
+    resume(scene.path(), &run, "--budget 330 --policy diet --policy-set diet.rho=0.25").ok();
     resume(scene.path(), &run, "--threads 1 --tile-cap 500 --image-cache 0 --quiet").ok();
 }
 

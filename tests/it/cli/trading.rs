@@ -15,31 +15,25 @@ fn trade(scene: &Path, output: &Path, more: &str) -> Outcome {
 fn every_level_is_measured_once_and_in_the_table() {
     let scene = Photographs::colmap_text();
     let (_root, output) = scratch();
-    let knobs = "alpha_min:1/32,ssim_every:2,tile_cap,transmittance_stop:1e-3:1e-2";
+    let knobs = "alpha_min:1/32,sh_degree:1,tile_cap,transmittance_stop:1e-3:1e-2";
     let call = format!("--knobs {knobs} --seeds 2 -- --sh-degree 0");
     let said = trade(scene.path(), &output, &call).ok().stdout;
     assert!(said.contains("[16/16]") && said.contains("alpha_min=1/32"), "{said}");
     let all = records(&output.join("trade.jsonl"));
-    let of = |kind: &str| -> Vec<&Value> { all.iter().filter(|r| r["kind"] == kind).collect() };
-    let is = |r: &Value, knob: &str, level: &str| {
-        (r["knob"] == knob || r["factor"] == knob) && r["level"] == level
-    };
-    let runs = of("run");
     let find = |knob: &str, level: &str, seed: u64| {
-        let is_it = |r: &&&Value| is(r, knob, level) && r["seed"] == seed;
-        *runs.iter().find(is_it).unwrap_or_else(|| panic!("{knob}={level}, {seed}: {runs:?}"))
+        let is_it = |r: &&Value| r["factor"] == knob && r["level"] == level && r["seed"] == seed;
+        all.iter().find(is_it).unwrap_or_else(|| panic!("{knob}={level}, {seed}: {all:?}"))
     };
     for seed in 0..2 {
         let base = find("", "", seed);
         assert!(
             base["psnr"].as_f64() > Some(5.0) && base["ssim"].is_f64() && base["flip"].is_f64()
         );
-        assert!(base["stage_seconds"]["rasterize"].as_f64() > Some(0.0), "{base}");
         assert!(base["seconds"].as_f64() > Some(0.0) && base["ledger_bytes"].is_u64(), "{base}");
         // Exact knobs change nothing, others do.
         assert_eq!(find("tile_cap", "250", seed)["model"], base["model"]);
         assert_ne!(find("alpha_min", "1/32", seed)["model"], base["model"]);
-        assert_ne!(find("ssim_every", "2", seed)["model"], base["model"]);
+        assert_ne!(find("sh_degree", "1", seed)["model"], base["model"]);
     }
     assert_ne!(find("", "", 0)["model"], find("", "", 1)["model"], "the seeds do nothing");
     // All but the knob are as with the preset `exact`.
@@ -50,22 +44,10 @@ fn every_level_is_measured_once_and_in_the_table() {
         (&changed["preset"], &changed["knob"]["alpha_min"]),
         (&"exact".into(), &"1/32".into())
     );
-    let images = of("image");
-    let psnr = |knob: &str, level: &str| {
-        let image = images.iter().find(|r| is(r, knob, level));
-        image.unwrap_or_else(|| panic!("{knob}={level}"))["standard"].as_f64().expect("a number")
-    };
-    let exact = psnr("", "");
-    assert!(exact > 80.0, "{exact}");
-    assert_eq!(psnr("tile_cap", "250").to_bits(), exact.to_bits());
-    assert!(psnr("alpha_min", "1/32") < 60.0 && psnr("transmittance_stop", "1e-2") < exact);
-    assert!(images.iter().all(|r| r["knob"] != "ssim_every"), "it changes no image");
-
     let table = read_text(&output.join("trade.md"));
-    for words in ["--sh-degree 0", "2 of 2", "bounded", "(exact)", "pareto-", "rasterize"] {
+    for words in ["--sh-degree 0", "2 of 2", "pareto-"] {
         assert!(table.contains(words), "{words} is not in {table}");
     }
-    assert_eq!(said.contains("stand out; together"), table.contains("## Knobs together"));
     let picture = table.split("](").nth(1).and_then(|rest| rest.split(')').next());
     let picture = read(&output.join(picture.expect("a plot")));
     assert!(picture.starts_with(b"<svg"));
@@ -73,7 +55,7 @@ fn every_level_is_measured_once_and_in_the_table() {
     // Again: nothing runs, and nothing changes.
     let before = files(&output);
     let said = trade(scene.path(), &output, &call).ok().stdout;
-    assert!(said.matches("done before").count() >= 16 && !said.contains("float64"), "{said}");
+    assert_eq!(said.matches("done before").count(), 16, "{said}");
     assert!(before == files(&output), "a study that was complete has changed");
 }
 

@@ -180,23 +180,17 @@ fn a_run_is_replaced_only_when_asked_and_as_a_whole() {
 }
 
 #[test]
-fn view_dependent_colour_steps_as_often_as_is_said() {
+fn view_dependent_colour_steps_as_often_as_the_policy_says() {
     let scene = Photographs::colmap_text();
     let trained = |flags: &str| {
         let (_root, run) = scratch();
-        let outcome = train(scene.path(), &run, 20, &format!("--budget 330 {flags}")).ok();
-        let sh_every = config(&run).get("sh_every").and_then(toml::Value::as_integer);
-        (model(&run, 20), sh_every, outcome.stdout.contains("gradients summed between steps"))
+        let flags = format!("--budget 330 --policy taming {flags}");
+        let outcome = train(scene.path(), &run, 20, &flags).ok();
+        (model(&run, 20), outcome.stdout.contains("gradients summed between steps"))
     };
-    let [plain, every, fourth] = ["", "--sh-every 1", "--sh-every 4"].map(trained);
-    assert_eq!((every.1, every.2), (Some(1), false));
-    assert_eq!((fourth.1, fourth.2), (Some(4), true));
-    assert_eq!((plain.1, plain.2), (None, false));
-    assert!(plain.0 == every.0 && plain.0 != fourth.0);
-    // The flag wins over the policy.
-    let taming = |flags: &str| trained(&format!("--policy taming {flags}"));
-    let [published, same, every] = ["", "--sh-every 16", "--sh-every 1"].map(taming);
-    assert!(published.2 && !every.2);
+    let [published, same, every] =
+        ["", "--policy-set taming.sh_every=16", "--policy-set taming.sh_every=1"].map(trained);
+    assert!(published.1 && !every.1);
     assert!(published.0 == same.0 && published.0 != every.0);
 }
 

@@ -1,6 +1,6 @@
 //! Measures rows in the training views: their weight, and whether their place is empty.
 
-use densify_policies::policy::{AuxColumn, AuxRequest, Signal};
+use densify_policies::policy::{AuxColumn, AuxRequest};
 use densify_scenegen::{Camera as RayCamera, GBuffer};
 use glam::DVec3;
 use rand_chacha::ChaCha8Rng;
@@ -52,13 +52,12 @@ impl Visibility {
             sample(&ground.truth.surface().triangles()).into_iter().map(|p| (p, 0)).collect();
         let mut visibility = Self {
             weights: vec![0.0; rows.len()],
-            peaks: Vec::new(),
+            peaks: vec![0.0; rows.len()],
             empty: vec![0; rows.len()],
             blended: (0.0, 0.0),
             samples: Vec::new(),
         };
-        let wanted = needs();
-        let request = wanted.aux.clone().unwrap_or_default();
+        let request = needs().aux.unwrap_or_default();
         for number in 0..views.count() {
             let name = views.name(number);
             let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
@@ -81,10 +80,6 @@ impl Visibility {
         }
         let enough = samples.into_iter().filter(|(_, views)| *views >= MIN_VIEWS);
         visibility.samples = enough.map(|(place, _)| place).collect();
-        let signals = backend.take_signals(wanted.signals)?;
-        // `needs` requests this signal.
-        visibility.peaks =
-            signals.get(Signal::FreshWeightMax).map(<[f32]>::to_vec).unwrap_or_default();
         Ok(visibility)
     }
 
@@ -115,14 +110,17 @@ impl Visibility {
             sh_degree: ground.sh_degree,
             request,
         })?;
-        backend.measure_weights(camera, ground.sh_degree)?;
         for (column, values) in output.columns {
-            let values = values.iter().map(|&value| f64::from(value));
+            let numbers = values.iter().map(|&value| f64::from(value));
             match column {
                 AuxColumn::WeightSum => {
-                    self.weights.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+                    self.weights.iter_mut().zip(numbers).for_each(|(sum, value)| *sum += value);
                 }
-                AuxColumn::PixelCount => self.blended.0 += values.sum::<f64>(),
+                AuxColumn::WeightMax => {
+                    let peaks = self.peaks.iter_mut().zip(values);
+                    peaks.for_each(|(peak, value)| *peak = peak.max(value));
+                }
+                AuxColumn::PixelCount => self.blended.0 += numbers.sum::<f64>(),
                 _ => {}
             }
         }
