@@ -10,6 +10,9 @@
 
 use std::ops::Range;
 
+use rayon::iter::Either;
+use rayon::prelude::*;
+
 use super::BLOCKS_PER_TASK;
 use super::simd::WIDTH;
 use crate::gaussians::sh_coefficients;
@@ -89,11 +92,17 @@ impl<T: Copy + Default> Blocks<T> {
     }
 
     /// The same, cut for the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize) -> Vec<BlockTask<'_, T>> {
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+    ) -> impl IndexedParallelIterator<Item = BlockTask<'_, T>>
+    where
+        T: Send,
+    {
         let stride = self.stride();
         let tasks = rows.div_ceil(WIDTH).div_ceil(BLOCKS_PER_TASK);
-        let parts = parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
-        parts.into_iter().map(|data| BlockTask { stride, data }).collect()
+        let parts = par_parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
+        parts.map(move |data| BlockTask { stride, data })
     }
 
     fn at(&self, row: usize, plane: usize) -> usize {
@@ -148,6 +157,18 @@ pub(super) fn parts<T>(buffer: &mut [T], per_task: usize, tasks: usize) -> Vec<&
         return (0..tasks).map(|_| Default::default()).collect();
     }
     buffer.chunks_mut(per_task).collect()
+}
+
+/// The same for the tasks of a region. Nothing is done for each until it runs.
+pub(super) fn par_parts<T: Send>(
+    buffer: &mut [T],
+    per_task: usize,
+    tasks: usize,
+) -> impl IndexedParallelIterator<Item = &mut [T]> {
+    if buffer.is_empty() {
+        return Either::Left((0..tasks).into_par_iter().map(|_| Default::default()));
+    }
+    Either::Right(buffer.par_chunks_mut(per_task))
 }
 
 /// Blocks that follow each other, to read.

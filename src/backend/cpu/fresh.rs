@@ -4,6 +4,8 @@
 //! it does in training; the image's gradient is zero. That is more than a forward pass alone would
 //! take, but weights are then the same to the bit as those of training.
 
+use rayon::prelude::*;
+
 use super::rasterize::DARK;
 use super::{BackendError, Camera, CpuBackend};
 
@@ -17,12 +19,14 @@ impl CpuBackend {
         let clock = std::mem::take(&mut self.clock);
         let frame = self.forward(camera, [0.0; 3], sh_degree, false);
         let measured = frame.map(|frame| {
-            for gradient in &mut self.gradient {
-                gradient.planes = [DARK; 5];
-            }
+            let Self { threads, gradient, .. } = self;
+            let tiles = gradient[..frame.grid.tiles()].par_iter_mut();
+            threads.install(|| {
+                threads.each("no gradient", tiles, |tile| tile.planes = [DARK; 5]);
+            });
             self.backward(&frame, self.signals.layout());
-            let Self { pool, signals, sums, visible, rows, .. } = self;
-            pool.install(|| signals.measure(*rows, sums, visible));
+            let Self { threads, signals, sums, visible, rows, .. } = self;
+            threads.install(|| signals.measure(threads, *rows, sums, visible));
         });
         self.clock = clock;
         measured

@@ -21,6 +21,7 @@ use super::blocks::parts;
 use super::rasterize::{DARK, TileCanvas, row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
+use super::threads::Threads;
 use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
 use window::{
@@ -119,6 +120,7 @@ impl LossBuffers {
     #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
+        threads: &Threads,
         arch: Arch,
         grid: &Grid,
         canvas: &[TileCanvas],
@@ -142,46 +144,36 @@ impl LossBuffers {
             let error_strips = [parts(ranking, strip, strips), parts(by_pixel, strip, strips)];
             let [mut ranking, mut by_pixel] = error_strips;
             let source = Source { grid, canvas, target, background, channel };
-            (e.par_chunks_mut(strip), y.par_chunks_mut(strip))
-                .into_par_iter()
-                .enumerate()
-                .for_each(|(i, (e, y))| {
-                    arch.dispatch(Lines { source, first: i * STRIP, stride, e, y });
-                });
+            let parts = (e.par_chunks_mut(strip), y.par_chunks_mut(strip));
+            let tasks = parts.into_par_iter().enumerate();
+            threads.each("loss lines", tasks, |(i, (e, y))| {
+                arch.dispatch(Lines { source, first: i * STRIP, stride, e, y });
+            });
             if l1_alone {
                 let scale = (1.0 - SSIM_WEIGHT) * (1.0 / samples as f32);
-                let parts: Vec<f64> = gradient
-                    .par_chunks_mut(grid.columns)
-                    .zip(e.par_chunks_mut(strip))
-                    .enumerate()
-                    .map(|(i, (tiles, e))| {
-                        let mask = target.mask.as_deref();
-                        let first = i * STRIP;
-                        arch.dispatch(Absolute {
-                            grid,
-                            channel,
-                            first,
-                            stride,
-                            e,
-                            scale,
-                            mask,
-                            tiles,
-                        })
-                    })
-                    .collect();
+                let tiles = gradient.par_chunks_mut(grid.columns);
+                let tasks = tiles.zip(e.par_chunks_mut(strip)).enumerate();
+                let parts = threads.collect("loss", tasks, |(i, (tiles, e))| {
+                    let mask = target.mask.as_deref();
+                    let first = i * STRIP;
+                    arch.dispatch(Absolute { grid, channel, first, stride, e, scale, mask, tiles })
+                });
                 l1 += parts.into_iter().sum::<f64>();
                 continue;
             }
-            let sums: Vec<LossValue> = (
+            let parts = (
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),
                 p3.par_chunks_mut(strip),
                 ranking.par_iter_mut(),
                 by_pixel.par_iter_mut(),
-            )
-                .into_par_iter()
-                .enumerate()
-                .map_init(Vec::new, |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
+            );
+            let tasks = parts.into_par_iter().enumerate();
+            let sums = threads.collect_with(
+                "loss similarity",
+                tasks,
+                Vec::new,
+                |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
                     arch.dispatch(Similarity {
                         grid,
                         first: i * STRIP,
@@ -193,44 +185,43 @@ impl LossBuffers {
                         errors: [ranking, by_pixel],
                         error_weights: error_weights.map(|weights| weights.map(|w| w / 3.0)),
                     })
-                })
-                .collect();
+                },
+            );
             for part in sums {
                 l1 += part.l1;
                 ssim += part.ssim;
             }
             let [e, y, p1, p2, p3] = &self.planes;
-            gradient.par_chunks_mut(grid.columns).enumerate().for_each_init(
-                Vec::new,
-                |scratch, (i, tiles)| {
-                    arch.dispatch(Gradient {
-                        grid,
-                        channel,
-                        first: i * STRIP,
-                        stride,
-                        scratch,
-                        e,
-                        y,
-                        derivatives: [p1, p2, p3],
-                        scale: 1.0 / samples as f32,
-                        ssim_weight,
-                        mask: target.mask.as_deref(),
-                        tiles,
-                    });
-                },
-            );
+            let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
+            threads.each_with("loss gradient", tasks, Vec::new, |scratch, (i, tiles)| {
+                arch.dispatch(Gradient {
+                    grid,
+                    channel,
+                    first: i * STRIP,
+                    stride,
+                    scratch,
+                    e,
+                    y,
+                    derivatives: [p1, p2, p3],
+                    scale: 1.0 / samples as f32,
+                    ssim_weight,
+                    mask: target.mask.as_deref(),
+                    tiles,
+                });
+            });
         }
         if by_pixel {
-            self.spread_over_tiles(grid, gradient);
+            self.spread_over_tiles(threads, grid, gradient);
         }
         let ssim = if ssim_weight == 0.0 { f64::NAN } else { ssim / samples };
         LossValue { l1: l1 / samples, ssim }
     }
 
     /// Writes the second error to the last plane of the gradient.
-    fn spread_over_tiles(&self, grid: &Grid, gradient: &mut [TileGradient]) {
+    fn spread_over_tiles(&self, threads: &Threads, grid: &Grid, gradient: &mut [TileGradient]) {
         let stride = self.stride;
-        gradient.par_chunks_mut(grid.columns).enumerate().for_each(|(i, tiles)| {
+        let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
+        threads.each("loss by pixel", tasks, |(i, tiles)| {
             for tile in tiles.iter_mut() {
                 tile.planes[4] = DARK;
             }
