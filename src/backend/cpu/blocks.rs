@@ -10,10 +10,10 @@
 
 use std::ops::Range;
 
-use rayon::iter::Either;
 use rayon::prelude::*;
 
 use super::BLOCKS_PER_TASK;
+use super::parts::parts;
 use super::simd::WIDTH;
 use crate::gaussians::sh_coefficients;
 
@@ -101,8 +101,8 @@ impl<T: Copy + Default> Blocks<T> {
     {
         let stride = self.stride();
         let tasks = rows.div_ceil(WIDTH).div_ceil(BLOCKS_PER_TASK);
-        let parts = par_parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
-        parts.map(move |data| BlockTask { stride, data })
+        let parts = parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
+        parts.par().map(move |data| BlockTask { stride, data })
     }
 
     fn at(&self, row: usize, plane: usize) -> usize {
@@ -149,26 +149,6 @@ impl<T: Copy + Default> Blocks<T> {
             }
         }
     }
-}
-
-/// Cuts a buffer for so many tasks; a buffer of nothing has nothing for each.
-pub(super) fn parts<T>(buffer: &mut [T], per_task: usize, tasks: usize) -> Vec<&mut [T]> {
-    if buffer.is_empty() {
-        return (0..tasks).map(|_| Default::default()).collect();
-    }
-    buffer.chunks_mut(per_task).collect()
-}
-
-/// The same for the tasks of a region. Nothing is done for each until it runs.
-pub(super) fn par_parts<T: Send>(
-    buffer: &mut [T],
-    per_task: usize,
-    tasks: usize,
-) -> impl IndexedParallelIterator<Item = &mut [T]> {
-    if buffer.is_empty() {
-        return Either::Left((0..tasks).into_par_iter().map(|_| Default::default()));
-    }
-    Either::Right(buffer.par_chunks_mut(per_task))
 }
 
 /// Blocks that follow each other, to read.

@@ -24,6 +24,7 @@ mod observe;
 mod optimise;
 mod options;
 mod parameters;
+mod parts;
 mod passes;
 mod project;
 mod project_bwd;

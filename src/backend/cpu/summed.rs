@@ -11,7 +11,8 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, par_parts, plane};
+use super::blocks::{BlockTask, Blocks, plane};
+use super::parts::parts;
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
 
@@ -106,7 +107,7 @@ impl Summed {
         let Self { first, sums, rest_ages, .. } = self;
         let first = *first;
         let aged = rest_ages.len().min(rows.next_multiple_of(WIDTH));
-        let ages = par_parts(&mut rest_ages[..aged], ROWS_PER_TASK, tasks);
+        let ages = parts(&mut rest_ages[..aged], ROWS_PER_TASK, tasks).par();
         sums.tasks(rows).zip(ages).map(move |(sums, rest_ages)| TaskSums { first, sums, rest_ages })
     }
 

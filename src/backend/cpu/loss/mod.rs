@@ -17,7 +17,7 @@ mod window;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::blocks::parts;
+use super::parts::{Parts, parts};
 use super::rasterize::{DARK, TileCanvas, row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
@@ -142,7 +142,7 @@ impl LossBuffers {
             let strips = grid.height.div_ceil(STRIP);
             let [ranking, by_pixel] = &mut self.errors;
             let error_strips = [parts(ranking, strip, strips), parts(by_pixel, strip, strips)];
-            let [mut ranking, mut by_pixel] = error_strips;
+            let [ranking, by_pixel] = error_strips.map(Parts::par);
             let source = Source { grid, canvas, target, background, channel };
             let parts = (e.par_chunks_mut(strip), y.par_chunks_mut(strip));
             let tasks = parts.into_par_iter().enumerate();
@@ -165,8 +165,8 @@ impl LossBuffers {
                 p1.par_chunks_mut(strip),
                 p2.par_chunks_mut(strip),
                 p3.par_chunks_mut(strip),
-                ranking.par_iter_mut(),
-                by_pixel.par_iter_mut(),
+                ranking,
+                by_pixel,
             );
             let tasks = parts.into_par_iter().enumerate();
             let sums = threads.collect_with(
