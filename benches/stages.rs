@@ -7,66 +7,17 @@
 
 #![expect(clippy::print_stdout, reason = "its output is a table")]
 
+mod steps;
+
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
 use densify::backend::cpu::{CpuBackend, CpuOptions};
 use densify::backend::gpu::{GpuBackend, GpuDevice, adapters};
-use densify::backend::{
-    AdapterChoice, AdapterKind, Backend, BackendError, BackendOptions, LearningRates, StepInput,
-};
-use densify::camera::Camera;
-use densify::dataset::images::Image8;
-use densify::gaussians::{Gaussians, sh_coefficients};
-use densify_policies::policy::Cadence;
-use glam::{DMat3, DVec3};
+use densify::backend::{AdapterChoice, AdapterKind, Backend, BackendError, BackendOptions};
 use pulp::{Arch, Simd, WithSimd};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-
-/// A random cloud in front of the camera. Gaussians are smaller the more there are, so that the number of
-/// tile entries per row is that of a trained scene: about 3 at 10,000 rows and 256², 2.7 at 50,000
-/// rows and 512².
-fn scene(rows: usize, sh_degree: u8) -> Gaussians {
-    let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
-    let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
-    let size = 0.0222 * (10_000.0 / rows as f32).powf(0.5);
-    let mut model = Gaussians { sh_degree, ..Gaussians::default() };
-    for _ in 0..rows {
-        model.means.push([0, 1, 2].map(|_| uniform(-1.0, 1.0)));
-        model.log_scales.push([0, 1, 2].map(|_| (size * uniform(0.3, 1.5)).ln()));
-        model.quats.push([0, 1, 2, 3].map(|_| uniform(-1.0, 1.0)));
-        model.opacity_logits.push(uniform(-2.0, 2.5));
-        model.sh.extend((0..3 * sh_coefficients(sh_degree)).map(|_| uniform(-0.3, 0.5)));
-    }
-    model
-}
-
-fn camera(size: u32) -> Camera {
-    let f = f64::from(size);
-    Camera {
-        width: size,
-        height: size,
-        fx: f,
-        fy: f,
-        cx: 0.5 * f,
-        cy: 0.5 * f,
-        rotation: DMat3::IDENTITY,
-        translation: DVec3::new(0.0, 0.0, 3.0),
-    }
-}
-
-fn target(size: u32) -> Image8 {
-    let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let rgb = (0..3 * size * size).map(|_| rng.random::<u8>()).collect();
-    Image8 { width: size, height: size, rgb, alpha: None, mask: None }
-}
-
-fn median(mut times: Vec<Duration>) -> f64 {
-    times.sort();
-    times[times.len() / 2].as_secs_f64() * 1e3
-}
+use steps::{median, ms};
 
 /// Multiply-adds on twelve independent vectors: 1.5 times as many as two units of latency four need.
 struct MultiplyAdds {
@@ -111,15 +62,6 @@ fn peak() -> (f64, f64) {
     rates
 }
 
-const RATES: LearningRates = LearningRates {
-    mean: 1e-6,
-    log_scale: 1e-6,
-    quat: 1e-6,
-    opacity: 1e-6,
-    sh_dc: 1e-6,
-    sh_rest: 1e-6,
-};
-
 /// Prints a line with medians over all steps but the first two.
 fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u32, on: &str) {
     let mut backend = match backend {
@@ -129,23 +71,13 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
             return;
         }
     };
-    let (camera, target) = (camera(size), target(size));
+    let (camera, target) = (steps::camera(size), steps::target(size));
     let (mut cpu, mut wall) = (Vec::new(), Vec::new());
     let mut stages: Vec<Vec<Duration>> = Vec::new();
-    let steps = (6_000_000 / rows).clamp(7, 60) as u32;
+    let steps = steps::count(rows);
     let mut entries = 0;
     for step in 1..=steps {
-        let input = StepInput {
-            step,
-            view: 0,
-            camera: &camera,
-            target: &target,
-            background: [0.0; 3],
-            sh_degree: 3,
-            rates: RATES,
-            cadence: Cadence::default(),
-            seed: 1,
-        };
+        let input = steps::input(step, &camera, &target);
         let (start, cpu_start) = (Instant::now(), ProcessTime::now());
         match backend.train_step(&input) {
             Ok(output) => entries = output.entries,
@@ -164,12 +96,12 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
         .stage_times()
         .iter()
         .zip(stages)
-        .map(|(&(name, _), times)| format!("{name} {:.2}", median(times)))
+        .map(|(&(name, _), times)| format!("{name} {:.2}", ms(median(times))))
         .collect();
     println!(
         "{rows:7} {size:5}² {entries:9} {on:>10} {:7.2} {:8.2}  {}",
-        median(cpu),
-        median(wall),
+        ms(median(cpu)),
+        ms(median(wall)),
         line.join(", ")
     );
 }
@@ -203,7 +135,7 @@ fn main() {
         if !only.is_empty() && !only.contains(&format!("{rows}@{size}")) {
             continue;
         }
-        let model = scene(rows, 3);
+        let model = steps::scene(rows, 3);
         for threads in [1, 2] {
             let options = CpuOptions {
                 threads: Some(threads),

@@ -1,6 +1,7 @@
 //! The list of candidates for new rows, the same for every backend: the worst pixels of a view
 //! (*Gaussians on a Diet*, arXiv 2604.20046, "compensation").
 
+use std::cmp::Ordering;
 use std::collections::HashMap;
 
 use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
@@ -12,9 +13,11 @@ use super::{StateError, Tensor};
 pub(super) struct Candidates {
     request: Option<CandidateRequest>,
     list: Vec<Candidate>,
-    /// (error, pixel) of one view.
-    ranking: Vec<(f32, u32)>,
+    ranking: Vec<Ranked>,
 }
+
+/// Error and number of a pixel of one view.
+pub(super) type Ranked = (f32, u32);
 
 /// Pixels ranked beyond those wanted, so that enough remain after spacing.
 const SPARE: usize = 16;
@@ -29,7 +32,7 @@ impl Candidates {
 
     /// Bytes of the list, and of the ranking of an image of so many pixels.
     pub(super) fn bytes(request: Option<CandidateRequest>, pixels: usize) -> u64 {
-        let ranking = pixels * size_of::<(f32, u32)>();
+        let ranking = pixels * size_of::<Ranked>();
         request.map_or(0, |r| (r.capacity * size_of::<Candidate>() + ranking) as u64)
     }
 
@@ -97,15 +100,18 @@ impl Candidates {
         spaced: bool,
         error: impl Fn(usize, usize) -> Option<f32>,
     ) -> Vec<(usize, usize, f32)> {
-        self.ranking.clear();
-        for y in 0..height {
-            for x in 0..width {
-                if let Some(e) = error(x, y).filter(|&e| e > 0.0) {
-                    self.ranking.push((e, (y * width + x) as u32));
+        let rank = |ranking: &mut Vec<Ranked>, _| {
+            ranking.clear();
+            for y in 0..height {
+                for x in 0..width {
+                    if let Some(e) = error(x, y).filter(|&e| e > 0.0) {
+                        ranking.push((e, (y * width + x) as u32));
+                    }
                 }
             }
-        }
-        self.worst_ranked([width, height], count, spaced, error)
+            ranking.len()
+        };
+        self.worst_by([width, height], count, spaced, rank, &error)
     }
 
     /// The same, where the pixels that may be among them are known, and their errors: at least
@@ -118,28 +124,32 @@ impl Candidates {
         spaced: bool,
         known: impl IntoIterator<Item = (f32, u32)>,
     ) -> Vec<(usize, usize, f32)> {
-        self.ranking.clear();
-        self.ranking.extend(known);
-        let errors: HashMap<u32, f32> = self.ranking.iter().map(|&(e, pixel)| (pixel, e)).collect();
+        let known: Vec<Ranked> = known.into_iter().collect();
+        let errors: HashMap<u32, f32> = known.iter().map(|&(e, pixel)| (pixel, e)).collect();
         // What is not known is less.
         let error = |x: usize, y: usize| errors.get(&((y * size[0] + x) as u32)).copied();
-        self.worst_ranked(size, count, spaced, error)
+        let rank = |ranking: &mut Vec<Ranked>, _| {
+            *ranking = known;
+            ranking.len()
+        };
+        self.worst_by(size, count, spaced, rank, error)
     }
 
-    fn worst_ranked(
+    /// The same, where `rank(list, n)` writes pixels to the head of the list, the `n` worst among them,
+    /// and returns how many.
+    pub(super) fn worst_by(
         &mut self,
         [width, height]: [usize; 2],
         count: usize,
         spaced: bool,
+        rank: impl FnOnce(&mut Vec<Ranked>, usize) -> usize,
         error: impl Fn(usize, usize) -> Option<f32>,
     ) -> Vec<(usize, usize, f32)> {
-        let worse = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
         let ranked = ranked(count, spaced);
-        if self.ranking.len() > ranked {
-            self.ranking.select_nth_unstable_by(ranked, worse);
-            self.ranking.truncate(ranked);
-        }
-        self.ranking.sort_unstable_by(worse);
+        let held = rank(&mut self.ranking, ranked);
+        let kept = keep_worst(&mut self.ranking[..held], ranked);
+        let ranking = &mut self.ranking[..kept];
+        ranking.sort_unstable_by(worse);
         let is_peak = |e: f32, pixel: u32| {
             let (x, y) = (pixel as usize % width, pixel as usize / width);
             let (x0, x1) = (x.saturating_sub(1), (x + 1).min(width - 1));
@@ -151,13 +161,26 @@ impl Candidates {
                 })
             })
         };
-        self.ranking
+        ranking
             .iter()
             .filter(|&&(e, pixel)| !spaced || is_peak(e, pixel))
             .take(count)
             .map(|&(e, pixel)| (pixel as usize % width, pixel as usize / width, e))
             .collect()
     }
+}
+
+/// A larger error comes first; of equal ones, the pixel with the lower number.
+fn worse(a: &Ranked, b: &Ranked) -> Ordering {
+    b.0.total_cmp(&a.0).then(a.1.cmp(&b.1))
+}
+
+/// Brings the `most` worst to the head, in any order; returns how many they are.
+pub(super) fn keep_worst(ranking: &mut [Ranked], most: usize) -> usize {
+    if ranking.len() > most {
+        ranking.select_nth_unstable_by(most, worse);
+    }
+    ranking.len().min(most)
 }
 
 /// How many of the worst pixels are looked at for `count` candidates.

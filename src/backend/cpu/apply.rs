@@ -10,6 +10,7 @@ use super::moments::Moments;
 use super::parameters::Parameters;
 use super::signals::Accumulators;
 use super::summed::Summed;
+use super::threads::Threads;
 use crate::gaussians::{logit, rgb_to_dc, sigmoid};
 
 /// The buffers that are re-indexed together.
@@ -19,6 +20,7 @@ pub(super) struct Model<'a> {
     pub(super) ages: &'a mut [u16],
     pub(super) signals: &'a mut Accumulators,
     pub(super) summed: &'a mut Summed,
+    pub(super) threads: &'a Threads,
 }
 
 /// Executes `ops`; the order and the invariants are those of [`RowOps`].
@@ -56,7 +58,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
         }
     }
     if ops.reset_signals {
-        model.signals.reset(ops.rows_after);
+        model.signals.reset(model.threads, ops.rows_after);
     }
 }
 

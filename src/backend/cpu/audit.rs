@@ -1,10 +1,8 @@
 //! Finds rows with a number that is not finite; see [`audit`](crate::backend::audit).
 
-use rayon::prelude::*;
-
-use super::CpuBackend;
 use super::blocks::{Scratch, planes};
 use super::simd::WIDTH;
+use super::{BLOCKS_PER_TASK, CpuBackend};
 use crate::backend::{Attribute, Kept, Unsound};
 
 impl CpuBackend {
@@ -22,20 +20,20 @@ impl CpuBackend {
                 .or_else(|| first(&|plane| self.moments.get(row, plane)[0], Kept::Moment))
                 .or_else(|| first(&|plane| self.moments.get(row, plane)[1], Kept::Moment))
         };
-        self.pool.install(|| {
-            (0..rows.div_ceil(WIDTH))
-                .into_par_iter()
-                .filter(|&b| {
-                    let mut scratch = [Scratch::ZERO; 2];
-                    if !is_sound(params.open(b, planes, &mut scratch[0])) {
-                        return true;
-                    }
-                    let both = moments.open(b, planes, &mut scratch);
-                    !both.into_iter().all(is_sound)
-                })
-                .flat_map_iter(|b| (b * WIDTH..rows.min((b + 1) * WIDTH)).filter_map(find))
-                .collect()
-        })
+        let blocks = rows.div_ceil(WIDTH);
+        let is_suspect = |block: usize| {
+            let mut scratch = [Scratch::ZERO; 2];
+            !is_sound(params.open(block, planes, &mut scratch[0]))
+                || !moments.open(block, planes, &mut scratch).into_iter().all(is_sound)
+        };
+        let of_task = |task: usize| -> Vec<Unsound> {
+            let blocks = task * BLOCKS_PER_TASK..blocks.min((task + 1) * BLOCKS_PER_TASK);
+            let suspects = blocks.filter(|&block| is_suspect(block));
+            suspects.flat_map(|b| b * WIDTH..rows.min((b + 1) * WIDTH)).filter_map(find).collect()
+        };
+        let tasks = 0..blocks.div_ceil(BLOCKS_PER_TASK);
+        let found = self.threads.install(|| self.threads.collect("audit", tasks, of_task));
+        found.into_iter().flatten().collect()
     }
 }
 

@@ -10,7 +10,10 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
+
 use super::BLOCKS_PER_TASK;
+use super::parts::parts;
 use super::simd::WIDTH;
 use crate::gaussians::sh_coefficients;
 
@@ -89,11 +92,17 @@ impl<T: Copy + Default> Blocks<T> {
     }
 
     /// The same, cut for the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize) -> Vec<BlockTask<'_, T>> {
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+    ) -> impl IndexedParallelIterator<Item = BlockTask<'_, T>>
+    where
+        T: Send,
+    {
         let stride = self.stride();
         let tasks = rows.div_ceil(WIDTH).div_ceil(BLOCKS_PER_TASK);
         let parts = parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
-        parts.into_iter().map(|data| BlockTask { stride, data }).collect()
+        parts.par().map(move |data| BlockTask { stride, data })
     }
 
     fn at(&self, row: usize, plane: usize) -> usize {
@@ -147,14 +156,6 @@ impl<T: Copy + Default> Blocks<T> {
             }
         }
     }
-}
-
-/// Cuts a buffer for so many tasks; a buffer of nothing has nothing for each.
-pub(super) fn parts<T>(buffer: &mut [T], per_task: usize, tasks: usize) -> Vec<&mut [T]> {
-    if buffer.is_empty() {
-        return (0..tasks).map(|_| Default::default()).collect();
-    }
-    buffer.chunks_mut(per_task).collect()
 }
 
 /// Blocks that follow each other, to read.

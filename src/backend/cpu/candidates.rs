@@ -9,13 +9,63 @@ use std::sync::atomic::AtomicU64;
 
 use densify_policies::policy::DepthMode;
 use glam::{Quat, Vec3};
+use rayon::prelude::*;
 
 use super::blocks::plane;
 use super::parameters::Parameters;
 use super::project::{Splat, ViewParams};
 use super::rasterize::ALPHA_MAX;
+use super::threads::Threads;
 use super::tiles::Entry;
 use crate::backend::Shortcuts;
+use crate::backend::candidates::{Ranked, keep_worst};
+
+/// Image rows that one task ranks.
+const LINES: usize = 2;
+/// Lists that one task makes into one.
+const LISTS: usize = 8;
+
+/// Writes the `most` worst pixels of an image to the head of `ranking`, in any order; returns how many
+/// they are. Each task keeps its own worst, and these are joined until one list is left.
+pub(super) fn rank(
+    threads: &Threads,
+    ranking: &mut Vec<Ranked>,
+    [width, height]: [usize; 2],
+    most: usize,
+    error: impl Fn(usize, usize) -> Option<f32> + Send + Sync,
+) -> usize {
+    let pixels = width * height;
+    if ranking.len() < pixels {
+        ranking.resize(pixels, (0.0, 0));
+    }
+    let ranking = &mut ranking[..pixels];
+    let mut part = LINES * width.max(1);
+    let tasks = ranking.par_chunks_mut(part).enumerate();
+    let mut kept = threads.collect("rank", tasks, |(task, ranking)| {
+        let mut found = 0;
+        for at in 0..ranking.len() {
+            let (x, y) = (at % width, task * LINES + at / width);
+            if let Some(error) = error(x, y).filter(|&error| error > 0.0) {
+                ranking[found] = (error, (y * width + x) as u32);
+                found += 1;
+            }
+        }
+        keep_worst(&mut ranking[..found], most)
+    });
+    while kept.len() > 1 {
+        let tasks = ranking.par_chunks_mut(LISTS * part).zip(kept.par_chunks(LISTS));
+        kept = threads.collect("rank", tasks, |(ranking, kept)| {
+            let mut found = 0;
+            for (i, &kept) in kept.iter().enumerate() {
+                ranking.copy_within(i * part..i * part + kept, found);
+                found += kept;
+            }
+            keep_worst(&mut ranking[..found], most)
+        });
+        part *= LISTS;
+    }
+    kept.first().copied().unwrap_or(0)
+}
 
 /// The row that stands for the surface at pixel centre `at`: the one with the largest blend weight
 /// or the one at which half the light is gone.
@@ -75,4 +125,41 @@ pub(super) fn closest_approach(
     let offset = turn * (centre - mean) / scale;
     let depth = -direction.dot(offset) / direction.length_squared();
     (depth.is_finite() && depth > view.near).then(|| (centre + ray * depth, depth))
+}
+
+#[cfg(test)]
+mod tests {
+    use densify_policies::policy::{CandidateRequest, ErrorMode};
+
+    use super::*;
+    use crate::backend::candidates::Candidates;
+
+    /// Of images of one line, of a few tasks, and of several rounds; with equal errors.
+    #[test]
+    fn the_worst_are_those_of_a_list_of_all() {
+        let threads = Threads::new(Some(2)).expect("threads");
+        let request = CandidateRequest {
+            from: 0,
+            until: 1,
+            rows_per_candidate: 1,
+            capacity: 1,
+            error: ErrorMode::L1,
+            depth: DepthMode::Median,
+            min_alpha: 0.0,
+            spaced: true,
+        };
+        for size in [[7, 1], [5, 6], [31, 150]] {
+            let error = |x: usize, y: usize| {
+                let hash = (x * 31 + y * 57) * 7919 % 97;
+                (hash != 5).then_some(hash as f32 - 10.0)
+            };
+            for (count, spaced) in [(1, true), (3, false), (40, true), (9999, false)] {
+                let [mut all, mut some] = [(); 2].map(|()| Candidates::new(Some(request)));
+                let rank = |ranking: &mut Vec<_>, most| rank(&threads, ranking, size, most, error);
+                let expected = all.worst(size[0], size[1], count, spaced, error);
+                assert!(!expected.is_empty());
+                assert_eq!(some.worst_by(size, count, spaced, rank, error), expected);
+            }
+        }
+    }
 }

@@ -27,7 +27,7 @@ impl Differentiable for CpuBackend {
         }
         let frame = self.forward(camera, background, sh_degree, true)?;
         let rendering = self.rendering(&frame);
-        for (tile, gradient) in self.gradient.iter_mut().enumerate() {
+        for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
             gradient.planes = [DARK; 5];
             for_each_pixel(&frame.grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
@@ -64,7 +64,7 @@ impl Differentiable for CpuBackend {
             "rendering and target differ in size"
         );
         self.resize_images(&grid);
-        for (tile, canvas) in self.canvas.iter_mut().enumerate() {
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter_mut().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
                     canvas.planes[channel][patch][lane] = rendering.rgb[3 * at + channel];
@@ -73,7 +73,7 @@ impl Differentiable for CpuBackend {
         }
         let value = self.image_loss(&grid, target, background, ImageTerms::default());
         let mut gradient = vec![0.0; rendering.rgb.len()];
-        for (tile, from) in self.gradient.iter().enumerate() {
+        for (tile, from) in self.gradient[..grid.tiles()].iter().enumerate() {
             for_each_pixel(&grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
                     gradient[3 * at + channel] = from.planes[channel][patch][lane];

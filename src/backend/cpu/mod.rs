@@ -24,6 +24,7 @@ mod optimise;
 mod options;
 mod order;
 mod parameters;
+mod parts;
 mod passes;
 mod project;
 mod project_bwd;
@@ -36,9 +37,11 @@ mod simd;
 mod stage_clock;
 mod state;
 mod summed;
+mod threads;
 mod tiles;
 
 use std::ops::Range;
+use std::sync::Arc;
 use std::sync::atomic::AtomicU32;
 use std::time::Duration;
 
@@ -71,23 +74,26 @@ use signals::Accumulators;
 use simd::WIDTH;
 use stage_clock::StageClock;
 use summed::Summed;
+use threads::Threads;
 use tiles::TileLists;
 
 pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
 pub use options::CpuOptions;
+pub use threads::StepTasks;
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.
 const MAX_SIDE: u32 = 16_384;
-/// Blocks per task: 256 rows, about a megabyte of parameters and moments at degree 3.
-const BLOCKS_PER_TASK: usize = 16;
+/// Blocks per task: 128 rows, a hundred kilobytes of parameters and moments at degree 3. Of 50,000 rows
+/// that is six tasks for each of 64 threads.
+const BLOCKS_PER_TASK: usize = 8;
 const ROWS_PER_TASK: usize = BLOCKS_PER_TASK * WIDTH;
 
 /// The native backend.
 #[derive(Debug)]
 pub struct CpuBackend {
     arch: Arch,
-    pool: rayon::ThreadPool,
+    threads: Arc<Threads>,
     ledger: Ledger,
     budget: usize,
     rows: usize,
@@ -141,12 +147,8 @@ impl CpuBackend {
     pub fn new(model: &Gaussians, options: &CpuOptions) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(options.threads.unwrap_or(0))
-            .thread_name(|i| format!("densify-{i}"))
-            .build()
-            .map_err(|error| BackendError::Threads(error.to_string()))?;
-        let ledger = budget::ledger(model.sh_degree, options, pool.current_num_threads());
+        let threads = Threads::new(options.threads)?;
+        let ledger = budget::ledger(model.sh_degree, options, threads.count());
         budget::reserve(&ledger)?;
         let signals = Accumulators::new(budget, &options.needs);
         let (stride, sums) = (signals.layout().stride(), signals.sums());
@@ -158,7 +160,7 @@ impl CpuBackend {
         params.pack(model);
         Ok(Self {
             arch: options.instructions.arch(),
-            pool,
+            threads: Arc::new(threads),
             ledger,
             budget,
             rows: model.len(),
@@ -186,6 +188,44 @@ impl CpuBackend {
             clock: StageClock::default(),
         })
     }
+
+    /// Records what the tasks of training steps take, from now on. Only on one thread: several would
+    /// slow each other down.
+    ///
+    /// # Panics
+    /// When the backend has more than one thread.
+    pub fn record_tasks(&mut self) {
+        self.threads.record();
+    }
+
+    /// The tasks of the last training step; none unless they are [recorded](Self::record_tasks).
+    #[must_use]
+    pub fn recorded_tasks(&self) -> StepTasks {
+        self.threads.recorded()
+    }
+
+    /// One training step, on a thread of the pool.
+    fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        let StepInput { camera, target, background, .. } = *input;
+        let frame = self.forward(camera, background, input.sh_degree, false)?;
+        let picks = self.candidates.open(input.step, self.rows);
+        let weights = picks.and_then(|(request, _)| error_weights(request.error));
+        let by_pixel = self.signals.layout().has(Field::Error);
+        let terms = ImageTerms { error: weights, by_pixel };
+        let value = self.image_loss(&frame.grid, target, background, terms);
+        if let Some((request, count)) = picks {
+            self.collect_candidates(&frame, target, &request, count);
+        }
+        self.backward(&frame, self.signals.layout());
+        self.optimise(&frame, input);
+        self.clock.lap("project_bwd + adam");
+        Ok(StepOutput {
+            visible: frame.visible,
+            entries: frame.entries,
+            bands: frame.bands.len() as u32,
+            ..scalars(value)
+        })
+    }
 }
 
 impl Backend for CpuBackend {
@@ -206,34 +246,18 @@ impl Backend for CpuBackend {
     }
 
     fn begin_epoch(&mut self) {
-        self.signals.begin_epoch(self.rows);
+        self.signals.begin_epoch(&self.threads, self.rows);
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, .. } = *input;
+        let StepInput { camera, target, .. } = *input;
         assert_eq!(
             (camera.width, camera.height),
             (target.width, target.height),
             "camera and image differ in size"
         );
-        let frame = self.forward(camera, background, input.sh_degree, false)?;
-        let picks = self.candidates.open(input.step, self.rows);
-        let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let by_pixel = self.signals.layout().has(Field::Error);
-        let terms = ImageTerms { error: weights, by_pixel };
-        let value = self.image_loss(&frame.grid, target, background, terms);
-        if let Some((request, count)) = picks {
-            self.collect_candidates(&frame, target, &request, count);
-        }
-        self.backward(&frame, self.signals.layout());
-        self.optimise(&frame, input);
-        self.clock.lap("project_bwd + adam");
-        let output = StepOutput {
-            visible: frame.visible,
-            entries: frame.entries,
-            bands: frame.bands.len() as u32,
-            ..scalars(value)
-        };
+        let threads = Arc::clone(&self.threads);
+        let output = threads.step(|| self.step(input))?;
         #[cfg(test)]
         let output = sabotage::spoilt_output(output);
         Ok(output)
@@ -247,7 +271,7 @@ impl Backend for CpuBackend {
         // The sums are not used between two steps.
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::within(memory, self.rows, wanted);
-        self.signals.read(&mut signals, wanted, &self.params, &self.ages);
+        self.signals.read(&self.threads, &mut signals, wanted, &self.params, &self.ages);
         Ok(signals)
     }
 
@@ -275,6 +299,7 @@ impl Backend for CpuBackend {
             ages: &mut self.ages,
             signals: &mut self.signals,
             summed: &mut self.summed,
+            threads: &self.threads,
         };
         apply::apply(&mut model, ops, &PolicyRng::new(seed, step));
         self.rows = ops.rows_after;
@@ -286,9 +311,9 @@ impl Backend for CpuBackend {
 
     fn sort_rows(&mut self) {
         self.have_sums(self.signals.layout());
-        let Self { pool, params, moments, ages, signals, summed, sums, rows, .. } = self;
-        let mut model = apply::Model { params, moments, ages, signals, summed };
-        pool.install(|| order::sort(&mut model, *rows, sums));
+        let Self { threads, params, moments, ages, signals, summed, sums, rows, .. } = self;
+        let mut model = apply::Model { threads, params, moments, ages, signals, summed };
+        threads.install(|| order::sort(&mut model, *rows, sums));
     }
 
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {

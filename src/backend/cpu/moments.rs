@@ -7,6 +7,8 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
+
 use super::blocks::{BlockTask, BlockView, Blocks, Scratch};
 use super::narrow::{Draws, F8, Narrow, first_moment, first_moments, narrow, ratios, widen};
 use super::simd::WIDTH;
@@ -107,18 +109,19 @@ impl Moments {
     }
 
     /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize) -> Vec<MomentTask<'_>> {
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+    ) -> impl IndexedParallelIterator<Item = MomentTask<'_>> {
         let is_narrow = self.is_narrow();
-        let [first, second] = &mut self.wide;
-        let wide = first.tasks(rows).into_iter().zip(second.tasks(rows));
-        let narrow = self.ratios.tasks(rows).into_iter().zip(self.seconds.tasks(rows));
-        let task = |((first, second), (ratios, seconds))| MomentTask {
+        let Self { wide: [first, second], ratios, seconds } = self;
+        let all = (first.tasks(rows), second.tasks(rows), ratios.tasks(rows), seconds.tasks(rows));
+        all.into_par_iter().map(move |(first, second, ratios, seconds)| MomentTask {
             is_narrow,
             wide: [first, second],
             ratios,
             seconds,
-        };
-        wide.zip(narrow).map(task).collect()
+        })
     }
 
     /// The first (0) or second (1) moments of some rows, as they are stored: numbers; or ratios in

@@ -5,18 +5,17 @@
 //! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
 //! map the plane of the image gradient that belongs to alpha.
 
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, DepthMode, PixelMap};
 use pulp::{Simd, WithSimd};
-use rayon::prelude::*;
 
 use super::batch::{BATCH, Batch, CORNER_X, CORNER_Y, LANE_X, LANE_Y};
 use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
 use super::rasterize::{ALPHA_MAX, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace};
-use super::records::{TileRecords, parts};
+use super::records::{Sums, TileRecords, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
@@ -78,7 +77,7 @@ impl CpuBackend {
         }
         let grid = &frame.grid;
         let mut alpha = vec![0.0; grid.width * grid.height];
-        for (tile, canvas) in self.canvas.iter().enumerate() {
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
             for_each_pixel(grid, tile, |patch, lane, at| {
                 alpha[at] = 1.0 - canvas.planes[TRANSMITTANCE][patch][lane];
             });
@@ -90,13 +89,13 @@ impl CpuBackend {
     /// Writes the pixel map to its plane.
     fn write_map(&mut self, grid: &Grid, target: &Image8, background: [f32; 3], map: PixelMap) {
         let mut rgb = vec![[0.0; 3]; grid.width * grid.height];
-        for (tile, canvas) in self.canvas.iter().enumerate() {
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
             for_each_pixel(grid, tile, |patch, lane, at| {
                 rgb[at] = [0, 1, 2].map(|i| canvas.planes[i][patch][lane]);
             });
         }
         let values = pixel_map(&rgb, target, background, map);
-        for (tile, gradient) in self.gradient.iter_mut().enumerate() {
+        for (tile, gradient) in self.gradient[..grid.tiles()].iter_mut().enumerate() {
             gradient.planes[MAP] = DARK;
             for_each_pixel(grid, tile, |patch, lane, at| {
                 gradient.planes[MAP][patch][lane] = values[at];
@@ -109,18 +108,21 @@ impl CpuBackend {
         let Frame { grid, bands, .. } = frame;
         let blending = self.shortcuts.into();
         self.have_sums(self.signals.layout());
-        let Self { pool, arch, lists, splats, records, sums, visible, gradient, rows, .. } = self;
+        let Self { threads, arch, lists, splats, records, sums, visible, gradient, rows, .. } =
+            self;
         let rows = *rows;
         let sums = &mut sums[..rows * STRIDE];
-        sums.fill(0.0);
         let is_seen = |row: usize| visible[row / WIDTH] >> (row % WIDTH) & 1 == 1;
-        pool.install(|| {
+        threads.install(|| {
+            let visible = &visible[..rows.div_ceil(WIDTH)];
             for band in bands {
                 if bands.len() > 1 {
-                    lists.refill(Visible { splats: &splats[..rows], seen: visible }, grid, band);
+                    let visible = Visible { splats: &splats[..rows], seen: visible };
+                    lists.refill(threads, visible, grid, band);
                 }
-                for part in parts(lists, band.len(), records.len() / STRIDE) {
-                    part.tiles.clone().into_par_iter().for_each(|i| {
+                let mut fresh = band.start == 0;
+                for part in parts(threads, lists, band.len(), records.len() / STRIDE) {
+                    threads.each("replay", part.tiles.clone(), |i| {
                         let tile = band.start + i;
                         arch.dispatch(Replay {
                             splats,
@@ -131,7 +133,8 @@ impl CpuBackend {
                             records: part.records(lists, i, records, STRIDE),
                         });
                     });
-                    part.gather(lists, records, sums, visible, (STRIDE, false), |sums, records| {
+                    let to = Sums { sums, stride: STRIDE, fresh, visible };
+                    part.gather(threads, lists, records, to, |sums, records: &[AtomicU32]| {
                         for record in records.chunks_exact(STRIDE) {
                             for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
                                 let x = f32::from_bits(x.load(Relaxed));
@@ -139,6 +142,7 @@ impl CpuBackend {
                             }
                         }
                     });
+                    fresh = false;
                 }
             }
         });

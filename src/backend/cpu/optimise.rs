@@ -26,8 +26,8 @@ const NARROW_SLACK: f32 = 1.0 / 16.0;
 
 /// One optimiser step for a run of whole blocks.
 pub(super) struct Optimise<'a> {
-    pub(super) params: &'a mut ParameterTask<'a>,
-    pub(super) moments: &'a mut MomentTask<'a>,
+    pub(super) params: ParameterTask<'a>,
+    pub(super) moments: MomentTask<'a>,
     /// Draws for rounding what is stored in fewer bits.
     pub(super) storing: &'a PolicyRng,
     pub(super) ages: &'a mut [u16],
@@ -43,7 +43,7 @@ pub(super) struct Optimise<'a> {
     pub(super) rates: &'a LearningRates,
     pub(super) bias: &'a BiasCorrection,
     /// Gradients kept for a later step.
-    pub(super) summed: &'a mut TaskSums<'a>,
+    pub(super) summed: TaskSums<'a>,
     /// Which parameters step now.
     pub(super) due: Due,
     /// Terms of the loss that concern every row, if there are any.
@@ -60,8 +60,8 @@ impl WithSimd for Optimise<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { params: stored, moments, ages, signals, planes: to, sums, .. } = self;
-        let Self { layout, visible, view, rates, bias, summed, due, terms, noise, .. } = self;
+        let Self { params: mut stored, mut moments, ages, signals, planes: to, sums, .. } = self;
+        let Self { layout, visible, view, rates, bias, mut summed, due, terms, noise, .. } = self;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;

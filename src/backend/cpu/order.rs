@@ -18,7 +18,7 @@ pub(super) fn sort(model: &mut Model<'_>, rows: usize, memory: &mut [f32]) {
     // Place on the curve and row; the rows are all different, so there is one order only.
     let keys: &mut [[u32; 2]] = &mut cast_slice_mut(&mut memory[..2 * rows]);
     let params = &*model.params;
-    keys.par_iter_mut().enumerate().for_each(|(row, key)| {
+    model.threads.each("order", keys.par_iter_mut().enumerate(), |(row, key)| {
         *key = [place(params.get_n(row, plane::MEAN)), row as u32];
     });
     keys.par_sort_unstable();

@@ -10,6 +10,8 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
+
 use super::BLOCKS_PER_TASK;
 use super::blocks::{BlockTask, BlockView, Blocks, Scratch, plane};
 use super::narrow::{Draws, F16, Narrow, fixed, narrow, narrow_fixed, widen, widen_fixed};
@@ -176,11 +178,14 @@ impl Parameters {
     }
 
     /// The blocks of the first `rows` rows, cut for the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize) -> Vec<ParameterTask<'_>> {
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+    ) -> impl IndexedParallelIterator<Item = ParameterTask<'_>> {
         let is_narrow = self.is_narrow();
-        let (wide, fixed, half) = (&mut self.wide, &mut self.fixed, &mut self.half);
-        let all = wide.tasks(rows).into_iter().zip(fixed.tasks(rows)).zip(half.tasks(rows));
-        all.map(|((wide, fixed), half)| ParameterTask { is_narrow, wide, fixed, half }).collect()
+        let Self { wide, fixed, half } = self;
+        let all = (wide.tasks(rows), fixed.tasks(rows), half.tasks(rows)).into_par_iter();
+        all.map(move |(wide, fixed, half)| ParameterTask { is_narrow, wide, fixed, half })
     }
 }
 

@@ -7,16 +7,16 @@ use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode
 use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
-use super::blocks::parts;
 use super::candidates;
 use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
+use super::parts::parts;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
     Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
 };
 use super::rasterize_bwd::{Blended, RasterizeBwd, TileGradient, gather};
-use super::records::parts as parts_of_records;
+use super::records::{Sums, parts as parts_of_records};
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
@@ -38,8 +38,12 @@ pub(super) struct Frame {
 
 impl CpuBackend {
     pub(super) fn resize_images(&mut self, grid: &Grid) {
-        self.canvas.resize(grid.tiles(), TileCanvas::EMPTY);
-        self.gradient.resize(grid.tiles(), TileGradient { planes: [DARK; 5] });
+        let tiles = grid.tiles();
+        // A smaller view leaves the rest as it is, so that views of two sizes do not fill it in turn.
+        if self.canvas.len() < tiles {
+            self.canvas.resize(tiles, TileCanvas::EMPTY);
+            self.gradient.resize(tiles, TileGradient { planes: [DARK; 5] });
+        }
     }
 
     pub(super) fn image_loss(
@@ -49,9 +53,11 @@ impl CpuBackend {
         background: [f32; 3],
         terms: ImageTerms,
     ) -> LossValue {
-        let Self { pool, loss, arch, canvas, gradient, clock, .. } = self;
-        let value =
-            pool.install(|| loss.run(*arch, grid, canvas, target, background, gradient, terms));
+        let Self { threads, loss, arch, canvas, gradient, clock, .. } = self;
+        let (canvas, gradient) = (&canvas[..grid.tiles()], &mut gradient[..grid.tiles()]);
+        let value = threads.install(|| {
+            loss.run(threads, *arch, grid, canvas, target, background, gradient, terms)
+        });
         clock.lap("loss");
         value
     }
@@ -76,28 +82,34 @@ impl CpuBackend {
         self.resize_images(&grid);
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
         let blending = Blending::from(self.shortcuts);
-        let Self { pool, arch, lists, splats, visible: seen, params, canvas, rows, clock, .. } =
-            self;
+        let Self {
+            threads, arch, lists, splats, visible: seen, params, canvas, rows, clock, ..
+        } = self;
         clock.start();
         let (rows, arch) = (*rows, *arch);
         let params = &params.view(rows);
-        pool.install(|| {
-            (splats[..rows].par_chunks_mut(ROWS_PER_TASK), seen.par_chunks_mut(BLOCKS_PER_TASK))
-                .into_par_iter()
-                .enumerate()
-                .for_each(|(task, (splats, seen))| {
-                    let (params, rows) = (params.task(task), splats.len());
-                    let (view, log2_reach) = (&view, blending.log2_reach);
-                    arch.dispatch(Project { view, log2_reach, params, rows, splats, seen });
-                });
+        threads.install(|| {
+            let seen = &mut seen[..rows.div_ceil(WIDTH)];
+            let parts = (
+                splats[..rows].par_chunks_mut(ROWS_PER_TASK),
+                seen.par_chunks_mut(BLOCKS_PER_TASK),
+            );
+            let tasks = parts.into_par_iter().enumerate();
+            let visible_rows = threads.sum("project", tasks, |(task, (splats, seen))| {
+                let (params, rows) = (params.task(task), splats.len());
+                let (view, log2_reach) = (&view, blending.log2_reach);
+                let lanes = &mut *seen;
+                arch.dispatch(Project { view, log2_reach, params, rows, splats, seen: lanes });
+                seen.iter().map(|seen| seen.count_ones() as usize).sum()
+            });
             clock.lap("project");
             let visible = Visible { splats: &splats[..rows], seen };
-            let (bands, entries) = lists.bands(visible, &grid);
+            let (bands, entries) = lists.bands(threads, visible, &grid);
             for band in &bands {
-                lists.fill(visible, &grid, band.clone(), bands.len() == 1);
+                lists.fill(threads, visible, &grid, band.clone(), bands.len() == 1);
                 clock.lap("tiles");
                 let tiles = canvas[band.clone()].par_iter_mut().enumerate();
-                tiles.for_each_init(Vec::new, |scratch, (i, canvas)| {
+                threads.each_with("rasterize", tiles, Vec::new, |scratch, (i, canvas)| {
                     lists.sort(i, scratch);
                     arch.dispatch(Rasterize {
                         splats,
@@ -111,9 +123,7 @@ impl CpuBackend {
                 });
                 clock.lap("rasterize");
             }
-            let visible =
-                seen[..rows.div_ceil(WIDTH)].iter().map(|s| s.count_ones() as usize).sum();
-            Ok(Frame { view, grid, background, bands, entries, visible })
+            Ok(Frame { view, grid, background, bands, entries, visible: visible_rows })
         })
     }
 
@@ -123,7 +133,7 @@ impl CpuBackend {
         let blending = self.shortcuts.into();
         self.have_sums(layout);
         let Self {
-            pool,
+            threads,
             arch,
             lists,
             splats,
@@ -137,15 +147,19 @@ impl CpuBackend {
             ..
         } = self;
         let stride = layout.stride();
-        pool.install(|| {
+        threads.install(|| {
+            // Slots of rows that are gone are those of an older frame.
+            let visible = &visible[..rows.div_ceil(WIDTH)];
             for band in bands {
                 if bands.len() > 1 {
-                    lists.refill(Visible { splats: &splats[..*rows], seen: visible }, grid, band);
+                    let visible = Visible { splats: &splats[..*rows], seen: visible };
+                    lists.refill(threads, visible, grid, band);
                 }
                 let mut fresh = band.start == 0;
-                for part in parts_of_records(lists, band.len(), records.len() / stride) {
-                    let tiles = part.tiles.clone().into_par_iter();
-                    tiles.for_each_init(Blended::boxed, |blended, i| {
+                let cap = records.len() / stride;
+                for part in parts_of_records(threads, lists, band.len(), cap) {
+                    let tiles = part.tiles.clone();
+                    threads.each_with("rasterize_bwd", tiles, Blended::boxed, |blended, i| {
                         let tile = band.start + i;
                         arch.dispatch(RasterizeBwd {
                             splats,
@@ -161,11 +175,9 @@ impl CpuBackend {
                         });
                     });
                     clock.lap("rasterize_bwd");
-                    // Slots of rows that are gone are those of an older frame.
-                    let visible = &visible[..rows.div_ceil(WIDTH)];
-                    part.gather(lists, records, sums, visible, (stride, fresh), |sum, records| {
-                        gather(sum, layout, records);
-                    });
+                    let add = |sum: &mut [f32], records: &[_]| gather(sum, layout, records);
+                    let to = Sums { sums, stride, fresh, visible };
+                    part.gather(threads, lists, records, to, add);
                     fresh = false;
                     clock.lap("gather");
                 }
@@ -190,7 +202,7 @@ impl CpuBackend {
         count: usize,
     ) {
         let Frame { grid, .. } = frame;
-        let Self { canvas, gradient, loss, candidates, .. } = self;
+        let Self { threads, canvas, gradient, loss, candidates, .. } = self;
         let place =
             |x: usize, y: usize| (y / TILE * grid.columns + x / TILE, in_plane(x % TILE, y % TILE));
         let error = |x: usize, y: usize| {
@@ -204,7 +216,11 @@ impl CpuBackend {
                 ErrorMode::L1 | ErrorMode::L1Dssim => loss.error_at(x, y),
             })
         };
-        let worst = candidates.worst(grid.width, grid.height, count, request.spaced, error);
+        let size = [grid.width, grid.height];
+        let rank = |ranking: &mut Vec<_>, most| {
+            threads.install(|| candidates::rank(threads, ranking, size, most, error))
+        };
+        let worst = candidates.worst_by(size, count, request.spaced, rank, error);
         for candidate in self.surface_points(frame, target, &worst, request.depth) {
             self.candidates.push(candidate);
         }
@@ -221,7 +237,7 @@ impl CpuBackend {
     ) -> Vec<Candidate> {
         let Frame { grid, bands, background, view, .. } = frame;
         let shortcuts = self.shortcuts;
-        let Self { lists, splats, params, visible, .. } = self;
+        let Self { threads, lists, splats, params, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
         let tile = |x: usize, y: usize| y / TILE * grid.columns + x / TILE;
         let focal = 0.5 * (view.focal[0] + view.focal[1]);
@@ -229,21 +245,27 @@ impl CpuBackend {
         for band in bands {
             let here = |x: usize, y: usize| band.contains(&tile(x, y));
             if bands.len() > 1 && pixels.iter().any(|&(x, y, _)| here(x, y)) {
-                lists.refill(visible, grid, band);
+                threads.install(|| lists.refill(threads, visible, grid, band));
             }
-            let of_band = found.iter_mut().zip(pixels).filter(|(_, (x, y, _))| here(*x, *y));
-            for (slot, &(x, y, error)) in of_band {
-                let at = [x as f32 + 0.5, y as f32 + 0.5];
-                let list = lists.of_tile(tile(x, y) - band.start);
-                let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
-                    .and_then(|row| candidates::closest_approach(params, row, view, at));
-                *slot = surface.map(|(position, depth)| Candidate {
-                    position: position.to_array(),
-                    colour: target.composited(x, y, *background),
-                    pixel_size: depth / focal,
-                    error,
-                });
-            }
+            let lists = &*lists;
+            let tasks = found.par_iter_mut().zip(pixels);
+            let point_of =
+                |(slot, &(x, y, error)): (&mut Option<Candidate>, &(usize, usize, f32))| {
+                    if !here(x, y) {
+                        return;
+                    }
+                    let at = [x as f32 + 0.5, y as f32 + 0.5];
+                    let list = lists.of_tile(tile(x, y) - band.start);
+                    let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
+                        .and_then(|row| candidates::closest_approach(params, row, view, at));
+                    *slot = surface.map(|(position, depth)| Candidate {
+                        position: position.to_array(),
+                        colour: target.composited(x, y, *background),
+                        pixel_size: depth / focal,
+                        error,
+                    });
+                };
+            threads.install(|| threads.each("surface points", tasks, point_of));
         }
         found.into_iter().flatten().collect()
     }
@@ -258,7 +280,7 @@ impl CpuBackend {
             alpha: vec![0.0; pixels],
             depth: vec![0.0; pixels],
         };
-        for (tile, canvas) in self.canvas.iter().enumerate() {
+        for (tile, canvas) in self.canvas[..grid.tiles()].iter().enumerate() {
             for_each_pixel(grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
                     out.rgb[3 * at + channel] = canvas.planes[channel][patch][lane];
@@ -274,9 +296,8 @@ impl CpuBackend {
 
     /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
     pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
-        let Self { pool, arch, params, moments, ages, signals, sums, visible, bias, rows, .. } =
-            self;
-        let (rows, arch) = (*rows, *arch);
+        let Self { threads, arch, params, moments, ages, signals, sums, visible, bias, .. } = self;
+        let (rows, arch) = (self.rows, *arch);
         let terms = Terms::new(self.terms, rows);
         let noise = self.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
@@ -286,46 +307,43 @@ impl CpuBackend {
         let blocks = rows.div_ceil(WIDTH);
         let tasks = blocks.div_ceil(BLOCKS_PER_TASK);
         let per_task = signal_stride * BLOCKS_PER_TASK;
-        let mut signal_blocks = parts(signals.blocks.of_rows_mut(rows), per_task, tasks);
-        let mut summed = self.summed.tasks(rows, tasks);
-        let mut param_tasks = params.tasks(rows);
-        let mut moment_tasks = moments.tasks(rows);
-        pool.install(|| {
-            (
-                param_tasks.par_iter_mut(),
-                moment_tasks.par_iter_mut(),
-                ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
-                signal_blocks.par_iter_mut(),
-                sums[..blocks * WIDTH * layout.stride()]
-                    .par_chunks(ROWS_PER_TASK * layout.stride()),
-                visible[..blocks].par_chunks(BLOCKS_PER_TASK),
-                summed.par_iter_mut().enumerate(),
-            )
-                .into_par_iter()
-                .for_each(
-                    |(params, moments, ages, signals, sums, visible, (task, summed))| {
-                        arch.dispatch(Optimise {
-                            params,
-                            moments,
-                            storing: &storing,
-                            ages,
-                            signals,
-                            planes,
-                            sums,
-                            layout,
-                            visible,
-                            view: &frame.view,
-                            rates: &input.rates,
-                            bias,
-                            summed,
-                            due,
-                            terms,
-                            noise,
-                            first_row: task * ROWS_PER_TASK,
-                            rows: rows - task * ROWS_PER_TASK,
-                        });
-                    },
-                );
+        let sums = &sums[..blocks * WIDTH * layout.stride()];
+        let parts = (
+            params.tasks(rows),
+            moments.tasks(rows),
+            ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
+            parts(signals.blocks.of_rows_mut(rows), per_task, tasks).par(),
+            sums.par_chunks(ROWS_PER_TASK * layout.stride()),
+            visible[..blocks].par_chunks(BLOCKS_PER_TASK),
+            self.summed.tasks(rows, tasks).enumerate(),
+        );
+        threads.install(|| {
+            threads.each(
+                "project_bwd + adam",
+                parts,
+                |(params, moments, ages, signals, sums, visible, (task, summed))| {
+                    arch.dispatch(Optimise {
+                        params,
+                        moments,
+                        storing: &storing,
+                        ages,
+                        signals,
+                        planes,
+                        sums,
+                        layout,
+                        visible,
+                        view: &frame.view,
+                        rates: &input.rates,
+                        bias,
+                        summed,
+                        due,
+                        terms,
+                        noise,
+                        first_row: task * ROWS_PER_TASK,
+                        rows: rows - task * ROWS_PER_TASK,
+                    });
+                },
+            );
         });
     }
 }

@@ -14,7 +14,9 @@ use std::sync::atomic::AtomicU32;
 use rayon::prelude::*;
 
 use super::simd::WIDTH;
+use super::threads::Threads;
 use super::tiles::{Entry, TileLists};
+use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 
 /// Entries of a band whose records are held together.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -48,29 +50,40 @@ impl<'a> TileRecords<'a> {
     }
 }
 
+/// Where records are summed.
+pub(super) struct Sums<'a> {
+    /// Shape: `[rows, stride]`, or more rows.
+    pub(super) sums: &'a mut [f32],
+    pub(super) stride: usize,
+    /// Whether the sums start anew.
+    pub(super) fresh: bool,
+    /// Bit per lane of each block: who has records. Shape: `[blocks]`.
+    pub(super) visible: &'a [u16],
+}
+
 /// The parts of a band of so many tiles, for at most `cap` records at a time, in order.
-pub(super) fn parts(lists: &TileLists, tiles: usize, cap: usize) -> Vec<Part> {
-    let firsts = (0..=tiles).map(|tile| lists.first_of(tile));
-    let parts = cut(&firsts.collect::<Vec<_>>(), cap);
+pub(super) fn parts(threads: &Threads, lists: &TileLists, tiles: usize, cap: usize) -> Vec<Part> {
+    let parts = cut(lists.firsts(tiles), cap);
     if parts.len() > 1 {
-        lists.note_positions(tiles);
+        lists.note_positions(threads, tiles);
     }
     parts
 }
 
 /// `firsts` has the number of entries before each tile, and of all.
-fn cut(firsts: &[usize], cap: usize) -> Vec<Part> {
+fn cut(firsts: &[u32], cap: usize) -> Vec<Part> {
     let cap = cap.max(1);
     let tiles = firsts.len() - 1;
-    if firsts[tiles] <= cap {
+    if firsts[tiles] as usize <= cap {
         return vec![Part { tiles: 0..tiles, entries: None }];
     }
     let mut parts = Vec::new();
     let mut start = 0;
     while start < tiles {
-        let fit = firsts[start + 1..].partition_point(|&first| first - firsts[start] <= cap);
+        let from = firsts[start] as usize;
+        let fit = firsts[start + 1..].partition_point(|&first| first as usize - from <= cap);
         let end = start + fit.max(1);
-        let mut entries = firsts[start]..firsts[end];
+        let mut entries = from..firsts[end] as usize;
         // More than one only of a tile that is too much by itself.
         while !entries.is_empty() {
             let some = entries.start..entries.end.min(entries.start + cap);
@@ -96,18 +109,21 @@ impl Part {
     }
 
     /// Shows each visible row its sum and its records, some at a time, in order of tile number.
-    /// `fresh` says that the sums start anew. Shape of `sums`: `[rows, stride]`.
     pub(super) fn gather(
         &self,
+        threads: &Threads,
         lists: &TileLists,
         bits: &[AtomicU32],
-        sums: &mut [f32],
-        visible: &[u16],
-        (stride, fresh): (usize, bool),
-        add: impl Fn(&mut [f32], &[AtomicU32]) + Sync,
+        to: Sums<'_>,
+        add: impl Fn(&mut [f32], &[AtomicU32]) + Send + Sync,
     ) {
-        sums.par_chunks_mut(stride * WIDTH).zip(visible).enumerate().for_each(
-            |(block, (sums, &seen))| {
+        let Sums { sums, stride, fresh, visible } = to;
+        let sums = sums.par_chunks_mut(ROWS_PER_TASK * stride);
+        let tasks = sums.zip(visible.par_chunks(BLOCKS_PER_TASK)).enumerate();
+        threads.each("gather", tasks, |(task, (sums, visible))| {
+            let first = task * BLOCKS_PER_TASK;
+            let blocks = sums.chunks_mut(stride * WIDTH).zip(visible);
+            for (block, (sums, &seen)) in (first..).zip(blocks) {
                 for (lane, sum) in sums.chunks_exact_mut(stride).enumerate() {
                     if fresh {
                         sum.fill(0.0);
@@ -128,7 +144,7 @@ impl Part {
                         }
                     }
                 }
-            },
-        );
+            }
+        });
     }
 }

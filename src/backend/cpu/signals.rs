@@ -2,6 +2,7 @@
 
 use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet, Signals};
 use pulp::Simd;
+use rayon::prelude::*;
 
 use super::blocks::{Blocks, plane};
 use super::parameters::Parameters;
@@ -9,6 +10,8 @@ use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
 use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
+use super::threads::Threads;
+use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 use crate::backend::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes};
 
 /// The accumulators of the requested signals.
@@ -123,43 +126,44 @@ impl Accumulators {
     }
 
     /// The current epoch's largest weights become the previous one's.
-    pub(super) fn begin_epoch(&mut self, rows: usize) {
+    pub(super) fn begin_epoch(&mut self, threads: &Threads, rows: usize) {
         let cleared = self.planes.begin_epoch();
-        self.clear(&cleared, rows);
+        self.clear(threads, &cleared, rows);
     }
 
     /// Sums start anew; the largest weights stay.
-    pub(super) fn reset(&mut self, rows: usize) {
-        self.clear(&self.planes.sums(), rows);
+    pub(super) fn reset(&mut self, threads: &Threads, rows: usize) {
+        self.clear(threads, &self.planes.sums(), rows);
     }
 
-    fn clear(&mut self, planes: &[usize], rows: usize) {
-        for &plane in planes {
-            for row in 0..rows {
-                self.blocks.set(row, plane, 0.0);
-            }
+    fn clear(&mut self, threads: &Threads, planes: &[usize], rows: usize) {
+        if planes.is_empty() {
+            return;
         }
+        let per_block = self.blocks.stride();
+        let tasks = self.blocks.of_rows_mut(rows).par_chunks_mut(per_block * BLOCKS_PER_TASK);
+        let clear = |blocks: &mut [f32]| {
+            for block in blocks.chunks_exact_mut(per_block) {
+                for &plane in planes {
+                    block[plane * WIDTH..(plane + 1) * WIDTH].fill(0.0);
+                }
+            }
+        };
+        threads.install(|| threads.each("clear signals", tasks, clear));
     }
 
     /// Writes the columns of the wanted signals.
     pub(super) fn read(
         &self,
+        threads: &Threads,
         signals: &mut Signals,
         wanted: SignalSet,
         params: &Parameters,
         ages: &[u16],
     ) {
         for signal in wanted.iter() {
-            if let (Some(attribute), Some(column)) =
-                (ParameterSignal::of(signal), signals.get_mut(signal))
-            {
-                for (row, numbers) in column.chunks_exact_mut(signal.width()).enumerate() {
-                    for (number, plane) in numbers.iter_mut().zip(attribute.parameters.clone()) {
-                        *number = (attribute.shown)(params.get(row, plane));
-                    }
-                }
-                continue;
-            }
+            let Some(column) = signals.get_mut(signal) else { continue };
+            let attribute = ParameterSignal::of(signal);
             let planes = self.planes.of(signal);
             let value = |row: usize| -> f32 {
                 if signal.kind() == SignalKind::Present {
@@ -168,11 +172,22 @@ impl Accumulators {
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
                 parts.reduce(f32::max).unwrap_or(0.0)
             };
-            if let Some(column) = signals.get_mut(signal) {
-                for (row, slot) in column.iter_mut().enumerate() {
-                    *slot = value(row);
+            let of_row = |row: usize, numbers: &mut [f32]| match &attribute {
+                Some(attribute) => {
+                    for (number, plane) in numbers.iter_mut().zip(attribute.parameters.clone()) {
+                        *number = (attribute.shown)(params.get(row, plane));
+                    }
                 }
-            }
+                None => numbers.fill(value(row)),
+            };
+            let width = signal.width();
+            let tasks = column.par_chunks_mut(ROWS_PER_TASK * width).enumerate();
+            let of_task = |(task, column): (usize, &mut [f32])| {
+                for (row, numbers) in (task * ROWS_PER_TASK..).zip(column.chunks_exact_mut(width)) {
+                    of_row(row, numbers);
+                }
+            };
+            threads.install(|| threads.each("read signals", tasks, of_task));
         }
     }
 }

@@ -8,9 +8,11 @@
 use std::ops::Range;
 
 use densify_policies::policy::Cadence;
+use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, parts, plane};
+use super::blocks::{BlockTask, Blocks, plane};
+use super::parts::parts;
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
 
@@ -97,15 +99,16 @@ impl Summed {
     }
 
     /// The sums, cut for the optimiser's tasks.
-    pub(super) fn tasks(&mut self, rows: usize, tasks: usize) -> Vec<TaskSums<'_>> {
-        let sums = self.sums.tasks(rows);
-        let aged = self.rest_ages.len().min(rows.next_multiple_of(WIDTH));
-        let ages = parts(&mut self.rest_ages[..aged], ROWS_PER_TASK, tasks);
-        let first = self.first;
-        sums.into_iter()
-            .zip(ages)
-            .map(|(sums, rest_ages)| TaskSums { first, sums, rest_ages })
-            .collect()
+    pub(super) fn tasks(
+        &mut self,
+        rows: usize,
+        tasks: usize,
+    ) -> impl IndexedParallelIterator<Item = TaskSums<'_>> {
+        let Self { first, sums, rest_ages, .. } = self;
+        let first = *first;
+        let aged = rest_ages.len().min(rows.next_multiple_of(WIDTH));
+        let ages = parts(&mut rest_ages[..aged], ROWS_PER_TASK, tasks).par();
+        sums.tasks(rows).zip(ages).map(move |(sums, rest_ages)| TaskSums { first, sums, rest_ages })
     }
 
     /// What is kept between steps, by name.

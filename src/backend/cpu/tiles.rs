@@ -26,14 +26,18 @@ use rayon::prelude::*;
 use super::footprint::Footprint;
 use super::project::Splat;
 use super::simd::WIDTH;
+use super::threads::Threads;
 
 /// Side of a tile `[px]`.
 pub(super) const TILE: usize = WIDTH;
-/// Bound for (chunks of rows) × (tiles) counters: 4 MiB of them.
-const MOST_COUNTERS: usize = 1 << 20;
-const MOST_CHUNKS: usize = 64;
-/// Tiles whose counters are added up by one task.
-const RUN: usize = 256;
+/// Bound for (chunks of rows) × (tiles) counters: 16 MiB of them.
+const MOST_COUNTERS: usize = 1 << 22;
+/// Four for each of 64 threads.
+const MOST_CHUNKS: usize = 256;
+const LEAST_ROWS_PER_CHUNK: usize = 128;
+/// Most tasks that add up counters, and the fewest tiles of one.
+const MOST_RUNS: usize = 64;
+const LEAST_TILES_PER_RUN: usize = 64;
 
 /// An image as a grid of tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -107,6 +111,7 @@ pub(super) struct TileLists {
     /// First entry of each tile of the band. Shape: `[tiles of the band + 1]`.
     starts: Vec<u32>,
     /// Entries per (chunk of rows, tile). While entries are emitted: their places in the tile's list.
+    /// Shape: `[chunks, tiles of the band]`, or more than these.
     counters: Vec<u32>,
     /// Entries per chunk of rows.
     lengths: Vec<u64>,
@@ -140,35 +145,46 @@ impl TileLists {
     }
 
     /// Bands of the image: ranges of tiles whose lists fit the cap, and the number of entries.
-    pub(super) fn bands(&mut self, visible: Visible<'_>, grid: &Grid) -> (Vec<Range<usize>>, u64) {
+    pub(super) fn bands(
+        &mut self,
+        threads: &Threads,
+        visible: Visible<'_>,
+        grid: &Grid,
+    ) -> (Vec<Range<usize>>, u64) {
         let tiles = grid.tiles();
-        self.count(visible, grid, 0..tiles);
+        self.count(threads, visible, grid, 0..tiles);
         let (cap, entries) = (self.cap() as u64, self.lengths.iter().sum());
         if entries <= cap {
             return (std::iter::once(0..tiles).collect(), entries);
         }
         let mut of_tiles = vec![0_u64; tiles];
-        for counters in self.counters.chunks_exact(tiles) {
-            for (sum, &n) in of_tiles.iter_mut().zip(counters) {
-                *sum += u64::from(n);
+        let run = tiles_per_run(tiles);
+        let counters = &self.counters[..self.lengths.len() * tiles];
+        let tasks = of_tiles.par_chunks_mut(run).enumerate();
+        threads.each("count tiles", tasks, |(i, sums)| {
+            for counters in counters.chunks_exact(tiles) {
+                for (sum, &n) in sums.iter_mut().zip(&counters[i * run..]) {
+                    *sum += u64::from(n);
+                }
             }
-        }
+        });
         cut(of_tiles.into_iter(), cap)
     }
 
     /// Fills the lists for one band. `counted` says that the counters already hold this band.
     pub(super) fn fill(
         &mut self,
+        threads: &Threads,
         visible: Visible<'_>,
         grid: &Grid,
         band: Range<usize>,
         counted: bool,
     ) {
         if !counted {
-            self.count(visible, grid, band.clone());
+            self.count(threads, visible, grid, band.clone());
         }
         let tiles = band.len();
-        self.find_places(tiles);
+        self.find_places(threads, tiles);
         let chunk = chunk_rows(visible.splats.len(), tiles);
         // Each chunk's slots lie side by side.
         let mut rest = &mut self.row_of_slot[..];
@@ -182,55 +198,58 @@ impl TileLists {
             first += length as usize;
         }
         let (entries, starts) = (&self.entries, &self.starts);
-        work.into_par_iter().zip(self.counters.par_chunks_mut(tiles.max(1))).enumerate().for_each(
-            |(i, ((first, row_of_slot, slots), places))| {
-                let mut filled = 0;
-                let rows = i * chunk..i * chunk + slots.len();
-                visible.each(rows.clone(), |row, splat| {
-                    let before = filled;
-                    let depth = u64::from(splat.depth.to_bits()) << 32;
-                    let footprint = Footprint(slots[row - rows.start]);
-                    footprint.for_each_tile(splat, grid, &band, |tile| {
-                        let key = depth | (first + filled) as u64;
-                        entries[(starts[tile] + places[tile]) as usize].store(key, Relaxed);
-                        places[tile] += 1;
-                        *row_of_slot[filled].get_mut() = row as u32;
-                        filled += 1;
-                    });
-                    slots[row - rows.start] = [(first + before) as u32, (filled - before) as u32];
+        let counters = self.counters.par_chunks_mut(tiles.max(1));
+        let tasks = work.into_par_iter().zip(counters).enumerate();
+        threads.each("fill", tasks, |(i, ((first, row_of_slot, slots), places))| {
+            let mut filled = 0;
+            let rows = i * chunk..i * chunk + slots.len();
+            visible.each(rows.clone(), |row, splat| {
+                let before = filled;
+                let depth = u64::from(splat.depth.to_bits()) << 32;
+                let footprint = Footprint(slots[row - rows.start]);
+                footprint.for_each_tile(splat, grid, &band, |tile| {
+                    let key = depth | (first + filled) as u64;
+                    entries[(starts[tile] + places[tile]) as usize].store(key, Relaxed);
+                    places[tile] += 1;
+                    *row_of_slot[filled].get_mut() = row as u32;
+                    filled += 1;
                 });
-            },
-        );
+                slots[row - rows.start] = [(first + before) as u32, (filled - before) as u32];
+            });
+        });
     }
 
     /// From the counters of so many tiles, where each list starts, and in their stead where in each list
     /// the entries of each chunk do: after those of the chunks before. Walked in the order of memory; down
     /// the chunks of one tile, each number would be a cache miss.
-    fn find_places(&mut self, tiles: usize) {
+    fn find_places(&mut self, threads: &Threads, tiles: usize) {
+        let run = tiles_per_run(tiles);
         let mut runs: Vec<Vec<&mut [u32]>> = Vec::new();
-        runs.resize_with(tiles.div_ceil(RUN), Vec::new);
-        for counters in self.counters.chunks_exact_mut(tiles.max(1)) {
-            for (run, counters) in runs.iter_mut().zip(counters.chunks_mut(RUN)) {
-                run.push(counters);
+        let chunks = self.lengths.len();
+        runs.resize_with(tiles.div_ceil(run), || Vec::with_capacity(chunks));
+        for counters in self.counters.chunks_exact_mut(tiles.max(1)).take(chunks) {
+            for (runs, counters) in runs.iter_mut().zip(counters.chunks_mut(run)) {
+                runs.push(counters);
             }
         }
-        self.starts.clear();
         self.starts.resize(tiles + 1, 0);
         let (starts, end) = self.starts.split_at_mut(tiles);
-        let count = |(chunks, starts): (Vec<&mut [u32]>, &mut [u32])| {
+        let tasks = runs.into_par_iter().zip(starts.par_chunks_mut(run));
+        let mut lengths: Vec<u32> = threads.collect("places", tasks, |(chunks, starts)| {
+            starts.fill(0);
             for counters in chunks {
                 for (n, start) in counters.iter_mut().zip(&mut *starts) {
                     *start += std::mem::replace(n, *start);
                 }
             }
             starts.iter().sum()
-        };
-        let mut lengths: Vec<u32> =
-            runs.into_par_iter().zip(starts.par_chunks_mut(RUN)).map(count).collect();
+        });
+        end[0] = 0;
         for length in &mut lengths {
             end[0] += std::mem::replace(length, end[0]);
         }
-        starts.par_chunks_mut(RUN).zip(lengths).for_each(|(starts, mut next)| {
+        let tasks = starts.par_chunks_mut(run).zip(lengths);
+        threads.each("starts", tasks, |(starts, mut next)| {
             for start in starts {
                 next += std::mem::replace(start, next);
             }
@@ -238,20 +257,29 @@ impl TileLists {
     }
 
     /// Fills and sorts the lists of a band again, after other bands were in their place.
-    pub(super) fn refill(&mut self, visible: Visible<'_>, grid: &Grid, band: &Range<usize>) {
-        self.fill(visible, grid, band.clone(), false);
-        (0..band.len()).into_par_iter().for_each_init(Vec::new, |scratch, i| self.sort(i, scratch));
+    pub(super) fn refill(
+        &mut self,
+        threads: &Threads,
+        visible: Visible<'_>,
+        grid: &Grid,
+        band: &Range<usize>,
+    ) {
+        self.fill(threads, visible, grid, band.clone(), false);
+        threads.each_with("sort", 0..band.len(), Vec::new, |scratch, i| self.sort(i, scratch));
     }
 
     /// Counts entries per (chunk, tile of the band).
-    fn count(&mut self, visible: Visible<'_>, grid: &Grid, band: Range<usize>) {
+    fn count(&mut self, threads: &Threads, visible: Visible<'_>, grid: &Grid, band: Range<usize>) {
         let tiles = band.len();
         let rows = visible.splats.len();
         let chunk = chunk_rows(rows, tiles);
-        self.counters.resize(rows.div_ceil(chunk) * tiles, 0);
+        let needed = rows.div_ceil(chunk) * tiles;
+        if self.counters.len() < needed {
+            self.counters.resize(needed, 0);
+        }
         let counters = self.counters.par_chunks_mut(tiles.max(1));
-        let work = counters.zip(self.slots[..rows].par_chunks_mut(chunk)).enumerate();
-        let lengths = work.map(|(i, (counters, slots))| {
+        let tasks = counters.zip(self.slots[..rows].par_chunks_mut(chunk)).enumerate();
+        self.lengths = threads.collect("count", tasks, |(i, (counters, slots))| {
             let (first, mut length) = (i * chunk, 0);
             counters.fill(0);
             visible.each(first..first + slots.len(), |row, splat| {
@@ -263,7 +291,6 @@ impl TileLists {
             });
             length
         });
-        lengths.collect_into_vec(&mut self.lengths);
     }
 
     /// Brings the list of tile `tile` of the band into its final order, front to back. Positive
@@ -290,10 +317,15 @@ impl TileLists {
         self.starts[tile] as usize
     }
 
+    /// The same before each of so many tiles, and all entries.
+    pub(super) fn firsts(&self, tiles: usize) -> &[u32] {
+        &self.starts[..=tiles]
+    }
+
     /// Notes of each slot which entry of the band it belongs to. After sorting, which needs the
     /// place.
-    pub(super) fn note_positions(&self, tiles: usize) {
-        (0..tiles).into_par_iter().for_each(|tile| {
+    pub(super) fn note_positions(&self, threads: &Threads, tiles: usize) {
+        threads.each("positions", 0..tiles, |tile| {
             let first = self.first_of(tile);
             for (i, entry) in self.of_tile(tile).iter().enumerate() {
                 self.row_of_slot[Entry::load(entry).slot].store((first + i) as u32, Relaxed);
@@ -334,7 +366,12 @@ fn cut(entries: impl Iterator<Item = u64>, cap: u64) -> (Vec<Range<usize>>, u64)
 /// Rows per chunk, whole blocks: independent of the number of threads.
 fn chunk_rows(rows: usize, tiles: usize) -> usize {
     let chunks = (MOST_COUNTERS / tiles.max(1)).clamp(1, MOST_CHUNKS);
-    rows.div_ceil(chunks).max(512).next_multiple_of(WIDTH)
+    rows.div_ceil(chunks).max(LEAST_ROWS_PER_CHUNK).next_multiple_of(WIDTH)
+}
+
+/// Tiles whose counters are added up by one task.
+fn tiles_per_run(tiles: usize) -> usize {
+    tiles.div_ceil(MOST_RUNS).max(LEAST_TILES_PER_RUN)
 }
 
 #[cfg(test)]
@@ -366,10 +403,10 @@ mod tests {
 
     #[test]
     fn chunks_cover_any_number_of_rows() {
-        for rows in [0, 1, 511, 512, 1 << 31, (1_usize << 32) - 1, 1 << 40] {
+        for rows in [0, 1, 127, 128, 1 << 31, (1_usize << 32) - 1, 1 << 40] {
             for tiles in [0, 1, 8160, 1 << 20] {
                 let chunk = chunk_rows(rows, tiles);
-                assert!(chunk.is_multiple_of(WIDTH) && chunk >= 512);
+                assert!(chunk.is_multiple_of(WIDTH) && chunk >= LEAST_ROWS_PER_CHUNK);
                 let chunks = rows.div_ceil(chunk);
                 assert!(chunks <= MOST_CHUNKS && chunks * tiles <= MOST_COUNTERS.max(tiles));
             }
@@ -379,12 +416,15 @@ mod tests {
     /// Of fewer tiles than a run has, of whole runs, and of more.
     #[test]
     fn places_are_sums_of_all_that_comes_before() {
-        for tiles in [1, RUN - 1, RUN, 2 * RUN, 2 * RUN + 7] {
+        const RUN: usize = LEAST_TILES_PER_RUN;
+        let threads = Threads::new(Some(2)).expect("threads");
+        for tiles in [1, RUN - 1, RUN, 2 * RUN, 2 * RUN + 7, MOST_RUNS * RUN + 1] {
             let chunks = 5;
             let counters: Vec<u32> = (0..chunks * tiles).map(|i| (i * 7 % 11) as u32).collect();
             let mut lists = TileLists::new(1, 1);
             lists.counters.clone_from(&counters);
-            lists.find_places(tiles);
+            lists.lengths = vec![0; chunks];
+            lists.find_places(&threads, tiles);
             let mut next = 0;
             for tile in 0..tiles {
                 for chunk in 0..chunks {

@@ -21,10 +21,11 @@ mod window;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::blocks::parts;
+use super::parts::{Parts, parts};
 use super::rasterize::{DARK, TileCanvas, copy_row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
+use super::threads::Threads;
 use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
 use window::{
@@ -113,6 +114,7 @@ impl LossBuffers {
     #[expect(clippy::too_many_arguments, reason = "a kernel: each is a buffer of its own")]
     pub(super) fn run(
         &mut self,
+        threads: &Threads,
         arch: Arch,
         grid: &Grid,
         canvas: &[TileCanvas],
@@ -131,26 +133,27 @@ impl LossBuffers {
         for channel in 0..3 {
             let [e, y, p1, p2, p3] = &mut self.planes;
             let source = Source { grid, canvas, target, background, channel };
-            (e.par_chunks_mut(strip), y.par_chunks_mut(strip))
-                .into_par_iter()
-                .enumerate()
-                .for_each_init(Vec::new, |scratch, (i, (e, y))| {
-                    arch.dispatch(Lines { source, segments, first: i * STRIP, scratch, e, y });
-                });
+            let tasks = (e.par_chunks_mut(strip), y.par_chunks_mut(strip));
+            let tasks = tasks.into_par_iter().enumerate();
+            threads.each_with("loss lines", tasks, Vec::new, |scratch, (i, (e, y))| {
+                arch.dispatch(Lines { source, segments, first: i * STRIP, scratch, e, y });
+            });
             let strips = grid.height.div_ceil(SHORT_STRIP);
             let [ranking, by_pixel] = &mut self.errors;
-            let (mut ranking, mut by_pixel) =
-                (parts(ranking, short, strips), parts(by_pixel, short, strips));
-            let sums: Vec<LossValue> = (
+            let error_strips = [parts(ranking, short, strips), parts(by_pixel, short, strips)];
+            let [ranking, by_pixel] = error_strips.map(Parts::par);
+            let tasks = (
                 p1.par_chunks_mut(short),
                 p2.par_chunks_mut(short),
                 p3.par_chunks_mut(short),
-                ranking.par_iter_mut(),
-                by_pixel.par_iter_mut(),
-            )
-                .into_par_iter()
-                .enumerate()
-                .map_init(Vec::new, |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
+                ranking,
+                by_pixel,
+            );
+            let sums = threads.collect_with(
+                "loss similarity",
+                tasks.into_par_iter().enumerate(),
+                Vec::new,
+                |scratch, (i, (p1, p2, p3, ranking, by_pixel))| {
                     arch.dispatch(Similarity {
                         width: grid.width,
                         segments,
@@ -162,56 +165,52 @@ impl LossBuffers {
                         errors: [ranking, by_pixel],
                         error_weights: error_weights.map(|weights| weights.map(|w| w / 3.0)),
                     })
-                })
-                .collect();
+                },
+            );
             for part in sums {
                 l1 += part.l1;
                 ssim += part.ssim;
             }
             let [e, y, p1, p2, p3] = &self.planes;
-            gradient.par_chunks_mut(grid.columns).enumerate().for_each_init(
-                Vec::new,
-                |scratch, (i, tiles)| {
-                    arch.dispatch(Gradient {
-                        grid,
-                        segments,
-                        channel,
-                        first: i * STRIP,
-                        scratch,
-                        e,
-                        y,
-                        derivatives: [p1, p2, p3],
-                        scale: 1.0 / samples as f32,
-                        mask: target.mask.as_deref(),
-                        tiles,
-                    });
-                },
-            );
+            let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
+            threads.each_with("loss gradient", tasks, Vec::new, |scratch, (i, tiles)| {
+                arch.dispatch(Gradient {
+                    grid,
+                    segments,
+                    channel,
+                    first: i * STRIP,
+                    scratch,
+                    e,
+                    y,
+                    derivatives: [p1, p2, p3],
+                    scale: 1.0 / samples as f32,
+                    mask: target.mask.as_deref(),
+                    tiles,
+                });
+            });
         }
         if by_pixel {
-            self.spread_over_tiles(grid, gradient);
+            self.spread_over_tiles(threads, grid, gradient);
         }
         LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
     /// Writes the second error to the last plane of the gradient.
-    fn spread_over_tiles(&self, grid: &Grid, gradient: &mut [TileGradient]) {
+    fn spread_over_tiles(&self, threads: &Threads, grid: &Grid, gradient: &mut [TileGradient]) {
         let segments = self.segments;
-        gradient.par_chunks_mut(grid.columns).enumerate().for_each_init(
-            || vec![0.0; segments.stride()],
-            |pixels, (i, tiles)| {
-                for tile in tiles.iter_mut() {
-                    tile.planes[4] = DARK;
+        let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
+        let line = || vec![0.0; segments.stride()];
+        threads.each_with("loss by pixel", tasks, line, |pixels, (i, tiles)| {
+            for tile in tiles.iter_mut() {
+                tile.planes[4] = DARK;
+            }
+            for row in 0..TILE.min(grid.height - i * TILE) {
+                segments.restore(segments.line(&self.errors[1], i * TILE + row), pixels);
+                for (tile, errors) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
+                    set_row_of_plane(&mut tile.planes[4], row, errors);
                 }
-                let rows = TILE.min(grid.height - i * TILE);
-                for row in 0..rows {
-                    segments.restore(segments.line(&self.errors[1], i * TILE + row), pixels);
-                    for (tile, errors) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
-                        set_row_of_plane(&mut tile.planes[4], row, errors);
-                    }
-                }
-            },
-        );
+            }
+        });
     }
 
     /// Error of a pixel after a run with error weights.

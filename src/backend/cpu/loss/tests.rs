@@ -27,7 +27,9 @@ fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
     };
     let mut gradient = vec![TileGradient { planes: [DARK; 5] }; grid.tiles()];
     let mut buffers = LossBuffers::new();
-    let value = buffers.run(Arch::new(), &grid, &canvas, &target, [0.0; 3], &mut gradient, terms);
+    let threads = Threads::new(Some(2)).expect("threads");
+    let (arch, gradients) = (Arch::new(), &mut gradient);
+    let value = buffers.run(&threads, arch, &grid, &canvas, &target, [0.0; 3], gradients, terms);
     let of = |planes: Range<usize>| -> Vec<f32> {
         let planes = gradient.iter().flat_map(|tile| &tile.planes[planes.clone()]);
         planes.flat_map(|plane| plane.as_flattened().iter().copied()).collect()

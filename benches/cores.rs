@@ -1,0 +1,218 @@
+//! How a training step would do on many cores, computed from the times of its tasks on one.
+//!
+//! Regions follow each other. In each, every core takes the next task as soon as it has none; what is in
+//! no region is done by one core. Nothing else is modelled: memory that cores share and the cost of
+//! waking them are not, so that these are upper bounds. What an empty region costs on the threads of this
+//! machine is printed below them. `cargo bench --bench cores [-- ROWS@SIZE...]`
+
+#![expect(clippy::print_stdout, reason = "its output is a table")]
+
+mod steps;
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::time::{Duration, Instant};
+
+use densify::backend::Backend;
+use densify::backend::cpu::{CpuBackend, CpuOptions, StepTasks};
+use densify_policies::policy::{CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet};
+use rayon::prelude::*;
+
+use steps::{median, ms};
+
+/// Numbers of cores.
+const CORES: [usize; 2] = [16, 64];
+
+/// A median step.
+struct Step {
+    /// What is in no region.
+    serial: Duration,
+    regions: Vec<(&'static str, Vec<Duration>)>,
+}
+
+impl Step {
+    /// Medians over the steps that have as many tasks as the last; steps look for a few pixels more or
+    /// less.
+    fn median(mut steps: Vec<StepTasks>) -> Self {
+        let tasks = |step: &StepTasks| -> Vec<usize> {
+            step.regions.iter().map(|(_, tasks)| tasks.len()).collect()
+        };
+        let usual = steps.last().map(tasks);
+        steps.retain(|step| Some(tasks(step)) == usual);
+        let of_regions = |step: &StepTasks| step.regions.iter().flat_map(|(_, tasks)| tasks).sum();
+        let serial = |step: &StepTasks| step.total.saturating_sub(of_regions(step));
+        let regions = steps[0].regions.iter().enumerate();
+        let median_task = |region: usize, task: usize| {
+            median(steps.iter().map(|step| step.regions[region].1[task]).collect())
+        };
+        let tasks = |region, n| (0..n).map(|task| median_task(region, task)).collect();
+        Self {
+            serial: median(steps.iter().map(serial).collect()),
+            regions: regions.map(|(i, (name, of))| (*name, tasks(i, of.len()))).collect(),
+        }
+    }
+
+    fn total(&self) -> Duration {
+        self.on(1)
+    }
+
+    /// What it takes on so many cores.
+    fn on(&self, cores: usize) -> Duration {
+        self.serial + self.regions.iter().map(|(_, tasks)| schedule(tasks, cores)).sum::<Duration>()
+    }
+}
+
+/// When the last of the tasks is done, if each core takes the next one as soon as it has none.
+fn schedule(tasks: &[Duration], cores: usize) -> Duration {
+    let mut free: BinaryHeap<Reverse<Duration>> =
+        (0..cores).map(|_| Reverse(Duration::ZERO)).collect();
+    let mut last = Duration::ZERO;
+    for &task in tasks {
+        let Some(Reverse(start)) = free.pop() else { break };
+        last = last.max(start + task);
+        free.push(Reverse(start + task));
+    }
+    last
+}
+
+fn percent(part: Duration, whole: Duration) -> f64 {
+    100.0 * part.as_secs_f64() / whole.as_secs_f64().max(1e-12)
+}
+
+/// The steps of a backend on one thread.
+fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
+    let options = CpuOptions {
+        threads: Some(1),
+        largest_image: (size, size),
+        tile_cap: rows * 8,
+        needs,
+        ..CpuOptions::new(rows)
+    };
+    let mut backend = match CpuBackend::new(&steps::scene(rows, 3), &options) {
+        Ok(backend) => backend,
+        Err(error) => {
+            println!("{rows} rows: {error}");
+            return None;
+        }
+    };
+    backend.record_tasks();
+    let (camera, target) = (steps::camera(size), steps::target(size));
+    let mut steps = Vec::new();
+    for step in 1..=steps::count(rows) {
+        if let Err(error) = backend.train_step(&steps::input(step, &camera, &target)) {
+            println!("{error}");
+            return None;
+        }
+        if step > 2 {
+            steps.push(backend.recorded_tasks());
+        }
+    }
+    Some(Step::median(steps))
+}
+
+/// A line per region; regions of one name together.
+fn print_regions(step: &Step) {
+    let total = step.total();
+    let mut names: Vec<&str> = Vec::new();
+    for (name, _) in &step.regions {
+        if !names.contains(name) {
+            names.push(name);
+        }
+    }
+    println!(
+        "  region               times  tasks       ms  share %  largest task %  of {CORES:?} cores busy %"
+    );
+    for name in names {
+        let of_name = || step.regions.iter().filter(|region| region.0 == name);
+        let tasks = || of_name().flat_map(|region| &region.1);
+        let time: Duration = tasks().sum();
+        let largest = tasks().copied().max().unwrap_or_default();
+        let busy = CORES.map(|cores| {
+            let spent: Duration = of_name().map(|region| schedule(&region.1, cores)).sum();
+            format!("{:.0}", percent(time, spent) / cores as f64)
+        });
+        println!(
+            "  {name:20} {:5} {:6} {:8.3} {:8.2} {:15.3}  {}",
+            of_name().count(),
+            tasks().count(),
+            ms(time),
+            percent(time, total),
+            percent(largest, total),
+            busy.join(", ")
+        );
+    }
+}
+
+fn print_summary(step: &Step, what: &str) {
+    let total = step.total();
+    let tasks = step.regions.iter().flat_map(|(name, tasks)| tasks.iter().map(move |t| (t, name)));
+    let (largest, name) = tasks.max().map_or((Duration::ZERO, "none"), |(t, name)| (*t, name));
+    let speed_ups = CORES.map(|cores| {
+        format!("{:.1} on {cores}", total.as_secs_f64() / step.on(cores).as_secs_f64())
+    });
+    println!(
+        "{what}: {:.2} ms; in no region {:.3} ms, {:.3} %; largest task {:.3} % ({name}); \
+         {} regions; at most {} cores",
+        ms(total),
+        ms(step.serial),
+        percent(step.serial, total),
+        percent(largest, total),
+        step.regions.len(),
+        speed_ups.join(", ")
+    );
+}
+
+/// A policy that wants errors by pixel and candidates of each step.
+fn demanding(rows: usize) -> Needs {
+    let candidates = CandidateRequest {
+        from: 0,
+        until: u32::MAX,
+        rows_per_candidate: 3000,
+        capacity: rows,
+        error: ErrorMode::L1Dssim,
+        depth: DepthMode::MaxWeight,
+        min_alpha: 0.5,
+        spaced: true,
+    };
+    let signals = [Signal::ScreenGradient, Signal::WeightedError];
+    Needs { signals: SignalSet::from(signals), candidates: Some(candidates), ..Needs::default() }
+}
+
+/// Time of a region of 256 tasks that do nothing.
+fn empty_region(threads: usize) -> Option<Duration> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok()?;
+    let region = || {
+        let start = Instant::now();
+        (0..256_usize).into_par_iter().for_each(|i| {
+            std::hint::black_box(i);
+        });
+        start.elapsed()
+    };
+    Some(pool.install(|| median((0..2000).map(|_| region()).collect())))
+}
+
+fn main() {
+    let size_of = |arg: String| {
+        let (rows, size) = arg.split_once('@')?;
+        Some((rows.parse().ok()?, size.parse().ok()?))
+    };
+    let mut sizes: Vec<(usize, u32)> = std::env::args().filter_map(size_of).collect();
+    if sizes.is_empty() {
+        sizes = vec![(50_000, 512), (1_000_000, 1024)];
+    }
+    for (rows, size) in sizes {
+        if let Some(step) = record(rows, size, Needs::default()) {
+            print_summary(&step, &format!("{rows}@{size}"));
+            print_regions(&step);
+        }
+        if let Some(step) = record(rows, size, demanding(rows)) {
+            print_summary(&step, &format!("{rows}@{size}, candidates and errors by pixel"));
+        }
+    }
+    let here = std::thread::available_parallelism().map_or(1, usize::from);
+    for threads in [1, 2, 4, 8, 16, 32, 64].into_iter().filter(|&threads| threads <= here) {
+        if let Some(time) = empty_region(threads) {
+            println!("an empty region on {threads} threads: {:.1} µs", time.as_secs_f64() * 1e6);
+        }
+    }
+}
