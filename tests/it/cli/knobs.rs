@@ -119,7 +119,7 @@ fn every_level_does_what_its_class_says() {
             assert_eq!(config(&run)["knob"][knob.name].as_str(), Some(*level), "{what}");
         }
     }
-    assert!(changed >= 9, "only {changed} levels change anything");
+    assert!(changed >= 7, "only {changed} levels change anything");
 }
 
 #[test]

@@ -109,7 +109,7 @@ fn whatever_outlives_a_step_is_kept() {
     // Gradients summed until the very next step; bands; a background of its own at every step; a later degree.
     for flags in [
         "--policy mcmc --policy-set mcmc.grow_every=7",
-        "--policy taming --policy-set taming.sh_every=17",
+        "--policy taming --policy-set taming.sh_every=17 --policy-set taming.grow_every=7",
         "--policy taming --policy-set taming.grow_every=7 --background random --threads 2",
         "--policy vanilla --policy-set vanilla.grow_every=9 --tile-cap 400 --seed 5",
         "--policy diet --policy-set diet.grow_every=9 --save-iterations 50,150 --eval \
