@@ -21,6 +21,9 @@ has 'test steady_conforms \.\.\. ok' said.txt
 has '^test +PSNR [0-9.]+ dB' said.txt
 has '\| steady +\|' my_policy/comparison/compare.md
 has '\| vanilla +\|' my_policy/comparison/compare.md
+# What a policy's tests are built from serves for its program too.
+built="$(grep -c 'Compiling densify-policies ' said.txt || true)"
+[ "$built" -le 1 ] || fail "densify-policies was built $built times: its dependencies have other features in densify"
 # What was left out is refused by name.
 for words in 'train scene:spheres --backend gpu' 'devices'; do
     code=0
