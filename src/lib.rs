@@ -25,7 +25,7 @@
 //! ```
 //!
 //! Features, all on by default: `gpu` (the GPU backend), `scenegen` (built-in scenes and known surfaces),
-//! `study` (`compare` and `trade`).
+//! `selftest` (the float64 renderer and the command that compares with it), `study` (`compare` and `trade`).
 
 pub mod backend;
 pub mod camera;
@@ -52,6 +52,7 @@ pub mod spread;
 #[cfg(feature = "study")]
 pub(crate) mod study;
 pub mod trainer;
+#[cfg(feature = "selftest")]
 pub mod verify;
 pub mod views;
 mod without;

@@ -29,11 +29,12 @@ mod progress;
 mod render;
 #[cfg(feature = "scenegen")]
 mod scenegen;
+#[cfg(feature = "selftest")]
 mod selftest;
 #[cfg(feature = "study")]
 mod study;
 mod train;
-#[cfg(not(all(feature = "gpu", feature = "scenegen", feature = "study")))]
+#[cfg(not(all(feature = "gpu", feature = "scenegen", feature = "selftest", feature = "study")))]
 mod without;
 
 use std::ffi::OsString;
@@ -47,6 +48,8 @@ use console::Console;
 use without::devices;
 #[cfg(not(feature = "scenegen"))]
 use without::scenegen;
+#[cfg(not(feature = "selftest"))]
+use without::selftest;
 #[cfg(not(feature = "study"))]
 use without::study;
 

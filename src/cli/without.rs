@@ -37,4 +37,5 @@ macro_rules! absent {
 
 absent!(devices, "gpu", run(DevicesArgs) "densify devices");
 absent!(scenegen, "scenegen", run(ScenegenArgs) "densify scenegen");
+absent!(selftest, "selftest", run(SelftestArgs) "densify selftest");
 absent!(study, "study", compare(Comparison) "densify compare", trade(Trade) "densify trade");
