@@ -91,6 +91,14 @@ impl WithSimd for RasterizeBwd<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let has = |field| self.layout.has(field);
+        // Where there are no vectors, records are not worth a kernel of their own: eleven, unrolled lane by
+        // lane, would be a tenth of the program, and what is not asked for is not written.
+        if const { S::F32_LANES == 1 } {
+            return match has(Field::Depth) {
+                false => self.run::<S, { extra::ERROR_ABS }>(s),
+                true => self.run::<S, { extra::ALL }>(s),
+            };
+        }
         let mut extras = 0;
         if has(Field::AbsX) {
             extras |= extra::ABS;
