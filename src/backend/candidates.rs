@@ -92,6 +92,10 @@ impl Candidates {
 
     /// The `count` worst pixels, worst first; `error(x, y)` is None where no candidate may be.
     /// Equal errors are ordered by pixel number.
+    #[cfg_attr(
+        not(any(test, feature = "gpu")),
+        expect(dead_code, reason = "only the GPU backend asks")
+    )]
     pub(super) fn worst(
         &mut self,
         width: usize,

@@ -16,7 +16,7 @@ const BITS: u32 = 10;
 /// Sorts the rows of a model. `memory` has room for two numbers per row.
 pub(super) fn sort(model: &mut Model<'_>, rows: usize, memory: &mut [f32]) {
     // Place on the curve and row; the rows are all different, so there is one order only.
-    let keys: &mut [[u32; 2]] = &mut cast_slice_mut(&mut memory[..2 * rows]);
+    let keys: &mut [[u32; 2]] = cast_slice_mut(&mut memory[..2 * rows]);
     let params = &*model.params;
     model.threads.each("order", keys.par_iter_mut().enumerate(), |(row, key)| {
         *key = [place(params.get_n(row, plane::MEAN)), row as u32];
@@ -57,6 +57,7 @@ fn spread(x: u32) -> u32 {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "what is moved is moved to the bit")]
 mod tests {
     use rand::seq::SliceRandom;
     use rand::{RngExt, SeedableRng};
