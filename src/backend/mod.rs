@@ -252,10 +252,6 @@ pub trait Backend: Send {
     /// caller, and going on would exceed the budget or corrupt the model.
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError>;
 
-    /// Brings rows that are near each other in the scene near each other in memory, if that makes steps
-    /// faster here; by default nothing changes. Each row takes along all that belongs to it.
-    fn sort_rows(&mut self) {}
-
     /// The rows with a parameter or a moment that is NaN or infinite, in order. Until they are
     /// removed they are not rendered, and nothing else depends on them.
     ///

@@ -67,13 +67,12 @@ impl<V: ViewSource> Trainer<V> {
     /// A new run. `backend` holds the initial model; `policy_name` is for messages only.
     pub fn new(
         views: V,
-        mut backend: Box<dyn Backend>,
+        backend: Box<dyn Backend>,
         (policy_name, policy): (&str, Box<dyn DensityPolicy>),
         scene: SceneInfo,
         options: TrainOptions,
     ) -> Result<Self, TrainError> {
         let count = views.count();
-        backend.sort_rows();
         check_options(&scene, &options, count, backend.as_ref())?;
         Ok(Self {
             needs: checked_needs(policy_name, policy.as_ref(), &scene)?,

@@ -151,15 +151,6 @@ impl Model<'_> {
         self.signals.blocks.copy_row(from, to);
         self.summed.copy_row(from, to);
     }
-
-    /// Two rows change places, with all that belongs to them.
-    pub(super) fn swap(&mut self, a: usize, b: usize) {
-        self.params.swap_rows(a, b);
-        self.moments.swap_rows(a, b);
-        self.ages.swap(a, b);
-        self.signals.blocks.swap_rows(a, b);
-        self.summed.swap_rows(a, b);
-    }
 }
 
 fn longest(log_scale: [f32; 3]) -> usize {

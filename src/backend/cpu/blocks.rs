@@ -125,13 +125,6 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
-        for plane in 0..self.planes {
-            let (a, b) = (self.at(a, plane), self.at(b, plane));
-            self.data.swap(a, b);
-        }
-    }
-
     pub(super) fn clear_row(&mut self, row: usize) {
         for plane in 0..self.planes {
             self.set(row, plane, T::default());

@@ -22,7 +22,6 @@ mod narrow;
 mod observe;
 mod optimise;
 mod options;
-mod order;
 mod parameters;
 mod parts;
 mod passes;
@@ -307,13 +306,6 @@ impl Backend for CpuBackend {
             self.candidates.clear();
         }
         Ok(())
-    }
-
-    fn sort_rows(&mut self) {
-        self.have_sums(self.signals.layout());
-        let Self { threads, params, moments, ages, signals, summed, sums, rows, .. } = self;
-        let mut model = apply::Model { threads, params, moments, ages, signals, summed };
-        threads.install(|| order::sort(&mut model, *rows, sums));
     }
 
     fn audit(&mut self) -> Result<Vec<Unsound>, BackendError> {

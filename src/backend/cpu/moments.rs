@@ -73,12 +73,6 @@ impl Moments {
         self.seconds.copy_row(from, to);
     }
 
-    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
-        self.wide.iter_mut().for_each(|blocks| blocks.swap_rows(a, b));
-        self.ratios.swap_rows(a, b);
-        self.seconds.swap_rows(a, b);
-    }
-
     /// Zero moments of one parameter.
     pub(super) fn forget(&mut self, row: usize, plane: usize) {
         if self.is_narrow() {

@@ -123,12 +123,6 @@ impl Parameters {
         self.half.copy_row(from, to);
     }
 
-    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
-        self.wide.swap_rows(a, b);
-        self.fixed.swap_rows(a, b);
-        self.half.swap_rows(a, b);
-    }
-
     pub(super) fn clear_row(&mut self, row: usize) {
         self.wide.clear_row(row);
         self.fixed.clear_row(row);

@@ -190,13 +190,6 @@ impl Summed {
         }
     }
 
-    pub(super) fn swap_rows(&mut self, a: usize, b: usize) {
-        self.sums.swap_rows(a, b);
-        if !self.rest_ages.is_empty() {
-            self.rest_ages.swap(a, b);
-        }
-    }
-
     /// As the opacity's moments are forgotten.
     pub(super) fn forget_opacity(&mut self, row: usize) {
         if self.first == 0 && self.planes() > 0 {
