@@ -1,9 +1,9 @@
 //! Auxiliary views: training views that are rendered for a policy's event, and measured row by row.
 //!
 //! Blending is replayed front to back, with the arithmetic of the forward pass, and each row's sums
-//! over the pixels that it is blended into, and its largest weight, are written to one record per (row, tile); these are
-//! added in order of tile number. Records and sums borrow the backward pass's buffers, and the pixel
-//! map the plane of the image gradient that belongs to alpha.
+//! over the pixels that it is blended into, and its largest weight, are written to one record per
+//! (row, tile); these are added in order of tile number. Records and sums borrow the backward pass's
+//! buffers, and the pixel map the plane of the image gradient that belongs to alpha.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -15,6 +15,7 @@ use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
 use super::rasterize::{ALPHA_MAX, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace};
+use super::rasterize_bwd::gather_all;
 use super::records::{Sums, TileRecords, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
@@ -24,8 +25,8 @@ use crate::dataset::images::Image8;
 
 /// Numbers per record: sums of the map, of pixels, of weights, of distances; the largest weight.
 const STRIDE: usize = 5;
-/// The one that is no sum.
-const MAXIMUM: usize = 4;
+/// The last, which is no sum.
+const MAXIMUM: usize = STRIDE - 1;
 /// The plane of a tile's gradient that holds the pixel map meanwhile.
 const MAP: usize = 3;
 
@@ -134,14 +135,10 @@ impl CpuBackend {
                         });
                     });
                     let to = Sums { sums, stride: STRIDE, fresh, visible };
-                    part.gather(threads, lists, records, to, |sums, records: &[AtomicU32]| {
-                        for record in records.chunks_exact(STRIDE) {
-                            for (i, (sum, x)) in sums.iter_mut().zip(record).enumerate() {
-                                let x = f32::from_bits(x.load(Relaxed));
-                                *sum = if i == MAXIMUM { sum.max(x) } else { *sum + x };
-                            }
-                        }
-                    });
+                    let add = |sums: &mut [f32], records: &[AtomicU32]| {
+                        gather_all::<STRIDE>(sums, true, records);
+                    };
+                    part.gather(threads, lists, records, to, add);
                     fresh = false;
                 }
             }

@@ -8,6 +8,8 @@
 //!   −½(u² + z²), never positive. L = [[l₁, 0], `[−l₁·r, l₃]`], l₁ = √(c/det), r = b/c, l₃ = 1/√c.
 //!   Inside a splat's footprint the error of u does not depend on which axis is eliminated, so
 //!   the one that makes z constant along an image row is taken.
+//!
+//! The file is one piece because the backward pass needs what the forward pass computes on its way.
 
 use bytemuck::{Pod, Zeroable};
 use pulp::{Simd, WithSimd};

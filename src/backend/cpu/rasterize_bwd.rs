@@ -371,7 +371,11 @@ pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU3
 
 /// Adds to what `sums` holds; the last number may be a maximum.
 #[inline(always)]
-fn gather_all<const STRIDE: usize>(sums: &mut [f32], maximum: bool, records: &[AtomicU32]) {
+pub(super) fn gather_all<const STRIDE: usize>(
+    sums: &mut [f32],
+    maximum: bool,
+    records: &[AtomicU32],
+) {
     let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
     for record in records.as_chunks::<STRIDE>().0 {
         for i in 0..STRIDE {

@@ -14,6 +14,8 @@
 //! consecutive tiles whose lists fit. Tiles are independent, and each row's gradients are summed in
 //! order of tile number, so bands change no bit of the result.
 //!
+//! The file is one piece because counting, placing and emitting share the counters and their cuts.
+//!
 //! Counting notes the tiles of a row as bits where its slots will stand. Only of rows that reach farther
 //! than the bits do, the ellipse is evaluated again when entries are emitted: by the same function on the
 //! same values, and Rust never contracts floating-point expressions; so the two passes agree.
