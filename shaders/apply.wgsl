@@ -1,6 +1,6 @@
 // Stage 9: executes a compiled plan in place, in chunks of operations; src/backend/cpu/apply.rs.
-// Pass 1 writes families, updates and seeds, no row twice; pass 2 moves tail rows into holes. Each
-// buffer that has rows is edited by itself.
+// Pass 1 writes families, updates and seeds, no row twice; pass 2 moves tail rows into holes and brings all
+// rows into their order. Each buffer that has rows is edited by itself.
 
 // Numbers per operation.
 const WORDS: u32 = 20u;
@@ -35,6 +35,25 @@ fn copy_rows(
     } else {
         buffer[to] = buffer[source * now.c + word * now.d];
     }
+}
+
+// Operations (a, b): exchanges two rows; no row twice. Numbers as in `copy_rows`.
+@compute @workgroup_size(256)
+fn swap_rows(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = group_of(id) * GROUP + lane;
+    let op = i / now.b;
+    let word = i % now.b;
+    if op >= now.a {
+        return;
+    }
+    let a = ops[2u * op] * now.c + word * now.d;
+    let b = ops[2u * op + 1u] * now.c + word * now.d;
+    let kept = buffer[a];
+    buffer[a] = buffer[b];
+    buffer[b] = kept;
 }
 
 fn longest(s: vec3<f32>) -> u32 {

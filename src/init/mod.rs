@@ -4,6 +4,7 @@
 //! mean square distance to the 3 nearest neighbours, opacity 0.1, colour in band 0. All in f64 and
 //! relative to the scene's size, so that remote and tiny scenes lose no precision.
 
+mod curve;
 mod random;
 
 use densify_policies::neighbours::Neighbours;
@@ -67,7 +68,7 @@ pub enum InitError {
 }
 
 /// Makes one Gaussian per point, in normalised coordinates. If there are more points than `budget`,
-/// the seed chooses a subset. Rows keep the order of the points.
+/// the seed chooses a subset. Rows near each other in space are mostly near each other in order.
 pub fn initialise(
     points: &PointCloud,
     budget: usize,
@@ -92,8 +93,8 @@ pub fn initialise(
     if chosen.len() > budget {
         report.over_budget = chosen.len() - budget;
         schedule::draw(&mut chosen, budget, &mut ChaCha8Rng::seed_from_u64(seed));
-        chosen.sort_unstable();
     }
+    chosen.sort_unstable_by_key(|&i| (curve::place(points.positions[i].to_array()), i));
     report.rows = chosen.len();
 
     let positions: Vec<[f64; 3]> = chosen.iter().map(|&i| points.positions[i].to_array()).collect();

@@ -19,12 +19,36 @@ fn scattered(count: usize, seed: u64) -> PointCloud {
     cloud(&(0..count).map(|_| [unit(), 2.0 * unit(), 0.1 * unit()]).collect::<Vec<_>>())
 }
 
+/// The point that each row was made of.
+fn origins(model: &Gaussians, points: &PointCloud) -> Vec<usize> {
+    let of = |mean: &[f32; 3]| {
+        points.positions.iter().position(|p| p.as_vec3().to_array() == *mean).unwrap()
+    };
+    model.means.iter().map(of).collect()
+}
+
+#[test]
+fn rows_follow_a_curve_through_space() {
+    let points = scattered(1000, 4);
+    let (model, _) = initialise(&points, 1000, 0, 0).unwrap();
+    let mut origins = origins(&model, &points);
+    let step = |rows: &[usize]| -> f64 {
+        rows.windows(2).map(|w| points.positions[w[0]].distance(points.positions[w[1]])).sum()
+    };
+    origins.dedup();
+    let in_order: Vec<usize> = (0..1000).collect();
+    assert!(step(&origins) < 0.2 * step(&in_order), "{} {}", step(&origins), step(&in_order));
+    origins.sort_unstable();
+    assert_eq!(origins, in_order);
+}
+
 #[test]
 fn scales_agree_with_brute_force() {
     let points = scattered(700, 5);
     let (model, report) = initialise(&points, 10_000, 2, 0).unwrap();
     assert_eq!(report, InitReport { points: 700, rows: 700, ..InitReport::default() });
-    for (row, p) in points.positions.iter().enumerate() {
+    for (row, origin) in origins(&model, &points).into_iter().enumerate() {
+        let p = &points.positions[origin];
         let mut squares: Vec<f64> =
             points.positions.iter().filter(|q| *q != p).map(|q| q.distance_squared(*p)).collect();
         squares.sort_by(f64::total_cmp);
@@ -36,13 +60,14 @@ fn scales_agree_with_brute_force() {
 
 #[test]
 fn rows_are_as_the_original_starts_them() {
-    let (model, _) = initialise(&scattered(100, 1), 1000, 3, 0).unwrap();
+    let points = scattered(100, 1);
+    let (model, _) = initialise(&points, 1000, 3, 0).unwrap();
     assert_eq!((model.len(), model.sh.len(), model.sh_degree), (100, 100 * 48, 3));
     assert!(model.quats.iter().all(|q| *q == [1.0, 0.0, 0.0, 0.0]));
-    for row in 0..100 {
+    for (row, origin) in origins(&model, &points).into_iter().enumerate() {
         assert!((1.0 / (1.0 + (-f64::from(model.opacity_logits[row])).exp()) - 0.1).abs() < 1e-7);
         let sh = model.sh_of(row);
-        let expected = [(row as f64 / 255.0).max(1.0 / 510.0), 1.0 / 510.0, 1.0 - 1.0 / 510.0];
+        let expected = [(origin as f64 / 255.0).max(1.0 / 510.0), 1.0 / 510.0, 1.0 - 1.0 / 510.0];
         for channel in 0..3 {
             assert!((0.5 + f64::from(C0 * sh[channel]) - expected[channel]).abs() < 1e-6);
         }
@@ -99,13 +124,8 @@ fn the_budget_is_kept_by_a_seeded_subsample() {
     assert_eq!(a.len(), 300);
     assert_eq!(a, initialise(&points, 300, 1, 7).unwrap().0);
     assert_ne!(a.means, initialise(&points, 300, 1, 8).unwrap().0.means);
-    // Every part of the cloud is drawn from: 300 of 1000 in order, not the first 300.
-    let place = |mean: &[f32; 3]| {
-        points.positions.iter().position(|p| p.as_vec3().to_array() == *mean).unwrap()
-    };
-    let places: Vec<usize> = a.means.iter().map(place).collect();
-    assert!(places.windows(2).all(|pair| pair[0] < pair[1]));
-    let late = places.iter().filter(|&&i| i >= 500).count();
+    // Every part of the cloud is drawn from, not the first 300 points only.
+    let late = origins(&a, &points).iter().filter(|&&i| i >= 500).count();
     assert!((110..190).contains(&late), "{late} of 300 from the second half");
 }
 

@@ -11,8 +11,8 @@ use crate::edit::{
 ///
 /// A backend executes in pass 1 `families` (the parent is read once, then its children and the
 /// parent itself are written), `updates` and `seeds`: no slot is written twice, and no written slot is
-/// read by another entry. In pass 2 it executes `moves`, then `clamp_opacity` over all rows, then the
-/// resets.
+/// read by another entry. In pass 2 it executes `moves`, then brings the rows into [`order`](Self::order),
+/// then it executes `clamp_opacity` over all rows and the resets.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RowOps {
     /// Rows before the edit.
@@ -134,6 +134,35 @@ impl RowOps {
             && self.moves.is_empty()
             && self.rows_before == self.rows_after
             && self.clamp_opacity.is_none())
+    }
+
+    /// The order in which rows stand at last: row i of the model is what pass 2 left in slot `order[i]`. A
+    /// permutation of `0..rows_after`; empty where nothing changes place.
+    ///
+    /// Rows keep their order, each followed by its children; seeds come last. Rows near each other in space,
+    /// as they begin, thus stay near each other in memory, which makes steps faster.
+    #[must_use]
+    pub fn order(&self) -> Vec<u32> {
+        // By slot: the row that was there before the edit, or the parent, and whether it is a child.
+        let mut origin: Vec<u64> = (0..self.rows_after as u64).map(|row| row << 1).collect();
+        for &(from, to) in &self.moves {
+            origin[to as usize] = u64::from(from) << 1;
+        }
+        for family in &self.families {
+            for &slot in self.children(family) {
+                origin[slot as usize] = u64::from(family.parent) << 1 | 1;
+            }
+        }
+        for (slot, _) in &self.seeds {
+            origin[*slot as usize] = u64::MAX;
+        }
+        if origin.is_sorted() {
+            return Vec::new();
+        }
+        let mut order: Vec<u32> = (0..self.rows_after as u32).collect();
+        // Siblings, and seeds, have ascending slots.
+        order.sort_unstable_by_key(|&slot| (origin[slot as usize], slot));
+        order
     }
 
     /// The slots of `family`'s children.

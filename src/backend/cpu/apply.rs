@@ -5,7 +5,7 @@ use densify_policies::plan::{
 };
 use densify_policies::rng::{PolicyRng, Purpose};
 
-use super::blocks::plane;
+use super::blocks::{plane, reorder};
 use super::moments::Moments;
 use super::parameters::Parameters;
 use super::signals::Accumulators;
@@ -49,6 +49,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
     for &(from, to) in &ops.moves {
         model.relocate(from as usize, to as usize);
     }
+    model.reorder(&ops.order());
     if let Some(most) = ops.clamp_opacity {
         for row in 0..ops.rows_after {
             let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
@@ -150,6 +151,14 @@ impl Model<'_> {
         self.ages[to] = self.ages[from];
         self.signals.blocks.copy_row(from, to);
         self.summed.copy_row(from, to);
+    }
+
+    fn reorder(&mut self, order: &[u32]) {
+        self.params.reorder(order);
+        self.moments.reorder(order);
+        reorder(self.ages, order);
+        self.signals.blocks.reorder(order);
+        self.summed.reorder(order);
     }
 }
 

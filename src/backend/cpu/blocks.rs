@@ -125,6 +125,20 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
+    /// Row i becomes what row `order[i]` was.
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        let mut values = vec![T::default(); order.len()];
+        // Plane by plane: rows mostly move a little, so that what is read lies mostly in a row.
+        for plane in 0..self.planes {
+            for (value, &row) in values.iter_mut().zip(order) {
+                *value = self.get(row as usize, plane);
+            }
+            for (row, &value) in values.iter().enumerate() {
+                self.set(row, plane, value);
+            }
+        }
+    }
+
     pub(super) fn clear_row(&mut self, row: usize) {
         for plane in 0..self.planes {
             self.set(row, plane, T::default());
@@ -149,6 +163,12 @@ impl<T: Copy + Default> Blocks<T> {
             }
         }
     }
+}
+
+/// Number i becomes what number `order[i]` was.
+pub(super) fn reorder<T: Copy>(numbers: &mut [T], order: &[u32]) {
+    let reordered: Vec<T> = order.iter().map(|&row| numbers[row as usize]).collect();
+    numbers[..order.len()].copy_from_slice(&reordered);
 }
 
 /// Blocks that follow each other, to read.

@@ -73,6 +73,12 @@ impl Moments {
         self.seconds.copy_row(from, to);
     }
 
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        self.wide.iter_mut().for_each(|blocks| blocks.reorder(order));
+        self.ratios.reorder(order);
+        self.seconds.reorder(order);
+    }
+
     /// Zero moments of one parameter.
     pub(super) fn forget(&mut self, row: usize, plane: usize) {
         if self.is_narrow() {

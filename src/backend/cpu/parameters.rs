@@ -123,6 +123,12 @@ impl Parameters {
         self.half.copy_row(from, to);
     }
 
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        self.wide.reorder(order);
+        self.fixed.reorder(order);
+        self.half.reorder(order);
+    }
+
     pub(super) fn clear_row(&mut self, row: usize) {
         self.wide.clear_row(row);
         self.fixed.clear_row(row);

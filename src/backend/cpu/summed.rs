@@ -11,7 +11,7 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, plane};
+use super::blocks::{BlockTask, Blocks, plane, reorder};
 use super::parts::parts;
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
@@ -187,6 +187,13 @@ impl Summed {
         self.sums.copy_row(from, to);
         if !self.rest_ages.is_empty() {
             self.rest_ages[to] = self.rest_ages[from];
+        }
+    }
+
+    pub(super) fn reorder(&mut self, order: &[u32]) {
+        self.sums.reorder(order);
+        if !self.rest_ages.is_empty() {
+            reorder(&mut self.rest_ages, order);
         }
     }
 

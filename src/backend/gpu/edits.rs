@@ -126,6 +126,30 @@ fn family_chunks(ops: &RowOps, room: usize) -> Vec<(usize, Vec<u32>)> {
     chunks
 }
 
+/// A permutation in which number i comes from `order[i]`, as two rounds of swaps. No number is in two swaps
+/// of a round, so that a device can make them all at once.
+///
+/// In a cycle of k places each number goes one place down. Two reflections do that: j to −j, then j to −j − 1.
+fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
+    let mut rounds = [Vec::new(), Vec::new()];
+    let mut is_done = vec![false; order.len()];
+    let mut cycle = Vec::new();
+    for first in 0..order.len() as u32 {
+        let mut row = first;
+        cycle.clear();
+        while !std::mem::replace(&mut is_done[row as usize], true) {
+            cycle.push(row);
+            row = order[row as usize];
+        }
+        for (round, last) in rounds.iter_mut().zip([cycle.len(), cycle.len().wrapping_sub(1)]) {
+            let pairs = (0..cycle.len()).map(|j| (j, last.wrapping_sub(j)));
+            let inside = pairs.filter(|&(j, other)| j < other && other < cycle.len());
+            round.extend(inside.map(|(j, other)| [cycle[j], cycle[other]]));
+        }
+    }
+    rounds
+}
+
 impl GpuBackend {
     /// Uploads one chunk of operations and executes what `encode` records.
     fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_>)) {
@@ -138,9 +162,26 @@ impl GpuBackend {
 
     /// Copies rows (from, to), or clears them, in all arrays that are edited in one of these ways.
     fn copy_rows(&self, pairs: &[[u32; 2]], ways: &[Edited]) {
+        let arrays = self.launches.copy_rows.iter().filter(|a| ways.contains(&a.edited));
+        self.for_pairs(pairs, arrays);
+    }
+
+    /// Brings the rows into an order, in which row i is what row `order[i]` was.
+    fn reorder(&self, order: &[u32]) {
+        for round in rounds_of_swaps(order) {
+            self.for_pairs(&round, self.launches.swap_rows.iter());
+        }
+    }
+
+    /// Dispatches what works on pairs of rows, for each of these arrays.
+    fn for_pairs<'a>(
+        &self,
+        pairs: &[[u32; 2]],
+        arrays: impl Iterator<Item = &'a RowLaunch<Launch>> + Clone,
+    ) {
         for chunk in pairs.chunks(CHUNK / 2) {
             self.execute(chunk.as_flattened(), |to| {
-                for array in self.launches.copy_rows.iter().filter(|a| ways.contains(&a.edited)) {
+                for array in arrays.clone() {
                     let RowLaunch { launch, numbers, pitch: [row, number], .. } = array;
                     let count = chunk.len() as u32;
                     let now = [count, *numbers, *row, *number];
@@ -218,6 +259,7 @@ impl GpuBackend {
         self.copy_rows(&reborn, &[Edited::Cleared]);
         let moves: Vec<_> = ops.moves.iter().map(|&(from, to)| [from, to]).collect();
         self.copy_rows(&moves, &[Edited::Computed, Edited::Inherited, Edited::Cleared]);
+        self.reorder(&ops.order());
         if let Some(most) = ops.clamp_opacity {
             let rows = ops.rows_after as u32;
             let waits = u32::from(self.sizes.waits()[0]);
@@ -244,9 +286,34 @@ impl GpuBackend {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashSet;
+
     use densify_policies::plan::{EditPlan, Offspring, UNTURNED};
+    use rand::SeedableRng;
+    use rand::seq::SliceRandom;
+    use rand_chacha::ChaCha8Rng;
 
     use super::*;
+
+    #[test]
+    fn two_rounds_of_swaps_are_any_permutation() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        for rows in [0, 1, 2, 3, 4, 5, 17, 300] {
+            let mut order: Vec<u32> = (0..rows).collect();
+            for _ in 0..4 {
+                let mut found: Vec<u32> = (0..rows).collect();
+                for round in rounds_of_swaps(&order) {
+                    let mut seen = HashSet::new();
+                    for [a, b] in round {
+                        assert!(seen.insert(a) && seen.insert(b), "{order:?}: a row in two swaps");
+                        found.swap(a as usize, b as usize);
+                    }
+                }
+                assert_eq!(found, order);
+                order.shuffle(&mut rng);
+            }
+        }
+    }
 
     #[test]
     fn families_cut_into_chunks_are_the_same_families() {

@@ -40,6 +40,8 @@ pub(super) struct Launches<L = Launch> {
     pub(super) in_slots: bool,
     /// Copies or clears rows, for every array that an edit touches.
     pub(super) copy_rows: Vec<RowLaunch<L>>,
+    /// Exchanges rows, for the same arrays.
+    pub(super) swap_rows: Vec<RowLaunch<L>>,
     pub(super) audits: Vec<Audit<L>>,
 }
 
@@ -115,7 +117,7 @@ impl<L> Launches<L> {
             None => vec![bind(kernel, &[])],
             Some(several) => several.iter().map(|instead| bind(kernel, instead)).collect(),
         };
-        let of_array = |kernel: &&str| !["copy_rows", "audit"].contains(kernel);
+        let of_array = |kernel: &&str| !["copy_rows", "swap_rows", "audit"].contains(kernel);
         Self {
             by_kernel: kernels
                 .filter(of_array)
@@ -123,7 +125,8 @@ impl<L> Launches<L> {
                 .collect(),
             record: sizes.records.stride() as u32,
             in_slots: sizes.accumulation == Accumulation::Slots,
-            copy_rows: copies(bind, sizes),
+            copy_rows: of_rows("copy_rows", bind, sizes),
+            swap_rows: of_rows("swap_rows", bind, sizes),
             audits: audits(bind, sizes),
         }
     }
@@ -191,17 +194,17 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Instead>>> {
     ])
 }
 
-/// One dispatch for each array that an edit touches.
-fn copies<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
-    let copy = |array: &RowArray| RowLaunch {
-        launch: bind("copy_rows", &[("buffer", array.name)]),
+/// One dispatch of a kernel for each array that an edit touches.
+fn of_rows<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
+    let launch = |array: &RowArray| RowLaunch {
+        launch: bind(kernel, &[("buffer", array.name)]),
         edited: array.holds.traits().edited,
         numbers: array.numbers as u32,
         pitch: array.pitch(sizes.budget),
     };
     let arrays = sizes.row_arrays();
     let edited = arrays.iter().filter(|array| array.holds.traits().edited != Edited::Untouched);
-    edited.map(copy).collect()
+    edited.map(launch).collect()
 }
 
 /// The marks borrow the sums of the sorts, which are not needed between two steps.

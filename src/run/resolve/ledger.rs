@@ -26,7 +26,8 @@ const PROGRAM_STEP: u64 = 8 << 20;
 /// What the system's allocator keeps between two uses of a piece. Measured at up to 5 MiB.
 const KEPT: u64 = 6 << 20;
 /// What a policy makes of its signals for each row before it plans: means, orders, sums of weights
-/// and draws. Those that make more of auxiliary views' columns have these counted twice.
+/// and draws. Those that make more of auxiliary views' columns have these counted twice. Bringing rows into
+/// their order takes at most as much, when this is free again.
 const PLANNING: u64 = 20;
 /// What a thread of either pool takes: what it touches of its stack and keeps of its buffers. Measured at
 /// 44 to 52 KiB for both together, from 64 to 256 threads.

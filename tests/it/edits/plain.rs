@@ -134,7 +134,8 @@ impl Row {
 pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &PolicyRng) -> Vec<Row> {
     let before = model;
     let mut slots: Vec<Option<Row>> = before.iter().cloned().map(Some).collect();
-    let (mut children, mut seeds) = (Vec::new(), Vec::new());
+    let mut children: Vec<Vec<Row>> = vec![Vec::new(); before.len()];
+    let mut seeds = Vec::new();
     let mut clamp = f32::INFINITY;
     let mut reset = false;
     for call in calls {
@@ -142,7 +143,8 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
             Call::Prune(row) => slots[*row as usize] = None,
             Call::Grow(row, how) => {
                 let parent = &before[*row as usize];
-                children.extend((1..=how.children).map(|n| parent.child(*row, n, how, rng)));
+                children[*row as usize] =
+                    (1..=how.children).map(|n| parent.child(*row, n, how, rng)).collect();
                 if how.parent == ParentFate::BecomesChild {
                     slots[*row as usize] = Some(parent.child(*row, 0, how, rng));
                 }
@@ -163,19 +165,11 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
             Call::Reset => reset = true,
         }
     }
-    for newborn in children.into_iter().chain(seeds) {
-        let slot = slots.iter().position(Option::is_none).unwrap_or(slots.len());
-        if slot == slots.len() {
-            slots.push(None);
-        }
-        slots[slot] = Some(newborn);
-        assert!(slots.len() <= budget.max(before.len()), "a slot beyond the budget");
-    }
-    let live = slots.iter().flatten().count();
-    assert!(live <= budget, "{live} rows, budget {budget}");
-    let mut tail = slots.split_off(live).into_iter().flatten();
-    let dense = slots.into_iter().map(|slot| slot.or_else(|| tail.next()));
-    let mut model: Vec<Row> = dense.map(|row| row.expect("as many rows as holes")).collect();
+    let families = slots.into_iter().zip(children);
+    let mut model: Vec<Row> =
+        families.flat_map(|(row, children)| row.into_iter().chain(children)).collect();
+    model.extend(seeds);
+    assert!(model.len() <= budget, "{} rows, budget {budget}", model.len());
     for row in &mut model {
         if clamp < 1.0 {
             row.logit = row.logit.min(logit(f64::from(clamp)));

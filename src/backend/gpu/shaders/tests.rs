@@ -128,8 +128,8 @@ fn every_kernel_is_dispatched_by_its_name() {
             "`rebound` has buffers for `{kernel}`, which is no kernel"
         );
     }
-    // These two are bound to each array of rows.
-    let mut dispatched = BTreeSet::from(["copy_rows", "audit"].map(str::to_owned));
+    // These are bound to each array of rows.
+    let mut dispatched = BTreeSet::from(["copy_rows", "swap_rows", "audit"].map(str::to_owned));
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/backend/gpu");
     for entry in std::fs::read_dir(folder).expect("the sources") {
         let path = entry.expect("a file").path();
