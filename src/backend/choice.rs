@@ -5,7 +5,7 @@ use clap::ValueEnum;
 use densify_policies::policy::Needs;
 use serde::{Deserialize, Serialize};
 
-use super::cpu::{CpuBackend, CpuOptions};
+use super::cpu::{CpuBackend, InstructionSet};
 use super::gpu::{GpuDevice, adapters, may_be_present};
 use super::{
     Accumulation, AdapterChoice, AdapterKind, AdapterSummary, Backend, BackendError, Shortcuts,
@@ -92,18 +92,22 @@ pub enum Device {
     Gpu(GpuDevice),
 }
 
-/// How to set up a backend, whichever it is.
+/// How to set up a backend, whichever it is. The default has room for one row.
 #[derive(Debug, Clone)]
-pub struct BackendOptions {
+pub struct Setup {
     /// Most rows there may ever be, >= 1 and >= the model's.
     pub budget: usize,
-    /// Near plane `[scene units]`, > 0.
+    /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
     pub near: f32,
     /// Most (row, tile) pairs held at a time, beyond which an image is processed in bands; `None`: 16
-    /// per row, or as many as the device can hold.
+    /// per row, or as many as the device can hold. At least the budget is taken, as one tile's list
+    /// must fit.
     pub tile_cap: Option<usize>,
-    /// Most gradient records held at a time (native backend).
+    /// Most gradient records, one per pair, held at a time, >= 1; where there are more pairs, the
+    /// backward pass takes them in parts (native backend).
     pub record_cap: usize,
+    /// What the kernels may use of the processor (native backend).
+    pub instructions: InstructionSet,
     /// Processor threads; `None`: all cores.
     pub threads: Option<usize>,
     /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
@@ -119,7 +123,7 @@ pub struct BackendOptions {
     pub needs: Needs,
 }
 
-impl BackendOptions {
+impl Setup {
     /// Options for models of at most `budget` rows.
     #[must_use]
     pub fn new(budget: usize) -> Self {
@@ -128,6 +132,7 @@ impl BackendOptions {
             near: 0.01,
             tile_cap: None,
             record_cap: usize::MAX,
+            instructions: InstructionSet::default(),
             threads: None,
             largest_image: (0, 0),
             photographs: KeptPhotographs::default(),
@@ -136,20 +141,11 @@ impl BackendOptions {
             needs: Needs::default(),
         }
     }
+}
 
-    fn cpu(&self) -> CpuOptions {
-        let defaults = CpuOptions::new(self.budget);
-        CpuOptions {
-            near: self.near,
-            tile_cap: self.tile_cap.unwrap_or(defaults.tile_cap),
-            record_cap: self.record_cap,
-            threads: self.threads,
-            largest_image: self.largest_image,
-            storage: self.storage,
-            needs: self.needs.clone(),
-            shortcuts: self.shortcuts,
-            ..defaults
-        }
+impl Default for Setup {
+    fn default() -> Self {
+        Self::new(1)
     }
 }
 
@@ -271,9 +267,9 @@ impl Device {
     /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
     /// The promise is for `threads` threads, whatever the options say.
     #[must_use]
-    pub fn promise(&self, sh_degree: u8, options: &BackendOptions, threads: usize) -> Ledger {
+    pub fn promise(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         match self {
-            Self::Processor => CpuBackend::promise(sh_degree, &options.cpu(), threads),
+            Self::Processor => CpuBackend::promise(sh_degree, options, threads),
             Self::Gpu(device) => device.promise(sh_degree, options),
         }
     }
@@ -304,10 +300,10 @@ impl Device {
     pub fn backend(
         &self,
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
     ) -> Result<Box<dyn Backend>, BackendError> {
         Ok(match self {
-            Self::Processor => Box::new(CpuBackend::new(model, &options.cpu())?),
+            Self::Processor => Box::new(CpuBackend::new(model, options)?),
             Self::Gpu(device) => device.backend(model, options)?,
         })
     }

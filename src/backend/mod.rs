@@ -34,7 +34,7 @@ use crate::memory::Ledger;
 pub use accumulation::Accumulation;
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
 pub use audit::{Attribute, Kept, Unsound};
-pub use choice::{BackendChoice, BackendKind, BackendOptions, Device, KeptPhotographs};
+pub use choice::{BackendChoice, BackendKind, Device, KeptPhotographs, Setup};
 pub use differentiable::{Differentiable, ImageGradient};
 pub use shortcuts::Shortcuts;
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};

@@ -21,7 +21,6 @@ mod moments;
 mod narrow;
 mod observe;
 mod optimise;
-mod options;
 mod parameters;
 mod parts;
 mod passes;
@@ -52,8 +51,8 @@ use pulp::Arch;
 use super::candidates::{Candidates, error_weights};
 use super::signals::Field;
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
-    StepInput, StepOutput, Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
+    StateError, StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
@@ -78,7 +77,6 @@ use tiles::TileLists;
 
 pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
-pub use options::CpuOptions;
 pub use threads::StepTasks;
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.
@@ -130,9 +128,9 @@ pub struct CpuBackend {
 
 impl CpuBackend {
     /// Bytes per buffer of a backend made with these options for models of this degree, on so many
-    /// threads; [`CpuOptions::threads`] is not looked at.
+    /// threads; [`Setup::threads`] is not looked at.
     #[must_use]
-    pub fn promise(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
+    pub fn promise(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         budget::ledger(sh_degree, options, threads)
     }
 
@@ -143,7 +141,7 @@ impl CpuBackend {
     ///
     /// # Panics
     /// When the model has more rows than the budget: the caller subsamples before.
-    pub fn new(model: &Gaussians, options: &CpuOptions) -> Result<Self, BackendError> {
+    pub fn new(model: &Gaussians, options: &Setup) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let threads = Threads::new(options.threads)?;

@@ -11,7 +11,7 @@ use super::wait::wait;
 use super::{GpuBackend, promise};
 use crate::backend::signals::RecordLayout;
 use crate::backend::{
-    Accumulation, AdapterChoice, AdapterSummary, BackendError, BackendOptions, Differentiable,
+    Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup,
 };
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
@@ -63,7 +63,7 @@ impl GpuDevice {
 
     /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
     #[must_use]
-    pub fn promise(&self, sh_degree: u8, options: &BackendOptions) -> Ledger {
+    pub fn promise(&self, sh_degree: u8, options: &Setup) -> Ledger {
         promise::ledger(&promise::sizes(&self.0, sh_degree, options), &options.needs)
     }
 
@@ -74,7 +74,7 @@ impl GpuDevice {
     pub fn backend(
         &self,
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
         Ok(Box::new(GpuBackend::new(model, options, self)?))
     }

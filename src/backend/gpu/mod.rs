@@ -46,8 +46,8 @@ use densify_policies::policy::{
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes};
 use super::{
-    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, BackendOptions, Rendering,
-    Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound,
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts,
+    StateArray, StateError, StepInput, StepOutput, Tensor, Unsound,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
@@ -100,7 +100,7 @@ pub struct GpuBackend {
 impl GpuBackend {
     fn without_canary(
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let shortcuts = options.shortcuts;
