@@ -9,7 +9,6 @@ use crate::checkpoint::CheckpointError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
 use crate::export::FormatError;
-use crate::import::ply::PlyError;
 use crate::init::InitError;
 use crate::knobs::KnobError;
 use crate::output::OutputError;
@@ -62,7 +61,6 @@ impl BadInput for DatasetError {}
 impl BadInput for FormatError {}
 impl BadInput for InitError {}
 impl BadInput for KnobError {}
-impl BadInput for PlyError {}
 /// Before training: the policy's name or parameters are wrong.
 impl BadInput for PolicyError {}
 
@@ -116,12 +114,10 @@ impl From<TrainError> for Failure {
 impl From<CheckpointError> for Failure {
     fn from(error: CheckpointError) -> Self {
         match error {
-            CheckpointError::Write(error) => error.into(),
+            CheckpointError::File(error) => error.into(),
             CheckpointError::Backend(error) => error.into(),
-            error @ (CheckpointError::Read { .. } | CheckpointError::Policy { .. }) => {
-                Self { code: OTHER, message: error.to_string() }
-            }
-            error @ CheckpointError::Invalid { .. } => Self::input(error),
+            CheckpointError::Policy { .. } => Self { code: OTHER, message: error.to_string() },
+            CheckpointError::Invalid { .. } => Self::input(error),
         }
     }
 }
