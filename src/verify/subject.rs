@@ -1,6 +1,5 @@
 //! What is tested: a backend, made the same way whichever it is.
 
-
 use super::compare::Limits;
 use crate::backend::cpu::{CpuBackend, InstructionSet};
 use crate::backend::gpu::GpuDevice;

@@ -52,7 +52,7 @@ use super::candidates::{Candidates, error_weights};
 use super::signals::Field;
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
-    StateError, StepInput, StepOutput, Tensor, Unsound,
+    StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
@@ -247,12 +247,7 @@ impl Backend for CpuBackend {
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, .. } = *input;
-        assert_eq!(
-            (camera.width, camera.height),
-            (target.width, target.height),
-            "camera and image differ in size"
-        );
+        assert_same_size(input.camera, input.target);
         let threads = Arc::clone(&self.threads);
         let output = threads.step(|| self.step(input))?;
         #[cfg(test)]
@@ -283,13 +278,7 @@ impl Backend for CpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        // Kept in release builds: this is the promise.
-        assert_eq!(ops.rows_before, self.rows, "a plan for another number of rows");
-        assert_eq!(ops.budget, self.budget, "a plan for another budget");
-        assert!(ops.rows_after <= self.budget, "{} rows over the budget", ops.rows_after);
-        if let Err(broken) = ops.check() {
-            panic!("a plan that breaks its own rules: {broken}");
-        }
+        assert_fits(ops, self.rows, self.budget);
         let mut model = apply::Model {
             params: &mut self.params,
             moments: &mut self.moments,
