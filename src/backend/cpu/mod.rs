@@ -22,7 +22,6 @@ mod narrow;
 mod observe;
 mod optimise;
 mod parameters;
-mod parts;
 mod passes;
 mod project;
 mod project_bwd;
