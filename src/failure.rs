@@ -89,12 +89,7 @@ fn is_input(error: &BackendError) -> bool {
 
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
-        let code = match error {
-            OutputError::Io { .. } | OutputError::Lost { .. } | OutputError::NotReplaced { .. } => {
-                OTHER
-            }
-            _ => INPUT,
-        };
+        let code = if matches!(error, OutputError::Unfit(_)) { INPUT } else { OTHER };
         Self { code, message: error.to_string() }
     }
 }
