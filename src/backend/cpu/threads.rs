@@ -107,7 +107,7 @@ impl Threads {
     {
         let tasks = tasks.into_par_iter();
         let recorder = self.begin(region, tasks.len());
-        tasks.for_each_init(scratch, |scratch, task| ended(recorder, run(scratch, task)));
+        tasks.for_each_init(scratch, |scratch, task| timed(recorder, || run(scratch, task)));
     }
 
     /// A region whose tasks return something, in their order.
@@ -136,7 +136,7 @@ impl Threads {
     {
         let tasks = tasks.into_par_iter();
         let recorder = self.begin(region, tasks.len());
-        tasks.map_init(scratch, |scratch, task| ended(recorder, run(scratch, task))).collect()
+        tasks.map_init(scratch, |scratch, task| timed(recorder, || run(scratch, task))).collect()
     }
 
     /// A region whose tasks count something. The order of adding whole numbers does not matter.
@@ -151,7 +151,7 @@ impl Threads {
     {
         let tasks = tasks.into_par_iter();
         let recorder = self.begin(region, tasks.len());
-        tasks.map(|task| ended(recorder, run(task))).sum()
+        tasks.map(|task| timed(recorder, || run(task))).sum()
     }
 
     /// Begins a region; returns what records the ends of its tasks, if they are recorded.
@@ -160,8 +160,9 @@ impl Threads {
     }
 }
 
-/// Passes on what a task returned, which has ended.
-fn ended<R>(recorder: Option<&Recorder>, result: R) -> R {
+/// Runs a task, and records its end.
+fn timed<R>(recorder: Option<&Recorder>, run: impl FnOnce() -> R) -> R {
+    let result = run();
     if let Some(recorder) = recorder {
         recorder.end_task();
     }
