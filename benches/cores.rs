@@ -13,7 +13,8 @@ use std::collections::BinaryHeap;
 use std::time::Duration;
 
 use densify::backend::Backend;
-use densify::backend::cpu::{CpuBackend, CpuOptions, StepTasks};
+use densify::backend::Setup;
+use densify::backend::cpu::{CpuBackend, StepTasks};
 use densify_policies::policy::{CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet};
 
 use steps::{median, ms};
@@ -79,12 +80,12 @@ fn percent(part: Duration, whole: Duration) -> f64 {
 
 /// The steps of a backend on one thread.
 fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
-    let options = CpuOptions {
+    let options = Setup {
         threads: Some(1),
         largest_image: (size, size),
-        tile_cap: rows * 8,
+        tile_cap: Some(rows * 8),
         needs,
-        ..CpuOptions::new(rows)
+        ..Setup::new(rows)
     };
     let mut backend = match CpuBackend::new(&steps::scene(rows, 3), &options) {
         Ok(backend) => backend,

@@ -13,9 +13,9 @@ use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
-use densify::backend::cpu::{CpuBackend, CpuOptions};
+use densify::backend::cpu::CpuBackend;
 use densify::backend::gpu::{GpuBackend, GpuDevice, adapters};
-use densify::backend::{AdapterChoice, AdapterKind, Backend, BackendError, BackendOptions};
+use densify::backend::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
 use steps::{median, ms};
 
@@ -137,11 +137,11 @@ fn main() {
         }
         let model = steps::scene(rows, 3);
         for threads in [1, 2] {
-            let options = CpuOptions {
+            let options = Setup {
                 threads: Some(threads),
                 largest_image: (size, size),
-                tile_cap: rows * 8,
-                ..CpuOptions::new(rows)
+                tile_cap: Some(rows * 8),
+                ..Setup::new(rows)
             };
             let backend = CpuBackend::new(&model, &options);
             let on = if threads == 1 { "1 thread" } else { "2 threads" };
@@ -151,8 +151,7 @@ fn main() {
             if device.adapter().kind == AdapterKind::Software && rows > 50_000 {
                 continue;
             }
-            let options =
-                BackendOptions { largest_image: (size, size), ..BackendOptions::new(rows) };
+            let options = Setup { largest_image: (size, size), ..Setup::new(rows) };
             let backend = GpuBackend::new(&model, &options, device);
             let on = format!("adapter {i}");
             measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &on);

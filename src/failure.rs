@@ -9,7 +9,6 @@ use crate::checkpoint::CheckpointError;
 use crate::dataset::DatasetError;
 use crate::evaluate::EvaluateError;
 use crate::export::FormatError;
-use crate::import::ply::PlyError;
 use crate::init::InitError;
 use crate::knobs::KnobError;
 use crate::output::OutputError;
@@ -62,7 +61,6 @@ impl BadInput for DatasetError {}
 impl BadInput for FormatError {}
 impl BadInput for InitError {}
 impl BadInput for KnobError {}
-impl BadInput for PlyError {}
 /// Before training: the policy's name or parameters are wrong.
 impl BadInput for PolicyError {}
 
@@ -91,12 +89,7 @@ fn is_input(error: &BackendError) -> bool {
 
 impl From<OutputError> for Failure {
     fn from(error: OutputError) -> Self {
-        let code = match error {
-            OutputError::Io { .. } | OutputError::Lost { .. } | OutputError::NotReplaced { .. } => {
-                OTHER
-            }
-            _ => INPUT,
-        };
+        let code = if matches!(error, OutputError::Unfit(_)) { INPUT } else { OTHER };
         Self { code, message: error.to_string() }
     }
 }
@@ -116,12 +109,10 @@ impl From<TrainError> for Failure {
 impl From<CheckpointError> for Failure {
     fn from(error: CheckpointError) -> Self {
         match error {
-            CheckpointError::Write(error) => error.into(),
+            CheckpointError::File(error) => error.into(),
             CheckpointError::Backend(error) => error.into(),
-            error @ (CheckpointError::Read { .. } | CheckpointError::Policy { .. }) => {
-                Self { code: OTHER, message: error.to_string() }
-            }
-            error @ CheckpointError::Invalid { .. } => Self::input(error),
+            CheckpointError::Policy { .. } => Self { code: OTHER, message: error.to_string() },
+            CheckpointError::Invalid { .. } => Self::input(error),
         }
     }
 }

@@ -5,11 +5,10 @@ use clap::ValueEnum;
 use densify_policies::policy::Needs;
 use serde::{Deserialize, Serialize};
 
-use super::cpu::{CpuBackend, CpuOptions};
+use super::cpu::CpuBackend;
 use super::gpu::{GpuDevice, adapters, may_be_present};
 use super::{
-    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, Backend, BackendError, Shortcuts,
-    Storage,
+    Accumulation, AdapterChoice, AdapterKind, AdapterSummary, Backend, BackendError, Setup,
 };
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
@@ -90,85 +89,6 @@ pub enum Device {
     Processor,
     /// An adapter that has been opened.
     Gpu(GpuDevice),
-}
-
-/// How to set up a backend, whichever it is.
-#[derive(Debug, Clone)]
-pub struct BackendOptions {
-    /// Most rows there may ever be, >= 1 and >= the model's.
-    pub budget: usize,
-    /// Near plane `[scene units]`, > 0.
-    pub near: f32,
-    /// Most (row, tile) pairs held at a time, beyond which an image is processed in bands; `None`: 16
-    /// per row, or as many as the device can hold.
-    pub tile_cap: Option<usize>,
-    /// Most gradient records held at a time (native backend).
-    pub record_cap: usize,
-    /// Processor threads; `None`: all cores.
-    pub threads: Option<usize>,
-    /// Largest image that will be rendered (width, height) `[px]`. Larger ones still work, with more
-    /// memory than the ledger says.
-    pub largest_image: (u32, u32),
-    /// Photographs that stay on a GPU instead of being uploaded at every step.
-    pub photographs: KeptPhotographs,
-    /// How parameters and moments are stored (native backend).
-    pub storage: Storage,
-    /// Where to compute less than could be.
-    pub shortcuts: Shortcuts,
-    /// Signals and candidates to collect.
-    pub needs: Needs,
-}
-
-impl BackendOptions {
-    /// Options for models of at most `budget` rows.
-    #[must_use]
-    pub fn new(budget: usize) -> Self {
-        Self {
-            budget,
-            near: 0.01,
-            tile_cap: None,
-            record_cap: usize::MAX,
-            threads: None,
-            largest_image: (0, 0),
-            photographs: KeptPhotographs::default(),
-            storage: Storage::default(),
-            shortcuts: Shortcuts::default(),
-            needs: Needs::default(),
-        }
-    }
-
-    fn cpu(&self) -> CpuOptions {
-        let defaults = CpuOptions::new(self.budget);
-        CpuOptions {
-            near: self.near,
-            tile_cap: self.tile_cap.unwrap_or(defaults.tile_cap),
-            record_cap: self.record_cap,
-            threads: self.threads,
-            largest_image: self.largest_image,
-            storage: self.storage,
-            needs: self.needs.clone(),
-            shortcuts: self.shortcuts,
-            ..defaults
-        }
-    }
-}
-
-/// Photographs that may stay on the device.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct KeptPhotographs {
-    /// How many.
-    pub count: usize,
-    /// Whether any of them has a mask.
-    pub with_masks: bool,
-}
-
-impl KeptPhotographs {
-    /// Bytes that one takes on the device, where the largest has this size: its pixels, and its mask.
-    #[must_use]
-    pub fn bytes((width, height): (u32, u32), with_masks: bool) -> [u64; 2] {
-        let pixels = u64::from(width) * u64::from(height);
-        [4 * pixels, if with_masks { pixels.next_multiple_of(4) } else { 0 }]
-    }
 }
 
 impl Device {
@@ -271,9 +191,9 @@ impl Device {
     /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
     /// The promise is for `threads` threads, whatever the options say.
     #[must_use]
-    pub fn promise(&self, sh_degree: u8, options: &BackendOptions, threads: usize) -> Ledger {
+    pub fn promise(&self, sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         match self {
-            Self::Processor => CpuBackend::promise(sh_degree, &options.cpu(), threads),
+            Self::Processor => CpuBackend::promise(sh_degree, options, threads),
             Self::Gpu(device) => device.promise(sh_degree, options),
         }
     }
@@ -304,10 +224,10 @@ impl Device {
     pub fn backend(
         &self,
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
     ) -> Result<Box<dyn Backend>, BackendError> {
         Ok(match self {
-            Self::Processor => Box::new(CpuBackend::new(model, &options.cpu())?),
+            Self::Processor => Box::new(CpuBackend::new(model, options)?),
             Self::Gpu(device) => device.backend(model, options)?,
         })
     }

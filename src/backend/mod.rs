@@ -16,10 +16,9 @@ pub mod gpu;
 #[path = "without_gpu.rs"]
 pub mod gpu;
 mod pixel_map;
-mod shortcuts;
+mod setup;
 mod signals;
 mod state;
-mod storage;
 
 use std::ops::Range;
 use std::time::Duration;
@@ -34,12 +33,11 @@ use crate::memory::Ledger;
 pub use accumulation::Accumulation;
 pub use adapter::{AdapterChoice, AdapterKind, AdapterSummary};
 pub use audit::{Attribute, Kept, Unsound};
-pub use choice::{BackendChoice, BackendKind, BackendOptions, Device, KeptPhotographs};
+pub use choice::{BackendChoice, BackendKind, Device};
 pub use differentiable::{Differentiable, ImageGradient};
-pub use shortcuts::Shortcuts;
+pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub(crate) use state::{ROWS_AT_A_TIME, pieces};
 pub use state::{StateArray, StateError, Tensor, Values};
-pub use storage::{MomentStorage, ParameterStorage, Storage};
 
 /// Step sizes of one iteration, one per parameter class.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -143,6 +141,22 @@ pub struct Rendering {
     pub alpha: Vec<f32>,
     /// Σ α·T·z, camera z `[scene units]`, without a background term. Shape: `[height, width]`.
     pub depth: Vec<f32>,
+}
+
+/// Panics unless they have the same size.
+fn assert_same_size(camera: &Camera, image: &Image8) {
+    let [camera, image] = [[camera.width, camera.height], [image.width, image.height]];
+    assert_eq!(camera, image, "camera and image differ in size");
+}
+
+/// Panics unless a plan fits the rows; in release builds too, as this is the promise.
+fn assert_fits(ops: &RowOps, rows: usize, budget: usize) {
+    assert_eq!(ops.rows_before, rows, "a plan for another number of rows");
+    assert_eq!(ops.budget, budget, "a plan for another budget");
+    assert!(ops.rows_after <= budget, "{} rows over the budget", ops.rows_after);
+    if let Err(broken) = ops.check() {
+        panic!("a plan that breaks its own rules: {broken}");
+    }
 }
 
 /// Why a backend cannot go on.

@@ -2,9 +2,7 @@
 
 use densify_policies::policy::Needs;
 
-use super::{
-    Accumulation, AdapterChoice, AdapterSummary, BackendError, BackendOptions, Differentiable,
-};
+use super::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup};
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 use crate::without::without;
@@ -37,14 +35,14 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn promise(&self, _: u8, _: &BackendOptions) -> Ledger {
+    pub(super) fn promise(&self, _: u8, _: &Setup) -> Ledger {
         match *self {}
     }
 
     pub(crate) fn backend(
         &self,
         _: &Gaussians,
-        _: &BackendOptions,
+        _: &Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
         match *self {}
     }

@@ -1,7 +1,9 @@
-//! The layout of a checkpoint file.
+//! The layout of a checkpoint file, and the names and shapes of the model's arrays in it.
 
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
+
+use crate::gaussians::{ModelArray, sh_coefficients};
 
 /// Version of the format, for writing and reading.
 pub const VERSION: u32 = 2;
@@ -38,5 +40,26 @@ impl Record {
 
     pub(super) fn bytes(&self) -> Option<usize> {
         self.values()?.checked_mul(self.kind.bitsize() / 8)
+    }
+}
+
+/// The name of an array.
+pub(super) fn name_of(array: ModelArray) -> &'static str {
+    match array {
+        ModelArray::Means => "model.means",
+        ModelArray::LogScales => "model.log_scales",
+        ModelArray::Quats => "model.quats",
+        ModelArray::OpacityLogits => "model.opacity_logits",
+        ModelArray::Sh => "model.sh",
+    }
+}
+
+/// The shape of an array of so many rows; `sh_degree` is at most
+/// [`MAX_SH_DEGREE`](crate::gaussians::MAX_SH_DEGREE).
+pub(super) fn shape_of(array: ModelArray, rows: usize, sh_degree: u8) -> Vec<usize> {
+    match array {
+        ModelArray::OpacityLogits => vec![rows],
+        ModelArray::Sh => vec![rows, sh_coefficients(sh_degree), 3],
+        _ => vec![rows, array.parameters(sh_degree).len()],
     }
 }

@@ -20,7 +20,6 @@
 mod fingerprint;
 mod folder;
 mod format;
-mod model;
 mod read;
 mod write;
 
@@ -62,14 +61,6 @@ pub struct Header {
 /// Why a checkpoint cannot be written or used.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// The file cannot be read.
-    #[error("cannot read {path}: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The error of the system.
-        source: std::io::Error,
-    },
     /// The file is damaged, or not a checkpoint.
     #[error("{path}: {problem}")]
     Invalid {
@@ -78,9 +69,9 @@ pub enum CheckpointError {
         /// Which part of it, and what is wrong.
         problem: String,
     },
-    /// The file cannot be written.
+    /// The file cannot be read or written.
     #[error(transparent)]
-    Write(#[from] OutputError),
+    File(#[from] OutputError),
     /// The policy cannot save its state.
     #[error("the policy's state: {source}")]
     Policy {

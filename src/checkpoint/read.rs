@@ -6,10 +6,13 @@ use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, Metadata};
 
-use super::format::{CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY};
-use super::{CheckpointError, Header, model};
+use super::format::{
+    CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY, name_of, shape_of,
+};
+use super::{CheckpointError, Header};
 use crate::backend::{Backend, BackendError, StateArray, Tensor, Values, pieces};
 use crate::gaussians::{Gaussians, MAX_SH_DEGREE, ModelArray};
+use crate::output::OutputError;
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 64 << 20;
@@ -30,10 +33,10 @@ impl Checkpoint {
     /// Opens a checkpoint and checks all of it.
     ///
     /// # Errors
-    /// [`CheckpointError::Read`], [`CheckpointError::Invalid`].
+    /// [`CheckpointError::File`], [`CheckpointError::Invalid`].
     pub fn open(path: &Path) -> Result<Self, CheckpointError> {
         let invalid = |problem: String| CheckpointError::invalid(path, problem);
-        let failed = |source| CheckpointError::Read { path: path.to_owned(), source };
+        let failed = |source| OutputError::io("read", path)(source);
         let mut file = crate::foreign::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
         let mut length = [0; LENGTH as usize];
@@ -83,7 +86,7 @@ impl Checkpoint {
         if sh_degree > MAX_SH_DEGREE {
             return Err(self.invalid(format!("sh_degree is {sh_degree}; at most {MAX_SH_DEGREE}")));
         }
-        let means = self.place(model::name(ModelArray::Means))?;
+        let means = self.place(name_of(ModelArray::Means))?;
         let rows = self.places[means].1.shape.first().copied().unwrap_or(0);
         if rows > budget {
             return Err(self.invalid(format!("{rows} rows, but its budget is {budget}")));
@@ -101,10 +104,10 @@ impl Checkpoint {
         rows: usize,
         sh_degree: u8,
     ) -> Result<usize, CheckpointError> {
-        let name = model::name(array);
+        let name = name_of(array);
         let place = self.place(name)?;
         let Record { shape, kind, .. } = &self.places[place].1;
-        let needed = model::shape(array, rows, sh_degree);
+        let needed = shape_of(array, rows, sh_degree);
         if (shape, *kind) == (&needed, Dtype::F32) {
             return Ok(place);
         }
@@ -118,11 +121,11 @@ impl Checkpoint {
     ///
     /// # Errors
     /// [`CheckpointError::Invalid`] if the arrays are not those of this backend;
-    /// [`CheckpointError::Read`], [`CheckpointError::Backend`].
+    /// [`CheckpointError::File`], [`CheckpointError::Backend`].
     pub fn restore(&mut self, backend: &mut dyn Backend) -> Result<(), CheckpointError> {
         let wanted = backend.state();
         let known = |name: &str| {
-            ModelArray::ALL.into_iter().any(|array| model::name(array) == name)
+            ModelArray::ALL.into_iter().any(|array| name_of(array) == name)
                 || wanted.iter().any(|array| array.name == name)
         };
         if let Some((_, record)) = self.places.iter().find(|(_, record)| !known(&record.name)) {
@@ -137,7 +140,7 @@ impl Checkpoint {
             let place = self.place_in_model(array, rows, sh_degree)?;
             let mut reader = ArrayReader::new(self, place)?;
             for rows in pieces(rows) {
-                let shape = model::shape(array, rows.len(), sh_degree);
+                let shape = shape_of(array, rows.len(), sh_degree);
                 let values = reader.tensor(rows.len())?.into_f32(&shape).map_err(&refused)?;
                 backend.upload_array(array, rows, &values)?;
             }
@@ -200,7 +203,7 @@ impl<'a> ArrayReader<'a> {
     }
 
     fn failed(&self, source: io::Error) -> CheckpointError {
-        CheckpointError::Read { path: self.path.to_owned(), source }
+        OutputError::io("read", self.path)(source).into()
     }
 
     /// The next `entries` along the first dimension.

@@ -11,7 +11,8 @@ use glam::DVec3;
 use safetensors::SafeTensors;
 
 use super::*;
-use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::Setup;
+use crate::backend::cpu::CpuBackend;
 use crate::backend::{Backend, ROWS_AT_A_TIME, StateArray, Tensor, Values};
 use crate::dataset::normalise::Normalisation;
 use crate::gaussians::Gaussians;
@@ -35,7 +36,7 @@ fn gaussians() -> Gaussians {
     }
 }
 
-fn options() -> CpuOptions {
+fn options() -> Setup {
     let candidates = CandidateRequest {
         from: 0,
         until: 9,
@@ -52,7 +53,7 @@ fn options() -> CpuOptions {
         cadence: Cadence { all: 2, sh_rest: 4 },
         ..Needs::default()
     };
-    CpuOptions { needs, threads: Some(1), ..CpuOptions::new(ROWS + 3) }
+    Setup { needs, threads: Some(1), ..Setup::new(ROWS + 3) }
 }
 
 /// A backend in the midst of a run: arbitrary values in every array of its state.
@@ -210,13 +211,13 @@ fn headers_that_promise_too_much_are_refused_without_allocation() {
 #[test]
 fn a_state_of_another_run_is_refused_by_name() {
     let (_root, path) = written();
-    let refused = |options: CpuOptions, words: &str| {
+    let refused = |options: Setup, words: &str| {
         let mut checkpoint = Checkpoint::open(&path).unwrap();
         let mut other = CpuBackend::new(&gaussians(), &options).unwrap();
         let problem = checkpoint.restore(&mut other).unwrap_err().to_string();
         assert!(problem.contains(words), "{problem}");
     };
-    let plain = CpuOptions { needs: Needs::default(), ..options() };
+    let plain = Setup { needs: Needs::default(), ..options() };
     refused(plain, "has a tensor `signals.MeanGradientX`, which this run does not have");
     let mut more = options();
     more.needs.signals = more.needs.signals.with(Signal::PixelCount);

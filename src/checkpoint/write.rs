@@ -7,8 +7,10 @@ use std::path::Path;
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
-use super::format::{CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY};
-use super::{CheckpointError, Header, model};
+use super::format::{
+    CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY, name_of, shape_of,
+};
+use super::{CheckpointError, Header};
 use crate::backend::{Backend, BackendError, StateArray, Tensor, Values, pieces};
 use crate::gaussians::ModelArray;
 use crate::output::{WriteError, write_atomically_from};
@@ -17,7 +19,7 @@ use crate::output::{WriteError, write_atomically_from};
 /// its name when it is complete and on disk; an existing file stays until then.
 ///
 /// # Errors
-/// [`CheckpointError::Write`], [`CheckpointError::Backend`].
+/// [`CheckpointError::File`], [`CheckpointError::Backend`].
 pub fn write(path: &Path, header: &Header, backend: &dyn Backend) -> Result<(), CheckpointError> {
     write_atomically_from(path, |out| {
         // Two passes over the arrays: the header, which comes first, has their checksums.
@@ -45,9 +47,9 @@ fn write_arrays(
     let mut records = Vec::new();
     for array in ModelArray::ALL {
         let piece = |rows: Range<usize>| {
-            let shape = model::shape(array, rows.len(), sh_degree);
+            let shape = shape_of(array, rows.len(), sh_degree);
             let values = backend.download_array(array, rows)?;
-            Ok(Tensor::f32(model::name(array), &shape, values))
+            Ok(Tensor::f32(name_of(array), &shape, values))
         };
         records.push(Record::write(pieces(rows).map(piece), &mut sink)?);
     }

@@ -4,16 +4,15 @@ use std::fmt::Display;
 use std::path::Path;
 
 use crate::foreign::one_line;
-use crate::import::ply::PlyError;
 
-/// Why a dataset, or one of its images, cannot be loaded.
+/// Why a dataset, one of its images, or a model of another program cannot be loaded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
-pub struct DatasetError(pub(super) String);
+pub struct DatasetError(pub(crate) String);
 
 impl DatasetError {
     /// A file cannot be opened or read.
-    pub(super) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+    pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
         move |source| {
             // What this program says of a file, with the remedy, rather than the system.
             let is_ours = source.raw_os_error().is_none();
@@ -26,7 +25,7 @@ impl DatasetError {
     }
 
     /// A file's contents contradict its format or themselves; `field` is the record, line or field.
-    pub(super) fn malformed(
+    pub(crate) fn malformed(
         path: &Path,
         field: impl Display,
         problem: impl Display,
@@ -68,11 +67,5 @@ impl DatasetError {
         let problem = format!("the file {} does not exist", image.display());
         let remedy = "restore it, or name the folder that holds the images with --images";
         Self::malformed(path, field, problem, remedy)
-    }
-}
-
-impl From<PlyError> for DatasetError {
-    fn from(error: PlyError) -> Self {
-        Self(error.to_string())
     }
 }

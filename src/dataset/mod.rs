@@ -7,7 +7,6 @@
 pub mod builtin;
 mod cache;
 mod colmap;
-mod describe;
 mod error;
 mod folders;
 pub mod images;
@@ -37,6 +36,8 @@ use glam::{DMat3, DVec3};
 
 use crate::camera::Camera;
 pub use crate::import::PointCloud;
+use crate::memory::Bytes;
+use crate::number::grouped;
 pub use builtin::GroundTruth;
 pub use error::DatasetError;
 use folders::Folders;
@@ -149,6 +150,27 @@ impl Dataset {
     #[must_use]
     pub fn extent(&self) -> f64 {
         normalise::EXTENT
+    }
+
+    /// Width and height that hold every view `[px]`.
+    #[must_use]
+    pub fn largest_image(&self) -> (u32, u32) {
+        let cameras = self.train.iter().chain(&self.test).map(|view| &view.camera);
+        cameras.fold((1, 1), |(w, h), camera| (w.max(camera.width), h.max(camera.height)))
+    }
+
+    /// A line about it: views, their size, points.
+    #[must_use]
+    pub fn describe(&self) -> String {
+        let (width, height) = self.largest_image();
+        let decoded: u64 = self.train.iter().map(|view| view.source.loaded_bytes()).sum();
+        format!(
+            "{} views to train on ({} decoded), {} held out, up to {width}x{height} px, {} points",
+            self.train.len(),
+            Bytes(decoded),
+            self.test.len(),
+            grouped(self.points.len()),
+        )
     }
 }
 

@@ -41,24 +41,23 @@ fn rig(centres: &[DVec3]) -> (DVec3, f64) {
     (centre, centres.iter().map(|c| c.distance(centre)).fold(0.0, f64::max))
 }
 
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
 /// Fewer cameras than this do not show what is usual.
 const FEW: usize = 10;
 
 /// Which cameras are so far from the others, and so few, that their poses are hardly right.
 #[must_use]
 pub(super) fn far(centres: &[DVec3]) -> Vec<bool> {
-    let median = |mut values: Vec<f64>| {
-        let middle = values.len() / 2;
-        if values.is_empty() {
-            0.0
-        } else {
-            *values.select_nth_unstable_by(middle, f64::total_cmp).1
-        }
+    let along = |axis: usize| {
+        median(centres.iter().map(|centre| centre[axis]).collect()).unwrap_or_default()
     };
-    let along = |axis: usize| median(centres.iter().map(|centre| centre[axis]).collect());
     let middle = DVec3::new(along(0), along(1), along(2));
     let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
-    let unit = median(distances.clone());
+    let unit = median(distances.clone()).unwrap_or_default();
     let is_one_place = unit <= SAME_PLACE * middle.length();
     if is_one_place || centres.len() < FEW {
         return vec![false; centres.len()];
@@ -80,13 +79,7 @@ impl Normalisation {
     pub fn fit(centres: &[DVec3], points: &[DVec3]) -> Self {
         let (centre, mut unit) = rig(centres);
         if unit <= SAME_PLACE * centre.length() {
-            let mut distances: Vec<f64> = points.iter().map(|p| p.distance(centre)).collect();
-            let middle = distances.len() / 2;
-            unit = if distances.is_empty() {
-                1.0
-            } else {
-                *distances.select_nth_unstable_by(middle, f64::total_cmp).1
-            };
+            unit = median(points.iter().map(|p| p.distance(centre)).collect()).unwrap_or(1.0);
         }
         let scale = 1.0 / unit;
         // Zero, and numbers without a normal inverse, cannot be the unit.

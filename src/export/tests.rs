@@ -80,7 +80,7 @@ fn rows_that_cannot_be_had_leave_the_old_file() {
     let path = folder.path().join("model.ply");
     std::fs::write(&path, "old").unwrap();
     let shape = Shape { rows: 100, sh_degree: 0 };
-    let lost = || OutputError::NotAFolder { path: "lost".into() };
+    let lost = || OutputError::Lost { path: "lost".into() };
     let written = PLY.write_file(&path, shape, |rows| match rows.start {
         0 => Ok(model(rows.len(), 0)),
         _ => Err(lost()),

@@ -48,24 +48,10 @@ pub struct InitReport {
     pub rows: usize,
 }
 
-/// Why the first Gaussians cannot be made.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum InitError {
-    /// There is no usable point.
-    #[error(
-        "the scene has no usable point to start from; start from random ones with --init random"
-    )]
-    NoPoints,
-    /// The budget is 0.
-    #[error("a budget of 0 Gaussians holds no model; give --budget at least 1")]
-    NoBudget,
-    /// The degree is not supported.
-    #[error("spherical-harmonic degree {0} is not one of 0 to 3; choose --sh-degree accordingly")]
-    ShDegree(u8),
-    /// The neighbour search does not support so many points.
-    #[error("{0} points are too many for the neighbour search; use fewer")]
-    TooManyPoints(usize),
-}
+/// Why the first Gaussians cannot be made, with the remedy.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct InitError(String);
 
 /// Makes one Gaussian per point, in normalised coordinates. If there are more points than `budget`,
 /// the seed chooses a subset. Rows near each other in space are mostly near each other in order.
@@ -75,11 +61,14 @@ pub fn initialise(
     sh_degree: u8,
     seed: u64,
 ) -> Result<(Gaussians, InitReport), InitError> {
+    let bad = |why: &str| Err(InitError(why.to_owned()));
     if budget == 0 {
-        return Err(InitError::NoBudget);
+        return bad("a budget of 0 Gaussians holds no model; give --budget at least 1");
     }
     if sh_degree > crate::gaussians::MAX_SH_DEGREE {
-        return Err(InitError::ShDegree(sh_degree));
+        return bad(&format!(
+            "spherical-harmonic degree {sh_degree} is not one of 0 to 3; choose --sh-degree accordingly"
+        ));
     }
     let mut report = InitReport { points: points.len(), ..InitReport::default() };
     let mut chosen = finite(points);
@@ -88,7 +77,9 @@ pub fn initialise(
     drop_duplicates(&mut chosen, &points.positions);
     report.duplicates = usable - chosen.len();
     if chosen.is_empty() {
-        return Err(InitError::NoPoints);
+        return bad(
+            "the scene has no usable point to start from; start from random ones with --init random",
+        );
     }
     if chosen.len() > budget {
         report.over_budget = chosen.len() - budget;
@@ -156,7 +147,9 @@ fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
 /// distinct.
 fn log_scales(positions: &[[f64; 3]]) -> Result<Vec<f32>, InitError> {
     if u32::try_from(positions.len()).is_err() {
-        return Err(InitError::TooManyPoints(positions.len()));
+        let count = positions.len();
+        let why = format!("{count} points are too many for the neighbour search; use fewer");
+        return Err(InitError(why));
     }
     if positions.len() == 1 {
         return Ok(vec![SINGLE_POINT_SCALE.ln() as f32]);

@@ -132,9 +132,15 @@ fn the_budget_is_kept_by_a_seeded_subsample() {
 #[test]
 fn impossible_requests_are_errors() {
     let points = scattered(10, 1);
-    assert_eq!(initialise(&points, 0, 0, 0), Err(InitError::NoBudget));
-    assert_eq!(initialise(&points, 1, 4, 0), Err(InitError::ShDegree(4)));
-    assert_eq!(initialise(&PointCloud::default(), 1, 0, 0), Err(InitError::NoPoints));
+    let none = PointCloud::default();
+    for (points, budget, degree, remedy) in [
+        (&points, 0, 0, "--budget"),
+        (&points, 1, 4, "--sh-degree"),
+        (&none, 1, 0, "--init random"),
+    ] {
+        let message = initialise(points, budget, degree, 0).unwrap_err().to_string();
+        assert!(message.contains(remedy), "{message}");
+    }
 }
 
 /// Cameras on a circle of radius 1, looking along `direction` of their place.

@@ -27,7 +27,7 @@ impl FolderLock {
     /// Locks a folder.
     ///
     /// # Errors
-    /// [`OutputError::InUse`] while another process has the lock; [`OutputError::Io`].
+    /// [`OutputError::Unfit`] while another process has the lock; [`OutputError::Io`].
     pub(super) fn take(folder: &Path) -> Result<Self, OutputError> {
         let path = folder.join(LOCK);
         if !cfg!(unix) {
@@ -58,7 +58,7 @@ impl FolderLock {
     /// Fails while a process has the lock on a folder. Writes nothing.
     ///
     /// # Errors
-    /// [`OutputError::InUse`].
+    /// [`OutputError::Unfit`].
     pub(super) fn check(folder: &Path) -> Result<(), OutputError> {
         if cfg!(unix)
             && let Ok(file) = foreign::open(&folder.join(LOCK))
@@ -93,8 +93,12 @@ impl Drop for FolderLock {
 fn in_use(folder: &Path, mut file: File) -> OutputError {
     let mut number = String::new();
     let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut number));
-    let process = read.ok().and_then(|_| number.parse().ok());
-    OutputError::InUse { path: folder.to_owned(), process }
+    let process = read.ok().and_then(|_| number.parse::<u32>().ok());
+    let who = process.map_or("another process".to_owned(), |number| format!("process {number}"));
+    let folder = folder.display();
+    OutputError::Unfit(format!(
+        "{folder} is in use: {who} is training there; wait for it, stop it, or choose another folder with -o"
+    ))
 }
 
 /// Whether an open file is the one at a path.
@@ -126,9 +130,6 @@ mod tests {
         let own = std::process::id();
         for refused in [FolderLock::check(path), FolderLock::take(path).map(drop)] {
             let error = refused.unwrap_err();
-            assert!(
-                matches!(error, OutputError::InUse { process: Some(number), .. } if number == own)
-            );
             assert!(error.to_string().contains(&format!("process {own}")), "{error}");
         }
         drop(held);

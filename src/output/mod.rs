@@ -34,6 +34,7 @@ pub use tensorboard::TensorBoard;
 
 pub use crate::evaluate::Mean;
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 /// Name of the file in a run's folder that describes the run.
@@ -42,25 +43,10 @@ pub const CONFIG_FILE: &str = "config.toml";
 /// Errors of writing and reading the files of a run.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// The folder holds another run.
-    #[error(
-        "{path} holds another run; choose another folder with -o, or replace it with --overwrite"
-    )]
-    Occupied {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// A process is training in the folder.
-    #[error(
-        "{path} is in use: {} is training there; wait for it, stop it, or choose another folder with -o",
-        process.map_or_else(|| "another process".to_owned(), |number| format!("process {number}"))
-    )]
-    InUse {
-        /// The folder.
-        path: PathBuf,
-        /// Number of the process, if known.
-        process: Option<u32>,
-    },
+    /// The folder, or a file in it, will not do: another run is in it or trains there, there is none, or
+    /// the file is invalid. What will do.
+    #[error("{0}")]
+    Unfit(String),
     /// The folder is no longer that of the run.
     #[error(
         "{path} was moved, removed or taken by another process while the run trained; nothing more is \
@@ -69,22 +55,6 @@ pub enum OutputError {
     Lost {
         /// The folder.
         path: PathBuf,
-    },
-    /// The path is not a folder.
-    #[error("{path} is not a folder; choose another one with -o")]
-    NotAFolder {
-        /// The path.
-        path: PathBuf,
-    },
-    /// There is no run in the folder.
-    #[error(
-        "{path} holds no run: there is no {missing}; name the folder that `densify train` wrote"
-    )]
-    NoRun {
-        /// The folder.
-        path: PathBuf,
-        /// What is missing.
-        missing: &'static str,
     },
     /// A run cannot replace the existing one.
     #[error(
@@ -110,14 +80,6 @@ pub enum OutputError {
         /// Which file could not be moved.
         source: Box<OutputError>,
     },
-    /// A file of a run is invalid.
-    #[error("{path}: {problem}; this file was written by another version or changed by hand")]
-    Malformed {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong, and where.
-        problem: String,
-    },
     /// Reading or writing failed.
     #[error("cannot {action} {path}: {source}")]
     Io {
@@ -131,7 +93,29 @@ pub enum OutputError {
 }
 
 impl OutputError {
-    fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    fn occupied(folder: &Path) -> Self {
+        let folder = folder.display();
+        Self::Unfit(format!(
+            "{folder} holds another run; choose another folder with -o, or replace it with --overwrite"
+        ))
+    }
+
+    /// A run's folder lacks this.
+    pub(crate) fn no_run(folder: &Path, missing: &str) -> Self {
+        let folder = folder.display();
+        Self::Unfit(format!(
+            "{folder} holds no run: there is no {missing}; name the folder that `densify train` wrote"
+        ))
+    }
+
+    pub(crate) fn malformed(file: &Path, problem: impl Display) -> Self {
+        let file = file.display();
+        Self::Unfit(format!(
+            "{file}: {problem}; this file was written by another version or changed by hand"
+        ))
+    }
+
+    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
     }

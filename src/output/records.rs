@@ -215,17 +215,13 @@ fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputE
 /// The entry of an iteration, if there is any.
 fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, OutputError> {
     let entry = read_entries(path)?.remove(&entry_name(iteration));
-    entry.map(serde_json::from_value).transpose().map_err(|e| malformed(path, &e))
-}
-
-fn malformed(path: &Path, problem: &serde_json::Error) -> OutputError {
-    OutputError::Malformed { path: path.to_owned(), problem: problem.to_string() }
+    entry.map(serde_json::from_value).transpose().map_err(|e| OutputError::malformed(path, e))
 }
 
 /// The entries of a file; none if it does not exist.
 fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
     match std::fs::read_to_string(path) {
-        Ok(text) => serde_json::from_str(&text).map_err(|e| malformed(path, &e)),
+        Ok(text) => serde_json::from_str(&text).map_err(|e| OutputError::malformed(path, e)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(Map::new()),
         Err(e) => Err(OutputError::io("read", path)(e)),
     }

@@ -70,8 +70,7 @@ pub(super) fn build(
     let steps = inputs.entry.step_parameters().iter().map(|step| step.name());
     let steps = steps.filter_map(|name| Some(format!("{name} {}", parameters.get(name)?)));
     let steps: Vec<String> = steps.collect();
-    let decided = Decided { setting, init, init_points, rates, parameters };
-    let mut config = decided.config(&inputs)?;
+    let mut config = decided(&inputs, setting, (init, init_points), rates, &parameters)?;
     config.resolved.sh_degree_lowered = match saved {
         Some(saved) => saved.resolved.sh_degree_lowered,
         None => size.is_lowered(&inputs),
@@ -129,59 +128,53 @@ pub(super) fn build(
     })
 }
 
-/// Everything that was open in the description of a run.
-struct Decided {
+/// The run with nothing open that was open in its description.
+fn decided(
+    inputs: &Inputs<'_>,
     setting: RunSize,
-    init: InitChoice,
-    init_points: Option<usize>,
+    (init, init_points): (InitChoice, Option<usize>),
     rates: RateOptions,
-    parameters: toml::Table,
-}
-
-impl Decided {
-    /// The run with nothing open.
-    fn config(self, inputs: &Inputs<'_>) -> Result<RunConfig, Failure> {
-        let Self { setting, init, init_points, rates, parameters } = self;
-        let mut spec = inputs.spec.clone();
-        // It is where the file is.
-        spec.output.output = None;
-        let name = inputs.entry.name;
-        let budget = spec.size.budget.unwrap_or(super::Budget::Rows(setting.rows));
-        spec.size.budget = Some(budget.limited_to(setting.rows));
-        spec.size.sh_degree = Some(match spec.size.sh_degree {
-            Some(ShDegree::Auto(_)) => ShDegree::Auto(Some(setting.sh_degree)),
-            _ => ShDegree::Fixed(setting.sh_degree),
-        });
-        // The knob says it otherwise.
-        spec.size.tile_cap = inputs.knobs.pairs_per_row.is_none().then_some(Rows(setting.tile_cap));
-        spec.size.image_cache = Some(ImageCache::Bytes(setting.image_cache));
-        spec.device.backend = inputs.device.kind().choice();
-        spec.device.gpu = inputs.device.adapter().map(str::to_owned);
-        spec.start.init = Some(init);
-        spec.start.init_points = init_points.map(Rows);
-        spec.schedule.lr =
-            assignments(&as_written(toml::Table::try_from(rates).map_err(Failure::input)?));
-        spec.schedule.knob = assignments(&inputs.knobs.table());
-        // Those of other policies stay, as one file may serve several.
-        spec.density.policy_set.retain(|setting| setting.path.first().is_none_or(|it| it != name));
-        spec.density.policy_set.extend(assignments(&parameters).into_iter().map(|setting| {
-            let path = std::iter::once(name.to_owned()).chain(setting.path).collect();
-            Assignment { path, value: setting.value }
-        }));
-        let scene = spec.start.scene.as_ref();
-        let resolved = Resolved {
-            working_directory: std::env::current_dir()
-                .ok()
-                // A name that is not UTF-8 cannot be in the file.
-                .filter(|folder| folder.to_str().is_some())
-                .filter(|_| scene.is_some_and(|scene| scene.is_relative())),
-            adapter: inputs.device.adapter().map(str::to_owned),
-            accumulation: inputs.device.accumulation().map(|way| way.name().to_owned()),
-            sh_degree_from: inputs.degree.source,
-            ..Resolved::default()
-        };
-        Ok(RunConfig { densify: env!("CARGO_PKG_VERSION").to_owned(), spec, resolved })
-    }
+    parameters: &toml::Table,
+) -> Result<RunConfig, Failure> {
+    let mut spec = inputs.spec.clone();
+    // It is where the file is.
+    spec.output.output = None;
+    let name = inputs.entry.name;
+    let budget = spec.size.budget.unwrap_or(super::Budget::Rows(setting.rows));
+    spec.size.budget = Some(budget.limited_to(setting.rows));
+    spec.size.sh_degree = Some(match spec.size.sh_degree {
+        Some(ShDegree::Auto(_)) => ShDegree::Auto(Some(setting.sh_degree)),
+        _ => ShDegree::Fixed(setting.sh_degree),
+    });
+    // The knob says it otherwise.
+    spec.size.tile_cap = inputs.knobs.pairs_per_row.is_none().then_some(Rows(setting.tile_cap));
+    spec.size.image_cache = Some(ImageCache::Bytes(setting.image_cache));
+    spec.device.backend = inputs.device.kind().choice();
+    spec.device.gpu = inputs.device.adapter().map(str::to_owned);
+    spec.start.init = Some(init);
+    spec.start.init_points = init_points.map(Rows);
+    spec.schedule.lr =
+        assignments(&as_written(toml::Table::try_from(rates).map_err(Failure::input)?));
+    spec.schedule.knob = assignments(&inputs.knobs.table());
+    // Those of other policies stay, as one file may serve several.
+    spec.density.policy_set.retain(|setting| setting.path.first().is_none_or(|it| it != name));
+    spec.density.policy_set.extend(assignments(parameters).into_iter().map(|setting| {
+        let path = std::iter::once(name.to_owned()).chain(setting.path).collect();
+        Assignment { path, value: setting.value }
+    }));
+    let scene = spec.start.scene.as_ref();
+    let resolved = Resolved {
+        working_directory: std::env::current_dir()
+            .ok()
+            // A name that is not UTF-8 cannot be in the file.
+            .filter(|folder| folder.to_str().is_some())
+            .filter(|_| scene.is_some_and(|scene| scene.is_relative())),
+        adapter: inputs.device.adapter().map(str::to_owned),
+        accumulation: inputs.device.accumulation().map(|way| way.name().to_owned()),
+        sh_degree_from: inputs.degree.source,
+        ..Resolved::default()
+    };
+    Ok(RunConfig { densify: env!("CARGO_PKG_VERSION").to_owned(), spec, resolved })
 }
 
 /// Numbers that are an `f32` as people write them: 0.005 rather than 0.004999999888241291.

@@ -103,14 +103,11 @@ impl RunConfig {
         let text =
             crate::foreign::read_text(&path, crate::foreign::MAX_OPTIONS).map_err(|error| {
                 match error.kind() {
-                    std::io::ErrorKind::NotFound => {
-                        OutputError::NoRun { path: run.to_owned(), missing: CONFIG_FILE }.into()
-                    }
+                    std::io::ErrorKind::NotFound => OutputError::no_run(run, CONFIG_FILE).into(),
                     _ => Failure::input(format!("cannot read {}: {error}", path.display())),
                 }
             })?;
-        let malformed =
-            |problem: String| Failure::from(OutputError::Malformed { path: path.clone(), problem });
+        let malformed = |problem: String| Failure::from(OutputError::malformed(&path, problem));
         let table: Table = text
             .parse()
             .map_err(|error: toml::de::Error| malformed(error.to_string().trim().into()))?;

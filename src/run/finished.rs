@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
-use crate::backend::{Backend, BackendOptions, Device};
+use crate::backend::{Backend, Device, Setup};
 use crate::dataset::{Dataset, View, builtin};
 use crate::evaluate::Split;
 use crate::failure::Failure;
@@ -94,12 +94,12 @@ pub(crate) fn open(
 ) -> Result<Opened, Failure> {
     let dataset = load(dataset, &data, observer)?;
     let model = dataset.normalisation.model_from_world(read_model(model, observer)?);
-    let options = BackendOptions {
+    let options = Setup {
         near: (near * dataset.extent()) as f32,
         threads: machine.threads,
         largest_image: dataset.largest_image(),
         needs,
-        ..BackendOptions::new(model.len().max(1))
+        ..Setup::new(model.len().max(1))
     };
     let backend = machine.device.backend(&model, &options)?;
     Ok(Opened { sh_degree: model.sh_degree, backend, dataset, data })

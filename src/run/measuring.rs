@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::finished::{Opened, read_model};
 use super::session::Session;
-use crate::backend::{BackendOptions, Device};
+use crate::backend::{Device, Setup};
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::memory::{Bytes, Ledger, Section, grant, peak_resident, resident};
@@ -18,7 +18,7 @@ use crate::output::{geometry_of, model_path, write_geometry};
 pub(super) struct Measuring {
     pub(super) device: Device,
     /// Of the backend, for any number of rows.
-    pub(super) options: BackendOptions,
+    pub(super) options: Setup,
     /// Threads that measure.
     pub(super) threads: usize,
     /// What the known surface takes `[bytes]`.
@@ -46,12 +46,12 @@ impl Measuring {
         [promise.on_host() + geometry + self.surface, promise.on_device()]
     }
 
-    fn for_rows(&self, rows: usize) -> BackendOptions {
+    fn for_rows(&self, rows: usize) -> Setup {
         let rows = rows.max(1);
         // A view rarely has more pairs; it is rendered in bands then, with the same result.
         let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.options.needs));
         let cap = self.options.tile_cap.map_or(pairs, |cap| cap.min(pairs));
-        BackendOptions {
+        Setup {
             budget: rows,
             tile_cap: Some(cap.max(rows)),
             // Nothing is differentiated.

@@ -6,7 +6,7 @@ use densify_policies::plan::{EditPlan, RowOps};
 use densify_policies::policy::{PolicyError, SceneInfo, Snapshot};
 use densify_policies::rng::PolicyRng;
 
-use super::policy_calls::call_policy;
+use super::policy_views::call_policy;
 use super::{EditEvent, TrainError, Trainer};
 use crate::views::ViewSource;
 

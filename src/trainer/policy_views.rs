@@ -1,8 +1,10 @@
-//! Renders training views for a decision of the policy.
+//! Calls the policy, and renders training views for its decisions.
 
-use densify_policies::policy::AuxView;
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use super::policy_calls::call_policy;
+use densify_policies::policy::{AuxView, PolicyError};
+
 use super::{TrainError, Trainer};
 use crate::backend::AuxInput;
 use crate::views::ViewSource;
@@ -38,4 +40,22 @@ impl<V: ViewSource> Trainer<V> {
         }
         Ok(())
     }
+}
+
+/// The result of `call`. A policy may come from anywhere: if it panics, the run ends with an error that names
+/// it, and the model can still be read. After a panic the policy is not called again, so its state does not matter; its
+/// calls change nothing else but the plan, which is dropped.
+///
+/// # Errors
+/// [`PolicyError::Other`] with the message of the panic.
+pub(super) fn call_policy<T>(call: impl FnOnce() -> T) -> Result<T, PolicyError> {
+    catch_unwind(AssertUnwindSafe(call)).map_err(|panic| {
+        let message = panic_message(&*panic);
+        PolicyError::Other(format!("it panicked: {message}; this is a bug in the policy"))
+    })
+}
+
+fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
 }

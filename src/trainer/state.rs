@@ -8,7 +8,7 @@ use std::time::Duration;
 use densify_policies::policy::{PolicyError, PolicyState};
 use serde::{Deserialize, Serialize};
 
-use super::policy_calls::call_policy;
+use super::policy_views::call_policy;
 use super::{AutoBudget, EditEvent, Trainer};
 use crate::schedule;
 use crate::views::ViewSource;

@@ -22,10 +22,11 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use crate::backend::BackendError;
 pub use crate::backend::Differentiable;
+pub use crate::backend::Setup;
 pub use cases::cases;
 pub use findings::{Finding, Tested};
 pub use report::{markdown, table};
-pub use subject::{Setup, Subject};
+pub use subject::Subject;
 use trial::Trial;
 
 /// Something that must hold on every backend.

@@ -1,11 +1,9 @@
 //! What is tested: a backend, made the same way whichever it is.
 
-use densify_policies::policy::Needs;
-
 use super::compare::Limits;
-use crate::backend::cpu::{CpuBackend, CpuOptions, InstructionSet};
+use crate::backend::cpu::{CpuBackend, InstructionSet};
 use crate::backend::gpu::GpuDevice;
-use crate::backend::{BackendError, BackendOptions, Differentiable, Shortcuts, Storage};
+use crate::backend::{BackendError, Differentiable, Setup};
 use crate::gaussians::Gaussians;
 
 /// What is tested.
@@ -20,27 +18,6 @@ pub enum Subject {
     },
     /// A GPU, or what stands for one.
     Gpu(GpuDevice),
-}
-
-/// What a backend is made for, beside its model. The default is what the model needs.
-#[derive(Debug, Clone, Default)]
-pub struct Setup {
-    /// Most rows; the model's, if these are more.
-    pub budget: usize,
-    /// Near plane `[scene units]`; 0.01 without one.
-    pub near: Option<f32>,
-    /// Most (row, tile) entries held at a time.
-    pub tile_cap: Option<usize>,
-    /// Most gradient records held at a time; only the native backend has this limit.
-    pub record_cap: Option<usize>,
-    /// Largest image that its ledger shall cover `[px]`.
-    pub largest_image: (u32, u32),
-    /// How parameters and moments are stored; only the native backend has the choice.
-    pub storage: Storage,
-    /// Signals to collect.
-    pub needs: Needs,
-    /// Where to compute less than could be.
-    pub shortcuts: Shortcuts,
 }
 
 impl Subject {
@@ -72,40 +49,22 @@ impl Subject {
         self.with(model, Setup::default())
     }
 
-    /// A backend with room for more.
+    /// A backend with room for more; it has room for the model whatever the budget.
     ///
     /// # Errors
     /// See [`BackendError`].
     pub fn with(
         &self,
         model: &Gaussians,
-        setup: Setup,
+        mut setup: Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
-        let Setup { budget, near, tile_cap, record_cap, largest_image, storage, needs, shortcuts } =
-            setup;
-        let budget = budget.max(model.len()).max(1);
+        setup.budget = setup.budget.max(model.len());
         match self {
             Self::Native { instructions, threads } => {
-                let mut options = CpuOptions::new(budget);
-                (options.instructions, options.threads) = (*instructions, *threads);
-                options.near = near.unwrap_or(options.near);
-                options.tile_cap = tile_cap.unwrap_or(options.tile_cap);
-                options.record_cap = record_cap.unwrap_or(options.record_cap);
-                (options.largest_image, options.needs) = (largest_image, needs);
-                (options.storage, options.shortcuts) = (storage, shortcuts);
-                Ok(Box::new(CpuBackend::new(model, &options)?))
+                (setup.instructions, setup.threads) = (*instructions, *threads);
+                Ok(Box::new(CpuBackend::new(model, &setup)?))
             }
-            Self::Gpu(device) => {
-                let mut options = BackendOptions {
-                    tile_cap,
-                    largest_image,
-                    needs,
-                    shortcuts,
-                    ..BackendOptions::new(budget)
-                };
-                options.near = near.unwrap_or(options.near);
-                device.backend(model, &options)
-            }
+            Self::Gpu(device) => device.backend(model, &setup),
         }
     }
 

@@ -7,7 +7,8 @@
 
 use std::path::Path;
 
-use densify::backend::cpu::{CpuBackend, CpuOptions};
+use densify::backend::Setup;
+use densify::backend::cpu::CpuBackend;
 use densify::checkpoint::Checkpoint;
 use densify::dataset::{Dataset, LoadOptions};
 use densify::import::ply::{read_points, read_splats};
@@ -119,7 +120,7 @@ fn checkpoint(bytes: &[u8]) -> bool {
             return false;
         };
         assert!(model.len() <= budget);
-        let options = CpuOptions { threads: Some(1), ..CpuOptions::new(model.len()) };
+        let options = Setup { threads: Some(1), ..Setup::new(model.len()) };
         let mut backend = CpuBackend::new(&model, &options).expect("it is as small as its file");
         // Whether this backend keeps what the file's kept is another question.
         let _ = found.restore(&mut backend);

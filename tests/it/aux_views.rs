@@ -59,7 +59,7 @@ fn backend(
         aux: Some(request.clone()),
         ..Needs::default()
     };
-    let (tile_cap, record_cap) = (Some(cap), Some(cap.div_ceil(2)));
+    let (tile_cap, record_cap) = (Some(cap), cap.div_ceil(2));
     let budget = scene.model.len() + 3;
     let setup = Setup { budget, tile_cap, record_cap, needs, ..Setup::default() };
     make_with(subject, &scene.model, setup)

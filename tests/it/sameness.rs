@@ -112,10 +112,10 @@ fn room_for_records_changes_nothing() {
         let setup = Setup { tile_cap: Some(tile_cap), record_cap, ..Setup::default() };
         run(&mut *make_with(&Subject::NATIVE, &model, setup), &camera)
     };
-    let whole = with(1 << 20, None);
+    let whole = with(1 << 20, usize::MAX);
     assert!(whole.2[0].entries > 1_500 && whole.2[0].bands == 1, "{:?}", whole.2[0]);
     for (tile_cap, record_cap) in [(1 << 20, 1_500), (1 << 20, 100), (1 << 20, 7), (500, 100)] {
-        let some = with(tile_cap, Some(record_cap));
+        let some = with(tile_cap, record_cap);
         assert!(without_bands(some) == whole, "{tile_cap} pairs, {record_cap} records");
     }
 }
@@ -149,7 +149,7 @@ fn rows_that_are_gone_have_no_records() {
     let camera = scenes::camera(64, 48, 11);
     let model = scenes::cloud(400, 2, &camera, 12);
     let with = |record_cap| {
-        let setup = Setup { record_cap: Some(record_cap), ..Setup::default() };
+        let setup = Setup { record_cap, ..Setup::default() };
         let mut backend = make_with(&Subject::NATIVE, &model, setup);
         run(&mut *backend, &camera);
         let mut plan = EditPlan::new(model.len(), model.len());

@@ -13,7 +13,6 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::BLOCKS_PER_TASK;
-use super::parts::parts;
 use super::simd::WIDTH;
 use crate::gaussians::sh_coefficients;
 
@@ -102,7 +101,7 @@ impl<T: Copy + Default> Blocks<T> {
         let stride = self.stride();
         let tasks = rows.div_ceil(WIDTH).div_ceil(BLOCKS_PER_TASK);
         let parts = parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
-        parts.par().map(move |data| BlockTask { stride, data })
+        parts.map(move |data| BlockTask { stride, data })
     }
 
     fn at(&self, row: usize, plane: usize) -> usize {
@@ -204,5 +203,41 @@ impl<T> BlockTask<'_, T> {
     #[inline(always)]
     pub(super) fn block(&mut self, block: usize) -> &mut [T] {
         &mut self.data[block * self.stride..(block + 1) * self.stride]
+    }
+}
+
+/// Cuts a buffer for so many tasks of a region, into parts of one length but the last; a buffer of nothing
+/// has nothing for each task.
+///
+/// It is one type whatever the buffer has: were it one of two iterators, a region over ten buffers would be
+/// compiled for each of their thousand combinations.
+pub(super) fn parts<T: Send>(
+    buffer: &mut [T],
+    per_task: usize,
+    tasks: usize,
+) -> impl IndexedParallelIterator<Item = &mut [T]> {
+    assert!(buffer.len() <= per_task * tasks, "{} over {per_task} · {tasks}", buffer.len());
+    let per_task = per_task.max(1);
+    let without = buffer.len().div_ceil(per_task)..tasks;
+    let nothing = without.into_par_iter().map(|_| <&mut [T]>::default());
+    buffer.par_chunks_mut(per_task).chain(nothing)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_chunks_and_nothing_where_there_is_nothing() {
+        for length in [1, 6, 7, 63, 64] {
+            let mut numbers: Vec<usize> = (0..length).collect();
+            let chunks: Vec<Vec<usize>> = numbers.chunks(7).map(<[_]>::to_vec).collect();
+            let found: Vec<Vec<usize>> =
+                parts(&mut numbers, 7, chunks.len()).map(|part| part.to_vec()).collect();
+            assert_eq!(found, chunks);
+        }
+        let nothing: &mut [u8] = &mut [];
+        let lengths: Vec<usize> = parts(nothing, 0, 5).map(|part| part.len()).collect();
+        assert_eq!(lengths, [0; 5]);
     }
 }

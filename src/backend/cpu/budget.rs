@@ -1,6 +1,5 @@
 //! The memory of the native backend: bytes per buffer, and the reservation before training.
 
-use super::CpuOptions;
 use super::adam::BiasCorrection;
 use super::blocks::planes;
 use super::loss::LossBuffers;
@@ -14,23 +13,24 @@ use super::signals::Accumulators;
 use super::simd::WIDTH;
 use super::summed::Summed;
 use super::tiles::{Grid, TileLists};
-use crate::backend::BackendError;
 use crate::backend::candidates::Candidates;
 use crate::backend::signals::Field;
+use crate::backend::{BackendError, Setup};
 use crate::memory::{Ledger, Section};
 
 /// A single tile's list holds each row at most once, so that the budget is always enough.
-pub(super) fn tile_cap(options: &CpuOptions) -> usize {
-    options.tile_cap.max(options.budget).max(1).min(u32::MAX as usize)
+pub(super) fn tile_cap(options: &Setup) -> usize {
+    let cap = options.tile_cap.unwrap_or(options.budget.saturating_mul(16));
+    cap.max(options.budget).max(1).min(u32::MAX as usize)
 }
 
 /// As many as there are entries, at most.
-pub(super) fn record_cap(options: &CpuOptions) -> usize {
+pub(super) fn record_cap(options: &Setup) -> usize {
     options.record_cap.clamp(1, tile_cap(options))
 }
 
 /// Bytes per buffer for these options.
-pub(super) fn ledger(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
+pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let budget = options.budget.max(1);
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
@@ -110,12 +110,12 @@ mod tests {
             (ParameterStorage::F16, MomentStorage::Both8, 3 * 4 + 56 * 2, 2 * 59),
         ];
         for (parameters, moments, of_parameters, of_moments) in formats {
-            let options = CpuOptions {
+            let options = Setup {
                 storage: Storage { parameters, moments },
-                tile_cap: 300,
+                tile_cap: Some(300),
                 record_cap: 70,
                 threads: Some(1),
-                ..CpuOptions::new(110)
+                ..Setup::new(110)
             };
             let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
             let backend = CpuBackend::new(&model, &options).unwrap();
@@ -143,7 +143,7 @@ mod tests {
     fn huge_budgets_are_refused_and_do_not_wrap() {
         let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
         for budget in [1 << 31, (1_usize << 32) - 1, 1 << 32, 1 << 40] {
-            let options = CpuOptions { threads: Some(1), ..CpuOptions::new(budget) };
+            let options = Setup { threads: Some(1), ..Setup::new(budget) };
             let ledger = ledger(3, &options, 1);
             // Parameters and moments: 59 numbers of four bytes, three times.
             let model_bytes = 3 * 59 * 4 * budget as u128;
@@ -151,7 +151,7 @@ mod tests {
             assert!(tile_cap(&options) <= u32::MAX as usize, "a slot is a u32");
         }
         // More than there are addresses for: refused before anything is allocated.
-        let options = CpuOptions { threads: Some(1), ..CpuOptions::new(1 << 40) };
+        let options = Setup { threads: Some(1), ..Setup::new(1 << 40) };
         let refused = CpuBackend::new(&model, &options).expect_err("a petabyte");
         assert!(matches!(refused, BackendError::OutOfMemory { .. }), "{refused}");
     }

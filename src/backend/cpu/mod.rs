@@ -21,9 +21,7 @@ mod moments;
 mod narrow;
 mod observe;
 mod optimise;
-mod options;
 mod parameters;
-mod parts;
 mod passes;
 mod project;
 mod project_bwd;
@@ -52,8 +50,8 @@ use pulp::Arch;
 use super::candidates::{Candidates, error_weights};
 use super::signals::Field;
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Rendering, Shortcuts, StateArray, StateError,
-    StepInput, StepOutput, Tensor, Unsound,
+    AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
+    StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
@@ -78,7 +76,6 @@ use tiles::TileLists;
 
 pub use instructions::InstructionSet;
 pub use optimise::ModelGradient;
-pub use options::CpuOptions;
 pub use threads::StepTasks;
 
 /// Largest image side [y][x]; at this size every index of the stages still fits its type.
@@ -130,9 +127,9 @@ pub struct CpuBackend {
 
 impl CpuBackend {
     /// Bytes per buffer of a backend made with these options for models of this degree, on so many
-    /// threads; [`CpuOptions::threads`] is not looked at.
+    /// threads; [`Setup::threads`] is not looked at.
     #[must_use]
-    pub fn promise(sh_degree: u8, options: &CpuOptions, threads: usize) -> Ledger {
+    pub fn promise(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         budget::ledger(sh_degree, options, threads)
     }
 
@@ -143,7 +140,7 @@ impl CpuBackend {
     ///
     /// # Panics
     /// When the model has more rows than the budget: the caller subsamples before.
-    pub fn new(model: &Gaussians, options: &CpuOptions) -> Result<Self, BackendError> {
+    pub fn new(model: &Gaussians, options: &Setup) -> Result<Self, BackendError> {
         let budget = options.budget.max(1);
         assert!(model.len() <= budget, "{} rows over a budget of {budget}", model.len());
         let threads = Threads::new(options.threads)?;
@@ -249,12 +246,7 @@ impl Backend for CpuBackend {
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, .. } = *input;
-        assert_eq!(
-            (camera.width, camera.height),
-            (target.width, target.height),
-            "camera and image differ in size"
-        );
+        assert_same_size(input.camera, input.target);
         let threads = Arc::clone(&self.threads);
         let output = threads.step(|| self.step(input))?;
         #[cfg(test)]
@@ -285,13 +277,7 @@ impl Backend for CpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        // Kept in release builds: this is the promise.
-        assert_eq!(ops.rows_before, self.rows, "a plan for another number of rows");
-        assert_eq!(ops.budget, self.budget, "a plan for another budget");
-        assert!(ops.rows_after <= self.budget, "{} rows over the budget", ops.rows_after);
-        if let Err(broken) = ops.check() {
-            panic!("a plan that breaks its own rules: {broken}");
-        }
+        assert_fits(ops, self.rows, self.budget);
         let mut model = apply::Model {
             params: &mut self.params,
             moments: &mut self.moments,

@@ -20,6 +20,7 @@ use super::records::{Sums, TileRecords, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
+use crate::backend::assert_same_size;
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::dataset::images::Image8;
 
@@ -42,11 +43,7 @@ impl CpuBackend {
     /// Measures one view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let AuxInput { camera, target, background, request, .. } = *input;
-        assert_eq!(
-            (camera.width, camera.height),
-            (target.width, target.height),
-            "camera and image differ in size"
-        );
+        assert_same_size(camera, target);
         // Stage times stay those of training.
         let clock = std::mem::take(&mut self.clock);
         let frame = self.forward(camera, background, input.sh_degree, false);

@@ -7,10 +7,10 @@ use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode
 use densify_policies::rng::PolicyRng;
 use rayon::prelude::*;
 
+use super::blocks::parts;
 use super::candidates;
 use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
-use super::parts::parts;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
     Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
@@ -312,7 +312,7 @@ impl CpuBackend {
             params.tasks(rows),
             moments.tasks(rows),
             ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
-            parts(signals.blocks.of_rows_mut(rows), per_task, tasks).par(),
+            parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),
             visible[..blocks].par_chunks(BLOCKS_PER_TASK),
             self.summed.tasks(rows, tasks).enumerate(),

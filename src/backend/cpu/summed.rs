@@ -11,8 +11,7 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, plane, reorder};
-use super::parts::parts;
+use super::blocks::{BlockTask, Blocks, parts, plane};
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
 
@@ -107,7 +106,7 @@ impl Summed {
         let Self { first, sums, rest_ages, .. } = self;
         let first = *first;
         let aged = rest_ages.len().min(rows.next_multiple_of(WIDTH));
-        let ages = parts(&mut rest_ages[..aged], ROWS_PER_TASK, tasks).par();
+        let ages = parts(&mut rest_ages[..aged], ROWS_PER_TASK, tasks);
         sums.tasks(rows).zip(ages).map(move |(sums, rest_ages)| TaskSums { first, sums, rest_ages })
     }
 

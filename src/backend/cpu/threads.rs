@@ -106,16 +106,8 @@ impl Threads {
         T: IntoParallelIterator<Iter: IndexedParallelIterator>,
     {
         let tasks = tasks.into_par_iter();
-        match self.recorder.get() {
-            None => tasks.for_each_init(scratch, run),
-            Some(recorder) => {
-                recorder.begin_region(region, tasks.len());
-                tasks.for_each_init(scratch, |scratch, task| {
-                    run(scratch, task);
-                    recorder.end_task();
-                });
-            }
-        }
+        let recorder = self.begin(region, tasks.len());
+        tasks.for_each_init(scratch, |scratch, task| timed(recorder, || run(scratch, task)));
     }
 
     /// A region whose tasks return something, in their order.
@@ -143,18 +135,8 @@ impl Threads {
         T: IntoParallelIterator<Iter: IndexedParallelIterator>,
     {
         let tasks = tasks.into_par_iter();
-        match self.recorder.get() {
-            None => tasks.map_init(scratch, run).collect(),
-            Some(recorder) => {
-                recorder.begin_region(region, tasks.len());
-                let run = |scratch: &mut S, task| {
-                    let result = run(scratch, task);
-                    recorder.end_task();
-                    result
-                };
-                tasks.map_init(scratch, run).collect()
-            }
-        }
+        let recorder = self.begin(region, tasks.len());
+        tasks.map_init(scratch, |scratch, task| timed(recorder, || run(scratch, task))).collect()
     }
 
     /// A region whose tasks count something. The order of adding whole numbers does not matter.
@@ -168,19 +150,23 @@ impl Threads {
         T: IntoParallelIterator<Iter: IndexedParallelIterator>,
     {
         let tasks = tasks.into_par_iter();
-        match self.recorder.get() {
-            None => tasks.map(run).sum(),
-            Some(recorder) => {
-                recorder.begin_region(region, tasks.len());
-                let run = |task| {
-                    let count = run(task);
-                    recorder.end_task();
-                    count
-                };
-                tasks.map(run).sum()
-            }
-        }
+        let recorder = self.begin(region, tasks.len());
+        tasks.map(|task| timed(recorder, || run(task))).sum()
     }
+
+    /// Begins a region; returns what records the ends of its tasks, if they are recorded.
+    fn begin(&self, region: &'static str, tasks: usize) -> Option<&Recorder> {
+        self.recorder.get().inspect(|recorder| recorder.begin_region(region, tasks))
+    }
+}
+
+/// Runs a task, and records its end.
+fn timed<R>(recorder: Option<&Recorder>, run: impl FnOnce() -> R) -> R {
+    let result = run();
+    if let Some(recorder) = recorder {
+        recorder.end_task();
+    }
+    result
 }
 
 impl Recorder {

@@ -4,8 +4,8 @@ use wgpu::{
     Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits,
 };
 
+use super::device::wait;
 use super::rows::widest_row;
-use super::wait::wait;
 use crate::backend::{Accumulation, AdapterChoice, AdapterKind, AdapterSummary, BackendError};
 
 impl Accumulation {

@@ -6,9 +6,9 @@ use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DMat3, DVec3};
 
 use super::{GpuBackend, GpuDevice};
-use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::cpu::CpuBackend;
 use crate::backend::signals::RecordLayout;
-use crate::backend::{Backend, BackendError, BackendOptions, LearningRates, StepInput, StepOutput};
+use crate::backend::{Backend, BackendError, LearningRates, Setup, StepInput, StepOutput};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::gaussians::{Gaussians, sh_coefficients};
@@ -97,7 +97,7 @@ impl GpuBackend {
     /// When the model has more rows than the budget: the caller subsamples before.
     pub fn new(
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let records = RecordLayout::new(options.needs.signals);
@@ -112,16 +112,10 @@ impl GpuBackend {
 /// [`BackendError::Device`] with what differs.
 fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
     let (model, camera, target) = scene();
-    let needs = Needs { signals: needs.signals, ..Needs::default() };
-    let rows = model.len();
-    let mut cpu = CpuOptions::new(rows);
-    cpu.threads = Some(1);
-    let mut cpu = CpuBackend::new(&model, &cpu)?;
-    let options = BackendOptions {
-        largest_image: (camera.width, camera.height),
-        needs,
-        ..BackendOptions::new(rows)
-    };
+    let mut options = Setup { threads: Some(1), ..Setup::new(model.len()) };
+    let mut cpu = CpuBackend::new(&model, &options)?;
+    options.largest_image = (camera.width, camera.height);
+    options.needs.signals = needs.signals;
     let mut gpu = GpuBackend::without_canary(&model, &options, device)?;
     let (expected, image) = run(&mut cpu, &camera, &target)?;
     let (found, rendered) = run(&mut gpu, &camera, &target)?;
@@ -160,8 +154,7 @@ mod tests {
     #[test]
     fn the_scene_exercises_what_it_should() {
         let (model, camera, target) = scene();
-        let mut options = CpuOptions::new(model.len());
-        options.threads = Some(1);
+        let options = Setup { threads: Some(1), ..Setup::new(model.len()) };
         let mut cpu = CpuBackend::new(&model, &options).unwrap();
         let (outputs, _) = run(&mut cpu, &camera, &target).unwrap();
         // Rows on screen and off it, several tiles, and steps that matter beyond the tolerance.

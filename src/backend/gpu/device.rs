@@ -1,17 +1,19 @@
 //! An open device with its kernels; translates its errors to [`BackendError`].
 
+use std::future::Future;
+use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll, Waker};
 
 use densify_policies::policy::Needs;
 use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::adapter::{choose, enumerate};
 use super::pipelines::{Pipelines, Variant};
-use super::wait::wait;
 use super::{GpuBackend, promise};
 use crate::backend::signals::RecordLayout;
 use crate::backend::{
-    Accumulation, AdapterChoice, AdapterSummary, BackendError, BackendOptions, Differentiable,
+    Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup,
 };
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
@@ -63,7 +65,7 @@ impl GpuDevice {
 
     /// Bytes per buffer of a backend with these options for models of this degree; nothing is allocated.
     #[must_use]
-    pub fn promise(&self, sh_degree: u8, options: &BackendOptions) -> Ledger {
+    pub fn promise(&self, sh_degree: u8, options: &Setup) -> Ledger {
         promise::ledger(&promise::sizes(&self.0, sh_degree, options), &options.needs)
     }
 
@@ -74,7 +76,7 @@ impl GpuDevice {
     pub fn backend(
         &self,
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
     ) -> Result<Box<dyn Differentiable>, BackendError> {
         Ok(Box::new(GpuBackend::new(model, options, self)?))
     }
@@ -204,6 +206,18 @@ impl Device {
 
 fn lock(reported: &Mutex<Reported>) -> std::sync::MutexGuard<'_, Reported> {
     reported.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Runs a future of wgpu's to its end; on native systems they are ready at once.
+pub(super) fn wait<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+            return value;
+        }
+        std::thread::yield_now();
+    }
 }
 
 #[cfg(test)]

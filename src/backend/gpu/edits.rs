@@ -154,10 +154,7 @@ impl GpuBackend {
     /// Uploads one chunk of operations and executes what `encode` records.
     fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_>)) {
         self.device.queue.write_buffer(self.buffers.get("ops"), 0, bytemuck::cast_slice(words));
-        let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&mut Recorder { pass });
-        self.device.queue.submit([encoder.finish()]);
+        self.submit(encode);
     }
 
     /// Copies rows (from, to), or clears them, in all arrays that are edited in one of these ways.

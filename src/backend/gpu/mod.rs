@@ -21,7 +21,6 @@ mod frame;
 mod launches;
 mod observe;
 mod passes;
-mod photographs;
 mod pipelines;
 mod promise;
 mod readback;
@@ -32,8 +31,8 @@ mod state;
 mod step;
 mod submit;
 mod transfer;
-mod wait;
 
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
@@ -46,8 +45,8 @@ use densify_policies::policy::{
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes};
 use super::{
-    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, BackendOptions, Rendering,
-    Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, Unsound,
+    AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts,
+    StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
 };
 use crate::camera::Camera;
 use crate::gaussians::{Gaussians, ModelArray};
@@ -61,7 +60,6 @@ pub use device::GpuDevice;
 pub(crate) use device::faults::with_device_lost_after;
 use frame::Frame;
 use launches::Launches;
-use photographs::PhotographPlaces;
 use pipelines::Variant;
 use promise::MAX_SIDE;
 use sizes::Sizes;
@@ -91,7 +89,11 @@ pub struct GpuBackend {
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
-    kept: PhotographPlaces,
+    /// Photographs on the device, the first ones seen; the others are uploaded at every step. The choice is
+    /// never changed: views come in a new random order in each epoch, so that the newest ones would be gone
+    /// before they are needed again. By view: place among those kept, size, and the bits that say what it
+    /// has.
+    kept: HashMap<usize, (u64, [u32; 2], u32)>,
     /// Bands that are encoded for the next view.
     bands: u32,
     laps: Vec<(&'static str, Duration)>,
@@ -100,7 +102,7 @@ pub struct GpuBackend {
 impl GpuBackend {
     fn without_canary(
         model: &Gaussians,
-        options: &BackendOptions,
+        options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
         let shortcuts = options.shortcuts;
@@ -135,7 +137,7 @@ impl GpuBackend {
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),
-            kept: PhotographPlaces::default(),
+            kept: HashMap::new(),
             bands: 1,
             laps: Vec::new(),
         };
@@ -172,7 +174,7 @@ impl GpuBackend {
         if width > most_wide || height > most_high {
             self.sizes.image = (most_wide.max(width), most_high.max(height));
             // Their places have moved.
-            self.kept.places.clear();
+            self.kept.clear();
             self.rebuild()?;
         }
         Ok(())
@@ -263,13 +265,7 @@ impl Backend for GpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        // Kept in release builds: this is the promise.
-        assert_eq!(ops.rows_before, self.rows, "a plan for another number of rows");
-        assert_eq!(ops.budget, self.budget, "a plan for another budget");
-        assert!(ops.rows_after <= self.budget, "{} rows over the budget", ops.rows_after);
-        if let Err(broken) = ops.check() {
-            panic!("a plan that breaks its own rules: {broken}");
-        }
+        assert_fits(ops, self.rows, self.budget);
         self.edit(ops, seed, step);
         if ops.reset_candidates {
             self.candidates.clear();

@@ -3,8 +3,9 @@
 //! those that are spaced; of auxiliary views the host chooses them, from a copy of the image. The
 //! device then finds their surface points, and the sums over each row's pixels.
 
-use densify_policies::policy::ErrorMode;
-use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode, ErrorMode,
+};
 
 use super::GpuBackend;
 use super::frame::Frame;
@@ -13,7 +14,7 @@ use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::backend::candidates::ranked;
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
-use crate::backend::{AuxInput, AuxOutput, BackendError};
+use crate::backend::{AuxInput, AuxOutput, BackendError, assert_same_size};
 use crate::dataset::images::Image8;
 
 /// √(½·log₂ e): folded into the splats' factors.
@@ -160,11 +161,7 @@ impl GpuBackend {
     /// Measures one view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let AuxInput { camera, target, background, request, .. } = *input;
-        assert_eq!(
-            (camera.width, camera.height),
-            (target.width, target.height),
-            "camera and image differ in size"
-        );
+        assert_same_size(camera, target);
         self.fit_image(camera.width, camera.height)?;
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.bring_photograph(input.view, target);

@@ -5,7 +5,7 @@ use densify_policies::policy::{AuxRequest, Candidate, Needs};
 use super::device::Device;
 use super::sizes::{MOST_ENTRIES, Sizes};
 use crate::backend::Accumulation;
-use crate::backend::BackendOptions;
+use crate::backend::Setup;
 use crate::backend::candidates::Candidates;
 use crate::backend::signals::RecordLayout;
 use crate::memory::{Ledger, Section};
@@ -23,7 +23,7 @@ pub(super) fn most_pairs(device: &Device, needs: &Needs) -> u64 {
     (device.largest_binding() / (4 * numbers)).min(MOST_ENTRIES)
 }
 
-pub(super) fn sizes(device: &Device, sh_degree: u8, options: &BackendOptions) -> Sizes {
+pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let budget = options.budget.max(1);
     let cap = match options.tile_cap {
         Some(cap) => cap as u64,

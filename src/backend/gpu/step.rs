@@ -8,7 +8,7 @@ use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
 use crate::backend::candidates::error_weights;
 use crate::backend::signals::Field;
-use crate::backend::{BackendError, StepInput, StepOutput};
+use crate::backend::{BackendError, StepInput, StepOutput, assert_same_size};
 
 impl GpuBackend {
     /// Which parameter groups step now and which have waited, as bits of the frame, and which wait
@@ -31,11 +31,7 @@ impl GpuBackend {
     /// Forward pass, loss, backward pass and optimiser.
     pub(super) fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, .. } = *input;
-        assert_eq!(
-            (camera.width, camera.height),
-            (target.width, target.height),
-            "camera and image differ in size"
-        );
+        assert_same_size(camera, target);
         let start = Instant::now();
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);

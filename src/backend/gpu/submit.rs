@@ -50,9 +50,14 @@ impl GpuBackend {
     pub(super) fn go_on(&self, shape: Shape, encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_>)) {
         let groups = self.buffers.get("groups");
         let passes = Passes { launches: &self.launches, groups, shape };
+        self.submit(|to| encode(&passes, to));
+    }
+
+    /// Submits what `encode` records.
+    pub(super) fn submit(&self, encode: impl FnOnce(&mut Recorder<'_>)) {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&passes, &mut Recorder { pass });
+        encode(&mut Recorder { pass });
         self.device.queue.submit([encoder.finish()]);
     }
 

@@ -5,7 +5,6 @@ use std::ops::Range;
 use densify_policies::policy::Signal;
 
 use super::frame::target;
-use super::passes::Recorder;
 use super::rows::{Holds, RowArray};
 use super::{GpuBackend, readback};
 use crate::backend::signals::ParameterSignal;
@@ -77,7 +76,7 @@ impl GpuBackend {
     /// Views keep their photographs.
     pub(super) fn bring_photograph(&mut self, view: usize, image: &Image8) -> u32 {
         let size = [image.width, image.height];
-        if let Some(&(place, kept, bits)) = self.kept.places.get(&view)
+        if let Some(&(place, kept, bits)) = self.kept.get(&view)
             && kept == size
         {
             self.copy_photograph(place, size, bits, false);
@@ -86,11 +85,11 @@ impl GpuBackend {
         let bits = self.upload_target(image);
         let room = self.sizes.photographs;
         // A view whose image has another size now keeps its place.
-        let own = self.kept.places.get(&view).map(|&(place, ..)| place);
-        let place = own.unwrap_or(self.kept.places.len() as u64);
+        let own = self.kept.get(&view).map(|&(place, ..)| place);
+        let place = own.unwrap_or(self.kept.len() as u64);
         if place < room.count as u64 && (bits & target::HAS_MASK == 0 || room.with_masks) {
             self.copy_photograph(place, size, bits, true);
-            self.kept.places.insert(view, (place, size, bits));
+            self.kept.insert(view, (place, size, bits));
         }
         bits
     }
@@ -212,13 +211,8 @@ impl GpuBackend {
 
     /// A column of present values; see `present` in `shaders/signals.wgsl`.
     pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
-        let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        let pass = encoder.begin_compute_pass(&Default::default());
-        let mut to = Recorder { pass };
-        let rows = self.rows as u32;
-        to.run(self.launches.get("present"), [signal as u32, rows, 0, 0], rows.div_ceil(256));
-        drop(to);
-        self.device.queue.submit([encoder.finish()]);
+        let (rows, launch) = (self.rows as u32, self.launches.get("present"));
+        self.submit(|to| to.run(launch, [signal as u32, rows, 0, 0], rows.div_ceil(256)));
         self.read("sums", 0, 4 * self.rows as u64)
     }
 }

@@ -10,13 +10,13 @@ use std::path::Path;
 
 use glam::DVec3;
 
+use super::super::PointCloud;
 use super::super::error::DatasetError;
 use super::super::paths::MAX_NAME;
 use super::super::tracks::{MAX_VIEWS, TrackSampler};
 use super::super::undistort::Lens;
-use super::super::{PointCloud, pose};
 use super::model::Model;
-use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME, checked_size};
+use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use crate::foreign;
 
 /// A file and the number of bytes left.
@@ -141,15 +141,8 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
         let field = format!("camera {id}");
         let model = i32::from_le_bytes(reader.bytes(&field)?);
         let model = Model::from_id(path, &field, model)?;
-        let (width, height) = (reader.u64(&field)?, reader.u64(&field)?);
-        let (width, height) = checked_size(path, &field, width, height)?;
-        let mut parameters = [0.0; 8];
-        for value in &mut parameters[..model.parameters()] {
-            *value = reader.f64(&field)?;
-        }
-        let lens = model.lens(width, height, &parameters[..model.parameters()]);
-        let lens = lens.ok_or_else(|| reader.fault(&field, "wrong number of parameters"))?;
-        pose::check_lens(path, &field, &lens)?;
+        let size = [reader.u64(&field)?, reader.u64(&field)?];
+        let lens = model.lens(path, &field, size, || reader.f64(&field))?;
         if cameras.insert(id, lens).is_some() {
             return Err(reader.fault(&field, "the id occurs twice"));
         }

@@ -187,21 +187,3 @@ pub(super) fn adopt_tracks(root: &Root, folder: &Path, scene: &mut Scene) {
         scene.tracks = model.tracks;
     }
 }
-
-/// Checks the size of a camera.
-fn checked_size(
-    file: &Path,
-    field: &str,
-    width: u64,
-    height: u64,
-) -> Result<(u32, u32), DatasetError> {
-    match (u32::try_from(width), u32::try_from(height)) {
-        (Ok(width), Ok(height)) if width > 0 && height > 0 => Ok((width, height)),
-        _ => Err(DatasetError::malformed(
-            file,
-            field,
-            format!("the size {width}x{height} px is impossible"),
-            REMEDY,
-        )),
-    }
-}

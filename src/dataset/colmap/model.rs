@@ -5,65 +5,76 @@ use std::path::Path;
 use glam::DVec2;
 
 use super::super::error::DatasetError;
+use super::super::pose::check_lens;
 use super::super::undistort::Lens;
+use super::REMEDY;
 
-/// Name and number of parameters, by model id (COLMAP, `sensor/models.h`).
-const MODELS: [(&str, usize); 12] = [
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+/// Names by model id (COLMAP, `sensor/models.h`).
+const MODELS: [&str; 12] = [
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
 ];
-
-const SUPPORTED: &str = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV";
+/// Of those that are supported, the number of focal lengths and of distortion terms.
+const PARAMETERS: [(usize, usize); 5] = [(1, 0), (2, 0), (1, 1), (1, 2), (2, 4)];
 
 /// A supported model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Model(usize);
+pub(super) struct Model {
+    focals: usize,
+    terms: usize,
+}
 
 impl Model {
     pub(super) fn from_id(file: &Path, camera: &str, id: i32) -> Result<Self, DatasetError> {
-        let known = usize::try_from(id).ok().filter(|&id| id < MODELS.len());
+        let known = usize::try_from(id).ok().and_then(|id| MODELS.get(id));
         match known {
-            Some(id) => Self::from_name(file, camera, MODELS[id].0),
+            Some(name) => Self::from_name(file, camera, name),
             None => Self::from_name(file, camera, &format!("number {id}")),
         }
     }
 
     pub(super) fn from_name(file: &Path, camera: &str, name: &str) -> Result<Self, DatasetError> {
-        match MODELS[..5].iter().position(|(known, _)| *known == name) {
-            Some(id) => Ok(Self(id)),
-            None => {
-                let problem = format!("the camera model {name} is not one of {SUPPORTED}");
-                Err(DatasetError::lens(file, camera, problem))
-            }
-        }
+        let supported = MODELS.iter().zip(PARAMETERS).find(|(known, _)| **known == name);
+        let (_, (focals, terms)) = supported.ok_or_else(|| {
+            let all = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV";
+            let problem = format!("the camera model {name} is not one of {all}");
+            DatasetError::lens(file, camera, problem)
+        })?;
+        Ok(Self { focals, terms })
     }
 
-    /// Number of parameters.
-    pub(super) fn parameters(self) -> usize {
-        MODELS[self.0].1
-    }
-
-    /// The lens with these parameters, of which there are [`Self::parameters`].
-    pub(super) fn lens(self, width: u32, height: u32, parameters: &[f64]) -> Option<Lens> {
-        let (focal, principal, distortion) = match (self.0, parameters) {
-            (0, &[f, cx, cy]) => ((f, f), (cx, cy), [0.0; 4]),
-            (1, &[fx, fy, cx, cy]) => ((fx, fy), (cx, cy), [0.0; 4]),
-            (2, &[f, cx, cy, k]) => ((f, f), (cx, cy), [k, 0.0, 0.0, 0.0]),
-            (3, &[f, cx, cy, k1, k2]) => ((f, f), (cx, cy), [k1, k2, 0.0, 0.0]),
-            (4, &[fx, fy, cx, cy, k1, k2, p1, p2]) => ((fx, fy), (cx, cy), [k1, k2, p1, p2]),
-            _ => return None,
+    /// The lens of a camera of this size, checked. `next` reads its parameters, one after the other.
+    pub(super) fn lens(
+        self,
+        file: &Path,
+        camera: &str,
+        [width, height]: [u64; 2],
+        mut next: impl FnMut() -> Result<f64, DatasetError>,
+    ) -> Result<Lens, DatasetError> {
+        let side = |side: u64| u32::try_from(side).ok().filter(|&side| side > 0);
+        let (Some(width), Some(height)) = (side(width), side(height)) else {
+            let problem = format!("the size {width}x{height} px is impossible");
+            return Err(DatasetError::malformed(file, camera, problem, REMEDY));
         };
-        let (focal, principal) = (DVec2::from(focal), DVec2::from(principal));
-        Some(Lens { width, height, focal, principal, distortion })
+        let fx = next()?;
+        let fy = if self.focals == 2 { next()? } else { fx };
+        let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(next()?, next()?));
+        let mut distortion = [0.0; 4];
+        for term in &mut distortion[..self.terms] {
+            *term = next()?;
+        }
+        let lens = Lens { width, height, focal, principal, distortion };
+        check_lens(file, camera, &lens)?;
+        Ok(lens)
     }
 }

@@ -9,13 +9,13 @@ use std::str::{FromStr, SplitWhitespace};
 
 use glam::DVec3;
 
+use super::super::PointCloud;
 use super::super::error::DatasetError;
 use super::super::paths::MAX_NAME;
 use super::super::tracks::TrackSampler;
 use super::super::undistort::Lens;
-use super::super::{PointCloud, pose};
 use super::model::Model;
-use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME, checked_size};
+use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use crate::foreign;
 
 /// Longest line accepted: the observations of one image, about 40 bytes each.
@@ -115,19 +115,12 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
         let field = format!("camera {id}");
         let model = words.next().ok_or_else(|| lines.fault(&field, "the model is missing"))?;
         let model = Model::from_name(path, &field, model)?;
-        let width = lines.number(&mut words, "width")?;
-        let height = lines.number(&mut words, "height")?;
-        let (width, height) = checked_size(path, &field, width, height)?;
-        let mut parameters = [0.0; 8];
-        for value in &mut parameters[..model.parameters()] {
-            *value = lines.number(&mut words, "camera parameters")?;
-        }
+        let size = [lines.number(&mut words, "width")?, lines.number(&mut words, "height")?];
+        let next = || lines.number(&mut words, "camera parameters");
+        let lens = model.lens(path, &field, size, next)?;
         if words.next().is_some() {
             return Err(lines.fault(&field, "there are more parameters than the model has"));
         }
-        let lens = model.lens(width, height, &parameters[..model.parameters()]);
-        let lens = lens.ok_or_else(|| lines.fault(&field, "wrong number of parameters"))?;
-        pose::check_lens(path, &field, &lens)?;
         if cameras.insert(id, lens).is_some() {
             return Err(lines.fault(&field, "the id occurs twice"));
         }

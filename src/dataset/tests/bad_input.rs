@@ -182,6 +182,12 @@ const TRANSFORMS: &[Replacement] = &[
     ("/frames/1/file_path", "\"../b.png\"", "frames[1].file_path, `..`"),
     ("/frames/1/file_path", "\"/b.png\"", "frames[1].file_path, absolute"),
     ("/frames/1/file_path", "\"b\\u0000.png\"", "frames[1].file_path, control character"),
+    ("/frames/1/file_path", "\"b\\u001b[2J\\n\"", "frames[1].file_path, control character"),
+    ("/frames/1/file_path", "\"./\"", "frames[1].file_path, is empty"),
+    ("/frames/1/file_path", "\"a\\\\..\\\\b\"", "frames[1].file_path, `..`"),
+    ("/frames/1/file_path", "\"C:\\\\a\"", "frames[1].file_path, absolute"),
+    ("/frames/1/file_path", "\"\\\\\\\\host\"", "frames[1].file_path, absolute"),
+    ("/frames/1/file_path", "\"file:///a\"", "frames[1].file_path, absolute"),
     ("/frames/1/mask_path", "\"../m.png\"", "frames[1].mask_path, `..`"),
     ("/frames/1/mask_path", "\"m.png\"", "frames[1].mask_path, m.png"),
     ("/frames/1/transform_matrix", "", "frames[1].transform_matrix"),
@@ -277,4 +283,9 @@ fn links_out_of_the_dataset() {
     refused("linked folder", &made, &LoadOptions::default(), "symbolic link, --images");
     let named = LoadOptions { images: Some(outside.path().to_owned()), ..LoadOptions::default() };
     assert!(Dataset::load(made.path(), &named).is_ok());
+    // Inside they are followed.
+    let made = Made::colmap_txt();
+    std::fs::rename(made.file("images"), made.file("photographs")).unwrap();
+    std::os::unix::fs::symlink("photographs", made.file("images")).unwrap();
+    assert!(Dataset::load(made.path(), &LoadOptions::default()).is_ok());
 }

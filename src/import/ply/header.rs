@@ -4,7 +4,8 @@ use std::fmt::Display;
 use std::io::{BufRead, Read};
 use std::path::Path;
 
-use super::PlyError;
+use super::malformed;
+use crate::dataset::DatasetError;
 
 /// Longest header accepted `[bytes]`.
 const MAX_HEADER: u64 = 1 << 20;
@@ -114,7 +115,7 @@ impl Element {
 
 impl Header {
     /// Reads the header and leaves `input` at the first byte of data.
-    pub(super) fn read(path: &Path, input: &mut impl BufRead) -> Result<Self, PlyError> {
+    pub(super) fn read(path: &Path, input: &mut impl BufRead) -> Result<Self, DatasetError> {
         let mut lines = Lines { path, input, number: 0, read: 0 };
         if lines.next()?.trim_end() != "ply" {
             return Err(lines.fault("it is not a PLY file: the first line is not `ply`"));
@@ -198,16 +199,19 @@ struct Lines<'a, R> {
 }
 
 impl<R: BufRead> Lines<'_, R> {
-    fn fault(&self, problem: impl Display) -> PlyError {
-        PlyError::malformed(self.path, format!("header line {}", self.number), problem)
+    fn fault(&self, problem: impl Display) -> DatasetError {
+        malformed(self.path, format!("header line {}", self.number), problem)
     }
 
-    fn next(&mut self) -> Result<String, PlyError> {
+    fn next(&mut self) -> Result<String, DatasetError> {
         let mut line = Vec::new();
         self.number += 1;
         let room = MAX_HEADER.saturating_sub(self.read);
-        let read =
-            self.input.take(room).read_until(b'\n', &mut line).map_err(PlyError::io(self.path))?;
+        let read = self
+            .input
+            .take(room)
+            .read_until(b'\n', &mut line)
+            .map_err(DatasetError::io(self.path))?;
         self.read += read as u64;
         if line.last() != Some(&b'\n') && line.trim_ascii() != b"end_header" {
             return Err(self.fault("the header ends without `end_header`, or is longer than 1 MiB"));
@@ -216,7 +220,7 @@ impl<R: BufRead> Lines<'_, R> {
         Ok(String::from_utf8_lossy(&line).into_owned())
     }
 
-    fn push(&self, elements: &mut [Element], property: Property) -> Result<(), PlyError> {
+    fn push(&self, elements: &mut [Element], property: Property) -> Result<(), DatasetError> {
         let Some(element) = elements.last_mut() else {
             return Err(self.fault("a property comes before any element"));
         };

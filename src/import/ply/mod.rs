@@ -11,35 +11,21 @@ mod splats;
 use std::fmt::Display;
 use std::path::Path;
 
-use crate::foreign::one_line;
+use crate::dataset::DatasetError;
 
 pub use points::read_points;
 pub(crate) use splats::splat_properties;
 pub use splats::{SplatFile, read_splats};
 
-/// Why a PLY file cannot be used: names the file, the place and the remedy.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct PlyError(String);
+/// The file contradicts the format at a line, an element or a property.
+fn malformed(path: &Path, field: impl Display, problem: impl Display) -> DatasetError {
+    DatasetError::malformed(path, field, problem, "export the file again")
+}
 
-impl PlyError {
-    fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
-        move |source| {
-            let path = path.display();
-            Self(format!("cannot read {path}: {source}; check that it exists and is readable"))
-        }
-    }
-
-    /// The file contradicts the format at a line, an element or a property.
-    fn malformed(path: &Path, field: impl Display, problem: impl Display) -> Self {
-        let [field, problem] = [field.to_string(), problem.to_string()].map(|text| one_line(&text));
-        Self(format!("{}: {field}: {problem}; export the file again", path.display()))
-    }
-
-    /// The vertices lack a property that the purpose needs.
-    fn missing(path: &Path, property: &str, remedy: &str) -> Self {
-        Self(format!("{}: the vertices have no property {property}; {remedy}", path.display()))
-    }
+/// The vertices lack a property that the purpose needs.
+fn missing(path: &Path, property: &str, remedy: &str) -> DatasetError {
+    let path = path.display();
+    DatasetError(format!("{path}: the vertices have no property {property}; {remedy}"))
 }
 
 #[cfg(test)]

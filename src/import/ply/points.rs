@@ -4,8 +4,9 @@ use std::path::Path;
 
 use glam::DVec3;
 
-use super::PlyError;
+use super::missing;
 use super::rows::Ply;
+use crate::dataset::DatasetError;
 use crate::import::PointCloud;
 
 /// Colour of points that have none.
@@ -16,12 +17,12 @@ const GREY: u8 = 128;
 ///
 /// # Errors
 /// When the file is unreadable, contradicts itself, or its vertices have no x, y, z.
-pub fn read_points(path: &Path) -> Result<PointCloud, PlyError> {
+pub fn read_points(path: &Path) -> Result<PointCloud, DatasetError> {
     let mut ply = Ply::open(path)?;
     let vertices = ply.element("vertex")?;
     let mut columns = Vec::new();
     for axis in ["x", "y", "z"] {
-        let missing = || PlyError::missing(path, axis, "a point cloud needs x, y and z");
+        let missing = || missing(path, axis, "a point cloud needs x, y and z");
         columns.push(vertices.find(&[axis]).ok_or_else(missing)?);
     }
     let channels: [Option<usize>; 3] = [

@@ -5,8 +5,9 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
 use std::path::Path;
 
-use super::PlyError;
 use super::header::{Element, Encoding, Header, Scalar};
+use super::malformed;
+use crate::dataset::DatasetError;
 use crate::foreign;
 
 /// Longest number accepted in an ascii file `[bytes]`.
@@ -22,9 +23,9 @@ pub(super) struct Ply<'a> {
 }
 
 impl<'a> Ply<'a> {
-    pub(super) fn open(path: &'a Path) -> Result<Self, PlyError> {
-        let file = foreign::open(path).map_err(PlyError::io(path))?;
-        let length = file.metadata().map_err(PlyError::io(path))?.len();
+    pub(super) fn open(path: &'a Path) -> Result<Self, DatasetError> {
+        let file = foreign::open(path).map_err(DatasetError::io(path))?;
+        let length = file.metadata().map_err(DatasetError::io(path))?.len();
         let mut input = BufReader::with_capacity(1 << 16, file);
         let header = Header::read(path, &mut input)?;
         let data = length.saturating_sub(header.length);
@@ -32,11 +33,9 @@ impl<'a> Ply<'a> {
     }
 
     /// The element of this name.
-    pub(super) fn element(&self, name: &str) -> Result<Element, PlyError> {
+    pub(super) fn element(&self, name: &str) -> Result<Element, DatasetError> {
         let found = self.header.elements.iter().find(|element| element.name == name).cloned();
-        found.ok_or_else(|| {
-            PlyError::malformed(self.path, "header", format!("there is no element {name:?}"))
-        })
+        found.ok_or_else(|| malformed(self.path, "header", format!("there is no element {name:?}")))
     }
 
     /// Calls `each` with the values of `columns` for every row of `wanted`, after skipping the
@@ -46,7 +45,7 @@ impl<'a> Ply<'a> {
         wanted: &Element,
         columns: &[usize],
         mut each: impl FnMut(&[f64]),
-    ) -> Result<(), PlyError> {
+    ) -> Result<(), DatasetError> {
         let elements = std::mem::take(&mut self.header.elements);
         for element in elements.iter().take_while(|element| element.name != wanted.name) {
             self.rows(element, &[], &mut |_| ())?;
@@ -56,12 +55,8 @@ impl<'a> Ply<'a> {
         Ok(())
     }
 
-    fn fault(&self, element: &Element, row: u64, problem: impl Display) -> PlyError {
-        PlyError::malformed(
-            self.path,
-            format!("{} {row} of {}", element.name, element.rows),
-            problem,
-        )
+    fn fault(&self, element: &Element, row: u64, problem: impl Display) -> DatasetError {
+        malformed(self.path, format!("{} {row} of {}", element.name, element.rows), problem)
     }
 
     fn rows(
@@ -69,7 +64,7 @@ impl<'a> Ply<'a> {
         element: &Element,
         columns: &[usize],
         each: &mut impl FnMut(&[f64]),
-    ) -> Result<(), PlyError> {
+    ) -> Result<(), DatasetError> {
         let encoding = self.header.encoding;
         let min_bytes = element.min_bytes(encoding);
         // The last number of an ascii file needs no separator.
@@ -78,11 +73,7 @@ impl<'a> Ply<'a> {
                 "{} rows need {min_bytes} bytes each, but the file holds {}",
                 element.rows, self.data
             );
-            return Err(PlyError::malformed(
-                self.path,
-                format!("element {}", element.name),
-                problem,
-            ));
+            return Err(malformed(self.path, format!("element {}", element.name), problem));
         }
         if min_bytes == 0 {
             return Ok(());
@@ -113,7 +104,7 @@ impl<'a> Ply<'a> {
         row: u64,
         length: Scalar,
         kind: Scalar,
-    ) -> Result<(), PlyError> {
+    ) -> Result<(), DatasetError> {
         let length = self.scalar(element, row, length)?;
         if !(0.0..=f64::from(u32::MAX)).contains(&length) {
             return Err(self.fault(element, row, format!("a list of length {length}")));
@@ -126,13 +117,13 @@ impl<'a> Ply<'a> {
         }
         let bytes = length as u64 * kind.size() as u64;
         let skipped = std::io::copy(&mut (&mut self.input).take(bytes), &mut std::io::sink());
-        if skipped.map_err(PlyError::io(self.path))? < bytes {
+        if skipped.map_err(DatasetError::io(self.path))? < bytes {
             return Err(self.fault(element, row, "the file ends here (truncated?)"));
         }
         Ok(())
     }
 
-    fn scalar(&mut self, element: &Element, row: u64, kind: Scalar) -> Result<f64, PlyError> {
+    fn scalar(&mut self, element: &Element, row: u64, kind: Scalar) -> Result<f64, DatasetError> {
         if self.header.encoding == Encoding::Ascii {
             return self.word(element, row);
         }
@@ -140,7 +131,7 @@ impl<'a> Ply<'a> {
         let size = kind.size();
         self.input.read_exact(&mut bytes[..size]).map_err(|source| match source.kind() {
             ErrorKind::UnexpectedEof => self.fault(element, row, "the file ends here (truncated?)"),
-            _ => PlyError::io(self.path)(source),
+            _ => DatasetError::io(self.path)(source),
         })?;
         if self.header.encoding == Encoding::BigEndian {
             bytes[..size].reverse();
@@ -159,14 +150,14 @@ impl<'a> Ply<'a> {
     }
 
     /// The next number of an ascii file, whichever line it is on.
-    fn word(&mut self, element: &Element, row: u64) -> Result<f64, PlyError> {
+    fn word(&mut self, element: &Element, row: u64) -> Result<f64, DatasetError> {
         let mut word = [0u8; MAX_WORD];
         let mut length = 0;
         loop {
             let buffer = match self.input.fill_buf() {
                 Ok(buffer) => buffer,
                 Err(source) if source.kind() == ErrorKind::Interrupted => continue,
-                Err(source) => return Err(PlyError::io(self.path)(source)),
+                Err(source) => return Err(DatasetError::io(self.path)(source)),
             };
             let at_end = buffer.is_empty();
             let mut used = 0;

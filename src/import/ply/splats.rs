@@ -4,9 +4,10 @@
 
 use std::path::Path;
 
-use super::PlyError;
 use super::header::Element;
 use super::rows::Ply;
+use super::{malformed, missing};
+use crate::dataset::DatasetError;
 use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Fraction of the rows that may be unusable.
@@ -30,13 +31,13 @@ pub struct SplatFile {
 /// # Errors
 /// When the file is unreadable or contradicts itself, a property is missing, the layout is the
 /// compressed one, or more than 1 % of the rows are not finite.
-pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
+pub fn read_splats(path: &Path) -> Result<SplatFile, DatasetError> {
     let mut ply = Ply::open(path)?;
     let packed = |element: &Element| {
         element.name == "chunk" || element.properties.iter().any(|p| p.name == "packed_position")
     };
     if ply.header.elements.iter().any(packed) {
-        return Err(PlyError(format!(
+        return Err(DatasetError(format!(
             "{} is a compressed splat PLY (element chunk, packed properties), which densify does not read; \
              export it as an uncompressed .ply, e.g. with SuperSplat or splat-transform",
             path.display()
@@ -64,7 +65,7 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, PlyError> {
         repaired += usize::from(push(&mut gaussians, &values, rest));
     })?;
     if dropped as f64 > MAX_BAD_ROWS * total as f64 {
-        return Err(PlyError(format!(
+        return Err(DatasetError(format!(
             "{}: {dropped} of {total} rows are not finite, more than 1 %; the file is damaged: export it again",
             path.display()
         )));
@@ -110,17 +111,17 @@ fn push(gaussians: &mut Gaussians, values: &[f32], rest: usize) -> bool {
     is_zero
 }
 
-fn column(path: &Path, vertices: &Element, name: &str) -> Result<usize, PlyError> {
+fn column(path: &Path, vertices: &Element, name: &str) -> Result<usize, DatasetError> {
     let remedy = "a splat PLY needs x y z, f_dc_0..2, opacity, scale_0..2 and rot_0..3 \
                   (a point cloud is not a splat file)";
-    vertices.find(&[name]).ok_or_else(|| PlyError::missing(path, name, remedy))
+    vertices.find(&[name]).ok_or_else(|| missing(path, name, remedy))
 }
 
-fn sh_degree(path: &Path, vertices: &Element) -> Result<u8, PlyError> {
+fn sh_degree(path: &Path, vertices: &Element) -> Result<u8, DatasetError> {
     let rest = vertices.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
     let fits = |degree: &u8| 3 * (sh_coefficients(*degree) - 1) == rest;
     (0..=MAX_SH_DEGREE).find(fits).ok_or_else(|| {
         let problem = format!("there are {rest} of them, but degrees 0 to 3 have 0, 9, 24 or 45");
-        PlyError::malformed(path, "f_rest_*", problem)
+        malformed(path, "f_rest_*", problem)
     })
 }

@@ -41,7 +41,7 @@ pub fn model_path(run: &Path, iteration: u32) -> PathBuf {
 /// The iterations whose model a run has saved, in order.
 ///
 /// # Errors
-/// [`OutputError::NoRun`] when there is none.
+/// [`OutputError::Unfit`] when there is none.
 pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
     let iteration = |name: &OsStr| name.to_str()?.strip_prefix("iteration_")?.parse().ok();
     let entries = fs::read_dir(run.join(MODELS)).into_iter().flatten().flatten();
@@ -51,7 +51,7 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
         .collect();
     saved.sort_unstable();
     if saved.is_empty() {
-        return Err(OutputError::NoRun { path: run.to_owned(), missing: "saved model" });
+        return Err(OutputError::no_run(run, "saved model"));
     }
     Ok(saved)
 }
@@ -88,19 +88,23 @@ impl RunFolder {
     /// Checks, without writing anything, that a run may go to `target`.
     ///
     /// # Errors
-    /// [`OutputError::InUse`] while a process trains there; [`OutputError::Occupied`] when it holds
-    /// another run and `overwrite` is not set; [`OutputError::NotAFolder`]; [`OutputError::Io`].
+    /// [`OutputError::Unfit`] while a process trains there; [`OutputError::Unfit`] when it holds
+    /// another run and `overwrite` is not set; [`OutputError::Unfit`]; [`OutputError::Io`].
     pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
         if !target.is_dir() {
             // A dangling link is in the way, too.
             return match target.symlink_metadata() {
-                Ok(_) => Err(OutputError::NotAFolder { path: target.to_owned() }),
+                Ok(_) => {
+                    let target = target.display();
+                    let problem = format!("{target} is not a folder; choose another one with -o");
+                    Err(OutputError::Unfit(problem))
+                }
                 Err(_) => Ok(()),
             };
         }
         FolderLock::check(target)?;
         if !overwrite && !owned_entries(target)?.is_empty() {
-            return Err(OutputError::Occupied { path: target.to_owned() });
+            return Err(OutputError::occupied(target));
         }
         Ok(())
     }
@@ -115,7 +119,7 @@ impl RunFolder {
         // Another process may have trained there since.
         let occupied = !owned_entries(target)?.is_empty();
         if occupied && !overwrite {
-            return Err(OutputError::Occupied { path: target.to_owned() });
+            return Err(OutputError::occupied(target));
         }
         if occupied {
             let staging = tempfile::Builder::new().prefix(NEW).tempdir_in(target);
@@ -129,8 +133,8 @@ impl RunFolder {
     /// then its files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`OutputError::InUse`], [`OutputError::NotAFolder`], [`OutputError::Io`];
-    /// [`OutputError::Occupied`] when a run that starts again would remove models or checkpoints, or
+    /// [`OutputError::Unfit`], [`OutputError::Unfit`], [`OutputError::Io`];
+    /// [`OutputError::Unfit`] when a run that starts again would remove models or checkpoints, or
     /// files of something that is no run.
     pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
         Self::check(target, true)?;
@@ -143,7 +147,7 @@ impl RunFolder {
             let is_foreign =
                 !target.join(CONFIG_FILE).exists() && !owned_entries(target)?.is_empty();
             if is_foreign || has_checkpoint || saved_iterations(target).is_ok() {
-                return Err(OutputError::Occupied { path: target.to_owned() });
+                return Err(OutputError::occupied(target));
             }
             // Its description stays until it is replaced: a kill must not lose it.
             remove_owned(target, |name| name != CONFIG_FILE);
@@ -170,7 +174,7 @@ impl RunFolder {
     /// be looked at.
     ///
     /// # Errors
-    /// [`OutputError::InUse`], [`OutputError::Io`].
+    /// [`OutputError::Unfit`], [`OutputError::Io`].
     pub fn settle(target: &Path) -> Result<(), OutputError> {
         if hidden(target, OLD).is_empty() && hidden(target, REPLACED).is_empty() {
             return Ok(());

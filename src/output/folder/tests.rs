@@ -133,13 +133,13 @@ fn a_run_that_goes_on_finds_nothing_half_written() {
     assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
     assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-new-x")]);
     // To start again would remove a model.
-    assert!(matches!(RunFolder::resume(root.path(), true), Err(OutputError::Occupied { .. })));
+    assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
     fs::remove_dir_all(root.path().join("point_cloud")).unwrap();
     drop(RunFolder::resume(root.path(), true).unwrap());
     assert_eq!(tree(root.path()), [".densify-new-x", "config.toml"]);
     // Without a description it is no run.
     fs::rename(root.path().join("config.toml"), root.path().join("stats")).unwrap();
-    assert!(matches!(RunFolder::resume(root.path(), true), Err(OutputError::Occupied { .. })));
+    assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
     fs::rename(root.path().join("stats"), root.path().join("config.toml")).unwrap();
     let run = RunFolder::create(root.path(), true).unwrap();
     write(&run.path().join("config.toml"), "new");
@@ -189,7 +189,7 @@ fn a_folder_in_use_is_neither_replaced_nor_resumed() {
         RunFolder::resume(root.path(), false).map(drop),
     ];
     for refused in refused {
-        assert!(matches!(refused, Err(OutputError::InUse { .. })), "{refused:?}");
+        assert!(refused.unwrap_err().to_string().contains("is in use"));
     }
     run.finish().unwrap();
     let replacing = RunFolder::create(root.path(), true).unwrap();
@@ -251,7 +251,7 @@ fn a_discarded_run_leaves_what_was_there() {
 #[test]
 fn saved_models_are_found_in_numeric_order() {
     let root = tempfile::tempdir().unwrap();
-    assert!(matches!(saved_iterations(root.path()), Err(OutputError::NoRun { .. })));
+    assert!(saved_iterations(root.path()).unwrap_err().to_string().contains("no saved model"));
     for iteration in [1_000, 30, 200] {
         write(&model_path(root.path(), iteration), "ply");
     }

@@ -6,9 +6,7 @@ use densify_policies::policy::Needs;
 use glam::DVec3;
 
 use super::{DECODERS, Inputs};
-use crate::backend::{
-    BackendOptions, KeptPhotographs, MomentStorage, ROWS_AT_A_TIME, Shortcuts, Storage,
-};
+use crate::backend::{KeptPhotographs, MomentStorage, ROWS_AT_A_TIME, Setup, Shortcuts, Storage};
 use crate::dataset::{Dataset, View};
 use crate::export::{PLY, Shape};
 use crate::gaussians::sh_coefficients;
@@ -39,12 +37,8 @@ const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
 
 impl Inputs<'_> {
     /// How the backend is made for a size.
-    pub(in crate::run) fn backend_options(
-        &self,
-        setting: &RunSize,
-        needs: Needs,
-    ) -> BackendOptions {
-        BackendOptions {
+    pub(in crate::run) fn backend_options(&self, setting: &RunSize, needs: Needs) -> Setup {
+        Setup {
             near: (self.spec.start.near.0 * self.dataset.extent()) as f32,
             tile_cap: Some(setting.tile_cap),
             record_cap: self.record_cap(setting),
@@ -54,7 +48,7 @@ impl Inputs<'_> {
             storage: self.knobs.storage,
             shortcuts: self.knobs.shortcuts,
             needs,
-            ..BackendOptions::new(setting.rows)
+            ..Setup::new(setting.rows)
         }
     }
 
@@ -136,7 +130,7 @@ impl Inputs<'_> {
     /// How the model is measured at the end, where views are held out and the surface is known.
     pub(in crate::run) fn measuring(&self, setting: &RunSize, threads: usize) -> Option<Measuring> {
         let surface = self.dataset.surface_bytes.filter(|_| !self.dataset.test.is_empty())?;
-        let options = BackendOptions {
+        let options = Setup {
             photographs: KeptPhotographs::default(),
             // Nothing is trained, so moments may be small.
             storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },

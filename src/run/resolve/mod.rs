@@ -252,20 +252,18 @@ fn check_knobs(knobs: &Knobs, kind: BackendKind) -> Result<(), Failure> {
 
 /// Fails where `--full` and an automatic reduction are both given.
 fn check_full(spec: &RunSpec) -> Result<(), Failure> {
-    if !spec.size.full {
-        return Ok(());
-    }
-    if spec.size.budget.is_some_and(Budget::is_auto) {
-        return Err(Failure::input(
-            "--full disables automatic reductions, and --budget auto is one; give one of the two, or --full \
-             with a number of Gaussians",
-        ));
-    }
-    if matches!(spec.size.sh_degree, Some(ShDegree::Auto(_))) {
-        return Err(Failure::input(
-            "--full disables automatic reductions, and --sh-degree auto is one; give one of the two, or \
-             --full with --sh-degree 3",
-        ));
+    let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
+    let is_auto_degree = matches!(spec.size.sh_degree, Some(ShDegree::Auto(_)));
+    for (is_given, option, other) in [
+        (is_auto_budget, "--budget auto", "with a number of Gaussians"),
+        (is_auto_degree, "--sh-degree auto", "with --sh-degree 3"),
+    ] {
+        if spec.size.full && is_given {
+            return Err(Failure::input(format!(
+                "--full disables automatic reductions, and {option} is one; give one of the two, or --full \
+                 {other}"
+            )));
+        }
     }
     Ok(())
 }

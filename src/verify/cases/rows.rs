@@ -4,11 +4,11 @@ use densify_policies::plan::EditPlan;
 
 use super::{GREY, UPRIGHT, flat_colour, straight};
 use crate::backend::BackendError;
+use crate::backend::Setup;
 use crate::gaussians::Gaussians;
 use crate::verify::compare::class;
 use crate::verify::reference::CLASSES;
 use crate::verify::scenes;
-use crate::verify::subject::Setup;
 use crate::verify::trial::{Trial, count_broken, step};
 
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];

@@ -2,12 +2,12 @@
 
 use super::{GREY, UPRIGHT, straight};
 use crate::backend::BackendError;
+use crate::backend::Setup;
 use crate::camera::Camera;
 use crate::gaussians::Gaussians;
 use crate::memory::resident;
 use crate::verify::reference::{Model, Rules, View, blend, project};
 use crate::verify::scenes;
-use crate::verify::subject::Setup;
 use crate::verify::trial::{Trial, count_broken, step};
 use crate::verify::values::{LARGE_SIZES, SIZES};
 

@@ -8,6 +8,7 @@ use glam::{DMat3, DVec3};
 
 use super::UPRIGHT;
 use crate::backend::BackendError;
+use crate::backend::Setup;
 use crate::camera::Camera;
 use crate::dataset::PointCloud;
 use crate::dataset::images::{Image8, SharedImage};
@@ -16,7 +17,7 @@ use crate::init::initialise;
 use crate::schedule::{Background, RateOptions};
 use crate::trainer::{OnNan, TrainOptions, Trainer};
 use crate::verify::scenes;
-use crate::verify::subject::{Setup, Subject};
+use crate::verify::subject::Subject;
 use crate::verify::trial::{Trial, count_broken};
 use crate::views::{ViewError, ViewSource};
 

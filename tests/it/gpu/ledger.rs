@@ -1,7 +1,7 @@
 //! What is allocated on a device is what the ledger says.
 
 use densify::backend::gpu::GpuBackend;
-use densify::backend::{Backend, BackendOptions};
+use densify::backend::{Backend, Setup};
 use densify::verify::scenes;
 use densify_policies::policy::{Needs, Signal};
 
@@ -16,11 +16,11 @@ fn what_is_allocated_is_what_the_ledger_says() {
     {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);
-        let options = BackendOptions {
+        let options = Setup {
             largest_image: (40, 30),
             tile_cap: Some(700),
             needs: Needs { signals: signals.iter().copied().collect(), ..Needs::default() },
-            ..BackendOptions::new(model.len())
+            ..Setup::new(model.len())
         };
         let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
         let promised = gpu.promised();

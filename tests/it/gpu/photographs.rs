@@ -1,7 +1,7 @@
 //! Photographs that stay on the device.
 
 use densify::backend::gpu::{GpuBackend, GpuDevice};
-use densify::backend::{Backend, BackendOptions, KeptPhotographs, StepInput};
+use densify::backend::{Backend, KeptPhotographs, Setup, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
@@ -15,10 +15,10 @@ fn view(size: (u32, u32), seed: u64) -> (Camera, Image8) {
 }
 
 fn backend(device: &GpuDevice, model: &Gaussians, count: usize, with_masks: bool) -> GpuBackend {
-    let options = BackendOptions {
+    let options = Setup {
         photographs: KeptPhotographs { count, with_masks },
         largest_image: (41, 30),
-        ..BackendOptions::new(model.len())
+        ..Setup::new(model.len())
     };
     GpuBackend::new(model, &options, device).expect("a small model fits")
 }

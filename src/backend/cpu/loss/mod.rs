@@ -21,7 +21,7 @@ mod window;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::parts::{Parts, parts};
+use super::blocks::parts;
 use super::rasterize::{DARK, TileCanvas, copy_row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
@@ -140,14 +140,12 @@ impl LossBuffers {
             });
             let strips = grid.height.div_ceil(SHORT_STRIP);
             let [ranking, by_pixel] = &mut self.errors;
-            let error_strips = [parts(ranking, short, strips), parts(by_pixel, short, strips)];
-            let [ranking, by_pixel] = error_strips.map(Parts::par);
             let tasks = (
                 p1.par_chunks_mut(short),
                 p2.par_chunks_mut(short),
                 p3.par_chunks_mut(short),
-                ranking,
-                by_pixel,
+                parts(ranking, short, strips),
+                parts(by_pixel, short, strips),
             );
             let sums = threads.collect_with(
                 "loss similarity",

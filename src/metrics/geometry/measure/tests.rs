@@ -6,7 +6,8 @@ use std::sync::Arc;
 use glam::{DMat3, DQuat, DVec3};
 
 use super::*;
-use crate::backend::cpu::{CpuBackend, CpuOptions};
+use crate::backend::Setup;
+use crate::backend::cpu::CpuBackend;
 use crate::dataset::GroundTruth;
 use crate::dataset::images::{Image8, SharedImage};
 use crate::dataset::normalise::Normalisation;
@@ -134,7 +135,7 @@ fn carpet(z: f64) -> Gaussians {
 
 fn measured(truth: &GroundTruth, world: &Gaussians) -> Geometry {
     let model = WORLD.model_from_world(world.clone());
-    let options = CpuOptions { needs: needs(), ..CpuOptions::new(model.len().max(1)) };
+    let options = Setup { needs: needs(), ..Setup::new(model.len().max(1)) };
     let mut backend = CpuBackend::new(&model, &options).unwrap();
     let ground = KnownScene {
         truth,
