@@ -11,9 +11,11 @@ CARGO_TARGET_DIR="$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")/tours"
 export CARGO_TARGET_DIR
 
 cd "$folder"
-# The checkout lies elsewhere, and dependencies have its versions: without a network there are no others.
+# The checkout lies elsewhere, and dependencies have its versions: without a network there are no others. `cargo test`
+# removes from the copy what the policy does not need, so the trainer, added later, needs a copy of its own.
+lock="cp '$root/Cargo.lock' ."
 recipe "$root/CONTRIBUTING.md" 'A policy' |
-    sed "s|\.\./densify|$root|g; s|^cd my_policy\$|&; cp '$root/Cargo.lock' .|" >recipe.sh
+    sed "s|\.\./densify|$root|g; s|^cd my_policy\$|&; $lock|; s|^cargo add |$lock; &|" >recipe.sh
 bash -euxo pipefail recipe.sh 2>&1 | tee said.txt
 
 has() { grep -qE "$1" "$2" || fail "$2 does not have: $1"; }
