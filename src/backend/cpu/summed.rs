@@ -11,7 +11,7 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, parts, plane};
+use super::blocks::{BlockTask, Blocks, parts, plane, reorder};
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
 
