@@ -15,42 +15,42 @@ const WORDS: u32 = 20u;
 @group(0) @binding(6) var<storage, read_write> second_rows: array<f32>;
 @group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
 
-// Operations (from, to): copies row `from`, or clears `to` where it is NONE. now.a: operations,
-// now.b: numbers per row, now.c: distance between rows, now.d: between the numbers of a row.
-@compute @workgroup_size(256)
-fn copy_rows(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
+// The operation of a lane, and the number of the row that it works on. now.a: operations, now.b: numbers per
+// row, now.c: distance between rows, now.d: between the numbers of a row.
+fn operation_of(id: vec3<u32>, lane: u32) -> vec2<u32> {
     let i = group_of(id) * GROUP + lane;
-    let op = i / now.b;
-    let word = i % now.b;
-    if op >= now.a {
+    return vec2(i / now.b, i % now.b);
+}
+
+fn place_of(row: u32, number: u32) -> u32 {
+    return row * now.c + number * now.d;
+}
+
+// Operations (from, to): copies row `from`, or clears `to` where it is NONE.
+@compute @workgroup_size(256)
+fn copy_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let op = operation_of(id, lane);
+    if op.x >= now.a {
         return;
     }
-    let source = ops[2u * op];
-    let to = ops[2u * op + 1u] * now.c + word * now.d;
+    let source = ops[2u * op.x];
+    let to = place_of(ops[2u * op.x + 1u], op.y);
     if source == NONE {
         buffer[to] = 0u;
     } else {
-        buffer[to] = buffer[source * now.c + word * now.d];
+        buffer[to] = buffer[place_of(source, op.y)];
     }
 }
 
-// Operations (a, b): exchanges two rows; no row twice. Numbers as in `copy_rows`.
+// Operations (a, b): exchanges two rows; no row twice.
 @compute @workgroup_size(256)
-fn swap_rows(
-    @builtin(workgroup_id) id: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = group_of(id) * GROUP + lane;
-    let op = i / now.b;
-    let word = i % now.b;
-    if op >= now.a {
+fn swap_rows(@builtin(workgroup_id) id: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let op = operation_of(id, lane);
+    if op.x >= now.a {
         return;
     }
-    let a = ops[2u * op] * now.c + word * now.d;
-    let b = ops[2u * op + 1u] * now.c + word * now.d;
+    let a = place_of(ops[2u * op.x], op.y);
+    let b = place_of(ops[2u * op.x + 1u], op.y);
     let kept = buffer[a];
     buffer[a] = buffer[b];
     buffer[b] = kept;

@@ -43,8 +43,8 @@ impl<V: ViewSource> Trainer<V> {
 }
 
 /// The result of `call`. A policy may come from anywhere: if it panics, the run ends with an error that names
-/// it, and the model can still be read. After a panic the policy is not called again, so its state does not matter; its
-/// calls change nothing else but the plan, which is dropped.
+/// it, and the model can still be read. After a panic the policy is not called again, so its state does not
+/// matter; its calls change nothing else but the plan, which is dropped.
 ///
 /// # Errors
 /// [`PolicyError::Other`] with the message of the panic.

@@ -189,7 +189,7 @@ fn rows_are_split_moved_and_painted_where_they_are() {
                 assert_eq!(after.sh_of(place)[3..], model.sh_of(row)[3..], "row {row}");
                 continue;
             }
-            if row == inside[inside.len() - 1] || row == inside[inside.len() - 2] {
+            if inside[inside.len() - 2..].contains(&row) {
                 assert_eq!(after.means[place], [x, y, z], "row {row} was refused");
                 continue;
             }

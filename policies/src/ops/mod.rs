@@ -136,7 +136,7 @@ impl RowOps {
             && self.clamp_opacity.is_none())
     }
 
-    /// The order in which rows stand at last: row i of the model is what pass 2 left in slot `order[i]`. A
+    /// The order in which rows stand in the end: row i of the model is what pass 2 left in slot `order[i]`. A
     /// permutation of `0..rows_after`; empty where nothing changes place.
     ///
     /// Rows keep their order, each followed by its children; seeds come last. Rows near each other in space,

@@ -141,10 +141,15 @@ fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
             cycle.push(row);
             row = order[row as usize];
         }
-        for (round, last) in rounds.iter_mut().zip([cycle.len(), cycle.len().wrapping_sub(1)]) {
-            let pairs = (0..cycle.len()).map(|j| (j, last.wrapping_sub(j)));
-            let inside = pairs.filter(|&(j, other)| j < other && other < cycle.len());
-            round.extend(inside.map(|(j, other)| [cycle[j], cycle[other]]));
+        let length = cycle.len();
+        if length < 2 {
+            continue;
+        }
+        // Two places of a cycle are swapped where their numbers add up to this.
+        for (round, sum) in rounds.iter_mut().zip([length, length - 1]) {
+            let pairs = (sum + 1 - length..).map(|j| (j, sum - j));
+            let pairs = pairs.take_while(|(j, other)| j < other);
+            round.extend(pairs.map(|(j, other)| [cycle[j], cycle[other]]));
         }
     }
     rounds

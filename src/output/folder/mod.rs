@@ -88,8 +88,8 @@ impl RunFolder {
     /// Checks, without writing anything, that a run may go to `target`.
     ///
     /// # Errors
-    /// [`OutputError::Unfit`] while a process trains there; [`OutputError::Unfit`] when it holds
-    /// another run and `overwrite` is not set; [`OutputError::Unfit`]; [`OutputError::Io`].
+    /// [`OutputError::Unfit`] while a process trains there, when it is no folder, and when it holds
+    /// another run and `overwrite` is not set; [`OutputError::Io`].
     pub fn check(target: &Path, overwrite: bool) -> Result<(), OutputError> {
         if !target.is_dir() {
             // A dangling link is in the way, too.
@@ -133,8 +133,8 @@ impl RunFolder {
     /// then its files are removed. Incomplete files of a killed process are removed in any case.
     ///
     /// # Errors
-    /// [`OutputError::Unfit`], [`OutputError::Unfit`], [`OutputError::Io`];
-    /// [`OutputError::Unfit`] when a run that starts again would remove models or checkpoints, or
+    /// [`OutputError::Io`]; [`OutputError::Unfit`] where there is no run, while a process trains there, and
+    /// when a run that starts again would remove models or checkpoints, or
     /// files of something that is no run.
     pub fn resume(target: &Path, anew: bool) -> Result<Self, OutputError> {
         Self::check(target, true)?;
