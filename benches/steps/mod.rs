@@ -6,7 +6,7 @@ use densify::backend::{LearningRates, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, sh_coefficients};
-use densify_policies::policy::Cadence;
+use densify_policies::policy::{Cadence, LossTerms};
 use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -51,6 +51,7 @@ pub(crate) fn target(size: u32) -> Image8 {
 
 const RATES: LearningRates = LearningRates {
     mean: 1e-6,
+    noise: 1e-6,
     log_scale: 1e-6,
     quat: 1e-6,
     opacity: 1e-6,
@@ -68,6 +69,8 @@ pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> St
         background: [0.0; 3],
         sh_degree: 3,
         rates: RATES,
+        loss_terms: LossTerms::default(),
+        noise: None,
         cadence: Cadence::default(),
         seed: 1,
     }

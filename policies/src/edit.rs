@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::signals::SignalSet;
+
 /// The children of a clone or a split, and what becomes of the parent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offspring {
@@ -121,6 +123,8 @@ pub enum Reset {
     /// All [`Signal`](crate::signals::Signal)s that are sums or counts; not `WeightMax` (kept per epoch)
     /// nor what a row is now (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
+    /// These signals, as far as they are sums or counts; for signals with a clock of their own.
+    Only(SignalSet),
     /// The list of candidates.
     Candidates,
 }

@@ -24,9 +24,11 @@ pub struct Needs {
     pub candidates: Option<CandidateRequest>,
     /// What is measured in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
     pub aux: Option<AuxRequest>,
-    /// Terms added to the training loss.
+    /// Terms added to the training loss, unless the policy has
+    /// [others](crate::policy::DensityPolicy::loss_terms) for a step.
     pub loss_terms: LossTerms,
-    /// Noise on the means after each optimiser step.
+    /// Noise on the means after each optimiser step, unless the policy has
+    /// [another](crate::policy::DensityPolicy::noise) for a step.
     pub noise: Option<NoiseTerm>,
     /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
     /// summed between optimiser steps, and the sums need memory.
@@ -47,36 +49,17 @@ impl Needs {
     /// # Errors
     /// The first that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
-        let finite = |name: &str, value: f64, least: f64| {
-            if value.is_finite() && value >= least {
-                return Ok(());
-            }
-            Err(format!("{name} is {value}; it must be finite and at least {least}"))
-        };
-        let above_zero = |name: &str, value: Option<f64>| match value {
-            Some(v) if !(v.is_finite() && v > 0.0) => {
-                Err(format!("{name} is {v}; it must be positive"))
-            }
-            _ => Ok(()),
-        };
         finite("full_depth", self.full_depth.into(), 0.0)?;
-        finite("loss_terms.opacity", self.loss_terms.opacity.into(), 0.0)?;
-        finite("loss_terms.scale", self.loss_terms.scale.into(), 0.0)?;
-        if let Some(noise) = self.noise {
-            finite("noise.strength", noise.strength.into(), 0.0)?;
-            finite("noise.sharpness", noise.sharpness.into(), 0.0)?;
-            finite("noise.opacity", noise.opacity.into(), 0.0)?;
-        }
+        self.loss_terms.check()?;
+        self.noise.map_or(Ok(()), |noise| noise.check())?;
         if let Some(aux) = &self.aux {
             finite("aux.map.error", aux.map.error.into(), 0.0)?;
             finite("aux.map.edge", aux.map.edge.into(), 0.0)?;
         }
         finite("cadence.all", self.cadence.all.into(), 1.0)?;
         finite("cadence.sh_rest", self.cadence.sh_rest.into(), 1.0)?;
-        above_zero("rates.mean_start", self.rates.mean_start)?;
-        above_zero("rates.mean_end", self.rates.mean_end)?;
-        above_zero("rates.sh_rest", self.rates.sh_rest.map(f64::from))?;
-        above_zero("start.scale", Some(self.start.scale.into()))?;
+        self.rates.check()?;
+        above_zero("start.scale", self.start.scale.into())?;
         match self.start.opacity {
             Some(opacity) if !(opacity > 0.0 && opacity < 1.0) => {
                 Err(format!("start.opacity is {opacity}; it must be between 0 and 1"))
@@ -84,6 +67,20 @@ impl Needs {
             _ => Ok(()),
         }
     }
+}
+
+fn finite(name: &str, value: f64, least: f64) -> Result<(), String> {
+    if value.is_finite() && value >= least {
+        return Ok(());
+    }
+    Err(format!("{name} is {value}; it must be finite and at least {least}"))
+}
+
+fn above_zero(name: &str, value: f64) -> Result<(), String> {
+    if value.is_finite() && value > 0.0 {
+        return Ok(());
+    }
+    Err(format!("{name} is {value}; it must be positive"))
 }
 
 /// Which pixels of the training views to collect as candidates for new rows.
@@ -147,12 +144,22 @@ impl LossTerms {
     pub fn is_none(&self) -> bool {
         !(self.opacity > 0.0 || self.scale > 0.0)
     }
+
+    /// Checks that both are finite and at least 0.
+    ///
+    /// # Errors
+    /// The first that is not, with its value.
+    pub fn check(&self) -> Result<(), String> {
+        finite("loss_terms.opacity", self.opacity.into(), 0.0)?;
+        finite("loss_terms.scale", self.scale.into(), 0.0)
+    }
 }
 
 /// Noise on the means after each optimiser step (*3D Gaussian Splatting as Markov Chain Monte Carlo*,
 /// Kheradmand et al. 2024, section 3.2): Δμ = Σ·ξ · σ(−`sharpness`·(o − `opacity`)) · `strength` · λ,
 /// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the step
-/// size of the means at that step `[scene units]`.
+/// size of the means at that step `[scene units]`, without the factor by which short runs lengthen steps:
+/// that is for what has a gradient to follow.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NoiseTerm {
     /// Strength of the noise `[1 / scene units²]`, >= 0.
@@ -168,6 +175,16 @@ impl NoiseTerm {
     #[must_use]
     pub fn share(&self, opacity: f32) -> f32 {
         1.0 / (1.0 + (self.sharpness * (opacity - self.opacity)).exp())
+    }
+
+    /// Checks that all numbers are finite and at least 0.
+    ///
+    /// # Errors
+    /// The first that is not, with its value.
+    pub fn check(&self) -> Result<(), String> {
+        finite("noise.strength", self.strength.into(), 0.0)?;
+        finite("noise.sharpness", self.sharpness.into(), 0.0)?;
+        finite("noise.opacity", self.opacity.into(), 0.0)
     }
 }
 
@@ -210,12 +227,73 @@ impl Cadence {
 /// Learning rates that a policy is published with; `None` leaves the trainer's.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct RateOverrides {
-    /// Means, at the start of the run `[fraction of the extent per step]`, > 0.
-    pub mean_start: Option<f64>,
-    /// Means, at the end of the run `[fraction of the extent per step]`, > 0.
-    pub mean_end: Option<f64>,
-    /// Spherical-harmonic coefficients of bands 1–3, > 0.
-    pub sh_rest: Option<f32>,
+    /// Means `[fraction of the extent per step]`.
+    pub mean: Option<Rate>,
+    /// Log-scales.
+    pub log_scale: Option<Rate>,
+    /// Quaternions.
+    pub quat: Option<Rate>,
+    /// Opacity logits.
+    pub opacity: Option<Rate>,
+    /// Spherical-harmonic coefficients of band 0.
+    pub sh_dc: Option<Rate>,
+    /// Spherical-harmonic coefficients of bands 1–3.
+    pub sh_rest: Option<Rate>,
+    /// A late fade of the rates of opacities and of all spherical-harmonic coefficients.
+    pub fade: Option<Fade>,
+}
+
+/// A learning rate, which falls (or rises) log-linearly over the run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Rate {
+    /// At the start of the run, > 0.
+    pub start: f64,
+    /// At its end, > 0.
+    pub end: f64,
+}
+
+/// A factor on learning rates that falls log-linearly from 1 to `to` in the last part of a run, so that
+/// the model does not memorise single photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Fade {
+    /// The share of the run after which it begins, in `[0, 1)`.
+    pub from: f64,
+    /// The factor at the end of the run, in (0, 1].
+    pub to: f64,
+}
+
+impl Rate {
+    /// The same from start to end.
+    #[must_use]
+    pub const fn constant(rate: f64) -> Self {
+        Self { start: rate, end: rate }
+    }
+}
+
+impl RateOverrides {
+    fn check(&self) -> Result<(), String> {
+        for (name, rate) in [
+            ("mean", self.mean),
+            ("log_scale", self.log_scale),
+            ("quat", self.quat),
+            ("opacity", self.opacity),
+            ("sh_dc", self.sh_dc),
+            ("sh_rest", self.sh_rest),
+        ] {
+            let Some(rate) = rate else { continue };
+            above_zero(&format!("rates.{name}.start"), rate.start)?;
+            above_zero(&format!("rates.{name}.end"), rate.end)?;
+        }
+        match self.fade {
+            Some(Fade { from, .. }) if !(0.0..1.0).contains(&from) => {
+                Err(format!("rates.fade.from is {from}; it must be at least 0 and below 1"))
+            }
+            Some(Fade { to, .. }) if !(to > 0.0 && to <= 1.0) => {
+                Err(format!("rates.fade.to is {to}; it must be above 0 and at most 1"))
+            }
+            _ => Ok(()),
+        }
+    }
 }
 
 /// Changes to the initial rows.
@@ -266,6 +344,8 @@ mod tests {
     fn numbers_out_of_range_are_refused() {
         assert_eq!(Needs::default().check(), Ok(()));
         let noise = NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 };
+        let fade =
+            |from, to| RateOverrides { fade: Some(Fade { from, to }), ..RateOverrides::default() };
         let wrong = [
             Needs { loss_terms: LossTerms { opacity: -1.0, scale: 0.0 }, ..Needs::default() },
             Needs { loss_terms: LossTerms { opacity: 0.0, scale: f32::NAN }, ..Needs::default() },
@@ -276,9 +356,14 @@ mod tests {
             Needs { cadence: Cadence { all: 0, sh_rest: 1 }, ..Needs::default() },
             Needs { cadence: Cadence { all: 1, sh_rest: 0 }, ..Needs::default() },
             Needs {
-                rates: RateOverrides { mean_end: Some(0.0), ..RateOverrides::default() },
+                rates: RateOverrides {
+                    quat: Some(Rate { start: 1.0, end: 0.0 }),
+                    ..RateOverrides::default()
+                },
                 ..Needs::default()
             },
+            Needs { rates: fade(1.0, 0.5), ..Needs::default() },
+            Needs { rates: fade(0.5, 0.0), ..Needs::default() },
             Needs { start: StartRule { opacity: Some(1.0), scale: 1.0 }, ..Needs::default() },
             Needs { start: StartRule { opacity: None, scale: 0.0 }, ..Needs::default() },
             Needs {

@@ -136,6 +136,12 @@ signals! {
 }
 
 impl Signal {
+    /// Whether a policy can [reset](crate::plan::Reset) it: whether it accumulates since its last reset.
+    #[must_use]
+    pub const fn is_reset(self) -> bool {
+        matches!(self.kind(), SignalKind::Sum | SignalKind::Count)
+    }
+
     /// Numbers per row.
     #[must_use]
     pub const fn width(self) -> usize {
@@ -155,6 +161,18 @@ impl SignalSet {
     #[must_use]
     pub fn with(self, signal: Signal) -> Self {
         Self(self.0 | 1 << signal as u32)
+    }
+
+    /// The signals of either set.
+    #[must_use]
+    pub fn union(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+
+    /// Whether no signal is in the set.
+    #[must_use]
+    pub fn is_empty(self) -> bool {
+        self.0 == 0
     }
 
     /// Whether `signal` is in the set.

@@ -24,7 +24,9 @@ use std::ops::Range;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{AuxColumn, AuxRequest, Cadence, Candidate, SignalSet, Signals};
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, Cadence, Candidate, LossTerms, NoiseTerm, SignalSet, Signals,
+};
 
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
@@ -44,6 +46,9 @@ pub use state::{StateArray, StateError, Tensor, Values};
 pub struct LearningRates {
     /// Means `[scene units per step]`.
     pub mean: f32,
+    /// Means, without the [boost](crate::schedule::RateOptions::boost) of short runs: what noise is
+    /// proportional to `[scene units per step]`.
+    pub noise: f32,
     /// Log-scales `[ln scene units per step]`.
     pub log_scale: f32,
     /// Quaternions.
@@ -73,6 +78,10 @@ pub struct StepInput<'a> {
     pub sh_degree: u8,
     /// Step sizes.
     pub rates: LearningRates,
+    /// Terms added to the loss.
+    pub loss_terms: LossTerms,
+    /// Noise on the means.
+    pub noise: Option<NoiseTerm>,
     /// How often the optimiser steps, no longer than the backend was made for.
     pub cadence: Cadence,
     /// Seed of the run, for noise on the means.

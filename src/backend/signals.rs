@@ -178,15 +178,9 @@ impl SignalPlanes {
         self.first[signal as usize].map(|first| first + usize::from(is_second))
     }
 
-    /// The planes of all signals of some kinds.
-    fn of_kinds(&self, kinds: &[SignalKind]) -> Vec<usize> {
-        let some = Signal::ALL.into_iter().filter(|signal| kinds.contains(&signal.kind()));
-        some.flat_map(|signal| self.of(signal)).collect()
-    }
-
-    /// Those that start anew when a policy resets its signals.
-    pub(super) fn sums(&self) -> Vec<usize> {
-        self.of_kinds(&[SignalKind::Sum, SignalKind::Count])
+    /// Those of some signals, which start anew when a policy resets them.
+    pub(super) fn of_all(&self, signals: SignalSet) -> Vec<usize> {
+        signals.iter().flat_map(|signal| self.of(signal)).collect()
     }
 
     /// The current epoch becomes the previous one: planes change places. Returns those to clear.

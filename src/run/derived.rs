@@ -151,6 +151,8 @@ impl RunSpec {
 
 #[cfg(test)]
 mod tests {
+    use densify_policies::policy::{Fade, Rate};
+
     use super::*;
     use crate::run::Partial;
 
@@ -169,10 +171,23 @@ mod tests {
         let given = rates("{ opacity = 0.05, mean_end = 1e-5 }", &RateOverrides::default());
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
         assert_eq!(given, expected);
-        let of_policy =
-            RateOverrides { mean_end: Some(3e-6), sh_rest: Some(2e-4), ..RateOverrides::default() };
-        let both = rates("{ mean_end = 1e-5 }", &of_policy);
-        let expected = RateOptions { mean_end: 1e-5, sh_rest: 2e-4, ..RateOptions::default() };
+        let of_policy = RateOverrides {
+            mean: Some(Rate { start: 1.6e-4, end: 3e-6 }),
+            opacity: Some(Rate { start: 0.5, end: 0.25 }),
+            sh_rest: Some(Rate::constant(2e-4)),
+            fade: Some(Fade { from: 0.5, to: 0.25 }),
+            ..RateOverrides::default()
+        };
+        let both = rates("{ mean_end = 1e-5, opacity_end = 0.125 }", &of_policy);
+        let expected = RateOptions {
+            mean_end: 1e-5,
+            opacity: 0.5,
+            opacity_end: Some(0.125),
+            sh_rest: 2e-4,
+            fade: 0.25,
+            fade_from: 0.5,
+            ..RateOptions::default()
+        };
         assert_eq!(both, expected);
         for (bad, part) in [
             ("{ opacity = \"x\" }", "NAME=RATE"),

@@ -232,9 +232,10 @@ run_spec! {
         #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
         seed: u64 = 0, Fixed;
 
-        /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc,
-        /// sh_rest, or boost (factor of them all at the start; 1 for runs of 30,000);
-        /// may be repeated
+        /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest;
+        /// of all but the means also NAME_end; fade: factor of opacity, sh_dc and sh_rest at the
+        /// end, from the share fade_from of the run on; boost: factor of all at the start (1 for
+        /// runs of 30,000); may be repeated
         #[arg(long, value_name = "NAME=RATE")]
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed;

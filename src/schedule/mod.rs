@@ -20,7 +20,7 @@ use crate::gaussians::MAX_SH_DEGREE;
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
 /// Step sizes of a run. The means' step size is a fraction of the scene's extent and falls
-/// log-linearly over the run; all others are constant.
+/// log-linearly over the run; all others are constant unless their value at the end is given.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateOptions {
@@ -38,6 +38,21 @@ pub struct RateOptions {
     pub sh_dc: f32,
     /// Spherical-harmonic coefficients of bands 1–3, > 0.
     pub sh_rest: f32,
+    /// Log-scales at the end of the run, > 0; `None`: as at the start, for this and the next four.
+    pub log_scale_end: Option<f32>,
+    /// Quaternions at the end of the run.
+    pub quat_end: Option<f32>,
+    /// Opacity logits at the end of the run.
+    pub opacity_end: Option<f32>,
+    /// Spherical-harmonic coefficients of band 0 at the end of the run.
+    pub sh_dc_end: Option<f32>,
+    /// Spherical-harmonic coefficients of bands 1–3 at the end of the run.
+    pub sh_rest_end: Option<f32>,
+    /// Factor, at the end of the run, of the step sizes of opacities and of all spherical-harmonic
+    /// coefficients, > 0. It falls log-linearly from 1, which it is up to `fade_from`.
+    pub fade: f64,
+    /// Share of the run after which these step sizes fade, in (0, 1].
+    pub fade_from: f64,
     /// Factor of all step sizes at the start of the run, > 0; it falls log-linearly to 1 at the end,
     /// so that the last steps are as fine as in a long run.
     pub boost: f64,
@@ -53,6 +68,13 @@ impl Default for RateOptions {
             opacity: 0.025,
             sh_dc: 2.5e-3,
             sh_rest: 1.25e-4,
+            log_scale_end: None,
+            quat_end: None,
+            opacity_end: None,
+            sh_dc_end: None,
+            sh_rest_end: None,
+            fade: 1.0,
+            fade_from: 1.0,
             boost: 1.0,
         }
     }
@@ -81,12 +103,26 @@ impl RateOptions {
     /// These step sizes, overlaid with those of a policy's paper.
     #[must_use]
     pub fn with(self, overrides: &RateOverrides) -> Self {
-        Self {
-            mean_start: overrides.mean_start.unwrap_or(self.mean_start),
-            mean_end: overrides.mean_end.unwrap_or(self.mean_end),
-            sh_rest: overrides.sh_rest.unwrap_or(self.sh_rest),
-            ..self
+        let mut rates = self;
+        if let Some(mean) = overrides.mean {
+            (rates.mean_start, rates.mean_end) = (mean.start, mean.end);
         }
+        for (start, end, rate) in [
+            (&mut rates.log_scale, &mut rates.log_scale_end, overrides.log_scale),
+            (&mut rates.quat, &mut rates.quat_end, overrides.quat),
+            (&mut rates.opacity, &mut rates.opacity_end, overrides.opacity),
+            (&mut rates.sh_dc, &mut rates.sh_dc_end, overrides.sh_dc),
+            (&mut rates.sh_rest, &mut rates.sh_rest_end, overrides.sh_rest),
+        ] {
+            if let Some(rate) = rate {
+                *start = rate.start as f32;
+                *end = (rate.end != rate.start).then_some(rate.end as f32);
+            }
+        }
+        if let Some(fade) = overrides.fade {
+            (rates.fade, rates.fade_from) = (fade.to, fade.from);
+        }
+        rates
     }
 
     /// Step sizes of iteration `step` (1-based) of `iterations`, in a scene of this extent
@@ -94,31 +130,46 @@ impl RateOptions {
     #[must_use]
     pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
         let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
-        let fraction = ((1.0 - t) * self.mean_start.ln() + t * self.mean_end.ln()).exp();
+        let between = |start: f64, end: f64| ((1.0 - t) * start.ln() + t * end.ln()).exp();
+        let mean = between(self.mean_start, self.mean_end) * f64::from(extent);
         let factor = self.boost.powf(1.0 - t);
-        let times = |rate: f32| (f64::from(rate) * factor) as f32;
+        let late = (t - self.fade_from).max(0.0) / (1.0 - self.fade_from).max(f64::MIN_POSITIVE);
+        let faded = factor * self.fade.powf(late);
+        let times = |factor: f64, start: f32, end: Option<f32>| {
+            let start = f64::from(start);
+            (end.map_or(start, |end| between(start, f64::from(end))) * factor) as f32
+        };
         LearningRates {
-            mean: (fraction * factor * f64::from(extent)) as f32,
-            log_scale: times(self.log_scale),
-            quat: times(self.quat),
-            opacity: times(self.opacity),
-            sh_dc: times(self.sh_dc),
-            sh_rest: times(self.sh_rest),
+            mean: (mean * factor) as f32,
+            noise: mean as f32,
+            log_scale: times(factor, self.log_scale, self.log_scale_end),
+            quat: times(factor, self.quat, self.quat_end),
+            opacity: times(faded, self.opacity, self.opacity_end),
+            sh_dc: times(faded, self.sh_dc, self.sh_dc_end),
+            sh_rest: times(faded, self.sh_rest, self.sh_rest_end),
         }
     }
 
     /// The first step size that is not a positive finite number, by name.
     #[must_use]
     pub fn invalid(&self) -> Option<&'static str> {
+        let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
         [
             ("mean_start", self.mean_start),
             ("mean_end", self.mean_end),
             ("boost", self.boost),
+            ("fade", self.fade),
+            ("fade_from", self.fade_from),
             ("log_scale", f64::from(self.log_scale)),
             ("quat", f64::from(self.quat)),
             ("opacity", f64::from(self.opacity)),
             ("sh_dc", f64::from(self.sh_dc)),
             ("sh_rest", f64::from(self.sh_rest)),
+            ("log_scale_end", end(self.log_scale_end)),
+            ("quat_end", end(self.quat_end)),
+            ("opacity_end", end(self.opacity_end)),
+            ("sh_dc_end", end(self.sh_dc_end)),
+            ("sh_rest_end", end(self.sh_rest_end)),
         ]
         .into_iter()
         .find_map(|(name, rate)| (!(rate.is_finite() && rate > 0.0)).then_some(name))

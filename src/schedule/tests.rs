@@ -1,5 +1,7 @@
 //! Rates, degrees, view order and backgrounds along a run.
 
+use densify_policies::policy::{Fade, Rate};
+
 use super::*;
 
 #[test]
@@ -127,4 +129,37 @@ fn backgrounds() {
         (0..3_000).map(|step| f64::from(Background::Random.at(9, step)[1])).sum::<f64>() / 3_000.0;
     // Uniform: deviation of the mean 0.29 / √3,000 = 0.005.
     assert!((mean - 0.5).abs() < 0.025, "{mean}");
+}
+
+#[test]
+fn rates_end_where_they_are_told_to_and_fade_late() {
+    let of_policy = RateOverrides {
+        mean: Some(Rate { start: 1e-4, end: 1e-6 }),
+        log_scale: Some(Rate { start: 0.04, end: 0.01 }),
+        opacity: Some(Rate::constant(0.05)),
+        sh_dc: Some(Rate { start: 4e-3, end: 1e-3 }),
+        fade: Some(Fade { from: 0.5, to: 0.25 }),
+        ..RateOverrides::default()
+    };
+    let rates = RateOptions::default().with(&of_policy);
+    let at = |step| rates.at(step, 1_000, 2.0);
+    let near = |found: f32, expected: f64| {
+        assert!((f64::from(found) / expected - 1.0).abs() < 1e-6, "{found} against {expected}");
+    };
+    // Half-way the geometric mean.
+    near(at(500).mean, 2e-5);
+    near(at(500).log_scale, 0.02);
+    near(at(1_000).log_scale, 0.01);
+    near(at(500).quat, 1e-3);
+    near(at(1_000).quat, 1e-3);
+    // The fade: 1 up to the half, 0.25^½ at three quarters.
+    for (step, factor) in [(0, 1.0), (500, 1.0), (750, 0.5), (1_000, 0.25), (9_000, 0.25)] {
+        near(at(step).opacity, 0.05 * factor);
+        near(at(step).sh_rest, 1.25e-4 * factor);
+    }
+    near(at(1_000).sh_dc, 1e-3 * 0.25);
+    // Noise knows no boost.
+    let short = RateOptions { boost: 4.0, ..rates }.at(500, 1_000, 2.0);
+    near(short.mean, 4e-5);
+    near(short.noise, 2e-5);
 }

@@ -20,7 +20,9 @@ mod validate;
 
 use std::time::{Duration, Instant};
 
-use densify_policies::policy::{Cadence, DensityPolicy, Needs, PolicyError, SceneInfo};
+use densify_policies::policy::{
+    Cadence, DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyError, SceneInfo,
+};
 
 use crate::backend::{Backend, BackendError, StepInput};
 use crate::dataset::images::SharedImage;
@@ -128,6 +130,7 @@ impl<V: ViewSource> Trainer<V> {
         }
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
+        let (loss_terms, noise) = self.terms(step)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
         let input = StepInput {
             step,
@@ -137,6 +140,8 @@ impl<V: ViewSource> Trainer<V> {
             background: background.at(seed, step),
             sh_degree: self.sh_degree(step),
             rates: rates.at(step, iterations, self.scene.extent),
+            loss_terms,
+            noise,
             cadence,
             seed,
         };
@@ -185,6 +190,16 @@ impl<V: ViewSource> Trainer<V> {
         }
         let error = format!("it wants {cadence:?}, but declared {declared:?}");
         Err(self.policy_error(step, PolicyError::Other(error)))
+    }
+
+    /// What the policy adds to the loss and to the means now.
+    fn terms(&self, step: u32) -> Result<(LossTerms, Option<NoiseTerm>), TrainError> {
+        let Needs { loss_terms, noise, .. } = self.needs;
+        let both = || (self.policy.loss_terms(step, loss_terms), self.policy.noise(step, noise));
+        let (terms, noise) = call_policy(both).map_err(|e| self.policy_error(step, e))?;
+        let checked = terms.check().and_then(|()| noise.map_or(Ok(()), |noise| noise.check()));
+        checked.map_err(|error| self.policy_error(step, PolicyError::Other(error)))?;
+        Ok((terms, noise))
     }
 
     fn policy_error(&self, step: u32, source: PolicyError) -> TrainError {

@@ -2,7 +2,7 @@
 
 use densify_policies::adc;
 use densify_policies::plan::EditPlan;
-use densify_policies::policy::Cadence;
+use densify_policies::policy::{Cadence, LossTerms};
 
 use super::compare::{Limits, Table, class, compare_images, relative_error};
 use super::reference::{CLASSES, Image, Model, Rules, ScreenGradient, View, blend, project};
@@ -195,6 +195,8 @@ pub(super) fn step(
         background,
         sh_degree,
         rates: RATES,
+        loss_terms: LossTerms::default(),
+        noise: None,
         cadence: Cadence::default(),
         seed: 7,
     })

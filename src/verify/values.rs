@@ -100,6 +100,7 @@ pub fn remove(model: &Gaussians, row: usize) -> Gaussians {
 /// Step sizes of tests that train: those of the schedule, with means in scene units.
 pub const RATES: LearningRates = LearningRates {
     mean: 1e-3,
+    noise: 2e-3,
     log_scale: 5e-3,
     quat: 1e-3,
     opacity: 0.025,

@@ -52,10 +52,22 @@ fn the_loss_and_its_gradient_are_those_of_the_native_backend() {
     }
 }
 
-fn step(backend: &mut dyn Backend, camera: &Camera, number: u32, cadence: Cadence) -> StepOutput {
+fn step(
+    backend: &mut dyn Backend,
+    camera: &Camera,
+    number: u32,
+    needs: &Needs,
+    cadence: Cadence,
+) -> StepOutput {
     let target = scenes::target(camera);
     let degree = (number / 2).min(3) as u8;
-    let input = StepInput { cadence, seed: 11, ..step_input(number, camera, &target, degree) };
+    let input = StepInput {
+        cadence,
+        loss_terms: needs.loss_terms,
+        noise: needs.noise,
+        seed: 11,
+        ..step_input(number, camera, &target, degree)
+    };
     backend.train_step(&input).expect("a small image is rendered")
 }
 
@@ -133,8 +145,8 @@ fn steps_are_those_of_the_native_backend() {
                     native.begin_epoch();
                     backend.begin_epoch();
                 }
-                let expected = step(&mut *native, &camera, n, *cadence);
-                let found = step(&mut *backend, &camera, n, *cadence);
+                let expected = step(&mut *native, &camera, n, needs, *cadence);
+                let found = step(&mut *backend, &camera, n, needs, *cadence);
                 let off = f64::from((found.loss - expected.loss).abs());
                 table.check(what, "loss", off, 1e-4);
                 assert_eq!(found.visible, expected.visible, "{what}, step {n}");

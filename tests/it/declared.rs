@@ -41,11 +41,14 @@ fn backend(subject: &Subject, model: &Gaussians, needs: Needs) -> Box<dyn Differ
     make_with(subject, model, Setup { needs, ..Setup::default() })
 }
 
-fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, cadence: Cadence) {
+/// A step with the terms and the noise of these needs.
+fn step(backend: &mut dyn Backend, camera: &Camera, step: u32, needs: &Needs, cadence: Cadence) {
     let target = target(camera, step.into());
     let sh_degree = backend.sh_degree();
     let input = StepInput {
         background: BACKGROUND,
+        loss_terms: needs.loss_terms,
+        noise: needs.noise,
         cadence,
         seed: 5,
         ..step_input(step, camera, &target, sh_degree)
@@ -72,8 +75,8 @@ fn noise_has_the_declared_covariance() {
         let noise = NoiseTerm { strength: 7.0, sharpness: 100.0, opacity: 0.005 };
         let run = |subject: &Subject, at: u32| {
             let needs = Needs { noise: Some(noise), ..Needs::default() };
-            let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &turned_away(&view(0)), at, EVERY);
+            let mut backend = backend(subject, &model, needs.clone());
+            step(&mut *backend, &turned_away(&view(0)), at, &needs, EVERY);
             backend.download().expect("a model")
         };
         let moved = run(subject, 3);
@@ -86,7 +89,7 @@ fn noise_has_the_declared_covariance() {
         // σ(−4) = 0.017986; its share is σ(−100·0.012986).
         let opacity = 1.0 / (1.0 + 4.0_f64.exp());
         let share = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
-        let factor = 7.0 * f64::from(RATES.mean) * share;
+        let factor = 7.0 * f64::from(RATES.noise) * share;
         // Deviations Σ·factor: variances of the axes, x and y swapped in turned rows.
         for (parity, variances) in [(0, [0.01, 0.04, 0.16]), (1, [0.04, 0.01, 0.16])] {
             let of_parity = moved.means.iter().skip(parity).step_by(2);
@@ -210,7 +213,7 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                 _ => longest,
             };
             let needs = Needs { cadence: longest, loss_terms, ..Needs::default() };
-            let mut backend = backend(subject, &model(ROWS), needs);
+            let mut backend = backend(subject, &model(ROWS), needs.clone());
             let mut classes = [
                 Adam::new("means", RATES.mean, 0..3, 3, ROWS),
                 Adam::new("log_scales", RATES.log_scale, 0..3, 3, ROWS),
@@ -234,7 +237,7 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                         *g += loss_terms.scale / (3 * ROWS) as f32 * scale.exp();
                     }
                 }
-                step(&mut *backend, &camera, number, cadence_at(number));
+                step(&mut *backend, &camera, number, &needs, cadence_at(number));
                 let after = backend.download().expect("a model");
                 let [main, rest] = cadence_at(number).steps_at(number);
                 for (i, class) in classes.iter_mut().enumerate() {
@@ -255,13 +258,13 @@ fn sums_move_with_their_rows_and_end_with_them() {
         let model = model(20);
         let run = |edit: fn(&mut EditPlan)| {
             let needs = Needs { cadence, ..Needs::default() };
-            let mut backend = backend(subject, &model, needs);
-            step(&mut *backend, &view(0), 1, cadence);
+            let mut backend = backend(subject, &model, needs.clone());
+            step(&mut *backend, &view(0), 1, &needs, cadence);
             let mut plan = EditPlan::new(20, 20);
             edit(&mut plan);
             backend.apply(&plan.compile(), 5, 1).expect("a plan is applied");
             // Nothing is seen: only what waits is left.
-            step(&mut *backend, &turned_away(&view(0)), 2, cadence);
+            step(&mut *backend, &turned_away(&view(0)), 2, &needs, cadence);
             backend.download().expect("a model")
         };
         // The rows after row 4 move up.
@@ -284,7 +287,7 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         let needs = Needs { cadence, detailed_edits: true, ..Needs::default() };
         let mut backend = backend(subject, &model(20), needs.clone());
         for number in 1..=6 {
-            step(&mut *backend, &view(number % 3), number, cadence);
+            step(&mut *backend, &view(number % 3), number, &needs, cadence);
         }
         let mut plan = EditPlan::new(20, 20).allowing(&needs);
         let opacity = OpacityRule::Same;
@@ -292,8 +295,8 @@ fn a_row_that_starts_anew_steps_as_a_newborn() {
         plan.update(11, update).expect("the row is free");
         backend.apply(&plan.compile(), 5, 6).expect("a plan is applied");
         let before = backend.download().expect("a model");
-        step(&mut *backend, &view(0), 7, cadence);
-        step(&mut *backend, &view(1), 8, cadence);
+        step(&mut *backend, &view(0), 7, &needs, cadence);
+        step(&mut *backend, &view(1), 8, &needs, cadence);
         let after = backend.download().expect("a model");
         // Bands 1–3 of the row have stepped once: by one learning rate, whatever the gradient.
         let moved = |row: usize| -> Vec<f32> {

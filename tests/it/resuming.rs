@@ -19,7 +19,6 @@ fn needs() -> Needs {
     Needs {
         signals: SignalSet::from(signals),
         cadence: CADENCE,
-        loss_terms: LossTerms { opacity: 0.01, scale: 0.0 },
         candidates: Some(CandidateRequest {
             from: 0,
             until: 100,
@@ -41,7 +40,11 @@ fn backend(subject: &Subject, storage: Storage, model: &Gaussians) -> Box<dyn Di
 fn step(backend: &mut dyn Backend, camera: &Camera, number: u32) {
     let target = scenes::target(camera);
     let degree = (number / 2).min(3) as u8;
-    let input = StepInput { cadence: CADENCE, ..step_input(number, camera, &target, degree) };
+    let input = StepInput {
+        cadence: CADENCE,
+        loss_terms: LossTerms { opacity: 0.01, scale: 0.0 },
+        ..step_input(number, camera, &target, degree)
+    };
     backend.train_step(&input).expect("a small image is rendered");
 }
 

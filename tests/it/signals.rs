@@ -27,8 +27,15 @@ fn tolerance(subject: &Subject) -> f64 {
 const FLIPPED: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 /// Steps of length zero: every view sees the same model.
-const STILL: LearningRates =
-    LearningRates { mean: 0.0, log_scale: 0.0, quat: 0.0, opacity: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
+const STILL: LearningRates = LearningRates {
+    mean: 0.0,
+    noise: 0.0,
+    log_scale: 0.0,
+    quat: 0.0,
+    opacity: 0.0,
+    sh_dc: 0.0,
+    sh_rest: 0.0,
+};
 
 struct Views {
     model: Gaussians,

@@ -129,7 +129,7 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
         opacity: still,
         sh_dc: still,
         sh_rest: still,
-        boost: 1.0,
+        ..RateOptions::default()
     };
     let options = TrainOptions {
         iterations: STEP,

@@ -16,7 +16,7 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject};
-use densify_policies::policy::Cadence;
+use densify_policies::policy::{Cadence, LossTerms};
 use glam::{DMat3, DVec3};
 use proptest::prelude::ProptestConfig;
 
@@ -157,6 +157,8 @@ pub(crate) fn step_input<'a>(
         background: GREY,
         sh_degree,
         rates: RATES,
+        loss_terms: LossTerms::default(),
+        noise: None,
         cadence: Cadence::default(),
         seed: 1,
     }

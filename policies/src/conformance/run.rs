@@ -57,7 +57,8 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     Ok(edits)
 }
 
-/// Checks that the needs are consistent and in range, and that no cadence exceeds the declared one.
+/// Checks that the needs are consistent and in range, at every step too, and that no cadence exceeds the
+/// declared one.
 fn check_needs(
     policy: &dyn DensityPolicy,
     needs: &Needs,
@@ -66,6 +67,11 @@ fn check_needs(
     let out_of_range = |why| (Check::DeclaresValidNumbers, why);
     needs.check().map_err(out_of_range)?;
     let mut steps = 1..=scenario.scene.iterations;
+    for step in steps.clone() {
+        let at_step = |why| out_of_range(format!("at step {step}, {why}"));
+        policy.loss_terms(step, needs.loss_terms).check().map_err(at_step)?;
+        policy.noise(step, needs.noise).map_or(Ok(()), |noise| noise.check()).map_err(at_step)?;
+    }
     match steps.find(|&step| !policy.cadence(step).is_within(needs.cadence)) {
         None => Ok(()),
         Some(step) => {
@@ -103,8 +109,12 @@ fn run_event(
         if !copy.is_due(step) {
             return Err(differs("is not due at this step"));
         }
-        if copy.aux_views(step, rows, budget) != aux || copy.cadence(step) != policy.cadence(step) {
-            return Err(differs("wants other views or another cadence"));
+        let schedule = |policy: &dyn DensityPolicy| {
+            let terms = policy.loss_terms(step, needs.loss_terms);
+            (policy.cadence(step), terms, policy.noise(step, needs.noise))
+        };
+        if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != schedule(policy) {
+            return Err(differs("wants other views, or another cadence, terms or noise"));
         }
         let sees_all = *check == Check::ReadsOnlyDeclared;
         observe(&mut **copy, step, rows, &views, &request, sees_all)?;

@@ -13,8 +13,8 @@ use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Refused, Update};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PolicyResult, PolicyState,
-    Signal, SignalSet, Snapshot,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, LossTerms, Needs, PolicyResult,
+    PolicyState, Signal, SignalSet, Snapshot,
 };
 use crate::registry::{ConfiguredPolicy, policies};
 use crate::rng::{PolicyRng, Purpose};
@@ -51,6 +51,7 @@ enum Fault {
     SavesOnlyPart,
     DeclaresNan,
     HasUndeclaredCadence,
+    HasNanTermsLate,
     NeverEdits,
     /// Takes one row in a thousand, by the system's clock.
     ReadsTheClock,
@@ -62,7 +63,7 @@ enum Fault {
     UpdatesUndeclared,
 }
 
-const FAULTS: [(Fault, Option<Check>); 25] = [
+const FAULTS: [(Fault, Option<Check>); 26] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
     (Fault::ReadsUndeclaredIfPresent, Some(Check::ReadsOnlyDeclared)),
@@ -82,6 +83,7 @@ const FAULTS: [(Fault, Option<Check>); 25] = [
     (Fault::SavesOnlyPart, Some(Check::RestoresState)),
     (Fault::DeclaresNan, Some(Check::DeclaresValidNumbers)),
     (Fault::HasUndeclaredCadence, Some(Check::DeclaresValidNumbers)),
+    (Fault::HasNanTermsLate, Some(Check::DeclaresValidNumbers)),
     (Fault::NeverEdits, Some(Check::Edits)),
     (Fault::ReadsTheClock, Some(Check::IsDeterministic)),
     (Fault::PanicsOnManyRows, Some(Check::NeverFails)),
@@ -159,6 +161,11 @@ impl DensityPolicy for Faulty {
         let all = if step > 100 { 3 } else { 1 };
         let sh_rest = if self.has(Fault::HasUndeclaredCadence) && step > 90 { 2 } else { 1 };
         Cadence { all: if sh_rest > 1 { 0 } else { all }, sh_rest }
+    }
+
+    fn loss_terms(&self, step: u32, declared: LossTerms) -> LossTerms {
+        let is_wrong = self.has(Fault::HasNanTermsLate) && step > 90;
+        LossTerms { scale: if is_wrong { f32::NAN } else { 0.0 }, ..declared }
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {

@@ -48,7 +48,7 @@ fn the_gradient_mixes_screen_and_colour() {
         .with(Signal::ColourGradient, &[0.0, 2.8e-5, 2.4e-5, 5.6e-5, 0.0]);
     let done = run(&event, "tau = 4e-4");
     assert_eq!(done.cloned, [3, 1, 0]);
-    assert!(done.ops.reset_signals && !done.ops.reset_candidates);
+    assert!(!done.ops.reset_signals.is_empty() && !done.ops.reset_candidates);
     assert_eq!(done.ops.cause, "grow");
     // Without colour: twice 4e-4, 2e-4, 2e-4, 0, 1.9e-4.
     assert_eq!(run(&event, "tau = 4e-4\nmixed_gradient = false").cloned, [0, 1, 2]);
@@ -266,7 +266,7 @@ fn at_the_budget_with_nothing_to_do_the_plan_is_empty() {
     assert!(pruning.ops.is_empty() && pruning.ops.counts == EditCounts::default());
     assert_eq!(pruning.ops.cause, "");
     let growing = run(&event(700, 20, 20), "");
-    assert!(!growing.ops.edits_rows() && growing.ops.reset_signals);
+    assert!(!growing.ops.edits_rows() && !growing.ops.reset_signals.is_empty());
     assert_eq!(growing.ops.counts, EditCounts::default());
 }
 
@@ -299,7 +299,7 @@ fn the_worst_pixels_become_rows() {
     let seed = |error, scale| Seed::round([error, 0.0, 0.0], [error, 0.5, 1.0], scale, 0.1);
     assert_eq!(seeds, [seed(0.3, 0.04), seed(0.2, 0.06)]);
     assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 2, updated: 0, denied: 0 });
-    assert!(done.ops.reset_candidates && !done.ops.reset_signals);
+    assert!(done.ops.reset_candidates && done.ops.reset_signals.is_empty());
     assert_eq!(done.ops.cause, "insert");
     let roomy = Event { budget: 41, ..event.clone() };
     assert_eq!(run(&roomy, "rho_c = 0.45").pruned, [0_u32; 0]);
@@ -337,7 +337,7 @@ fn growth_pruning_and_insertion_can_fall_on_one_step() {
     assert_eq!(done.pruned, [0, 1, 2, 3, 4, 6, 7, 8, 9]);
     assert_eq!(done.cloned, [41, 40, 5]);
     assert_eq!((done.ops.seeds.len(), done.ops.rows_after), (2, 40));
-    assert!(done.ops.reset_signals && done.ops.reset_candidates);
+    assert!(!done.ops.reset_signals.is_empty() && done.ops.reset_candidates);
 }
 
 #[test]
@@ -419,7 +419,7 @@ fn the_model_is_replaced_by_surface_points() {
     let done = run(&event, "reinit_at = 5000");
     assert_eq!(done.ops.counts, EditCounts { removed: 9, added: 8, updated: 0, denied: 0 });
     assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (8, "reinit"));
-    assert!(done.ops.reset_signals && done.ops.reset_candidates);
+    assert!(!done.ops.reset_signals.is_empty() && done.ops.reset_candidates);
     // Neighbours of 0: 1, 2, 3; of 1: 1, 1, 2.
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
     let sizes = [(14.0_f32 / 3.0).sqrt(), 2.0_f32.sqrt()];

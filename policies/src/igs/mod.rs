@@ -80,7 +80,7 @@ use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one,
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
@@ -164,9 +164,9 @@ impl DensityPolicy for Igs {
             }),
             cadence: Cadence { all: params.sum.max(params.sum_more), sh_rest: 1 },
             rates: RateOverrides {
-                mean_start: Some(params.mean_start),
-                mean_end: Some(params.mean_end),
-                sh_rest: Some(params.sh_rest as f32),
+                mean: Some(Rate { start: params.mean_start, end: params.mean_end }),
+                sh_rest: Some(Rate::constant(params.sh_rest)),
+                ..RateOverrides::default()
             },
             ..Needs::default()
         }

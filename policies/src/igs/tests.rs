@@ -29,7 +29,7 @@ fn growth_follows_the_square_root() {
     let done = run(&event, "");
     assert_eq!((done.ops.rows_after, done.split.len()), (70, 10));
     assert_eq!(done.ops.cause, "grow");
-    assert!(done.ops.reset_signals);
+    assert!(!done.ops.reset_signals.is_empty());
     let after = |step| run(&Event { step, ..event.clone() }, "").ops.rows_after;
     // Not below what there is; the budget at 14,500, and not beyond it.
     assert_eq!([after(600), after(2000), after(14_500), after(14_900)], [60, 60, 120, 120]);
@@ -88,7 +88,7 @@ fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
     let event = event(300, &[1.0; 4], 100).with(Signal::Opacity, &[0.0199, 0.02, 0.004, f32::NAN]);
     let first = run(&event, "");
     assert_eq!((first.pruned, first.ops.cause.as_str()), (vec![0, 2, 3], "first-prune"));
-    assert!(first.split.is_empty() && !first.ops.reset_signals);
+    assert!(first.split.is_empty() && first.ops.reset_signals.is_empty());
     let growing = run(&Event { step: 600, ..event.clone() }, "");
     assert_eq!(growing.pruned, [2, 3]);
     // Pruned rows are not drawn.
@@ -155,7 +155,11 @@ fn the_optimiser_steps_less_often_towards_the_end() {
     let rates = "mean_start = 0.5\nmean_end = 0.25\nsh_rest = 0.125";
     assert_eq!(
         build("igs", rates, &scene).needs(&scene).rates,
-        RateOverrides { mean_start: Some(0.5), mean_end: Some(0.25), sh_rest: Some(0.125) }
+        RateOverrides {
+            mean: Some(Rate { start: 0.5, end: 0.25 }),
+            sh_rest: Some(Rate::constant(0.125)),
+            ..RateOverrides::default()
+        }
     );
     let plain = build("igs", "sum = 1\nsum_more = 1", &scene);
     assert_eq!(plain.needs(&scene).cadence, Cadence::default());

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::edit::{
     Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed, UNTURNED, Update, in_open_unit,
 };
+use crate::signals::SignalSet;
 
 /// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it; no slot
 /// at or beyond the budget is ever written.
@@ -36,8 +37,8 @@ pub struct RowOps {
     pub moves: Vec<(u32, u32)>,
     /// Upper bound for all opacities, in (0, 1); both opacity moments of all rows become zero.
     pub clamp_opacity: Option<f32>,
-    /// Whether the signal sums are reset; otherwise moved rows keep theirs.
-    pub reset_signals: bool,
+    /// The signals that start anew in all rows; rows that move keep the others.
+    pub reset_signals: SignalSet,
     /// Whether the candidate list is cleared.
     pub reset_candidates: bool,
     /// Numbers of rows changed, for the event log.
@@ -122,7 +123,7 @@ impl RowOps {
     /// empty too; see [`EditCounts::denied`].
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        !self.edits_rows() && !self.reset_signals && !self.reset_candidates
+        !self.edits_rows() && self.reset_signals.is_empty() && !self.reset_candidates
     }
 
     /// Whether any row is added, removed, rewritten or clamped.

@@ -12,6 +12,7 @@ pub use crate::edit::{
 };
 use crate::needs::Needs;
 pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
+use crate::signals::{Signal, SignalSet};
 
 /// Why a plan refused an edit. Each refusal is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -77,7 +78,7 @@ pub struct EditPlan {
     updates: Vec<(u32, Update)>,
     seeds: Vec<Seed>,
     clamp_opacity: Option<f32>,
-    reset_signals: bool,
+    reset_signals: SignalSet,
     reset_candidates: bool,
     cause: String,
 }
@@ -99,7 +100,7 @@ impl EditPlan {
             updates: Vec::new(),
             seeds: Vec::new(),
             clamp_opacity: None,
-            reset_signals: false,
+            reset_signals: SignalSet::default(),
             reset_candidates: false,
             cause: String::new(),
         }
@@ -225,7 +226,11 @@ impl EditPlan {
     /// Resets an accumulator, after all other edits.
     pub fn reset(&mut self, accumulator: Reset) {
         match accumulator {
-            Reset::Signals => self.reset_signals = true,
+            Reset::Signals => self.reset(Reset::Only(Signal::ALL.into())),
+            Reset::Only(signals) => {
+                let some = signals.iter().filter(|signal| signal.is_reset()).collect();
+                self.reset_signals = self.reset_signals.union(some);
+            }
             Reset::Candidates => self.reset_candidates = true,
         }
     }

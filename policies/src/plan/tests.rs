@@ -102,7 +102,7 @@ fn the_lowest_bound_and_every_cause_hold() {
     let ops = plan.compile();
     assert_eq!(ops.clamp_opacity, Some(0.01));
     assert_eq!(ops.cause, "grow+reset");
-    assert!(ops.reset_candidates && !ops.reset_signals && !ops.is_empty());
+    assert!(ops.reset_candidates && ops.reset_signals.is_empty() && !ops.is_empty());
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -221,4 +221,25 @@ proptest! {
         });
         prop_assert_eq!(found, expected);
     }
+}
+
+#[test]
+fn signals_are_reset_alone_or_all_together() {
+    let reset = |resets: &[Reset]| {
+        let mut plan = EditPlan::new(1, 1);
+        for &each in resets {
+            plan.reset(each);
+        }
+        plan.compile().reset_signals
+    };
+    let only = |signals: &[Signal]| Reset::Only(signals.iter().copied().collect());
+    let some = reset(&[only(&[Signal::WeightSum]), only(&[Signal::VisibleCount])]);
+    assert_eq!(some, SignalSet::from([Signal::VisibleCount, Signal::WeightSum]));
+    // What a row is now, and what is kept by epoch, has no reset.
+    assert!(reset(&[only(&[Signal::Opacity, Signal::WeightMax])]).is_empty());
+    let all = reset(&[only(&[Signal::WeightSum]), Reset::Signals]);
+    let resettable: SignalSet =
+        Signal::ALL.into_iter().filter(|signal| signal.is_reset()).collect();
+    assert_eq!(all, resettable);
+    assert!(all.contains(Signal::ScreenGradient) && !all.contains(Signal::Age));
 }

@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 
 pub use crate::error::{PolicyError, PolicyResult};
 pub use crate::needs::{
-    AuxRequest, Cadence, CandidateRequest, DepthMode, ErrorMode, LossTerms, Needs, NoiseTerm,
-    PixelMap, RateOverrides, StartRule,
+    AuxRequest, Cadence, CandidateRequest, DepthMode, ErrorMode, Fade, LossTerms, Needs, NoiseTerm,
+    PixelMap, Rate, RateOverrides, StartRule,
 };
 use crate::plan::EditPlan;
 use crate::rng::PolicyRng;
@@ -31,6 +31,18 @@ pub trait DensityPolicy: Send {
     fn cadence(&self, step: u32) -> Cadence {
         let _ = step;
         Cadence::default()
+    }
+
+    /// The terms added to the loss of iteration `step`; `declared` are those of [`Needs::loss_terms`].
+    fn loss_terms(&self, step: u32, declared: LossTerms) -> LossTerms {
+        let _ = step;
+        declared
+    }
+
+    /// The noise after iteration `step`; `declared` is that of [`Needs::noise`].
+    fn noise(&self, step: u32, declared: Option<NoiseTerm>) -> Option<NoiseTerm> {
+        let _ = step;
+        declared
     }
 
     /// How many training views, drawn at random without replacement, are rendered and

@@ -94,7 +94,7 @@ use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult,
+    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
@@ -183,7 +183,7 @@ impl DensityPolicy for Taming {
             }),
             cadence: Cadence { all: 1, sh_rest: params.sh_every },
             rates: RateOverrides {
-                sh_rest: Some(params.sh_rest as f32),
+                sh_rest: Some(Rate::constant(params.sh_rest)),
                 ..RateOverrides::default()
             },
             ..Needs::default()

@@ -108,7 +108,7 @@ fn the_curve_and_the_qualified_bound_growth() {
     let event = event(1000, 100, 942);
     let done = run(&event, "");
     assert_eq!((done.ops.rows_after, done.cloned.len()), (157, 57));
-    assert!(done.ops.reset_signals);
+    assert!(!done.ops.reset_signals.is_empty());
     assert_eq!(done.ops.cause, "densify");
     // 30 qualify.
     let gradient: Vec<f32> = (0..100).map(|row| if row < 30 { 8.01e-4 } else { 7.9e-4 }).collect();
@@ -232,7 +232,10 @@ fn views_are_rendered_and_bands_are_summed_as_the_parameters_say() {
     let needs = policy.needs(&scene);
     assert_eq!(policy.cadence(1), Cadence { all: 1, sh_rest: 5 });
     assert_eq!(needs.cadence, policy.cadence(1));
-    assert_eq!(needs.rates, RateOverrides { sh_rest: Some(0.5), ..RateOverrides::default() });
+    assert_eq!(
+        needs.rates,
+        RateOverrides { sh_rest: Some(Rate::constant(0.5)), ..RateOverrides::default() }
+    );
     assert_eq!(needs.aux.unwrap().map, PixelMap { error: 3.0, edge: 50.0 });
 }
 

@@ -26,7 +26,7 @@ fn the_threshold_applies_to_the_mean_over_views() {
     assert_eq!(done.cloned, [2, 0]);
     assert!(done.split.is_empty() && done.pruned.is_empty());
     assert_eq!(done.ops.rows_after, 6);
-    assert!(done.ops.reset_signals && done.ops.clamp_opacity.is_none());
+    assert!(!done.ops.reset_signals.is_empty() && done.ops.clamp_opacity.is_none());
     assert_eq!(done.ops.cause, "densify");
 }
 
@@ -110,12 +110,12 @@ fn a_reset_and_growth_can_share_an_event() {
     let grown = run(&event(3000, &[9.0], 8), "");
     assert_eq!(grown.cloned, [0]);
     assert_eq!(grown.ops.clamp_opacity, Some(0.01));
-    assert!(grown.ops.reset_signals);
+    assert!(!grown.ops.reset_signals.is_empty());
     assert_eq!(grown.ops.cause, "densify+reset");
     let mut white = event(500, &[9.0], 8);
     white.scene.white_background = true;
     let reset = run(&white, "");
-    assert!(reset.cloned.is_empty() && !reset.ops.reset_signals);
+    assert!(reset.cloned.is_empty() && reset.ops.reset_signals.is_empty());
     assert_eq!((reset.ops.clamp_opacity, reset.ops.cause.as_str()), (Some(0.01), "reset"));
 }
 

@@ -58,9 +58,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
             model.summed.forget_opacity(row);
         }
     }
-    if ops.reset_signals {
-        model.signals.reset(model.threads, ops.rows_after);
-    }
+    model.signals.reset(ops.reset_signals, model.threads, ops.rows_after);
 }
 
 impl Model<'_> {

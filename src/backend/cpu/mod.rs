@@ -43,7 +43,7 @@ use std::sync::atomic::AtomicU32;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Candidate, LossTerms, NoiseTerm, SignalSet, Signals};
+use densify_policies::policy::{Candidate, SignalSet, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
@@ -101,8 +101,6 @@ pub struct CpuBackend {
     ages: Vec<u16>,
     bias: BiasCorrection,
     summed: Summed,
-    terms: LossTerms,
-    noise: Option<NoiseTerm>,
     signals: Accumulators,
     candidates: Candidates,
     /// Shape: `[budget]`.
@@ -168,8 +166,6 @@ impl CpuBackend {
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
             summed: Summed::new(budget, per_row, options.needs.cadence),
-            terms: options.needs.loss_terms,
-            noise: options.needs.noise,
             signals,
             candidates: Candidates::new(options.needs.candidates),
             splats: vec![Splat::default(); budget],

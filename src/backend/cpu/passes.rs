@@ -298,8 +298,8 @@ impl CpuBackend {
     pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
         let Self { threads, arch, params, moments, ages, signals, sums, visible, bias, .. } = self;
         let (rows, arch) = (self.rows, *arch);
-        let terms = Terms::new(self.terms, rows);
-        let noise = self.noise.map(|term| Noise::new(term, input));
+        let terms = Terms::new(input.loss_terms, rows);
+        let noise = input.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
         let (planes, layout) = (signals.planes(), signals.layout());
         let signal_stride = signals.blocks.stride();

@@ -64,7 +64,7 @@ pub(super) struct Noise {
 impl Noise {
     pub(super) fn new(term: NoiseTerm, input: &StepInput<'_>) -> Self {
         let rng = PolicyRng::new(input.seed, input.step);
-        Self { term, factor: term.strength * input.rates.mean, rng }
+        Self { term, factor: term.strength * input.rates.noise, rng }
     }
 
     /// Moves the means of the first `rows` rows of a block, the first of which is `first_row`. Draws

@@ -131,9 +131,9 @@ impl Accumulators {
         self.clear(threads, &cleared, rows);
     }
 
-    /// Sums start anew; the largest weights stay.
-    pub(super) fn reset(&mut self, threads: &Threads, rows: usize) {
-        self.clear(threads, &self.planes.sums(), rows);
+    /// These signals start anew.
+    pub(super) fn reset(&mut self, signals: SignalSet, threads: &Threads, rows: usize) {
+        self.clear(threads, &self.planes.of_all(signals), rows);
     }
 
     fn clear(&mut self, threads: &Threads, planes: &[usize], rows: usize) {

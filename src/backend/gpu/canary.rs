@@ -1,7 +1,7 @@
 //! The canary: before a device trains anything, two steps on a fixed small scene are compared with the
 //! native backend. A driver that miscompiles a kernel is then an error instead of a bad model.
 
-use densify_policies::policy::{Cadence, Needs};
+use densify_policies::policy::{Cadence, LossTerms, Needs};
 use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DMat3, DVec3};
 
@@ -63,6 +63,7 @@ fn run(
 ) -> Result<(Vec<StepOutput>, Vec<f32>), BackendError> {
     let rates = LearningRates {
         mean: 5e-3,
+        noise: 5e-3,
         log_scale: 0.05,
         quat: 0.01,
         opacity: 0.3,
@@ -79,6 +80,8 @@ fn run(
             background: BACKGROUND,
             sh_degree: 1,
             rates,
+            loss_terms: LossTerms::default(),
+            noise: None,
             cadence: Cadence::default(),
             seed: 1,
         })?);

@@ -268,14 +268,15 @@ impl GpuBackend {
             let now = [rows, logit(most).to_bits(), waits, 0];
             self.execute(&[0], |to| to.run(launches.get("clamp_opacity"), now, rows.div_ceil(256)));
         }
-        if ops.reset_signals {
-            self.clear_planes(&self.planes.sums());
-        }
+        self.clear_planes(&self.planes.of_all(ops.reset_signals));
         self.rows = ops.rows_after;
     }
 
     /// Sets planes of the signals to 0.
     pub(super) fn clear_planes(&self, planes: &[usize]) {
+        if planes.is_empty() {
+            return;
+        }
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let bytes = 4 * self.sizes.budget;
         for &plane in planes {

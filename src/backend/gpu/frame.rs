@@ -2,7 +2,7 @@
 //! `shaders/shared/view.wgsl`. A test compares both sides field by field.
 
 use bytemuck::{Pod, Zeroable};
-use densify_policies::policy::{LossTerms, NoiseTerm, Signal};
+use densify_policies::policy::Signal;
 
 use crate::backend::signals::SignalPlanes;
 use crate::backend::{StepInput, StepOutput};
@@ -135,20 +135,14 @@ impl Frame {
     }
 
     /// Adds what an optimiser step needs.
-    pub(super) fn for_step(
-        &mut self,
-        input: &StepInput<'_>,
-        due: u32,
-        (terms, noise): (LossTerms, Option<NoiseTerm>),
-        planes: &SignalPlanes,
-    ) {
-        let rates = &input.rates;
+    pub(super) fn for_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
+        let StepInput { rates, loss_terms: terms, noise, .. } = input;
         let rows = self.model[0].max(1) as f32;
         self.rates = [rates.mean, rates.log_scale, rates.quat, rates.opacity];
         self.more_rates =
             [rates.sh_dc, rates.sh_rest, terms.opacity / rows, terms.scale / (3.0 * rows)];
         if let Some(noise) = noise {
-            self.noise = [noise.strength * rates.mean, noise.sharpness, noise.opacity, 0.0];
+            self.noise = [noise.strength * rates.noise, noise.sharpness, noise.opacity, 0.0];
         }
         let adds = (if terms.is_none() { 0 } else { due::TERMS })
             | (if noise.is_some() { due::NOISE } else { 0 });

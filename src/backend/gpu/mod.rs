@@ -38,9 +38,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{
-    Cadence, Candidate, LossTerms, NoiseTerm, SignalKind, SignalSet, Signals,
-};
+use densify_policies::policy::{Cadence, Candidate, SignalKind, SignalSet, Signals};
 
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes};
@@ -84,8 +82,6 @@ pub struct GpuBackend {
     near: f32,
     shortcuts: Shortcuts,
     planes: SignalPlanes,
-    terms: LossTerms,
-    noise: Option<NoiseTerm>,
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
@@ -132,8 +128,6 @@ impl GpuBackend {
             near: options.near,
             shortcuts,
             planes,
-            terms: options.needs.loss_terms,
-            noise: options.needs.noise,
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),

@@ -37,7 +37,7 @@ impl GpuBackend {
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.bring_photograph(input.view, target);
-        frame.for_step(input, due, (self.terms, self.noise), &self.planes);
+        frame.for_step(input, due, &self.planes);
         if self.sizes.records.has(Field::Error) {
             frame.draw[3] |= of_target::BY_PIXEL;
         }

@@ -65,6 +65,10 @@ impl Backend for CountingBackend {
             let Cadence { all, sh_rest } = input.cadence;
             note(&self.log, format!("cadence {all} {sh_rest}"));
         }
+        let terms = (input.loss_terms.opacity, input.noise.map(|noise| noise.strength));
+        if terms != (0.0, None) {
+            note(&self.log, format!("terms {terms:?}"));
+        }
         let loss = if input.step == self.nan_loss_at { f32::NAN } else { 0.5 };
         Ok(StepOutput { loss, ..StepOutput::default() })
     }
@@ -138,6 +142,8 @@ struct ScriptedPolicy {
     every: u32,
     aux_views: u32,
     cadence: Cadence,
+    /// From step 7 on.
+    terms: (LossTerms, Option<NoiseTerm>),
     seen: Vec<f32>,
     behaviour: Behaviour,
 }
@@ -165,6 +171,12 @@ impl DensityPolicy for ScriptedPolicy {
     }
     fn cadence(&self, step: u32) -> Cadence {
         if step > 5 { self.cadence } else { Cadence::default() }
+    }
+    fn loss_terms(&self, step: u32, declared: LossTerms) -> LossTerms {
+        if step > 6 { self.terms.0 } else { declared }
+    }
+    fn noise(&self, step: u32, declared: Option<NoiseTerm>) -> Option<NoiseTerm> {
+        if step > 6 { self.terms.1 } else { declared }
     }
     fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
         assert!(self.is_due(step) && rows <= budget);
@@ -248,6 +260,7 @@ struct Case {
     every: u32,
     aux_views: u32,
     cadence: Cadence,
+    terms: (LossTerms, Option<NoiseTerm>),
     nan_loss_at: u32,
     unsound: u32,
     unreadable: Option<usize>,
@@ -260,6 +273,7 @@ const CASE: Case = Case {
     every: 2,
     aux_views: 0,
     cadence: Cadence { all: 1, sh_rest: 1 },
+    terms: (LossTerms { opacity: 0.0, scale: 0.0 }, None),
     nan_loss_at: 0,
     unsound: 0,
     unreadable: None,
@@ -290,6 +304,13 @@ const OPTIONS: TrainOptions = TrainOptions {
         opacity: 1.0,
         sh_dc: 1.0,
         sh_rest: 1.0,
+        log_scale_end: None,
+        quat_end: None,
+        opacity_end: None,
+        sh_dc_end: None,
+        sh_rest_end: None,
+        fade: 1.0,
+        fade_from: 1.0,
     },
     prefetch: 2,
     on_nan: OnNan::Prune,
@@ -318,8 +339,8 @@ fn build(
         unreadable: case.unreadable,
         prefetched: prefetched.clone(),
     };
-    let Case { every, aux_views, cadence, behaviour, .. } = *case;
-    let policy = ScriptedPolicy { every, aux_views, cadence, seen: Vec::new(), behaviour };
+    let Case { every, aux_views, cadence, terms, behaviour, .. } = *case;
+    let policy = ScriptedPolicy { every, aux_views, cadence, terms, seen: Vec::new(), behaviour };
     let policy = ("scripted", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, log, prefetched))

@@ -23,6 +23,27 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
 }
 
 #[test]
+fn terms_and_noise_change_with_the_step() {
+    let noted = |opacity: f32, strength: f32| {
+        let noise = NoiseTerm { strength, sharpness: 1.0, opacity: 0.5 };
+        let terms = (LossTerms { opacity, scale: 0.0 }, Some(noise));
+        let (mut trainer, log, _) = trainer(&Case { terms, every: 100, ..CASE });
+        for _ in 0..8 {
+            trainer.step()?;
+        }
+        let log = log.lock().unwrap().clone();
+        Ok(log.into_iter().filter(|d| d.starts_with("terms")).collect::<Vec<_>>())
+    };
+    let found: Result<_, TrainError> = noted(0.25, 2.0);
+    assert_eq!(found.unwrap(), ["terms (0.25, Some(2.0))"; 2]);
+    for (opacity, strength, part) in [(f32::NAN, 2.0, "opacity"), (0.5, -1.0, "noise.strength")] {
+        let error = noted(opacity, strength).unwrap_err().to_string();
+        assert!(error.starts_with("step 7: policy `scripted`: "), "{error}");
+        assert!(error.contains(part), "{error}");
+    }
+}
+
+#[test]
 fn the_policy_sets_the_cadence() {
     let noted = |all: u32, sh_rest: u32| {
         let case = Case { cadence: Cadence { all, sh_rest }, every: 100, ..CASE };
