@@ -14,6 +14,7 @@ const WORDS: u32 = 20u;
 @group(0) @binding(5) var<storage, read_write> first_rows: array<f32>;
 @group(0) @binding(6) var<storage, read_write> second_rows: array<f32>;
 @group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
+@group(0) @binding(8) var<storage, read> signals: array<f32>;
 
 // The operation of a lane, and the number of the row that it works on. now.a: operations, now.b: numbers per
 // row, now.c: distance between rows, now.d: between the numbers of a row.
@@ -64,7 +65,7 @@ fn longest(s: vec3<f32>) -> u32 {
 }
 
 // The rule at a place of `ops`, and the logarithms of three factors. 0: all by the first; 1: the longest by
-// the first, the others by the second; 2: each by its own.
+// the first, the others by the second; 2: each by its own; 3: all are the first.
 fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
     let rule = ops[at];
     let terms = vec3(real(at + 1u), real(at + 2u), real(at + 3u));
@@ -73,6 +74,9 @@ fn scales_of(s: vec3<f32>, at: u32) -> vec3<f32> {
     }
     if rule == 2u {
         return s + terms;
+    }
+    if rule == 3u {
+        return vec3(terms.x);
     }
     var changed = s + terms.y;
     let long = longest(s);
@@ -252,6 +256,40 @@ fn sow(
     put(row, mean, log_scale, quaternion_at(op + 7u), real(op + 11u));
     for (var k = 0u; k < 3u; k++) {
         sh0[3u * row + k] = real(op + 12u + k);
+    }
+}
+
+// Where opacities stop that decay.
+const OPACITY_LEAST: f32 = 2e-4;
+
+// Takes something off opacities and scales; now.a: rows, now.b: bits of what opacities lose, now.c: bits of
+// the logarithm of the factor of scales, now.d: where the numbers of views that have shown each row begin in
+// `signals`, or NONE if rows decay that none has shown too.
+@compute @workgroup_size(256)
+fn decay(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row >= now.a {
+        return;
+    }
+    if now.d != NONE && !(signals[now.d + row] > 0.0) {
+        return;
+    }
+    let loss = bitcast<f32>(now.b);
+    let base = 12u * row;
+    let logit = rows[base + 10u];
+    // What is not finite is left to the audit.
+    if loss > 0.0 && below(logit, LARGEST) {
+        let e = exp_exact(-abs(logit));
+        let opacity = select(e, 1.0, logit >= 0.0) / (1.0 + e);
+        let complement = select(1.0, e, logit >= 0.0) / (1.0 + e);
+        let left = max(opacity - loss, OPACITY_LEAST);
+        rows[base + 10u] = min(logit, logit_of(left, complement + (opacity - left)));
+    }
+    for (var k = 0u; k < 3u; k++) {
+        rows[base + 3u + k] += bitcast<f32>(now.c);
     }
 }
 

@@ -6,6 +6,11 @@
 // did not.
 @group(0) @binding(7) var<storage, read_write> finish: array<vec2<u32>>;
 
+// Pixels of each row in which none has a larger blend weight; nothing where they are not counted.
+@group(0) @binding(8) var<storage, read_write> dominant: array<atomic<u32>>;
+
+override COUNTS_DOMINANT: bool = false;
+
 // Splats at hand at a time, where all invocations work together.
 const BATCH: u32 = 64u;
 
@@ -16,6 +21,9 @@ struct Shown {
     blue: vec4<f32>,
     depth: vec4<f32>,
     stop: vec4<u32>,
+    // The largest weight, and the place of its splat in the list.
+    most: vec4<f32>,
+    most_at: vec4<u32>,
 }
 
 // Draws splat k of `count` at hand, the first of which is the nth of the list.
@@ -37,6 +45,10 @@ fn draw(
     (*shown).green += w * splat.colour.y;
     (*shown).blue += w * splat.colour.z;
     (*shown).depth += w * splat.b.z;
+    if COUNTS_DOMINANT {
+        (*shown).most_at = select((*shown).most_at, vec4(n + k), w > (*shown).most);
+        (*shown).most = max((*shown).most, w);
+    }
     let stops = went_on & !(*pixels).goes_on;
     (*shown).stop = select((*shown).stop, vec4(n + k), stops);
 }
@@ -56,7 +68,8 @@ fn rasterize(
     let begin = tile_starts[tile];
     let end = tile_starts[tile + 1u];
     var pixels = Open(vec4(1.0), quad.inside);
-    var shown = Shown(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(NONE));
+    let dark = vec4(0.0);
+    var shown = Shown(dark, dark, dark, dark, vec4(NONE), dark, vec4(0u));
     var has_ended = true;
     var first = begin;
     for (; first < end; first += m.members) {
@@ -88,6 +101,20 @@ fn rasterize(
             let to = quad.place[p];
             canvas[to] = vec4(red[p], green[p], blue[p], shown.depth[p]);
             finish[to] = vec2(bitcast<u32>(pixels.light[p]), shown.stop[p]);
+            if COUNTS_DOMINANT && shown.most[p] > 0.0 {
+                atomicAdd(&dominant[row_of_slot[list[begin + shown.most_at[p]]]], 1u);
+            }
         }
+    }
+}
+
+@compute @workgroup_size(256)
+fn clear_dominant(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row < frame.model.x {
+        atomicStore(&dominant[row], 0u);
     }
 }

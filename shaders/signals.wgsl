@@ -10,8 +10,12 @@
 @group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> rows: array<f32>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
+// Pixels that the row dominates, where they are counted.
+@group(0) @binding(9) var<storage, read> dominant: array<u32>;
 
 const FOLD: f32 = 0.8493218;
+// Least largest weight of a view that counts as support.
+const SUPPORT_WEIGHT: f32 = 0.02;
 
 // The signals' numbers, which are places in frame.planes; policies/src/signals.rs has the table.
 override VISIBLE_COUNT: u32;
@@ -26,6 +30,11 @@ override WEIGHT_MAX: u32;
 override WEIGHT_SUM: u32;
 override PIXEL_COUNT: u32;
 override WEIGHTED_ERROR: u32;
+override WEIGHT_MAX_ROOT: u32;
+override SUPPORT: u32;
+override DEPTH_MIN: u32;
+override PIXEL_SIZE_MIN: u32;
+override DOMINANT_PIXELS: u32;
 override OPACITY: u32;
 override SCALE_MAX: u32;
 override SCALE_PRODUCT: u32;
@@ -95,7 +104,17 @@ fn accumulate(
         add(WEIGHTED_ERROR, row, row_sums[at + ERROR_AT]);
     }
     if WEIGHT_MAX_AT > 0u {
-        raise(WEIGHT_MAX, row, row_sums[at + WEIGHT_MAX_AT]);
+        let largest = row_sums[at + WEIGHT_MAX_AT];
+        raise(WEIGHT_MAX, row, largest);
+        add(WEIGHT_MAX_ROOT, row, sqrt(largest));
+        add(SUPPORT, row, select(0.0, 1.0, largest >= SUPPORT_WEIGHT));
+    }
+    // Of the smallest values the largest inverse is kept, which starts at 0.
+    raise(DEPTH_MIN, row, 1.0 / depth);
+    raise(PIXEL_SIZE_MIN, row, 0.5 * (frame.lens.x + frame.lens.y) / depth);
+    if plane(DOMINANT_PIXELS) != NONE {
+        let pixels = f32(frame.image.x * frame.image.y);
+        raise(DOMINANT_PIXELS, row, f32(dominant[row]) / pixels);
     }
 }
 

@@ -66,6 +66,8 @@ pub enum ScaleRule {
     },
     /// Each multiplied by its own factor, > 0.
     Axes([f32; 3]),
+    /// All three set to this standard deviation `[scene units]`, > 0: the row becomes round.
+    Set(f32),
 }
 
 /// How opacities follow from the parent's.
@@ -94,9 +96,28 @@ pub struct Update {
     /// New base colour, sRGB-encoded, between −[`COLOUR_MAX`] and `COLOUR_MAX`: what a row shows may lie
     /// beyond `[0, 1]`. What depends on the direction stays. `None`: it stays.
     pub colour: Option<[f32; 3]>,
+    /// Highest spherical-harmonic degree that stays; what depends on the direction beyond it becomes 0, and
+    /// the moments of that too. `None`: all stays.
+    pub sh_degree: Option<u8>,
     /// Whether the row keeps its moments and its age; otherwise both become zero.
     pub keep_moments: bool,
 }
+
+/// What all rows lose at once, however many they are; they keep their moments. See
+/// [`EditPlan::decay`](crate::plan::EditPlan::decay).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Decay {
+    /// What opacities lose, >= 0; they do not fall below [`OPACITY_LEAST`] by it.
+    pub opacity: f32,
+    /// Share of the standard deviations that is lost, in `[0, 1)`.
+    pub scale: f32,
+    /// Whether only those rows lose anything that a view has shown since the last reset of
+    /// [`Signal::VisibleCount`](crate::signals::Signal::VisibleCount), which must be declared then.
+    pub seen_only: bool,
+}
+
+/// Where opacities stop that decay: far below what is rendered, 1/255.
+pub const OPACITY_LEAST: f32 = 2e-4;
 
 /// Most that a base colour is off 0: more would not fit the narrowest storage.
 pub const COLOUR_MAX: f32 = 1e4;
@@ -120,10 +141,10 @@ pub struct Seed {
 /// An accumulator that a plan resets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reset {
-    /// All [`Signal`](crate::signals::Signal)s that are sums or counts; not `WeightMax` (kept per epoch)
-    /// nor what a row is now (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
+    /// All [`Signal`](crate::signals::Signal)s that accumulate; not `WeightMax` (kept per epoch) nor what
+    /// a row is now (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
-    /// These signals, as far as they are sums or counts; for signals with a clock of their own.
+    /// These signals, as far as they accumulate; for signals with a clock of their own.
     Only(SignalSet),
     /// The list of candidates.
     Candidates,
@@ -170,11 +191,11 @@ impl Offspring {
         ])
     }
 
-    /// Whether scales change by axis, or anything is turned: [`Needs::detailed_edits`](crate::policy::Needs)
+    /// Whether scales change by axis or are set, or anything is turned: [`Needs::detailed_edits`](crate::policy::Needs)
     /// declares it.
     #[must_use]
     pub fn is_detailed(&self) -> bool {
-        matches!(self.scale, ScaleRule::Axes(_))
+        matches!(self.scale, ScaleRule::Axes(_) | ScaleRule::Set(_))
             || self.turn.map(f32::to_bits) != UNTURNED.map(f32::to_bits)
     }
 
@@ -192,6 +213,7 @@ impl ScaleRule {
         match *self {
             Self::Uniform(factor) => positive(factor),
             Self::LongAxis { long, other } => positive(long) && positive(other),
+            Self::Set(scale) => positive(scale),
             Self::Axes(factors) => factors.into_iter().all(positive),
         }
     }
@@ -216,8 +238,23 @@ impl Update {
         scale: ScaleRule::Uniform(1.0),
         position: None,
         colour: None,
+        sh_degree: None,
         keep_moments: true,
     };
+
+    /// The row begins anew where it is: round, of this standard deviation `[scene units]` and opacity, of the
+    /// same colour from everywhere, without moments.
+    #[must_use]
+    pub const fn restart(scale: f32, opacity: f32) -> Self {
+        Self {
+            opacity: OpacityRule::Set(opacity),
+            scale: ScaleRule::Set(scale),
+            position: None,
+            colour: None,
+            sh_degree: Some(0),
+            keep_moments: false,
+        }
+    }
 
     /// The field that is not finite or out of its range, if any. [`OpacityRule::Conserved`] is not in
     /// range: there are no children to share the opacity with.
@@ -231,6 +268,15 @@ impl Update {
             (self.position.is_none_or(|position| finite(&position)), "position"),
             (self.colour.is_none_or(colour), "colour"),
         ])
+    }
+}
+
+impl Decay {
+    /// The field that is not finite or out of its range, if any.
+    #[must_use]
+    pub fn bad_field(&self) -> Option<&'static str> {
+        let opacity = self.opacity.is_finite() && self.opacity >= 0.0;
+        first_bad(&[(opacity, "opacity"), ((0.0..1.0).contains(&self.scale), "scale")])
     }
 }
 
@@ -278,6 +324,7 @@ mod tests {
             assert_eq!(scaled(ScaleRule::LongAxis { long: bad, other: 1.0 }), Some("scale"));
             assert_eq!(scaled(ScaleRule::LongAxis { long: 1.0, other: bad }), Some("scale"));
             assert_eq!(scaled(ScaleRule::Axes([1.0, bad, 1.0])), Some("scale"), "{bad}");
+            assert_eq!(scaled(ScaleRule::Set(bad)), Some("scale"), "{bad}");
             assert_eq!(covering(OpacityRule::Set(bad)), Some("opacity"), "{bad}");
             assert_eq!(covering(OpacityRule::Scaled(bad)), Some("opacity"), "{bad}");
         }
@@ -318,7 +365,22 @@ mod tests {
     }
 
     #[test]
+    fn a_bad_field_of_a_decay_is_named() {
+        let sound = Decay { opacity: 0.0, scale: 0.0, seen_only: false };
+        assert_eq!(sound.bad_field(), None);
+        for bad in NOT_FINITE.into_iter().chain([-0.1]) {
+            assert_eq!(Decay { opacity: bad, ..sound }.bad_field(), Some("opacity"), "{bad}");
+            assert_eq!(Decay { scale: bad, ..sound }.bad_field(), Some("scale"), "{bad}");
+        }
+        assert_eq!(Decay { scale: 1.0, ..sound }.bad_field(), Some("scale"));
+        assert_eq!(Decay { opacity: 2.0, scale: 0.999, ..sound }.bad_field(), None);
+    }
+
+    #[test]
     fn a_bad_field_of_an_update_is_named() {
+        assert_eq!(Update::restart(0.1, 0.1).bad_field(), None);
+        assert_eq!(Update::restart(0.0, 0.1).bad_field(), Some("scale"));
+        assert_eq!(Update::restart(0.1, 1.0).bad_field(), Some("opacity"));
         assert_eq!(Update::NONE.bad_field(), None);
         let wrong = |update: Update| update.bad_field();
         assert_eq!(

@@ -14,6 +14,10 @@ pub enum SignalKind {
     Count,
     /// The largest value of the previous and the current epoch.
     EpochMaximum,
+    /// The largest value of a view since the last reset, or since the row was created.
+    Maximum,
+    /// The smallest value of the views in which the row was visible since then; +∞ where there are none.
+    Minimum,
     /// Computed from the current parameters or age of the row; needs no memory.
     Present,
     /// So many numbers of the row as it is now, copied at events only; needs no memory in between.
@@ -112,6 +116,19 @@ signals! {
     /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
     /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is seen.
     WeightedError: Sum "pixels" [WeightedError];
+    /// Sum over views of √w, w the row's largest blend weight α·T of the view, >= 0. Divided by
+    /// [`VisibleCount`](Self::VisibleCount) it says how much a row matters in all views that see it,
+    /// where [`WeightMax`](Self::WeightMax) is content with one.
+    WeightMaxRoot: Sum "1" [LargestWeight];
+    /// Number of views in which the row matters: its largest blend weight α·T is at least
+    /// [`SUPPORT_WEIGHT`].
+    Support: Count "views" [LargestWeight];
+    /// Smallest camera depth of the mean `[scene units]`, > 0.
+    DepthMin: Minimum "scene units" [];
+    /// Smallest width of a pixel at the depth of the mean, depth / focal length `[scene units]`, > 0.
+    PixelSizeMin: Minimum "scene units" [];
+    /// Largest share of a view's pixels in which no row has a larger blend weight, in `[0, 1]`.
+    DominantPixels: Maximum "image" [];
     /// Opacity now, in (0, 1).
     Opacity: Present "1" [];
     /// Largest of the three standard deviations now `[scene units]`, > 0.
@@ -135,11 +152,17 @@ signals! {
     Colour: Attribute(3) "1" [];
 }
 
+/// Least largest blend weight in a view that counts as [`Signal::Support`].
+pub const SUPPORT_WEIGHT: f32 = 0.02;
+
 impl Signal {
     /// Whether a policy can [reset](crate::plan::Reset) it: whether it accumulates since its last reset.
     #[must_use]
     pub const fn is_reset(self) -> bool {
-        matches!(self.kind(), SignalKind::Sum | SignalKind::Count)
+        matches!(
+            self.kind(),
+            SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum
+        )
     }
 
     /// Numbers per row.
@@ -285,6 +308,8 @@ pub enum AuxColumn {
     DistanceSum,
     /// Largest blend weight α·T, in `[0, 1]`.
     WeightMax,
+    /// Number of pixels in which no row has a larger blend weight, >= 0.
+    DominantPixels,
     /// Camera z of the mean `[scene units]`.
     Depth,
     /// Radius on screen, three standard deviations along the longer axis, rounded up `[px]`.
@@ -293,12 +318,13 @@ pub enum AuxColumn {
 
 impl AuxColumn {
     /// All columns, in declaration order.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::MapSum,
         Self::PixelCount,
         Self::WeightSum,
         Self::DistanceSum,
         Self::WeightMax,
+        Self::DominantPixels,
         Self::Depth,
         Self::Radius,
     ];

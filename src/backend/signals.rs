@@ -6,7 +6,9 @@
 
 use std::ops::Range;
 
-use densify_policies::policy::{Needs, PixelSum, Signal, SignalKind, SignalSet};
+use densify_policies::policy::{
+    AuxColumn, AuxRequest, Needs, PixelSum, Signal, SignalKind, SignalSet,
+};
 
 use crate::gaussians::{ModelArray, dc_to_rgb};
 
@@ -131,6 +133,18 @@ impl RecordLayout {
     }
 }
 
+/// Whether pixels must be counted for the row with their largest blend weight.
+pub(super) fn counts_dominant(needs: &Needs) -> bool {
+    let in_views = |aux: &AuxRequest| aux.columns.contains(&AuxColumn::DominantPixels);
+    needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
+}
+
+/// What a plane holds of a signal, as the policy reads it. Of the smallest values the largest inverse is
+/// kept, which starts at 0 like all others.
+pub(super) fn as_read(signal: Signal, kept: f32) -> f32 {
+    if signal.kind() == SignalKind::Minimum { 1.0 / kept } else { kept }
+}
+
 /// The planes of the requested signals.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SignalPlanes {
@@ -147,7 +161,7 @@ pub(super) struct SignalPlanes {
 /// How many planes a signal has.
 const fn planes(kind: SignalKind) -> usize {
     match kind {
-        SignalKind::Sum | SignalKind::Count => 1,
+        SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => 1,
         // The previous epoch, and the current one.
         SignalKind::EpochMaximum => 2,
         SignalKind::Present | SignalKind::Attribute(_) => 0,
@@ -196,7 +210,9 @@ impl SignalPlanes {
         for signal in Signal::ALL {
             let Some(current) = self.current(signal) else { continue };
             match signal.kind() {
-                SignalKind::Sum | SignalKind::Count => kept.push((format!("{signal:?}"), current)),
+                SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => {
+                    kept.push((format!("{signal:?}"), current))
+                }
                 SignalKind::EpochMaximum => {
                     let both = self.of(signal);
                     let previous = both.start + both.end - 1 - current;
@@ -238,6 +254,11 @@ impl ParameterSignal {
             | Signal::WeightSum
             | Signal::PixelCount
             | Signal::WeightedError
+            | Signal::WeightMaxRoot
+            | Signal::Support
+            | Signal::DepthMin
+            | Signal::PixelSizeMin
+            | Signal::DominantPixels
             | Signal::Opacity
             | Signal::ScaleMax
             | Signal::ScaleProduct

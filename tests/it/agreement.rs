@@ -6,7 +6,9 @@ use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::{Setup, Subject, scenes};
-use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
+use densify_policies::policy::{
+    Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalKind, SignalSet,
+};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -73,7 +75,11 @@ fn step(
 
 fn columns(backend: &mut dyn Backend, needs: &Needs) -> Vec<(Signal, Vec<f32>)> {
     let signals = backend.take_signals(needs.signals).expect("signals");
-    let of = |s: Signal| signals.get(s).expect("it was asked for").to_vec();
+    // Of the smallest values the inverses: rows that were not seen have none.
+    let shown = |s: Signal, x: f32| if s.kind() == SignalKind::Minimum { 1.0 / x } else { x };
+    let of = |s: Signal| -> Vec<f32> {
+        signals.get(s).expect("it was asked for").iter().map(|&x| shown(s, x)).collect()
+    };
     needs.signals.iter().map(|s| (s, of(s))).collect()
 }
 

@@ -141,11 +141,15 @@ fn every_column_is_that_of_the_reference() {
     for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
         let pixels = map(&scene, &image, weights);
         let mut sums = vec![[0.0_f64; 5]; scene.model.len()];
+        let mut largest = vec![(0.0, None); pixels.len()];
         each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, distance| {
             for (sum, x) in sums[row].iter_mut().zip([pixels[p], 1.0, weight, distance]) {
                 *sum += x;
             }
             sums[row][4] = sums[row][4].max(weight);
+            if weight > largest[p].0 {
+                largest[p] = (weight, Some(row));
+            }
         });
         // A row may be on screen without being blended anywhere.
         let shown: Vec<usize> = (0..sums.len()).filter(|&row| sums[row][1] > 0.0).collect();
@@ -156,6 +160,9 @@ fn every_column_is_that_of_the_reference() {
             AuxColumn::WeightSum => sums[row][2],
             AuxColumn::DistanceSum => sums[row][3],
             AuxColumn::WeightMax => sums[row][4],
+            AuxColumn::DominantPixels => {
+                largest.iter().filter(|pixel| pixel.1 == Some(row)).count() as f64
+            }
             AuxColumn::Depth => splats[row].depth,
             AuxColumn::Radius => {
                 let [a, b, c] = splats[row].covariance;

@@ -5,7 +5,7 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, dc_to_rgb};
 use densify_policies::plan::EditPlan;
-use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet};
+use densify_policies::policy::{Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet};
 
 use crate::subject::{all, devices, make_with, normalised, repeatable, step_input, storages};
 use densify::verify::compare::{Table, relative_error};
@@ -57,12 +57,13 @@ fn views() -> Views {
     Views { model, cameras, targets }
 }
 
-/// The reference's gradient of the training loss of one view, and each row's weighted error.
+/// The reference's gradient of the training loss of one view, each row's weighted error, and the share of
+/// the pixels that it dominates.
 pub(crate) fn reference(
     model: &Gaussians,
     view: View<'_>,
     target: &Image8,
-) -> (Gradient, Vec<f64>) {
+) -> (Gradient, Vec<f64>, Vec<f64>) {
     let model = Model::of(model);
     let image = render(&model, view, &Rules::STANDARD);
     let truth: Vec<f64> = target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
@@ -76,12 +77,20 @@ pub(crate) fn reference(
     }
     let splats = project(&model, view, &Rules::STANDARD);
     let mut errors = vec![0.0; splats.len()];
+    let mut largest = vec![(0.0, None); image.alpha.len()];
     each_blended(&splats, &by_depth(&splats), view, &Rules::STANDARD, |pixel, row, weight, _| {
         errors[row] += weight * loss.by_pixel[pixel];
+        if weight > largest[pixel].0 {
+            largest[pixel] = (weight, Some(row));
+        }
     });
+    let mut dominated = vec![0.0; splats.len()];
+    for row in largest.iter().filter_map(|pixel| pixel.1) {
+        dominated[row] += 1.0 / image.alpha.len() as f64;
+    }
     let nothing = vec![0.0; image.alpha.len()];
     let upstream = Upstream { rgb: loss.gradient, alpha: nothing.clone(), depth: nothing };
-    (differentiate(&model, view, &Rules::STANDARD, &upstream).1, errors)
+    (differentiate(&model, view, &Rules::STANDARD, &upstream).1, errors, dominated)
 }
 
 fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
@@ -91,32 +100,41 @@ fn norm(values: impl IntoIterator<Item = f64>) -> f64 {
 /// One view's contribution to a signal, where views count in full from a depth on. Shape: [rows].
 fn contribution(
     signal: Signal,
-    (gradient, errors): &(Gradient, Vec<f64>),
+    (gradient, errors, dominated): &(Gradient, Vec<f64>, Vec<f64>),
     camera: &Camera,
     depths: &[f64],
     full_depth: f64,
 ) -> Vec<f64> {
     let ndc = [0.5 * f64::from(camera.width), 0.5 * f64::from(camera.height)];
     let rows = gradient.screen.iter().zip(&gradient.model.means).zip(depths).zip(errors);
-    rows.map(|(((s, mean), depth), &error)| {
-        let near = if full_depth > 0.0 { (depth / full_depth).min(1.0).powi(2) } else { 1.0 };
-        match signal {
-            Signal::VisibleCount => f64::from(u8::from(s.pixels > 0)),
-            Signal::ScreenGradient => near * norm([0, 1].map(|i| s.mean[i] * ndc[i])),
-            Signal::ScreenGradientAbs => near * norm([0, 1].map(|i| s.mean_abs[i] * ndc[i])),
-            Signal::ColourGradient => near * norm(s.colour),
-            Signal::MeanGradientX => mean[0],
-            Signal::MeanGradientY => mean[1],
-            Signal::MeanGradientZ => mean[2],
-            Signal::MeanGradientNorm => norm(*mean),
-            Signal::WeightMax => s.max_weight,
-            Signal::WeightSum => s.sum_weight,
-            Signal::PixelCount => f64::from(s.pixels),
-            Signal::WeightedError => error,
-            other => panic!("{other:?} is no sum over views"),
-        }
-    })
-    .collect()
+    rows.zip(dominated)
+        .map(|((((s, mean), depth), &error), &dominated)| {
+            let seen = f64::from(u8::from(s.pixels > 0));
+            let focal = 0.5 * (camera.fx + camera.fy);
+            let near = if full_depth > 0.0 { (depth / full_depth).min(1.0).powi(2) } else { 1.0 };
+            match signal {
+                Signal::VisibleCount => seen,
+                Signal::ScreenGradient => near * norm([0, 1].map(|i| s.mean[i] * ndc[i])),
+                Signal::ScreenGradientAbs => near * norm([0, 1].map(|i| s.mean_abs[i] * ndc[i])),
+                Signal::ColourGradient => near * norm(s.colour),
+                Signal::MeanGradientX => mean[0],
+                Signal::MeanGradientY => mean[1],
+                Signal::MeanGradientZ => mean[2],
+                Signal::MeanGradientNorm => norm(*mean),
+                Signal::WeightMax => s.max_weight,
+                Signal::WeightSum => s.sum_weight,
+                Signal::PixelCount => f64::from(s.pixels),
+                Signal::WeightedError => error,
+                Signal::WeightMaxRoot => s.max_weight.sqrt(),
+                Signal::Support => f64::from(u8::from(s.max_weight >= f64::from(SUPPORT_WEIGHT))),
+                // Of the smallest, the inverse.
+                Signal::DepthMin => seen / depth,
+                Signal::PixelSizeMin => seen * focal / depth,
+                Signal::DominantPixels => dominated,
+                other => panic!("{other:?} is no sum over views"),
+            }
+        })
+        .collect()
 }
 
 /// Runs one step per view and takes the signals.
@@ -150,9 +168,7 @@ fn every_signal_whatever_else_is_asked_for() {
             reference(&views.model, view, target)
         })
         .collect();
-    let is_accumulated = |s: &Signal| {
-        matches!(s.kind(), SignalKind::Sum | SignalKind::Count | SignalKind::EpochMaximum)
-    };
+    let is_accumulated = |s: &Signal| s.is_reset() || s.kind() == SignalKind::EpochMaximum;
     let everything: Vec<Signal> = Signal::ALL.into_iter().filter(is_accumulated).collect();
     let mut base = everything.clone();
     base.retain(|signal| signal.pixel_sums().is_empty());
@@ -178,14 +194,17 @@ fn every_signal_whatever_else_is_asked_for() {
         let mut table = Table::new(&format!("signals, {}", subject.name()));
         for (request, full_depth) in &requests {
             let (_, columns) = collect(&subject, &views, request, *full_depth);
-            for (&signal, column) in request.iter().zip(columns) {
+            for (&signal, mut column) in request.iter().zip(columns) {
+                if signal.kind() == SignalKind::Minimum {
+                    column.iter_mut().for_each(|value| *value = 1.0 / *value);
+                }
                 let mut expected = vec![0.0; views.model.len()];
                 for (gradient, camera) in gradients.iter().zip(&views.cameras) {
                     let full_depth = f64::from(*full_depth);
                     let parts = contribution(signal, gradient, camera, &depths(camera), full_depth);
                     for (sum, part) in expected.iter_mut().zip(parts) {
-                        let is_maximum = signal.kind() == SignalKind::EpochMaximum;
-                        *sum = if is_maximum { part.max(*sum) } else { *sum + part };
+                        let is_sum = matches!(signal.kind(), SignalKind::Sum | SignalKind::Count);
+                        *sum = if is_sum { *sum + part } else { part.max(*sum) };
                     }
                 }
                 let what = format!("{} signals, full from {full_depth}", request.len());

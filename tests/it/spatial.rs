@@ -162,7 +162,7 @@ fn rows_are_split_moved_and_painted_where_they_are() {
     let inside: Vec<usize> = (0..30).filter(|&row| model.means[row][0] > spatial.left).collect();
     assert!((5..25).contains(&inside.len()), "{inside:?}");
     let view = View { camera: &camera, background: [0.0; 3], sh_degree: 1 };
-    let (gradient, errors) = reference(&model, view, &scenes::target(&camera));
+    let (gradient, errors, _) = reference(&model, view, &scenes::target(&camera));
     let mean_error = |row: usize| errors[row] / gradient.screen[row].sum_weight;
     on_each(repeatable(), |subject| {
         // Two splits are refused.

@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::edit::{
-    Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed, UNTURNED, Update, in_open_unit,
+    Decay, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed, UNTURNED, Update,
+    in_open_unit,
 };
 use crate::signals::SignalSet;
 
@@ -13,7 +14,7 @@ use crate::signals::SignalSet;
 /// A backend executes in pass 1 `families` (the parent is read once, then its children and the
 /// parent itself are written), `updates` and `seeds`: no slot is written twice, and no written slot is
 /// read by another entry. In pass 2 it executes `moves`, then brings the rows into [`order`](Self::order),
-/// then it executes `clamp_opacity` over all rows and the resets.
+/// then it executes `decay` and `clamp_opacity` over all rows and the resets.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RowOps {
     /// Rows before the edit.
@@ -35,6 +36,8 @@ pub struct RowOps {
     /// (from, to): live tail rows that fill the holes left by pruned rows; every `from` >=
     /// `rows_after` > every `to`.
     pub moves: Vec<(u32, u32)>,
+    /// What all rows lose.
+    pub decay: Option<Decay>,
     /// Upper bound for all opacities, in (0, 1); both opacity moments of all rows become zero.
     pub clamp_opacity: Option<f32>,
     /// The signals that start anew in all rows; rows that move keep the others.
@@ -126,7 +129,7 @@ impl RowOps {
         !self.edits_rows() && self.reset_signals.is_empty() && !self.reset_candidates
     }
 
-    /// Whether any row is added, removed, rewritten or clamped.
+    /// Whether any row is added, removed, rewritten, clamped or decays.
     #[must_use]
     pub fn edits_rows(&self) -> bool {
         !(self.families.is_empty()
@@ -134,6 +137,7 @@ impl RowOps {
             && self.seeds.is_empty()
             && self.moves.is_empty()
             && self.rows_before == self.rows_after
+            && self.decay.is_none()
             && self.clamp_opacity.is_none())
     }
 
@@ -242,6 +246,7 @@ impl RowOps {
         let is_child = |family: &&Family| family.fate == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_child).count();
         require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
+        sound(self.decay.and_then(|decay| decay.bad_field()), || "the decay".to_owned())?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {
             format!("opacity bound {:?}", self.clamp_opacity)
         })

@@ -7,8 +7,8 @@
 
 use crate::edit::in_open_unit;
 pub use crate::edit::{
-    COLOUR_MAX, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, UNTURNED,
-    Update,
+    COLOUR_MAX, Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, Reset,
+    ScaleRule, Seed, UNTURNED, Update,
 };
 use crate::needs::Needs;
 pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
@@ -29,9 +29,11 @@ pub enum Refused {
     /// A number in this field of the edit is not finite or out of its range.
     #[error("`{0}` is not finite or out of range")]
     BadValue(&'static str),
-    /// The edit is one that only [`Needs::detailed_edits`] allows.
+    /// The edit is one that only [`Needs::detailed_edits`] allows, or a decay of rows that were seen without
+    /// the signal that says which.
     #[error(
-        "not declared: updates, scales by axis and turns need `detailed_edits` in the policy's needs"
+        "not declared: updates, scales by axis and turns need `detailed_edits` in the policy's needs, \
+         and a decay of what was seen needs the signal `visible_count`"
     )]
     Undeclared,
 }
@@ -72,11 +74,13 @@ pub struct EditPlan {
     added: usize,
     denied: usize,
     detailed: bool,
+    knows_seen: bool,
     was_undeclared: bool,
     families: Vec<Family>,
     shapes: Vec<(ScaleRule, [f32; 4])>,
     updates: Vec<(u32, Update)>,
     seeds: Vec<Seed>,
+    decay: Option<Decay>,
     clamp_opacity: Option<f32>,
     reset_signals: SignalSet,
     reset_candidates: bool,
@@ -94,11 +98,13 @@ impl EditPlan {
             added: 0,
             denied: 0,
             detailed: false,
+            knows_seen: false,
             was_undeclared: false,
             families: Vec::new(),
             shapes: Vec::new(),
             updates: Vec::new(),
             seeds: Vec::new(),
+            decay: None,
             clamp_opacity: None,
             reset_signals: SignalSet::default(),
             reset_candidates: false,
@@ -106,10 +112,11 @@ impl EditPlan {
         }
     }
 
-    /// The plan, with detailed edits if `needs` declares them.
+    /// The plan, with the edits that `needs` declares.
     #[must_use]
     pub fn allowing(self, needs: &Needs) -> Self {
-        Self { detailed: needs.detailed_edits, ..self }
+        let knows_seen = needs.signals.contains(Signal::VisibleCount);
+        Self { detailed: needs.detailed_edits, knows_seen, ..self }
     }
 
     /// Rows before the edit.
@@ -169,7 +176,7 @@ impl EditPlan {
         let children = offspring.children as usize;
         let is_detailed = offspring.is_detailed();
         if is_detailed {
-            self.check_declared()?;
+            self.check_declared(self.detailed)?;
         }
         self.claim(parent, offspring.bad_field(), children, RowEdit::Grown)?;
         // The most there can be, if no more rows are pruned: growing an array in steps would hold it
@@ -192,7 +199,7 @@ impl EditPlan {
     /// # Errors
     /// [`Refused::Undeclared`], [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
     pub fn update(&mut self, row: u32, update: Update) -> Result<(), Refused> {
-        self.check_declared()?;
+        self.check_declared(self.detailed)?;
         self.claim(row, update.bad_field(), 0, RowEdit::Updated)?;
         if self.updates.is_empty() {
             self.updates.reserve_exact(self.rows() - self.pruned - self.families.len());
@@ -209,6 +216,19 @@ impl EditPlan {
         self.check(seed.bad_field(), 1)?;
         self.added += 1;
         self.seeds.push(seed);
+        Ok(())
+    }
+
+    /// Takes something off the opacities and scales of all rows, new ones too unless only
+    /// [seen](Decay::seen_only) rows decay, after all other edits but
+    /// [`clamp_opacity`](Self::clamp_opacity). A later call replaces an earlier one.
+    ///
+    /// # Errors
+    /// [`Refused::BadValue`], [`Refused::Undeclared`].
+    pub fn decay(&mut self, decay: Decay) -> Result<(), Refused> {
+        self.check_declared(self.knows_seen || !decay.seen_only)?;
+        self.check(decay.bad_field(), 0)?;
+        self.decay = Some(decay);
         Ok(())
     }
 
@@ -284,6 +304,7 @@ impl EditPlan {
             updates: self.updates,
             seeds,
             moves,
+            decay: self.decay,
             clamp_opacity: self.clamp_opacity,
             reset_signals: self.reset_signals,
             reset_candidates: self.reset_candidates,
@@ -299,8 +320,8 @@ impl EditPlan {
         self.was_undeclared
     }
 
-    fn check_declared(&mut self) -> Result<(), Refused> {
-        if self.detailed {
+    fn check_declared(&mut self, is_declared: bool) -> Result<(), Refused> {
+        if is_declared {
             return Ok(());
         }
         self.was_undeclared = true;

@@ -243,3 +243,17 @@ fn signals_are_reset_alone_or_all_together() {
     assert_eq!(all, resettable);
     assert!(all.contains(Signal::ScreenGradient) && !all.contains(Signal::Age));
 }
+
+#[test]
+fn a_decay_of_what_was_seen_needs_to_know_what_was_seen() {
+    let decay = Decay { opacity: 0.1, scale: 0.2, seen_only: true };
+    let mut plan = EditPlan::new(1, 1).allowing(&detailed());
+    assert_eq!(plan.decay(decay), Err(Refused::Undeclared));
+    assert!(plan.was_undeclared() && plan.decay(Decay { seen_only: false, ..decay }).is_ok());
+    let signals = SignalSet::from([Signal::VisibleCount]);
+    let mut plan = EditPlan::new(1, 1).allowing(&Needs { signals, ..Needs::default() });
+    assert_eq!(plan.decay(decay), Ok(()));
+    assert_eq!(plan.decay(Decay { scale: 1.0, ..decay }), Err(Refused::BadValue("scale")));
+    let ops = plan.compile();
+    assert!(ops.decay == Some(decay) && ops.edits_rows());
+}

@@ -15,7 +15,9 @@ pub use crate::needs::{
 };
 use crate::plan::EditPlan;
 use crate::rng::PolicyRng;
-pub use crate::signals::{AuxColumn, PixelSum, Signal, SignalKind, SignalSet, Signals};
+pub use crate::signals::{
+    AuxColumn, PixelSum, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet, Signals,
+};
 
 /// A density-control policy.
 pub trait DensityPolicy: Send {

@@ -1,11 +1,13 @@
 //! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
 
 use densify_policies::plan::{
-    Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed, UNTURNED,
+    Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
+    UNTURNED,
 };
+use densify_policies::policy::Signal;
 use densify_policies::rng::{PolicyRng, Purpose};
 
-use super::blocks::{plane, reorder};
+use super::blocks::{plane, planes, reorder};
 use super::moments::Moments;
 use super::parameters::Parameters;
 use super::signals::Accumulators;
@@ -39,6 +41,9 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
         if let Some(colour) = update.colour {
             model.params.set_n(row, plane::SH, colour.map(rgb_to_dc));
         }
+        if let Some(degree) = update.sh_degree {
+            model.drop_bands(row, degree);
+        }
         if !update.keep_moments {
             model.reborn(row);
         }
@@ -50,12 +55,15 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
         model.relocate(from as usize, to as usize);
     }
     model.reorder(&ops.order());
+    if let Some(decay) = ops.decay {
+        model.decay(decay, ops.rows_after);
+    }
     if let Some(most) = ops.clamp_opacity {
         for row in 0..ops.rows_after {
             let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
             model.params.set(row, plane::OPACITY, clamped);
             model.moments.forget(row, plane::OPACITY);
-            model.summed.forget_opacity(row);
+            model.summed.forget(row, plane::OPACITY);
         }
     }
     model.signals.reset(ops.reset_signals, model.threads, ops.rows_after);
@@ -135,6 +143,39 @@ impl Model<'_> {
         self.params.set(row, plane::OPACITY, logit);
     }
 
+    /// No colour beyond a degree, nor moments of it.
+    fn drop_bands(&mut self, row: usize, degree: u8) {
+        for plane in planes(degree)..self.params.planes() {
+            self.params.set(row, plane, 0.0);
+            self.moments.forget(row, plane);
+            self.summed.forget(row, plane);
+        }
+    }
+
+    fn decay(&mut self, decay: Decay, rows: usize) {
+        let seen = self.signals.planes().current(Signal::VisibleCount);
+        let shrunk = (1.0 - decay.scale).ln();
+        for row in 0..rows {
+            let was_seen = seen.is_some_and(|plane| self.signals.blocks.get(row, plane) > 0.0);
+            if decay.seen_only && !was_seen {
+                continue;
+            }
+            let was = self.params.get(row, plane::OPACITY);
+            // What is not finite is left to the audit, and no loss must not change a bit.
+            if decay.opacity > 0.0 && was.is_finite() {
+                let opacity = sigmoid(was);
+                let left = (opacity - decay.opacity).max(OPACITY_LEAST);
+                // 1 − o from the logit, so that nothing cancels.
+                let off = sigmoid(-was) + (opacity - left);
+                self.params.set(row, plane::OPACITY, was.min((left / off).ln()));
+            }
+            if decay.scale > 0.0 {
+                let scales = self.params.get_n::<3>(row, plane::LOG_SCALE).map(|x| x + shrunk);
+                self.params.set_n(row, plane::LOG_SCALE, scales);
+            }
+        }
+    }
+
     /// Zero moments, age 0, no past.
     fn reborn(&mut self, row: usize) {
         self.moments.clear_row(row);
@@ -175,6 +216,7 @@ fn scales_of(log_scale: [f32; 3], rule: ScaleRule) -> [f32; 3] {
             scales
         }
         ScaleRule::Axes(factors) => [0, 1, 2].map(|i| log_scale[i] + factors[i].ln()),
+        ScaleRule::Set(scale) => [scale.ln(); 3],
     }
 }
 

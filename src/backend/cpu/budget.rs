@@ -14,7 +14,7 @@ use super::simd::WIDTH;
 use super::summed::Summed;
 use super::tiles::{Grid, TileLists};
 use crate::backend::candidates::Candidates;
-use crate::backend::signals::Field;
+use crate::backend::signals::{Field, counts_dominant};
 use crate::backend::{BackendError, Setup};
 use crate::memory::{Ledger, Section};
 
@@ -60,6 +60,9 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         ledger.add_to(Section::Policy, "auxiliary views", bytes);
     }
     ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs));
+    if counts_dominant(needs) {
+        ledger.add_to(Section::Policy, "dominated pixels", 4 * budget as u64);
+    }
     ledger.add_to(
         Section::Policy,
         "candidates",

@@ -48,7 +48,7 @@ use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
 use super::candidates::{Candidates, error_weights};
-use super::signals::Field;
+use super::signals::{Field, counts_dominant};
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
     StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits, assert_same_size,
@@ -103,6 +103,9 @@ pub struct CpuBackend {
     summed: Summed,
     signals: Accumulators,
     candidates: Candidates,
+    /// Pixels that each row dominates in the view at hand. Shape: `[budget]`, or empty if they are not
+    /// counted.
+    dominant: Vec<AtomicU32>,
     /// Shape: `[budget]`.
     splats: Vec<Splat>,
     /// Bit per lane: on screen in the view at hand. Shape: `[blocks]`.
@@ -168,6 +171,11 @@ impl CpuBackend {
             summed: Summed::new(budget, per_row, options.needs.cadence),
             signals,
             candidates: Candidates::new(options.needs.candidates),
+            dominant: bytemuck::zeroed_vec(if counts_dominant(&options.needs) {
+                budget
+            } else {
+                0
+            }),
             splats: vec![Splat::default(); budget],
             visible: vec![0; blocks],
             lists: TileLists::new(budget, cap),

@@ -110,6 +110,7 @@ impl CpuBackend {
             self;
         let rows = *rows;
         let sums = &mut sums[..rows * STRIDE];
+        let dominant = &self.dominant;
         let is_seen = |row: usize| visible[row / WIDTH] >> (row % WIDTH) & 1 == 1;
         threads.install(|| {
             let visible = &visible[..rows.div_ceil(WIDTH)];
@@ -147,6 +148,7 @@ impl CpuBackend {
             AuxColumn::WeightSum => sums[row * STRIDE + 2],
             AuxColumn::DistanceSum => sums[row * STRIDE + 3],
             AuxColumn::WeightMax => sums[row * STRIDE + MAXIMUM],
+            AuxColumn::DominantPixels => dominant[row].load(Relaxed) as f32,
             AuxColumn::Depth => splats[row].depth,
             AuxColumn::Radius => radius(&splats[row]),
         };

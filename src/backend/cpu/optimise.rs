@@ -2,6 +2,8 @@
 //! live in the cache only; there is no gradient buffer of the model's size, unless a policy wants
 //! gradients summed between optimiser steps.
 
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
 use densify_policies::rng::PolicyRng;
 use pulp::{Simd, WithSimd};
 
@@ -34,6 +36,8 @@ pub(super) struct Optimise<'a> {
     /// Accumulators of these blocks; empty if no sum is requested.
     pub(super) signals: &'a mut [f32],
     pub(super) planes: SignalPlanes,
+    /// Pixels that each row dominates; empty if they are not counted. Shape: `[rows]`.
+    pub(super) dominant: &'a [AtomicU32],
     /// Shape: `[rows, layout.stride()]`.
     pub(super) sums: &'a [f32],
     pub(super) layout: RecordLayout,
@@ -80,6 +84,10 @@ impl WithSimd for Optimise<'_> {
             }
             if seen != 0 && signal_stride > 0 {
                 let block = &mut signals[b * signal_stride..(b + 1) * signal_stride];
+                let pixels = self.dominant.iter().skip(self.first_row + b * WIDTH);
+                for (to, pixels) in gradient.dominant.iter_mut().zip(pixels) {
+                    *to = pixels.load(Relaxed) as f32;
+                }
                 to.accumulate(s, block, &gradient, view);
             }
             if let Some(terms) = &terms {

@@ -75,6 +75,11 @@ impl Parameters {
         self.wide.held() + self.fixed.held() + self.half.held()
     }
 
+    /// Numbers per row.
+    pub(super) fn planes(&self) -> usize {
+        self.wide.planes() + self.fixed.planes() + self.half.planes()
+    }
+
     fn is_narrow(&self) -> bool {
         self.fixed.planes() > 0
     }

@@ -2,6 +2,7 @@
 //! work into tasks for the pool, at fixed places, and run the stages' kernels on them.
 
 use std::ops::Range;
+use std::sync::atomic::Ordering::Relaxed;
 
 use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode};
 use densify_policies::rng::PolicyRng;
@@ -83,8 +84,19 @@ impl CpuBackend {
         let view = ViewParams::new(camera, self.near, sh_degree.min(self.sh_degree));
         let blending = Blending::from(self.shortcuts);
         let Self {
-            threads, arch, lists, splats, visible: seen, params, canvas, rows, clock, ..
+            threads,
+            arch,
+            lists,
+            splats,
+            visible: seen,
+            params,
+            dominant,
+            canvas,
+            rows,
+            clock,
+            ..
         } = self;
+        let dominant = &dominant[..];
         clock.start();
         let (rows, arch) = (*rows, *arch);
         let params = &params.view(rows);
@@ -97,6 +109,9 @@ impl CpuBackend {
             let tasks = parts.into_par_iter().enumerate();
             let visible_rows = threads.sum("project", tasks, |(task, (splats, seen))| {
                 let (params, rows) = (params.task(task), splats.len());
+                for pixels in dominant.iter().skip(task * ROWS_PER_TASK).take(rows) {
+                    pixels.store(0, Relaxed);
+                }
                 let (view, log2_reach) = (&view, blending.log2_reach);
                 let lanes = &mut *seen;
                 arch.dispatch(Project { view, log2_reach, params, rows, splats, seen: lanes });
@@ -117,6 +132,7 @@ impl CpuBackend {
                         place: TilePlace::new(&grid, band.start + i),
                         background,
                         with_depth,
+                        dominant,
                         blending,
                         canvas,
                     });
@@ -297,6 +313,7 @@ impl CpuBackend {
     /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
     pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
         let Self { threads, arch, params, moments, ages, signals, sums, visible, bias, .. } = self;
+        let dominant = &self.dominant[..self.rows.min(self.dominant.len())];
         let (rows, arch) = (self.rows, *arch);
         let terms = Terms::new(input.loss_terms, rows);
         let noise = input.noise.map(|term| Noise::new(term, input));
@@ -329,6 +346,7 @@ impl CpuBackend {
                         ages,
                         signals,
                         planes,
+                        dominant,
                         sums,
                         layout,
                         visible,

@@ -39,6 +39,8 @@ pub(super) struct BlockGradient {
     pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],
     /// 1 for visible rows, 0 for others.
     pub(super) visible: [f32; WIDTH],
+    /// Pixels in which the row has the largest blend weight, where they are counted.
+    pub(super) dominant: [f32; WIDTH],
 }
 
 impl BlockGradient {
@@ -49,6 +51,7 @@ impl BlockGradient {
         inv_z: [0.0; WIDTH],
         sums: [[0.0; WIDTH]; RecordLayout::MOST],
         visible: [0.0; WIDTH],
+        dominant: [0.0; WIDTH],
     };
 
     /// Differentiates the rows of `block` that are set in `visible`; the others get 0.

@@ -9,14 +9,14 @@
 //! move by a constant each. A bit per patch says whether the splat reaches it, another whether any of
 //! its pixels still takes light.
 
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
 use super::project::Splat;
 use super::simd::{V, WIDTH, each};
-use super::tiles::{Grid, TILE};
+use super::tiles::{Entry, Grid, TILE};
 use crate::backend::Shortcuts;
 
 /// Largest alpha: keeps 1 − alpha, and so the transmittance, recoverable.
@@ -144,6 +144,9 @@ pub(super) struct Rasterize<'a> {
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) with_depth: bool,
+    /// Pixels of each row in which none has a larger blend weight, to which the tile adds its own; empty
+    /// if they are not counted. Whole numbers, so that it does not matter which tile is first.
+    pub(super) dominant: &'a [AtomicU32],
     pub(super) blending: Blending,
     pub(super) canvas: &'a mut TileCanvas,
 }
@@ -153,7 +156,8 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        match self.with_depth {
+        // One kernel for all that is rarely wanted.
+        match self.with_depth || !self.dominant.is_empty() {
             true => self.run::<S, true>(s),
             false => self.run::<S, false>(s),
         }
@@ -162,8 +166,8 @@ impl WithSimd for Rasterize<'_> {
 
 impl Rasterize<'_> {
     #[inline(always)]
-    fn run<S: Simd, const WITH_DEPTH: bool>(self, s: S) {
-        let Self { splats, list, place, background, canvas, blending, .. } = self;
+    fn run<S: Simd, const WITH_MORE: bool>(self, s: S) {
+        let Self { splats, list, place, background, dominant, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));
@@ -180,6 +184,9 @@ impl Rasterize<'_> {
         for (stop, light) in stop.as_flattened_mut().iter_mut().zip(light.as_flattened()) {
             *stop = if *light > 0.0 { u32::MAX } else { 0 };
         }
+        // The largest weight of each pixel, and the place of its splat in the list.
+        let mut largest = Aligned(DARK);
+        let mut largest_at = [[0_u32; WIDTH]; PATCHES];
         let mut batch = Batch::new();
         for (n, chunk) in list.chunks(BATCH).enumerate() {
             if alive == 0 {
@@ -202,6 +209,8 @@ impl Rasterize<'_> {
                         V::load(s, &blue[p][at..]),
                     ];
                     let mut at_depth = V::load(s, &depth[p][at..]);
+                    let mut most = V::load(s, &largest.0[p][at..]);
+                    let mut most_at = S::as_simd_u32s(&largest_at[p][at..]).0[0];
                     let mut todo = reached;
                     while todo != 0 {
                         // 32 bits; saying so again spares every load its bounds check.
@@ -228,8 +237,11 @@ impl Rasterize<'_> {
                         }
                         let w = alpha * t;
                         colour = each!(k in 3 => w.mul_add(c(splat.colour[k]), colour[k]));
-                        if WITH_DEPTH {
+                        if WITH_MORE {
                             at_depth = w.mul_add(c(splat.depth), at_depth);
+                            let here = s.splat_u32s((n * BATCH + i) as u32);
+                            most_at = most.lt(w).select_u32s(here, most_at);
+                            most = most.max(w);
                         }
                         t = next;
                     }
@@ -237,8 +249,10 @@ impl Rasterize<'_> {
                     colour[0].store(&mut red[p][at..]);
                     colour[1].store(&mut green[p][at..]);
                     colour[2].store(&mut blue[p][at..]);
-                    if WITH_DEPTH {
+                    if WITH_MORE {
                         at_depth.store(&mut depth[p][at..]);
+                        most.store(&mut largest.0[p][at..]);
+                        S::as_mut_simd_u32s(&mut largest_at[p][at..]).0[0] = most_at;
                     }
                     takes_light |= zero.lt(t).any();
                 }
@@ -254,6 +268,13 @@ impl Rasterize<'_> {
                 blend(s, t, c(background[0]), &mut red[p][at..]);
                 blend(s, t, c(background[1]), &mut green[p][at..]);
                 blend(s, t, c(background[2]), &mut blue[p][at..]);
+            }
+        }
+        if WITH_MORE && !dominant.is_empty() {
+            let pixels = largest.0.as_flattened().iter().zip(largest_at.as_flattened());
+            for (_, &at) in pixels.filter(|(weight, _)| **weight > 0.0) {
+                let row = Entry::load(&list[at as usize]).row;
+                dominant[row].fetch_add(1, Relaxed);
             }
         }
     }

@@ -1,6 +1,6 @@
 //! Stage 8: the signals that policies ask for, accumulated over views. Only requested signals have memory.
 
-use densify_policies::policy::{Needs, Signal, SignalKind, SignalSet, Signals};
+use densify_policies::policy::{Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet, Signals};
 use pulp::Simd;
 use rayon::prelude::*;
 
@@ -12,7 +12,7 @@ use super::rasterize_bwd::field;
 use super::simd::{V, WIDTH, each};
 use super::threads::Threads;
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
-use crate::backend::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes};
+use crate::backend::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes, as_read};
 
 /// The accumulators of the requested signals.
 #[derive(Debug)]
@@ -42,6 +42,8 @@ impl SignalPlanes {
         g: &BlockGradient,
         view: &ViewParams,
     ) {
+        let focal = 0.5 * (view.focal[0] + view.focal[1]);
+        let per_pixel = 1.0 / (view.width * view.height) as f32;
         let half = [V::splat(s, 0.5 * view.width as f32), V::splat(s, 0.5 * view.height as f32)];
         for at in (0..WIDTH).step_by(S::F32_LANES) {
             macro_rules! line {
@@ -59,6 +61,7 @@ impl SignalPlanes {
             let one = V::splat(s, 1.0);
             let depth = (one / (line!(g.inv_z) * self.full_depth)).min(one);
             let weight = depth * depth;
+            let seen = V::zero(s).lt(line!(g.visible));
             for signal in Signal::ALL {
                 let Some(plane) = self.current(signal) else { continue };
                 let x = match signal {
@@ -81,6 +84,13 @@ impl SignalPlanes {
                     Signal::WeightSum => sum!(Field::WeightSum.number()),
                     Signal::PixelCount => sum!(Field::PixelCount.number()),
                     Signal::WeightedError => sum!(Field::Error.number()),
+                    Signal::WeightMaxRoot => sum!(Field::WeightMax.number()).sqrt(),
+                    Signal::Support => {
+                        V::splat(s, SUPPORT_WEIGHT).le(sum!(Field::WeightMax.number())).keep(one)
+                    }
+                    Signal::DepthMin => seen.keep(line!(g.inv_z)),
+                    Signal::PixelSizeMin => seen.keep(line!(g.inv_z) * focal),
+                    Signal::DominantPixels => line!(g.dominant) * per_pixel,
                     // Of the row as it is when it is read.
                     Signal::Opacity
                     | Signal::ScaleMax
@@ -93,8 +103,8 @@ impl SignalPlanes {
                 };
                 let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
                 let was = V::load(s, to);
-                let is_maximum = matches!(signal.kind(), SignalKind::EpochMaximum);
-                (if is_maximum { was.max(x) } else { was + x }).store(to);
+                let is_sum = matches!(signal.kind(), SignalKind::Sum | SignalKind::Count);
+                (if is_sum { was + x } else { was.max(x) }).store(to);
             }
         }
     }
@@ -170,7 +180,7 @@ impl Accumulators {
                     return present(signal, row, params, ages);
                 }
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
-                parts.reduce(f32::max).unwrap_or(0.0)
+                as_read(signal, parts.reduce(f32::max).unwrap_or(0.0))
             };
             let of_row = |row: usize, numbers: &mut [f32]| match &attribute {
                 Some(attribute) => {

@@ -196,10 +196,10 @@ impl Summed {
         }
     }
 
-    /// As the opacity's moments are forgotten.
-    pub(super) fn forget_opacity(&mut self, row: usize) {
-        if self.first == 0 && self.planes() > 0 {
-            self.sums.set(row, plane::OPACITY, 0.0);
+    /// As the moments of a parameter are forgotten.
+    pub(super) fn forget(&mut self, row: usize, plane: usize) {
+        if let Some(summed) = plane.checked_sub(self.first).filter(|&p| p < self.planes()) {
+            self.sums.set(row, summed, 0.0);
         }
     }
 }

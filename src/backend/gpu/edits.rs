@@ -1,7 +1,10 @@
 //! Executes a compiled plan on the device, in place: encodes its operations as numbers, in chunks of
 //! fixed size, and dispatches them. `shaders/apply.wgsl` says what the numbers mean.
 
-use densify_policies::plan::{OpacityRule, ParentFate, Placement, RowOps, ScaleRule};
+use densify_policies::plan::{
+    Decay, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Update,
+};
+use densify_policies::policy::Signal;
 
 use super::GpuBackend;
 use super::frame::folded_seed;
@@ -9,7 +12,7 @@ use super::launches::{Launch, RowLaunch};
 use super::passes::Recorder;
 use super::rows::Edited;
 use super::sizes::OPS_BYTES;
-use crate::gaussians::{logit, rgb_to_dc};
+use crate::gaussians::{ModelArray, logit, rgb_to_dc};
 
 /// Numbers that fit one chunk.
 const CHUNK: usize = (OPS_BYTES / 4) as usize;
@@ -23,6 +26,7 @@ fn scale_words(rule: ScaleRule) -> [u32; 4] {
         ScaleRule::Uniform(factor) => (0, [factor, 1.0, 1.0]),
         ScaleRule::LongAxis { long, other } => (1, [long, other, 1.0]),
         ScaleRule::Axes(factors) => (2, factors),
+        ScaleRule::Set(scale) => (3, [scale, 1.0, 1.0]),
     };
     let [a, b, c] = factors.map(|factor| factor.ln().to_bits());
     [rule, a, b, c]
@@ -203,6 +207,17 @@ impl GpuBackend {
         }
     }
 
+    /// Clears the colour of rows beyond their degree, and the moments of it.
+    fn drop_bands(&self, updates: &[(u32, Update)]) {
+        for degree in 0..self.sizes.sh_degree {
+            let of_degree = updates.iter().filter(|(_, u)| u.sh_degree == Some(degree));
+            let rows: Vec<_> = of_degree.map(|&(row, _)| [NOTHING, row]).collect();
+            let last = ModelArray::Sh.parameters(degree).end;
+            let arrays = self.launches.copy_rows.iter();
+            self.for_pairs(&rows, arrays.filter(|array| array.first_parameter >= last));
+        }
+    }
+
     /// Executes a plan that holds, in the order of [`RowOps`].
     pub(super) fn edit(&mut self, ops: &RowOps, seed: u64, step: u32) {
         let launches = &self.launches;
@@ -239,6 +254,7 @@ impl GpuBackend {
             })
             .collect();
         self.run_ops(launches.get("rewrite"), &updates);
+        self.drop_bands(&ops.updates);
         reborn.extend(ops.updates.iter().filter(|(_, u)| !u.keep_moments).map(|u| clear(u.0)));
         let seeded: Vec<_> = ops.seeds.iter().map(|&(row, _)| clear(row)).collect();
         self.copy_rows(&seeded, &[Edited::Inherited]);
@@ -262,6 +278,9 @@ impl GpuBackend {
         let moves: Vec<_> = ops.moves.iter().map(|&(from, to)| [from, to]).collect();
         self.copy_rows(&moves, &[Edited::Computed, Edited::Inherited, Edited::Cleared]);
         self.reorder(&ops.order());
+        if let Some(decay) = ops.decay {
+            self.decay(decay, ops.rows_after as u32);
+        }
         if let Some(most) = ops.clamp_opacity {
             let rows = ops.rows_after as u32;
             let waits = u32::from(self.sizes.waits()[0]);
@@ -270,6 +289,14 @@ impl GpuBackend {
         }
         self.clear_planes(&self.planes.of_all(ops.reset_signals));
         self.rows = ops.rows_after;
+    }
+
+    fn decay(&self, decay: Decay, rows: u32) {
+        let seen = self.planes.current(Signal::VisibleCount).filter(|_| decay.seen_only);
+        let seen = seen.map_or(NOTHING, |plane| (plane as u64 * self.sizes.budget) as u32);
+        let shrunk = (1.0 - decay.scale).ln();
+        let now = [rows, decay.opacity.to_bits(), shrunk.to_bits(), seen];
+        self.execute(&[0], |to| to.run(self.launches.get("decay"), now, rows.div_ceil(256)));
     }
 
     /// Sets planes of the signals to 0.

@@ -38,6 +38,8 @@ pub(super) struct Launches<L = Launch> {
     pub(super) record: u32,
     /// Whether the device adds up in slots: it gathers, and has no sums to clear.
     pub(super) in_slots: bool,
+    /// Whether pixels are counted for the row that dominates them.
+    pub(super) counts_dominant: bool,
     /// Copies or clears rows, for every array that an edit touches.
     pub(super) copy_rows: Vec<RowLaunch<L>>,
     /// Exchanges rows, for the same arrays.
@@ -51,6 +53,8 @@ pub(super) struct Launches<L = Launch> {
 pub(super) struct RowLaunch<L> {
     pub(super) launch: L,
     pub(super) edited: Edited,
+    /// The first of the parameters that the numbers belong to; 0 where they belong to none.
+    pub(super) first_parameter: usize,
     pub(super) numbers: u32,
     pub(super) pitch: [u32; 2],
 }
@@ -125,6 +129,7 @@ impl<L> Launches<L> {
                 .collect(),
             record: sizes.records.stride() as u32,
             in_slots: sizes.accumulation == Accumulation::Slots,
+            counts_dominant: sizes.dominant,
             copy_rows: of_rows("copy_rows", bind, sizes),
             swap_rows: of_rows("swap_rows", bind, sizes),
             audits: audits(bind, sizes),
@@ -199,6 +204,7 @@ fn of_rows<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L
     let launch = |array: &RowArray| RowLaunch {
         launch: bind(kernel, &[("buffer", array.name)]),
         edited: array.holds.traits().edited,
+        first_parameter: array.parameters.start,
         numbers: array.numbers as u32,
         pitch: array.pitch(sizes.budget),
     };

@@ -41,7 +41,7 @@ use densify_policies::plan::RowOps;
 use densify_policies::policy::{Cadence, Candidate, SignalKind, SignalSet, Signals};
 
 use super::candidates::Candidates;
-use super::signals::{ParameterSignal, SignalPlanes};
+use super::signals::{ParameterSignal, SignalPlanes, as_read};
 use super::{
     AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts,
     StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
@@ -195,8 +195,9 @@ fn launches(
     shortcuts: Shortcuts,
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
-    let &Sizes { records, more, accumulation, .. } = sizes;
-    let pipelines = device.pipelines(Variant { records, more, shortcuts, accumulation })?;
+    let &Sizes { records, more, accumulation, dominant, .. } = sizes;
+    let variant = Variant { records, more, shortcuts, accumulation, dominant };
+    let pipelines = device.pipelines(variant)?;
     device.guarded("the kernels", 0, |device| Launches::bound(device, &pipelines, buffers, sizes))
 }
 
@@ -245,7 +246,10 @@ impl Backend for GpuBackend {
                     planes.map(|plane| self.column(plane, 0..self.rows)).collect();
                 let most =
                     |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect();
-                columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows])
+                let mut kept =
+                    columns?.into_iter().reduce(most).unwrap_or_else(|| vec![0.0; self.rows]);
+                kept.iter_mut().for_each(|value| *value = as_read(signal, *value));
+                kept
             };
             if let Some(column) = signals.get_mut(signal) {
                 column.copy_from_slice(&values);

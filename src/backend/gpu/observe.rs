@@ -197,6 +197,8 @@ impl GpuBackend {
         let sums = self.read("row sums", 0, 20 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
+        let counted = if self.sizes.dominant { n } else { 0 };
+        let dominant = self.read("dominant", 0, 4 * counted)?;
         let value = |column: AuxColumn, row: usize| {
             if depths[row].to_bits() == u32::MAX {
                 return 0.0;
@@ -207,6 +209,7 @@ impl GpuBackend {
                 AuxColumn::WeightSum => sums[5 * row + 2],
                 AuxColumn::DistanceSum => sums[5 * row + 3],
                 AuxColumn::WeightMax => sums[5 * row + 4],
+                AuxColumn::DominantPixels => dominant[row].to_bits() as f32,
                 AuxColumn::Depth => depths[row],
                 AuxColumn::Radius => {
                     let [_, _, l1, shear, l3] = [0, 1, 2, 3, 4].map(|i| splats[12 * row + i]);

@@ -118,6 +118,9 @@ impl Passes<'_> {
         let l = self.launches;
         let Shape { rows, bands, .. } = self.shape;
         to.run(l.get("project"), [0; 4], rows.div_ceil(256));
+        if l.counts_dominant {
+            to.run(l.get("clear_dominant"), [0; 4], rows.div_ceil(256));
+        }
         to.run(l.get("scan_blocks"), [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
         to.run(l.get("scan_sums"), [FLAGS, bands, 0, 0], 1);
         to.run(l.get("compact"), [0; 4], rows.div_ceil(256));

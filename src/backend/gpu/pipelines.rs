@@ -18,6 +18,8 @@ pub(super) struct Variant {
     pub(super) more: bool,
     pub(super) shortcuts: Shortcuts,
     pub(super) accumulation: Accumulation,
+    /// Whether pixels are counted for the row that dominates them.
+    pub(super) dominant: bool,
 }
 
 impl Variant {
@@ -26,6 +28,7 @@ impl Variant {
         let mut all = vec![
             ("RECORD".to_owned(), self.records.stride() as f64),
             ("MORE".to_owned(), f64::from(u8::from(self.more))),
+            ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.dominant))),
             ("ALPHA_MIN".to_owned(), f64::from(self.shortcuts.alpha_min)),
             ("LOG2_REACH".to_owned(), f64::from(self.shortcuts.log2_reach())),
             ("TRANSMITTANCE_MIN".to_owned(), f64::from(self.shortcuts.transmittance_min)),

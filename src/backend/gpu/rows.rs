@@ -37,6 +37,8 @@ pub(super) enum Holds {
     Signals,
     /// What projection and tile lists know of a row in the view at hand.
     Projected,
+    /// Pixels that a row dominates in the view at hand.
+    Dominated,
     /// Gradients of splats, summed over the view at hand.
     SplatGradients,
     /// Gradients by parameters in the view at hand.
@@ -86,6 +88,7 @@ impl Holds {
             Self::Ages => (Section::Model, "optimiser ages and bias tables", Cleared, true, None),
             Self::Signals => (Section::Policy, "signals", Cleared, false, None),
             Self::Projected => (Section::Renderer, "projected splats", Untouched, false, None),
+            Self::Dominated => (Section::Policy, "dominated pixels", Untouched, false, None),
             Self::SplatGradients => (Section::Gradients, "splat gradients", Untouched, false, None),
             Self::RowGradients => (Section::Gradients, "row gradients", Untouched, false, None),
         };
@@ -121,12 +124,12 @@ impl RowArray {
 }
 
 /// Every array of a model of this degree; `waits`: whether gradients of the geometry and of band 0,
-/// and those of bands 1–3, may wait for a step; planes of signals; fields of a record.
+/// and those of bands 1–3, may wait for a step; planes of signals, fields of a record, and counts of
+/// pixels that a row dominates.
 pub(super) fn row_arrays(
     sh_degree: u8,
     waits: [bool; 2],
-    planes: usize,
-    fields: usize,
+    [planes, fields, counts]: [usize; 3],
 ) -> Vec<RowArray> {
     let geometry = 0..ModelArray::Sh.parameters(sh_degree).start;
     let band = |band: usize| {
@@ -161,6 +164,7 @@ pub(super) fn row_arrays(
         ("slots of row", 2, Holds::Projected),
         ("row sums", fields, Holds::SplatGradients),
         ("gradient", GRADIENT, Holds::RowGradients),
+        ("dominant", counts, Holds::Dominated),
     ];
     let unlike_parameters =
         |(name, numbers, holds)| RowArray { name, numbers, holds, parameters: 0..0 };
@@ -170,6 +174,6 @@ pub(super) fn row_arrays(
 
 /// Most bytes per row of any one array of a model of this degree, whatever the policy needs.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
-    let arrays = row_arrays(sh_degree, [false; 2], 0, 0);
+    let arrays = row_arrays(sh_degree, [false; 2], [0; 3]);
     arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)
 }

@@ -7,7 +7,7 @@ use super::frame::{Frame, State, grid};
 use super::rows::{Holds, RowArray, row_arrays};
 use crate::backend::Accumulation;
 use crate::backend::KeptPhotographs;
-use crate::backend::signals::{Field, RecordLayout, SignalPlanes};
+use crate::backend::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
 use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, Section};
 
@@ -39,6 +39,8 @@ pub(super) struct Sizes {
     /// Whether gradients of alpha and depth are given as well.
     pub(super) more: bool,
     pub(super) cadence: Cadence,
+    /// Whether pixels are counted for the row that dominates them.
+    pub(super) dominant: bool,
     pub(super) with_error: bool,
 }
 
@@ -72,6 +74,7 @@ impl Sizes {
             accumulation,
             more: false,
             cadence: needs.cadence,
+            dominant: counts_dominant(needs),
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
         }
     }
@@ -84,7 +87,8 @@ impl Sizes {
 
     /// Every array with an entry per row.
     pub(super) fn row_arrays(&self) -> Vec<RowArray> {
-        row_arrays(self.sh_degree, self.waits(), self.planes, self.records.stride())
+        let others = [self.planes, self.records.stride(), usize::from(self.dominant)];
+        row_arrays(self.sh_degree, self.waits(), others)
     }
 
     /// The arrays that hold the model.

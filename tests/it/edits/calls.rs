@@ -1,8 +1,8 @@
 //! Any calls of a plan, sensible or not.
 
 use densify_policies::plan::{
-    EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed, UNTURNED,
-    Update,
+    Decay, EditPlan, Offspring, OpacityRule, ParentFate, Placement, Reset, ScaleRule, Seed,
+    UNTURNED, Update,
 };
 use proptest::prelude::*;
 
@@ -15,6 +15,7 @@ pub(super) enum Call {
     Grow(u32, Offspring),
     Update(u32, Update),
     Append(Seed),
+    Decay(Decay),
     Clamp(f32),
     Reset,
 }
@@ -34,6 +35,7 @@ fn scale_rule() -> impl Strategy<Value = ScaleRule> {
         factor().prop_map(ScaleRule::Uniform),
         (factor(), factor()).prop_map(|(long, other)| ScaleRule::LongAxis { long, other }),
         prop::array::uniform3(factor()).prop_map(ScaleRule::Axes),
+        (0.01_f32..0.3).prop_map(ScaleRule::Set),
     ]
 }
 
@@ -66,15 +68,22 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
     // Some beyond the last row, whatever the plan before has left.
     let row = || 0..ROWS as u32 + 12;
     let maybe = || prop::option::of(prop::array::uniform3(-0.5_f32..1.5));
-    let update = (opacity_rule(), scale_rule(), maybe(), maybe(), any::<bool>()).prop_map(
-        |(opacity, scale, position, colour, keep_moments)| Update {
+    let degree = prop::option::of(0..2_u8);
+    let update = (opacity_rule(), scale_rule(), maybe(), maybe(), degree, any::<bool>()).prop_map(
+        |(opacity, scale, position, colour, sh_degree, keep_moments)| Update {
             opacity,
             scale,
             position,
             colour,
+            sh_degree,
             keep_moments,
         },
     );
+    let restart = (0.01_f32..0.3, 0.01_f32..0.99);
+    let restart = restart.prop_map(|(scale, opacity)| Update::restart(scale, opacity));
+    let update = prop_oneof![3 => update, 1 => restart];
+    let decay = (0.0_f32..0.3, 0.0_f32..0.3, any::<bool>());
+    let decay = decay.prop_map(|(opacity, scale, seen_only)| Decay { opacity, scale, seen_only });
     let unit = || prop::array::uniform3(0.0_f32..1.0);
     let scales = prop::array::uniform3(0.01_f32..0.3);
     let seed = (unit(), unit(), scales, quaternion(), 0.01_f32..0.99).prop_map(
@@ -91,6 +100,7 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
         8 => (row(), offspring()).prop_map(|(row, how)| Call::Grow(row, how)),
         4 => (row(), update).prop_map(|(row, how)| Call::Update(row, how)),
         4 => seed.prop_map(Call::Append),
+        1 => decay.prop_map(Call::Decay),
         1 => (0.05_f32..0.9).prop_map(Call::Clamp),
         1 => Just(Call::Reset),
     ]
@@ -103,6 +113,7 @@ pub(super) fn enter(plan: &mut EditPlan, call: &Call) -> bool {
         Call::Grow(row, how) => plan.grow(row, how),
         Call::Update(row, how) => plan.update(row, how),
         Call::Append(seed) => plan.append(seed),
+        Call::Decay(how) => plan.decay(how),
         Call::Clamp(max) => plan.clamp_opacity(max),
         Call::Reset => {
             plan.reset(Reset::Signals);

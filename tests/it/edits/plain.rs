@@ -1,11 +1,13 @@
 //! The plain vector: one struct per row, executed by the words of the plan's documentation.
 
-use densify_policies::plan::{Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
+use densify_policies::plan::{
+    Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed,
+};
 use densify_policies::rng::{PolicyRng, Purpose};
 use glam::{DQuat, DVec3};
 
-use super::SIGNALS;
 use super::calls::Call;
+use super::{SEEN, SIGNALS};
 
 /// One row as the plain vector has it.
 #[derive(Debug, Clone)]
@@ -20,6 +22,8 @@ pub(super) struct Row {
     pub(super) moments: Option<usize>,
     /// Whether the opacity's moments are zero, whatever the others are.
     pub(super) opacity_rests: bool,
+    /// Coefficients from here on have zero moments, whatever the others have.
+    pub(super) sh_rests_from: usize,
 }
 
 fn sigmoid(logit: f32) -> f64 {
@@ -46,14 +50,18 @@ fn unfold(quat: DQuat) -> [f32; 4] {
 impl Row {
     fn rescale(&mut self, rule: ScaleRule) {
         let long_axis = longest(self.log_scale);
-        for (axis, scale) in self.log_scale.iter_mut().enumerate() {
+        for (axis, value) in self.log_scale.iter_mut().enumerate() {
             let factor = match rule {
                 ScaleRule::Uniform(factor) => factor,
                 ScaleRule::LongAxis { long, .. } if axis == long_axis => long,
                 ScaleRule::LongAxis { other, .. } => other,
                 ScaleRule::Axes(factors) => factors[axis],
+                ScaleRule::Set(scale) => {
+                    *value = scale.ln();
+                    continue;
+                }
             };
-            *scale = (f64::from(*scale) + f64::from(factor).ln()) as f32;
+            *value = (f64::from(*value) + f64::from(factor).ln()) as f32;
         }
     }
 
@@ -65,6 +73,15 @@ impl Row {
             OpacityRule::Scaled(factor) => logit(opacity * f64::from(factor)),
             OpacityRule::Conserved => logit(1.0 - (1.0 - opacity).powf(1.0 / f64::from(siblings))),
         };
+    }
+
+    fn wither(&mut self, how: Decay) {
+        if how.opacity > 0.0 {
+            let least = f64::from(OPACITY_LEAST);
+            let left = logit((sigmoid(self.logit) - f64::from(how.opacity)).max(least));
+            self.logit = self.logit.min(left);
+        }
+        self.rescale(ScaleRule::Uniform(1.0 - how.scale));
     }
 
     /// Zero moments, age 0, no past.
@@ -124,6 +141,7 @@ impl Row {
             signals: [0.0; SIGNALS.len()],
             moments: None,
             opacity_rests: false,
+            sh_rests_from: usize::MAX,
         };
         sown.paint(seed.colour);
         sown
@@ -137,6 +155,7 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
     let mut children: Vec<Vec<Row>> = vec![Vec::new(); before.len()];
     let mut seeds = Vec::new();
     let mut clamp = f32::INFINITY;
+    let mut decay = None;
     let mut reset = false;
     for call in calls {
         match call {
@@ -153,6 +172,11 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
                 let mut updated = before[*row as usize].clone();
                 updated.rescale(how.scale);
                 updated.cover(how.opacity, 1);
+                if let Some(degree) = how.sh_degree {
+                    let kept = 3 * (usize::from(degree) + 1).pow(2);
+                    updated.sh.iter_mut().skip(kept).for_each(|coefficient| *coefficient = 0.0);
+                    updated.sh_rests_from = updated.sh_rests_from.min(kept);
+                }
                 updated.mean = how.position.unwrap_or(updated.mean);
                 if let Some(colour) = how.colour {
                     updated.paint(colour);
@@ -161,6 +185,7 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
                     Some(if how.keep_moments { updated } else { updated.reborn() });
             }
             Call::Append(seed) => seeds.push(Row::sown(seed)),
+            Call::Decay(how) => decay = Some(*how),
             Call::Clamp(max) => clamp = clamp.min(*max),
             Call::Reset => reset = true,
         }
@@ -171,12 +196,16 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
     model.extend(seeds);
     assert!(model.len() <= budget, "{} rows, budget {budget}", model.len());
     for row in &mut model {
+        if let Some(how) = decay.filter(|how| !how.seen_only || row.signals[SEEN] > 0.0) {
+            row.wither(how);
+        }
         if clamp < 1.0 {
             row.logit = row.logit.min(logit(f64::from(clamp)));
             row.opacity_rests = true;
         }
         if reset {
             row.signals[0] = 0.0;
+            row.signals[SEEN] = 0.0;
         }
     }
     model

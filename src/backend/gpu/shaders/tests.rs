@@ -76,6 +76,7 @@ fn every_override_has_a_value_and_every_signal_a_number() {
         more: true,
         shortcuts: Shortcuts::default(),
         accumulation: Accumulation::Slots,
+        dominant: true,
     };
     let constants: BTreeSet<String> =
         variant.constants().into_iter().map(|(name, _)| name).collect();
