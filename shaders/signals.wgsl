@@ -11,6 +11,8 @@
 @group(0) @binding(7) var<storage, read> rows: array<f32>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
 // Pixels that the row dominates, where they are counted.
+// Logits of masks, counted from where they began, where there are masks.
+@group(0) @binding(10) var<storage, read> mask_offsets: array<f32>;
 @group(0) @binding(9) var<storage, read> dominant: array<u32>;
 
 const FOLD: f32 = 0.8493218;
@@ -38,6 +40,7 @@ override DOMINANT_PIXELS: u32;
 override OPACITY: u32;
 override SCALE_MAX: u32;
 override SCALE_PRODUCT: u32;
+override MASK: u32;
 override AGE: u32;
 
 fn plane(signal: u32) -> u32 {
@@ -137,8 +140,14 @@ fn norm3(v: vec3<f32>) -> f32 {
     return most * sqrt(dot(scaled, scaled));
 }
 
+fn sigmoid(x: f32) -> f32 {
+    let e = exp_exact(-abs(x));
+    return select(e, 1.0, x >= 0.0) / (1.0 + e);
+}
+
 // Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal,
-// now.b: the number of rows, as no view need have been rendered yet.
+// now.b: the number of rows, as no view need have been rendered yet, now.c: bits of the logit at which masks
+// begin.
 @compute @workgroup_size(256)
 fn present(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -152,8 +161,9 @@ fn present(
     let logit = rows[12u * row + 10u];
     var value = 0.0;
     if now.a == OPACITY {
-        let e = exp_exact(-abs(logit));
-        value = select(e, 1.0, logit >= 0.0) / (1.0 + e);
+        value = sigmoid(logit);
+    } else if now.a == MASK {
+        value = sigmoid(bitcast<f32>(now.c) + mask_offsets[row]);
     } else if now.a == SCALE_MAX {
         value = exp_exact(max(max(s.x, s.y), s.z));
     } else if now.a == SCALE_PRODUCT {

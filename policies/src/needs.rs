@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::signals::{AuxColumn, SignalSet};
+use crate::signals::{AuxColumn, Signal, SignalSet};
 
 /// What a policy reads, and how it wants the model initialised and trained.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -30,6 +30,8 @@ pub struct Needs {
     /// Noise on the means after each optimiser step, unless the policy has
     /// [another](crate::policy::DensityPolicy::noise) for a step.
     pub noise: Option<NoiseTerm>,
+    /// A number per row that learns whether the row is worth its place, if any.
+    pub mask: Option<MaskTerm>,
     /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
     /// summed between optimiser steps, and the sums need memory.
     pub cadence: Cadence,
@@ -52,6 +54,18 @@ impl Needs {
         finite("full_depth", self.full_depth.into(), 0.0)?;
         self.loss_terms.check()?;
         self.noise.map_or(Ok(()), |noise| noise.check())?;
+        match &self.mask {
+            Some(mask) => {
+                mask.check()?;
+                if self.cadence.all > 1 {
+                    return Err("masks step with every view: cadence.all must be 1".to_owned());
+                }
+            }
+            None if self.signals.contains(Signal::Mask) => {
+                return Err("the signal Mask is declared, but no mask".to_owned());
+            }
+            None => {}
+        }
         if let Some(aux) = &self.aux {
             finite("aux.map.error", aux.map.error.into(), 0.0)?;
             finite("aux.map.edge", aux.map.edge.into(), 0.0)?;
@@ -185,6 +199,40 @@ impl NoiseTerm {
         finite("noise.strength", self.strength.into(), 0.0)?;
         finite("noise.sharpness", self.sharpness.into(), 0.0)?;
         finite("noise.opacity", self.opacity.into(), 0.0)
+    }
+}
+
+/// A trained mask per row (*Compact 3D Gaussian Representation*, Lee et al. 2024, section 3.1). A row
+/// renders with its opacity and its scales times 1\[σ(m) > `threshold`\], whose derivative by m is taken to
+/// be that of σ(m), and `weight` · mean σ(m) is added to the loss. A row whose mask falls to the threshold
+/// becomes transparent for good, also in what is saved; that the policy prunes it is for the policy to do.
+///
+/// m steps by Adam with every view. A newborn row has its parent's mask.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct MaskTerm {
+    /// m at first.
+    pub start: f32,
+    /// Step size of m, > 0.
+    pub rate: f32,
+    /// Coefficient of the mean of σ(m) over rows, >= 0.
+    pub weight: f32,
+    /// In (0, 1).
+    pub threshold: f32,
+}
+
+impl MaskTerm {
+    fn check(&self) -> Result<(), String> {
+        above_zero("mask.rate", self.rate.into())?;
+        finite("mask.weight", self.weight.into(), 0.0)?;
+        if !(self.threshold > 0.0 && self.threshold < 1.0) {
+            let threshold = self.threshold;
+            return Err(format!("mask.threshold is {threshold}; it must be between 0 and 1"));
+        }
+        // Beyond it σ(m) is 0 or 1 and has no derivative.
+        if !(self.start.abs() <= 20.0) {
+            return Err(format!("mask.start is {}; it must be from -20 to 20", self.start));
+        }
+        Ok(())
     }
 }
 
@@ -344,6 +392,8 @@ mod tests {
     fn numbers_out_of_range_are_refused() {
         assert_eq!(Needs::default().check(), Ok(()));
         let noise = NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 };
+        let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
+        assert_eq!(Needs { mask: Some(mask), ..Needs::default() }.check(), Ok(()));
         let fade =
             |from, to| RateOverrides { fade: Some(Fade { from, to }), ..RateOverrides::default() };
         let wrong = [
@@ -353,6 +403,12 @@ mod tests {
                 noise: Some(NoiseTerm { strength: f32::INFINITY, ..noise }),
                 ..Needs::default()
             },
+            Needs { signals: SignalSet::from([Signal::Mask]), ..Needs::default() },
+            Needs { mask: Some(MaskTerm { start: f32::NAN, ..mask }), ..Needs::default() },
+            Needs { mask: Some(MaskTerm { rate: 0.0, ..mask }), ..Needs::default() },
+            Needs { mask: Some(MaskTerm { weight: -1.0, ..mask }), ..Needs::default() },
+            Needs { mask: Some(MaskTerm { threshold: 1.0, ..mask }), ..Needs::default() },
+            Needs { mask: Some(mask), cadence: Cadence { all: 2, sh_rest: 1 }, ..Needs::default() },
             Needs { cadence: Cadence { all: 0, sh_rest: 1 }, ..Needs::default() },
             Needs { cadence: Cadence { all: 1, sh_rest: 0 }, ..Needs::default() },
             Needs {

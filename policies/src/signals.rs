@@ -135,6 +135,8 @@ signals! {
     ScaleMax: Present "scene units" [];
     /// Product of the three standard deviations now `[scene units³]`, >= 0.
     ScaleProduct: Present "scene units³" [];
+    /// σ(m) of the row's [mask](crate::policy::MaskTerm) now, in `[0, 1]`; only where one is declared.
+    Mask: Present "1" [];
     /// Optimiser steps since the row was created or rewritten, saturating at 65,535.
     Age: Present "steps" [];
     /// Mean now `[scene units]`: world coordinates of the scene as it is trained on. Their origin is the

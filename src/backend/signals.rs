@@ -262,6 +262,7 @@ impl ParameterSignal {
             | Signal::Opacity
             | Signal::ScaleMax
             | Signal::ScaleProduct
+            | Signal::Mask
             | Signal::Age => return None,
         };
         // Of the coefficients, those of band 0.

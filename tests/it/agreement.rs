@@ -7,7 +7,7 @@ use densify::gaussians::Gaussians;
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::{Setup, Subject, scenes};
 use densify_policies::policy::{
-    Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalKind, SignalSet,
+    Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalKind, SignalSet,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -118,11 +118,17 @@ fn asked_for() -> [(&'static str, Needs, Cadence); 7] {
     let some = SignalSet::from([Signal::ScreenGradient, Signal::WeightMax, Signal::Age]);
     let noise = NoiseTerm { strength: 5e3, sharpness: 100.0, opacity: 0.3 };
     let loss_terms = LossTerms { opacity: 0.01, scale: 0.02 };
+    // Some fall to the threshold within the six steps.
+    let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 1e-3, threshold: 0.725 };
     let [plain, third, other] =
         [(1, 1), (1, 3), (2, 4)].map(|(all, sh_rest)| Cadence { all, sh_rest });
     [
         ("plain", Needs::default(), plain),
-        ("all signals", Needs { signals: all, ..Needs::default() }, plain),
+        (
+            "all signals and masks",
+            Needs { signals: all, mask: Some(mask), ..Needs::default() },
+            plain,
+        ),
         ("absolute gradients", Needs { signals: absolute, ..Needs::default() }, plain),
         ("pixels and weights", Needs { signals: pixels, ..Needs::default() }, plain),
         (

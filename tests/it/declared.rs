@@ -12,8 +12,9 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::Gaussians;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
-use densify_policies::plan::{EditPlan, OpacityRule, Update};
-use densify_policies::policy::{Cadence, LossTerms, Needs, NoiseTerm, Signal, SignalSet};
+use densify_policies::adc::clone_at;
+use densify_policies::plan::{EditPlan, OpacityRule, Seed, Update};
+use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalSet};
 use glam::DVec3;
 
 use crate::subject::{
@@ -248,6 +249,66 @@ fn a_step_takes_the_sum_of_the_gradients_since_the_last() {
                 }
             }
         }
+    });
+}
+
+/// The mask is a factor on opacity and scales, of which it has the derivative; what falls to the threshold
+/// becomes transparent; masks go where their rows go.
+#[test]
+fn masks_step_by_what_they_would_switch_off() {
+    const ROWS: usize = 40;
+    let mask = MaskTerm { start: 1.0, rate: 0.02, weight: 1e-3, threshold: 0.72 };
+    let signals = SignalSet::from([Signal::Mask]);
+    let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
+    on_each(repeatable(), |subject| {
+        let needs = Needs { mask: Some(mask), signals, ..Needs::default() };
+        let mut backend = backend(subject, &model(ROWS), needs.clone());
+        let values = |backend: &mut dyn Differentiable| -> Vec<f64> {
+            let signals = backend.take_signals(signals).expect("signals can be taken");
+            let masks = signals.get(Signal::Mask).expect("it was declared");
+            masks.iter().map(|&value| f64::from(value)).collect()
+        };
+        let mut expected = [[1.0_f64, 0.0, 0.0]; ROWS];
+        for number in 1..=5 {
+            let camera = view(number % 3);
+            let before = backend.download().expect("a model");
+            let gradient = gradient(subject, &before, &camera, number.into());
+            step(&mut *backend, &camera, number, &needs, EVERY);
+            let found = values(&mut *backend);
+            let after = backend.download().expect("a model");
+            for (row, [m, first, second]) in expected.iter_mut().enumerate() {
+                let opacity = sigmoid(f64::from(before.opacity_logits[row]));
+                let by_scales: f64 = gradient.log_scales[row].map(f64::from).iter().sum();
+                let by_factor = f64::from(gradient.opacity_logits[row]) / (1.0 - opacity);
+                let slope = sigmoid(*m) * sigmoid(-*m);
+                let g = (by_factor + by_scales + 1e-3 / ROWS as f64) * slope;
+                *first = 0.9 * *first + 0.1 * g;
+                *second = 0.999 * *second + 0.001 * g * g;
+                let age = number as i32;
+                let of_first = *first / (1.0 - 0.9_f64.powi(age));
+                let of_second = *second / (1.0 - 0.999_f64.powi(age));
+                *m -= 0.02 * of_first / of_second.sqrt();
+                // A hundredth of a step.
+                let off = (found[row] - sigmoid(*m)).abs();
+                assert!(off < 0.01 * 0.02, "step {number}, row {row}: {} {m}", found[row]);
+                let is_transparent = after.opacity_logits[row] < -9.0;
+                let is_close = (sigmoid(*m) - 0.72).abs() < 1e-4;
+                assert!(is_close || is_transparent == (sigmoid(*m) <= 0.72), "row {row}: {m}");
+            }
+        }
+        let masks = values(&mut *backend);
+        let fallen = masks.iter().filter(|&&mask| mask <= 0.72).count();
+        assert!((1..ROWS - 1).contains(&fallen), "{fallen} of {ROWS}: nothing is shown");
+        let mut plan = EditPlan::new(ROWS, ROWS);
+        plan.prune_all([0, 1]);
+        plan.grow(5, clone_at([0.1; 3])).expect("there is room");
+        plan.append(Seed::round([0.5; 3], [0.5; 3], 0.1, 0.1)).expect("there is room");
+        backend.apply(&plan.compile(), 5, 5).expect("a plan is applied");
+        // The child stands behind its parent, the seed at the end, with a fresh mask.
+        let edited = values(&mut *backend);
+        assert_eq!(edited[..4], masks[2..6]);
+        assert_eq!(edited[4..ROWS - 1], masks[5..]);
+        assert!((edited[ROWS - 1] - sigmoid(1.0)).abs() < 1e-6);
     });
 }
 

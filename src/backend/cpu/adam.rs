@@ -15,11 +15,11 @@ use super::blocks::plane;
 use super::simd::{V, WIDTH, each};
 use crate::backend::LearningRates;
 
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
-const EPSILON: f32 = 1e-15;
+pub(super) const BETA1: f32 = 0.9;
+pub(super) const BETA2: f32 = 0.999;
+pub(super) const EPSILON: f32 = 1e-15;
 /// Opacities within 1e-4 of 0 and 1: their gradient is then still a number of full precision.
-const LOGIT_MAX: f32 = 9.2;
+pub(super) const LOGIT_MAX: f32 = 9.2;
 /// Standard deviations from 1e-6 to 10 of the scene's size; scenes are normalised to size 1.
 const LOG_SCALE_RANGE: [f32; 2] = [-13.8, 2.3];
 /// Age from which 1 − 0.999^age is 1 in f32: ln(2⁻²⁵)/ln(0.999) = 17,320.
@@ -48,7 +48,7 @@ impl BiasCorrection {
         ((MATURE + 1) * size_of::<[f32; 2]>()) as u64
     }
 
-    fn of(&self, age: u16) -> [f32; 2] {
+    pub(super) fn of(&self, age: u16) -> [f32; 2] {
         self.table[usize::from(age).min(MATURE)]
     }
 }

@@ -8,6 +8,7 @@ use densify_policies::policy::Signal;
 use densify_policies::rng::{PolicyRng, Purpose};
 
 use super::blocks::{plane, planes, reorder};
+use super::mask::Masks;
 use super::moments::Moments;
 use super::parameters::Parameters;
 use super::signals::Accumulators;
@@ -20,6 +21,7 @@ pub(super) struct Model<'a> {
     pub(super) params: &'a mut Parameters,
     pub(super) moments: &'a mut Moments,
     pub(super) ages: &'a mut [u16],
+    pub(super) masks: &'a mut Masks,
     pub(super) signals: &'a mut Accumulators,
     pub(super) summed: &'a mut Summed,
     pub(super) threads: &'a Threads,
@@ -105,6 +107,7 @@ impl Model<'_> {
         for (i, &slot) in children.iter().enumerate() {
             let slot = slot as usize;
             self.params.copy_row(parent, slot);
+            self.masks.inherit(parent, slot);
             self.params.set_n(slot, plane::MEAN, stand(i as u32 + 1));
             self.params.set_n(slot, plane::LOG_SCALE, scales);
             self.params.set_n(slot, plane::QUAT, turned);
@@ -122,6 +125,7 @@ impl Model<'_> {
 
     fn sow(&mut self, row: usize, seed: &Seed) {
         self.params.clear_row(row);
+        self.masks.clear_row(row);
         self.params.set_n(row, plane::MEAN, seed.position);
         self.params.set_n(row, plane::LOG_SCALE, seed.scales.map(f32::ln));
         self.params.set_n(row, plane::QUAT, turned(UNTURNED, seed.orientation));
@@ -179,6 +183,7 @@ impl Model<'_> {
     /// Zero moments, age 0, no past.
     fn reborn(&mut self, row: usize) {
         self.moments.clear_row(row);
+        self.masks.forget(row);
         self.ages[row] = 0;
         self.signals.blocks.clear_row(row);
         self.summed.clear_row(row);
@@ -187,6 +192,7 @@ impl Model<'_> {
     fn relocate(&mut self, from: usize, to: usize) {
         self.params.copy_row(from, to);
         self.moments.copy_row(from, to);
+        self.masks.copy_row(from, to);
         self.ages[to] = self.ages[from];
         self.signals.blocks.copy_row(from, to);
         self.summed.copy_row(from, to);
@@ -195,6 +201,7 @@ impl Model<'_> {
     fn reorder(&mut self, order: &[u32]) {
         self.params.reorder(order);
         self.moments.reorder(order);
+        self.masks.reorder(order);
         reorder(self.ages, order);
         self.signals.blocks.reorder(order);
         self.summed.reorder(order);

@@ -3,6 +3,7 @@
 use super::adam::BiasCorrection;
 use super::blocks::planes;
 use super::loss::LossBuffers;
+use super::mask::Masks;
 use super::moments::Moments;
 use super::observe;
 use super::parameters::Parameters;
@@ -60,6 +61,9 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         ledger.add_to(Section::Policy, "auxiliary views", bytes);
     }
     ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs));
+    if needs.mask.is_some() {
+        ledger.add_to(Section::Policy, "masks", Masks::bytes(budget));
+    }
     if counts_dominant(needs) {
         ledger.add_to(Section::Policy, "dominated pixels", 4 * budget as u64);
     }

@@ -17,6 +17,7 @@ mod differentiate;
 mod footprint;
 mod instructions;
 mod loss;
+mod mask;
 mod moments;
 mod narrow;
 mod observe;
@@ -61,6 +62,7 @@ use crate::verify::sabotage;
 use adam::BiasCorrection;
 use blocks::planes;
 use loss::{ImageTerms, LossBuffers};
+use mask::Masks;
 use moments::Moments;
 use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
@@ -101,6 +103,7 @@ pub struct CpuBackend {
     ages: Vec<u16>,
     bias: BiasCorrection,
     summed: Summed,
+    masks: Masks,
     signals: Accumulators,
     candidates: Candidates,
     /// Pixels that each row dominates in the view at hand. Shape: `[budget]`, or empty if they are not
@@ -169,6 +172,7 @@ impl CpuBackend {
             ages: vec![0; blocks * WIDTH],
             bias: BiasCorrection::new(),
             summed: Summed::new(budget, per_row, options.needs.cadence),
+            masks: Masks::new(budget, options.needs.mask),
             signals,
             candidates: Candidates::new(options.needs.candidates),
             dominant: bytemuck::zeroed_vec(if counts_dominant(&options.needs) {
@@ -266,7 +270,8 @@ impl Backend for CpuBackend {
         // The sums are not used between two steps.
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::within(memory, self.rows, wanted);
-        self.signals.read(&self.threads, &mut signals, wanted, &self.params, &self.ages);
+        let of_rows = (&self.params, &self.masks, &self.ages[..]);
+        self.signals.read(&self.threads, &mut signals, wanted, of_rows);
         Ok(signals)
     }
 
@@ -286,6 +291,7 @@ impl Backend for CpuBackend {
             params: &mut self.params,
             moments: &mut self.moments,
             ages: &mut self.ages,
+            masks: &mut self.masks,
             signals: &mut self.signals,
             summed: &mut self.summed,
             threads: &self.threads,

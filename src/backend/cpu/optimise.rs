@@ -9,6 +9,7 @@ use pulp::{Simd, WithSimd};
 
 use super::adam::{self, BiasCorrection};
 use super::blocks::{Scratch, plane, planes};
+use super::mask::MaskTask;
 use super::moments::MomentTask;
 use super::narrow::Draws;
 use super::parameters::{ParameterTask, ParameterView};
@@ -46,6 +47,8 @@ pub(super) struct Optimise<'a> {
     pub(super) view: &'a ViewParams,
     pub(super) rates: &'a LearningRates,
     pub(super) bias: &'a BiasCorrection,
+    /// Masks of these rows, where they are declared.
+    pub(super) masks: Option<MaskTask<'a>>,
     /// Gradients kept for a later step.
     pub(super) summed: TaskSums<'a>,
     /// Which parameters step now.
@@ -65,7 +68,8 @@ impl WithSimd for Optimise<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params: mut stored, mut moments, ages, signals, planes: to, sums, .. } = self;
-        let Self { layout, visible, view, rates, bias, mut summed, due, terms, noise, .. } = self;
+        let Self { layout, visible, view, rates, bias, due, terms, noise, .. } = self;
+        let Self { mut masks, mut summed, .. } = self;
         let trained = planes(view.sh_degree);
         let mut gradient = BlockGradient::ZERO;
         let mut was_zero = true;
@@ -89,6 +93,10 @@ impl WithSimd for Optimise<'_> {
                     *to = pixels.load(Relaxed) as f32;
                 }
                 to.accumulate(s, block, &gradient, view);
+            }
+            if let Some(masks) = &mut masks {
+                let ages = &ages[b * WIDTH..(b + 1) * WIDTH];
+                masks.step(b, params, &gradient.params, ages, bias);
             }
             if let Some(terms) = &terms {
                 terms.add(s, params, &mut gradient.params);

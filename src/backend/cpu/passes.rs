@@ -312,7 +312,9 @@ impl CpuBackend {
 
     /// Stages 6–8 in one sweep over the rows, so that gradients never leave the cache.
     pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
-        let Self { threads, arch, params, moments, ages, signals, sums, visible, bias, .. } = self;
+        let Self {
+            threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
+        } = self;
         let dominant = &self.dominant[..self.rows.min(self.dominant.len())];
         let (rows, arch) = (self.rows, *arch);
         let terms = Terms::new(input.loss_terms, rows);
@@ -328,6 +330,7 @@ impl CpuBackend {
         let parts = (
             params.tasks(rows),
             moments.tasks(rows),
+            masks.tasks(rows),
             ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
             parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),
@@ -338,10 +341,11 @@ impl CpuBackend {
             threads.each(
                 "project_bwd + adam",
                 parts,
-                |(params, moments, ages, signals, sums, visible, (task, summed))| {
+                |(params, moments, masks, ages, signals, sums, visible, (task, summed))| {
                     arch.dispatch(Optimise {
                         params,
                         moments,
+                        masks,
                         storing: &storing,
                         ages,
                         signals,

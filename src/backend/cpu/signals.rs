@@ -5,6 +5,7 @@ use pulp::Simd;
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, plane};
+use super::mask::Masks;
 use super::parameters::Parameters;
 use super::project::{ViewParams, dot, lanes};
 use super::project_bwd::BlockGradient;
@@ -95,6 +96,7 @@ impl SignalPlanes {
                     Signal::Opacity
                     | Signal::ScaleMax
                     | Signal::ScaleProduct
+                    | Signal::Mask
                     | Signal::Age
                     | Signal::Position
                     | Signal::LogScale
@@ -168,8 +170,7 @@ impl Accumulators {
         threads: &Threads,
         signals: &mut Signals,
         wanted: SignalSet,
-        params: &Parameters,
-        ages: &[u16],
+        (params, masks, ages): (&Parameters, &Masks, &[u16]),
     ) {
         for signal in wanted.iter() {
             let Some(column) = signals.get_mut(signal) else { continue };
@@ -177,7 +178,7 @@ impl Accumulators {
             let planes = self.planes.of(signal);
             let value = |row: usize| -> f32 {
                 if signal.kind() == SignalKind::Present {
-                    return present(signal, row, params, ages);
+                    return present(signal, row, params, masks, ages);
                 }
                 let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
                 as_read(signal, parts.reduce(f32::max).unwrap_or(0.0))
@@ -202,7 +203,7 @@ impl Accumulators {
     }
 }
 
-fn present(signal: Signal, row: usize, params: &Parameters, ages: &[u16]) -> f32 {
+fn present(signal: Signal, row: usize, params: &Parameters, masks: &Masks, ages: &[u16]) -> f32 {
     let log_scales = || params.get_n::<3>(row, plane::LOG_SCALE);
     match signal {
         Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
@@ -214,6 +215,7 @@ fn present(signal: Signal, row: usize, params: &Parameters, ages: &[u16]) -> f32
             let [x, y, z] = log_scales();
             (x + y + z).exp()
         }
+        Signal::Mask => masks.value(row),
         Signal::Age => f32::from(ages[row]),
         summed => unreachable!("{summed:?} is no present value"),
     }

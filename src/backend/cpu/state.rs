@@ -11,6 +11,7 @@ use crate::backend::{StateArray, StateError, Tensor};
 
 const MOMENTS: [&str; 2] = ["moments.first", "moments.second"];
 const AGES: &str = "ages";
+const MASKS: &str = "masks";
 const CANDIDATES: &str = "candidates";
 /// Before the name of a signal.
 const SIGNAL: &str = "signals.";
@@ -21,6 +22,7 @@ impl CpuBackend {
     pub(super) fn state_arrays(&self) -> Vec<StateArray> {
         let of_rows = MOMENTS.into_iter().chain([AGES]).map(StateArray::of_rows);
         let mut arrays: Vec<StateArray> = of_rows.collect();
+        arrays.extend(self.masks.is_declared().then(|| StateArray::of_rows(MASKS)));
         let signals = self.signals.planes().kept();
         arrays.extend(
             signals.into_iter().map(|(name, _)| StateArray::of_rows(format!("{SIGNAL}{name}"))),
@@ -44,6 +46,9 @@ impl CpuBackend {
         }
         if name == AGES {
             return Tensor::u16(name, &[rows.len()], self.ages[rows].to_vec());
+        }
+        if name == MASKS {
+            return self.masks.tensor(name, rows);
         }
         if name == CANDIDATES {
             return self.candidates.tensor(name);
@@ -69,6 +74,8 @@ impl CpuBackend {
         } else if name == AGES {
             let ages = tensor.into_u16(&[rows.len()])?;
             self.ages[rows].copy_from_slice(&ages);
+        } else if name == MASKS && self.masks.is_declared() {
+            self.masks.restore(rows, tensor)?;
         } else if name == CANDIDATES && self.candidates.is_wanted() {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = signal_plane(&self.signals, &name) {

@@ -38,7 +38,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use densify_policies::plan::RowOps;
-use densify_policies::policy::{Cadence, Candidate, SignalKind, SignalSet, Signals};
+use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalSet, Signals};
 
 use super::candidates::Candidates;
 use super::signals::{ParameterSignal, SignalPlanes, as_read};
@@ -82,6 +82,7 @@ pub struct GpuBackend {
     near: f32,
     shortcuts: Shortcuts,
     planes: SignalPlanes,
+    mask: Option<MaskTerm>,
     cadence: Cadence,
     waiting: Waiting,
     candidates: Candidates,
@@ -128,6 +129,7 @@ impl GpuBackend {
             near: options.near,
             shortcuts,
             planes,
+            mask: options.needs.mask,
             cadence: options.needs.cadence,
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),

@@ -1,10 +1,12 @@
 //! Encodes the passes of a view: forward, image loss, backward, optimiser. What is encoded depends only
 //! on the image's size and the number of bands; everything else is counted on the device.
 
+use densify_policies::policy::MaskTerm;
 use wgpu::ComputePass;
 
 use super::launches::{Launch, Launches};
 use super::sizes::BLOCK;
+use crate::gaussians::logit;
 
 /// Workgroups in the first of two dimensions; see `shaders/shared/view.wgsl`.
 const ACROSS: u32 = 32_768;
@@ -201,12 +203,23 @@ impl Passes<'_> {
     }
 
     /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends.
-    pub(super) fn optimise(&self, to: &mut Recorder<'_>, sh_degree: u8, signals: bool) {
+    pub(super) fn optimise(
+        &self,
+        to: &mut Recorder<'_>,
+        sh_degree: u8,
+        signals: bool,
+        mask: Option<MaskTerm>,
+    ) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);
         self.differentiate(to);
         if signals {
             to.run(l.get("accumulate"), [0; 4], groups);
+        }
+        if let Some(MaskTerm { start, rate, weight, threshold }) = mask {
+            let weight = weight / self.shape.rows.max(1) as f32;
+            let now = [start, rate, weight, logit(threshold)].map(f32::to_bits);
+            to.run(l.get("step_masks"), now, groups);
         }
         for band in 0..=usize::from(sh_degree) {
             let now = [(band * band) as u32, (2 * band + 1) as u32, 0, 0];

@@ -37,6 +37,9 @@ pub(super) enum Holds {
     Signals,
     /// What projection and tile lists know of a row in the view at hand.
     Projected,
+    /// Logits of masks, counted from where they began, so that 0 is a fresh one.
+    Masks,
+    MaskMoments,
     /// Pixels that a row dominates in the view at hand.
     Dominated,
     /// Gradients of splats, summed over the view at hand.
@@ -88,6 +91,8 @@ impl Holds {
             Self::Ages => (Section::Model, "optimiser ages and bias tables", Cleared, true, None),
             Self::Signals => (Section::Policy, "signals", Cleared, false, None),
             Self::Projected => (Section::Renderer, "projected splats", Untouched, false, None),
+            Self::Masks => (Section::Policy, "masks", Inherited, true, None),
+            Self::MaskMoments => (Section::Policy, "masks", Cleared, true, None),
             Self::Dominated => (Section::Policy, "dominated pixels", Untouched, false, None),
             Self::SplatGradients => (Section::Gradients, "splat gradients", Untouched, false, None),
             Self::RowGradients => (Section::Gradients, "row gradients", Untouched, false, None),
@@ -124,12 +129,12 @@ impl RowArray {
 }
 
 /// Every array of a model of this degree; `waits`: whether gradients of the geometry and of band 0,
-/// and those of bands 1–3, may wait for a step; planes of signals, fields of a record, and counts of
-/// pixels that a row dominates.
+/// and those of bands 1–3, may wait for a step; planes of signals, fields of a record, counts of pixels
+/// that a row dominates, and masks.
 pub(super) fn row_arrays(
     sh_degree: u8,
     waits: [bool; 2],
-    [planes, fields, counts]: [usize; 3],
+    [planes, fields, counts, masks]: [usize; 4],
 ) -> Vec<RowArray> {
     let geometry = 0..ModelArray::Sh.parameters(sh_degree).start;
     let band = |band: usize| {
@@ -165,6 +170,8 @@ pub(super) fn row_arrays(
         ("row sums", fields, Holds::SplatGradients),
         ("gradient", GRADIENT, Holds::RowGradients),
         ("dominant", counts, Holds::Dominated),
+        ("mask offsets", masks, Holds::Masks),
+        ("mask moments", 2 * masks, Holds::MaskMoments),
     ];
     let unlike_parameters =
         |(name, numbers, holds)| RowArray { name, numbers, holds, parameters: 0..0 };
@@ -174,6 +181,6 @@ pub(super) fn row_arrays(
 
 /// Most bytes per row of any one array of a model of this degree, whatever the policy needs.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
-    let arrays = row_arrays(sh_degree, [false; 2], [0; 3]);
+    let arrays = row_arrays(sh_degree, [false; 2], [0; 4]);
     arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)
 }

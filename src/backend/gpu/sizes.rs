@@ -41,6 +41,8 @@ pub(super) struct Sizes {
     pub(super) cadence: Cadence,
     /// Whether pixels are counted for the row that dominates them.
     pub(super) dominant: bool,
+    /// Whether rows have masks.
+    pub(super) masks: bool,
     pub(super) with_error: bool,
 }
 
@@ -75,6 +77,7 @@ impl Sizes {
             more: false,
             cadence: needs.cadence,
             dominant: counts_dominant(needs),
+            masks: needs.mask.is_some(),
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
         }
     }
@@ -87,7 +90,8 @@ impl Sizes {
 
     /// Every array with an entry per row.
     pub(super) fn row_arrays(&self) -> Vec<RowArray> {
-        let others = [self.planes, self.records.stride(), usize::from(self.dominant)];
+        let [counts, masks] = [self.dominant, self.masks].map(usize::from);
+        let others = [self.planes, self.records.stride(), counts, masks];
         row_arrays(self.sh_degree, self.waits(), others)
     }
 

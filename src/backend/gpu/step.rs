@@ -41,10 +41,10 @@ impl GpuBackend {
         if self.sizes.records.has(Field::Error) {
             frame.draw[3] |= of_target::BY_PIXEL;
         }
-        let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
+        let (degree, signals, mask) = (frame.model[1] as u8, self.planes.count > 0, self.mask);
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.backward(to);
-            passes.optimise(to, degree, signals);
+            passes.optimise(to, degree, signals, mask);
         };
         let state = if let Some((request, count)) = self.candidates.open(input.step, self.rows) {
             let weights = error_weights(request.error);

@@ -212,7 +212,9 @@ impl GpuBackend {
     /// A column of present values; see `present` in `shaders/signals.wgsl`.
     pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
         let (rows, launch) = (self.rows as u32, self.launches.get("present"));
-        self.submit(|to| to.run(launch, [signal as u32, rows, 0, 0], rows.div_ceil(256)));
+        let start = self.mask.map_or(0.0, |mask| mask.start);
+        let now = [signal as u32, rows, start.to_bits(), 0];
+        self.submit(|to| to.run(launch, now, rows.div_ceil(256)));
         self.read("sums", 0, 4 * self.rows as u64)
     }
 }

@@ -67,6 +67,7 @@ pub(super) const STAGES: &[Stage] = &[
         &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
     stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")]),
+    stage("mask", On::All, &[VIEW, shader!("mask")]),
     stage("adam", On::All, &[VIEW, RANDOM, shader!("adam")]),
     stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]),
     stage("apply", On::All, &[VIEW, RANDOM, shader!("apply")]),

@@ -1,0 +1,54 @@
+// A number per row that learns whether the row is worth its place; src/backend/cpu/mask.rs. One row per
+// invocation, before the geometry steps.
+
+@group(0) @binding(1) var<storage, read> state: State;
+// The geometry: twelve numbers per row.
+@group(0) @binding(2) var<storage, read_write> rows: array<f32>;
+// How far the mask's logit is from where it began; its two moments.
+@group(0) @binding(3) var<storage, read_write> mask_offsets: array<f32>;
+@group(0) @binding(4) var<storage, read_write> mask_moments: array<f32>;
+@group(0) @binding(5) var<storage, read> ages: array<u32>;
+// See project_bwd.wgsl.
+@group(0) @binding(6) var<storage, read> gradient: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read> bias: array<vec2<f32>>;
+
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPSILON: f32 = 1e-15;
+const LOGIT_MAX: f32 = 9.2;
+const MATURE: u32 = 17400u;
+
+fn sigmoid(x: f32) -> f32 {
+    let e = exp_exact(-abs(x));
+    return select(e, 1.0, x >= 0.0) / (1.0 + e);
+}
+
+// now.a: bits of the logit at which masks begin, now.b: of the step size, now.c: of the term's derivative by
+// the mask, per row, now.d: of the logit of the threshold.
+@compute @workgroup_size(256)
+fn step_masks(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = group_of(id) * GROUP + lane;
+    if row >= frame.model.x || state.short != 0u {
+        return;
+    }
+    let start = bitcast<f32>(now.a);
+    let opacity_at = 12u * row + 10u;
+    let g_opacity = gradient[5u * row + 2u].z;
+    let g_scales = gradient[5u * row].w + gradient[5u * row + 1u].x + gradient[5u * row + 1u].y;
+    let by_factor = g_opacity / sigmoid(-rows[opacity_at]) + g_scales;
+    let m = start + mask_offsets[row];
+    let g = (by_factor + bitcast<f32>(now.c)) * sigmoid(m) * sigmoid(-m);
+    let first = mask_moments[2u * row] * BETA1 + g * (1.0 - BETA1);
+    let second = mask_moments[2u * row + 1u] * BETA2 + g * g * (1.0 - BETA2);
+    let correction = bias[min((ages[row] & 0xffffu) + 1u, MATURE)];
+    let step = first * correction.x * bitcast<f32>(now.b) / (sqrt(second) * correction.y + EPSILON);
+    mask_offsets[row] -= step;
+    mask_moments[2u * row] = first;
+    mask_moments[2u * row + 1u] = second;
+    if start + mask_offsets[row] <= bitcast<f32>(now.d) {
+        rows[opacity_at] = -LOGIT_MAX;
+    }
+}
