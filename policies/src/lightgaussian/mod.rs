@@ -176,17 +176,13 @@ impl DensityPolicy for LightGaussian {
         let share = self.share_at(now.step);
         if share > 0.0 {
             let count = (share * now.rows() as f64).floor() as usize;
-            let significance = match self.params.victims {
-                Victims::Random => Some(Vec::new()),
+            let significance = match (self.params.victims, self.hits.take(now)) {
+                (Victims::Random, _) => Vec::new(),
+                (Victims::Lowest, Some(hits)) => self.significance(now, &hits)?,
                 // Without a view nothing is known of any row, and none is pruned.
-                Victims::Lowest => match self.hits.take(now) {
-                    Some(hits) => Some(self.significance(now, &hits)?),
-                    None => None,
-                },
+                (Victims::Lowest, None) => return Ok(()),
             };
-            if let Some(significance) = significance {
-                self.params.victims.prune(plan, &significance, count, rng);
-            }
+            self.params.victims.prune(plan, &significance, count, rng);
         }
         Ok(())
     }
