@@ -3,8 +3,9 @@
 //! This crate holds the interface ([`policy`], [`plan`]), the registry ([`registry`]), a conformance
 //! suite for any policy ([`conformance`]), and the built-in policies: [`vanilla`], the original
 //! adaptive density control; [`taming`], growth by score along a curve; [`diet`], replacement of the
-//! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges. It
-//! knows no renderer, no image and no device.
+//! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges;
+//! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown. It knows no renderer, no
+//! image and no device.
 //!
 //! # For users of gsplat
 //!
@@ -166,6 +167,7 @@ mod error;
 #[cfg(test)]
 mod event;
 pub mod igs;
+pub mod lightgaussian;
 pub mod mcmc;
 mod needs;
 pub mod neighbours;
@@ -173,6 +175,8 @@ mod ops;
 pub mod parameters;
 pub mod plan;
 pub mod policy;
+pub mod prune;
+pub mod radsplat;
 pub mod registry;
 pub mod rng;
 pub mod sample;

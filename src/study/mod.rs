@@ -7,6 +7,7 @@
 
 mod cell;
 mod child;
+mod columns;
 mod compare;
 mod difference;
 mod journal;

@@ -17,7 +17,9 @@ pub use inventory;
 /// A policy that can be built from a table of parameters.
 pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
     /// The parameters: a struct with `#[serde(deny_unknown_fields, default)]`. Use `f64`, `u32`, `bool`
-    /// and enums without data, so that defaults print as written.
+    /// and enums without data, so that defaults print as written. Those of another policy can be a
+    /// field with `#[serde(flatten)]`; then leave out `deny_unknown_fields`, which serde does not
+    /// support with it. Unknown names are refused all the same.
     type Params: Serialize + DeserializeOwned + Default;
 
     /// Integer parameters that count steps. Their defaults are for a run of 30,000 steps and scale with

@@ -1,8 +1,10 @@
 //! The study behind `densify compare`: policies under equal conditions, at several budgets.
 
 mod contender;
+mod counts;
 mod crops;
 mod plots;
+mod ranking;
 mod report;
 
 use std::collections::BTreeSet;
@@ -10,6 +12,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 use clap::Args;
+use densify_policies::registry;
 use toml::Value;
 
 use super::cell::Cell;
@@ -25,6 +28,8 @@ use contender::Contender;
 /// Options of a run that are the comparison's to set.
 const OWN_OPTIONS: [&str; 7] =
     ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations"];
+/// What stands for all policies.
+const ALL: &str = "all";
 /// Measurements along each run, for the curves.
 const POINTS: u32 = 8;
 
@@ -35,6 +40,7 @@ Examples:
   densify compare data/garden --policies vanilla,diet --budget 1M -- -r 4 --sh-degree 2
   densify compare data/room data/cup --policies vanilla,diet --budget room=28k,30k
   densify compare data/garden --policies diet,diet:rho=0,diet:full_depth=0 --budget 200k
+  densify compare data/garden --policies vanilla,all --budget 200k
   densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
 
 /// Trains a scene with several policies, under the same conditions, and says which did best.
@@ -46,17 +52,20 @@ Examples:
 ///
 /// Quality is measured on views held out. Differences are taken between runs of the same scene,
 /// budget and seed, against the first policy named, with 95 % intervals of their mean from three
-/// seeds on. A run whose peak exceeded its budget is marked, and takes no part in the ranking. Where the geometry
-/// is known (built-in scenes, and those that `densify scenegen` wrote), the tables also say how well
-/// the Gaussians sit on it.
+/// seeds on; policies are ranked by that mean. A run whose peak exceeded its budget is marked, and
+/// takes no part in the ranking. The budget bounds the peak, and some policies end far below it: how
+/// many Gaussians each has at the end stands beside the peak. Where the geometry is known (built-in
+/// scenes, and those that `densify scenegen` wrote), the tables also say how well the Gaussians sit
+/// on it.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Comparison {
     /// Folders of the scenes, or built-in scenes (scene:NAME)
     #[arg(required = true)]
     pub scenes: Vec<PathBuf>,
-    /// Policies, separated by commas; the others are compared with the first. A policy with
-    /// parameters of its own is one more: diet:rho=0, or diet:rho=0:split=random
+    /// Policies, separated by commas; the others are compared with the first. `all` stands for all that
+    /// are not named besides. A policy with parameters of its own is one more: diet:rho=0, or
+    /// diet:rho=0:split=random
     #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
     pub policies: Vec<String>,
     /// Budgets in Gaussians, separated by commas; SCENE=ROWS for one scene alone, by its folder's
@@ -109,12 +118,13 @@ impl SceneBudget {
 impl Comparison {
     /// Makes the runs that are not done yet, all with the options `train`, and writes tables and pictures.
     pub(crate) fn run(&self, train: Partial, observer: &dyn Observer) -> Result<Finished, Failure> {
-        let cells = self.cells(train)?;
+        let policies = all_policies(&self.policies)?;
+        let cells = self.cells(&policies, train)?;
         let mut study = Study::open(&self.output, "compare", observer)?;
         let outcomes = study.run(&cells)?;
-        let mut text = report::markdown(&outcomes, &self.policies);
+        let mut text = report::markdown(&outcomes, &policies);
         text += "\n## Pictures\n";
-        for picture in plots::draw(&self.output, &outcomes, &self.policies)? {
+        for picture in plots::draw(&self.output, &outcomes, &policies)? {
             text += &format!("\n![{}]({})\n", picture.caption, picture.file);
         }
         for picture in crops::draw(&self.output, &outcomes, observer)? {
@@ -122,20 +132,19 @@ impl Comparison {
             text += &format!("\n![{caption}]({})\n\n{caption}.\n", picture.file);
         }
         text += &report::options(&outcomes)?;
-        study.finish("compare", &text, report::summary(&outcomes, &self.policies))
+        study.finish("compare", &text, report::summary(&outcomes, &policies))
     }
 
     /// All runs, in the order in which they run: seed after seed, so that an interrupted comparison is a
     /// fair one of fewer seeds.
-    fn cells(&self, train: Partial) -> Result<Vec<Cell>, Failure> {
+    fn cells(&self, policies: &[String], train: Partial) -> Result<Vec<Cell>, Failure> {
         let shared = shared_options(train, &OWN_OPTIONS)?;
-        unique(&self.policies, "--policies")?;
         unique(&self.budget, "--budget")?;
         let labels = labels(&self.scenes)?;
         let budgets = budgets(&self.budget, &labels)?;
         let least = budgets.iter().flatten().copied().min().unwrap_or(1);
         let contenders: Vec<Contender<'_>> =
-            self.policies.iter().map(|policy| Contender::new(policy)).collect();
+            policies.iter().map(|policy| Contender::new(policy)).collect();
         for contender in &contenders {
             contender.check(least, self.iterations)?;
         }
@@ -147,21 +156,37 @@ impl Comparison {
             for ((scene, label), budgets) in self.scenes.iter().zip(&labels).zip(&budgets) {
                 for &budget in budgets {
                     let base = Cell::new(&shared, (scene, label), budget, seed, self.iterations);
-                    cells.extend(self.policies.iter().zip(&contenders).map(
-                        |(policy, contender)| Cell {
+                    cells.extend(policies.iter().zip(&contenders).map(|(policy, contender)| {
+                        Cell {
                             factor: policy.clone(),
                             level: budget.to_string(),
                             title: format!("{policy}, {} rows", grouped(budget)),
                             folder: format!("{}-{budget}", contender.folder()),
                             spec: contender.options().over(base.spec.clone()),
                             ..base.clone()
-                        },
-                    ));
+                        }
+                    }));
                 }
             }
         }
         Ok(cells)
     }
+}
+
+/// The policies that are named, each once. `all` becomes every registered policy that is not named by
+/// itself, in the order of their names.
+fn all_policies(named: &[String]) -> Result<Vec<String>, Failure> {
+    unique(named, "--policies")?;
+    let registered = registry::policies()?;
+    let others = || {
+        let names = registered.iter().map(|entry| entry.name.to_owned());
+        names.filter(|name| !named.contains(name))
+    };
+    let expand = |name: &String| match name.as_str() {
+        ALL => others().collect(),
+        _ => vec![name.clone()],
+    };
+    Ok(named.iter().flat_map(expand).collect())
 }
 
 fn unique<T: Ord + std::fmt::Display>(values: &[T], flag: &str) -> Result<(), Failure> {
@@ -234,6 +259,28 @@ fn difference<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn all_are_those_registered_that_are_not_named_besides() {
+        let expanded = |text: &str| {
+            let named: Vec<String> = text.split(',').map(String::from).collect();
+            all_policies(&named).map_err(|failure| failure.message)
+        };
+        let registered = registry::policies().expect("the registry is sound");
+        let names = || registered.iter().map(|entry| entry.name.to_owned());
+        let without = |left_out: &str| names().filter(|name| name != left_out).collect::<Vec<_>>();
+        assert_eq!(expanded("all"), Ok(names().collect()));
+        let vanilla = "vanilla".to_owned();
+        assert_eq!(
+            expanded("vanilla,all"),
+            Ok([vec![vanilla.clone()], without("vanilla")].concat())
+        );
+        assert_eq!(expanded("all,vanilla"), Ok([without("vanilla"), vec![vanilla]].concat()));
+        // With parameters it is one more, and `diet` itself is there too.
+        let with = expanded("diet:rho=0,all").expect("they are known");
+        assert_eq!((with[0].as_str(), with[1..].to_vec()), ("diet:rho=0", names().collect()));
+        assert!(expanded("all,diet,all").is_err_and(|message| message.contains("all twice")));
+    }
 
     #[test]
     fn a_scene_with_budgets_of_its_own_takes_no_others() {

@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 use super::{Outcome, at, scenes_and_budgets};
@@ -26,6 +27,9 @@ const COLOURS: [RGBColor; 7] = [
     RGBColor(86, 180, 233),
     RGBColor(0, 0, 0),
 ];
+
+/// A dash and the gap after it `[px]`.
+const DASH: [i32; 2] = [6, 4];
 
 /// A curve per policy.
 struct Panel {
@@ -194,10 +198,18 @@ fn draw_panel(
     for (i, (policy, points)) in panel.curves.iter().enumerate() {
         let colour = COLOURS[i % COLOURS.len()];
         let style = colour.stroke_width(2);
-        chart
-            .draw_series(LineSeries::new(points.iter().copied(), style))?
-            .label(policy)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+        let points_of = points.iter().copied();
+        let ends = |(x, y)| [(x, y), (x + 18, y)];
+        // With more curves than colours, those that repeat a colour are dashed.
+        if i < COLOURS.len() {
+            let line = chart.draw_series(LineSeries::new(points_of, style))?;
+            line.label(policy).legend(move |at| PathElement::new(ends(at), style));
+        } else {
+            let [dash, gap] = DASH;
+            let line = chart.draw_series(DashedLineSeries::new(points_of, dash, gap, style))?;
+            let legend = move |at| DashedPathElement::new(ends(at), dash, gap, style);
+            line.label(policy).legend(legend);
+        }
         // Few points are measurements, which a line alone would hide.
         if points.len() <= 2 * super::POINTS as usize {
             let dot = |&point: &(f64, f64)| Circle::new(point, 3, colour.filled());
@@ -302,6 +314,14 @@ mod tests {
         for (least, most, expected) in [(29.0, 36.0, 0), (0.9, 0.93, 3), (12.0, 90_000.0, 0)] {
             assert_eq!(digits(&even_ticks(least, most)), expected, "{least} to {most}");
         }
+        let many = |count: usize| {
+            let curve = |i: usize| (format!("p{i}"), vec![(1.0, i as f64), (4.0, i as f64)]);
+            svg(&[Panel { curves: (0..count).map(curve).collect(), ..panel(false) }]).unwrap()
+        };
+        // As many lines as policies, in curves and legend; the eighth, which repeats a colour, is dashed.
+        let lines = |text: &str| text.matches("stroke-width=\"2\"").count();
+        assert_eq!(lines(&many(7)), 14);
+        assert!(lines(&many(8)) > 40, "{}", lines(&many(8)));
         let empty = Panel { curves: Vec::new(), ..panel(false) };
         assert!(svg(&[empty]).unwrap().starts_with("<svg"));
     }

@@ -5,7 +5,7 @@ use std::fmt::Write;
 
 use toml::{Table, Value};
 
-use super::{Outcome, at, difference, scenes_and_budgets};
+use super::{Outcome, at, counts, difference, ranking, scenes_and_budgets};
 use crate::failure::Failure;
 use crate::metrics::geometry::Geometry;
 use crate::number::grouped;
@@ -22,7 +22,7 @@ fn mean_of(runs: &[&Outcome], value: impl Fn(&Outcome) -> Option<f64>) -> Option
 /// The whole comparison.
 pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
     let mut text = String::from("# Comparison of density-control policies\n");
-    let (Some((first, others)), Some(run)) = (policies.split_first(), outcomes.first()) else {
+    let (Some(first), Some(run)) = (policies.first(), outcomes.first()) else {
         return text;
     };
     let seeds = distinct(outcomes.iter().map(|r| r.seed)).len();
@@ -33,13 +33,11 @@ pub(super) fn markdown(outcomes: &[Outcome], policies: &[String]) -> String {
         grouped(run.iterations as usize),
         if seeds == 1 { "seed" } else { "seeds" },
     );
-    if !others.is_empty() {
-        let _ = write!(
-            text,
-            "\n## Over all scenes and budgets\n\n{}",
-            ranking(outcomes, first, others)
-        );
+    if policies.len() > 1 {
+        let ranks = ranking::table(outcomes, policies);
+        let _ = write!(text, "\n## Over all scenes and budgets\n\n{ranks}");
     }
+    text += &counts::tables(outcomes, policies);
     for (scene, budget) in scenes_and_budgets(outcomes) {
         let here = at(outcomes, scene, budget);
         let _ = write!(text, "\n## {scene}, {} rows\n\n", grouped(budget));
@@ -88,34 +86,6 @@ fn keep_common(table: &mut Table, other: &Table) {
         }
         (value, other) => Some(&*value) == other,
     });
-}
-
-/// Every policy against the first.
-fn ranking(outcomes: &[Outcome], first: &str, others: &[String]) -> MarkdownTable {
-    let mut table =
-        MarkdownTable::new("policy | PSNR [dB] | better in | SSIM | better in | FLIP | better in");
-    for policy in others {
-        let versus = |score: fn(&Outcome) -> f64| difference(outcomes.iter(), policy, first, score);
-        let all = (versus(|r| r.psnr), versus(|r| r.ssim), versus(|r| r.flip));
-        let (Some(psnr), Some(ssim), Some(flip)) = all else {
-            let mut cells = vec![String::new(); 7];
-            cells[0].clone_from(policy);
-            cells[1] = "not ranked: no run kept its budget".into();
-            table.row(&cells);
-            continue;
-        };
-        table.row(&[
-            policy.clone(),
-            psnr.show(2),
-            format!("{} of {}", psnr.above, psnr.pairs),
-            ssim.show(4),
-            format!("{} of {}", ssim.above, ssim.pairs),
-            flip.show(4),
-            // An error: less is better.
-            format!("{} of {}", flip.below, flip.pairs),
-        ]);
-    }
-    table
 }
 
 /// A policy's results among those of a scene and budget.
@@ -182,23 +152,13 @@ fn geometry(here: &[&Outcome], policies: &[String]) -> String {
     format!("\nGeometry, lengths as % of the diagonal of the scene:\n\n{table}")
 }
 
-/// A line per policy: means over everything.
+/// For the terminal: who did best over everything, and with how many Gaussians.
 pub(super) fn summary(outcomes: &[Outcome], policies: &[String]) -> String {
-    let width = policies.iter().map(String::len).max().unwrap_or(0).max(6);
-    let mut text = format!("{:width$}  PSNR [dB]    SSIM    FLIP  runs", "policy");
-    for policy in policies {
-        let (runs, over): (Vec<&Outcome>, Vec<&Outcome>) =
-            outcomes.iter().filter(|r| r.factor == *policy).partition(|r| r.kept_its_budget());
-        let psnr = number_or_dash(mean_of(&runs, |r| Some(r.psnr)), 3);
-        let ssim = number_or_dash(mean_of(&runs, |r| Some(r.ssim)), 4);
-        let flip = number_or_dash(mean_of(&runs, |r| Some(r.flip)), 4);
-        let _ =
-            write!(text, "\n{policy:width$}  {psnr:>9}  {ssim:>6}  {flip:>6}  {:>4}", runs.len());
-        if !over.is_empty() {
-            let _ = write!(text, "  ({} more over the budget, not counted)", over.len());
-        }
-    }
-    text
+    let (ranks, counts) = (ranking::lines(outcomes, policies), counts::lines(outcomes, policies));
+    format!(
+        "{ranks}\n\nDifferences are paired by scene, budget and seed; brackets are 95 % intervals of \
+         their mean.\n\n{counts}\n"
+    )
 }
 
 #[cfg(test)]
@@ -222,18 +182,24 @@ mod tests {
         ];
         let policies = ["a", "b", "c"].map(String::from);
         let text = markdown(&all, &policies);
-        assert!(text.contains("| b | +0.50, two runs | 2 of 2 |"), "{text}");
+        assert!(text.contains("| b | +0.50, two runs | 2 of 2 | 1 |"), "{text}");
         assert!(text.contains("| b | 31.50 (+0.50, two runs) |"), "{text}");
         let more = [record("a", 2, 30.0, 1000), record("b", 2, 31.5, 1000)];
         let text = markdown(&[&all[..], &more].concat(), &policies);
         // Student's t of two degrees of freedom, 4.303, times √(1/3)/√3.
-        assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 |"), "{text}");
+        assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 | 1 |"), "{text}");
+        assert!(text.contains("| b | 900 | 1,000 |"), "{text}");
         assert!(text.contains("| c | not ranked"), "{text}");
         assert!(text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | – |"), "{text}");
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
         let said = summary(&all, &policies);
-        assert!(said.contains("c               –       –       –     0  (2 more over"), "{said}");
+        let of_c = "   –  c               –                        –     –       –     –     0  (2 more over";
+        assert!(
+            said.contains(of_c) && said.contains("b          31.500  +0.50, two runs"),
+            "{said}"
+        );
+        assert!(said.contains("policy  1,000: end          peak"), "{said}");
     }
 
     #[test]

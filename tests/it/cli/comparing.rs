@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use densify_policies::registry::policies;
+
 use super::{Outcome, call, files, read, read_text, records, scratch, text};
 use crate::photographs::Photographs;
 
@@ -86,6 +88,36 @@ fn a_policy_competes_with_itself_by_its_parameters() {
 }
 
 #[test]
+fn all_policies_compete_and_are_ranked() {
+    let scene = Photographs::colmap_text();
+    let (_root, output) = scratch();
+    let what = "--seeds 1 --policies vanilla,all --budget 320 --iterations 24";
+    let said =
+        call(&format!("compare {} -o {} {what}", text(scene.path()), text(&output))).ok().stdout;
+    let registered = policies().expect("the registry is sound");
+    let others = registered.iter().map(|entry| entry.name).filter(|name| *name != "vanilla");
+    let names: Vec<&str> = std::iter::once("vanilla").chain(others).collect();
+    let all = records(&output.join("compare.jsonl"));
+    let ran: Vec<&str> = all.iter().filter_map(|record| record["factor"].as_str()).collect();
+    assert_eq!(ran, names);
+    let table = read_text(&output.join("compare.md"));
+    for name in names {
+        // RANK NAME PSNR …, then NAME END PEAK.
+        let words = |line: &str| line.split_whitespace().map(String::from).collect::<Vec<_>>();
+        let has = |at: usize, other: usize| {
+            said.lines().map(words).any(|it| {
+                it.get(at).is_some_and(|word| word == name)
+                    && it.get(other).is_some_and(|word| word.parse::<usize>().is_ok())
+            })
+        };
+        assert!(has(1, 0) && has(0, 2), "{name}: {said}");
+        assert!(table.contains(&format!("| {name} |")), "{name}: {table}");
+    }
+    assert!(said.contains("from vanilla") && said.contains("320: end"), "{said}");
+    assert!(table.contains("### Budget of 320\n"), "{table}");
+}
+
+#[test]
 fn bad_comparisons_are_refused_before_anything_runs() {
     let scene = Photographs::colmap_text();
     let (root, output) = scratch();
@@ -104,6 +136,7 @@ fn bad_comparisons_are_refused_before_anything_runs() {
         ("diet,dite", ["dite", "diet"]),
         ("diet,diet:rho", ["--policies", "diet.rho"]),
         ("diet,diet", ["--policies", "twice"]),
+        ("all,diet,all", ["--policies", "all twice"]),
         ("diet --seeds 0", ["--seeds", "0"]),
     ] {
         let (scene, output) = (text(scene.path()), text(&output));

@@ -1,0 +1,227 @@
+//! Tests of the rules of `lightgaussian`, each worked out by hand.
+
+use super::*;
+use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
+use crate::parameters::REFERENCE_ITERATIONS;
+use crate::policy::SignalSet;
+use crate::registry::find;
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run("lightgaussian", set)
+}
+
+/// Rows of opacity 0.5 and volume 1 that neither grow nor die, and no view.
+fn event(step: u32, rows: usize) -> Event {
+    Event::new(step, rows, rows)
+        .with_all(Signal::VisibleCount, 4.0)
+        .with_all(Signal::Opacity, 0.5)
+        .with_all(Signal::ScaleMax, 0.05)
+        .with_all(Signal::ScaleProduct, 1.0)
+}
+
+/// A view in which the rows are blended into so many pixels, with such sums of blend weights.
+fn view(pixels: &[f32], weights: &[f32]) -> View {
+    let columns =
+        vec![(AuxColumn::PixelCount, pixels.to_vec()), (AuxColumn::WeightSum, weights.to_vec())];
+    View { columns, ..View::default() }
+}
+
+#[test]
+fn significance_is_summed_over_all_views() {
+    // Row by row, pixels of both views · opacity: 30·0.5 = 15, 12·0.9 = 10.8, 100·0.1 = 10, 24·0.5 = 12.
+    // The first view alone would rank row 0 lowest, and pixels alone row 1.
+    let mut event = event(16_000, 4).with(Signal::Opacity, &[0.5, 0.9, 0.1, 0.5]);
+    event.views =
+        vec![view(&[0.0, 12.0, 50.0, 12.0], &[0.0; 4]), view(&[30.0, 0.0, 50.0, 12.0], &[0.0; 4])];
+    assert_eq!(run(&event, "first_share = 0.25").pruned, [2]);
+    assert_eq!(run(&event, "first_share = 0.5").pruned, [1, 2]);
+    assert_eq!(run(&event, "first_share = 0.75").pruned, [1, 2, 3]);
+    let done = run(&event, "");
+    assert_eq!((done.ops.cause.as_str(), done.ops.rows_after), ("prune", 2));
+    assert!(done.ops.clamp_opacity.is_none() && done.cloned.is_empty() && done.split.is_empty());
+}
+
+#[test]
+fn the_blend_weight_has_the_opacity_in_it() {
+    // Weights 3, 2, 4 of both views; times the opacity row 2 would be lowest with 0.4.
+    let mut event = event(16_000, 3).with(Signal::Opacity, &[0.5, 0.9, 0.1]);
+    event.views = vec![view(&[9.0; 3], &[1.0, 2.0, 4.0]), view(&[9.0; 3], &[2.0, 0.0, 0.0])];
+    assert_eq!(run(&event, "hit = \"blend-weight\"\nfirst_share = 0.34").pruned, [1]);
+    assert_eq!(run(&event, "hit = \"blend-weight\"\nfirst_share = 0.67").pruned, [0, 1]);
+    // By opacity: 9, 16.2, 1.8.
+    assert_eq!(run(&event, "first_share = 0.34").pruned, [2]);
+}
+
+#[test]
+fn volume_counts_by_its_tenth_root() {
+    // Volumes 1 and 1024: factors 1 and 1024^0.1 = 2. Pixels · ½ · factor: 5, 4.5·2 = 9, 4, 2.5·2 = 5.
+    let mut event = event(16_000, 4).with(Signal::ScaleProduct, &[1.0, 1024.0, 1.0, 1024.0]);
+    event.views = vec![view(&[10.0, 9.0, 8.0, 4.9], &[0.0; 4])];
+    // 4, 4.9, 5, 9.
+    let pruned = |set: &str| run(&event, set).pruned;
+    assert_eq!(pruned("first_share = 0.25"), [2]);
+    assert_eq!(pruned("first_share = 0.5"), [2, 3]);
+    // Without the volume: 10, 9, 8, 4.9.
+    assert_eq!(pruned("first_share = 0.5\nvolume_power = 0"), [2, 3]);
+    assert_eq!(pruned("first_share = 0.25\nvolume_power = 0"), [3]);
+    // The volume itself: 5, 4608, 4, 2508.8.
+    assert_eq!(pruned("first_share = 0.5\nvolume_power = 1"), [0, 2]);
+}
+
+/// The significance of the rows of an event with these pixels in its one view.
+fn significance(event: &Event, set: &str, pixels: &[f32]) -> Vec<f32> {
+    let growth = Vanilla::new(Default::default(), &event.scene).unwrap();
+    let params: LightGaussianParams = toml::from_str(set).unwrap();
+    let policy = LightGaussian { params, growth, hits: OverViews::default() };
+    let set = SignalSet::from([Signal::Opacity, Signal::ScaleProduct]);
+    let mut signals = crate::policy::Signals::zeros(event.rows, set);
+    for (signal, values) in &event.signals {
+        if let Some(column) = signals.get_mut(*signal) {
+            column.copy_from_slice(values);
+        }
+    }
+    let (step, scene) = (event.step, &event.scene);
+    let now = Snapshot { step, scene, signals: &signals, candidates: &[] };
+    policy.significance(&now, pixels).unwrap()
+}
+
+#[test]
+fn the_largest_tenth_of_volumes_is_clipped() {
+    // Of twenty volumes two are larger than V90 = 32^10, and count as it: factors 1, 32, 32 and 32
+    // instead of 1, 32, 64 and 128. Pixels 2 · ½ = 1.
+    let mut volume = [1.0; 20];
+    volume[7] = 32_f32.powi(10);
+    volume[8] = 64_f32.powi(10);
+    volume[9] = 128_f32.powi(10);
+    let event = event(16_000, 20).with(Signal::ScaleProduct, &volume);
+    let at = |set: &str| {
+        let all = significance(&event, set, &[2.0; 20]);
+        [6, 7, 8, 9].map(|row: usize| (all[row] * 1e4).round() / 1e4)
+    };
+    assert_eq!(at(""), [1.0, 32.0, 64.0, 128.0]);
+    assert_eq!(at("volume = \"clipped\""), [1.0, 32.0, 32.0, 32.0]);
+    assert_eq!(ninety_percent(&[1.0, 3.0, 2.0]), 3.0);
+    assert_eq!(ninety_percent(&[1.0, 9.0, 3.0, 2.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0]), 8.0);
+    assert!(ninety_percent(&[]).is_infinite());
+}
+
+#[test]
+fn what_is_not_a_number_is_pruned_first() {
+    let event = event(16_000, 3).with(Signal::ScaleProduct, &[1.0, f32::NAN, 1.0]);
+    assert_eq!(significance(&event, "", &[f32::NAN, 4.0, 4.0]), [0.0, 0.0, 2.0]);
+}
+
+#[test]
+fn the_published_shares_leave_three_tenths() {
+    // 1,000 → 500 → 300, the second share being 0.5·0.8; once: 1,000 → 340.
+    let at = |step, rows: usize, set: &str| {
+        let mut event = event(step, rows);
+        event.views = vec![view(&vec![1.0; rows], &vec![1.0; rows])];
+        run(&event, set).ops.rows_after
+    };
+    assert_eq!([at(16_000, 1000, ""), at(24_000, 500, "")], [500, 300]);
+    assert_eq!(at(20_000, 1000, "schedule = \"once\""), 340);
+    // ⌊0.5·7⌋ = 3.
+    assert_eq!(at(16_000, 7, ""), 4);
+    // The last row is kept.
+    assert_eq!(at(16_000, 7, "first_share = 1.0"), 1);
+    assert_eq!(at(16_000, 1, ""), 1);
+}
+
+#[test]
+fn prunes_come_after_growth_and_scale_with_the_run() {
+    let due = |set: &str, iterations| {
+        let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
+        due_steps("lightgaussian", &format!("grow_every = 0\nreset_every = 0\n{set}"), &scene)
+    };
+    assert_eq!(due("", REFERENCE_ITERATIONS), [16_000, 24_000]);
+    assert_eq!(due("schedule = \"once\"", REFERENCE_ITERATIONS), [20_000]);
+    // 7,000/30,000 of them: 3733.3 and 5600; 4666.7.
+    assert_eq!(due("", 7000), [3733, 5600]);
+    assert_eq!(due("schedule = \"once\"", 7000), [4667]);
+    assert_eq!(due("first_share = 0.0", REFERENCE_ITERATIONS), [24_000]);
+    assert_eq!(due("first_at = 0", REFERENCE_ITERATIONS), [24_000]);
+    let growth = due_steps("lightgaussian", "", &Event::new(1, 1, 1).scene);
+    assert_eq!((growth.len(), growth[143]), (146, 14_900));
+}
+
+#[test]
+fn growth_is_that_of_vanilla() {
+    // Over 4 views the means are 2e-4, less, and 1e-3; the last row is faint.
+    let event = Event { budget: 9, ..event(600, 4) }
+        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
+        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
+        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
+    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
+        let (ours, theirs) = (run(&event, set), event.run("vanilla", set));
+        assert_eq!(ours.ops, theirs.ops, "{set}");
+        assert!(ours.ops.edits_rows(), "{set}");
+    }
+    let (ours, theirs) = (find("lightgaussian").unwrap(), find("vanilla").unwrap());
+    assert!(theirs.parameters().iter().all(|p| ours.parameters().contains(p)));
+    assert!(ours.step_parameters().starts_with(theirs.step_parameters()));
+}
+
+#[test]
+fn a_prune_passes_over_rows_that_the_same_event_grew() {
+    // Row 0 has the lowest significance and is cloned; of four rows two are pruned.
+    let mut event =
+        Event { budget: 9, ..event(600, 4) }.with(Signal::ScreenGradient, &[1.0, 0.0, 0.0, 0.0]);
+    event.views = vec![view(&[1.0, 2.0, 3.0, 4.0], &[0.0; 4])];
+    let done = run(&event, "first_at = 600");
+    assert_eq!((done.cloned.as_slice(), done.pruned.as_slice()), (&[0][..], &[1, 2][..]));
+    assert_eq!((done.ops.cause.as_str(), done.ops.counts.denied), ("densify+prune", 0));
+}
+
+#[test]
+fn the_control_prunes_as_many_at_random_and_renders_nothing() {
+    let event = event(16_000, 1000);
+    let random = "victims = \"random\"";
+    let done = run(&event, random);
+    assert_eq!(done.ops.rows_after, 500);
+    // Not the first or last 500, which would be an order: of 1,000 in halves, 250 ± 5·√62.5.
+    let early = done.pruned.iter().filter(|row| **row < 500).count();
+    assert!(early.abs_diff(250) < 40, "{early}");
+    assert!(run(&Event { step: 24_000, ..event.clone() }, random).pruned != done.pruned);
+    let views = |set: &str, step| build("lightgaussian", set, &event.scene).aux_views(step, 9, 9);
+    assert_eq!([15_999, 16_000, 24_000].map(|step| views("", step)), [0, u32::MAX, u32::MAX]);
+    assert_eq!([16_000, 24_000].map(|step| views(random, step)), [0, 0]);
+    let needs = |set: &str| build("lightgaussian", set, &event.scene).needs(&event.scene);
+    assert_eq!(needs("").aux.unwrap().columns, [AuxColumn::PixelCount]);
+    assert_eq!(needs("hit = \"blend-weight\"").aux.unwrap().columns, [AuxColumn::WeightSum]);
+    assert_eq!(needs(random), build("vanilla", "", &event.scene).needs(&event.scene));
+}
+
+#[test]
+fn without_a_view_nothing_is_pruned() {
+    assert!(run(&event(16_000, 10), "").pruned.is_empty());
+}
+
+#[test]
+fn bad_parameters_are_named() {
+    for (set, name) in [
+        ("tau = -1.0", "lightgaussian.tau"),
+        ("first_share = 1.5", "lightgaussian.first_share"),
+        ("reset_opacity = 1.0", "lightgaussian.reset_opacity"),
+        ("grow_every = -1", "lightgaussian.grow_every"),
+        ("victims = \"lowst\"", "lightgaussian.victims"),
+        ("tua = 1.0", "tua"),
+    ] {
+        let built = find("lightgaussian").unwrap().build(&set.parse().unwrap(), &event(1, 1).scene);
+        let error = built.map(drop).unwrap_err().to_string();
+        assert!(error.contains(name), "{set}: {error}");
+    }
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "lightgaussian",
+        &[
+            "schedule = \"once\"\nhit = \"blend-weight\"",
+            "volume = \"clipped\"\nvolume_power = 1.0",
+            "victims = \"random\"\ngovernor = true",
+            "first_at = 200\nsecond_at = 300\nfirst_share = 1.0\nsecond_share = 1.0",
+        ],
+    );
+}

@@ -1,0 +1,135 @@
+//! Tests of the rules of `radsplat`, each worked out by hand.
+
+use super::*;
+use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
+use crate::policy::Signal;
+use crate::registry::find;
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run("radsplat", set)
+}
+
+/// Rows of opacity 0.5 that neither grow nor die, with these largest blend weights in each view.
+fn event(step: u32, views: &[&[f32]]) -> Event {
+    let rows = views[0].len();
+    let mut event = Event::new(step, rows, rows)
+        .with_all(Signal::VisibleCount, 4.0)
+        .with_all(Signal::Opacity, 0.5)
+        .with_all(Signal::ScaleMax, 0.05);
+    let view = |weights: &&[f32]| View {
+        columns: vec![(AuxColumn::WeightMax, weights.to_vec())],
+        ..View::default()
+    };
+    event.views = views.iter().map(view).collect();
+    event
+}
+
+#[test]
+fn rows_below_the_weight_in_every_view_are_pruned() {
+    // Largest: 0.0099, 0.01, 0.5, 0, 0.02. Row 0 has more than row 1 in sum.
+    let views: [&[f32]; 2] = [&[0.0099, 0.01, 0.0, 0.0, 0.02], &[0.0099, 0.0, 0.5, f32::NAN, 0.0]];
+    for step in [16_000, 24_000] {
+        let done = run(&event(step, &views), "");
+        assert_eq!((done.pruned.as_slice(), done.ops.cause.as_str()), (&[0, 3][..], "prune"));
+        assert!(done.ops.clamp_opacity.is_none() && done.cloned.is_empty());
+    }
+    // The light variant leaves row 2.
+    assert_eq!(run(&event(16_000, &views), "min_weight = 0.25").pruned, [0, 1, 3, 4]);
+    assert!(run(&event(16_000, &views), "min_weight = 0.0").pruned.is_empty());
+    // The last row is kept, the one with the largest weight.
+    assert_eq!(run(&event(16_000, &views), "min_weight = 1.0").pruned, [0, 1, 3, 4]);
+}
+
+#[test]
+fn prunes_come_after_growth_and_scale_with_the_run() {
+    let due = |set: &str, iterations| {
+        let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
+        due_steps("radsplat", &format!("grow_every = 0\nreset_every = 0\n{set}"), &scene)
+    };
+    assert_eq!(due("", 30_000), [16_000, 24_000]);
+    // 7,000/30,000 of them: 3733.3 and 5600.
+    assert_eq!(due("", 7000), [3733, 5600]);
+    assert_eq!(due("first_at = 0", 30_000), [24_000]);
+    assert_eq!(due("second_at = 0", 30_000), [16_000]);
+    let scene = Event::new(1, 1, 1).scene;
+    let growth = due_steps("radsplat", "", &scene);
+    assert_eq!((growth.len(), growth[143]), (146, 14_900));
+    let policy = build("radsplat", "", &scene);
+    assert_eq!(
+        [14_900, 16_000, 24_000].map(|s| policy.aux_views(s, 9, 9)),
+        [0, u32::MAX, u32::MAX]
+    );
+    assert_eq!(policy.needs(&scene).aux.unwrap().columns, [AuxColumn::WeightMax]);
+}
+
+#[test]
+fn growth_is_that_of_vanilla() {
+    let event = Event { budget: 9, ..event(600, &[&[0.0; 4]]) }
+        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
+        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
+        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
+    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
+        let (ours, theirs) = (run(&event, set), event.run("vanilla", set));
+        assert_eq!(ours.ops, theirs.ops, "{set}");
+        assert!(ours.ops.edits_rows(), "{set}");
+    }
+    let (ours, theirs) = (find("radsplat").unwrap(), find("vanilla").unwrap());
+    assert!(theirs.parameters().iter().all(|p| ours.parameters().contains(p)));
+    assert!(ours.step_parameters().starts_with(theirs.step_parameters()));
+}
+
+#[test]
+fn a_prune_passes_over_rows_that_the_same_event_grew() {
+    // Rows 0 and 1 are below the weight, and row 0 is cloned.
+    let event = Event { budget: 9, ..event(600, &[&[0.0, 0.0, 0.5]]) }
+        .with(Signal::ScreenGradient, &[1.0, 0.0, 0.0]);
+    let done = run(&event, "first_at = 600");
+    assert_eq!((done.cloned.as_slice(), done.pruned.as_slice()), (&[0][..], &[1][..]));
+    assert_eq!((done.ops.cause.as_str(), done.ops.counts.denied), ("densify+prune", 0));
+}
+
+#[test]
+fn the_control_prunes_as_many_at_random() {
+    // 300 of 1,000 are below the weight.
+    let weights: Vec<f32> = (0..1000).map(|row| if row < 300 { 0.001 } else { 0.5 }).collect();
+    let event = event(16_000, &[&weights]);
+    assert!(run(&event, "").pruned.iter().all(|row| *row < 300));
+    let random = run(&event, "victims = \"random\"");
+    assert_eq!(random.ops.rows_after, 700);
+    // 0.3 of those below the weight by chance: 90 ± 5·√44.1 (hypergeometric).
+    let low = random.pruned.iter().filter(|row| **row < 300).count();
+    assert!(low.abs_diff(90) < 34, "{low}");
+}
+
+#[test]
+fn the_control_may_be_told_what_the_second_prune_leaves() {
+    let scene = Event::new(1, 1, 1).scene;
+    let set = "victims = \"random\"\nrandom_keep = 3";
+    let event = event(24_000, &[&[0.0, 0.5, 0.5, 0.5, 0.5]]);
+    assert_eq!(run(&event, set).ops.rows_after, 3);
+    // Not at the first prune, and not by the real policy; a smaller model is left as it is.
+    assert_eq!(run(&Event { step: 16_000, ..event.clone() }, set).ops.rows_after, 4);
+    assert_eq!(run(&event, "random_keep = 3").ops.rows_after, 4);
+    assert_eq!(run(&event, "victims = \"random\"\nrandom_keep = 9").ops.rows_after, 5);
+    let views = |step| build("radsplat", set, &scene).aux_views(step, 9, 9);
+    assert_eq!([16_000, 24_000].map(views), [u32::MAX, 0]);
+}
+
+#[test]
+fn without_a_view_nothing_is_pruned() {
+    let event = Event { views: Vec::new(), ..event(16_000, &[&[0.0; 10]]) };
+    assert!(run(&event, "").pruned.is_empty());
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "radsplat",
+        &[
+            "min_weight = 0.25\ngovernor = true",
+            "victims = \"random\"",
+            "victims = \"random\"\nrandom_keep = 5",
+            "first_at = 200\nsecond_at = 300\nmin_weight = 1.0",
+        ],
+    );
+}
