@@ -16,20 +16,22 @@
 //! in proportion to their edge scores. For these, `views` random training views are rendered; in each,
 //! a Gaussian's score is the sum of the edge map over the pixels that it is blended into, divided by
 //! the mean of all Gaussians with a positive sum; the scores of all views are added. At the first
-//! growth after a recovery prune all views are used. From `final_from` on the gradient itself is the
+//! growth after a recovery prune all views are used. After `final_from` the gradient itself is the
 //! score, no view is rendered, and `tau` is divided by `final_divisor`.
 //!
 //! A candidate is **split along its longest axis**. With d = `split_share`, two children are placed at
 //! ±3d standard deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²)
 //! times, so that both ends stay in place. Their opacity is the parent's times `child_opacity`.
 //!
-//! **Pruning** removes Gaussians less opaque than `first_prune_opacity` at step `first_prune_at`, and
-//! those less opaque than `min_opacity` before every growth. `recover` steps after each opacity reset
-//! it removes the share `recovery_share` of all Gaussians with the lowest opacity: those that have not
-//! recovered are not needed.
+//! **Pruning** follows the splits of the same event. What it frees is used by the next growth, and
+//! Gaussians below the limit may be drawn before. It removes those less opaque than `min_opacity` at each
+//! growth before `prune_until`, and none at the last: nothing would take their place. `recover` steps
+//! after each of the first `recoveries` opacity resets it also removes the share `recovery_share` of what
+//! is left, those with the lowest opacity: what has not recovered is not needed. Before all growth, at
+//! step `first_prune_at`, it removes those less opaque than `first_prune_opacity`.
 //!
 //! **Opacity resets** limit opacities to `reset_opacity` every `reset_every` steps, `resets` times in
-//! all, and never from `grow_until` on.
+//! all, and never from `grow_until` on. Only the recovery prunes end after two resets; the resets do not.
 //!
 //! **The optimiser** steps at every iteration up to `sum_from`, then once per `sum` iterations, after
 //! `sum_more_from` once per `sum_more`, on the summed gradients. The learning rate of the means falls
@@ -37,8 +39,16 @@
 //!
 //! ## Differences from the published code
 //!
+//! - **`sums`.** The published 5 and 20 give 1,500 + 375 optimiser steps after half of 30,000 iterations,
+//!   but 350 + 88 in a run of 7,000. By default (`"scaled"`) both are multiplied by iterations / 30,000
+//!   and rounded, at least 1, so that a short run has about as many optimiser steps, as far as it has
+//!   iterations; 7,000 gives 1 and 5. `"fixed"` takes them as they are in a run of any length.
+//! - The published code splits, then prunes. A plan has one edit per Gaussian: one that is drawn, and
+//!   whose children would be pruned in the same event, is pruned itself. What is left is the same.
 //! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half
 //!   the interval of resets, so that the prune comes before the next reset.
+//! - The published code averages gradients from step 500 on; here the first growth averages over all
+//!   steps before it.
 //! - The published code divides edge scores by their mean over all Gaussians; here it is the mean over
 //!   those that the view shows.
 //! - The last Gaussian is never pruned.
@@ -55,26 +65,30 @@
 //! | views | 10 | >= 1 | views | views rendered per growth; all if there are fewer |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the children's opacity |
-//! | final_from | 14500 | >= 0 | step | start of growth by gradient |
+//! | final_from | 14500 | >= 0 | step | start of growth by gradient (exclusive) |
 //! | final_divisor | 1.5 | >= 1 | | divides `tau` from then on |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
+//! | prune_until | 14900 | >= 0 | step | end of pruning at growths (exclusive) |
 //! | first_prune_at | 300 | >= 0 | step | the first pruning; 0: none |
 //! | first_prune_opacity | 0.02 | 0 to 1 | | opacity limit of the first pruning |
 //! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
-//! | resets | 2 | >= 0 | | number of opacity resets |
+//! | resets | 4 | >= 0 | | number of opacity resets |
 //! | reset_opacity | 0.05 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | recover | 300 | >= 1 | steps | from a reset to the recovery prune |
+//! | recoveries | 2 | >= 0 | | number of resets that a recovery prune follows |
 //! | recovery_share | 0.2 | 0 to 1 | Gaussians | share that the recovery prune removes; 0: none |
 //! | sum_from | 15000 | >= 0 | step | start of summed gradients (exclusive) |
 //! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step from then on |
 //! | sum_more_from | 22500 | >= 0 | step | start of longer sums (exclusive) |
 //! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step from then on |
+//! | sums | "scaled" | scaled, fixed | | whether `sum` and `sum_more` scale with the run |
 //! | mean_start | 0.00004 | > 0 | extent / step | learning rate of the means at the start |
 //! | mean_end | 0.000002 | > 0 | extent / step | learning rate of the means at the end |
 //! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
-//! (`…_every`) do not shrink below 100 steps. `recover`, `sum` and `sum_more` do not scale.
+//! (`…_every`) do not shrink below 100 steps. `recover` does not scale; `sum` and `sum_more` are for a run
+//! of 30,000 even where they are set, unless `sums` is `"fixed"`.
 
 use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
 use crate::parameters::StepParameter::{self, Interval, Step};
@@ -85,11 +99,11 @@ use crate::policy::{
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
-use crate::sample::{smallest, weighted};
+use crate::sample::weighted;
 
 mod parameters;
 
-pub use parameters::IgsParams;
+pub use parameters::{IgsParams, Sums};
 
 crate::register_policy!(
     "igs",
@@ -107,6 +121,8 @@ pub struct Igs {
     resets: OpacityResets,
     /// Steps from a reset to its recovery prune.
     recover: u32,
+    /// Iterations per optimiser step after `sum_from`, and after `sum_more_from`, in this run.
+    sums: [u32; 2],
     score: EdgeScore,
 }
 
@@ -126,6 +142,7 @@ impl ConfiguredPolicy for Igs {
         Interval("grow_every"),
         Step("curve_until"),
         Step("final_from"),
+        Step("prune_until"),
         Step("first_prune_at"),
         Interval("reset_every"),
         Step("sum_from"),
@@ -142,6 +159,7 @@ impl ConfiguredPolicy for Igs {
             grow: Window { from, until, every },
             resets: OpacityResets::new(params.reset_every, resets_until, 0, opacity, scene)?,
             recover: params.recover.min((params.reset_every / 2).max(1)),
+            sums: params.sums_of(scene.iterations),
             score: EdgeScore::default(),
             params,
         })
@@ -162,7 +180,7 @@ impl DensityPolicy for Igs {
                 columns: vec![AuxColumn::MapSum],
                 points: 0,
             }),
-            cadence: Cadence { all: params.sum.max(params.sum_more), sh_rest: 1 },
+            cadence: Cadence { all: self.sums[0].max(self.sums[1]), sh_rest: 1 },
             rates: RateOverrides {
                 mean: Some(Rate { start: params.mean_start, end: params.mean_end }),
                 sh_rest: Some(Rate::constant(params.sh_rest)),
@@ -181,15 +199,15 @@ impl DensityPolicy for Igs {
 
     fn cadence(&self, step: u32) -> Cadence {
         let all = match step {
-            _ if step > self.params.sum_more_from => self.params.sum_more,
-            _ if step > self.params.sum_from => self.params.sum,
+            _ if step > self.params.sum_more_from => self.sums[1],
+            _ if step > self.params.sum_from => self.sums[0],
             _ => 1,
         };
         Cadence { all, sh_rest: 1 }
     }
 
     fn aux_views(&self, step: u32, _rows: usize, _budget: usize) -> u32 {
-        if !self.grow.is_due(step) || step >= self.params.final_from {
+        if !self.grow.is_due(step) || self.is_final(step) {
             return 0;
         }
         // The first growth after a recovery prune.
@@ -205,13 +223,24 @@ impl DensityPolicy for Igs {
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         let score = std::mem::take(&mut self.score);
-        self.prune(now, plan)?;
+        let drawn = self.draw(now, &score, rng, plan.budget())?;
+        self.prune(now, &drawn, plan)?;
+        let IgsParams { split_share, child_opacity, .. } = self.params;
+        let split = split_long_axis(split_share as f32, child_opacity as f32);
+        for &row in &drawn {
+            // A row that is pruned because its children would be is not split.
+            if plan.is_free(row) {
+                let _ = plan.grow(row, split);
+            }
+        }
         if self.grow.is_due(now.step) {
             plan.cause("grow");
-            self.split(now, &score, rng, plan)?;
+        }
+        let step = now.step;
+        if !drawn.is_empty() || self.is_first_prune(step) || self.is_recovery_prune(step) {
             plan.reset(Reset::Signals);
         }
-        self.resets.plan(now.step, plan);
+        self.resets.plan(step, plan);
         Ok(())
     }
 }
@@ -239,9 +268,25 @@ impl Igs {
     }
 
     fn is_recovery_prune(&self, step: u32) -> bool {
-        self.params.recovery_share > 0.0
-            && step < self.params.grow_until
-            && step.checked_sub(self.recover).is_some_and(|reset| self.resets.is_due(reset))
+        let IgsParams { reset_every, recoveries, recovery_share, grow_until, .. } = self.params;
+        let last = reset_every.saturating_mul(recoveries);
+        recovery_share > 0.0
+            && step < grow_until
+            && step
+                .checked_sub(self.recover)
+                .is_some_and(|reset| reset <= last && self.resets.is_due(reset))
+    }
+
+    /// Whether the gradient is the score.
+    fn is_final(&self, step: u32) -> bool {
+        step > self.params.final_from
+    }
+
+    /// What is pruned at `step` before anything is drawn.
+    fn first_limits(&self, step: u32) -> PruneLimits {
+        let first = self.params.first_prune_opacity as f32;
+        let min_opacity = if self.is_first_prune(step) { first } else { 0.0 };
+        PruneLimits { min_opacity, max_scale: f32::INFINITY }
     }
 
     /// Number of rows that the growth curve allows at `step`.
@@ -252,61 +297,77 @@ impl Igs {
         (budget as f64 * passed.min(1.0).sqrt()).floor() as usize
     }
 
-    fn prune(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> PolicyResult {
-        let opacity = now.signal(Signal::Opacity)?;
-        let mut least: f64 = 0.0;
-        if self.grow.is_due(now.step) {
-            least = self.params.min_opacity;
-        }
-        if self.is_first_prune(now.step) {
-            least = least.max(self.params.first_prune_opacity);
-            plan.cause("first-prune");
-        }
-        let limits = PruneLimits { min_opacity: least as f32, max_scale: f32::INFINITY };
-        let is_dead = |row: &u32| limits.exceeded(opacity[*row as usize], 0.0);
-        let (mut dead, mut living): (Vec<u32>, Vec<u32>) =
-            (0..now.rows() as u32).partition(is_dead);
-        if self.is_recovery_prune(now.step) {
-            plan.cause("recovery-prune");
-            let count = (self.params.recovery_share * now.rows() as f64).floor() as usize;
-            living = smallest(living, opacity, count.saturating_sub(dead.len()));
-            dead.append(&mut living);
-            dead.sort_unstable();
-        }
-        spare_one(&mut dead, opacity);
-        plan.prune_all(dead);
-        Ok(())
-    }
-
-    /// Splits candidates, drawn by their scores, as far as the curve allows.
-    fn split(
+    /// The candidates to split, drawn by their scores, as many as the curve allows.
+    fn draw(
         &self,
         now: &Snapshot<'_>,
         score: &EdgeScore,
         rng: &PolicyRng,
-        plan: &mut EditPlan,
-    ) -> PolicyResult {
+        budget: usize,
+    ) -> PolicyResult<Vec<u32>> {
+        if !self.grow.is_due(now.step) {
+            return Ok(Vec::new());
+        }
+        let opacity = now.signal(Signal::Opacity)?;
+        let limits = self.first_limits(now.step);
         let views = now.signal(Signal::VisibleCount)?;
         let gradient = mean_over_views(now.signal(Signal::ScreenGradientAbs)?, views);
-        let by_gradient = now.step >= self.params.final_from;
-        let divisor = if by_gradient { self.params.final_divisor } else { 1.0 };
+        let is_final = self.is_final(now.step);
+        let divisor = if is_final { self.params.final_divisor } else { 1.0 };
         let tau = (self.params.tau / divisor) as f32;
         let weight = |row: usize| {
-            let is_candidate = gradient[row] >= tau && plan.is_free(row as u32);
-            let score = if by_gradient { Some(&gradient[row]) } else { score.rows.get(row) };
+            let is_candidate = gradient[row] >= tau && !limits.exceeded(opacity[row], 0.0);
+            let score = if is_final { Some(&gradient[row]) } else { score.rows.get(row) };
             if is_candidate { score.copied().unwrap_or(0.0) } else { 0.0 }
         };
         let weights: Vec<f32> = (0..now.rows()).map(weight).collect();
-        let rows = plan.rows() - plan.pruned();
-        let count = self.allowed(now.step, plan.budget()).saturating_sub(rows);
-        let split =
-            split_long_axis(self.params.split_share as f32, self.params.child_opacity as f32);
-        for row in weighted(&weights, count, rng) {
-            // A refusal is counted by the plan.
-            let _ = plan.grow(row, split);
+        let rows = opacity.iter().filter(|&&opacity| !limits.exceeded(opacity, 0.0)).count();
+        let count = self.allowed(now.step, budget).saturating_sub(rows);
+        Ok(weighted(&weights, count, rng))
+    }
+
+    /// Prunes rows, as if those in `drawn` were already split.
+    fn prune(&self, now: &Snapshot<'_>, drawn: &[u32], plan: &mut EditPlan) -> PolicyResult {
+        let opacity = now.signal(Signal::Opacity)?;
+        let limits = self.first_limits(now.step);
+        if self.is_first_prune(now.step) {
+            plan.cause("first-prune");
         }
+        // The opacity after the splits, of both children where there are any; NaN: out before them.
+        let is_out = |&opacity: &f32| limits.exceeded(opacity, 0.0);
+        let mut after: Vec<f32> =
+            opacity.iter().map(|o| if is_out(o) { f32::NAN } else { *o }).collect();
+        for &row in drawn {
+            after[row as usize] *= self.params.child_opacity as f32;
+        }
+        let mut least = 0.0;
+        if self.grow.is_due(now.step) && now.step < self.params.prune_until {
+            least = self.params.min_opacity as f32;
+        }
+        if self.is_recovery_prune(now.step) {
+            plan.cause("recovery-prune");
+            let children = drawn.iter().map(|row| &after[*row as usize]);
+            let left = after.iter().chain(children).copied().filter(|&opacity| opacity >= least);
+            least = limit_of_share(left.collect(), self.params.recovery_share).max(least);
+        }
+        let is_kept = |row: &u32| after[*row as usize] >= least;
+        let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|row| !is_kept(row)).collect();
+        spare_one(&mut dead, opacity);
+        plan.prune_all(dead);
         Ok(())
     }
+}
+
+/// The value below which a `share` of the values is: the first, in ascending order, that is not below the
+/// interpolated quantile. Of equal values all or none are below it.
+fn limit_of_share(mut values: Vec<f32>, share: f64) -> f32 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let place = share * (values.len() - 1) as f64;
+    // A product just above an integer counts as this integer: its error is at most 2⁻⁵³ of itself.
+    let place = (place * (1.0 - f64::EPSILON)).ceil() as usize;
+    *values.select_nth_unstable_by(place, f32::total_cmp).1
 }
 
 #[cfg(test)]

@@ -4,8 +4,11 @@ use std::ops::Bound::{Excluded, Included, Unbounded};
 
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::in_range;
+use crate::parameters::{REFERENCE_ITERATIONS, in_range};
 use crate::policy::PolicyResult;
+
+/// Most iterations per optimiser step.
+const MOST_SUMMED: u32 = 1000;
 
 /// Parameters of [`Igs`](super::Igs).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,20 +26,33 @@ pub struct IgsParams {
     pub final_from: u32,
     pub final_divisor: f64,
     pub min_opacity: f64,
+    pub prune_until: u32,
     pub first_prune_at: u32,
     pub first_prune_opacity: f64,
     pub reset_every: u32,
     pub resets: u32,
     pub reset_opacity: f64,
     pub recover: u32,
+    pub recoveries: u32,
     pub recovery_share: f64,
     pub sum_from: u32,
     pub sum: u32,
     pub sum_more_from: u32,
     pub sum_more: u32,
+    pub sums: Sums,
     pub mean_start: f64,
     pub mean_end: f64,
     pub sh_rest: f64,
+}
+
+/// What `sum` and `sum_more` are in a run that is not 30,000 iterations long.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Sums {
+    /// In proportion to the run's length, so that the number of optimiser steps stays.
+    Scaled,
+    /// As they are.
+    Fixed,
 }
 
 impl Default for IgsParams {
@@ -53,17 +69,20 @@ impl Default for IgsParams {
             final_from: 14_500,
             final_divisor: 1.5,
             min_opacity: 0.005,
+            prune_until: 14_900,
             first_prune_at: 300,
             first_prune_opacity: 0.02,
             reset_every: 3000,
-            resets: 2,
+            resets: 4,
             reset_opacity: 0.05,
             recover: 300,
+            recoveries: 2,
             recovery_share: 0.2,
             sum_from: 15_000,
             sum: 5,
             sum_more_from: 22_500,
             sum_more: 20,
+            sums: Sums::Scaled,
             mean_start: 4e-5,
             mean_end: 2e-6,
             sh_rest: 2.5e-4,
@@ -72,6 +91,18 @@ impl Default for IgsParams {
 }
 
 impl IgsParams {
+    /// `sum` and `sum_more` in a run of so many iterations.
+    pub(super) fn sums_of(&self, iterations: u32) -> [u32; 2] {
+        [self.sum, self.sum_more].map(|sum| match self.sums {
+            Sums::Fixed => sum,
+            Sums::Scaled => {
+                let exact =
+                    f64::from(sum) * f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
+                exact.round().clamp(1.0, f64::from(MOST_SUMMED)) as u32
+            }
+        })
+    }
+
     /// Checks ranges.
     pub(super) fn check(&self) -> PolicyResult {
         let positive = (Excluded(0.0), Unbounded);
@@ -87,8 +118,8 @@ impl IgsParams {
         in_range("first_prune_opacity", self.first_prune_opacity, 0.0..=1.0)?;
         in_range("recover", self.recover.into(), 1.0..)?;
         in_range("recovery_share", self.recovery_share, 0.0..=1.0)?;
-        in_range("sum", self.sum.into(), 1.0..=1000.0)?;
-        in_range("sum_more", self.sum_more.into(), 1.0..=1000.0)?;
+        in_range("sum", self.sum.into(), 1.0..=MOST_SUMMED.into())?;
+        in_range("sum_more", self.sum_more.into(), 1.0..=MOST_SUMMED.into())?;
         in_range("mean_start", self.mean_start, positive)?;
         in_range("mean_end", self.mean_end, positive)?;
         in_range("sh_rest", self.sh_rest, positive)?;

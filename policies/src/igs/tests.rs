@@ -31,7 +31,7 @@ fn growth_follows_the_square_root() {
     assert_eq!(done.ops.cause, "grow");
     assert!(!done.ops.reset_signals.is_empty());
     let after = |step| run(&Event { step, ..event.clone() }, "").ops.rows_after;
-    // Not below what there is; the budget at 14,500, and not beyond it.
+    // Not below what there is; the budget at 14,500, and not beyond it. (At the end the gradient decides.)
     assert_eq!([after(600), after(2000), after(14_500), after(14_900)], [60, 60, 120, 120]);
     let low = Event { budget: 100, ..event.clone() };
     assert_eq!(run(&Event { step: 14_500, ..low }, "").ops.rows_after, 100);
@@ -45,12 +45,15 @@ fn only_candidates_with_edges_are_split() {
     let mut split = run(&event, "").split;
     split.sort_unstable();
     assert_eq!(split, [0, 2]);
-    // At the end 2e-4 is enough, and the gradient is the score.
-    let mut last = run(&Event { step: 14_500, ..event.clone() }, "").split;
-    last.sort_unstable();
-    assert_eq!(last, [0, 1, 2, 3]);
+    // After 14,500 2e-4 is enough, and the gradient is the score.
+    let sorted = |step| {
+        let mut split = run(&Event { step, ..event.clone() }, "").split;
+        split.sort_unstable();
+        split
+    };
+    assert_eq!((sorted(14_500), sorted(14_600)), (vec![0, 2], vec![0, 1, 2, 3]));
     let none = event.with(Signal::ScreenGradientAbs, &[7.9e-4; 4]);
-    assert!(run(&Event { step: 14_500, ..none }, "").split.is_empty());
+    assert!(run(&Event { step: 14_600, ..none }, "").split.is_empty());
 }
 
 #[test]
@@ -88,43 +91,146 @@ fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
     let event = event(300, &[1.0; 4], 100).with(Signal::Opacity, &[0.0199, 0.02, 0.004, f32::NAN]);
     let first = run(&event, "");
     assert_eq!((first.pruned, first.ops.cause.as_str()), (vec![0, 2, 3], "first-prune"));
-    assert!(first.split.is_empty() && first.ops.reset_signals.is_empty());
+    assert!(first.split.is_empty() && !first.ops.reset_signals.is_empty());
     let growing = run(&Event { step: 600, ..event.clone() }, "");
     assert_eq!(growing.pruned, [2, 3]);
-    // Pruned rows are not drawn.
+    // ⌊100 · √(100/14000)⌋ = 8 may be: all are drawn but what is not a number, and 0.6 · 0.004 goes.
     assert_eq!((growing.split.len(), growing.ops.counts.denied), (2, 0));
-    let all = event.with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
+    let all = event.clone().with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
     assert_eq!(run(&all, "").pruned, [0, 2, 3]);
+    // Where both fall on one step, the first prune comes before the draw.
+    // Two of 24 may be, and it is the one left that is split, not those with edges.
+    let budget = 24;
+    let edges = vec![view(&[1e9, 1.0, 1e9, 1e9])];
+    let both = Event { step: 600, budget, views: edges, ..event };
+    let both = run(&both, "first_prune_at = 600");
+    assert_eq!((both.pruned, both.split), (vec![0, 2, 3], vec![1]));
 }
 
 #[test]
-fn a_fifth_is_pruned_after_each_reset() {
+fn rows_are_split_before_they_are_pruned() {
+    // ⌊7 · √(3500/14000)⌋ = 3 Gaussians may be at step 4000, as there are: nothing is split, though one
+    // is pruned; its slot is for the next growth.
+    let faint = event(4000, &[1.0; 3], 7).with(Signal::Opacity, &[0.5, 0.004, 0.5]);
+    let done = run(&faint, "");
+    assert_eq!((&done.pruned[..], done.split.len(), done.ops.rows_after), (&[1][..], 0, 2));
+    assert!(done.ops.reset_signals.is_empty(), "nothing was split");
+    let next = event(4000, &[1.0; 2], 7);
+    assert_eq!(run(&next, "").split.len(), 1);
+    // ⌊9 · 0.5⌋ = 4: one is drawn, the only one with edges. Its children would have opacities of
+    // 0.6 · 0.0083 < 0.005: it goes, and none of the others takes its place.
+    let last = event(4000, &[0.0, 1.0, 0.0], 9);
+    let drawn = |opacity: f32| {
+        let done = run(&last.clone().with(Signal::Opacity, &[0.5, opacity, 0.5]), "");
+        assert!(!done.ops.reset_signals.is_empty());
+        (done.pruned, done.split, done.ops.counts.denied)
+    };
+    assert_eq!(drawn(0.0083), (vec![1], vec![], 0));
+    assert_eq!(drawn(0.0084), (vec![], vec![1], 0));
+    // One that is below the limit itself is drawn like any other, here in place of nobody.
+    assert_eq!(drawn(0.004), (vec![1], vec![], 0));
+}
+
+#[test]
+fn nothing_is_pruned_at_the_end() {
+    let at = |step, set: &str| {
+        let faint = event(step, &[0.0; 2], 9).with(Signal::Opacity, &[0.5, 0.004]);
+        run(&faint.with_all(Signal::ScreenGradientAbs, 0.0), set).pruned
+    };
+    assert_eq!([at(14_800, ""), at(14_900, "")], [vec![1], vec![]]);
+    assert_eq!(at(14_900, "prune_until = 14901"), [1]);
+    // Nor is what is split: 0.6 · 0.004 is kept. A value that is not a number is not.
+    let split = event(14_900, &[1.0; 2], 9).with(Signal::Opacity, &[0.004, f32::NAN]);
+    let done = run(&split, "");
+    assert_eq!((done.pruned, done.split), (vec![1], vec![0]));
+}
+
+#[test]
+fn the_budget_holds_while_rows_are_split_and_pruned() {
+    // All at the budget of 4; the curve is at its end. Nothing is split, one is pruned.
+    let full = event(14_600, &[1.0; 4], 4).with(Signal::Opacity, &[0.5, 0.004, 0.5, 0.5]);
+    let done = run(&full, "");
+    assert_eq!((&done.pruned[..], done.split.len(), done.ops.rows_after), (&[1][..], 0, 3));
+    // Room for one: one of four is split, as pruning comes later, or goes with its children.
+    let room = run(&Event { budget: 5, ..full.clone() }, "");
+    assert_eq!((room.pruned, room.ops.counts.denied), (vec![1], 0));
+    assert!(room.split.len() <= 1);
+    // Room for all: all are drawn, and three are split.
+    let all = run(&Event { budget: 8, ..full }, "");
+    assert_eq!((&all.pruned[..], all.split.len(), all.ops.rows_after), (&[1][..], 3, 6));
+}
+
+#[test]
+fn a_fifth_is_pruned_after_each_of_two_resets() {
     let opacity = [0.5, 0.01, 0.4, 0.3, 0.02, 0.2, 0.9, 0.03, 0.8, 0.7];
     let event = event(3300, &[1.0; 10], 10).with(Signal::Opacity, &opacity);
     let done = run(&event, "");
+    // Below the quantile, which is at place 0.2 · 9 = 1.8 in the order of opacity.
     assert_eq!(done.pruned, [1, 4]);
     assert_eq!(done.ops.cause, "recovery-prune+grow");
-    // The dead are counted among the fifth.
-    let one_dead =
-        event.clone().with(Signal::Opacity, &opacity.map(|o| if o < 0.015 { 0.001 } else { o }));
-    assert_eq!(run(&one_dead, "").pruned, [1, 4]);
+    assert!(!done.ops.reset_signals.is_empty());
+    // The dead go first; of nine, those below place 0.2 · 8 = 1.6: two more.
+    let one_dead = opacity.map(|o| if o < 0.015 { 0.001 } else { o });
+    let one_dead = event.clone().with(Signal::Opacity, &one_dead);
+    assert_eq!(run(&one_dead, "").pruned, [1, 4, 7]);
+    // Of equal ones all or none.
+    let equal = event.clone().with(Signal::Opacity, &opacity.map(|o| o.max(0.03)));
+    assert!(run(&equal, "").pruned.is_empty());
     assert!(run(&event, "recovery_share = 0").pruned.is_empty());
-    for step in [3000, 3200, 3400] {
+    for step in [3000, 3200, 3400, 9300, 12_300] {
         assert!(run(&Event { step, ..event.clone() }, "").pruned.is_empty(), "{step}");
     }
+    assert_eq!(run(&Event { step: 6300, ..event.clone() }, "").pruned, [1, 4]);
+    assert_eq!(run(&Event { step: 9300, ..event }, "recoveries = 3").pruned, [1, 4]);
 }
 
 #[test]
-fn opacities_are_reset_twice() {
+fn the_fifth_is_that_of_the_model_after_the_splits() {
+    // Step 3300: √(2800/14000) = 0.447; ⌊20 · 0.447⌋ = 8: two of six are drawn, those with edges.
+    let opacity = [0.9, 0.1, 0.05, 0.3, 0.4, 0.2];
+    let event = event(3300, &[0.0, 1.0, 0.0, 0.0, 1.0, 0.0], 20).with(Signal::Opacity, &opacity);
+    // Then there are 0.05, 0.06, 0.06, 0.2, 0.24, 0.24, 0.3, 0.9; place 0.2 · 7 = 1.4, so that all below
+    // the next, 0.06, go: only row 2.
+    let done = run(&event, "");
+    assert_eq!((done.pruned, done.ops.rows_after), (vec![2], 7));
+    // Place 0.3 · 7 = 2.1: below 0.2. Both children of row 1 go, and row 1 in their place.
+    // (Place 0.28 · 7 = 1.96 is below it; were children counted once, 0.28 · 5 = 1.4 would be 0.2 too.)
+    assert_eq!(run(&event, "recovery_share = 0.28").pruned, [2]);
+    let more = run(&event, "recovery_share = 0.3");
+    assert_eq!((more.pruned, more.split), (vec![1, 2], vec![4]));
+}
+
+#[test]
+fn the_share_is_cut_at_the_quantile() {
+    let eleven: Vec<f32> = (0..11_u8).map(f32::from).collect();
+    // At 2.5 the quantile is between 2 and 3: whatever is below 3 is below it.
+    let limits: Vec<f32> =
+        [0.0, 0.2, 0.25, 1.0].iter().map(|&share| limit_of_share(eleven.clone(), share)).collect();
+    assert_eq!(limits, [0.0, 2.0, 3.0, 10.0]);
+    // 0.07 · 100 is 7.000000000000001 as computed.
+    let hundred = (0..=100_u8).map(f32::from).collect();
+    assert_eq!(vec![limit_of_share(hundred, 0.07)], [7.0]);
+    assert_eq!((limit_of_share(vec![], 0.2), limit_of_share(vec![5.0], 0.2)), (0.0, 5.0));
+}
+
+#[test]
+fn opacities_are_reset_four_times() {
     let at = |step| run(&event(step, &[1.0], 10), "").ops.clamp_opacity;
-    assert_eq!([at(3000), at(6000), at(9000), at(3100)], [Some(0.05), Some(0.05), None, None]);
+    let four = [3000, 6000, 9000, 12_000];
+    assert_eq!(four.map(at), [Some(0.05); 4]);
+    assert_eq!([at(3100), at(14_900)], [None; 2]);
     let scene = Event::new(1, 1, 1).scene;
     let due = |set: &str, scene| {
         due_steps("igs", &format!("grow_every = 0\nfirst_prune_at = 0\n{set}"), scene)
     };
-    assert_eq!(due("", &scene), [3000, 3300, 6000, 6300]);
-    assert_eq!(due("resets = 9", &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
-    assert_eq!(due("recovery_share = 0", &scene), [3000, 6000]);
+    assert_eq!(due("", &scene), [3000, 3300, 6000, 6300, 9000, 12_000]);
+    assert_eq!(due("resets = 2", &scene), [3000, 3300, 6000, 6300]);
+    let all = "resets = 9\nrecoveries = 9";
+    assert_eq!(due(all, &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
+    // No recovery prune without a reset.
+    assert_eq!(due("resets = 1\nrecoveries = 9", &scene), [3000, 3300]);
+    assert_eq!(due("recovery_share = 0", &scene), four);
+    assert_eq!(due("recoveries = 0", &scene), four);
     assert_eq!(due("reset_every = 0", &scene), [0; 0]);
     // The recovery prune comes before the next reset: after at most half the interval.
     let short = SceneInfo { iterations: 600, ..scene };
@@ -138,9 +244,9 @@ fn all_views_are_rendered_after_a_recovery_prune() {
         (0..=30_000).filter(|&step| policy.aux_views(step, 1, 9) == count).collect()
     };
     assert_eq!(views(u32::MAX), [3400, 6400]);
-    // 600..14,400 except these two.
+    // 600..14,500 except these two.
     let some = views(10);
-    assert_eq!((some.len(), some[0], some.last()), (137, 600, Some(&14_400)));
+    assert_eq!((some.len(), some[0], some.last()), (138, 600, Some(&14_500)));
 }
 
 #[test]
@@ -163,6 +269,45 @@ fn the_optimiser_steps_less_often_towards_the_end() {
     );
     let plain = build("igs", "sum = 1\nsum_more = 1", &scene);
     assert_eq!(plain.needs(&scene).cadence, Cadence::default());
+}
+
+/// Iterations at which the optimiser steps, in the two quarters after `sum_from`.
+fn optimiser_steps(set: &str, iterations: u32) -> [usize; 2] {
+    let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
+    let policy = build("igs", set, &scene);
+    let longest = policy.needs(&scene).cadence;
+    let count = |from: u32, to: u32| {
+        let of = |step| {
+            assert!(policy.cadence(step).is_within(longest), "{step}");
+            policy.cadence(step).steps_at(step)[0]
+        };
+        (from + 1..=to).filter(|&step| of(step)).count()
+    };
+    let quarter = iterations / 4;
+    [count(2 * quarter, 3 * quarter), count(3 * quarter, iterations)]
+}
+
+#[test]
+fn a_short_run_has_as_many_optimiser_steps_as_it_can() {
+    // 7500/5 and 7500/20; twice as long, sums of 10 and 40.
+    assert_eq!(optimiser_steps("", 30_000), [1500, 375]);
+    assert_eq!(optimiser_steps("", 60_000), [1500, 375]);
+    // 7,000: 5 · 7/30 = 1.17, 20 · 7/30 = 4.67, so 1 and 5: 1750 and 350.
+    assert_eq!(optimiser_steps("", 7000), [1750, 350]);
+    // 1.33 becomes 1: as many as there are iterations.
+    assert_eq!(optimiser_steps("", 2000), [500, 500]);
+    assert_eq!(optimiser_steps("", 4), [1, 1]);
+    // As published: 1,750/5, and the multiples of 20 from 5,260 to 7,000.
+    let fixed = "sums = \"fixed\"";
+    assert_eq!(optimiser_steps(fixed, 30_000), [1500, 375]);
+    assert_eq!(optimiser_steps(fixed, 7000), [350, 88]);
+    // What is set is for 30,000 too.
+    assert_eq!(optimiser_steps("sum = 30", 7000), [250, 350]);
+    assert_eq!(optimiser_steps(&format!("sum = 30\n{fixed}"), 7000), [59, 88]);
+    // Not beyond what a sum may be: 20 · 400 / 3.
+    let scene = SceneInfo { iterations: 4_000_000, ..Event::new(1, 1, 1).scene };
+    let long = build("igs", "", &scene);
+    assert_eq!(long.needs(&scene).cadence, Cadence { all: 1000, sh_rest: 1 });
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! # mcmc — relocation of dead Gaussians, noise on faint ones
 //!
-//! Moves dead Gaussians to places where others do the work, adds 5 % per event up to the budget, and
-//! lets faint Gaussians explore by adding noise to their means.
+//! Moves dead Gaussians to places where others do the work, adds 5 % in a three-hundredth of the run up
+//! to the budget, and lets faint Gaussians explore by adding noise to their means.
 //!
 //! Source: *3D Gaussian Splatting as Markov Chain Monte Carlo*, Kheradmand, Rebain, Sharma, Sun, Tseng,
 //! Isack, Kar, Tagliasacchi, Yi, NeurIPS 2024, arXiv 2404.09591, with the constants of its public code
@@ -14,7 +14,8 @@
 //! 1. Gaussians with an opacity of at most `min_opacity` are dead. Each is replaced by a copy of a
 //!    living Gaussian, drawn with replacement in proportion to opacity.
 //! 2. The model grows by the factor 1 + `growth`, up to the budget: that many more copies are drawn in
-//!    the same way.
+//!    the same way. An event that stands for n published ones grows by (1 + `growth`)ⁿ; n is 1 in a run
+//!    of 30,000 with the default `grow_every`.
 //!
 //! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each
 //! has the opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and standard deviations multiplied
@@ -24,7 +25,13 @@
 //! **In every step** two terms are added to the loss, `opacity_term` · mean opacity and
 //! `scale_term` · mean standard deviation, so that Gaussians which are not needed fade and shrink.
 //! After the optimiser's step every mean moves by Σ·ξ · σ(−`noise_sharpness`·(o − `noise_opacity`)) ·
-//! `noise` · λ, with Σ the Gaussian's covariance, ξ ~ N(0, I) and λ the learning rate of the means.
+//! `noise` · λ, with Σ the Gaussian's covariance, ξ ~ N(0, I) and λ the learning rate of the means at
+//! that step. The factor by which the trainer lengthens the steps of short runs is not part of this λ:
+//! steps are lengthened to follow their gradients further, and noise follows none.
+//!
+//! **Learning rates** are the published ones, whatever the trainer's are: means 1.6e-4 falling to
+//! 1.6e-6, log-scales 5e-3, quaternions 1e-3, opacities 0.05, SH band 0 2.5e-3 and bands 1–3 a twentieth
+//! of it. The trainer lengthens all of them in short runs, and `--lr` overrides each.
 //!
 //! **At the start** all opacities are `start_opacity`, and standard deviations are multiplied by
 //! `start_scale`. Opacities are never reset.
@@ -38,6 +45,10 @@
 //!   of dead Gaussians.
 //! - The published `noise` and `scale_term` depend on the unit of length. Here the unit is the camera
 //!   radius (scene extent / 1.1), as in gsplat's normalised scenes.
+//! - The published code grows by 5 % every 100 steps: 244 events, ×150,000. A run of 2,000 has 16 events,
+//!   which at 5 % each end at twice the initial number, whatever the budget. So `growth` is meant per 100
+//!   steps of a run of 30,000, and an event stands for n = `grow_every` · 300 / iterations of them: 15 in
+//!   that run, where it doubles the model.
 //! - If no Gaussian is alive, nothing is done.
 //!
 //! ## Parameters
@@ -48,7 +59,7 @@
 //! | grow_until | 25000 | >= 0 | step | end of relocation and growth (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of relocation and growth; 0: never |
 //! | min_opacity | 0.005 | 0 to 1, both excluded | | Gaussians up to this opacity are dead |
-//! | growth | 0.05 | 0 to 1 | Gaussians | growth per event |
+//! | growth | 0.05 | 0 to 1 | Gaussians | growth per 1/300 of the run |
 //! | most_shares | 51 | 2 to 51 | Gaussians | largest N in the formulas |
 //! | opacity_term | 0.01 | >= 0 | loss | coefficient of the mean opacity |
 //! | scale_term | 0.01 | >= 0 | loss / camera radius | coefficient of the mean standard deviation |
@@ -67,11 +78,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::adc::Window;
 use crate::parameters::StepParameter::{self, Interval, Step};
-use crate::parameters::in_range;
+use crate::parameters::{REFERENCE_ITERATIONS, in_range};
 use crate::plan::{EditPlan, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, UNTURNED};
 use crate::policy::{
-    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyResult, SceneInfo, Signal, SignalSet,
-    Snapshot, StartRule,
+    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyResult, Rate, RateOverrides, SceneInfo,
+    Signal, SignalSet, Snapshot, StartRule,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -87,6 +98,20 @@ crate::register_policy!(
 
 /// Scene extent / camera radius.
 const EXTENT_MARGIN: f64 = 1.1;
+
+/// Steps from one published event to the next.
+const PUBLISHED_INTERVAL: u32 = 100;
+
+/// The published learning rates.
+const RATES: RateOverrides = RateOverrides {
+    mean: Some(Rate { start: 1.6e-4, end: 1.6e-6 }),
+    log_scale: Some(Rate::constant(5e-3)),
+    quat: Some(Rate::constant(1e-3)),
+    opacity: Some(Rate::constant(0.05)),
+    sh_dc: Some(Rate::constant(2.5e-3)),
+    sh_rest: Some(Rate::constant(2.5e-3 / 20.0)),
+    fade: None,
+};
 
 /// Parameters of [`Mcmc`], explained in its manual page.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -133,6 +158,8 @@ impl Default for McmcParams {
 pub struct Mcmc {
     params: McmcParams,
     grow: Window,
+    /// Factor on the number of rows at an event.
+    growth: f64,
 }
 
 impl ConfiguredPolicy for Mcmc {
@@ -141,7 +168,7 @@ impl ConfiguredPolicy for Mcmc {
     const STEP_PARAMETERS: &'static [StepParameter] =
         &[Step("grow_from"), Step("grow_until"), Interval("grow_every")];
 
-    fn new(params: McmcParams, _scene: &SceneInfo) -> PolicyResult<Self> {
+    fn new(params: McmcParams, scene: &SceneInfo) -> PolicyResult<Self> {
         // Rounded to the f32 that plans take: 0.99999999 becomes 1.
         let rounded = |value: f64| f64::from(value as f32);
         in_range("min_opacity", rounded(params.min_opacity), (Excluded(0.0), Excluded(1.0)))?;
@@ -155,7 +182,8 @@ impl ConfiguredPolicy for Mcmc {
         in_range("start_opacity", rounded(params.start_opacity), (Excluded(0.0), Excluded(1.0)))?;
         in_range("start_scale", params.start_scale, (Excluded(0.0), Unbounded))?;
         let McmcParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
-        Ok(Self { grow: Window { from, until, every }, params })
+        let growth = growth_of_event(params.growth, every, scene.iterations);
+        Ok(Self { grow: Window { from, until, every }, growth, params })
     }
 }
 
@@ -179,6 +207,7 @@ impl DensityPolicy for Mcmc {
                 opacity: Some(params.start_opacity as f32),
                 scale: params.start_scale as f32,
             },
+            rates: RATES,
             ..Needs::default()
         }
     }
@@ -198,7 +227,7 @@ impl DensityPolicy for Mcmc {
         if dead.len() == now.rows() {
             return Ok(());
         }
-        let target = grown(now.rows(), self.params.growth).min(plan.budget());
+        let target = grown(now.rows(), self.growth).min(plan.budget());
         let copies = dead.len() + target.saturating_sub(now.rows());
         if !dead.is_empty() {
             plan.cause("relocate");
@@ -214,10 +243,17 @@ impl DensityPolicy for Mcmc {
     }
 }
 
-/// ⌊(1 + `growth`)·`rows`⌋.
+/// The factor on the number of rows at an event every `every` steps, where `growth` is that of an event
+/// every 100 steps of 30,000; infinite where an event stands for very many.
+fn growth_of_event(growth: f64, every: u32, iterations: u32) -> f64 {
+    let published = f64::from(REFERENCE_ITERATIONS / PUBLISHED_INTERVAL);
+    (1.0 + growth).powf(f64::from(every) * published / f64::from(iterations.max(1)))
+}
+
+/// ⌊`growth`·`rows`⌋, at most `usize::MAX`.
 fn grown(rows: usize, growth: f64) -> usize {
     // A product just below an integer counts as this integer: its error is at most 2⁻⁵³ of itself.
-    ((1.0 + growth) * rows as f64 * (1.0 + f64::EPSILON)).floor() as usize
+    (growth * rows as f64 * (1.0 + f64::EPSILON)).floor() as usize
 }
 
 impl Mcmc {

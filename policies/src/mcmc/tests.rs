@@ -93,6 +93,71 @@ fn growth_is_five_percent_up_to_the_budget() {
 }
 
 #[test]
+fn an_event_of_a_short_run_stands_for_several_published_ones() {
+    let opacity = [0.5; 100];
+    let after = |iterations: u32, set: &str| {
+        let mut event = event(&opacity, 100_000);
+        event.scene.iterations = iterations;
+        // Within the window of any of these runs.
+        run(&Event { step: 200, ..event }, &format!("grow_from = 0\ngrow_until = 999\n{set}"))
+            .ops
+            .rows_after
+    };
+    // 100 steps of 30,000; of 15,000 two events, 1.1025; of 2,000 fifteen, 1.05¹⁵ = 2.0789.
+    assert_eq!([after(30_000, ""), after(15_000, ""), after(2000, "")], [105, 110, 207]);
+    // Intervals grow with longer runs (100 becomes 200), and the growth stays.
+    assert_eq!(after(60_000, ""), 105);
+    // Half an interval is half the exponent: √1.21 = 1.1. Twice is its square.
+    assert_eq!(after(30_000, "growth = 0.21\ngrow_every = 50"), 110);
+    assert_eq!(after(30_000, "growth = 0.21\ngrow_every = 200"), 146);
+}
+
+#[test]
+fn extreme_growth_fills_the_budget_and_no_more() {
+    for (growth, every, iterations) in [(0.05, u32::MAX, 30_000), (1.0, u32::MAX, 1), (1.0, 100, 0)]
+    {
+        let factor = growth_of_event(growth, every, iterations);
+        assert_eq!(grown(3, factor).min(1000), 1000, "{growth} {every} {iterations}");
+    }
+    for (growth, every) in [(0.0, u32::MAX), (0.5, 0)] {
+        assert_eq!(grown(3, growth_of_event(growth, every, 1)), 3);
+    }
+    // As published, to the bit.
+    for growth in [0.0, 0.05, 0.1, 1.0] {
+        assert_eq!(growth_of_event(growth, 100, 30_000).to_bits(), (1.0 + growth).to_bits());
+    }
+}
+
+#[test]
+fn runs_of_2_000_steps_fill_their_budget() {
+    let scene = SceneInfo { iterations: 2000, ..Event::new(1, 1, 1).scene };
+    let mut policy = build("mcmc", "", &scene);
+    // From 100 rows, 2.0789-fold at each event: 207, 430, 893, 1856, 3858, 8020, and then all.
+    let (mut rows, mut seen) = (100, Vec::new());
+    for step in (1..=2000).filter(|&step| build("mcmc", "", &scene).is_due(step)) {
+        let event = Event { step, ..event(&vec![0.5; rows], 10_000) };
+        rows = event.run_policy(&mut *policy).unwrap().ops.rows_after;
+        seen.push(rows);
+    }
+    assert_eq!(seen.len(), 16);
+    assert_eq!(seen[..8], [207, 430, 893, 1856, 3858, 8020, 10_000, 10_000]);
+}
+
+#[test]
+fn every_group_has_its_published_rate() {
+    let scene = Event::new(1, 1, 1).scene;
+    let rates = build("mcmc", "", &scene).needs(&scene).rates;
+    let start_end = |rate: Option<Rate>| rate.map(|rate| (rate.start, rate.end));
+    assert_eq!(start_end(rates.mean), Some((0.000_16, 0.000_001_6)));
+    assert_eq!(start_end(rates.log_scale), Some((0.005, 0.005)));
+    assert_eq!(start_end(rates.quat), Some((0.001, 0.001)));
+    assert_eq!(start_end(rates.opacity), Some((0.05, 0.05)));
+    assert_eq!(start_end(rates.sh_dc), Some((0.0025, 0.0025)));
+    assert_eq!(start_end(rates.sh_rest), Some((0.000_125, 0.000_125)));
+    assert_eq!(rates.fade, None);
+}
+
+#[test]
 fn the_opaque_are_drawn_more_often() {
     let opacity: Vec<f32> = (0..2000).map(|row| if row % 2 == 0 { 0.1 } else { 0.4 }).collect();
     let done = run(&event(&opacity, 4000), "growth = 1.0");
