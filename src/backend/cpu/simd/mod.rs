@@ -268,13 +268,24 @@ impl<S: Simd> Mask<S> {
     /// `yes` where true, 0 elsewhere.
     #[inline(always)]
     pub(super) fn keep(self, yes: V<S>) -> V<S> {
-        self.select(yes, V::zero(self.s))
+        let s = self.s;
+        if size_of::<S::m32s>() != size_of::<S::u32s>() {
+            return self.select(yes, V::zero(s));
+        }
+        // All bits of a lane are set or none. The compiler does not know, and would look at their signs.
+        let mask: S::u32s = pulp::bytemuck::cast(self.m);
+        V::of_bits(s, s.and_u32s(mask, s.transmute_u32s_f32s(yes.v)))
     }
 
     /// Bit i: lane i. AVX-512 masks are bits already; others have all bits of a lane set or none, and
     /// where there are no vectors a lane is one byte.
     #[inline(always)]
     pub(super) fn bits(self) -> u32 {
+        // One instruction of AVX2. Without asking for it by name it would be two dozen.
+        #[cfg(target_arch = "x86_64")]
+        if let Some(v3) = (&self.s as &dyn std::any::Any).downcast_ref::<pulp::x86::V3>() {
+            return v3.avx._mm256_movemask_ps(pulp::bytemuck::cast(self.m)) as u32;
+        }
         let bytes = pulp::bytemuck::bytes_of(&self.m);
         if let [low, high] = *bytes {
             return u32::from(u16::from_le_bytes([low, high]));
@@ -300,7 +311,7 @@ impl<S: Simd> Mask<S> {
 
     #[inline(always)]
     pub(super) fn any(self) -> bool {
-        self.s.first_true_m32s(self.m) < S::F32_LANES
+        self.bits() != 0
     }
 }
 
