@@ -1,9 +1,9 @@
 //! Measures the time per training step and per stage on random scenes.
 //!
 //! Runs on one and on two threads, and on every adapter with each of its methods to add up gradients
-//! (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE]`, such as
-//! `10000@256` for one scene. Times are medians: processor time, which a loaded machine distorts little,
-//! wall time, and the wall time of each stage.
+//! (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`, such as
+//! `10000@256` for one scene; `avx2` is for machines that have more. Times are medians: processor time,
+//! which a loaded machine distorts little, wall time, and the wall time of each stage.
 
 #![expect(clippy::print_stdout, reason = "its output is a table")]
 
@@ -13,7 +13,7 @@ use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use cpu_time::ProcessTime;
-use densify::backend::cpu::CpuBackend;
+use densify::backend::cpu::{CpuBackend, InstructionSet};
 use densify::backend::gpu::{GpuBackend, GpuDevice, adapters};
 use densify::backend::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
@@ -110,6 +110,8 @@ fn main() {
     let (flops, bytes) = peak();
     println!("one thread: peak of {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
     let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
+    let avx2 = std::env::args().any(|arg| arg == "avx2");
+    let instructions = if avx2 { InstructionSet::Avx2 } else { InstructionSet::Best };
     let usable = adapters().into_iter().filter(|a| a.missing.is_empty());
     let mut devices: Vec<GpuDevice> = Vec::new();
     for adapter in usable {
@@ -138,6 +140,7 @@ fn main() {
         let model = steps::scene(rows, 3);
         for threads in [1, 2] {
             let options = Setup {
+                instructions,
                 threads: Some(threads),
                 largest_image: (size, size),
                 tile_cap: Some(rows * 8),

@@ -39,10 +39,10 @@ const C2: f32 = 0.03 * 0.03;
 const SSIM_WEIGHT: f32 = 0.2;
 /// What is taken from y.
 const MIDDLE: f32 = 0.5;
-/// Rows per strip where tiles are read or written: a row of tiles.
+/// Rows per strip where tiles are written: a row of tiles.
 const STRIP: usize = TILE;
 /// Rows per strip elsewhere.
-const SHORT_STRIP: usize = 2 * TOGETHER;
+const SHORT_STRIP: usize = TOGETHER;
 /// Lines that are convolved vertically for each row: of e, y, e², y² and e·y.
 const CONVOLVED: usize = 5;
 /// Lines of scratch of a pass, at most: those, and what is outside the image of e and of y.
@@ -93,19 +93,19 @@ impl LossBuffers {
         Self { planes: Default::default(), errors: Default::default(), segments: Segments::of(0) }
     }
 
-    /// Makes room for an image. Images of one size, or smaller ones, allocate nothing more.
-    fn resize(&mut self, grid: &Grid, asked: [bool; 2]) {
+    /// Makes room for an image; returns the vectors of its planes. Images of one size, or smaller ones,
+    /// allocate nothing more. What is there is left: clearing it would be work for one thread, and all of
+    /// it is written before it is read.
+    fn resize(&mut self, grid: &Grid, asked: [bool; 2]) -> usize {
         self.segments = Segments::of(grid.width);
         let vectors = self.segments.pitch() * grid.height;
-        for plane in &mut self.planes {
-            plane.resize(vectors, [0.0; WIDTH]);
-        }
-        for (error, asked) in self.errors.iter_mut().zip(asked) {
-            error.clear();
-            if asked {
-                error.resize(vectors, [0.0; WIDTH]);
+        let errors = self.errors.iter_mut().zip(asked).filter_map(|(e, asked)| asked.then_some(e));
+        for plane in self.planes.iter_mut().chain(errors) {
+            if plane.len() < vectors {
+                plane.resize(vectors, [0.0; WIDTH]);
             }
         }
+        vectors
     }
 
     /// Computes the loss of `canvas` against `target`, and dL/dpixel into `gradient`; with weights
@@ -124,28 +124,33 @@ impl LossBuffers {
         terms: ImageTerms,
     ) -> LossValue {
         let ImageTerms { error: error_weights, by_pixel } = terms;
-        self.resize(grid, [error_weights.is_some(), by_pixel]);
+        let asked = [error_weights.is_some(), by_pixel];
+        let vectors = self.resize(grid, asked);
+        let Self { planes, errors, segments } = self;
+        let segments = *segments;
+        let [e, y, p1, p2, p3] = planes.each_mut().map(|plane| &mut plane[..vectors]);
+        let [ranking, errors_by_pixel] = errors;
+        // Of those that are not asked for, nothing.
+        let ranking = &mut ranking[..if asked[0] { vectors } else { 0 }];
+        let errors_by_pixel = &mut errors_by_pixel[..if asked[1] { vectors } else { 0 }];
         let error_weights = [error_weights.unwrap_or_default(), [1.0 - SSIM_WEIGHT, SSIM_WEIGHT]];
-        let segments = self.segments;
-        let (strip, short) = (STRIP * segments.pitch(), SHORT_STRIP * segments.pitch());
+        let short = SHORT_STRIP * segments.pitch();
         let samples = (3 * grid.width * grid.height) as f64;
         let (mut l1, mut ssim) = (0.0_f64, 0.0_f64);
         for channel in 0..3 {
-            let [e, y, p1, p2, p3] = &mut self.planes;
             let source = Source { grid, canvas, target, background, channel };
-            let tasks = (e.par_chunks_mut(strip), y.par_chunks_mut(strip));
+            let tasks = (e.par_chunks_mut(short), y.par_chunks_mut(short));
             let tasks = tasks.into_par_iter().enumerate();
             threads.each_with("loss lines", tasks, Vec::new, |scratch, (i, (e, y))| {
-                arch.dispatch(Lines { source, segments, first: i * STRIP, scratch, e, y });
+                arch.dispatch(Lines { source, segments, first: i * SHORT_STRIP, scratch, e, y });
             });
             let strips = grid.height.div_ceil(SHORT_STRIP);
-            let [ranking, by_pixel] = &mut self.errors;
             let tasks = (
                 p1.par_chunks_mut(short),
                 p2.par_chunks_mut(short),
                 p3.par_chunks_mut(short),
                 parts(ranking, short, strips),
-                parts(by_pixel, short, strips),
+                parts(errors_by_pixel, short, strips),
             );
             let sums = threads.collect_with(
                 "loss similarity",
@@ -161,6 +166,7 @@ impl LossBuffers {
                         y,
                         derivatives: [p1, p2, p3],
                         errors: [ranking, by_pixel],
+                        first_channel: channel == 0,
                         error_weights: error_weights.map(|weights| weights.map(|w| w / 3.0)),
                     })
                 },
@@ -169,7 +175,6 @@ impl LossBuffers {
                 l1 += part.l1;
                 ssim += part.ssim;
             }
-            let [e, y, p1, p2, p3] = &self.planes;
             let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
             threads.each_with("loss gradient", tasks, Vec::new, |scratch, (i, tiles)| {
                 arch.dispatch(Gradient {
@@ -323,6 +328,8 @@ struct Similarity<'a> {
     errors: [&'a mut Line; 2],
     /// Weights of |e| and of 1 − SSIM in each of them.
     error_weights: [[f32; 2]; 2],
+    /// Whether errors are written, not added.
+    first_channel: bool,
 }
 
 impl WithSimd for Similarity<'_> {
@@ -332,7 +339,7 @@ impl WithSimd for Similarity<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) -> LossValue {
         let Self { width, segments, first, scratch, e, y, derivatives, .. } = self;
-        let Self { mut errors, error_weights, .. } = self;
+        let Self { mut errors, error_weights, first_channel, .. } = self;
         let [p1, p2, p3] = derivatives;
         let (length, pitch) = (segments.length(), segments.pitch());
         let rows = p1.len() / pitch;
@@ -387,7 +394,11 @@ impl WithSimd for Similarity<'_> {
                             if let Some(error) = error.get_mut(here + i) {
                                 let dssim = inside.keep(V::splat(s, 1.0) - ssim);
                                 let add = abs * by_abs + dssim * by_dssim;
-                                (V::load(s, &error[lane..]) + add).store(&mut error[lane..]);
+                                let sum = match first_channel {
+                                    true => add,
+                                    false => V::load(s, &error[lane..]) + add,
+                                };
+                                sum.store(&mut error[lane..]);
                             }
                         }
                     }

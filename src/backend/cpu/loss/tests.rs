@@ -8,7 +8,16 @@ use super::*;
 
 /// The scalars, dL/dpixel and each pixel's part of the loss, of an image with structure against another.
 fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
-    let grid = Grid::new(37, 50);
+    run_in(&mut LossBuffers::new(), [37, 50], terms, mask)
+}
+
+fn run_in(
+    buffers: &mut LossBuffers,
+    [width, height]: [u32; 2],
+    terms: ImageTerms,
+    mask: bool,
+) -> (LossValue, Vec<f32>, Vec<f32>) {
+    let grid = Grid::new(width, height);
     let mut canvas = vec![TileCanvas::EMPTY; grid.tiles()];
     for (tile, canvas) in canvas.iter_mut().enumerate() {
         for (channel, plane) in canvas.planes.iter_mut().take(3).enumerate() {
@@ -17,16 +26,15 @@ fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
             }
         }
     }
-    let pixels = 37 * 50;
+    let pixels = (width * height) as usize;
     let target = Image8 {
-        width: 37,
-        height: 50,
+        width,
+        height,
         rgb: (0..3 * pixels).map(|i| (i * 11 % 251) as u8).collect(),
         alpha: None,
         mask: mask.then(|| (0..pixels).map(|i| (i * 37 % 256) as u8).collect()),
     };
     let mut gradient = vec![TileGradient { planes: [DARK; 5] }; grid.tiles()];
-    let mut buffers = LossBuffers::new();
     let threads = Threads::new(Some(2)).expect("threads");
     let (arch, gradients) = (Arch::new(), &mut gradient);
     let value = buffers.run(&threads, arch, &grid, &canvas, &target, [0.0; 3], gradients, terms);
@@ -50,5 +58,25 @@ fn parts_of_pixels_make_up_the_loss() {
             let mean = parts.into_iter().map(f64::from).sum::<f64>() / (37.0 * 50.0);
             assert!((mean - full.loss()).abs() < 1e-6, "{mean} {full:?}");
         }
+    }
+}
+
+/// What images of other sizes, and steps that asked for other things, have left in the buffers is nothing to
+/// the next.
+#[test]
+fn buffers_are_those_of_one_image() {
+    let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: true };
+    let all = |buffers: &mut LossBuffers, size: [u32; 2]| {
+        let [width, height] = size.map(|side| side as usize);
+        let found = run_in(buffers, size, terms, false);
+        let at = |i| buffers.error_at(i % width, i / width);
+        let errors: Vec<f32> = (0..width * height).map(at).collect();
+        assert!(errors.iter().any(|error| *error > 0.0));
+        (found, errors)
+    };
+    let mut buffers = LossBuffers::new();
+    for size in [[37, 50], [60, 20], [37, 50], [100, 70]] {
+        assert_eq!(all(&mut buffers, size), all(&mut LossBuffers::new(), size), "{size:?}");
+        run_in(&mut buffers, [50, 90], ImageTerms::default(), true);
     }
 }
