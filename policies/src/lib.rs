@@ -4,8 +4,9 @@
 //! suite for any policy ([`conformance`]), and the built-in policies: [`vanilla`], the original
 //! adaptive density control; [`taming`], growth by score along a curve; [`diet`], replacement of the
 //! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges;
-//! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown. It knows no renderer, no
-//! image and no device.
+//! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown; [`compact_3dgs`], which
+//! learns what to prune; [`mini_splatting`], which samples by importance. It knows no renderer, no image
+//! and no device.
 //!
 //! # For users of gsplat
 //!
@@ -160,6 +161,7 @@
 //! `use my_policies as _;` and calls the command line of `densify`; CONTRIBUTING.md shows all of it.
 
 pub mod adc;
+pub mod compact_3dgs;
 pub mod conformance;
 pub mod diet;
 mod edit;
@@ -169,6 +171,7 @@ mod event;
 pub mod igs;
 pub mod lightgaussian;
 pub mod mcmc;
+pub mod mini_splatting;
 mod needs;
 pub mod neighbours;
 mod ops;
@@ -181,5 +184,6 @@ pub mod registry;
 pub mod rng;
 pub mod sample;
 mod signals;
+pub mod surface;
 pub mod taming;
 pub mod vanilla;

@@ -1,0 +1,219 @@
+//! # compact-3dgs — growth as in `vanilla`, with a learned mask that says which Gaussians to prune
+//!
+//! Grows a model as `vanilla` does, while every Gaussian learns a mask; those whose mask falls to almost
+//! nothing are pruned, during growth and to the end of the run.
+//!
+//! Source: *Compact 3D Gaussian Representation for Radiance Field*, Lee, Rho, Sun, Ko, Park, CVPR 2024,
+//! arXiv 2311.13681, section 3.1, with the constants of its public code.
+//!
+//! ## Method
+//!
+//! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
+//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
+//!
+//! **Mask.** Each Gaussian has a number m, at first `mask_start`, and renders with its opacity and its
+//! scales times 1\[σ(m) > `min_mask`\]. The derivative of this step is taken to be that of σ(m)
+//! (straight-through). `mask_weight` · mean σ(m) is added to the loss, so that masks fall unless the
+//! images hold them up. m has the learning rate `mask_rate`. A clone or a child of a split begins with
+//! its parent's mask.
+//!
+//! **Pruning.** Gaussians with σ(m) ≤ `min_mask` are pruned at every growth, every `mask_every` steps to
+//! the end of the run, and after its last step. Until then they are transparent.
+//!
+//! `random_keep` is a control that shows what the masks are worth: there are none, and at `grow_until`
+//! Gaussians are drawn at random and pruned until this number is left.
+//!
+//! ## Under a budget
+//!
+//! The budget bounds growth and is never exceeded. What the masks free is grown anew until `grow_until`.
+//! Nothing grows after that, so a run ends below the budget, by as much as the masks find needless.
+//!
+//! ## Differences from the published code
+//!
+//! - A Gaussian whose mask has fallen to `min_mask` stays transparent until it is pruned. In the published
+//!   code its mask could in principle rise again, although it has no gradient but that of the term.
+//! - The paper also replaces colours by a grid with a small network and quantises shapes. Neither is
+//!   density control.
+//! - The last Gaussian is never pruned.
+//!
+//! ## Parameters
+//!
+//! The first thirteen are those of `vanilla`.
+//!
+//! | name | default | range | unit | meaning |
+//! |---|---|---|---|---|
+//! | grow_from | 500 | >= 0 | step | start of growth (exclusive) |
+//! | grow_until | 15000 | >= 0 | step | end of growth, of pruning by opacity and of opacity resets (exclusive) |
+//! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
+//! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
+//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
+//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
+//! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |
+//! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
+//! | reset_every | 3000 | >= 0 | steps | interval of opacity resets; 0: never |
+//! | reset_opacity | 0.01 | 0 to 1, both excluded | | largest opacity after a reset |
+//! | white_reset_at | 500 | >= 0 | step | one more reset, on a white background only; 0: never |
+//! | governor | false | | | grow along a curve instead of by `tau` |
+//! | mask_start | 1.0 | -20 to 20 | | m of a fresh Gaussian |
+//! | mask_rate | 0.01 | > 0 | | learning rate of m |
+//! | mask_weight | 0.0005 | >= 0 | loss | coefficient of the mean of σ(m) |
+//! | min_mask | 0.01 | 0 to 1, both excluded | | Gaussians whose σ(m) is no larger are pruned |
+//! | mask_every | 1000 | >= 0 | steps | interval of pruning by masks beside growth; 0: only then and at the end |
+//! | random_keep | 0 | >= 0 | Gaussians | a control: no masks, and this many left at random; 0: masks |
+//!
+//! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
+//! (`…_every`) do not shrink below 100 steps.
+
+use std::ops::Bound::{Excluded, Unbounded};
+
+use serde::{Deserialize, Serialize};
+
+use crate::adc::Window;
+use crate::parameters::StepParameter::{self, Interval, Step};
+use crate::parameters::in_range;
+use crate::plan::EditPlan;
+use crate::policy::{DensityPolicy, MaskTerm, Needs, PolicyResult, SceneInfo, Signal, Snapshot};
+use crate::prune::Victims;
+use crate::registry::ConfiguredPolicy;
+use crate::rng::PolicyRng;
+use crate::vanilla::{Vanilla, VanillaParams};
+
+crate::register_policy!(
+    "compact-3dgs",
+    Compact,
+    summary: "growth as in vanilla, with a learned mask per Gaussian that says what to prune",
+    source: "Compact-3DGS, Lee et al. 2024, arXiv 2311.13681",
+    doc: include_str!("mod.rs"),
+);
+
+/// Parameters of [`Compact`], explained in its manual page.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+#[expect(missing_docs, reason = "the manual page documents every parameter, and a test checks it")]
+pub struct CompactParams {
+    #[serde(flatten)]
+    pub growth: VanillaParams,
+    pub mask_start: f64,
+    pub mask_rate: f64,
+    pub mask_weight: f64,
+    pub min_mask: f64,
+    pub mask_every: u32,
+    pub random_keep: u32,
+}
+
+impl Default for CompactParams {
+    fn default() -> Self {
+        Self {
+            growth: VanillaParams::default(),
+            mask_start: 1.0,
+            mask_rate: 0.01,
+            mask_weight: 5e-4,
+            min_mask: 0.01,
+            mask_every: 1000,
+            random_keep: 0,
+        }
+    }
+}
+
+/// Growth as in `vanilla`, and pruning by learned masks.
+#[derive(Debug)]
+pub struct Compact {
+    params: CompactParams,
+    growth: Vanilla,
+    /// When growth is due, at which masks prune too.
+    grow: Window,
+    prune: Window,
+    iterations: u32,
+}
+
+impl ConfiguredPolicy for Compact {
+    type Params = CompactParams;
+
+    const STEP_PARAMETERS: &'static [StepParameter] = &[
+        Step("grow_from"),
+        Step("grow_until"),
+        Interval("grow_every"),
+        Step("max_scale_from"),
+        Interval("reset_every"),
+        Step("white_reset_at"),
+        Interval("mask_every"),
+    ];
+
+    fn new(params: CompactParams, scene: &SceneInfo) -> PolicyResult<Self> {
+        let CompactParams { mask_start, mask_rate, mask_weight, min_mask, mask_every, .. } = params;
+        // Rounded to the f32 that backends take: 0.99999999 becomes 1.
+        let rounded = |value: f64| f64::from(value as f32);
+        in_range("mask_start", mask_start, -20.0..=20.0)?;
+        in_range("mask_rate", rounded(mask_rate), (Excluded(0.0), Unbounded))?;
+        in_range("mask_weight", mask_weight, 0.0..)?;
+        in_range("min_mask", rounded(min_mask), (Excluded(0.0), Excluded(1.0)))?;
+        let VanillaParams { grow_from: from, grow_until: until, grow_every: every, .. } =
+            params.growth;
+        Ok(Self {
+            growth: Vanilla::new(params.growth.clone(), scene)?,
+            grow: Window { from, until, every },
+            prune: Window { from: 0, until: u32::MAX, every: mask_every },
+            iterations: scene.iterations,
+            params,
+        })
+    }
+}
+
+impl DensityPolicy for Compact {
+    fn needs(&self, scene: &SceneInfo) -> Needs {
+        let growth = self.growth.needs(scene);
+        if self.is_control() {
+            return growth;
+        }
+        let CompactParams { mask_start, mask_rate, mask_weight, min_mask, .. } = self.params;
+        let mask = MaskTerm {
+            start: mask_start as f32,
+            rate: mask_rate as f32,
+            weight: mask_weight as f32,
+            threshold: min_mask as f32,
+        };
+        Needs { signals: growth.signals.with(Signal::Mask), mask: Some(mask), ..growth }
+    }
+
+    fn is_due(&self, step: u32) -> bool {
+        self.growth.is_due(step) || self.is_prune(step)
+    }
+
+    fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
+        if self.growth.is_due(now.step) {
+            self.growth.plan(now, rng, plan)?;
+        }
+        if !self.is_prune(now.step) {
+            return Ok(());
+        }
+        if self.is_control() {
+            let kept = self.params.random_keep as usize;
+            let count = (plan.rows() - plan.pruned()).saturating_sub(kept);
+            Victims::Random.prune(plan, &[], count, rng);
+            return Ok(());
+        }
+        let mask = now.signal(Signal::Mask)?;
+        let is_masked = |row: u32| mask[row as usize] <= self.params.min_mask as f32;
+        let masked = (0..plan.rows() as u32).filter(|&row| plan.is_free(row) && is_masked(row));
+        let count = masked.count();
+        Victims::Lowest.prune(plan, mask, count, rng);
+        Ok(())
+    }
+}
+
+impl Compact {
+    fn is_control(&self) -> bool {
+        self.params.random_keep > 0
+    }
+
+    fn is_prune(&self, step: u32) -> bool {
+        if self.is_control() {
+            return step > 0 && step == self.params.growth.grow_until;
+        }
+        self.grow.is_due(step) || self.prune.is_due(step) || (step > 0 && step == self.iterations)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,110 @@
+//! Tests of the rules of `compact-3dgs`, each worked out by hand.
+
+use super::*;
+use crate::event::{Event, Outcome, assert_conforms, build, due_steps};
+use crate::registry::find;
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run("compact-3dgs", set)
+}
+
+/// Rows of opacity 0.5 that neither grow nor die by themselves, with these masks.
+fn event(step: u32, masks: &[f32]) -> Event {
+    Event::new(step, masks.len(), masks.len())
+        .with_all(Signal::VisibleCount, 4.0)
+        .with_all(Signal::Opacity, 0.5)
+        .with_all(Signal::ScaleMax, 0.05)
+        .with(Signal::Mask, masks)
+}
+
+#[test]
+fn rows_whose_mask_has_fallen_are_pruned() {
+    let masks = [0.01, 0.0101, 0.5, 0.0, f32::NAN];
+    // At a growth, at a multiple of 1,000 after growth, and at the end.
+    for step in [600, 17_000, 30_000] {
+        let done = run(&event(step, &masks), "");
+        assert_eq!(done.pruned, [0, 3], "step {step}");
+        assert!(done.ops.cause.ends_with("prune"), "{}", done.ops.cause);
+    }
+    assert_eq!(run(&event(17_000, &masks), "min_mask = 0.4").pruned, [0, 1, 3]);
+    // The last row is kept, the one with the largest mask.
+    assert_eq!(run(&event(17_000, &[0.001, 0.003, 0.002]), "").pruned, [0, 2]);
+}
+
+#[test]
+fn masks_prune_at_every_growth_and_every_thousand_steps_to_the_end() {
+    let due = |set: &str, iterations| {
+        let scene = SceneInfo { iterations, ..Event::new(1, 1, 1).scene };
+        due_steps("compact-3dgs", &format!("reset_every = 0\n{set}"), &scene)
+    };
+    let steps = due("", 30_000);
+    // 144 growths, 600 to 14,900; from 15,000 on every thousand; the last is the end of the run.
+    let late: Vec<u32> = (15..=30).map(|thousand| 1000 * thousand).collect();
+    assert_eq!((steps[0], &steps[144..]), (600, &late[..]));
+    // A run of 7,000: 1,000 · 7/30 = 233.3 steps, and the last step, which is no multiple.
+    let short = due("grow_every = 0", 7000);
+    assert_eq!((short[0], short.len(), short.last()), (233, 31, Some(&7000)));
+    assert_eq!(due("grow_every = 0\nmask_every = 0", 7000), [7000]);
+    assert_eq!(due("grow_every = 0\nrandom_keep = 5", 30_000), [15_000]);
+}
+
+#[test]
+fn the_mask_is_declared_as_published_and_its_control_has_none() {
+    let scene = Event::new(1, 1, 1).scene;
+    let needs = build("compact-3dgs", "", &scene).needs(&scene);
+    let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
+    assert_eq!((needs.mask, needs.check()), (Some(mask), Ok(())));
+    assert!(needs.signals.contains(Signal::Mask));
+    let control = build("compact-3dgs", "random_keep = 9", &scene).needs(&scene);
+    assert_eq!(control, build("vanilla", "", &scene).needs(&scene));
+}
+
+#[test]
+fn growth_is_that_of_vanilla() {
+    let event = Event { budget: 9, ..event(600, &[0.5; 4]) }
+        .with(Signal::ScreenGradient, &[8.01e-4, 7.99e-4, 4e-3, 1.0])
+        .with(Signal::ScaleMax, &[0.05, 0.05, 0.2, 0.05])
+        .with(Signal::Opacity, &[0.5, 0.5, 0.5, 0.001]);
+    for set in ["", "tau = 0.0005", "small = 0.03", "governor = true", "min_opacity = 0.6"] {
+        let (ours, theirs) = (run(&event, set), event.run("vanilla", set));
+        assert_eq!((ours.cloned, ours.split), (theirs.cloned, theirs.split), "{set}");
+        assert_eq!(ours.pruned, theirs.pruned, "{set}");
+    }
+    let (ours, theirs) = (find("compact-3dgs").unwrap(), find("vanilla").unwrap());
+    assert!(theirs.parameters().iter().all(|p| ours.parameters().contains(p)));
+    assert!(ours.step_parameters().starts_with(theirs.step_parameters()));
+}
+
+#[test]
+fn the_control_leaves_so_many_at_random() {
+    let event = event(15_000, &[0.0; 100]);
+    let done = run(&event, "random_keep = 40");
+    assert_eq!(done.ops.rows_after, 40);
+    // Not the first sixty: rows on both sides of the middle go.
+    assert!(done.pruned.iter().any(|&row| row >= 50) && done.pruned.iter().any(|&row| row < 50));
+    assert_eq!(run(&event, "random_keep = 200").ops.rows_after, 100);
+}
+
+#[test]
+fn numbers_out_of_range_are_refused_by_name() {
+    let scene = Event::new(1, 1, 1).scene;
+    for (set, name) in [
+        ("mask_start = 21.0", "mask_start"),
+        ("mask_rate = 0.0", "mask_rate"),
+        ("mask_weight = -1.0", "mask_weight"),
+        ("min_mask = 0.99999999", "min_mask"),
+        ("min_mask = 0.0", "min_mask"),
+    ] {
+        let refused = find("compact-3dgs").unwrap().build(&set.parse().unwrap(), &scene);
+        let message = refused.map(|_| ()).unwrap_err().to_string();
+        assert!(message.contains(name), "{set}: {message}");
+    }
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "compact-3dgs",
+        &["min_mask = 0.9\nmask_every = 100", "random_keep = 5", "governor = true"],
+    );
+}

@@ -1,0 +1,187 @@
+//! Tests of the rules of `mini-splatting`, each worked out by hand.
+
+use super::*;
+use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
+use crate::plan::{OpacityRule, ScaleRule};
+use crate::registry::find;
+
+fn run(event: &Event, set: &str) -> Outcome {
+    event.run("mini-splatting", set)
+}
+
+/// Rows of opacity 0.5 along a line, one unit apart, that neither grow nor die by themselves.
+fn event(step: u32, rows: usize) -> Event {
+    let line: Vec<f32> = (0..rows).flat_map(|row| [row as f32, 0.0, 0.0]).collect();
+    Event::new(step, rows, rows)
+        .with_all(Signal::VisibleCount, 4.0)
+        .with_all(Signal::Opacity, 0.5)
+        .with_all(Signal::ScaleMax, 0.05)
+        .with(Signal::Position, &line)
+}
+
+/// A view with these sums of weights, pixels blended into, and pixels dominated.
+fn view(weights: &[f32], pixels: &[f32], dominated: &[f32]) -> View {
+    let columns = [
+        (AuxColumn::WeightSum, weights),
+        (AuxColumn::PixelCount, pixels),
+        (AuxColumn::DominantPixels, dominated),
+    ];
+    View {
+        columns: columns.map(|(column, values)| (column, values.to_vec())).into(),
+        ..View::default()
+    }
+}
+
+#[test]
+fn what_dominates_too_many_pixels_is_split() {
+    let event = Event { budget: 9, ..event(600, 4) }
+        // H·W/5000 is 2e-4 of the pixels; row 3 grows by its gradient and is not split as well.
+        .with(Signal::DominantPixels, &[1.99e-4, 2.01e-4, 0.5, 0.5])
+        .with(Signal::ScreenGradient, &[0.0, 0.0, 0.0, 1.0]);
+    let done = run(&event, "");
+    assert_eq!((done.cloned.as_slice(), done.split.as_slice()), (&[3][..], &[1, 2][..]));
+    assert_eq!(done.offspring()[1].scale, ScaleRule::Uniform(1.0 / 1.6));
+    assert_eq!(run(&event, "dominant_share = 0.4").split, [2]);
+    assert!(run(&event, "dominant_share = 1.0").split.is_empty());
+    // The budget holds: one clone, one split.
+    assert_eq!(run(&Event { budget: 6, ..event }, "").ops.rows_after, 6);
+}
+
+#[test]
+fn the_schedule_is_the_published_one() {
+    let scene = Event::new(1, 1, 1).scene;
+    let steps = due_steps("mini-splatting", "", &scene);
+    // Growth from 600 to 14,900, sampling, the cut.
+    assert_eq!((steps.len(), steps[0], &steps[143..]), (146, 600, &[14_900, 15_000, 20_000][..]));
+    let policy = build("mini-splatting", "", &scene);
+    let all: Vec<u32> =
+        (0..=30_000).filter(|&step| policy.aux_views(step, 9, 9) == u32::MAX).collect();
+    assert_eq!(all, [5000, 10_000, 15_000, 20_000]);
+    let needs = policy.needs(&scene);
+    assert_eq!(needs.rates.opacity, Some(Rate::constant(0.05)));
+    assert!(needs.detailed_edits && needs.check() == Ok(()));
+    // 7,000/30,000 of them.
+    let short = SceneInfo { iterations: 7000, ..scene.clone() };
+    assert_eq!(due_steps("mini-splatting", "grow_every = 0", &short), [1167, 2333, 3500, 4667]);
+    // No opacity resets.
+    let white = SceneInfo { white_background: true, ..scene };
+    assert_eq!(
+        due_steps("mini-splatting", "grow_every = 0", &white),
+        [5000, 10_000, 15_000, 20_000]
+    );
+}
+
+#[test]
+fn the_model_is_replaced_by_surface_points() {
+    let point = |x: f32| Candidate {
+        position: [x, 0.0, 0.0],
+        colour: [0.5; 3],
+        pixel_size: 0.1,
+        error: 1.0,
+    };
+    let event = Event { budget: 10, ..event(5000, 4) };
+    let seen = View { points: (0..9).map(|x| point(x as f32)).collect(), ..View::default() };
+    let scene = SceneInfo { train_views: 2, budget: 10, ..event.scene.clone() };
+    let event = Event { views: vec![seen.clone(), seen], scene, ..event }
+        .with_all(Signal::ScreenGradient, 1.0);
+    let done = run(&event, "");
+    // 0.8 · 10 rows, four of each view; nothing grows.
+    assert_eq!((done.ops.rows_after, done.ops.seeds.len()), (8, 8));
+    assert!(done.ops.families.is_empty() && done.ops.cause == "reinit");
+    assert!(done.ops.seeds.iter().all(|(_, seed)| seed.opacity == 0.1));
+    assert_eq!(run(&event, "reinit_share = 0.4").ops.rows_after, 4);
+    // Without points, and at another step, it is kept.
+    assert!(run(&Event { views: Vec::new(), ..event.clone() }, "").ops.is_empty());
+    assert!(!run(&Event { step: 5100, ..event }, "").cloned.is_empty());
+}
+
+#[test]
+fn half_of_what_has_an_importance_stays_and_restarts() {
+    // Row 1 dominates nothing, row 4 is nowhere: three have an importance, of which ⌊1.5⌋ = 1 stays.
+    let mut event = event(15_000, 5);
+    event.views = vec![
+        view(&[5.0, 9.0, 0.0, 0.0, 0.0], &[5.0; 5], &[1.0, 0.0, 0.0, 0.0, 0.0]),
+        view(&[0.0, 9.0, 1e-9, 1e-9, 0.0], &[5.0; 5], &[0.0, 0.0, 1.0, 1.0, 1.0]),
+    ];
+    let done = run(&event, "");
+    assert_eq!((done.pruned.as_slice(), done.ops.cause.as_str()), (&[1, 2, 3, 4][..], "sample"));
+    // Alone: 0.02 of the extent of 10.
+    let restart = Update::restart(0.2, 0.1);
+    assert_eq!(done.ops.updates, [(0, restart)]);
+    assert_eq!((restart.opacity, restart.sh_degree), (OpacityRule::Set(0.1), Some(0)));
+    // All three: at 0, 2 and 3. Row 0: √((4 + 9)/2).
+    let all = run(&event, "sample_share = 1.0");
+    assert_eq!(all.pruned, [1, 4]);
+    let ScaleRule::Set(size) = all.ops.updates[0].1.scale else { panic!("{:?}", all.ops.updates) };
+    assert!((size - 6.5_f32.sqrt()).abs() < 1e-6, "{size}");
+    assert!(!all.ops.reset_signals.is_empty());
+    // Without a view nothing is known.
+    assert!(run(&Event { views: Vec::new(), ..event }, "").ops.is_empty());
+}
+
+#[test]
+fn importance_may_be_counted_per_pixel() {
+    // Sums 1e6 and 1; per pixel 1e-6 and 1.
+    let mut event = event(15_000, 2);
+    event.views = vec![view(&[1e6, 1.0], &[1e12, 1.0], &[1.0, 1.0])];
+    assert_eq!(run(&event, "").pruned, [1]);
+    assert_eq!(run(&event, "importance = \"density\"").pruned, [0]);
+}
+
+#[test]
+fn the_cut_leaves_ninety_nine_percent_of_the_importance() {
+    // 0.4 + 0.5 + 0.2 = 1.1 is more than 1 of 100; 0.4 + 0.2 is not.
+    let mut event = event(20_000, 5);
+    event.views = vec![view(&[0.4, 90.0, 8.9, 0.5, 0.2], &[1.0; 5], &[1.0; 5])];
+    let done = run(&event, "");
+    assert_eq!((done.pruned.as_slice(), done.ops.cause.as_str()), (&[0, 4][..], "prune"));
+    assert!(done.ops.updates.is_empty());
+    assert_eq!(run(&event, "cut_mass = 0.9").pruned, [0, 2, 3, 4]);
+    assert!(run(&event, "cut_mass = 1.0").pruned.is_empty());
+}
+
+#[test]
+fn the_control_keeps_as_many_at_random() {
+    // 300 of 1,000 have an importance.
+    let weights: Vec<f32> = (0..1000).map(|row| if row < 300 { 1.0 } else { 0.0 }).collect();
+    let mut event = event(15_000, 1000);
+    event.views = vec![view(&weights, &[1.0; 1000], &[1.0; 1000])];
+    let real = run(&event, "");
+    assert_eq!((real.ops.rows_after, real.ops.updates.len()), (150, 150));
+    assert!(real.ops.updates.iter().all(|(row, _)| *row < 300));
+    let control = run(&event, "victims = \"random\"");
+    assert_eq!(control.ops.rows_after, 150);
+    // 0.3 · 150 of them have an importance by chance: 45 ± 5·5.2 (hypergeometric).
+    let low = control.ops.updates.iter().filter(|(row, _)| *row < 300).count();
+    assert!(low.abs_diff(45) < 26, "{low}");
+}
+
+#[test]
+fn numbers_out_of_range_are_refused_by_name() {
+    let scene = Event::new(1, 1, 1).scene;
+    for (name, value) in [
+        ("dominant_share", 1.1),
+        ("reinit_share", 0.0),
+        ("sample_share", -0.1),
+        ("restart_opacity", 0.999_999_99),
+        ("cut_mass", 1.5),
+        ("opacity_rate", 0.0),
+    ] {
+        let set = format!("{name} = {value:?}").parse().unwrap();
+        let refused = find("mini-splatting").unwrap().build(&set, &scene);
+        let message = refused.map(|_| ()).unwrap_err().to_string();
+        assert!(message.contains(name), "{name}: {message}");
+    }
+}
+
+#[test]
+fn every_choice_conforms() {
+    assert_conforms(
+        "mini-splatting",
+        &[
+            "first_reinit_at = 200\nsecond_reinit_at = 0\nsample_at = 300\ncut_at = 400",
+            "importance = \"density\"\nsample_at = 100\ncut_mass = 0.5\ncut_at = 200",
+            "victims = \"random\"\ndominant_share = 0.0\nsample_share = 0.0",
+        ],
+    );
+}

@@ -1,0 +1,87 @@
+//! Models made anew: from surface points that the training views show, or from rows that begin again.
+//!
+//! *Mini-Splatting*, Fang and Wang 2024, "depth reinitialization" and the restart after sampling, as its
+//! published code and that of diet do it.
+
+use crate::neighbours::Neighbours;
+use crate::plan::{EditPlan, Reset, Seed};
+use crate::policy::Candidate;
+
+/// Smallest size of a row, in extents: nearer points sample the surface at the same place (as in the
+/// initialisation).
+const LEAST_DISTANCE: f64 = 2e-4;
+/// Size of a row without neighbours, in extents.
+const LONE_SIZE: f64 = 0.02;
+
+/// For each position the standard deviation of a round row there: the root mean square distance to the
+/// three nearest others `[scene units]`; in a scene of this `extent`. Shape: `[positions]`.
+#[must_use]
+pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
+    let extent = f64::from(extent);
+    if positions.len() == 1 {
+        return vec![(LONE_SIZE * extent) as f32];
+    }
+    let neighbours = Neighbours::new(positions);
+    let size = |index| neighbours.mean_square_distance(index).sqrt().max(LEAST_DISTANCE * extent);
+    (0..positions.len()).map(|index| size(index) as f32).collect()
+}
+
+/// Prunes all rows and appends at most `most` of the surface points instead, with this opacity. Without any
+/// sound point the model is kept.
+pub fn replace_model(
+    points: &[Candidate],
+    most: usize,
+    opacity: f32,
+    extent: f32,
+    plan: &mut EditPlan,
+) {
+    // A valid size until the neighbours are known.
+    let seed = |c: &Candidate| Seed::round(c.position, c.colour, 1.0, opacity);
+    let sound = points.iter().map(seed).filter(|seed| seed.bad_field().is_none());
+    let mut seeds: Vec<Seed> = sound.take(most).collect();
+    if seeds.is_empty() {
+        return;
+    }
+    let positions: Vec<_> = seeds.iter().map(|seed| seed.position.map(f64::from)).collect();
+    for (seed, size) in seeds.iter_mut().zip(sizes(&positions, extent)) {
+        seed.scales = [size; 3];
+    }
+    plan.cause("reinit");
+    plan.prune_all(0..plan.rows() as u32);
+    for seed in seeds {
+        // A refusal is counted by the plan.
+        let _ = plan.append(seed);
+    }
+    plan.reset(Reset::Signals);
+    plan.reset(Reset::Candidates);
+}
+
+/// How many surface points of a view to measure for `most` of all `views`, at least one.
+#[must_use]
+pub fn points_per_view(most: usize, views: u32) -> u32 {
+    let per_view = (most / views.max(1) as usize).max(1);
+    u32::try_from(per_view).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_distances_to_neighbours() {
+        // A line: the first has neighbours at 1, 3 and 6: √(46/3).
+        let line = [[0.0; 3], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0], [6.0, 0.0, 0.0]];
+        let found = sizes(&line, 1.0);
+        assert!((found[0] - (46.0_f32 / 3.0).sqrt()).abs() < 1e-6, "{found:?}");
+        // At one place: 2e-4 of the extent; alone: 0.02 of it; none: none.
+        assert_eq!(sizes(&[[1.0; 3]; 3], 10.0), [2e-3; 3]);
+        assert_eq!(sizes(&[[1.0; 3]], 10.0), [0.2]);
+        assert!(sizes(&[], 10.0).is_empty());
+    }
+
+    #[test]
+    fn points_are_shared_among_the_views() {
+        assert_eq!([points_per_view(100, 8), points_per_view(3, 8)], [12, 1]);
+        assert_eq!(points_per_view(5, 0), 5);
+    }
+}
