@@ -229,7 +229,7 @@ impl MaskTerm {
             return Err(format!("mask.threshold is {threshold}; it must be between 0 and 1"));
         }
         // Beyond it σ(m) is 0 or 1 and has no derivative.
-        if !(self.start.abs() <= 20.0) {
+        if !(-20.0..=20.0).contains(&self.start) {
             return Err(format!("mask.start is {}; it must be from -20 to 20", self.start));
         }
         Ok(())

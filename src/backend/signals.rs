@@ -211,7 +211,7 @@ impl SignalPlanes {
             let Some(current) = self.current(signal) else { continue };
             match signal.kind() {
                 SignalKind::Sum | SignalKind::Count | SignalKind::Maximum | SignalKind::Minimum => {
-                    kept.push((format!("{signal:?}"), current))
+                    kept.push((format!("{signal:?}"), current));
                 }
                 SignalKind::EpochMaximum => {
                     let both = self.of(signal);

@@ -115,8 +115,9 @@ impl RateOptions {
             (&mut rates.sh_rest, &mut rates.sh_rest_end, overrides.sh_rest),
         ] {
             if let Some(rate) = rate {
-                *start = rate.start as f32;
-                *end = (rate.end != rate.start).then_some(rate.end as f32);
+                let (first, last) = (rate.start as f32, rate.end as f32);
+                *start = first;
+                *end = (last.to_bits() != first.to_bits()).then_some(last);
             }
         }
         if let Some(fade) = overrides.fade {

@@ -1,5 +1,7 @@
 //! Tests of the rules of `lightgaussian`, each worked out by hand.
 
+#![expect(clippy::float_cmp, reason = "values are carried to the last bit")]
+
 use super::*;
 use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 use crate::parameters::REFERENCE_ITERATIONS;

@@ -171,6 +171,8 @@ impl WithSimd for Rasterize<'_> {
 impl Rasterize<'_> {
     /// `N` vectors of a patch at a time.
     #[inline(always)]
+    #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
+    #[expect(clippy::needless_range_loop, reason = "several arrays go side by side")]
     fn run<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
         let Self { splats, list, place, background, dominant, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);

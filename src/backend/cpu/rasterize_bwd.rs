@@ -165,6 +165,7 @@ impl RasterizeBwd<'_> {
     /// behind the batch to its front. Returns the end of each patch's pairs. `N` vectors at a time, as in
     /// the forward pass.
     #[inline(always)]
+    #[expect(clippy::needless_range_loop, reason = "several arrays go side by side")]
     fn blend_again<S: Simd, const N: usize>(
         &mut self,
         s: S,
