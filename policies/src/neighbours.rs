@@ -1,7 +1,5 @@
 //! The nearest neighbours of points and the distances to them, by a k-d tree (Bentley 1975).
 
-use std::cmp::Ordering;
-
 /// Points in a leaf of the tree; so few are searched faster one by one.
 const LEAF: usize = 8;
 /// Number of neighbours that distances are averaged over.
@@ -33,6 +31,8 @@ struct Nearest<'a> {
     point: u32,
     /// Ascending; those not found yet are at an infinite distance. Not empty.
     found: &'a mut [Neighbour],
+    /// Squared distance that all that is yet to be found is below.
+    bound: f64,
 }
 
 /// The place of a neighbour that is not found yet.
@@ -67,16 +67,46 @@ impl<'a> Neighbours<'a> {
     /// # Panics
     /// When there is no such point.
     pub fn nearest<'b>(&self, index: usize, buffer: &'b mut [Neighbour]) -> &'b [Neighbour] {
+        self.nearest_below(index, f64::INFINITY, buffer)
+    }
+
+    /// Calls `visit` with each point and its `most` [nearest](Self::nearest) others, in an order in which
+    /// points that follow each other are near each other.
+    pub fn each_nearest(&self, most: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
+        let most = most.min(self.points.len().saturating_sub(1));
+        let mut buffer = vec![UNKNOWN; most];
+        let mut before: Option<(usize, f64)> = None;
+        for &index in &self.order {
+            let index = index as usize;
+            // What was near the point before is at most so far from this one; with room for rounding.
+            let bound = before.map_or(f64::INFINITY, |(before, farthest)| {
+                let step = square(self.points[before], self.points[index]).sqrt();
+                (farthest.sqrt() + step).powi(2) * (1.0 + 1e-9) + f64::MIN_POSITIVE
+            });
+            let found = self.nearest_below(index, bound, &mut buffer);
+            visit(index, found);
+            before = found.last().filter(|_| found.len() == most).map(|last| (index, last.square));
+        }
+    }
+
+    fn nearest_below<'b>(
+        &self,
+        index: usize,
+        bound: f64,
+        buffer: &'b mut [Neighbour],
+    ) -> &'b [Neighbour] {
         buffer.fill(UNKNOWN);
         let (at, point) = (self.points[index], index as u32);
         if !buffer.is_empty() {
-            self.visit(0, self.points.len(), &mut Nearest { at, point, found: &mut *buffer });
+            let mut nearest = Nearest { at, point, found: &mut *buffer, bound };
+            self.visit(0, self.points.len(), [0.0; 3], &mut nearest);
         }
         let count = buffer.iter().take_while(|other| other.square.is_finite()).count();
         &buffer[..count]
     }
 
-    fn visit(&self, from: usize, to: usize, nearest: &mut Nearest<'_>) {
+    /// Visits the points of a range, which is this far from the point along each axis.
+    fn visit(&self, from: usize, to: usize, outside: [f64; 3], nearest: &mut Nearest<'_>) {
         if to - from <= LEAF {
             for &other in &self.order[from..to] {
                 nearest.take(self.points, other);
@@ -88,13 +118,20 @@ impl<'a> Neighbours<'a> {
         let beyond = nearest.at[axis] - self.points[self.order[middle] as usize][axis];
         let (near, far) = ((from, middle), (middle + 1, to));
         let (near, far) = if beyond < 0.0 { (near, far) } else { (far, near) };
-        self.visit(near.0, near.1, nearest);
+        self.visit(near.0, near.1, outside, nearest);
         nearest.take(self.points, self.order[middle]);
+        let mut outside = outside;
+        outside[axis] = beyond;
         // Not where the two are equal: points that coincide would all be visited.
-        if beyond * beyond < nearest.farthest() {
-            self.visit(far.0, far.1, nearest);
+        if square(outside, [0.0; 3]) < nearest.bound {
+            self.visit(far.0, far.1, outside, nearest);
         }
     }
+}
+
+fn square(a: [f64; 3], b: [f64; 3]) -> f64 {
+    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    x * x + y * y + z * z
 }
 
 fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
@@ -121,25 +158,21 @@ fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
 }
 
 impl Nearest<'_> {
-    /// Squared distance of the last of the neighbours.
-    fn farthest(&self) -> f64 {
-        self.found[self.found.len() - 1].square
-    }
-
     fn take(&mut self, points: &[[f64; 3]], index: u32) {
-        let [x, y, z] = points[index as usize];
-        let [dx, dy, dz] = [x - self.at[0], y - self.at[1], z - self.at[2]];
-        let square = dx * dx + dy * dy + dz * dz;
-        // Also passes over NaN.
-        if index == self.point || square.partial_cmp(&self.farthest()) != Some(Ordering::Less) {
+        let square = square(points[index as usize], self.at);
+        // NaN is not below either.
+        let is_below = square < self.bound;
+        if index == self.point || !is_below {
             return;
         }
-        let mut place = self.found.len() - 1;
+        let last = self.found.len() - 1;
+        let mut place = last;
         while place > 0 && square < self.found[place - 1].square {
             self.found[place] = self.found[place - 1];
             place -= 1;
         }
         self.found[place] = Neighbour { square, index };
+        self.bound = self.bound.min(self.found[last].square);
     }
 }
 
@@ -200,6 +233,13 @@ mod tests {
             |a: &[f64; 3], b: &[f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>();
         for k in [0, 1, 2, 30, 699, 900] {
             let mut buffer = vec![UNKNOWN; k];
+            let mut visits = vec![0; points.len()];
+            let mut together = vec![Vec::new(); points.len()];
+            tree.each_nearest(k, |index, found| {
+                visits[index] += 1;
+                together[index] = found.iter().map(|other| other.square).collect();
+            });
+            assert_eq!(visits, vec![1; points.len()]);
             for (i, a) in points.iter().enumerate().step_by(7) {
                 let others = points.iter().enumerate().filter(|(j, _)| *j != i);
                 let mut expected: Vec<f64> = others.map(|(_, b)| square(a, b)).collect();
@@ -208,6 +248,7 @@ mod tests {
                 let found = tree.nearest(i, &mut buffer);
                 let squares: Vec<f64> = found.iter().map(|other| other.square).collect();
                 assert_eq!(squares, expected, "{k} neighbours of {i}");
+                assert_eq!(together[i], expected, "{k} neighbours of {i}, all together");
                 for other in found {
                     assert_eq!(
                         square(a, &points[other.index as usize]).to_bits(),
@@ -232,5 +273,6 @@ mod tests {
             let found = tree.nearest(index, &mut buffer);
             assert!(found.len() == 30 && found.iter().all(|other| other.square == 0.0));
         }
+        tree.each_nearest(30, |_, found| assert_eq!(found.len(), 30));
     }
 }

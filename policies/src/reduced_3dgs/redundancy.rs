@@ -1,6 +1,6 @@
 //! How many Gaussians share the space of a pixel: spheres around means, and the ellipsoids that meet them.
 
-use crate::neighbours::{Neighbour, Neighbours, UNKNOWN};
+use crate::neighbours::Neighbours;
 
 /// Half the diagonal of a cube with edge 1.
 const HALF_DIAGONAL: f64 = 0.866_025_403_784_438_6;
@@ -47,33 +47,37 @@ impl Shapes<'_> {
             rows.iter().map(|&row| self.means[row as usize].map(f64::from)).collect();
         let tree = Neighbours::new(&points);
         let mut redundancy = vec![f32::INFINITY; self.means.len()];
-        let mut buffer = vec![UNKNOWN; most.min(rows.len().saturating_sub(1))];
         let mut met = Vec::new();
-        for (index, &row) in rows.iter().enumerate() {
+        tree.each_nearest(most, |index, nearest| {
+            let (row, mean) = (rows[index], points[index]);
             let radius = HALF_DIAGONAL * f64::from(self.pixel_sizes[row as usize]);
-            if !(radius > 0.0 && radius <= LONGEST) {
-                continue;
+            let has_sphere = radius > 0.0 && radius <= LONGEST;
+            if !has_sphere {
+                return;
             }
             met.clear();
             met.push(row);
-            for Neighbour { square, index: other } in tree.nearest(index, &mut buffer) {
-                let (other, at) = (rows[*other as usize], points[*other as usize]);
-                let axes = half_axes[other as usize];
-                let reach = axes[0].max(axes[1]).max(axes[2]) + radius;
-                if *square > reach * reach {
-                    continue;
-                }
-                let from = [0, 1, 2].map(|k: usize| points[index][k] - at[k]);
-                let from = turned_back(self.orientations[other as usize], from);
-                if sphere_meets(from, radius, axes) {
-                    met.push(other);
+            for other in nearest {
+                let (row, at) = (rows[other.index as usize], points[other.index as usize]);
+                let axes = half_axes[row as usize];
+                let (short, long) =
+                    (axes[0].min(axes[1]).min(axes[2]), axes[0].max(axes[1]).max(axes[2]));
+                let is_farther = |reach: f64| other.square > reach * reach;
+                let meets = || {
+                    let from = [0, 1, 2].map(|k: usize| mean[k] - at[k]);
+                    let from = turned_back(self.orientations[row as usize], from);
+                    sphere_meets(from, radius, axes)
+                };
+                // What meets the ball within the ellipsoid, and what misses the ball around it.
+                if !is_farther(short + radius) || (!is_farther(long + radius) && meets()) {
+                    met.push(row);
                 }
             }
             for &other in &met {
                 let known = &mut redundancy[other as usize];
                 *known = known.min(met.len() as f32);
             }
-        }
+        });
         redundancy.into_iter().map(|count| if count.is_finite() { count } else { 1.0 }).collect()
     }
 
@@ -108,7 +112,12 @@ fn turned_back(q: [f32; 4], v: [f64; 3]) -> [f64; 3] {
 /// as D there is too large, the sphere misses.
 fn sphere_meets(centre: [f64; 3], radius: f64, half_axes: [f64; 3]) -> bool {
     let axes = [0, 1, 2].map(|k: usize| (half_axes[k], centre[k].abs()));
-    if axes.iter().map(|(e, p)| (p / e).powi(2)).sum::<f64>() <= 1.0 {
+    if axes.iter().any(|(e, p)| *p > e + radius) {
+        return false;
+    }
+    // The ellipsoid with half-axes e + r lies within what spheres around points of this one cover: the
+    // root of Σ (e + r)² u² is at most that of Σ e² u² plus r (Minkowski), for every direction u.
+    if axes.iter().map(|(e, p)| (p / (e + radius)).powi(2)).sum::<f64>() <= 1.0 {
         return true;
     }
     let is_within = |t: f64| {
@@ -199,7 +208,12 @@ mod tests {
         let turned = turned_back([half, 0.0, 0.0, half], [0.0, 3.0, 5.0]);
         let expected = [3.0, 0.0, 5.0];
         assert!((0..3).all(|k| (turned[k] - expected[k]).abs() < 1e-6), "{turned:?}");
-        assert_eq!(turned_back(UPRIGHT, [1.0, 2.0, 3.0]), [1.0, 2.0, 3.0]);
+        assert!(
+            turned_back(UPRIGHT, [1.0, 2.0, 3.0])
+                .iter()
+                .zip(1..)
+                .all(|(x, k)| (x - f64::from(k)).abs() < 1e-12)
+        );
     }
 
     fn redundancy(xs: &[f32], half_axes: &[[f32; 3]], pixels: &[f32], most: usize) -> Vec<f32> {
