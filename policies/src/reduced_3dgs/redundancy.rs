@@ -262,33 +262,4 @@ mod tests {
         assert_eq!(redundancy(&xs, &axes, &[1.0; 4], 30), [1.0; 4]);
         assert_eq!(redundancy(&[0.0; 2], &[[1.0; 3]; 2], &[f32::NAN, 1.0], 30), [2.0; 2]);
     }
-
-    #[test]
-    #[ignore = "a measurement: time of an event with 100,000 rows"]
-    fn time_of_an_event() {
-        let rng = PolicyRng::new(5, 5);
-        let rows = 100_000;
-        let normal = |row, purpose| rng.normal3(row, purpose, 0);
-        let means: Vec<[f32; 3]> = (0..rows).map(|row| normal(row, Purpose::Place)).collect();
-        let log_scales: Vec<[f32; 3]> =
-            (0..rows).map(|row| normal(row, Purpose::Noise).map(|z| z - 4.0)).collect();
-        let orientations: Vec<[f32; 4]> = (0..rows)
-            .map(|row| {
-                let [x, y, z] = normal(row, Purpose::Draw);
-                [1.0, x, y, z]
-            })
-            .collect();
-        let pixel_sizes = vec![0.005; rows as usize];
-        let shapes = Shapes {
-            means: &means,
-            log_scales: &log_scales,
-            orientations: &orientations,
-            pixel_sizes: &pixel_sizes,
-            sigmas: 3.0,
-        };
-        let start = std::time::Instant::now();
-        let redundancy = shapes.redundancy(30);
-        let mean = redundancy.iter().sum::<f32>() / rows as f32;
-        eprintln!("{:?}, mean redundancy {mean}", start.elapsed());
-    }
 }
