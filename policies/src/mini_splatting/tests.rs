@@ -92,7 +92,7 @@ fn the_model_is_replaced_by_surface_points() {
     // 0.8 · 10 rows, four of each view; nothing grows.
     assert_eq!((done.ops.rows_after, done.ops.seeds.len()), (8, 8));
     assert!(done.ops.families.is_empty() && done.ops.cause == "reinit");
-    assert!(done.ops.seeds.iter().all(|(_, seed)| (seed.opacity - 0.1).abs() < 1e-6));
+    assert!(done.ops.seeds.iter().all(|(_, seed)| seed.opacity == 0.1));
     assert_eq!(run(&event, "reinit_share = 0.4").ops.rows_after, 4);
     // Without points, and at another step, it is kept.
     assert!(run(&Event { views: Vec::new(), ..event.clone() }, "").ops.is_empty());
