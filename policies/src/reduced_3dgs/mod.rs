@@ -16,7 +16,7 @@
 //! views since the last prune: half the diagonal of a cube with edge p. Of the Gaussian's `neighbours`
 //! nearest neighbours, those are counted whose ellipsoid (`sigmas` standard deviations) meets the sphere, and
 //! itself. The redundancy R of a Gaussian is the smallest of the counts of all spheres that it meets in
-//! this way: it is only redundant if every place where it is has enough others.
+//! this way, so that it is not redundant where it fills a place that has few others.
 //!
 //! **Pruning** every `prune_every` steps until `prune_until` (inclusive), but not at opacity resets:
 //!
@@ -182,7 +182,7 @@ impl Reduced {
 
     /// Prunes the redundant and the faint, or as many at random, of those without an edit.
     fn prune(&self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
-        if let Some(count) = self.random_count(now.step, plan) {
+        if let Some(count) = self.random_count(now, plan) {
             Victims::Random.prune(plan, &[], count, rng);
             return Ok(());
         }
@@ -241,13 +241,14 @@ impl Reduced {
 
     /// How many rows the control prunes at `step`, where the number that it leaves is given: the same share
     /// at all prunes from the end of growth on, and before that none.
-    fn random_count(&self, step: u32, plan: &EditPlan) -> Option<usize> {
+    fn random_count(&self, now: &Snapshot<'_>, plan: &EditPlan) -> Option<usize> {
         let ReducedParams { victims, random_keep, prune_until, prune_every, .. } = self.params;
+        let (step, until) = (now.step, prune_until.min(now.scene.iterations));
         if victims != Victims::Random || random_keep == 0 || step < self.params.growth.grow_until {
             return None;
         }
         let left = plan.rows() - plan.pruned();
-        let later = (step / prune_every + 1..=prune_until / prune_every)
+        let later = (step / prune_every + 1..=until / prune_every)
             .filter(|event| self.is_prune(event * prune_every));
         let prunes = later.count() + 1;
         let kept = left as f64 * (f64::from(random_keep) / left as f64).powf(1.0 / prunes as f64);

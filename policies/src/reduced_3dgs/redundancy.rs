@@ -4,7 +4,8 @@ use crate::neighbours::Neighbours;
 
 /// Half the diagonal of a cube with edge 1.
 const HALF_DIAGONAL: f64 = 0.866_025_403_784_438_6;
-/// Most steps of Newton's method; five are enough for axes that differ by a factor of 1,000.
+/// Most steps of Newton's method. Of a million random cases with axes that differ by up to 10¹², none took
+/// more than 16.
 const MOST_STEPS: u32 = 50;
 /// Relative change at which Newton's method ends: some roundings of an f64.
 const SETTLED: f64 = 1e-14;

@@ -218,6 +218,8 @@ fn the_control_may_end_at_a_given_number() {
     assert_eq!([left(27_000, 810, ""), left(28_000, 270, ""), left(29_000, 90, "")], [270, 90, 30]);
     assert_eq!([left(30_000, 30, ""), left(30_000, 810, ""), left(30_000, 5, "")], [10, 10, 5]);
     assert_eq!(left(27_000, 810, "prune_until = 27500"), 10);
+    // Prunes after the run's last step do not count.
+    assert_eq!(left(29_000, 90, "prune_until = 90000"), 30);
     // Of the sixteen from the end of growth on, the first leaves 810·(1/81)^(1/16) = 615.5.
     assert_eq!(left(15_000, 810, ""), 615);
     // During growth as many as the rule would prune, which is none here.
