@@ -5,8 +5,8 @@
 //! adaptive density control; [`taming`], growth by score along a curve; [`diet`], replacement of the
 //! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges;
 //! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown; [`compact_3dgs`], which
-//! learns what to prune; [`mini_splatting`], which samples by importance. It knows no renderer, no image
-//! and no device.
+//! learns what to prune; [`mini_splatting`], which samples by importance; [`reduced_3dgs`], which prunes
+//! where many Gaussians share a pixel. It knows no renderer, no image and no device.
 //!
 //! # For users of gsplat
 //!
@@ -180,6 +180,7 @@ pub mod plan;
 pub mod policy;
 pub mod prune;
 pub mod radsplat;
+pub mod reduced_3dgs;
 pub mod registry;
 pub mod rng;
 pub mod sample;

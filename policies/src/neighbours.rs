@@ -1,9 +1,9 @@
-//! Distances to the nearest neighbours, by a k-d tree (Bentley 1975).
+//! The nearest neighbours of points and the distances to them, by a k-d tree (Bentley 1975).
 
 /// Points in a leaf of the tree; so few are searched faster one by one.
 const LEAF: usize = 8;
-/// Number of neighbours.
-const NEIGHBOURS: usize = 3;
+/// Number of neighbours that distances are averaged over.
+const AVERAGED: usize = 3;
 
 /// Points, arranged so that the nearest neighbours of each are found quickly. It takes 5 bytes per point
 /// beside the points.
@@ -15,11 +15,28 @@ pub struct Neighbours<'a> {
     axes: Vec<u8>,
 }
 
-struct Nearest {
-    point: u32,
-    /// Ascending.
-    squares: [f64; NEIGHBOURS],
+/// A neighbour of a point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Neighbour {
+    /// Squared distance, >= 0.
+    pub square: f64,
+    /// Its place among the points.
+    pub index: u32,
 }
+
+/// The nearest neighbours so far of one point.
+struct Nearest<'a> {
+    at: [f64; 3],
+    /// The point, which is no neighbour of itself.
+    point: u32,
+    /// Ascending; those not found yet are at an infinite distance. Not empty.
+    found: &'a mut [Neighbour],
+    /// Squared distance that all that is yet to be found is below.
+    bound: f64,
+}
+
+/// The place of a neighbour that is not found yet.
+pub const UNKNOWN: Neighbour = Neighbour { square: f64::INFINITY, index: u32::MAX };
 
 impl<'a> Neighbours<'a> {
     /// Arranges at most 2³² points, whose coordinates must not be NaN.
@@ -38,14 +55,58 @@ impl<'a> Neighbours<'a> {
     /// When there is no such point.
     #[must_use]
     pub fn mean_square_distance(&self, index: usize) -> f64 {
-        let mut nearest = Nearest { point: index as u32, squares: [f64::INFINITY; NEIGHBOURS] };
-        self.visit(0, self.points.len(), &mut nearest);
-        let found = nearest.squares.iter().filter(|square| square.is_finite());
-        let (count, sum) = found.fold((0.0, 0.0), |(n, sum), square| (n + 1.0, sum + square));
+        let mut found = [UNKNOWN; AVERAGED];
+        let found = self.nearest(index, &mut found).iter();
+        let (count, sum) = found.fold((0.0, 0.0), |(n, sum), other| (n + 1.0, sum + other.square));
         if count > 0.0 { sum / count } else { 0.0 }
     }
 
-    fn visit(&self, from: usize, to: usize, nearest: &mut Nearest) {
+    /// The nearest others of a point, nearest first: as many as `buffer` holds, or all if there are fewer.
+    /// Of points at the same distance, which ones are found depends on nothing but the points.
+    ///
+    /// # Panics
+    /// When there is no such point.
+    pub fn nearest<'b>(&self, index: usize, buffer: &'b mut [Neighbour]) -> &'b [Neighbour] {
+        self.nearest_below(index, f64::INFINITY, buffer)
+    }
+
+    /// Calls `visit` with each point and its `most` [nearest](Self::nearest) others, in an order in which
+    /// points that follow each other are near each other.
+    pub fn each_nearest(&self, most: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
+        let most = most.min(self.points.len().saturating_sub(1));
+        let mut buffer = vec![UNKNOWN; most];
+        let mut before: Option<(usize, f64)> = None;
+        for &index in &self.order {
+            let index = index as usize;
+            // What was near the point before is at most so far from this one; with room for rounding.
+            let bound = before.map_or(f64::INFINITY, |(before, farthest)| {
+                let step = square(self.points[before], self.points[index]).sqrt();
+                (farthest.sqrt() + step).powi(2) * (1.0 + 1e-9) + f64::MIN_POSITIVE
+            });
+            let found = self.nearest_below(index, bound, &mut buffer);
+            visit(index, found);
+            before = found.last().filter(|_| found.len() == most).map(|last| (index, last.square));
+        }
+    }
+
+    fn nearest_below<'b>(
+        &self,
+        index: usize,
+        bound: f64,
+        buffer: &'b mut [Neighbour],
+    ) -> &'b [Neighbour] {
+        buffer.fill(UNKNOWN);
+        let (at, point) = (self.points[index], index as u32);
+        if !buffer.is_empty() {
+            let mut nearest = Nearest { at, point, found: &mut *buffer, bound };
+            self.visit(0, self.points.len(), [0.0; 3], &mut nearest);
+        }
+        let count = buffer.iter().take_while(|other| other.square.is_finite()).count();
+        &buffer[..count]
+    }
+
+    /// Visits the points of a range, which is this far from the point along each axis.
+    fn visit(&self, from: usize, to: usize, outside: [f64; 3], nearest: &mut Nearest<'_>) {
         if to - from <= LEAF {
             for &other in &self.order[from..to] {
                 nearest.take(self.points, other);
@@ -54,16 +115,23 @@ impl<'a> Neighbours<'a> {
         }
         let middle = from + (to - from) / 2;
         let axis = usize::from(self.axes[middle]);
-        let here = |index: u32| self.points[index as usize][axis];
-        let beyond = here(nearest.point) - here(self.order[middle]);
+        let beyond = nearest.at[axis] - self.points[self.order[middle] as usize][axis];
         let (near, far) = ((from, middle), (middle + 1, to));
         let (near, far) = if beyond < 0.0 { (near, far) } else { (far, near) };
-        self.visit(near.0, near.1, nearest);
+        self.visit(near.0, near.1, outside, nearest);
         nearest.take(self.points, self.order[middle]);
-        if beyond * beyond <= nearest.squares[NEIGHBOURS - 1] {
-            self.visit(far.0, far.1, nearest);
+        let mut outside = outside;
+        outside[axis] = beyond;
+        // Not where the two are equal: points that coincide would all be visited.
+        if square(outside, [0.0; 3]) < nearest.bound {
+            self.visit(far.0, far.1, outside, nearest);
         }
     }
+}
+
+fn square(a: [f64; 3], b: [f64; 3]) -> f64 {
+    let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    x * x + y * y + z * z
 }
 
 fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
@@ -89,18 +157,22 @@ fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
     split(points, &mut high[1..], &mut high_axes[1..]);
 }
 
-impl Nearest {
-    fn take(&mut self, points: &[[f64; 3]], other: u32) {
-        if other == self.point {
+impl Nearest<'_> {
+    fn take(&mut self, points: &[[f64; 3]], index: u32) {
+        let square = square(points[index as usize], self.at);
+        // NaN is not below either.
+        let is_below = square < self.bound;
+        if index == self.point || !is_below {
             return;
         }
-        let (a, b) = (points[self.point as usize], points[other as usize]);
-        let mut square = (0..3).map(|axis: usize| (a[axis] - b[axis]).powi(2)).sum::<f64>();
-        for known in &mut self.squares {
-            if square < *known {
-                std::mem::swap(&mut square, known);
-            }
+        let last = self.found.len() - 1;
+        let mut place = last;
+        while place > 0 && square < self.found[place - 1].square {
+            self.found[place] = self.found[place - 1];
+            place -= 1;
         }
+        self.found[place] = Neighbour { square, index };
+        self.bound = self.bound.min(self.found[last].square);
     }
 }
 
@@ -126,14 +198,18 @@ mod tests {
         assert!((mean_square_distances(&five)[0] - 5.0 / 3.0).abs() < 1e-12);
     }
 
-    #[test]
-    fn the_tree_agrees_with_a_full_search() {
+    /// Clustered points, with ties and points that coincide.
+    fn clustered() -> Vec<[f64; 3]> {
         let rng = PolicyRng::new(1, 1);
-        // Clustered, with ties and points that coincide.
-        let points: Vec<[f64; 3]> = (0..700)
+        (0..700)
             .map(|i| rng.normal3(i % 650, Purpose::Place, 0))
             .map(|[x, y, z]| [x, (y * 4.0).round() / 4.0, z * 0.01].map(f64::from))
-            .collect();
+            .collect()
+    }
+
+    #[test]
+    fn the_tree_agrees_with_a_full_search() {
+        let points = clustered();
         let found = mean_square_distances(&points);
         for (i, a) in points.iter().enumerate() {
             let square = |b: &[f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum();
@@ -147,5 +223,56 @@ mod tests {
                 found[i]
             );
         }
+    }
+
+    #[test]
+    fn any_number_of_neighbours_is_found_nearest_first() {
+        let points = clustered();
+        let tree = Neighbours::new(&points);
+        let square =
+            |a: &[f64; 3], b: &[f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>();
+        for k in [0, 1, 2, 30, 699, 900] {
+            let mut buffer = vec![UNKNOWN; k];
+            let mut visits = vec![0; points.len()];
+            let mut together = vec![Vec::new(); points.len()];
+            tree.each_nearest(k, |index, found| {
+                visits[index] += 1;
+                together[index] = found.iter().map(|other| other.square).collect();
+            });
+            assert_eq!(visits, vec![1; points.len()]);
+            for (i, a) in points.iter().enumerate().step_by(7) {
+                let others = points.iter().enumerate().filter(|(j, _)| *j != i);
+                let mut expected: Vec<f64> = others.map(|(_, b)| square(a, b)).collect();
+                expected.sort_by(f64::total_cmp);
+                expected.truncate(k);
+                let found = tree.nearest(i, &mut buffer);
+                let squares: Vec<f64> = found.iter().map(|other| other.square).collect();
+                assert_eq!(squares, expected, "{k} neighbours of {i}");
+                assert_eq!(together[i], expected, "{k} neighbours of {i}, all together");
+                for other in found {
+                    assert_eq!(
+                        square(a, &points[other.index as usize]).to_bits(),
+                        other.square.to_bits()
+                    );
+                }
+                let mut places: Vec<u32> = found.iter().map(|other| other.index).collect();
+                places.sort_unstable();
+                places.dedup();
+                assert!(places.len() == found.len() && !places.contains(&(i as u32)));
+            }
+        }
+    }
+
+    #[test]
+    fn points_that_coincide_are_not_all_visited() {
+        // With all pairs visited this would take minutes.
+        let points = vec![[1.0, 2.0, 3.0]; 200_000];
+        let tree = Neighbours::new(&points);
+        let mut buffer = [UNKNOWN; 30];
+        for index in 0..points.len() {
+            let found = tree.nearest(index, &mut buffer);
+            assert!(found.len() == 30 && found.iter().all(|other| other.square == 0.0));
+        }
+        tree.each_nearest(30, |_, found| assert_eq!(found.len(), 30));
     }
 }

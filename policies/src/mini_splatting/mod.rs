@@ -11,7 +11,8 @@
 //! **Growth** is that of `vanilla`, with its parameters, but without opacity resets (`reset_every` = 0).
 //! Besides, a Gaussian that dominates more than `dominant_share` of a view's pixels, in any view since the
 //! last growth, is split: in these pixels no other Gaussian has a larger blend weight, so that one
-//! Gaussian stands for a whole area, mostly blurred. (Published as more than H·W/5000 pixels.)
+//! Gaussian stands for a whole area, mostly blurred. (Published as more than H·W/5000 pixels.) These splits
+//! follow those of `vanilla`, the largest share first while there is room.
 //!
 //! **Re-initialisation** at the steps `first_reinit_at` and `second_reinit_at`: the whole model is replaced by
 //! at most `reinit_share` of the budget in surface points, drawn in all training views in proportion to
@@ -89,12 +90,12 @@ use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset, Update};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
-    RateOverrides, SceneInfo, Signal, Snapshot,
+    RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::prune::{OverViews, Victims};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
-use crate::sample::weighted;
+use crate::sample::{largest, weighted};
 use crate::surface::{points_per_view, replace_model, sizes};
 use crate::vanilla::Vanilla;
 
@@ -244,12 +245,13 @@ impl MiniSplatting {
         self.growth.plan(now, rng, plan)?;
         let share = now.signal(Signal::DominantPixels)?;
         let split = split_by(self.params.growth.split_factor as f32);
-        for (row, &share) in (0..).zip(share) {
-            if share > self.params.dominant_share as f32 && plan.is_free(row) {
-                // A refusal is counted by the plan.
-                let _ = plan.grow(row, split);
-            }
+        let dominates = |row: u32| share[row as usize] > self.params.dominant_share as f32;
+        let rows = (0..now.rows() as u32).filter(|&row| dominates(row) && plan.is_free(row));
+        for row in largest(rows.collect(), share, now.rows()) {
+            // A refusal is counted by the plan.
+            let _ = plan.grow(row, split);
         }
+        plan.reset(Reset::Only(SignalSet::default().with(Signal::DominantPixels)));
         Ok(())
     }
 

@@ -38,15 +38,17 @@ fn view(weights: &[f32], pixels: &[f32], dominated: &[f32]) -> View {
 fn what_dominates_too_many_pixels_is_split() {
     let event = Event { budget: 9, ..event(600, 4) }
         // H·W/5000 is 2e-4 of the pixels; row 3 grows by its gradient and is not split as well.
-        .with(Signal::DominantPixels, &[1.99e-4, 2.01e-4, 0.5, 0.5])
+        .with(Signal::DominantPixels, &[1.99e-4, 2.01e-4, 0.5, 0.6])
         .with(Signal::ScreenGradient, &[0.0, 0.0, 0.0, 1.0]);
     let done = run(&event, "");
-    assert_eq!((done.cloned.as_slice(), done.split.as_slice()), (&[3][..], &[1, 2][..]));
+    assert_eq!((done.cloned.as_slice(), done.split.as_slice()), (&[3][..], &[2, 1][..]));
     assert_eq!(done.offspring()[1].scale, ScaleRule::Uniform(1.0 / 1.6));
+    assert!(done.ops.reset_signals.contains(Signal::DominantPixels));
     assert_eq!(run(&event, "dominant_share = 0.4").split, [2]);
     assert!(run(&event, "dominant_share = 1.0").split.is_empty());
-    // The budget holds: one clone, one split.
-    assert_eq!(run(&Event { budget: 6, ..event }, "").ops.rows_after, 6);
+    // The budget holds: one clone, then the split of the row that dominates most.
+    let full = run(&Event { budget: 6, ..event }, "");
+    assert_eq!((full.ops.rows_after, full.split.as_slice()), (6, &[2][..]));
 }
 
 #[test]

@@ -176,7 +176,8 @@ impl DensityPolicy for Vanilla {
         if self.grow.is_due(now.step) {
             plan.cause("densify");
             self.densify(now, plan)?;
-            plan.reset(Reset::Signals);
+            // No others: a policy that grows as this one does may have signals with a clock of their own.
+            plan.reset(Reset::Only([Signal::VisibleCount, Signal::ScreenGradient].into()));
         }
         self.resets.plan(now.step, plan);
         Ok(())
@@ -184,6 +185,11 @@ impl DensityPolicy for Vanilla {
 }
 
 impl Vanilla {
+    /// Whether opacities are reset at `step` (1-based).
+    pub(crate) fn is_reset(&self, step: u32) -> bool {
+        self.resets.is_due(step)
+    }
+
     /// Grows, then prunes. As in the original, rows are pruned as they are after growth: a huge row
     /// that is split is judged by the size of its children.
     fn densify(&self, now: &Snapshot<'_>, plan: &mut EditPlan) -> PolicyResult {

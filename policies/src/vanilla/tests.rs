@@ -26,7 +26,8 @@ fn the_threshold_applies_to_the_mean_over_views() {
     assert_eq!(done.cloned, [2, 0]);
     assert!(done.split.is_empty() && done.pruned.is_empty());
     assert_eq!(done.ops.rows_after, 6);
-    assert!(!done.ops.reset_signals.is_empty() && done.ops.clamp_opacity.is_none());
+    assert_eq!(done.ops.reset_signals, [Signal::VisibleCount, Signal::ScreenGradient].into());
+    assert!(done.ops.clamp_opacity.is_none());
     assert_eq!(done.ops.cause, "densify");
 }
 

@@ -1,0 +1,266 @@
+//! How many Gaussians share the space of a pixel: spheres around means, and the ellipsoids that meet them.
+
+use crate::neighbours::Neighbours;
+
+/// Half the diagonal of a cube with edge 1.
+const HALF_DIAGONAL: f64 = 0.866_025_403_784_438_6;
+/// Most steps of Newton's method. Of a million random cases with axes that differ by up to 10¹², none took
+/// more than 16.
+const MOST_STEPS: u32 = 50;
+/// Relative change at which Newton's method ends: some roundings of an f64.
+const SETTLED: f64 = 1e-14;
+/// Shortest half-axis: its square is far from the smallest f64, and no scene is so small.
+const SHORTEST: f64 = 1e-38;
+/// Longest half-axis and distance, likewise.
+const LONGEST: f64 = 1e38;
+
+/// Means, ellipsoids and pixel sizes of all rows.
+pub(super) struct Shapes<'a> {
+    /// `[scene units]`.
+    pub(super) means: &'a [[f32; 3]],
+    /// `[ln scene units]`.
+    pub(super) log_scales: &'a [[f32; 3]],
+    /// Quaternions (w, x, y, z) of any length but 0.
+    pub(super) orientations: &'a [[f32; 4]],
+    /// Smallest width of a pixel at the row `[scene units]`; not finite or not positive where no view
+    /// showed it.
+    pub(super) pixel_sizes: &'a [f32],
+    /// Half-axes of ellipsoids `[standard deviations]`, > 0.
+    pub(super) sigmas: f64,
+}
+
+impl Shapes<'_> {
+    /// For each row the smallest count of the spheres that it meets, its own included: the row of the
+    /// sphere, and those of the row's `most` nearest neighbours whose ellipsoids meet the sphere. 1 for
+    /// a row that meets none, or is not finite. Shape: `[rows]`.
+    pub(super) fn redundancy(&self, most: usize) -> Vec<f32> {
+        let half_axes: Vec<[f64; 3]> = self.log_scales.iter().map(|s| self.half_axes(*s)).collect();
+        let is_sound = |&row: &u32| {
+            let row = row as usize;
+            let turns = self.orientations[row].iter().map(|q| q * q).sum::<f32>().is_normal();
+            let fits = |value: f64| value.abs() <= LONGEST;
+            turns
+                && half_axes[row].iter().all(|&axis| fits(axis))
+                && self.means[row].iter().all(|&x| fits(x.into()))
+        };
+        let rows: Vec<u32> = (0..self.means.len() as u32).filter(is_sound).collect();
+        let points: Vec<[f64; 3]> =
+            rows.iter().map(|&row| self.means[row as usize].map(f64::from)).collect();
+        let tree = Neighbours::new(&points);
+        let mut redundancy = vec![f32::INFINITY; self.means.len()];
+        let mut met = Vec::new();
+        tree.each_nearest(most, |index, nearest| {
+            let (row, mean) = (rows[index], points[index]);
+            let radius = HALF_DIAGONAL * f64::from(self.pixel_sizes[row as usize]);
+            let has_sphere = radius > 0.0 && radius <= LONGEST;
+            if !has_sphere {
+                return;
+            }
+            met.clear();
+            met.push(row);
+            for other in nearest {
+                let (row, at) = (rows[other.index as usize], points[other.index as usize]);
+                let axes = half_axes[row as usize];
+                let (short, long) =
+                    (axes[0].min(axes[1]).min(axes[2]), axes[0].max(axes[1]).max(axes[2]));
+                let is_farther = |reach: f64| other.square > reach * reach;
+                let meets = || {
+                    let from = [0, 1, 2].map(|k: usize| mean[k] - at[k]);
+                    let from = turned_back(self.orientations[row as usize], from);
+                    sphere_meets(from, radius, axes)
+                };
+                // What meets the ball within the ellipsoid, and what misses the ball around it.
+                if !is_farther(short + radius) || (!is_farther(long + radius) && meets()) {
+                    met.push(row);
+                }
+            }
+            for &other in &met {
+                let known = &mut redundancy[other as usize];
+                *known = known.min(met.len() as f32);
+            }
+        });
+        redundancy.into_iter().map(|count| if count.is_finite() { count } else { 1.0 }).collect()
+    }
+
+    fn half_axes(&self, log_scales: [f32; 3]) -> [f64; 3] {
+        log_scales.map(|log| {
+            let axis = self.sigmas * f64::from(log).exp();
+            // `max` would turn NaN into the limit.
+            if axis < SHORTEST { SHORTEST } else { axis }
+        })
+    }
+}
+
+/// A vector of the scene along the axes of the quaternion (w, x, y, z) of any length but 0: R(q)ᵀ · v.
+fn turned_back(q: [f32; 4], v: [f64; 3]) -> [f64; 3] {
+    let [w, x, y, z] = q.map(f64::from);
+    let norm = w * w + x * x + y * y + z * z;
+    // v + 2 u × (u × v − w v), u = (x, y, z): the rotation by the conjugate.
+    let cross = |a: [f64; 3], b: [f64; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let u = [x, y, z];
+    let inner = cross(u, v);
+    let outer = cross(u, [0, 1, 2].map(|k: usize| inner[k] - w * v[k]));
+    [0, 1, 2].map(|k: usize| v[k] + 2.0 * outer[k] / norm)
+}
+
+/// Whether the sphere around `centre` meets the ellipsoid with these `half_axes` at the origin.
+///
+/// With half-axes e and the centre p outside, the ellipsoid's nearest point is eᵢ² pᵢ / (eᵢ² + t) with the
+/// t >= 0 at which F(t) = Σ (eᵢ pᵢ / (eᵢ² + t))² − 1 is 0; its squared distance D(t) = t² Σ (pᵢ / (eᵢ² + t))²
+/// grows with t. F falls and is convex, so that Newton's method from below never passes the root: as soon
+/// as D there is too large, the sphere misses.
+fn sphere_meets(centre: [f64; 3], radius: f64, half_axes: [f64; 3]) -> bool {
+    let axes = [0, 1, 2].map(|k: usize| (half_axes[k], centre[k].abs()));
+    if axes.iter().any(|(e, p)| *p > e + radius) {
+        return false;
+    }
+    // The ellipsoid with half-axes e + r lies within what spheres around points of this one cover: the
+    // root of Σ (e + r)² u² is at most that of Σ e² u² plus r (Minkowski), for every direction u.
+    if axes.iter().map(|(e, p)| (p / (e + radius)).powi(2)).sum::<f64>() <= 1.0 {
+        return true;
+    }
+    let is_within = |t: f64| {
+        axes.iter().map(|(e, p)| (t * p / (e * e + t)).powi(2)).sum::<f64>() <= radius * radius
+    };
+    // Each term of F + 1 is at most 1 at the root; and none has a smaller denominator than the shortest axis.
+    let mut t = axes.iter().map(|(e, p)| e * (p - e)).fold(0.0, f64::max);
+    let shortest = half_axes[0].min(half_axes[1]).min(half_axes[2]);
+    let most = axes.iter().map(|(e, p)| (e * p).powi(2)).sum::<f64>().sqrt() - shortest * shortest;
+    if is_within(most.max(t)) {
+        return true;
+    }
+    for _ in 0..MOST_STEPS {
+        if !is_within(t) {
+            return false;
+        }
+        let (mut value, mut slope) = (-1.0, 0.0);
+        for (e, p) in axes {
+            let term = (e * p / (e * e + t)).powi(2);
+            value += term;
+            slope -= 2.0 * term / (e * e + t);
+        }
+        let step = -value / slope;
+        t += step;
+        if step <= SETTLED * t {
+            break;
+        }
+    }
+    is_within(t)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::{PolicyRng, Purpose};
+
+    const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
+
+    /// Asserts that a sphere at `centre` just misses, and just meets, where its distance is `distance`.
+    fn assert_distance(centre: [f64; 3], half_axes: [f64; 3], distance: f64) {
+        let meets = |radius| sphere_meets(centre, radius, half_axes);
+        assert!(!meets(distance * (1.0 - 1e-9)), "{centre:?} {half_axes:?} {distance}");
+        assert!(meets(distance * (1.0 + 1e-9)), "{centre:?} {half_axes:?} {distance}");
+    }
+
+    #[test]
+    fn distances_to_an_ellipsoid_by_hand() {
+        // A ball; the end of each axis; inside.
+        assert_distance([0.0, -2.0, 0.0], [1.0; 3], 1.0);
+        assert_distance([2.0, 2.0, 1.0], [1.0; 3], 2.0);
+        assert_distance([5.0, 0.0, 0.0], [3.0, 2.0, 1.0], 2.0);
+        assert_distance([0.0, 0.0, 1.5], [3.0, 2.0, 1.0], 0.5);
+        assert!(sphere_meets([1.0, 1.0, 0.5], 1e-30, [3.0, 2.0, 1.0]));
+        assert!(sphere_meets([0.0; 3], 1e-30, [1e-38; 3]));
+        // From (1.8, 1.6, 0) of the ellipse with axes 3 and 2, (1.8/9, 1.6/4) = (0.2, 0.4) points outward:
+        // twice that is √0.8 away.
+        assert_distance([2.2, 2.4, 0.0], [3.0, 2.0, 1.0], 0.8_f64.sqrt());
+        // A needle and a disk, thin as a hair.
+        assert_distance([5.0, 1.0, 0.0], [10.0, 1e-12, 1e-12], 1.0);
+        assert_distance([3.0, 0.0, 4.0], [3.0, 3.0, 1e-9], 4.0);
+    }
+
+    #[test]
+    fn distances_agree_with_points_off_the_surface() {
+        // From a point of the surface along its normal, the distance is how far one went.
+        let rng = PolicyRng::new(3, 1);
+        for case in 0..2000 {
+            let unit = rng.normal3(case, Purpose::Place, 0).map(f64::from);
+            let length = unit.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let logs = rng.normal3(case, Purpose::Noise, 0).map(f64::from);
+            let half_axes = logs.map(|log| (2.0 * log).exp());
+            let surface = [0, 1, 2].map(|k: usize| half_axes[k] * unit[k] / length);
+            let normal = [0, 1, 2].map(|k: usize| surface[k] / half_axes[k].powi(2));
+            let steep = normal.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let distance = (3.0 * logs[0]).exp();
+            let centre = [0, 1, 2].map(|k: usize| surface[k] + distance * normal[k] / steep);
+            let meets = |radius| sphere_meets(centre, radius, half_axes);
+            // What is lost where the surface is far and the distance small.
+            let lost = 1e-6 * distance + 1e-12 * half_axes.iter().fold(0.0, |a: f64, b| a.max(*b));
+            assert!(!meets(distance - lost) && meets(distance + lost), "{case}: {centre:?}");
+        }
+    }
+
+    #[test]
+    fn vectors_are_turned_back_onto_the_axes() {
+        // A quarter turn about z takes the row's x axis to the scene's y axis; a quaternion of length 2.
+        let half = 2.0_f32.sqrt();
+        let turned = turned_back([half, 0.0, 0.0, half], [0.0, 3.0, 5.0]);
+        let expected = [3.0, 0.0, 5.0];
+        assert!((0..3).all(|k| (turned[k] - expected[k]).abs() < 1e-6), "{turned:?}");
+        assert!(
+            turned_back(UPRIGHT, [1.0, 2.0, 3.0])
+                .iter()
+                .zip(1..)
+                .all(|(x, k)| (x - f64::from(k)).abs() < 1e-12)
+        );
+    }
+
+    fn redundancy(xs: &[f32], half_axes: &[[f32; 3]], pixels: &[f32], most: usize) -> Vec<f32> {
+        let means: Vec<_> = xs.iter().map(|&x| [x, 0.0, 0.0]).collect();
+        let log_scales: Vec<_> =
+            half_axes.iter().map(|axes| axes.map(|a| (a / 3.0).ln())).collect();
+        let shapes = Shapes {
+            means: &means,
+            log_scales: &log_scales,
+            orientations: &vec![UPRIGHT; xs.len()],
+            pixel_sizes: pixels,
+            sigmas: 3.0,
+        };
+        shapes.redundancy(most)
+    }
+
+    #[test]
+    fn the_smallest_count_of_the_spheres_that_a_row_meets() {
+        // Balls of radius 1 at 0, 2, 4 and 20, with spheres of radius 1.1: each of the first two meets the
+        // next ball's rim, 1 away. Counts: 2, 3, 2, 1. The middle one is in the sphere of the first.
+        let pixel = 1.1 / 0.866_025_4;
+        let xs = [0.0, 2.0, 4.0, 20.0];
+        assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[pixel; 4], 30), [2.0, 2.0, 2.0, 1.0]);
+        // Radius √3/2 does not reach: 1 is farther.
+        assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[1.0; 4], 30), [1.0; 4]);
+        // The sphere of the middle one alone: it counts three, and so do those that it meets.
+        let own = [0.0, pixel, f32::INFINITY, 0.0];
+        assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &own, 30), [3.0, 3.0, 3.0, 1.0]);
+        // A needle that reaches everywhere, and one across. Counts: 2, 3, 3, 2.
+        let along = [[30.0, 0.01, 0.01], [1.0; 3], [1.0; 3], [0.01, 0.01, 30.0]];
+        assert_eq!(redundancy(&xs, &along, &[pixel; 4], 30), [2.0, 2.0, 3.0, 2.0]);
+    }
+
+    #[test]
+    fn only_the_nearest_neighbours_are_looked_at() {
+        // Five at one place: with two neighbours each sphere counts three, with thirty it counts five.
+        let at = |most| redundancy(&[1.0; 5], &[[1.0; 3]; 5], &[1.0; 5], most);
+        assert_eq!((at(2), at(30)), (vec![3.0; 5], vec![5.0; 5]));
+        assert!(redundancy(&[], &[], &[], 30).is_empty());
+    }
+
+    #[test]
+    fn what_is_not_finite_meets_nothing() {
+        let axes = [[1.0; 3], [1.0; 3], [f32::INFINITY; 3], [f32::NAN; 3]];
+        let xs = [0.0, f32::NAN, 0.0, 0.0];
+        assert_eq!(redundancy(&xs, &axes, &[1.0; 4], 30), [1.0; 4]);
+        assert_eq!(redundancy(&[0.0; 2], &[[1.0; 3]; 2], &[f32::NAN, 1.0], 30), [2.0; 2]);
+    }
+}
