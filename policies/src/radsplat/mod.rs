@@ -27,7 +27,8 @@
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends below
 //! the budget, by as much as the scene has Gaussians that no pixel shows; compare it by its final
-//! number too.
+//! number too. Of what had grown within a budget of 8,000 in 2,000 steps at half size, the defaults
+//! left 97 % on room256 and 87 % on cup, the light variant 34 % and 11 %.
 //!
 //! ## Differences from the paper
 //!

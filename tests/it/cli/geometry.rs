@@ -68,13 +68,22 @@ impl Known {
     }
 
     /// Holds every policy to what is allowed, as shares: depth RMSE of the diagonal, floaters of the rows.
-    fn check(&self, depth: impl Fn(&str) -> f64, floaters: f64, more: impl Fn(&Outcome) -> bool) {
+    fn check(
+        &self,
+        depth: impl Fn(&str) -> f64,
+        floaters: f64,
+        more: impl Fn(&str, &Outcome) -> bool,
+    ) {
         for entry in policies().expect("the registry is sound") {
             let outcome = self.train(entry.name, STEPS, "--backend cpu");
             let found = &outcome.geometry;
             let is_near = found.depth.rmse < depth(entry.name) && found.depth.coverage > 0.95;
             let is_clean = found.floaters.of_rows < floaters;
-            assert!(is_near && is_clean && more(&outcome), "{}: {outcome:?}", entry.name);
+            assert!(
+                is_near && is_clean && more(entry.name, &outcome),
+                "{}: {outcome:?}",
+                entry.name
+            );
         }
     }
 }
@@ -82,7 +91,7 @@ impl Known {
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
 fn spheres() {
-    Known::new("spheres", 64).check(|_| 0.032, 0.005, |_| true);
+    Known::new("spheres", 64).check(|_| 0.032, 0.005, |_, _| true);
 }
 
 #[test]
@@ -92,9 +101,10 @@ fn clutter() {
         "mcmc" | "igs" => 0.05,
         "diet" => 0.056,
         "taming" => 0.065,
+        "lightgaussian" => 0.11,
         _ => 0.09,
     };
-    Known::new("table", 64).check(depth, 0.025, |_| true);
+    Known::new("table", 64).check(depth, 0.025, |_, _| true);
 }
 
 #[test]
@@ -104,7 +114,11 @@ fn wires() {
         let thin = outcome.geometry.thin.iter().find(|t| (t.width - width).abs() < 1e-9);
         thin.map_or(0.0, |t| t.recall)
     };
-    let is_found = |outcome: &Outcome| recall(outcome, 2.0) > 0.2 && recall(outcome, 4.0) > 0.27;
+    let is_found = |policy: &str, outcome: &Outcome| {
+        // Three tenths of the Gaussians show less of a wire.
+        let least = if policy == "lightgaussian" { [0.16, 0.25] } else { [0.2, 0.27] };
+        recall(outcome, 2.0) > least[0] && recall(outcome, 4.0) > least[1]
+    };
     Known::new("thin", 96).check(|_| 0.063, 0.01, is_found);
 }
 
