@@ -15,7 +15,7 @@ use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
 use super::project::Splat;
-use super::simd::{V, WIDTH, each};
+use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
 use super::tiles::{Grid, TILE};
 use crate::backend::Shortcuts;
 
@@ -153,16 +153,21 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        match self.with_depth {
-            true => self.run::<S, true>(s),
-            false => self.run::<S, false>(s),
+        // Halves or quarters of a patch go in twos: what is the same for both is loaded once.
+        match (self.with_depth, matches!(S::F32_LANES, 4 | 8)) {
+            (true, true) => self.run::<S, true, 2>(s),
+            (true, false) => self.run::<S, true, 1>(s),
+            (false, true) => self.run::<S, false, 2>(s),
+            (false, false) => self.run::<S, false, 1>(s),
         }
     }
 }
 
 impl Rasterize<'_> {
+    /// `N` vectors of a patch at a time.
     #[inline(always)]
-    fn run<S: Simd, const WITH_DEPTH: bool>(self, s: S) {
+    #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
+    fn run<S: Simd, const WITH_DEPTH: bool, const N: usize>(self, s: S) {
         let Self { splats, list, place, background, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
@@ -181,7 +186,7 @@ impl Rasterize<'_> {
             *stop = if *light > 0.0 { u32::MAX } else { 0 };
         }
         let mut batch = Batch::new();
-        for (n, chunk) in list.chunks(BATCH).enumerate() {
+        for (first, chunk) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
             if alive == 0 {
                 break;
             }
@@ -192,55 +197,78 @@ impl Rasterize<'_> {
                     continue;
                 }
                 let mut takes_light = false;
-                for at in (0..WIDTH).step_by(S::F32_LANES) {
-                    let mut t = V::load(s, &light[p][at..]);
+                for at in (0..WIDTH).step_by(N * S::F32_LANES) {
+                    let mut t = load_of::<S, N>(s, &light[p][at..]);
                     // Pixels without light have stopped, and must not do so again.
-                    let mut least = zero.lt(t).select(least_light, never);
-                    let mut colour = [
-                        V::load(s, &red[p][at..]),
-                        V::load(s, &green[p][at..]),
-                        V::load(s, &blue[p][at..]),
-                    ];
-                    let mut at_depth = V::load(s, &depth[p][at..]);
+                    let mut least = t;
+                    for n in 0..N {
+                        least[n] = zero.lt(t[n]).select(least_light, never);
+                    }
+                    let mut r = load_of::<S, N>(s, &red[p][at..]);
+                    let mut g = load_of::<S, N>(s, &green[p][at..]);
+                    let mut b = load_of::<S, N>(s, &blue[p][at..]);
+                    let mut at_depth = load_of::<S, N>(s, &depth[p][at..]);
                     let mut todo = reached;
                     while todo != 0 {
                         // 32 bits; saying so again spares every load its bounds check.
                         let i = todo.trailing_zeros() as usize % BATCH;
                         todo &= todo - 1;
                         let splat = &batch.splats[i];
-                        let [u, z] = batch.u_and_z(s, i, p, at);
-                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                        let alpha = faintest.le(e).keep(e.exp2().min(c(ALPHA_MAX)));
-                        let mut next = alpha.neg_mul_add(t, t);
-                        let stops = next.le(least);
-                        if stops.any() {
-                            let here = s.splat_u32s((n * BATCH + i) as u32);
-                            let finished = &mut finished[p][at..];
-                            stops.select(t, V::load(s, finished)).store(finished);
-                            let stop = &mut S::as_mut_simd_u32s(&mut stop[p][at..]).0[0];
-                            *stop = stops.select_u32s(here, *stop);
-                            t = stops.select(zero, t);
-                            least = stops.select(never, least);
-                            next = alpha.neg_mul_add(t, t);
-                            if !zero.lt(t).any() {
+                        let mut e = t;
+                        for (n, e) in e.iter_mut().enumerate() {
+                            let [u, z] = batch.u_and_z(s, i, p, at + n * S::F32_LANES);
+                            *e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                        }
+                        let mut alpha = exp2_of(e);
+                        let mut next = t;
+                        for n in 0..N {
+                            alpha[n] = faintest.le(e[n]).keep(alpha[n].min(c(ALPHA_MAX)));
+                            next[n] = alpha[n].neg_mul_add(t[n], t[n]);
+                        }
+                        let mut some_stop = next[0].le(least[0]);
+                        for n in 1..N {
+                            some_stop = some_stop.or(next[n].le(least[n]));
+                        }
+                        if some_stop.any() {
+                            let here = s.splat_u32s(first + i as u32);
+                            let mut all_stopped = true;
+                            for n in 0..N {
+                                let stops = next[n].le(least[n]);
+                                let at = at + n * S::F32_LANES;
+                                let finished = &mut finished[p][at..];
+                                stops.select(t[n], V::load(s, finished)).store(finished);
+                                let stop = &mut S::as_mut_simd_u32s(&mut stop[p][at..]).0[0];
+                                *stop = stops.select_u32s(here, *stop);
+                                t[n] = stops.select(zero, t[n]);
+                                least[n] = stops.select(never, least[n]);
+                                next[n] = alpha[n].neg_mul_add(t[n], t[n]);
+                                all_stopped &= !zero.lt(t[n]).any();
+                            }
+                            if all_stopped {
                                 todo = 0;
                             }
                         }
-                        let w = alpha * t;
-                        colour = each!(k in 3 => w.mul_add(c(splat.colour[k]), colour[k]));
-                        if WITH_DEPTH {
-                            at_depth = w.mul_add(c(splat.depth), at_depth);
+                        for n in 0..N {
+                            let w = alpha[n] * t[n];
+                            r[n] = w.mul_add(c(splat.colour[0]), r[n]);
+                            g[n] = w.mul_add(c(splat.colour[1]), g[n]);
+                            b[n] = w.mul_add(c(splat.colour[2]), b[n]);
+                            if WITH_DEPTH {
+                                at_depth[n] = w.mul_add(c(splat.depth), at_depth[n]);
+                            }
                         }
                         t = next;
                     }
-                    t.store(&mut light[p][at..]);
-                    colour[0].store(&mut red[p][at..]);
-                    colour[1].store(&mut green[p][at..]);
-                    colour[2].store(&mut blue[p][at..]);
+                    store_of(t, &mut light[p][at..]);
+                    store_of(r, &mut red[p][at..]);
+                    store_of(g, &mut green[p][at..]);
+                    store_of(b, &mut blue[p][at..]);
                     if WITH_DEPTH {
-                        at_depth.store(&mut depth[p][at..]);
+                        store_of(at_depth, &mut depth[p][at..]);
                     }
-                    takes_light |= zero.lt(t).any();
+                    for t in t {
+                        takes_light |= zero.lt(t).any();
+                    }
                 }
                 if !takes_light {
                     alive &= !(1 << p);

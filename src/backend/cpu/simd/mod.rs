@@ -144,27 +144,10 @@ impl<S: Simd> V<S> {
     }
 
     /// 2^self for self in `[−126, 126]`; relative error below 2e-7. Outside, any value.
-    ///
-    /// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest f, in
-    /// `[−½, ½]`, goes through the minimax polynomial of 2^f of degree 6 (relative error of 2e-9
-    /// before rounding).
     #[inline(always)]
     pub(super) fn exp2(self) -> Self {
-        let s = self.s;
-        let magic = Self::splat(s, 12_582_912.0);
-        let shifted = self + magic;
-        let f = self - (shifted - magic);
-        let c = |x: f32| Self::splat(s, x);
-        let p = c(1.534_581_2e-4)
-            .mul_add(f, c(1.339_993_1e-3))
-            .mul_add(f, c(9.618_489e-3))
-            .mul_add(f, c(5.550_328_8e-2))
-            .mul_add(f, c(2.402_264_7e-1))
-            .mul_add(f, c(6.931_472e-1))
-            .mul_add(f, c(1.0));
-        let exponent = s.wrapping_dyn_shl_u32s(s.transmute_u32s_f32s(shifted.v), s.splat_u32s(23));
-        let bits = s.add_u32s(s.transmute_u32s_f32s(p.v), exponent);
-        Self { s, v: s.transmute_f32s_u32s(bits) }
+        let [power] = exp2_of([self]);
+        power
     }
 
     /// e^self, clamped to self in `[−87, 88]`; relative error below 2e-7.
@@ -210,6 +193,56 @@ impl<S: Simd> V<S> {
             .mul_add(t2, c(1.0));
         t * p * c(2.0 * std::f32::consts::LOG2_E)
     }
+}
+
+/// The first `N` vectors of `from`.
+#[inline(always)]
+pub(super) fn load_of<S: Simd, const N: usize>(s: S, from: &[f32]) -> [V<S>; N] {
+    let mut vectors = [V::zero(s); N];
+    for (n, vector) in vectors.iter_mut().enumerate() {
+        *vector = V::load(s, &from[n * S::F32_LANES..]);
+    }
+    vectors
+}
+
+/// The opposite.
+#[inline(always)]
+pub(super) fn store_of<S: Simd, const N: usize>(vectors: [V<S>; N], to: &mut [f32]) {
+    for (n, vector) in vectors.into_iter().enumerate() {
+        vector.store(&mut to[n * S::F32_LANES..]);
+    }
+}
+
+/// [`V::exp2`] of some vectors, step by step: with sixteen registers a constant is loaded for each use, and
+/// so serves all of them.
+///
+/// The nearest integer comes from adding 1.5·2²³, whose last bits then hold it; the rest f, in
+/// `[−½, ½]`, goes through the minimax polynomial of 2^f of degree 6 (relative error of 2e-9
+/// before rounding).
+#[inline(always)]
+pub(super) fn exp2_of<S: Simd, const N: usize>(x: [V<S>; N]) -> [V<S>; N] {
+    let s = x[0].s;
+    let magic = V::splat(s, 12_582_912.0);
+    let (mut shifted, mut f) = (x, x);
+    for n in 0..N {
+        shifted[n] = x[n] + magic;
+        f[n] = x[n] - (shifted[n] - magic);
+    }
+    let mut p = [V::splat(s, 1.534_581_2e-4); N];
+    for coefficient in
+        [1.339_993_1e-3, 9.618_489e-3, 5.550_328_8e-2, 2.402_264_7e-1, 6.931_472e-1, 1.0]
+    {
+        let coefficient = V::splat(s, coefficient);
+        for n in 0..N {
+            p[n] = p[n].mul_add(f[n], coefficient);
+        }
+    }
+    for n in 0..N {
+        let shifted = s.transmute_u32s_f32s(shifted[n].v);
+        let exponent = s.wrapping_dyn_shl_u32s(shifted, s.splat_u32s(23));
+        p[n] = V::of_bits(s, s.add_u32s(s.transmute_u32s_f32s(p[n].v), exponent));
+    }
+    p
 }
 
 impl V<Scalar> {
@@ -258,6 +291,11 @@ impl<S: Simd> Mask<S> {
     #[inline(always)]
     pub(super) fn and(self, b: Self) -> Self {
         Self { s: self.s, m: self.s.and_m32s(self.m, b.m) }
+    }
+
+    #[inline(always)]
+    pub(super) fn or(self, b: Self) -> Self {
+        Self { s: self.s, m: self.s.or_m32s(self.m, b.m) }
     }
 
     #[inline(always)]

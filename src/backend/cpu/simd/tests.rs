@@ -79,3 +79,36 @@ fn sums_of_four_are_four_sums() {
         assert_eq!(sums, expected, "{set}");
     }
 }
+
+/// Bits, [`Mask::any`] and [`Mask::keep`] of the lanes that hold more than a number.
+struct Above(f32);
+
+impl WithSimd for Above {
+    type Output = (u32, bool, Vec<f32>);
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> Self::Output {
+        let lanes: [f32; WIDTH] = std::array::from_fn(|i| (i * 7 % WIDTH) as f32);
+        let lanes = V::load(s, &lanes);
+        let mask = V::splat(s, self.0).lt(lanes);
+        let mut kept = [0.0; WIDTH];
+        mask.keep(-lanes).store(&mut kept);
+        (mask.bits(), mask.any(), kept[..S::F32_LANES].to_vec())
+    }
+}
+
+#[test]
+fn masks_have_a_bit_per_lane() {
+    for set in InstructionSet::available() {
+        for limit in [-1.0, 0.0, 5.5, 12.5, 15.0] {
+            let (bits, any, kept) = set.arch().dispatch(Above(limit));
+            let lanes = (0..kept.len()).map(|i| (i * 7 % WIDTH) as f32);
+            let expected: Vec<f32> = lanes.map(|x| if x > limit { -x } else { 0.0 }).collect();
+            assert_eq!(kept, expected, "{set}");
+            for (i, x) in expected.iter().enumerate() {
+                let above = if limit < 0.0 { 1 } else { u32::from(*x != 0.0) };
+                assert_eq!(bits >> i & 1, above, "{set}");
+            }
+            assert_eq!((any, bits >> kept.len()), (bits != 0, 0), "{set}");
+        }
+    }
+}
