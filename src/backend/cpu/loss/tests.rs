@@ -13,7 +13,7 @@ fn run(terms: ImageTerms, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
 
 fn run_in(
     buffers: &mut LossBuffers,
-    [width, height]: [usize; 2],
+    [width, height]: [u32; 2],
     terms: ImageTerms,
     mask: bool,
 ) -> (LossValue, Vec<f32>, Vec<f32>) {
@@ -26,7 +26,7 @@ fn run_in(
             }
         }
     }
-    let pixels = width * height;
+    let pixels = (width * height) as usize;
     let target = Image8 {
         width,
         height,
@@ -66,10 +66,11 @@ fn parts_of_pixels_make_up_the_loss() {
 #[test]
 fn buffers_are_those_of_one_image() {
     let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: true };
-    let all = |buffers: &mut LossBuffers, size: [usize; 2]| {
+    let all = |buffers: &mut LossBuffers, size: [u32; 2]| {
         let found = run_in(buffers, size, terms, false);
-        let at = |i| buffers.error_at(i % size[0], i / size[0]);
-        let errors: Vec<f32> = (0..size[0] * size[1]).map(at).collect();
+        let [width, height] = size.map(|side| side as usize);
+        let at = |i| buffers.error_at(i % width, i / width);
+        let errors: Vec<f32> = (0..width * height).map(at).collect();
         assert!(errors.iter().any(|error| *error > 0.0));
         (found, errors)
     };
