@@ -172,7 +172,6 @@ impl Rasterize<'_> {
     /// `N` vectors of a patch at a time.
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    #[expect(clippy::needless_range_loop, reason = "several arrays go side by side")]
     fn run<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
         let Self { splats, list, place, background, dominant, canvas, blending, .. } = self;
         let c = |x: f32| V::splat(s, x);
@@ -225,9 +224,9 @@ impl Rasterize<'_> {
                         todo &= todo - 1;
                         let splat = &batch.splats[i];
                         let mut e = t;
-                        for n in 0..N {
+                        for (n, e) in e.iter_mut().enumerate() {
                             let [u, z] = batch.u_and_z(s, i, p, at + n * S::F32_LANES);
-                            e[n] = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
+                            *e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
                         }
                         let mut alpha = exp2_of(e);
                         let mut next = t;

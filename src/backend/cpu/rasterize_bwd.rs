@@ -29,7 +29,7 @@ use super::rasterize::{
     ALPHA_MAX, Aligned, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
 };
 use super::records::TileRecords;
-use super::simd::{V, WIDTH, each, exp2_of, load_of, store_of, sums_of_four};
+use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 use crate::backend::signals::{BASE, Field, RecordLayout};
 
@@ -162,11 +162,9 @@ struct Sums<S: Simd> {
 
 impl RasterizeBwd<'_> {
     /// The first walk over a batch, whose first splat is entry `first` of the list. `light` is moved from
-    /// behind the batch to its front. Returns the end of each patch's pairs. `N` vectors at a time, as in
-    /// the forward pass.
+    /// behind the batch to its front. Returns the end of each patch's pairs.
     #[inline(always)]
-    #[expect(clippy::needless_range_loop, reason = "several arrays go side by side")]
-    fn blend_again<S: Simd, const N: usize>(
+    fn blend_again<S: Simd>(
         &mut self,
         s: S,
         batch: &Batch,
@@ -183,39 +181,28 @@ impl RasterizeBwd<'_> {
             if reached == 0 {
                 continue;
             }
-            for at in (0..WIDTH).step_by(N * S::F32_LANES) {
-                let mut product = [c(1.0); N];
+            for at in (0..WIDTH).step_by(S::F32_LANES) {
+                let stop = S::as_simd_u32s(&self.canvas.stop[p][at..]).0[0];
+                let mut product = c(1.0);
                 let (mut pair, mut todo) = (start, reached);
                 while todo != 0 {
                     // The mask has 32 bits; saying so again spares every load its bounds check.
                     let i = todo.trailing_zeros() as usize % BATCH;
                     todo &= todo - 1;
+                    let [u, z] = batch.u_and_z(s, i, p, at);
                     let log2_opacity = c(batch.splats[i].log2_opacity);
-                    let mut e = product;
-                    for n in 0..N {
-                        let [u, z] = batch.u_and_z(s, i, p, at + n * S::F32_LANES);
-                        e[n] = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
-                    }
+                    let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
                     let here = s.splat_u32s((first + i) as u32);
-                    let mut alpha = exp2_of(e);
-                    for n in 0..N {
-                        let at = at + n * S::F32_LANES;
-                        let stop = S::as_simd_u32s(&self.canvas.stop[p][at..]).0[0];
-                        let seen = faintest.le(e[n]).and(super::simd::before(s, here, stop));
-                        alpha[n] = seen.keep(alpha[n].min(c(ALPHA_MAX)));
-                        alpha[n].store(&mut alphas[pair % PAIRS][at..]);
-                        (alpha[n] * product[n]).store(&mut weights[pair % PAIRS][at..]);
-                        product[n] = alpha[n].neg_mul_add(product[n], product[n]);
-                    }
+                    let seen = faintest.le(e).and(super::simd::before(s, here, stop));
+                    let alpha = seen.keep(e.exp2().min(c(ALPHA_MAX)));
+                    alpha.store(&mut alphas[pair % PAIRS][at..]);
+                    (alpha * product).store(&mut weights[pair % PAIRS][at..]);
+                    product = alpha.neg_mul_add(product, product);
                     pair += 1;
                 }
                 // Where the product leaves f32, the light behind has done so, too.
                 let light = &mut light[p][at..];
-                let mut front = load_of::<S, N>(s, light);
-                for n in 0..N {
-                    front[n] = front[n] / product[n].max(c(f32::MIN_POSITIVE));
-                }
-                store_of(front, light);
+                (V::load(s, light) / product.max(c(f32::MIN_POSITIVE))).store(light);
             }
             start += reached.count_ones() as usize;
             ends[p] = start;
@@ -260,11 +247,7 @@ impl RasterizeBwd<'_> {
             for (p, &end) in patch_end.iter().enumerate() {
                 batch.cut(p, (end as usize).saturating_sub(first));
             }
-            let mut ends = if matches!(S::F32_LANES, 4 | 8) {
-                self.blend_again::<S, 2>(s, &batch, first, light)
-            } else {
-                self.blend_again::<S, 1>(s, &batch, first, light)
-            };
+            let mut ends = self.blend_again(s, &batch, first, light);
             for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
                 let mut todo = batch.patches_of[i];
                 let colour = each!(i in 3 => c(splat.colour[i]));

@@ -72,10 +72,15 @@ fn compare(scene: &Path, flags: &str, what: &str) {
     assert!(!steps.contains(&half), "{what}: an edit just then");
 }
 
-/// Flags by which a policy acts almost to the end.
+/// Flags by which a policy acts almost to the end, and does once a little later what it would do at half of
+/// the run.
 fn late(policy: &PolicyEntry) -> String {
-    let ends = policy.parameters().into_iter().filter(|(name, _)| name.ends_with("_until"));
-    ends.map(|(name, _)| format!("--policy-set {}.{name}=190 ", policy.name)).collect()
+    let at = |(name, default): (String, toml::Value)| {
+        let is_half = name.ends_with("_at") && default.as_integer() == Some(15_000);
+        let step = if is_half { Some(107) } else { name.ends_with("_until").then_some(190) };
+        Some(format!("--policy-set {}.{name}={} ", policy.name, step?))
+    };
+    policy.parameters().into_iter().filter_map(at).collect()
 }
 
 /// Stops and resumes a run of every registered policy, with these flags.
