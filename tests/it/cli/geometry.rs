@@ -74,24 +74,30 @@ impl Known {
         floaters: f64,
         more: impl Fn(&str, &Outcome) -> bool,
     ) {
+        let mut beyond = Vec::new();
         for entry in policies().expect("the registry is sound") {
             let outcome = self.train(entry.name, STEPS, "--backend cpu");
             let found = &outcome.geometry;
             let is_near = found.depth.rmse < depth(entry.name) && found.depth.coverage > 0.95;
             let is_clean = found.floaters.of_rows < floaters;
-            assert!(
-                is_near && is_clean && more(entry.name, &outcome),
-                "{}: {outcome:?}",
-                entry.name
-            );
+            if !(is_near && is_clean && more(entry.name, &outcome)) {
+                beyond.push((entry.name, outcome));
+            }
         }
+        assert!(beyond.is_empty(), "{beyond:#?}");
     }
 }
 
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
 fn spheres() {
-    Known::new("spheres", 64).check(|_| 0.032, 0.005, |_, _| true);
+    // They end with a fifth and a half of the budget.
+    let depth = |policy: &str| match policy {
+        "mini-splatting" => 0.042,
+        "reduced-3dgs" => 0.039,
+        _ => 0.032,
+    };
+    Known::new("spheres", 64).check(depth, 0.005, |_, _| true);
 }
 
 #[test]
@@ -101,7 +107,7 @@ fn clutter() {
         "mcmc" | "igs" => 0.05,
         "diet" => 0.056,
         "taming" => 0.065,
-        "lightgaussian" => 0.11,
+        "lightgaussian" | "reduced-3dgs" => 0.11,
         _ => 0.09,
     };
     Known::new("table", 64).check(depth, 0.025, |_, _| true);
@@ -115,11 +121,20 @@ fn wires() {
         thin.map_or(0.0, |t| t.recall)
     };
     let is_found = |policy: &str, outcome: &Outcome| {
-        // Three tenths of the Gaussians show less of a wire.
-        let least = if policy == "lightgaussian" { [0.16, 0.25] } else { [0.2, 0.27] };
+        // A third or a fifth of the Gaussians shows less of a wire.
+        let least = match policy {
+            "lightgaussian" => [0.16, 0.25],
+            "mini-splatting" => [0.08, 0.11],
+            _ => [0.2, 0.27],
+        };
         recall(outcome, 2.0) > least[0] && recall(outcome, 4.0) > least[1]
     };
-    Known::new("thin", 96).check(|_| 0.063, 0.01, is_found);
+    let depth = |policy: &str| match policy {
+        "mini-splatting" => 0.083,
+        "lightgaussian" => 0.075,
+        _ => 0.063,
+    };
+    Known::new("thin", 96).check(depth, 0.01, is_found);
 }
 
 /// At equal budget, both at it, `diet` is nearer to pictures held out and to the surface than a hard
