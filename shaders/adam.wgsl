@@ -17,13 +17,8 @@
 // 1/(1 − β₁^age) and √(1/(1 − β₂^age)).
 @group(0) @binding(8) var<storage, read> bias: array<vec2<f32>>;
 
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
-const EPSILON: f32 = 1e-15;
-const LOGIT_MAX: f32 = 9.2;
 const LOG_SCALE_LEAST: f32 = -13.8;
 const LOG_SCALE_MOST: f32 = 2.3;
-const MATURE: u32 = 17400u;
 const LEAST_SHARE: f32 = 5.9604645e-8;
 
 // Bits of frame.draw.z.
@@ -200,9 +195,7 @@ fn confine_to(at: u32, least: f32, most: f32) {
 
 // Δμ = R·S²·Rᵀ·ξ · share · factor.
 fn add_noise(row: u32, base: u32) {
-    let logit = params[base + 10u];
-    let e = exp_exact(-abs(logit));
-    let opacity = select(e, 1.0, logit >= 0.0) / (1.0 + e);
+    let opacity = sigmoid(params[base + 10u]);
     let share = 1.0 / (1.0 + exp_exact(frame.noise.y * (opacity - frame.noise.z)));
     if share < LEAST_SHARE {
         return;

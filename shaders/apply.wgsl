@@ -91,9 +91,8 @@ fn logit_of(opacity: f32, complement: f32) -> f32 {
 
 // Rule 0: the same, 1: this logit, 2: opacity times a factor, 3: conserved by so many siblings.
 fn logit_after(logit: f32, rule: u32, value: f32) -> f32 {
-    let e = exp_exact(-abs(logit));
-    let opacity = select(e, 1.0, logit >= 0.0) / (1.0 + e);
-    let complement = select(1.0, e, logit >= 0.0) / (1.0 + e);
+    let opacity = sigmoid(logit);
+    let complement = sigmoid(-logit);
     switch rule {
         case 1u: { return value; }
         case 2u: {
@@ -282,11 +281,9 @@ fn decay(
     let logit = rows[base + 10u];
     // What is not finite is left to the audit.
     if loss > 0.0 && below(logit, LARGEST) {
-        let e = exp_exact(-abs(logit));
-        let opacity = select(e, 1.0, logit >= 0.0) / (1.0 + e);
-        let complement = select(1.0, e, logit >= 0.0) / (1.0 + e);
+        let opacity = sigmoid(logit);
         let left = max(opacity - loss, OPACITY_LEAST);
-        rows[base + 10u] = min(logit, logit_of(left, complement + (opacity - left)));
+        rows[base + 10u] = min(logit, logit_of(left, sigmoid(-logit) + (opacity - left)));
     }
     for (var k = 0u; k < 3u; k++) {
         rows[base + 3u + k] += bitcast<f32>(now.c);

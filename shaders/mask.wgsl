@@ -12,17 +12,6 @@
 @group(0) @binding(6) var<storage, read> gradient: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> bias: array<vec2<f32>>;
 
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
-const EPSILON: f32 = 1e-15;
-const LOGIT_MAX: f32 = 9.2;
-const MATURE: u32 = 17400u;
-
-fn sigmoid(x: f32) -> f32 {
-    let e = exp_exact(-abs(x));
-    return select(e, 1.0, x >= 0.0) / (1.0 + e);
-}
-
 // now.a: bits of the logit at which masks begin, now.b: of the step size, now.c: of the term's derivative by
 // the mask, per row, now.d: of the logit of the threshold.
 @compute @workgroup_size(256)

@@ -11,9 +11,9 @@
 @group(0) @binding(7) var<storage, read> rows: array<f32>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
 // Pixels that the row dominates, where they are counted.
+@group(0) @binding(9) var<storage, read> dominant: array<u32>;
 // Logits of masks, counted from where they began, where there are masks.
 @group(0) @binding(10) var<storage, read> mask_offsets: array<f32>;
-@group(0) @binding(9) var<storage, read> dominant: array<u32>;
 
 const FOLD: f32 = 0.8493218;
 // Least largest weight of a view that counts as support.
@@ -138,11 +138,6 @@ fn norm3(v: vec3<f32>) -> f32 {
     }
     let scaled = v / most;
     return most * sqrt(dot(scaled, scaled));
-}
-
-fn sigmoid(x: f32) -> f32 {
-    let e = exp_exact(-abs(x));
-    return select(e, 1.0, x >= 0.0) / (1.0 + e);
 }
 
 // Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal,

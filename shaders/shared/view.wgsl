@@ -111,3 +111,9 @@ fn exp_exact(wide: f32) -> f32 {
     p = fma(p, f, 1.0);
     return bitcast<f32>(bitcast<u32>(p) + (bitcast<u32>(i32(n)) << 23u));
 }
+
+// The logistic function; 1 − sigmoid(x) is sigmoid(−x), where nothing cancels.
+fn sigmoid(x: f32) -> f32 {
+    let e = exp_exact(-abs(x));
+    return select(e, 1.0, x >= 0.0) / (1.0 + e);
+}

@@ -28,6 +28,7 @@ const ATOMICS: &str = shader!("shared/atomics");
 const BACKWARD: &str = shader!("shared/backward");
 const BLENDED: &str = shader!("shared/blended");
 const RECORD: &str = shader!("shared/record");
+const STEPS: &str = shader!("shared/steps");
 
 /// Which devices have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,8 +68,8 @@ pub(super) const STAGES: &[Stage] = &[
         &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
     stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")]),
-    stage("mask", On::All, &[VIEW, shader!("mask")]),
-    stage("adam", On::All, &[VIEW, RANDOM, shader!("adam")]),
+    stage("mask", On::All, &[VIEW, STEPS, shader!("mask")]),
+    stage("adam", On::All, &[VIEW, RANDOM, STEPS, shader!("adam")]),
     stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]),
     stage("apply", On::All, &[VIEW, RANDOM, shader!("apply")]),
     stage("candidates", On::All, &[VIEW, RANDOM, shader!("candidates")]),
