@@ -179,6 +179,7 @@ pub mod parameters;
 pub mod plan;
 pub mod policy;
 pub mod prune;
+mod quota;
 pub mod radsplat;
 pub mod reduced_3dgs;
 pub mod registry;

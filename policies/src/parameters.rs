@@ -76,6 +76,25 @@ pub enum StepParameter {
     Interval(&'static str),
 }
 
+/// The step parameters of a policy that has all those of another, `first`, and `more`; N in all.
+///
+/// # Panics
+/// When they are not N; it does not compile then where the result is a constant.
+#[must_use]
+pub const fn extended<const N: usize>(
+    first: &[StepParameter],
+    more: &[StepParameter],
+) -> [StepParameter; N] {
+    assert!(first.len() + more.len() == N, "another number of step parameters");
+    let mut all = [StepParameter::Step(""); N];
+    let mut i = 0;
+    while i < N {
+        all[i] = if i < first.len() { first[i] } else { more[i - first.len()] };
+        i += 1;
+    }
+    all
+}
+
 impl StepParameter {
     /// The parameter's name.
     #[must_use]

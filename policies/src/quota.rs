@@ -3,13 +3,13 @@
 use crate::adc::Window;
 
 /// ⌊`share` · `budget`⌋.
-pub(super) fn rows_of_share(share: f64, budget: usize) -> usize {
+pub(crate) fn rows_of_share(share: f64, budget: usize) -> usize {
     floor(share * budget as f64)
 }
 
 /// Rows for the event of `window` at `step`: all events together get ⌊`share` · `budget`⌋, each an
 /// equal part but for rounding.
-pub(super) fn rows_of_event(share: f64, window: Window, step: u32, budget: usize) -> usize {
+pub(crate) fn rows_of_event(share: f64, window: Window, step: u32, budget: usize) -> usize {
     let events = f64::from(window.count(u32::MAX).max(1));
     let until = |step: u32| floor(share * budget as f64 * f64::from(window.count(step)) / events);
     until(step) - until(step.saturating_sub(1))

@@ -70,8 +70,8 @@ use std::ops::Bound::{Excluded, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::adc::Window;
-use crate::parameters::StepParameter::{self, Interval, Step};
-use crate::parameters::in_range;
+use crate::parameters::StepParameter::{self, Interval};
+use crate::parameters::{extended, in_range};
 use crate::plan::EditPlan;
 use crate::policy::{DensityPolicy, MaskTerm, Needs, PolicyResult, SceneInfo, Signal, Snapshot};
 use crate::prune::Victims;
@@ -121,8 +121,7 @@ impl Default for CompactParams {
 pub struct Compact {
     params: CompactParams,
     growth: Vanilla,
-    /// When growth is due, at which masks prune too.
-    grow: Window,
+    /// When masks prune beside growth.
     prune: Window,
     iterations: u32,
 }
@@ -130,15 +129,8 @@ pub struct Compact {
 impl ConfiguredPolicy for Compact {
     type Params = CompactParams;
 
-    const STEP_PARAMETERS: &'static [StepParameter] = &[
-        Step("grow_from"),
-        Step("grow_until"),
-        Interval("grow_every"),
-        Step("max_scale_from"),
-        Interval("reset_every"),
-        Step("white_reset_at"),
-        Interval("mask_every"),
-    ];
+    const STEP_PARAMETERS: &'static [StepParameter] =
+        &extended::<7>(Vanilla::STEP_PARAMETERS, &[Interval("mask_every")]);
 
     fn new(params: CompactParams, scene: &SceneInfo) -> PolicyResult<Self> {
         let CompactParams { mask_start, mask_rate, mask_weight, min_mask, mask_every, .. } = params;
@@ -148,11 +140,8 @@ impl ConfiguredPolicy for Compact {
         in_range("mask_rate", rounded(mask_rate), (Excluded(0.0), Unbounded))?;
         in_range("mask_weight", mask_weight, 0.0..)?;
         in_range("min_mask", rounded(min_mask), (Excluded(0.0), Excluded(1.0)))?;
-        let VanillaParams { grow_from: from, grow_until: until, grow_every: every, .. } =
-            params.growth;
         Ok(Self {
             growth: Vanilla::new(params.growth.clone(), scene)?,
-            grow: Window { from, until, every },
             prune: Window { from: 0, until: u32::MAX, every: mask_every },
             iterations: scene.iterations,
             params,
@@ -211,7 +200,9 @@ impl Compact {
         if self.is_control() {
             return step > 0 && step == self.params.growth.grow_until;
         }
-        self.grow.is_due(step) || self.prune.is_due(step) || (step > 0 && step == self.iterations)
+        self.growth.grows_at(step)
+            || self.prune.is_due(step)
+            || (step > 0 && step == self.iterations)
     }
 }
 

@@ -1,10 +1,10 @@
 //! Compensation: pixels with a large error become new rows.
 
-use super::quota::rows_of_event;
 use super::{Diet, NewbornSize};
 use crate::adc::Window;
 use crate::plan::{EditPlan, Seed};
 use crate::policy::{CandidateRequest, PolicyResult, SceneInfo, Signal, Snapshot};
+use crate::quota::rows_of_event;
 use crate::sample::top_k;
 
 impl Diet {

@@ -152,16 +152,15 @@ use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo,
     Signal, SignalSet, Snapshot,
 };
+use crate::quota::rows_of_event;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::largest;
-use quota::rows_of_event;
 
 mod compensate;
 mod eviction;
 mod offspring;
 mod parameters;
-mod quota;
 mod reinit;
 
 pub use parameters::{CloneOpacity, DietParams, Growth, Importance, NewbornSize, Shift, Split};

@@ -1,9 +1,9 @@
 //! Re-initialisation: the whole model is replaced by surface points seen in the training views.
 
 use super::Diet;
-use super::quota::rows_of_share;
 use crate::plan::EditPlan;
 use crate::policy::SceneInfo;
+use crate::quota::rows_of_share;
 use crate::surface::{points_per_view, replace_model};
 
 impl Diet {

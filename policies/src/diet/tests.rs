@@ -1,12 +1,12 @@
 //! Tests of the rules of `diet`, each worked out by hand. One piece, as all share one kind of event.
 
 use super::offspring::conserving_scale;
-use super::quota::rows_of_share;
 use super::*;
 use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 use crate::plan::{EditCounts, Offspring, OpacityRule, ParentFate, Placement, ScaleRule, Seed};
 use crate::policy::{Candidate, DepthMode, ErrorMode};
+use crate::quota::rows_of_share;
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("diet", set)

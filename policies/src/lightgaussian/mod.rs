@@ -84,7 +84,8 @@
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
 
-use crate::parameters::StepParameter::{self, Interval, Step};
+use crate::parameters::StepParameter::{self, Step};
+use crate::parameters::extended;
 use crate::plan::EditPlan;
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PixelMap, PolicyResult, SceneInfo,
@@ -119,17 +120,10 @@ pub struct LightGaussian {
 impl ConfiguredPolicy for LightGaussian {
     type Params = LightGaussianParams;
 
-    const STEP_PARAMETERS: &'static [StepParameter] = &[
-        Step("grow_from"),
-        Step("grow_until"),
-        Interval("grow_every"),
-        Step("max_scale_from"),
-        Interval("reset_every"),
-        Step("white_reset_at"),
-        Step("first_at"),
-        Step("second_at"),
-        Step("once_at"),
-    ];
+    const STEP_PARAMETERS: &'static [StepParameter] = &extended::<9>(
+        Vanilla::STEP_PARAMETERS,
+        &[Step("first_at"), Step("second_at"), Step("once_at")],
+    );
 
     fn new(params: LightGaussianParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;

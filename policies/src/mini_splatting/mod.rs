@@ -86,13 +86,15 @@
 //! (`…_every`) do not shrink below 100 steps.
 
 use crate::adc::split_by;
-use crate::parameters::StepParameter::{self, Interval, Step};
+use crate::parameters::StepParameter::{self, Step};
+use crate::parameters::extended;
 use crate::plan::{EditPlan, Reset, Update};
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::prune::{OverViews, Victims};
+use crate::quota::rows_of_share;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::{largest, weighted};
@@ -126,18 +128,10 @@ pub struct MiniSplatting {
 impl ConfiguredPolicy for MiniSplatting {
     type Params = MiniSplattingParams;
 
-    const STEP_PARAMETERS: &'static [StepParameter] = &[
-        Step("grow_from"),
-        Step("grow_until"),
-        Interval("grow_every"),
-        Step("max_scale_from"),
-        Interval("reset_every"),
-        Step("white_reset_at"),
-        Step("first_reinit_at"),
-        Step("second_reinit_at"),
-        Step("sample_at"),
-        Step("cut_at"),
-    ];
+    const STEP_PARAMETERS: &'static [StepParameter] = &extended::<10>(
+        Vanilla::STEP_PARAMETERS,
+        &[Step("first_reinit_at"), Step("second_reinit_at"), Step("sample_at"), Step("cut_at")],
+    );
 
     fn new(params: MiniSplattingParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
@@ -236,8 +230,7 @@ impl MiniSplatting {
 
     /// Most rows after a re-initialisation.
     fn reinit_rows(&self, budget: usize) -> usize {
-        // A product just below an integer counts as this integer.
-        (self.params.reinit_share * budget as f64 * (1.0 + f64::EPSILON)).floor() as usize
+        rows_of_share(self.params.reinit_share, budget)
     }
 
     /// As in `vanilla`, and splits of what dominates too much.

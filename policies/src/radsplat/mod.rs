@@ -69,8 +69,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::StepParameter::{self, Interval, Step};
-use crate::parameters::in_range;
+use crate::parameters::StepParameter::{self, Step};
+use crate::parameters::{extended, in_range};
 use crate::plan::EditPlan;
 use crate::policy::{
     AuxColumn, AuxRequest, AuxView, DensityPolicy, Needs, PixelMap, PolicyResult, SceneInfo,
@@ -128,16 +128,8 @@ pub struct RadSplat {
 impl ConfiguredPolicy for RadSplat {
     type Params = RadSplatParams;
 
-    const STEP_PARAMETERS: &'static [StepParameter] = &[
-        Step("grow_from"),
-        Step("grow_until"),
-        Interval("grow_every"),
-        Step("max_scale_from"),
-        Interval("reset_every"),
-        Step("white_reset_at"),
-        Step("first_at"),
-        Step("second_at"),
-    ];
+    const STEP_PARAMETERS: &'static [StepParameter] =
+        &extended::<8>(Vanilla::STEP_PARAMETERS, &[Step("first_at"), Step("second_at")]);
 
     fn new(params: RadSplatParams, scene: &SceneInfo) -> PolicyResult<Self> {
         in_range("min_weight", params.min_weight, 0.0..=1.0)?;

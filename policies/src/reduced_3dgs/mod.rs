@@ -86,6 +86,7 @@
 //! (`…_every`) do not shrink below 100 steps.
 
 use crate::parameters::StepParameter::{self, Interval, Step};
+use crate::parameters::extended;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
     DensityPolicy, LossTerms, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
@@ -122,16 +123,8 @@ pub struct Reduced {
 impl ConfiguredPolicy for Reduced {
     type Params = ReducedParams;
 
-    const STEP_PARAMETERS: &'static [StepParameter] = &[
-        Step("grow_from"),
-        Step("grow_until"),
-        Interval("grow_every"),
-        Step("max_scale_from"),
-        Interval("reset_every"),
-        Step("white_reset_at"),
-        Interval("prune_every"),
-        Step("prune_until"),
-    ];
+    const STEP_PARAMETERS: &'static [StepParameter] =
+        &extended::<8>(Vanilla::STEP_PARAMETERS, &[Interval("prune_every"), Step("prune_until")]);
 
     fn new(params: ReducedParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;

@@ -185,6 +185,11 @@ impl DensityPolicy for Vanilla {
 }
 
 impl Vanilla {
+    /// Whether rows grow at `step` (1-based).
+    pub(crate) fn grows_at(&self, step: u32) -> bool {
+        self.grow.is_due(step)
+    }
+
     /// Whether opacities are reset at `step` (1-based).
     pub(crate) fn is_reset(&self, step: u32) -> bool {
         self.resets.is_due(step)
