@@ -24,6 +24,8 @@ pub(super) struct Row {
     pub(super) opacity_rests: bool,
     /// Coefficients from here on have zero moments, whatever the others have.
     pub(super) sh_rests_from: usize,
+    /// Whether the opacity has decayed.
+    pub(super) has_decayed: bool,
 }
 
 fn sigmoid(logit: f32) -> f64 {
@@ -80,6 +82,7 @@ impl Row {
             let least = f64::from(OPACITY_LEAST);
             let left = logit((sigmoid(self.logit) - f64::from(how.opacity)).max(least));
             self.logit = self.logit.min(left);
+            self.has_decayed = true;
         }
         self.rescale(ScaleRule::Uniform(1.0 - how.scale));
     }
@@ -142,6 +145,7 @@ impl Row {
             moments: None,
             opacity_rests: false,
             sh_rests_from: usize::MAX,
+            has_decayed: false,
         };
         sown.paint(seed.colour);
         sown
