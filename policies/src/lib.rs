@@ -5,8 +5,9 @@
 //! adaptive density control; [`taming`], growth by score along a curve; [`diet`], replacement of the
 //! least important Gaussians; [`mcmc`], relocation and noise; [`igs`], long-axis splits at edges;
 //! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown; [`compact_3dgs`], which
-//! learns what to prune; [`mini_splatting`], which samples by importance; [`reduced_3dgs`], which prunes
-//! where many Gaussians share a pixel. It knows no renderer, no image and no device.
+//! learns what to prune; [`eagles`], which prunes the least influential and begins with small images;
+//! [`mini_splatting`], which samples by importance; [`reduced_3dgs`], which prunes where many Gaussians
+//! share a pixel. It knows no renderer, no image and no device.
 //!
 //! # For users of gsplat
 //!
@@ -164,6 +165,7 @@ pub mod adc;
 pub mod compact_3dgs;
 pub mod conformance;
 pub mod diet;
+pub mod eagles;
 mod edit;
 mod error;
 #[cfg(test)]

@@ -35,6 +35,10 @@ pub struct Needs {
     /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
     /// summed between optimiser steps, and the sums need memory.
     pub cadence: Cadence,
+    /// Smallest [share of their sides](crate::policy::DensityPolicy::resolution) that training images are
+    /// ever shrunk to, in (0, 1]; `None`: they are always whole, and no memory is set aside for smaller
+    /// ones.
+    pub least_resolution: Option<f64>,
     /// Learning rates that replace the trainer's defaults, but not what the user sets.
     pub rates: RateOverrides,
     /// Changes to the initial rows.
@@ -46,6 +50,18 @@ pub struct Needs {
 }
 
 impl Needs {
+    /// Checks that images may be shrunk to this share of their sides at a step.
+    ///
+    /// # Errors
+    /// When it is not a number, above 1 or below what was declared, with both.
+    pub fn check_resolution(&self, share: f64) -> Result<(), String> {
+        let least = self.least_resolution.unwrap_or(1.0);
+        if (least..=1.0).contains(&share) {
+            return Ok(());
+        }
+        Err(format!("the resolution is {share}; it must be from {least}, as declared, to 1"))
+    }
+
     /// Checks that every number is finite and in its range.
     ///
     /// # Errors
@@ -69,6 +85,9 @@ impl Needs {
         if let Some(aux) = &self.aux {
             finite("aux.map.error", aux.map.error.into(), 0.0)?;
             finite("aux.map.edge", aux.map.edge.into(), 0.0)?;
+        }
+        if let Some(least) = self.least_resolution.filter(|least| !(*least > 0.0 && *least <= 1.0)) {
+            return Err(format!("least_resolution is {least}; it must be above 0 and at most 1"));
         }
         finite("cadence.all", self.cadence.all.into(), 1.0)?;
         finite("cadence.sh_rest", self.cadence.sh_rest.into(), 1.0)?;
@@ -419,6 +438,9 @@ mod tests {
                 ..Needs::default()
             },
             Needs { rates: fade(1.0, 0.5), ..Needs::default() },
+            Needs { least_resolution: Some(0.0), ..Needs::default() },
+            Needs { least_resolution: Some(1.5), ..Needs::default() },
+            Needs { least_resolution: Some(f64::NAN), ..Needs::default() },
             Needs { rates: fade(0.5, 0.0), ..Needs::default() },
             Needs { start: StartRule { opacity: Some(1.0), scale: 1.0 }, ..Needs::default() },
             Needs { start: StartRule { opacity: None, scale: 0.0 }, ..Needs::default() },
@@ -433,6 +455,16 @@ mod tests {
         for needs in wrong {
             assert!(needs.check().is_err(), "{needs:?}");
         }
+    }
+
+    #[test]
+    fn images_are_shrunk_as_far_as_declared() {
+        let needs = Needs { least_resolution: Some(0.3), ..Needs::default() };
+        assert!([0.3, 0.5, 1.0].iter().all(|&share| needs.check_resolution(share).is_ok()));
+        let wrong = [0.29, 1.01, f64::NAN, -0.5];
+        assert!(wrong.iter().all(|&share| needs.check_resolution(share).is_err()));
+        let whole = Needs::default();
+        assert!(whole.check_resolution(1.0).is_ok() && whole.check_resolution(0.99).is_err());
     }
 
     #[test]

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use super::resample;
+
 /// A decoded image, packed 8 bits per channel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image8 {
@@ -32,6 +34,12 @@ impl Image8 {
             alpha * f32::from(self.rgb[3 * pixel + channel]) / 255.0
                 + (1.0 - alpha) * background[channel]
         })
+    }
+
+    /// A smaller copy, each pixel the mean of those that it covers.
+    #[must_use]
+    pub fn shrunk(&self, width: u32, height: u32) -> Self {
+        resample::shrink(self, width, height)
     }
 
     /// Size of the pixels `[bytes]`.

@@ -15,6 +15,7 @@ mod policy_views;
 mod probe;
 mod progress;
 mod report;
+mod resolution;
 mod state;
 mod validate;
 
@@ -131,11 +132,12 @@ impl<V: ViewSource> Trainer<V> {
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
         let (loss_terms, noise) = self.terms(step)?;
+        let (camera, image) = self.at_resolution(step, view, image)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
         let input = StepInput {
             step,
             view,
-            camera: self.views.camera(view),
+            camera: &camera,
             target: &image,
             background: background.at(seed, step),
             sh_degree: self.sh_degree(step),

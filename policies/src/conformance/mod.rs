@@ -53,7 +53,8 @@ pub enum Check {
     RequestsConsistently,
     /// It rewrites, turns or scales by axis only if its needs declare detailed edits.
     DeclaresEdits,
-    /// Every number in its needs is in its range, and at no step is its cadence longer than declared.
+    /// Every number in its needs is in its range, and at no step is its cadence longer or its resolution
+    /// lower than declared.
     DeclaresValidNumbers,
     /// It plans without error or panic, whatever the statistics hold and whatever the plan refuses.
     NeverFails,

@@ -71,6 +71,7 @@ fn check_needs(
         let at_step = |why| out_of_range(format!("at step {step}, {why}"));
         policy.loss_terms(step, needs.loss_terms).check().map_err(at_step)?;
         policy.noise(step, needs.noise).map_or(Ok(()), |noise| noise.check()).map_err(at_step)?;
+        needs.check_resolution(policy.resolution(step)).map_err(at_step)?;
     }
     match steps.find(|&step| !policy.cadence(step).is_within(needs.cadence)) {
         None => Ok(()),

@@ -47,6 +47,14 @@ pub trait DensityPolicy: Send {
         declared
     }
 
+    /// What both sides of the training image are multiplied by at iteration `step`, from the
+    /// [declared least](Needs::least_resolution) to 1. Views rendered for policies and measurements are
+    /// always whole.
+    fn resolution(&self, step: u32) -> f64 {
+        let _ = step;
+        1.0
+    }
+
     /// How many training views, drawn at random without replacement, are rendered and
     /// [observed](Self::observe) before the plan of `step`, at which the policy is due; all of them
     /// if there are fewer. 0 for a policy that declares no [`Needs::aux`].

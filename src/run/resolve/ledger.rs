@@ -81,6 +81,9 @@ impl Inputs<'_> {
         let held = train.held(setting.image_cache);
         ledger.add_to(Section::Images, "decoded training views", held);
         ledger.add_to(Section::Images, "decoding", train.decoding(DECODERS));
+        if needs.least_resolution.is_some() {
+            ledger.add_to(Section::Images, "a view at a lower resolution", train.largest);
+        }
         let budget = setting.rows as u64;
         let float = size_of::<f32>() as u64;
         let row = float * (11 + 3 * sh_coefficients(degree) as u64);

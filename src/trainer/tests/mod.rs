@@ -61,6 +61,11 @@ impl Backend for CountingBackend {
     }
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         note(&self.log, format!("step {} view {}", input.step, input.target.rgb[0]));
+        let Camera { width, height, cx, fy, .. } = *input.camera;
+        assert_eq!((input.target.width, input.target.height), (width, height));
+        if (width, height) != (SIDE, SIDE) {
+            note(&self.log, format!("size {width}x{height}, cx {cx}, fy {fy}"));
+        }
         if input.cadence != Cadence::default() {
             let Cadence { all, sh_rest } = input.cadence;
             note(&self.log, format!("cadence {all} {sh_rest}"));
@@ -144,6 +149,8 @@ struct ScriptedPolicy {
     cadence: Cadence,
     /// From step 7 on.
     terms: (LossTerms, Option<NoiseTerm>),
+    /// Up to step 2.
+    resolution: f64,
     seen: Vec<f32>,
     behaviour: Behaviour,
 }
@@ -164,7 +171,8 @@ impl DensityPolicy for ScriptedPolicy {
         let aux = (self.aux_views > 0)
             .then(|| AuxRequest { columns: vec![AuxColumn::Depth], ..AuxRequest::default() });
         let cadence = Cadence { all: 4, sh_rest: 1 };
-        Needs { signals, aux, cadence, ..Needs::default() }
+        let least_resolution = Some(0.25);
+        Needs { signals, aux, cadence, least_resolution, ..Needs::default() }
     }
     fn is_due(&self, step: u32) -> bool {
         step.is_multiple_of(self.every)
@@ -177,6 +185,9 @@ impl DensityPolicy for ScriptedPolicy {
     }
     fn noise(&self, step: u32, declared: Option<NoiseTerm>) -> Option<NoiseTerm> {
         if step > 6 { self.terms.1 } else { declared }
+    }
+    fn resolution(&self, step: u32) -> f64 {
+        if step <= 2 { self.resolution } else { 1.0 }
     }
     fn aux_views(&self, step: u32, rows: usize, budget: usize) -> u32 {
         assert!(self.is_due(step) && rows <= budget);
@@ -225,6 +236,9 @@ impl DensityPolicy for ScriptedPolicy {
     }
 }
 
+/// Sides of the views.
+const SIDE: u32 = 64;
+
 struct FakeViews {
     cameras: Vec<Camera>,
     unreadable: Option<usize>,
@@ -245,8 +259,8 @@ impl ViewSource for FakeViews {
         if self.unreadable == Some(view) {
             return Err("file is gone".into());
         }
-        let rgb = vec![view as u8; 3];
-        Ok(Arc::new(Image8 { width: 1, height: 1, rgb, alpha: None, mask: None }))
+        let rgb = vec![view as u8; 3 * (SIDE * SIDE) as usize];
+        Ok(Arc::new(Image8 { width: SIDE, height: SIDE, rgb, alpha: None, mask: None }))
     }
     fn prefetch(&self, upcoming: &[usize]) {
         note(&self.prefetched, format!("{upcoming:?}"));
@@ -261,6 +275,7 @@ struct Case {
     aux_views: u32,
     cadence: Cadence,
     terms: (LossTerms, Option<NoiseTerm>),
+    resolution: f64,
     nan_loss_at: u32,
     unsound: u32,
     unreadable: Option<usize>,
@@ -274,6 +289,7 @@ const CASE: Case = Case {
     aux_views: 0,
     cadence: Cadence { all: 1, sh_rest: 1 },
     terms: (LossTerms { opacity: 0.0, scale: 0.0 }, None),
+    resolution: 1.0,
     nan_loss_at: 0,
     unsound: 0,
     unreadable: None,
@@ -322,7 +338,7 @@ fn build(
     scene: SceneInfo,
     options: TrainOptions,
 ) -> Result<(Trainer<FakeViews>, CallLog, CallLog), TrainError> {
-    let camera = Camera::centred((1, 1), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
+    let camera = Camera::centred((SIDE, SIDE), (1.0, 1.0), DMat3::IDENTITY, DVec3::ZERO);
     let (log, prefetched) = (CallLog::default(), CallLog::default());
     let backend = CountingBackend {
         rows: case.rows,
@@ -339,8 +355,10 @@ fn build(
         unreadable: case.unreadable,
         prefetched: prefetched.clone(),
     };
-    let Case { every, aux_views, cadence, terms, behaviour, .. } = *case;
-    let policy = ScriptedPolicy { every, aux_views, cadence, terms, seen: Vec::new(), behaviour };
+    let Case { every, aux_views, cadence, terms, resolution, behaviour, .. } = *case;
+    let seen = Vec::new();
+    let policy =
+        ScriptedPolicy { every, aux_views, cadence, terms, resolution, seen, behaviour };
     let policy = ("scripted", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, log, prefetched))

@@ -65,6 +65,25 @@ fn the_policy_sets_the_cadence() {
 }
 
 #[test]
+fn views_are_shrunk_with_their_cameras() {
+    let noted = |resolution: f64| {
+        let case = Case { resolution, every: 100, ..CASE };
+        let (mut trainer, log, _) = trainer(&case);
+        for _ in 0..3 {
+            trainer.step()?;
+        }
+        let log = log.lock().unwrap().clone();
+        Ok::<_, TrainError>(log.into_iter().filter(|d| d.starts_with("size")).collect::<Vec<_>>())
+    };
+    assert_eq!(noted(0.5).unwrap(), ["size 32x32, cx 16, fy 0.5"; 2]);
+    assert_eq!(noted(1.0).unwrap(), [""; 0]);
+    for share in [0.2, 1.5, f64::NAN] {
+        let error = noted(share).unwrap_err().to_string();
+        assert!(error.starts_with("step 1: policy `scripted`: the resolution is"), "{error}");
+    }
+}
+
+#[test]
 fn errors_name_the_view() {
     let (message, _, calls) = failure(&Case { nan_loss_at: 4, every: 4, ..CASE });
     let view = ["a.png", "b.png", "c.png"][schedule::view_order(3, 7, 1)[0]];
