@@ -11,7 +11,8 @@
 @group(0) @binding(4) var<storage, read> mask: array<u32>;
 // Derivatives of SSIM by the window's mean of e, e² and e·y, per channel: nine planes.
 @group(0) @binding(5) var<storage, read_write> derivatives: array<f32>;
-// dL/dpixel: three planes; and each pixel's part of the loss, where that is asked for.
+// dL/dpixel: three planes; each pixel's part of the loss, where that is asked for, and its weight by edges,
+// where these count.
 @group(0) @binding(6) var<storage, read_write> gradient: array<f32>;
 // Sums of |e| and of SSIM per tile.
 @group(0) @binding(7) var<storage, read_write> tile_sums: array<vec2<f32>>;
@@ -267,7 +268,8 @@ fn similarity(
     if lane < LINES && (frame.draw.w & BY_PIXEL) != 0u {
         let eight = eight_of(corner, lane);
         for (var p = 0u; p < eight.inside; p++) {
-            gradient[3u * size + eight.place + p] = lost[p / 4u][p % 4u] * (1.0 / 3.0);
+            let to = 3u * size + eight.place + p;
+            gradient[to] = weighed(lost[p / 4u][p % 4u] * (1.0 / 3.0), to + size);
         }
     }
     reduced[lane] = sums;
@@ -275,6 +277,18 @@ fn similarity(
     if lane == 0u {
         tile_sums[tile] = of_tile;
     }
+}
+
+// What rows are scored by of a pixel's error, where weights by edges are at this place.
+fn weighed(error: f32, place: u32) -> f32 {
+    var map = error;
+    if frame.score.x != 1.0 {
+        map = pow(max(error, 0.0), frame.score.x);
+    }
+    if frame.score.y > 0.0 {
+        map *= gradient[place];
+    }
+    return map;
 }
 
 // The sum of `reduced`, for the first invocation.

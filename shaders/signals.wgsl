@@ -32,6 +32,7 @@ override WEIGHT_MAX: u32;
 override WEIGHT_SUM: u32;
 override PIXEL_COUNT: u32;
 override WEIGHTED_ERROR: u32;
+override ERROR_SCORE: u32;
 override WEIGHT_MAX_ROOT: u32;
 override SUPPORT: u32;
 override DEPTH_MIN: u32;
@@ -105,6 +106,9 @@ fn accumulate(
     }
     if ERROR_AT > 0u {
         add(WEIGHTED_ERROR, row, row_sums[at + ERROR_AT]);
+        if WEIGHT_SUM_AT > 0u {
+            add(ERROR_SCORE, row, score(row_sums[at + ERROR_AT], row_sums[at + WEIGHT_SUM_AT]));
+        }
     }
     if WEIGHT_MAX_AT > 0u {
         let largest = row_sums[at + WEIGHT_MAX_AT];
@@ -119,6 +123,21 @@ fn accumulate(
         let pixels = f32(frame.image.x * frame.image.y);
         raise(DOMINANT_PIXELS, row, f32(dominant[row]) / pixels);
     }
+}
+
+// The score of one view, from the sums of weighed errors and of weights.
+fn score(error: f32, weight: f32) -> f32 {
+    if !(error > 0.0 && weight > 0.0) {
+        return 0.0;
+    }
+    var score = error;
+    if frame.score.z > 0.0 {
+        score /= pow(weight, frame.score.z);
+    }
+    if frame.score.w < 1.0 {
+        score = pow(score, frame.score.w);
+    }
+    return score;
 }
 
 // Squares of small gradients would underflow, and some devices flush them to 0 sooner.

@@ -20,6 +20,8 @@ pub struct Needs {
     /// mostly produces floaters that explain one photograph (*Pixel-GS*, Zhang et al. 2024,
     /// section 3.3).
     pub full_depth: f32,
+    /// How the errors of pixels add up to [`Signal::ErrorScore`].
+    pub error_score: ErrorScore,
     /// Pixels to collect as candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
     /// What is measured in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
@@ -68,6 +70,7 @@ impl Needs {
     /// The first that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
         finite("full_depth", self.full_depth.into(), 0.0)?;
+        self.error_score.check()?;
         self.loss_terms.check()?;
         self.noise.map_or(Ok(()), |noise| noise.check())?;
         match &self.mask {
@@ -86,7 +89,8 @@ impl Needs {
             finite("aux.map.error", aux.map.error.into(), 0.0)?;
             finite("aux.map.edge", aux.map.edge.into(), 0.0)?;
         }
-        if let Some(least) = self.least_resolution.filter(|least| !(*least > 0.0 && *least <= 1.0)) {
+        if let Some(least) = self.least_resolution.filter(|least| !(*least > 0.0 && *least <= 1.0))
+        {
             return Err(format!("least_resolution is {least}; it must be above 0 and at most 1"));
         }
         finite("cadence.all", self.cadence.all.into(), 1.0)?;
@@ -114,6 +118,71 @@ fn above_zero(name: &str, value: f64) -> Result<(), String> {
         return Ok(());
     }
     Err(format!("{name} is {value}; it must be positive"))
+}
+
+/// How the errors of pixels add up to [`Signal::ErrorScore`]. A view adds
+///
+/// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
+///
+/// both sums over the pixels p that the row is blended into, w its blend weight α·T there and e the pixel's
+/// part of the training loss, as in [`Signal::WeightedError`]. g is the 8-neighbour Laplacian of the
+/// photograph's 8-bit luma, clipped to 0..255, and ḡ its mean over the view (in a view without edges all
+/// weigh the same).
+///
+/// The default is Σ w·e. A power above 1 looks at the worst pixels, a footprint of 1 at the mean error
+/// whatever the row's size, and a view power below 1 at rows that many views complain of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ErrorScore {
+    /// Power of a pixel's error, in (0, 16].
+    pub power: f32,
+    /// Weight of edges, >= 0; 0: none, at no cost.
+    pub edge: f32,
+    /// Power of the sum of blend weights that divides, in `[0, 1]`.
+    pub footprint: f32,
+    /// Power of a view's score, in (0, 1].
+    pub view_power: f32,
+}
+
+impl Default for ErrorScore {
+    fn default() -> Self {
+        Self { power: 1.0, edge: 0.0, footprint: 0.0, view_power: 1.0 }
+    }
+}
+
+impl ErrorScore {
+    /// Whether M is the error itself, but for edges.
+    #[must_use]
+    pub fn is_plain_map(&self) -> bool {
+        self.power.total_cmp(&1.0).is_eq()
+    }
+
+    /// The score of one view, from Σ w·M and Σ w; 0 where the row has no error.
+    #[must_use]
+    pub fn of_view(&self, error: f32, weight: f32) -> f32 {
+        if !(error > 0.0 && weight > 0.0) {
+            return 0.0;
+        }
+        let by_size =
+            if self.footprint > 0.0 { error / weight.powf(self.footprint) } else { error };
+        if self.view_power < 1.0 { by_size.powf(self.view_power) } else { by_size }
+    }
+
+    fn check(&self) -> Result<(), String> {
+        finite("error_score.edge", self.edge.into(), 0.0)?;
+        for (name, value, lowest, most) in [
+            ("power", self.power, f32::MIN_POSITIVE, 16.0),
+            ("footprint", self.footprint, 0.0, 1.0),
+            ("view_power", self.view_power, f32::MIN_POSITIVE, 1.0),
+        ] {
+            if !(lowest..=most).contains(&value) {
+                let above = if lowest > 0.0 { "above 0" } else { "at least 0" };
+                return Err(format!(
+                    "error_score.{name} is {value}; it must be {above}, at most {most}"
+                ));
+            }
+        }
+        Ok(())
+    }
 }
 
 /// Which pixels of the training views to collect as candidates for new rows.
@@ -413,6 +482,7 @@ mod tests {
         let noise = NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 };
         let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
         assert_eq!(Needs { mask: Some(mask), ..Needs::default() }.check(), Ok(()));
+        let score = |error_score| Needs { error_score, ..Needs::default() };
         let fade =
             |from, to| RateOverrides { fade: Some(Fade { from, to }), ..RateOverrides::default() };
         let wrong = [
@@ -438,6 +508,10 @@ mod tests {
                 ..Needs::default()
             },
             Needs { rates: fade(1.0, 0.5), ..Needs::default() },
+            score(ErrorScore { power: 0.0, ..ErrorScore::default() }),
+            score(ErrorScore { edge: f32::NAN, ..ErrorScore::default() }),
+            score(ErrorScore { footprint: 1.5, ..ErrorScore::default() }),
+            score(ErrorScore { view_power: 0.0, ..ErrorScore::default() }),
             Needs { least_resolution: Some(0.0), ..Needs::default() },
             Needs { least_resolution: Some(1.5), ..Needs::default() },
             Needs { least_resolution: Some(f64::NAN), ..Needs::default() },
@@ -455,6 +529,16 @@ mod tests {
         for needs in wrong {
             assert!(needs.check().is_err(), "{needs:?}");
         }
+    }
+
+    #[test]
+    fn a_view_scores_by_error_size_and_power() {
+        let score = ErrorScore { footprint: 0.5, view_power: 0.5, ..ErrorScore::default() };
+        // 8 / √4 = 4, and its root.
+        assert!((score.of_view(8.0, 4.0) - 2.0).abs() < 1e-6);
+        assert!((ErrorScore::default().of_view(8.0, 4.0) - 8.0).abs() < 1e-6);
+        let none = [(0.0, 4.0), (8.0, 0.0), (f32::NAN, 4.0)];
+        assert!(none.iter().all(|&(error, weight)| score.of_view(error, weight).to_bits() == 0));
     }
 
     #[test]

@@ -22,6 +22,9 @@ struct Frame {
     more_rates: vec4<f32>,
     // Strength times step size, sharpness, opacity.
     noise: vec4<f32>,
+    // How errors add up to a score: power of a pixel's error, weight of edges, powers of the weights' sum and
+    // of a view.
+    score: vec4<f32>,
     // Seed, step, bits of what is due (see adam.wgsl), kind of target (see loss.wgsl).
     draw: vec4<u32>,
     // Planes of the signals' accumulators, by their numbers; NONE where not asked for.

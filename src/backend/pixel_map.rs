@@ -1,7 +1,7 @@
 //! Measurements of auxiliary views that every backend makes on the host: the pixel map, the choice of
 //! pixels for surface points, and a row's radius.
 
-use densify_policies::policy::PixelMap;
+use densify_policies::policy::{ErrorScore, PixelMap};
 use densify_policies::rng::PolicyRng;
 use densify_policies::sample::weighted;
 
@@ -26,7 +26,7 @@ pub(super) fn pixel_map(
             weight(at) * (difference(0) + difference(1) + difference(2)) / 3.0
         })
         .collect();
-    let mut edge = edges(target, background);
+    let mut edge: Vec<f32> = edges(target, background).into_iter().map(f32::from).collect();
     for (at, edge) in edge.iter_mut().enumerate() {
         *edge *= weight(at);
     }
@@ -63,28 +63,49 @@ pub(super) fn radius_px(inv_l1: f32, shear: f32, inv_l3: f32) -> f32 {
     (3.0 * (mid + root).sqrt()).ceil()
 }
 
-/// 8-neighbour Laplacian of the 8-bit luma, clipped to 0..255; borders are repeated.
-/// Shape: `[height, width]`.
-fn edges(target: &Image8, background: [f32; 3]) -> Vec<f32> {
-    let (width, height) = (target.width as usize, target.height as usize);
-    let luma: Vec<u8> = (0..width * height)
-        .map(|at| {
-            let rgb = target.composited(at % width, at / width, background);
-            let [r, g, b] = rgb.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u32);
-            // ITU-R 601-2 in 16 bits: 0.299, 0.587, 0.114.
-            ((19_595 * r + 38_470 * g + 7_471 * b + 32_768) >> 16) as u8
-        })
-        .collect();
+/// The edges of an image. Shape: `[height, width]`.
+fn edges(target: &Image8, background: [f32; 3]) -> Vec<u8> {
+    let size = [target.width as usize, target.height as usize];
+    let mut luma = vec![0; size[0] * size[1]];
+    for (y, line) in luma.chunks_exact_mut(size[0].max(1)).enumerate() {
+        luma_line(target, background, y, line);
+    }
+    (0..luma.len()).map(|at| edge_at(&luma, size, at)).collect()
+}
+
+/// Writes the 8-bit luma of a line of pixels.
+pub(super) fn luma_line(target: &Image8, background: [f32; 3], y: usize, line: &mut [u8]) {
+    for (x, luma) in line.iter_mut().enumerate() {
+        let rgb = target.composited(x, y, background);
+        let [r, g, b] = rgb.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u32);
+        // ITU-R 601-2 in 16 bits: 0.299, 0.587, 0.114.
+        *luma = ((19_595 * r + 38_470 * g + 7_471 * b + 32_768) >> 16) as u8;
+    }
+}
+
+/// 8-neighbour Laplacian of the 8-bit luma in a pixel, clipped to 0..255; borders are repeated.
+pub(super) fn edge_at(luma: &[u8], [width, height]: [usize; 2], pixel: usize) -> u8 {
     let at = |x: usize, y: usize| i32::from(luma[y * width + x]);
-    (0..width * height)
-        .map(|pixel| {
-            let (x, y) = (pixel % width, pixel / width);
-            let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
-            let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
-            let sum: i32 = rows.iter().flat_map(|&y| columns.map(|x| at(x, y))).sum();
-            (9 * at(x, y) - sum).clamp(0, 255) as f32
-        })
-        .collect()
+    let (x, y) = (pixel % width, pixel / width);
+    let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
+    let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
+    let sum: i32 = rows.iter().flat_map(|&y| columns.map(|x| at(x, y))).sum();
+    (9 * at(x, y) - sum).clamp(0, 255) as u8
+}
+
+/// What an edge of 1 adds to the weight of a pixel, where edges weigh so much at their mean, in an image
+/// whose edges have this sum.
+pub(super) fn edge_factor(weight: f32, sum: u64, pixels: usize) -> f32 {
+    if sum == 0 { 0.0 } else { (f64::from(weight) * pixels as f64 / sum as f64) as f32 }
+}
+
+/// Weights of all pixels for [`ErrorScore::edge`]. Shape: `[height, width]`.
+#[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only the GPU backend asks"))]
+pub(super) fn edge_weights(target: &Image8, background: [f32; 3], score: &ErrorScore) -> Vec<f32> {
+    let edges = edges(target, background);
+    let sum = edges.iter().map(|&edge| u64::from(edge)).sum();
+    let factor = edge_factor(score.edge, sum, edges.len());
+    edges.iter().map(|&edge| 1.0 + factor * f32::from(edge)).collect()
 }
 
 /// Brings values to 0..1 by their least and their largest; all 0 where they are equal.

@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use densify_policies::policy::{
-    AuxColumn, AuxRequest, Needs, PixelSum, Signal, SignalKind, SignalSet,
+    AuxColumn, AuxRequest, ErrorScore, Needs, PixelSum, Signal, SignalKind, SignalSet,
 };
 
 use crate::gaussians::{ModelArray, dc_to_rgb};
@@ -154,6 +154,8 @@ pub(super) struct SignalPlanes {
     pub(super) count: usize,
     /// See [`Needs::full_depth`].
     pub(super) full_depth: f32,
+    /// See [`Needs::error_score`].
+    pub(super) score: ErrorScore,
     /// Whether the current epoch's plane is the first of two, rather than the second.
     swapped: bool,
 }
@@ -177,7 +179,8 @@ impl SignalPlanes {
             count += if first.is_some() { own } else { 0 };
             first
         });
-        Self { first, count, full_depth: needs.full_depth, swapped: false }
+        let (full_depth, score) = (needs.full_depth, needs.error_score);
+        Self { first, count, full_depth, score, swapped: false }
     }
 
     /// The planes of a signal; its value is the largest of theirs.
@@ -254,6 +257,7 @@ impl ParameterSignal {
             | Signal::WeightSum
             | Signal::PixelCount
             | Signal::WeightedError
+            | Signal::ErrorScore
             | Signal::WeightMaxRoot
             | Signal::Support
             | Signal::DepthMin

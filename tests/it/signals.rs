@@ -5,14 +5,16 @@ use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, dc_to_rgb};
 use densify_policies::plan::EditPlan;
-use densify_policies::policy::{Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet};
+use densify_policies::policy::{ErrorScore, Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet};
 
 use crate::subject::{all, devices, make_with, normalised, repeatable, step_input, storages};
 use densify::verify::compare::{Table, relative_error};
 use densify::verify::reference::blend::each_blended;
-use densify::verify::reference::loss::loss;
+use densify::verify::reference::loss::{Loss, loss};
 use densify::verify::reference::project::{by_depth, project};
-use densify::verify::reference::{Gradient, Model, Rules, Upstream, View, differentiate, render};
+use densify::verify::reference::{
+    Gradient, Image, Model, Rules, Upstream, View, differentiate, render,
+};
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 
 /// A quarter of the loss's gradient jumps with the sign of render − target, and a few pixels are
@@ -57,15 +59,9 @@ fn views() -> Views {
     Views { model, cameras, targets }
 }
 
-/// The reference's gradient of the training loss of one view, each row's weighted error, and the share of
-/// the pixels that it dominates.
-pub(crate) fn reference(
-    model: &Gaussians,
-    view: View<'_>,
-    target: &Image8,
-) -> (Gradient, Vec<f64>, Vec<f64>) {
-    let model = Model::of(model);
-    let image = render(&model, view, &Rules::STANDARD);
+/// The reference's rendering of one view, and its training loss.
+fn rendering_and_loss(model: &Model, view: View<'_>, target: &Image8) -> (Image, Loss) {
+    let image = render(model, view, &Rules::STANDARD);
     let truth: Vec<f64> = target.rgb.iter().map(|&v| f64::from(v) / 255.0).collect();
     // What is masked agrees, so far as it is.
     let mask = |i: usize| target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[i / 3]) / 255.0);
@@ -75,6 +71,18 @@ pub(crate) fn reference(
     for (i, gradient) in loss.gradient.iter_mut().enumerate() {
         *gradient *= mask(i);
     }
+    (image, loss)
+}
+
+/// The reference's gradient of the training loss of one view, each row's weighted error, and the share of
+/// the pixels that it dominates.
+pub(crate) fn reference(
+    model: &Gaussians,
+    view: View<'_>,
+    target: &Image8,
+) -> (Gradient, Vec<f64>, Vec<f64>) {
+    let model = Model::of(model);
+    let (image, loss) = rendering_and_loss(&model, view, target);
     let splats = project(&model, view, &Rules::STANDARD);
     let mut errors = vec![0.0; splats.len()];
     let mut largest = vec![(0.0, None); image.alpha.len()];
@@ -124,7 +132,8 @@ fn contribution(
                 Signal::WeightMax => s.max_weight,
                 Signal::WeightSum => s.sum_weight,
                 Signal::PixelCount => f64::from(s.pixels),
-                Signal::WeightedError => error,
+                // Unless it is declared otherwise, the score is the same.
+                Signal::WeightedError | Signal::ErrorScore => error,
                 Signal::WeightMaxRoot => s.max_weight.sqrt(),
                 Signal::Support => f64::from(u8::from(s.max_weight >= f64::from(SUPPORT_WEIGHT))),
                 // Of the smallest, the inverse.
@@ -145,6 +154,16 @@ fn collect(
     full_depth: f32,
 ) -> (Box<dyn Differentiable>, Vec<Vec<f32>>) {
     let needs = Needs { signals: wanted.iter().copied().collect(), full_depth, ..Needs::default() };
+    collect_with(subject, views, wanted, needs)
+}
+
+/// The same with these needs.
+fn collect_with(
+    subject: &Subject,
+    views: &Views,
+    wanted: &[Signal],
+    needs: Needs,
+) -> (Box<dyn Differentiable>, Vec<Vec<f32>>) {
     let setup = Setup { needs: needs.clone(), ..Setup::default() };
     let mut backend = make_with(subject, &views.model, setup);
     for (v, (camera, target)) in views.cameras.iter().zip(&views.targets).enumerate() {
@@ -212,6 +231,75 @@ fn every_signal_whatever_else_is_asked_for() {
                 let flips = if signal == Signal::PixelCount { FLIPPED } else { 0.0 };
                 table.check(&what, &format!("{signal:?}"), error, tolerance(&subject) + flips);
             }
+        }
+        table.finish();
+    }
+}
+
+/// 8-neighbour Laplacian of the luma of a pixel, clipped, borders repeated.
+fn edge(target: &Image8, pixel: usize) -> f64 {
+    let (width, height) = (target.width as i64, target.height as i64);
+    let luma = |x: i64, y: i64| {
+        let at = 3 * (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize;
+        let [r, g, b] = [0, 1, 2].map(|i| f64::from(target.rgb[at + i]));
+        (0.299 * r + 0.587 * g + 0.114 * b).round()
+    };
+    let (x, y) = (pixel as i64 % width, pixel as i64 / width);
+    let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy)));
+    (9.0 * luma(x, y) - around.map(|(x, y)| luma(x, y)).sum::<f64>()).clamp(0.0, 255.0)
+}
+
+/// Each row's score of one view, by the definition of [`ErrorScore`].
+fn scores(model: &Gaussians, view: View<'_>, target: &Image8, score: &ErrorScore) -> Vec<f64> {
+    let model = Model::of(model);
+    let (image, loss) = rendering_and_loss(&model, view, target);
+    let edges: Vec<f64> = (0..image.alpha.len()).map(|pixel| edge(target, pixel)).collect();
+    let mean = edges.iter().sum::<f64>() / edges.len() as f64;
+    assert!(mean > 1.0, "the image has edges");
+    let [power, weight, footprint, view_power] =
+        [score.power, score.edge, score.footprint, score.view_power].map(f64::from);
+    let splats = project(&model, view, &Rules::STANDARD);
+    let mut sums = vec![(0.0, 0.0); splats.len()];
+    each_blended(&splats, &by_depth(&splats), view, &Rules::STANDARD, |pixel, row, w, _| {
+        let map = loss.by_pixel[pixel].powf(power) * (1.0 + weight * edges[pixel] / mean);
+        sums[row] = (sums[row].0 + w * map, sums[row].1 + w);
+    });
+    let of_row = |(error, w): (f64, f64)| {
+        if error > 0.0 { (error / w.powf(footprint)).powf(view_power) } else { 0.0 }
+    };
+    sums.into_iter().map(of_row).collect()
+}
+
+#[test]
+fn error_scores_weigh_pixels_sizes_and_views() {
+    let views = views();
+    for subject in all() {
+        let mut table = Table::new(&format!("error scores, {}", subject.name()));
+        for score in [
+            ErrorScore { power: 4.0, edge: 0.25, footprint: 0.75, view_power: 0.4 },
+            ErrorScore { power: 2.0, ..ErrorScore::default() },
+            ErrorScore { power: 1.5, ..ErrorScore::default() },
+            ErrorScore { edge: 1.5, ..ErrorScore::default() },
+            ErrorScore { footprint: 1.0, ..ErrorScore::default() },
+            ErrorScore { view_power: 0.5, ..ErrorScore::default() },
+        ] {
+            let wanted = [Signal::ErrorScore];
+            let needs = Needs { signals: wanted.into(), error_score: score, ..Needs::default() };
+            let (_, columns) = collect_with(&subject, &views, &wanted, needs);
+            let mut expected = vec![0.0; views.model.len()];
+            for (camera, target) in views.cameras.iter().zip(&views.targets) {
+                let view = View { camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
+                for (sum, part) in
+                    expected.iter_mut().zip(scores(&views.model, view, target, &score))
+                {
+                    *sum += part;
+                }
+            }
+            let error = relative_error(&columns[0], &expected);
+            let what = format!("{score:?}");
+            // The error's own inaccuracy counts as often as its power says.
+            let tolerance = tolerance(&subject) * f64::from(score.power);
+            table.check(&what, "ErrorScore", error, tolerance);
         }
         table.finish();
     }

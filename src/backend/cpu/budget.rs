@@ -82,7 +82,7 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
     let records = record_cap(options) as u64 * stride as u64 * float;
     ledger.add_to(Section::Tiles, "gradients per entry", records);
-    let by_pixel = signals.layout().has(Field::Error);
+    let by_pixel = signals.layout().has(Field::Error).then_some(needs.error_score);
     let loss = LossBuffers::bytes(grid.width, grid.height, threads, by_pixel);
     let per_tile = size_of::<TileCanvas>() + size_of::<TileGradient>();
     ledger.add_to(Section::Renderer, "image and image gradient", (grid.tiles() * per_tile) as u64);

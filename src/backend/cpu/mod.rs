@@ -214,7 +214,8 @@ impl CpuBackend {
         let frame = self.forward(camera, background, input.sh_degree, false)?;
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
-        let by_pixel = self.signals.layout().has(Field::Error);
+        let by_pixel =
+            self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);
         let terms = ImageTerms { error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
         if let Some((request, count)) = picks {

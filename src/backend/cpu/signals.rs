@@ -1,5 +1,7 @@
 //! Stage 8: the signals that policies ask for, accumulated over views. Only requested signals have memory.
 
+use std::ops::Range;
+
 use densify_policies::policy::{Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet, Signals};
 use pulp::Simd;
 use rayon::prelude::*;
@@ -85,6 +87,7 @@ impl SignalPlanes {
                     Signal::WeightSum => sum!(Field::WeightSum.number()),
                     Signal::PixelCount => sum!(Field::PixelCount.number()),
                     Signal::WeightedError => sum!(Field::Error.number()),
+                    Signal::ErrorScore => V::load(s, &self.scores(g, at..at + S::F32_LANES)[at..]),
                     Signal::WeightMaxRoot => sum!(Field::WeightMax.number()).sqrt(),
                     Signal::Support => {
                         V::splat(s, SUPPORT_WEIGHT).le(sum!(Field::WeightMax.number())).keep(one)
@@ -109,6 +112,19 @@ impl SignalPlanes {
                 (if is_sum { was + x } else { was.max(x) }).store(to);
             }
         }
+    }
+}
+
+impl SignalPlanes {
+    /// [`Signal::ErrorScore`] of one view, in these lanes. Powers have no vectors.
+    fn scores(&self, g: &BlockGradient, lanes: Range<usize>) -> [f32; WIDTH] {
+        let [errors, weights] =
+            [Field::Error, Field::WeightSum].map(|field| &g.sums[field.number()]);
+        let mut scores = [0.0; WIDTH];
+        for lane in lanes {
+            scores[lane] = self.score.of_view(errors[lane], weights[lane]);
+        }
+        scores
     }
 }
 

@@ -2,7 +2,7 @@
 //! `shaders/shared/view.wgsl`. A test compares both sides field by field.
 
 use bytemuck::{Pod, Zeroable};
-use densify_policies::policy::Signal;
+use densify_policies::policy::{ErrorScore, Signal};
 
 use crate::backend::signals::SignalPlanes;
 use crate::backend::{StepInput, StepOutput};
@@ -29,6 +29,7 @@ pub(super) struct Frame {
     pub(super) rates: [f32; 4],
     pub(super) more_rates: [f32; 4],
     pub(super) noise: [f32; 4],
+    pub(super) score: [f32; 4],
     pub(super) draw: [u32; 4],
     pub(super) planes: [[u32; 4]; 8],
 }
@@ -148,6 +149,8 @@ impl Frame {
             | (if noise.is_some() { due::NOISE } else { 0 });
         self.draw = [folded_seed(input.seed), input.step, due | adds, self.draw[3]];
         self.background[3] = planes.full_depth;
+        let ErrorScore { power, edge, footprint, view_power } = planes.score;
+        self.score = [power, edge, footprint, view_power];
         // To which planes the view adds.
         for (signal, plane) in Signal::ALL.into_iter().zip(self.planes.as_flattened_mut()) {
             *plane = planes.current(signal).map_or(u32::MAX, |plane| plane as u32);

@@ -48,6 +48,10 @@ pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     let pixels = u64::from(sizes.image.0) * u64::from(sizes.image.1);
     let candidates = Candidates::bytes(needs.candidates, pixels as usize);
     ledger.add_to(Section::Policy, "candidates", candidates);
+    if sizes.with_edges {
+        // Luma, edges and their weights.
+        ledger.add_to(Section::Policy, "edges of a photograph", 6 * pixels);
+    }
     if let Some(request) = &needs.aux {
         let bytes = aux_bytes(request, pixels);
         ledger.add_to(Section::Policy, "auxiliary views", bytes);

@@ -44,6 +44,8 @@ pub(super) struct Sizes {
     /// Whether rows have masks.
     pub(super) masks: bool,
     pub(super) with_error: bool,
+    /// Whether pixels weigh more at edges.
+    pub(super) with_edges: bool,
 }
 
 /// A buffer to allocate.
@@ -78,6 +80,7 @@ impl Sizes {
             cadence: needs.cadence,
             dominant: counts_dominant(needs),
             masks: needs.mask.is_some(),
+            with_edges: needs.error_score.edge > 0.0,
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
         }
     }
@@ -134,7 +137,8 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
-        let channels = if self.more { 5 } else { 3 + u64::from(self.records.has(Field::Error)) };
+        let errors = u64::from(self.records.has(Field::Error));
+        let channels = if self.more { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
         add(Section::Renderer, "loss", "derivatives", 36 * pixels);
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);

@@ -7,6 +7,7 @@ use super::observe::DrawnView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
 use crate::backend::candidates::error_weights;
+use crate::backend::pixel_map::edge_weights;
 use crate::backend::signals::Field;
 use crate::backend::{BackendError, StepInput, StepOutput, assert_same_size};
 
@@ -40,6 +41,12 @@ impl GpuBackend {
         frame.for_step(input, due, &self.planes);
         if self.sizes.records.has(Field::Error) {
             frame.draw[3] |= of_target::BY_PIXEL;
+            let score = &self.planes.score;
+            if score.edge > 0.0 {
+                let pixels = u64::from(camera.width) * u64::from(camera.height);
+                let weights = edge_weights(target, background, score);
+                self.write_at("pixel gradient", 4 * size_of::<f32>() as u64 * pixels, &weights);
+            }
         }
         let (degree, signals, mask) = (frame.model[1] as u8, self.planes.count > 0, self.mask);
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {

@@ -357,8 +357,7 @@ fn build(
     };
     let Case { every, aux_views, cadence, terms, resolution, behaviour, .. } = *case;
     let seen = Vec::new();
-    let policy =
-        ScriptedPolicy { every, aux_views, cadence, terms, resolution, seen, behaviour };
+    let policy = ScriptedPolicy { every, aux_views, cadence, terms, resolution, seen, behaviour };
     let policy = ("scripted", Box::new(policy) as Box<dyn DensityPolicy>);
     let trainer = Trainer::new(views, Box::new(backend), policy, scene, options)?;
     Ok((trainer, log, prefetched))

@@ -16,8 +16,10 @@
 //! horizontally: nothing is computed twice, however the image is cut. How the pixels of a line are arranged
 //! for that, [`Segments`] says.
 
+mod pixel_weights;
 mod window;
 
+use densify_policies::policy::ErrorScore;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -28,6 +30,7 @@ use super::simd::{V, WIDTH, each};
 use super::threads::Threads;
 use super::tiles::{Grid, TILE};
 use crate::dataset::images::Image8;
+use pixel_weights::PixelWeights;
 use window::{
     Line, LinePerRow, Near, Segments, TOGETHER, horizontal, vertical, vertical_of_product,
     vertical_with_square,
@@ -56,6 +59,7 @@ pub(super) struct LossBuffers {
     /// Errors per pixel, the mean over channels, if asked for. Same shape.
     errors: [Vec<[f32; WIDTH]>; 2],
     segments: Segments,
+    weights: PixelWeights,
 }
 
 /// What of a loss is asked for.
@@ -63,8 +67,8 @@ pub(super) struct LossBuffers {
 pub(super) struct ImageTerms {
     /// Weights of |e| and of 1 − SSIM in the error of each pixel, if that is asked for.
     pub(super) error: Option<[f32; 2]>,
-    /// Whether each pixel's part of the loss goes to the last plane of the gradient.
-    pub(super) by_pixel: bool,
+    /// Whether each pixel's part of the loss goes to the last plane of the gradient, weighed like this.
+    pub(super) by_pixel: Option<ErrorScore>,
 }
 
 /// The scalars of a loss.
@@ -82,15 +86,26 @@ impl LossValue {
 
 impl LossBuffers {
     /// Bytes for an image of this size, and for the strips of so many threads.
-    pub(super) fn bytes(width: usize, height: usize, threads: usize, by_pixel: bool) -> u64 {
+    pub(super) fn bytes(
+        width: usize,
+        height: usize,
+        threads: usize,
+        by_pixel: Option<ErrorScore>,
+    ) -> u64 {
         let segments = Segments::of(width);
-        let planes = (6 + usize::from(by_pixel)) * segments.pitch() * WIDTH * height;
+        let weights = by_pixel.map_or(0, |score| PixelWeights::bytes(width * height, &score));
+        let planes = (6 + usize::from(by_pixel.is_some())) * segments.pitch() * WIDTH * height;
         let lines = threads * MOST_LINES * segments.padded() * WIDTH;
-        ((planes + lines) * size_of::<f32>()) as u64
+        ((planes + lines) * size_of::<f32>()) as u64 + weights
     }
 
     pub(super) fn new() -> Self {
-        Self { planes: Default::default(), errors: Default::default(), segments: Segments::of(0) }
+        Self {
+            planes: Default::default(),
+            errors: Default::default(),
+            segments: Segments::of(0),
+            weights: PixelWeights::default(),
+        }
     }
 
     /// Makes room for an image; returns the vectors of its planes. Images of one size, or smaller ones,
@@ -124,9 +139,9 @@ impl LossBuffers {
         terms: ImageTerms,
     ) -> LossValue {
         let ImageTerms { error: error_weights, by_pixel } = terms;
-        let asked = [error_weights.is_some(), by_pixel];
+        let asked = [error_weights.is_some(), by_pixel.is_some()];
         let vectors = self.resize(grid, asked);
-        let Self { planes, errors, segments } = self;
+        let Self { planes, errors, segments, .. } = self;
         let segments = *segments;
         let [e, y, p1, p2, p3] = planes.each_mut().map(|plane| &mut plane[..vectors]);
         let [ranking, errors_by_pixel] = errors;
@@ -192,14 +207,21 @@ impl LossBuffers {
                 });
             });
         }
-        if by_pixel {
-            self.spread_over_tiles(threads, grid, gradient);
+        if let Some(score) = by_pixel {
+            self.weights.measure(threads, target, background, &score);
+            self.spread_over_tiles(threads, grid, gradient, &score);
         }
         LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
-    /// Writes the second error to the last plane of the gradient.
-    fn spread_over_tiles(&self, threads: &Threads, grid: &Grid, gradient: &mut [TileGradient]) {
+    /// Writes the second error to the last plane of the gradient, as rows are scored by it.
+    fn spread_over_tiles(
+        &self,
+        threads: &Threads,
+        grid: &Grid,
+        gradient: &mut [TileGradient],
+        score: &ErrorScore,
+    ) {
         let segments = self.segments;
         let tasks = gradient.par_chunks_mut(grid.columns).enumerate();
         let line = || vec![0.0; segments.stride()];
@@ -208,7 +230,9 @@ impl LossBuffers {
                 tile.planes[4] = DARK;
             }
             for row in 0..TILE.min(grid.height - i * TILE) {
-                segments.restore(segments.line(&self.errors[1], i * TILE + row), pixels);
+                let y = i * TILE + row;
+                segments.restore(segments.line(&self.errors[1], y), pixels);
+                self.weights.apply(score, y, &mut pixels[..grid.width]);
                 for (tile, errors) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
                     set_row_of_plane(&mut tile.planes[4], row, errors);
                 }

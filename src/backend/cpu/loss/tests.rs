@@ -53,7 +53,8 @@ fn parts_of_pixels_make_up_the_loss() {
         let (full, gradient, _) = run(ImageTerms::default(), mask);
         assert!(gradient.iter().any(|g| *g != 0.0));
         for error in [None, Some([1.0, 1.0])] {
-            let (value, same, parts) = run(ImageTerms { error, by_pixel: true }, mask);
+            let (value, same, parts) =
+                run(ImageTerms { error, by_pixel: Some(ErrorScore::default()) }, mask);
             assert_eq!((value, &same), (full, &gradient));
             let mean = parts.into_iter().map(f64::from).sum::<f64>() / (37.0 * 50.0);
             assert!((mean - full.loss()).abs() < 1e-6, "{mean} {full:?}");
@@ -65,7 +66,7 @@ fn parts_of_pixels_make_up_the_loss() {
 /// the next.
 #[test]
 fn buffers_are_those_of_one_image() {
-    let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: true };
+    let terms = ImageTerms { error: Some([0.3, 0.7]), by_pixel: Some(ErrorScore::default()) };
     let all = |buffers: &mut LossBuffers, size: [u32; 2]| {
         let [width, height] = size.map(|side| side as usize);
         let found = run_in(buffers, size, terms, false);
