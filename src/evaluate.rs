@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::backend::{Backend, BackendError};
-use crate::metrics::{MetricError, flip, psnr, ssim};
+use crate::metrics::{Lpips, MetricError, flip, psnr, ssim};
 use crate::views::{ViewError, ViewSource};
 
 /// Part of a dataset.
@@ -28,6 +28,8 @@ pub struct ViewScore {
     pub ssim: f64,
     /// FLIP error.
     pub flip: f64,
+    /// LPIPS, where there are weights for it.
+    pub lpips: Option<f64>,
 }
 
 /// Mean scores of a set of views.
@@ -42,6 +44,9 @@ pub struct Mean {
     /// FLIP error: visible difference, 0 for equal images.
     #[serde(rename = "FLIP")]
     pub flip: f64,
+    /// LPIPS: distance by the features of a network, 0 for equal images; where there were weights for it.
+    #[serde(rename = "LPIPS", default, skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
 }
 
 /// JSON has no infinity, the ratio of two equal images, and writes it as null.
@@ -60,6 +65,12 @@ impl Mean {
             psnr: mean(|view| view.psnr),
             ssim: mean(|view| view.ssim),
             flip: mean(|view| view.flip),
+            lpips: views
+                .iter()
+                .map(|view| view.lpips)
+                .sum::<Option<f64>>()
+                .filter(|_| !views.is_empty())
+                .map(|sum| sum / views.len() as f64),
         }
     }
 }
@@ -94,13 +105,14 @@ pub enum EvaluateError {
     Stopped,
 }
 
-/// Renders every view and compares it with its image. `after_view` is called after each view and may
+/// Renders every view and compares it with its image, by LPIPS too where there is a network. `after_view` is called after each view and may
 /// stop the evaluation.
 pub fn evaluate(
     backend: &mut dyn Backend,
     views: &impl ViewSource,
     background: [f32; 3],
     sh_degree: u8,
+    lpips: Option<&Lpips>,
     mut after_view: impl FnMut(&ViewScore) -> ControlFlow<()>,
 ) -> Result<Vec<ViewScore>, EvaluateError> {
     let count = views.count();
@@ -120,6 +132,10 @@ pub fn evaluate(
             psnr: psnr(&rendering.rgb, &image, background).map_err(metric)?,
             ssim: ssim(&rendering.rgb, &image, background).map_err(metric)?,
             flip: flip(&rendering.rgb, &image, background).map_err(metric)?,
+            lpips: lpips
+                .map(|lpips| lpips.compare(&rendering.rgb, &image, background))
+                .transpose()
+                .map_err(metric)?,
         };
         let flow = after_view(&score);
         scores.push(score);

@@ -10,13 +10,14 @@ use super::console::Console;
 use super::limits::{self, Limit};
 use crate::evaluate::{Mean, Split, evaluate};
 use crate::failure::Failure;
+use crate::metrics::Lpips;
 use crate::metrics::geometry::{self, Geometry};
 use crate::number::{grouped, percent};
 use crate::output::{write_geometry, write_scores};
 use crate::run::finished::{Machine, iteration, open_run};
 use crate::run::{DeviceSpec, RunConfig};
 
-/// Measures a trained scene against its photographs: PSNR, SSIM and FLIP.
+/// Measures a trained scene against its photographs: PSNR, SSIM, FLIP, and LPIPS on request.
 ///
 /// Prints the scores of each view and their mean, and writes them to results.json and
 /// per_view.json in the run's folder (results_train.json and per_view_train.json for the views
@@ -37,7 +38,11 @@ pub(super) struct EvalArgs {
     /// Folder of the dataset, where it is no longer where it was
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
-    /// Exit with code 4 where a value is smaller: psnr, ssim, flip, or the path of a number in
+    /// Also measure LPIPS, with the weights in this safetensors file (VGG-16 or AlexNet; they are not part
+    /// of densify, docs/options.md says how to write the file)
+    #[arg(long, value_name = "FILE")]
+    lpips: Option<PathBuf>,
+    /// Exit with code 4 where a value is smaller: psnr, ssim, flip, lpips, or the path of a number in
     /// geometry.json, such as centres.f_score_one_percent; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     fail_below: Vec<Limit>,
@@ -52,32 +57,38 @@ const EXAMPLES: &str = "\
 Examples:
   densify eval output/garden-diet
   densify eval output/garden-diet --iteration 7000 --split train
+  densify eval output/garden-diet --lpips lpips-vgg.safetensors
   densify eval output/garden-diet --fail-below psnr=25 --fail-above flip=0.1";
 
 pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let run = &args.run;
     // A folder without config.toml is no run, whatever else it holds.
     RunConfig::read(run)?;
+    let lpips = args.lpips.as_deref().map(Lpips::open).transpose();
+    let lpips = lpips.map_err(|e| Failure::input(format!("--lpips: {e}")))?;
     let iteration = iteration(run, args.iteration)?;
     let moved_to = args.scene.clone();
     let machine = Machine::open(&args.device, console)?;
     let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
     let views = opened.views(args.split)?;
     let knows_geometry = opened.dataset.surface_bytes.is_some();
-    limits::check_keys(knows_geometry, &args.fail_below, &args.fail_above)?;
+    limits::check_keys(knows_geometry, lpips.is_some(), &args.fail_below, &args.fail_above)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
     let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
-    console.result(format_args!("{:width$}  PSNR [dB]    SSIM    FLIP", "view"));
-    let line = |name: &str, psnr: f64, ssim: f64, flip: f64| {
-        console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}"));
+    let column = if lpips.is_some() { "   LPIPS" } else { "" };
+    console.result(format_args!("{:width$}  PSNR [dB]    SSIM    FLIP{column}", "view"));
+    let line = |name: &str, psnr: f64, ssim: f64, flip: f64, lpips: Option<f64>| {
+        let lpips = lpips.map_or(String::new(), |value| format!("  {value:.4}"));
+        console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
-    let scores = evaluate(opened.backend.as_mut(), &views, background, opened.sh_degree, |view| {
-        line(&view.name, view.psnr, view.ssim, view.flip);
+    let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
+    let scores = evaluate(backend, &views, background, degree, lpips.as_ref(), |view| {
+        line(&view.name, view.psnr, view.ssim, view.flip, view.lpips);
         ControlFlow::Continue(())
     })?;
     let mean = Mean::of(&scores);
-    line("mean", mean.psnr, mean.ssim, mean.flip);
+    line("mean", mean.psnr, mean.ssim, mean.flip, mean.lpips);
     write_scores(run, args.split, iteration, &scores)?;
     let geometry = opened.geometry(&views, &|| false)?;
     if let Some(measured) = &geometry {

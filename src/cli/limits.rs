@@ -36,7 +36,9 @@ pub(super) fn values(mean: &Mean, geometry: Option<&Geometry>) -> BTreeMap<Strin
     if let Some(geometry) = geometry.and_then(|measured| serde_json::to_value(measured).ok()) {
         flatten("", &geometry, &mut values);
     }
-    for (key, value) in [("psnr", mean.psnr), ("ssim", mean.ssim), ("flip", mean.flip)] {
+    let lpips = mean.lpips.map(|value| ("lpips", value));
+    let scores = [("psnr", mean.psnr), ("ssim", mean.ssim), ("flip", mean.flip)];
+    for (key, value) in scores.into_iter().chain(lpips) {
         values.insert(key.to_owned(), value);
     }
     values
@@ -66,11 +68,12 @@ fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
 /// Code 2 with the keys that there are.
 pub(super) fn check_keys(
     knows_geometry: bool,
+    knows_lpips: bool,
     below: &[Limit],
     above: &[Limit],
 ) -> Result<(), Failure> {
     let example = Geometry { thin: vec![ThinRecall::default()], ..Geometry::default() };
-    let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0 };
+    let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips: knows_lpips.then_some(0.0) };
     let known = values(&mean, knows_geometry.then_some(&example));
     for (limits, flag) in [(below, "--fail-below"), (above, "--fail-above")] {
         for Limit { key, .. } in limits {
@@ -96,8 +99,9 @@ fn unknown(flag: &str, key: &str, known: &BTreeMap<String, f64>) -> Failure {
         false => format!("; {}", without("scenegen", "geometry is not measured")),
     };
     let names = names.join(", ");
+    let lpips = if key == "lpips" { "; LPIPS is measured with --lpips FILE" } else { "" };
     Failure::input(format!(
-        "{flag}: nothing called `{key}` is measured; there are {names}{geometry}"
+        "{flag}: nothing called `{key}` is measured; there are {names}{geometry}{lpips}"
     ))
 }
 
@@ -136,7 +140,7 @@ mod tests {
 
     #[test]
     fn values_beyond_their_limits_are_named() {
-        let mean = Mean { psnr: 24.5, ssim: 0.9, flip: 0.1 };
+        let mean = Mean { psnr: 24.5, ssim: 0.9, flip: 0.1, lpips: None };
         let mut values = values(&mean, None);
         flatten("", &serde_json::json!({ "depth": { "rmse": 0.02 }, "thin": [null] }), &mut values);
         let limit = |text: &str| vec![text.parse::<Limit>().unwrap()];
@@ -150,13 +154,15 @@ mod tests {
         assert_eq!(check("thin.0=0", "flip=1").unwrap_err().code, LIMIT);
         let unknown = check("PSNR=1", "flip=1").unwrap_err();
         assert!(unknown.code == 2 && unknown.message.contains("psnr, ssim"), "{unknown}");
-        let early = |knows, key: &str| check_keys(knows, &limit(&format!("{key}=1")), &[]);
+        let early = |knows, key: &str| check_keys(knows, false, &limit(&format!("{key}=1")), &[]);
         for key in ["flip", "centres.f_score_one_percent", "thin.3.recall", "normal_error"] {
             assert_eq!(early(true, key), Ok(()), "{key}");
             let failure = early(false, key).err().map(|failure| failure.message);
             let told = failure.is_some_and(|it| it.contains("flip") && it.contains("scenegen"));
             assert_eq!(told, key != "flip", "{key}");
         }
+        assert_eq!(check_keys(false, true, &limit("lpips=1"), &[]), Ok(()));
+        assert!(early(true, "lpips").unwrap_err().message.contains("--lpips"));
         let typo = early(true, "depth.rsme").unwrap_err();
         assert!(typo.code == 2 && typo.message.contains("depth.rmse"), "{typo}");
         for bad in ["psnr", "psnr=", "psnr=nan", "=x"] {

@@ -1,4 +1,4 @@
-//! Image metrics (PSNR, SSIM, FLIP) and errors against a known surface ([`geometry`]).
+//! Image metrics (PSNR, SSIM, FLIP, LPIPS) and errors against a known surface ([`geometry`]).
 //!
 //! The image metrics compare a rendered image with a packed target, both in sRGB encoding, and sum
 //! in `f64`, so that results do not depend on the size of the image or the number of threads.
@@ -8,10 +8,12 @@
 
 mod flip;
 pub mod geometry;
+mod lpips;
 mod psnr;
 mod ssim;
 
 pub use flip::flip;
+pub use lpips::{Lpips, LpipsError, Network};
 pub use psnr::psnr;
 pub use ssim::ssim;
 
@@ -69,6 +71,18 @@ pub enum MetricError {
         found: usize,
         /// Values it should have.
         expected: usize,
+        /// The target's width `[px]`.
+        width: u32,
+        /// The target's height `[px]`.
+        height: u32,
+    },
+    /// The image is too small for a network.
+    #[error(
+        "an image of {width}x{height} px is too small for LPIPS; its sides must have at least {least} px"
+    )]
+    TooSmall {
+        /// Least side `[px]`.
+        least: usize,
         /// The target's width `[px]`.
         width: u32,
         /// The target's height `[px]`.

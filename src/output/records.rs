@@ -160,14 +160,19 @@ pub fn write_scores(
         Split::Test => ("results.json", "per_view.json"),
         Split::Train => ("results_train.json", "per_view_train.json"),
     };
-    let column = |score: fn(&ViewScore) -> f64| -> Map<String, Value> {
-        scores.iter().map(|view| (view.name.clone(), score(view).into())).collect()
+    let column = |score: fn(&ViewScore) -> Option<f64>| -> Map<String, Value> {
+        let pair = |view: &ViewScore| Some((view.name.clone(), score(view)?.into()));
+        scores.iter().filter_map(pair).collect()
     };
-    let views = serde_json::json!({
-        "PSNR": column(|v| v.psnr),
-        "SSIM": column(|v| v.ssim),
-        "FLIP": column(|v| v.flip),
+    let mut views = serde_json::json!({
+        "PSNR": column(|v| Some(v.psnr)),
+        "SSIM": column(|v| Some(v.ssim)),
+        "FLIP": column(|v| Some(v.flip)),
     });
+    let lpips = column(|v| v.lpips);
+    if !lpips.is_empty() {
+        views["LPIPS"] = lpips.into();
+    }
     insert_entry(&run.join(per_view), iteration, views)?;
     let mean = serde_json::to_value(Mean::of(scores)).unwrap_or_default();
     insert_entry(&run.join(results), iteration, mean)
@@ -232,7 +237,13 @@ mod tests {
     use super::*;
 
     fn scores(psnr: f64) -> [ViewScore; 2] {
-        let view = |name: &str, psnr| ViewScore { name: name.into(), psnr, ssim: 0.5, flip: 0.25 };
+        let view = |name: &str, psnr| ViewScore {
+            name: name.into(),
+            psnr,
+            ssim: 0.5,
+            flip: 0.25,
+            lpips: None,
+        };
         [view("b.png", psnr), view("a/c.png", psnr + 2.0)]
     }
 
@@ -281,7 +292,7 @@ mod tests {
 
     #[test]
     fn a_perfect_score_is_read_back() {
-        let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0 };
+        let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0, lpips: None };
         let text = serde_json::to_string(&perfect).unwrap();
         assert_eq!(serde_json::from_str::<Mean>(&text).unwrap(), perfect);
     }

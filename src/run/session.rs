@@ -351,7 +351,7 @@ impl<'a> Session<'a> {
         }
         let (background, degree) = (config.spec.data.background.fixed(), config.sh_degree());
         let observer = self.observer;
-        let scores = evaluate(trainer.backend(), test, background, degree, |_| {
+        let scores = evaluate(trainer.backend(), test, background, degree, None, |_| {
             observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
         });
         let scores = match (scores, self.observer.interrupt()) {
@@ -362,7 +362,7 @@ impl<'a> Session<'a> {
         };
         let mean = Mean::of(&scores);
         write_scores(&self.folder, Split::Test, step, &scores)?;
-        let Mean { psnr, ssim, flip } = mean;
+        let Mean { psnr, ssim, flip, .. } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
         self.logs.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
         self.totals.tested.insert(step, mean);

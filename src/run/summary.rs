@@ -54,7 +54,7 @@ impl Session<'_> {
     pub(super) fn report(&self, path: &Path) {
         let Run { config, trainer, test, ledger, .. } = &self.run;
         let steps = trainer.steps_done();
-        if let Some(Mean { psnr, ssim, flip }) = self.totals.tested.get(&steps) {
+        if let Some(Mean { psnr, ssim, flip, .. }) = self.totals.tested.get(&steps) {
             let views = test.count();
             self.observer.say(format_args!(
                 "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"

@@ -1,0 +1,146 @@
+//! A convolution with a rectifier, as products of small matrices.
+//!
+//! Sixteen pixels are taken together. What the kernel sees of them is copied side by side once, and then
+//! multiplied with the weights of six outputs at a time, whose 6×16 sums stay in registers.
+
+use std::ops::Range;
+
+use pulp::Arch;
+use rayon::prelude::*;
+
+use super::network::Activation;
+use crate::metrics::THREADS;
+
+/// Pixels taken together.
+const PIXELS: usize = 16;
+/// Outputs taken together.
+const OUTPUTS: usize = 6;
+
+/// A convolution.
+#[derive(Debug)]
+pub(super) struct Convolution {
+    /// Channels in and out.
+    pub(super) channels: [usize; 2],
+    side: usize,
+    step: usize,
+    padding: usize,
+    /// Shape: `[outputs / 6, input channels · side · side, 6]`; outputs beyond the last are 0.
+    weights: Vec<[f32; OUTPUTS]>,
+    /// Shape: `[outputs]`.
+    bias: Vec<f32>,
+}
+
+impl Convolution {
+    /// From published weights. Shapes: `[outputs, inputs, side, side]`, `[outputs]`.
+    pub(super) fn new(
+        channels: [usize; 2],
+        (side, step, padding): (usize, usize, usize),
+        weights: &[f32],
+        bias: Vec<f32>,
+    ) -> Self {
+        let seen = channels[0] * side * side;
+        let groups = channels[1].div_ceil(OUTPUTS);
+        let weight = |output: usize, at: usize| {
+            if output < channels[1] { weights[output * seen + at] } else { 0.0 }
+        };
+        let weights = (0..groups)
+            .flat_map(|group| (0..seen).map(move |at| (group, at)))
+            .map(|(group, at)| std::array::from_fn(|i| weight(group * OUTPUTS + i, at)))
+            .collect();
+        Self { channels, side, step, padding, weights, bias }
+    }
+
+    /// Pixels along a side of the result, of an image with so many; 0 if it is too small.
+    pub(super) fn side_of(&self, side: usize) -> usize {
+        (side + 2 * self.padding).checked_sub(self.side).map_or(0, |rest| rest / self.step + 1)
+    }
+
+    /// The rows of an image of this height that some rows of the result see.
+    pub(super) fn seen(&self, rows: &Range<usize>, height: usize) -> Range<usize> {
+        let first = (rows.start * self.step).saturating_sub(self.padding);
+        let end = (rows.end.saturating_sub(1) * self.step + self.side).saturating_sub(self.padding);
+        first..end.min(height)
+    }
+
+    /// Some rows of the result; `image` has at least the rows that they see, and those that it lacks are
+    /// outside of the whole image.
+    pub(super) fn run(&self, image: &Activation, rows: Range<usize>) -> Activation {
+        let width = self.side_of(image.width);
+        let pixels = rows.len() * width;
+        let blocks = pixels.div_ceil(PIXELS);
+        let arch = Arch::new();
+        let block = |block: usize| {
+            let pixels = block * PIXELS..((block + 1) * PIXELS).min(pixels);
+            let place = |pixel: usize| (rows.start + pixel / width, pixel % width);
+            let seen = self.gather(image, pixels.map(place));
+            arch.dispatch(|| self.multiply(&seen))
+        };
+        let all = || (0..blocks).into_par_iter().map(block).collect::<Vec<_>>();
+        let by_block = match &*THREADS {
+            Some(pool) => pool.install(all),
+            None => all(),
+        };
+        let mut result = Activation::zeros(self.channels[1], rows, width);
+        for (output, (channel, &bias)) in
+            result.values.chunks_exact_mut(pixels.max(1)).zip(&self.bias).enumerate()
+        {
+            for (pixels, block) in channel.chunks_mut(PIXELS).zip(&by_block) {
+                for (pixel, sum) in pixels.iter_mut().zip(&block[output]) {
+                    let value = sum + bias;
+                    // `max` would lose a NaN.
+                    *pixel = if value < 0.0 { 0.0 } else { value };
+                }
+            }
+        }
+        result
+    }
+
+    /// What the kernel sees of some pixels of the result (row, column); 0 outside of the image. Shape:
+    /// `[input channels · side · side, 16]`.
+    fn gather(
+        &self,
+        image: &Activation,
+        pixels: impl Iterator<Item = (usize, usize)>,
+    ) -> Vec<[f32; PIXELS]> {
+        let area = self.side * self.side;
+        let mut seen = vec![[0.0; PIXELS]; self.channels[0] * area];
+        for (lane, (row, column)) in pixels.enumerate() {
+            for y in 0..self.side {
+                let row = (row * self.step + y).checked_sub(self.padding);
+                let Some(row) = row.filter(|row| image.rows.contains(row)) else { continue };
+                for x in 0..self.side {
+                    let column = (column * self.step + x).checked_sub(self.padding);
+                    let Some(column) = column.filter(|&column| column < image.width) else {
+                        continue;
+                    };
+                    let first = (row - image.rows.start) * image.width + column;
+                    let plane = image.rows.len() * image.width;
+                    let values = image.values[first..].iter().step_by(plane);
+                    let to = seen[y * self.side + x..].iter_mut().step_by(area);
+                    for (to, &value) in to.zip(values) {
+                        to[lane] = value;
+                    }
+                }
+            }
+        }
+        seen
+    }
+
+    /// Sums of all outputs for the pixels taken together.
+    #[inline(always)]
+    fn multiply(&self, seen: &[[f32; PIXELS]]) -> Vec<[f32; PIXELS]> {
+        let mut result = Vec::with_capacity(self.weights.len() / seen.len().max(1) * OUTPUTS);
+        for weights in self.weights.chunks_exact(seen.len()) {
+            let mut sums = [[0.0_f32; PIXELS]; OUTPUTS];
+            for (weights, seen) in weights.iter().zip(seen) {
+                for (sums, &weight) in sums.iter_mut().zip(weights) {
+                    for (sum, &value) in sums.iter_mut().zip(seen) {
+                        *sum = weight.mul_add(value, *sum);
+                    }
+                }
+            }
+            result.extend(sums);
+        }
+        result
+    }
+}
