@@ -39,7 +39,7 @@ pub(super) struct EvalArgs {
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Also measure LPIPS, with the weights in this safetensors file (VGG-16 or AlexNet; they are not part
-    /// of densify, docs/options.md says how to write the file)
+    /// of densify, docs/metrics.md says how to write the file)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
     /// Exit with code 4 where a value is smaller: psnr, ssim, flip, lpips, or the path of a number in

@@ -14,7 +14,7 @@ use crate::foreign;
 /// Most bytes of a file that are read; VGG-16 takes 59 MB.
 const MOST_BYTES: u64 = 256 << 20;
 /// What to do about a file that does not fit.
-const REMEDY: &str = "write it as docs/options.md says";
+const REMEDY: &str = "write it as docs/metrics.md says";
 
 /// Why weights cannot be used.
 #[derive(Debug, thiserror::Error)]

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use safetensors::tensor::{Dtype, TensorView};
+
 use super::{call, files, json, scratch, text, train};
 use crate::photographs::{Photographs, SIZE, VIEWS, name};
 
@@ -49,6 +51,58 @@ fn eval_repeats_what_training_measured() {
     let views = &json(&run.join("per_view_train.json"))["ours_40"]["PSNR"];
     assert_eq!(views.as_object().map(serde_json::Map::len), Some(VIEWS - 2));
     agree(&json(&run.join("results.json")), &trained[0], 2e-3);
+}
+
+/// A file with weights of AlexNet's shape.
+fn weights(path: &Path) {
+    let layers = [(1, 0, 64, 3, 11), (2, 3, 192, 64, 5), (3, 6, 384, 192, 3), (4, 8, 256, 384, 3)];
+    let layers = layers.into_iter().chain([(5, 10, 256, 256, 3)]);
+    let mut arrays: Vec<(String, Vec<usize>)> = Vec::new();
+    for (stage, number, outputs, inputs, side) in layers {
+        let name = format!("net.slice{stage}.{number}");
+        arrays.push((format!("{name}.weight"), vec![outputs, inputs, side, side]));
+        arrays.push((format!("{name}.bias"), vec![outputs]));
+        arrays.push((format!("lin{}.model.1.weight", stage - 1), vec![1, outputs, 1, 1]));
+    }
+    let value = |i: usize| (0.001 * (i * 37 % 101) as f32 - 0.03).to_le_bytes();
+    let bytes = arrays.iter().map(|(_, shape)| (0..shape.iter().product()).flat_map(value));
+    let bytes: Vec<Vec<u8>> = bytes.map(Iterator::collect).collect();
+    let views = arrays.iter().zip(&bytes).map(|((name, shape), bytes)| {
+        let view = TensorView::new(Dtype::F32, shape.clone(), bytes);
+        (name, view.expect("the shape has as many bytes"))
+    });
+    safetensors::serialize_to_file(views, None, path).expect("a file is written");
+}
+
+#[test]
+fn eval_measures_lpips_with_the_users_weights() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let file = root.path().join("alex.safetensors");
+    weights(&file);
+    let call_with = |file: &Path, more: &str| {
+        call(&format!("eval {} --lpips {} {more}", text(&run), text(file)))
+    };
+    let outcome = call_with(&file, "--fail-above lpips=100").ok();
+    assert!(outcome.stdout.contains("LPIPS"), "{}", outcome.stdout);
+    let mean = json(&run.join("results.json"))["ours_40"]["LPIPS"].as_f64();
+    let views = json(&run.join("per_view.json"))["ours_40"]["LPIPS"].clone();
+    let views: Vec<f64> =
+        views.as_object().into_iter().flatten().map(|v| v.1.as_f64().unwrap()).collect();
+    assert_eq!(views.len(), 2);
+    assert!(views.iter().all(|&value| value > 0.0), "{views:?}");
+    assert!((mean.unwrap() - 0.5 * (views[0] + views[1])).abs() < 1e-12, "{mean:?}");
+    let beyond = call_with(&file, "--fail-above lpips=0");
+    assert!(beyond.code == Some(4) && beyond.stderr.contains("lpips is"), "{beyond:?}");
+    // Without the file nothing is new.
+    call(&format!("eval {}", text(&run))).ok();
+    assert!(json(&run.join("results.json"))["ours_40"].get("LPIPS").is_none());
+    let without = call(&format!("eval {} --fail-above lpips=1", text(&run)));
+    without.refused("no weights are given", &["lpips", "--lpips FILE"]);
+    std::fs::write(&file, "no weights").unwrap();
+    let words = ["--lpips", "alex.safetensors", "no safetensors file", "docs/metrics.md"];
+    call_with(&file, "").refused("no weights are in the file", &words);
 }
 
 /// Size of a picture [px].
