@@ -1,0 +1,146 @@
+//! What a policy declares: the statistics it reads, and changes to initialisation, loss and optimiser.
+//!
+//! The trainer and the backend act on these declarations without knowing the policy. What is not
+//! declared is neither computed nor allocated.
+
+mod pixels;
+mod rates;
+mod terms;
+
+use serde::{Deserialize, Serialize};
+
+use crate::signals::{Signal, SignalSet};
+pub use pixels::{AuxRequest, CandidateRequest, DepthMode, ErrorMode, ErrorScore, PixelMap};
+pub use rates::{Cadence, Fade, Rate, RateOverrides};
+pub use terms::{LossTerms, MaskTerm, NoiseTerm};
+
+/// What a policy reads, and how it wants the model initialised and trained.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Needs {
+    /// Per-row statistics.
+    pub signals: SignalSet,
+    /// Camera depth z₀ `[scene units]`, >= 0, below which a view counts less in the signals of screen
+    /// and colour gradients: it is weighted by min(1, z/z₀)², z the depth of the row's mean. 0: all
+    /// views count equally.
+    ///
+    /// Gaussians near a camera have large screen gradients but appear in few other views; growing them
+    /// mostly produces floaters that explain one photograph (*Pixel-GS*, Zhang et al. 2024,
+    /// section 3.3).
+    pub full_depth: f32,
+    /// How the errors of pixels add up to [`Signal::ErrorScore`].
+    pub error_score: ErrorScore,
+    /// Pixels to collect as candidates for new rows, if any.
+    pub candidates: Option<CandidateRequest>,
+    /// What is measured in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
+    pub aux: Option<AuxRequest>,
+    /// Terms added to the training loss, unless the policy has
+    /// [others](crate::policy::DensityPolicy::loss_terms) for a step.
+    pub loss_terms: LossTerms,
+    /// Noise on the means after each optimiser step, unless the policy has
+    /// [another](crate::policy::DensityPolicy::noise) for a step.
+    pub noise: Option<NoiseTerm>,
+    /// A number per row that learns whether the row is worth its place, if any.
+    pub mask: Option<MaskTerm>,
+    /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
+    /// summed between optimiser steps, and the sums need memory.
+    pub cadence: Cadence,
+    /// Smallest [share of their sides](crate::policy::DensityPolicy::resolution) that training images are
+    /// ever shrunk to, in (0, 1]; `None`: they are always whole, and no memory is set aside for smaller
+    /// ones.
+    pub least_resolution: Option<f64>,
+    /// Learning rates that replace the trainer's defaults, but not what the user sets.
+    pub rates: RateOverrides,
+    /// Changes to the initial rows.
+    pub start: StartRule,
+    /// Whether plans hold edits that take more memory: rows rewritten in place
+    /// ([`EditPlan::update`](crate::plan::EditPlan::update)), children that are turned, or whose scales
+    /// change by axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
+    pub detailed_edits: bool,
+}
+
+impl Needs {
+    /// Checks that images may be shrunk to this share of their sides at a step.
+    ///
+    /// # Errors
+    /// When it is not a number, above 1 or below what was declared, with both.
+    pub fn check_resolution(&self, share: f64) -> Result<(), String> {
+        let least = self.least_resolution.unwrap_or(1.0);
+        if (least..=1.0).contains(&share) {
+            return Ok(());
+        }
+        Err(format!("the resolution is {share}; it must be from {least}, as declared, to 1"))
+    }
+
+    /// Checks that every number is finite and in its range.
+    ///
+    /// # Errors
+    /// The first that is not, with its value.
+    pub fn check(&self) -> Result<(), String> {
+        finite("full_depth", self.full_depth.into(), 0.0)?;
+        self.error_score.check()?;
+        self.loss_terms.check()?;
+        self.noise.map_or(Ok(()), |noise| noise.check())?;
+        match &self.mask {
+            Some(mask) => {
+                mask.check()?;
+                if self.cadence.all > 1 {
+                    return Err("masks step with every view: cadence.all must be 1".to_owned());
+                }
+            }
+            None if self.signals.contains(Signal::Mask) => {
+                return Err("the signal Mask is declared, but no mask".to_owned());
+            }
+            None => {}
+        }
+        if let Some(aux) = &self.aux {
+            finite("aux.map.error", aux.map.error.into(), 0.0)?;
+            finite("aux.map.edge", aux.map.edge.into(), 0.0)?;
+        }
+        if let Some(least) = self.least_resolution.filter(|least| !(*least > 0.0 && *least <= 1.0))
+        {
+            return Err(format!("least_resolution is {least}; it must be above 0 and at most 1"));
+        }
+        finite("cadence.all", self.cadence.all.into(), 1.0)?;
+        finite("cadence.sh_rest", self.cadence.sh_rest.into(), 1.0)?;
+        self.rates.check()?;
+        above_zero("start.scale", self.start.scale.into())?;
+        match self.start.opacity {
+            Some(opacity) if !(opacity > 0.0 && opacity < 1.0) => {
+                Err(format!("start.opacity is {opacity}; it must be between 0 and 1"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+fn finite(name: &str, value: f64, least: f64) -> Result<(), String> {
+    if value.is_finite() && value >= least {
+        return Ok(());
+    }
+    Err(format!("{name} is {value}; it must be finite and at least {least}"))
+}
+
+fn above_zero(name: &str, value: f64) -> Result<(), String> {
+    if value.is_finite() && value > 0.0 {
+        return Ok(());
+    }
+    Err(format!("{name} is {value}; it must be positive"))
+}
+
+/// Changes to the initial rows.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StartRule {
+    /// Opacity of all rows, in (0, 1); `None` leaves the trainer's.
+    pub opacity: Option<f32>,
+    /// Factor on all standard deviations, > 0.
+    pub scale: f32,
+}
+
+impl Default for StartRule {
+    fn default() -> Self {
+        Self { opacity: None, scale: 1.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests;

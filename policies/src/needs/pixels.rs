@@ -1,0 +1,142 @@
+//! What policies want to know of pixels: candidates for new rows, error scores, auxiliary views.
+
+use serde::{Deserialize, Serialize};
+
+use super::finite;
+use crate::signals::AuxColumn;
+
+/// How the errors of pixels add up to [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A view adds
+///
+/// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
+///
+/// both sums over the pixels p that the row is blended into, w its blend weight α·T there and e the pixel's
+/// part of the training loss, as in [`Signal::WeightedError`](crate::policy::Signal::WeightedError). g is the 8-neighbour Laplacian of the
+/// photograph's 8-bit luma, clipped to 0..255, and ḡ its mean over the view (in a view without edges all
+/// weigh the same).
+///
+/// The default is Σ w·e. A power above 1 looks at the worst pixels, a footprint of 1 at the mean error
+/// whatever the row's size, and a view power below 1 at rows that many views complain of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ErrorScore {
+    /// Power of a pixel's error, in (0, 16].
+    pub power: f32,
+    /// Weight of edges, >= 0; 0: none, at no cost.
+    pub edge: f32,
+    /// Power of the sum of blend weights that divides, in `[0, 1]`.
+    pub footprint: f32,
+    /// Power of a view's score, in (0, 1].
+    pub view_power: f32,
+}
+
+impl Default for ErrorScore {
+    fn default() -> Self {
+        Self { power: 1.0, edge: 0.0, footprint: 0.0, view_power: 1.0 }
+    }
+}
+
+impl ErrorScore {
+    /// Whether M is the error itself, but for edges.
+    #[must_use]
+    pub fn is_plain_map(&self) -> bool {
+        self.power.total_cmp(&1.0).is_eq()
+    }
+
+    /// The score of one view, from Σ w·M and Σ w; 0 where the row has no error.
+    #[must_use]
+    pub fn of_view(&self, error: f32, weight: f32) -> f32 {
+        if !(error > 0.0 && weight > 0.0) {
+            return 0.0;
+        }
+        let by_size =
+            if self.footprint > 0.0 { error / weight.powf(self.footprint) } else { error };
+        if self.view_power < 1.0 { by_size.powf(self.view_power) } else { by_size }
+    }
+
+    pub(super) fn check(&self) -> Result<(), String> {
+        finite("error_score.edge", self.edge.into(), 0.0)?;
+        for (name, value, lowest, most) in [
+            ("power", self.power, f32::MIN_POSITIVE, 16.0),
+            ("footprint", self.footprint, 0.0, 1.0),
+            ("view_power", self.view_power, f32::MIN_POSITIVE, 1.0),
+        ] {
+            if !(lowest..=most).contains(&value) {
+                let above = if lowest > 0.0 { "above 0" } else { "at least 0" };
+                return Err(format!(
+                    "error_score.{name} is {value}; it must be {above}, at most {most}"
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Which pixels of the training views to collect as candidates for new rows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CandidateRequest {
+    /// Start of the window (exclusive) `[step]`.
+    pub from: u32,
+    /// End of the window (exclusive) `[step]`.
+    pub until: u32,
+    /// Each step collects one candidate per this many rows, >= 1.
+    pub rows_per_candidate: u32,
+    /// Most candidates held at a time; later ones are dropped.
+    pub capacity: usize,
+    /// The error that ranks pixels.
+    pub error: ErrorMode,
+    /// How the surface point on the pixel's ray is chosen.
+    pub depth: DepthMode,
+    /// Least accumulated alpha of a pixel, in `[0, 1]`: a transparent pixel has no depth.
+    pub min_alpha: f32,
+    /// Non-maximum suppression: only pixels with the largest error of their 3×3 neighbours count.
+    pub spaced: bool,
+}
+
+/// The error of a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ErrorMode {
+    /// ‖dL/dC‖₂ of the rendered colour, as in the Diet code. It responds to blurred structure and
+    /// not to a constant colour offset.
+    #[serde(rename = "grad")]
+    Gradient,
+    /// Mean over channels of |I − G|.
+    L1,
+    /// 0.8 · L1 + 0.2 · (1 − SSIM), per pixel.
+    L1Dssim,
+}
+
+/// How the surface point of a pixel is chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DepthMode {
+    /// The ray's closest point, in Mahalanobis distance, to the Gaussian with the largest blend
+    /// weight (Mini-Splatting).
+    MaxWeight,
+    /// The same for the Gaussian at which transmittance first falls below one half.
+    Median,
+}
+
+/// What is measured in an auxiliary view: a training view rendered for one event of the policy.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct AuxRequest {
+    /// The pixel map M that [`AuxColumn::MapSum`] sums.
+    pub map: PixelMap,
+    /// Per-row statistics.
+    pub columns: Vec<AuxColumn>,
+    /// Most surface points per view: pixels drawn without replacement in proportion to their
+    /// accumulated alpha, with the point that [`DepthMode::MaxWeight`] chooses.
+    pub points: u32,
+}
+
+/// The pixel map M(p) = `error`·n(e) + `edge`·n(g).
+///
+/// n scales a map to 0..1 by its minimum and maximum in the view (0 where they are equal), e(p) is the
+/// mean over channels of |I − G|, and g(p) the 8-neighbour Laplacian of the 8-bit luma of the ground
+/// truth, clipped to 0..255, with repeated borders. The image's mask multiplies e and g.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PixelMap {
+    /// Weight of the error, >= 0.
+    pub error: f32,
+    /// Weight of the edges, >= 0.
+    pub edge: f32,
+}

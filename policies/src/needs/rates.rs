@@ -1,0 +1,113 @@
+//! How the optimiser steps for a policy: its learning rates, and how often.
+
+use serde::{Deserialize, Serialize};
+
+use super::above_zero;
+
+/// How often the optimiser steps; in between, gradients are summed over the views.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Cadence {
+    /// Iterations per optimiser step, for all parameters; >= 1.
+    pub all: u32,
+    /// The same for the spherical-harmonic coefficients of bands 1–3, which step at most as often as
+    /// the others; >= 1.
+    pub sh_rest: u32,
+}
+
+impl Default for Cadence {
+    fn default() -> Self {
+        Self { all: 1, sh_rest: 1 }
+    }
+}
+
+impl Cadence {
+    /// Whether the optimiser steps after iteration `step`: first for all parameters but the
+    /// spherical-harmonic coefficients of bands 1–3, then for these.
+    #[must_use]
+    pub fn steps_at(self, step: u32) -> [bool; 2] {
+        let all = self.all.max(1);
+        [step.is_multiple_of(all), step.is_multiple_of(self.sh_rest.max(all))]
+    }
+
+    /// Whether a backend made for `longest` has the gradient sums and step counts that this cadence
+    /// needs.
+    #[must_use]
+    pub fn is_within(self, longest: Self) -> bool {
+        let is_sound = self.all > 0 && self.sh_rest > 0;
+        let all = self.all == 1 || longest.all > 1;
+        let apart = self.sh_rest <= self.all || longest.sh_rest > 1;
+        is_sound && all && apart
+    }
+}
+
+/// Learning rates that a policy is published with; `None` leaves the trainer's.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct RateOverrides {
+    /// Means `[fraction of the extent per step]`.
+    pub mean: Option<Rate>,
+    /// Log-scales.
+    pub log_scale: Option<Rate>,
+    /// Quaternions.
+    pub quat: Option<Rate>,
+    /// Opacity logits.
+    pub opacity: Option<Rate>,
+    /// Spherical-harmonic coefficients of band 0.
+    pub sh_dc: Option<Rate>,
+    /// Spherical-harmonic coefficients of bands 1–3.
+    pub sh_rest: Option<Rate>,
+    /// A late fade of the rates of opacities and of all spherical-harmonic coefficients.
+    pub fade: Option<Fade>,
+}
+
+/// A learning rate, which falls (or rises) log-linearly over the run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Rate {
+    /// At the start of the run, > 0.
+    pub start: f64,
+    /// At its end, > 0.
+    pub end: f64,
+}
+
+/// A factor on learning rates that falls log-linearly from 1 to `to` in the last part of a run, so that
+/// the model does not memorise single photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Fade {
+    /// The share of the run after which it begins, in `[0, 1)`.
+    pub from: f64,
+    /// The factor at the end of the run, in (0, 1].
+    pub to: f64,
+}
+
+impl Rate {
+    /// The same from start to end.
+    #[must_use]
+    pub const fn constant(rate: f64) -> Self {
+        Self { start: rate, end: rate }
+    }
+}
+
+impl RateOverrides {
+    pub(super) fn check(&self) -> Result<(), String> {
+        for (name, rate) in [
+            ("mean", self.mean),
+            ("log_scale", self.log_scale),
+            ("quat", self.quat),
+            ("opacity", self.opacity),
+            ("sh_dc", self.sh_dc),
+            ("sh_rest", self.sh_rest),
+        ] {
+            let Some(rate) = rate else { continue };
+            above_zero(&format!("rates.{name}.start"), rate.start)?;
+            above_zero(&format!("rates.{name}.end"), rate.end)?;
+        }
+        match self.fade {
+            Some(Fade { from, .. }) if !(0.0..1.0).contains(&from) => {
+                Err(format!("rates.fade.from is {from}; it must be at least 0 and below 1"))
+            }
+            Some(Fade { to, .. }) if !(to > 0.0 && to <= 1.0) => {
+                Err(format!("rates.fade.to is {to}; it must be above 0 and at most 1"))
+            }
+            _ => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! Tests of declarations: their ranges, and what follows from them.
+
+use super::*;
+
+#[test]
+fn numbers_out_of_range_are_refused() {
+    assert_eq!(Needs::default().check(), Ok(()));
+    let noise = NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 };
+    let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
+    assert_eq!(Needs { mask: Some(mask), ..Needs::default() }.check(), Ok(()));
+    let score = |error_score| Needs { error_score, ..Needs::default() };
+    let fade =
+        |from, to| RateOverrides { fade: Some(Fade { from, to }), ..RateOverrides::default() };
+    let wrong = [
+        Needs { loss_terms: LossTerms { opacity: -1.0, scale: 0.0 }, ..Needs::default() },
+        Needs { loss_terms: LossTerms { opacity: 0.0, scale: f32::NAN }, ..Needs::default() },
+        Needs { noise: Some(NoiseTerm { strength: f32::INFINITY, ..noise }), ..Needs::default() },
+        Needs { signals: SignalSet::from([Signal::Mask]), ..Needs::default() },
+        Needs { mask: Some(MaskTerm { start: f32::NAN, ..mask }), ..Needs::default() },
+        Needs { mask: Some(MaskTerm { rate: 0.0, ..mask }), ..Needs::default() },
+        Needs { mask: Some(MaskTerm { weight: -1.0, ..mask }), ..Needs::default() },
+        Needs { mask: Some(MaskTerm { threshold: 1.0, ..mask }), ..Needs::default() },
+        Needs { mask: Some(mask), cadence: Cadence { all: 2, sh_rest: 1 }, ..Needs::default() },
+        Needs { cadence: Cadence { all: 0, sh_rest: 1 }, ..Needs::default() },
+        Needs { cadence: Cadence { all: 1, sh_rest: 0 }, ..Needs::default() },
+        Needs {
+            rates: RateOverrides {
+                quat: Some(Rate { start: 1.0, end: 0.0 }),
+                ..RateOverrides::default()
+            },
+            ..Needs::default()
+        },
+        Needs { rates: fade(1.0, 0.5), ..Needs::default() },
+        score(ErrorScore { power: 0.0, ..ErrorScore::default() }),
+        score(ErrorScore { edge: f32::NAN, ..ErrorScore::default() }),
+        score(ErrorScore { footprint: 1.5, ..ErrorScore::default() }),
+        score(ErrorScore { view_power: 0.0, ..ErrorScore::default() }),
+        Needs { least_resolution: Some(0.0), ..Needs::default() },
+        Needs { least_resolution: Some(1.5), ..Needs::default() },
+        Needs { least_resolution: Some(f64::NAN), ..Needs::default() },
+        Needs { rates: fade(0.5, 0.0), ..Needs::default() },
+        Needs { start: StartRule { opacity: Some(1.0), scale: 1.0 }, ..Needs::default() },
+        Needs { start: StartRule { opacity: None, scale: 0.0 }, ..Needs::default() },
+        Needs {
+            aux: Some(AuxRequest {
+                map: PixelMap { error: -1.0, edge: 0.0 },
+                ..AuxRequest::default()
+            }),
+            ..Needs::default()
+        },
+    ];
+    for needs in wrong {
+        assert!(needs.check().is_err(), "{needs:?}");
+    }
+}
+
+#[test]
+fn a_view_scores_by_error_size_and_power() {
+    let score = ErrorScore { footprint: 0.5, view_power: 0.5, ..ErrorScore::default() };
+    // 8 / √4 = 4, and its root.
+    assert!((score.of_view(8.0, 4.0) - 2.0).abs() < 1e-6);
+    assert!((ErrorScore::default().of_view(8.0, 4.0) - 8.0).abs() < 1e-6);
+    let none = [(0.0, 4.0), (8.0, 0.0), (f32::NAN, 4.0)];
+    assert!(none.iter().all(|&(error, weight)| score.of_view(error, weight).to_bits() == 0));
+}
+
+#[test]
+fn images_are_shrunk_as_far_as_declared() {
+    let needs = Needs { least_resolution: Some(0.3), ..Needs::default() };
+    assert!([0.3, 0.5, 1.0].iter().all(|&share| needs.check_resolution(share).is_ok()));
+    let wrong = [0.29, 1.01, f64::NAN, -0.5];
+    assert!(wrong.iter().all(|&share| needs.check_resolution(share).is_err()));
+    let whole = Needs::default();
+    assert!(whole.check_resolution(1.0).is_ok() && whole.check_resolution(0.99).is_err());
+}
+
+#[test]
+fn the_optimiser_steps_at_multiples_of_the_cadence() {
+    let due = |cadence: Cadence, class: usize| -> Vec<u32> {
+        (1..=12).filter(|&step| cadence.steps_at(step)[class]).collect()
+    };
+    assert_eq!(due(Cadence::default(), 0).len(), 12);
+    let sh = Cadence { all: 1, sh_rest: 4 };
+    assert_eq!((due(sh, 0).len(), due(sh, 1)), (12, vec![4, 8, 12]));
+    // Bands 1–3 are never ahead of the others.
+    let all = Cadence { all: 5, sh_rest: 1 };
+    assert_eq!((due(all, 0), due(all, 1)), (vec![5, 10], vec![5, 10]));
+    assert!(sh.is_within(sh) && !sh.is_within(Cadence::default()));
+    assert!(!sh.is_within(all) && !all.is_within(sh));
+    assert!(Cadence::default().is_within(all) && all.is_within(Cadence { all: 2, sh_rest: 1 }));
+    assert!(Cadence { all: 4, sh_rest: 3 }.is_within(all));
+    assert!(!Cadence { all: 0, sh_rest: 1 }.is_within(all));
+}
+
+#[test]
+fn noise_is_halved_at_its_opacity() {
+    let noise = NoiseTerm { strength: 1.0, sharpness: 100.0, opacity: 0.005 };
+    assert!((noise.share(0.005) - 0.5).abs() < 1e-6);
+    // σ(−100·(0.1 − 0.005)) = σ(−9.5).
+    assert!((noise.share(0.1) / 7.484_62e-5 - 1.0).abs() < 1e-4);
+}
