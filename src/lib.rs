@@ -27,6 +27,7 @@
 //! Features, all on by default: `gpu` (the GPU backend), `scenegen` (built-in scenes and known surfaces),
 //! `selftest` (the float64 renderer and the command that compares with it), `study` (`compare` and `trade`).
 
+mod animation;
 pub mod backend;
 pub mod camera;
 pub mod checkpoint;
@@ -35,6 +36,7 @@ pub mod dataset;
 pub mod evaluate;
 pub mod export;
 pub mod failure;
+pub mod flight;
 mod foreign;
 pub mod gaussians;
 pub mod import;

@@ -19,6 +19,7 @@ mod console;
 mod devices;
 mod eval;
 mod export;
+mod film;
 mod flags;
 mod interrupt;
 mod knobs;

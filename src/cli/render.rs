@@ -1,15 +1,18 @@
 //! `densify render`.
 
 use std::collections::{BTreeMap, HashSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{ArgMatches, Args};
 use densify_policies::policy::Needs;
 use image::{DynamicImage, ImageBuffer, Luma};
 
 use super::console::Console;
+use super::film::{self, FilmArgs};
 use crate::backend::Rendering;
+
 use crate::dataset::images::Image8;
+use crate::dataset::normalise::Normalisation;
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::output::write_json;
@@ -21,7 +24,7 @@ use crate::views::ViewSource;
 /// Renders a trained scene to PNG files.
 ///
 /// Renders the views held out, or those trained on, of a run or of any .ply of Gaussian splats
-/// (which needs --scene for the cameras).
+/// (which needs --scene for the cameras); or with --path a flight through the scene, and a film of it.
 ///
 /// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
 /// distance along the optical axis. It is written in 16 bits, 65535 standing for the largest
@@ -52,6 +55,8 @@ pub(super) struct RenderArgs {
     /// Also write photograph and rendering beside each other, as NAME.pair.png
     #[arg(long)]
     side_by_side: bool,
+    #[command(flatten)]
+    film: FilmArgs,
     /// Nearest distance to a camera at which anything of a .ply is drawn, as a fraction of the
     /// scene's extent
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
@@ -67,6 +72,8 @@ Options under Scene are for a .ply; a run brings its own.
 
 Examples:
   densify render output/garden-diet -o pictures --side-by-side
+  densify render output/garden-diet -o frames --path orbit --video orbit.mp4
+  densify render output/garden-diet -o frames --path camera_path.json --size 1920x1080
   densify render others.ply --scene data/garden --eval -o pictures --depth";
 
 pub(super) fn run(
@@ -74,38 +81,86 @@ pub(super) fn run(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
+    let extras = Extras { alpha: args.alpha, depth: args.depth };
+    if args.film.path.is_some() && args.side_by_side {
+        return Err(Failure::input("--side-by-side: a flight has no photographs; leave it out"));
+    }
     let mut opened = open_model(args, matches, console)?;
+    if let Some(route) = &args.film.path {
+        return film::run(&args.film, route, &args.output, extras, &mut opened, console);
+    }
     let views = opened.views(args.split)?;
     let background = opened.data.background.fixed();
-    let units = 1.0 / opened.dataset.normalisation.scale;
     let names: Vec<&str> = (0..views.count()).map(|view| views.name(view)).collect();
     let files = file_names(&names);
-    let mut depths = BTreeMap::new();
+    let mut depths = extras.depths(&opened.dataset.normalisation);
     for (view, name) in files.iter().enumerate() {
         let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
-        let to = |ending: &str| args.output.join(format!("{name}{ending}"));
-        write_png(&to(".png"), &picture(&rendering).into())?;
-        if args.alpha {
-            write_png(&to(".alpha.png"), &alpha(&rendering))?;
-        }
-        if args.depth {
-            let (png, largest) = depth(&rendering);
-            write_png(&to(".depth.png"), &png)?;
-            depths.insert(format!("{name}.depth.png"), f64::from(largest) * units);
-        }
+        write_pictures(&args.output, name, &rendering, extras, &mut depths)?;
         if args.side_by_side {
             let image = views.image(view).map_err(Failure::input)?;
-            write_png(&to(".pair.png"), &pair(&image, background, &rendering))?;
+            let path = args.output.join(format!("{name}.pair.png"));
+            write_png(&path, &pair(&image, background, &rendering))?;
         }
     }
-    if args.depth {
+    depths.write(&args.output)?;
+    console.result(format_args!("{} views in {}", files.len(), args.output.display()));
+    Ok(())
+}
+
+/// What is written beside the colours.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Extras {
+    alpha: bool,
+    depth: bool,
+}
+
+/// What the pictures of depth stand for.
+pub(super) struct Depths {
+    /// Of the dataset, per scene unit.
+    units: f64,
+    /// Largest depth by picture.
+    largest: BTreeMap<String, f64>,
+}
+
+impl Extras {
+    pub(super) fn depths(self, normalisation: &Normalisation) -> Depths {
+        Depths { units: 1.0 / normalisation.scale, largest: BTreeMap::new() }
+    }
+}
+
+impl Depths {
+    /// Writes depth.json, if there are pictures of depth.
+    pub(super) fn write(&self, folder: &Path) -> Result<(), Failure> {
+        if self.largest.is_empty() {
+            return Ok(());
+        }
         let said = serde_json::json!({
             "what": "depth = value / 65535 * largest, in the dataset's own units",
-            "largest": depths,
+            "largest": self.largest,
         });
-        write_json(&args.output.join("depth.json"), &said)?;
+        Ok(write_json(&folder.join("depth.json"), &said)?)
     }
-    console.result(format_args!("{} views in {}", files.len(), args.output.display()));
+}
+
+/// Writes the pictures of one rendering.
+pub(super) fn write_pictures(
+    folder: &Path,
+    name: &str,
+    rendering: &Rendering,
+    extras: Extras,
+    depths: &mut Depths,
+) -> Result<(), Failure> {
+    let to = |ending: &str| folder.join(format!("{name}{ending}"));
+    write_png(&to(".png"), &picture(rendering).into())?;
+    if extras.alpha {
+        write_png(&to(".alpha.png"), &alpha(rendering))?;
+    }
+    if extras.depth {
+        let (png, largest) = depth(rendering);
+        write_png(&to(".depth.png"), &png)?;
+        depths.largest.insert(format!("{name}.depth.png"), f64::from(largest) * depths.units);
+    }
     Ok(())
 }
 

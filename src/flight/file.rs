@@ -1,0 +1,114 @@
+//! Camera paths as files: nerfstudio's JSON, as its viewer saves it.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DMat4, DQuat, DVec3};
+use serde::Deserialize;
+
+use super::{Flight, Key};
+use crate::foreign;
+
+/// Most bytes of a file.
+const MOST_BYTES: u64 = 64 << 20;
+/// Most cameras of a path.
+const MOST_KEYS: usize = 100_000;
+
+/// Why a camera path cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum FlightError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: std::io::Error,
+    },
+    /// It is no camera path.
+    #[error("{}: {problem}", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, and the remedy.
+        problem: String,
+    },
+}
+
+/// The parts of the file that say where cameras are.
+#[derive(Deserialize)]
+struct Saved {
+    camera_path: Vec<SavedKey>,
+    #[serde(default)]
+    camera_type: Option<String>,
+    #[serde(default)]
+    is_cycle: bool,
+}
+
+#[derive(Deserialize)]
+struct SavedKey {
+    /// Row-major, 4×4; the camera's axes are x right, y up, z backward.
+    camera_to_world: Vec<f64>,
+    /// Vertical field of view `[°]`.
+    fov: f64,
+}
+
+/// Reads a camera path; its cameras are in the coordinates of the dataset.
+///
+/// # Errors
+/// When the file cannot be read, is longer than 64 MiB, or is no path of 1 to 100,000 perspective cameras with
+/// finite poses and fields of view between 0 and 180 degrees.
+pub fn read(path: &Path) -> Result<Flight, FlightError> {
+    let io = |source| FlightError::Read { path: path.to_owned(), source };
+    let mut bytes = Vec::new();
+    let file = foreign::open(path).map_err(io)?;
+    file.take(MOST_BYTES + 1).read_to_end(&mut bytes).map_err(io)?;
+    parse(&bytes).map_err(|problem| FlightError::Malformed { path: path.to_owned(), problem })
+}
+
+pub(super) fn parse(bytes: &[u8]) -> Result<Flight, String> {
+    if bytes.len() as u64 > MOST_BYTES {
+        return Err("it is longer than 64 MiB; save a shorter path".to_owned());
+    }
+    let saved: Saved = serde_json::from_slice(bytes)
+        .map_err(|e| format!("it is no camera path of nerfstudio ({e}); save one in its viewer"))?;
+    if let Some(kind) = saved.camera_type.filter(|kind| !kind.eq_ignore_ascii_case("perspective")) {
+        return Err(format!("camera_type is {kind:?}; only perspective cameras can be rendered"));
+    }
+    let count = saved.camera_path.len();
+    if count == 0 || count > MOST_KEYS {
+        return Err(format!("camera_path has {count} cameras; 1 to {MOST_KEYS} are possible"));
+    }
+    let keys = saved.camera_path.iter().enumerate().map(|(at, saved)| {
+        key(saved).map_err(|problem| format!("camera {at} of camera_path: {problem}"))
+    });
+    Ok(Flight { keys: keys.collect::<Result<_, String>>()?, is_loop: saved.is_cycle })
+}
+
+fn key(saved: &SavedKey) -> Result<Key, String> {
+    let SavedKey { camera_to_world: numbers, fov } = saved;
+    let Ok(rows) = <[f64; 16]>::try_from(&numbers[..]) else {
+        return Err(format!("camera_to_world has {} numbers, not 16", numbers.len()));
+    };
+    if rows.iter().any(|number| !number.is_finite()) {
+        return Err("camera_to_world is not finite".to_owned());
+    }
+    if !(*fov > 0.0 && *fov < 180.0) {
+        return Err(format!("fov is {fov}; it must be between 0 and 180 degrees"));
+    }
+    let pose = DMat4::from_cols_array(&rows).transpose();
+    let axes = DMat3::from_mat4(pose);
+    let lengths = [axes.x_axis, axes.y_axis, axes.z_axis].map(DVec3::length);
+    let volume = axes.determinant();
+    let is_turn =
+        volume > 0.0 && (volume / (lengths[0] * lengths[1] * lengths[2]) - 1.0).abs() < 1e-2;
+    if !is_turn {
+        return Err("camera_to_world does not turn its axes, but bends or mirrors them".to_owned());
+    }
+    // y and z point the other way here.
+    let axes = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis);
+    let x = axes.x_axis.normalize();
+    let z = (axes.z_axis - x * axes.z_axis.dot(x)).normalize();
+    let turn = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z));
+    Ok(Key { centre: pose.w_axis.truncate(), turn, fov_y: fov.to_radians() })
+}

@@ -1,0 +1,176 @@
+//! Tests of flights: their shapes, their smoothness, and files.
+
+use std::f64::consts::{PI, TAU};
+
+use super::file::parse;
+use super::*;
+
+const UP: DVec3 = DVec3::Z;
+
+/// Cameras in a circle of radius 2 at height 1 around a point, looking at it or away from it.
+fn circle(count: u32, around: DVec3, inward: bool) -> Vec<Camera> {
+    let camera = |i: u32| {
+        let angle = TAU * f64::from(i) / f64::from(count);
+        let away = DVec3::new(angle.cos(), angle.sin(), 0.0);
+        let centre = around + 2.0 * away + UP;
+        let target = if inward { around } else { centre + away };
+        Key::looking_at(centre, target, UP, 1.0).camera((64, 48))
+    };
+    (0..count).map(camera).collect()
+}
+
+#[test]
+fn a_key_looks_where_it_should_with_the_world_upright() {
+    let key = Key::looking_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(1.0, 5.0, 3.0), UP, 0.5 * PI);
+    let camera = key.camera((80, 60));
+    let (pixel, depth) = camera.project(DVec3::new(1.0, 5.0, 3.0));
+    assert!((depth - 3.0).abs() < 1e-12 && (pixel.x - 40.0).abs() < 1e-9, "{pixel} {depth}");
+    // Higher in the world is higher in the image, and at 45° its upper edge.
+    let (pixel, _) = camera.project(DVec3::new(1.0, 5.0, 6.0));
+    assert!((pixel.y - 0.0).abs() < 1e-9 && (pixel.x - 40.0).abs() < 1e-9, "{pixel}");
+    let (pixel, _) = camera.project(DVec3::new(2.0, 5.0, 3.0));
+    assert!(pixel.x > 40.0, "x goes to the right: {pixel}");
+}
+
+#[test]
+fn an_orbit_goes_around_what_the_cameras_look_at() {
+    let around = DVec3::new(5.0, -3.0, 0.5);
+    let flight = orbit(&circle(12, around, true));
+    assert!(flight.is_loop);
+    for frame in 0..90 {
+        let key = flight.frame(frame, 90);
+        let offset = key.centre - around;
+        let level = DVec3::new(offset.x, offset.y, 0.0).length();
+        assert!((level - 2.0).abs() < 1e-3 && (offset.z - 1.0).abs() < 1e-6, "{offset}");
+        let (pixel, depth) = key.camera((64, 48)).project(around);
+        assert!(depth > 2.0 && pixel.distance(glam::DVec2::new(32.0, 24.0)) < 0.1, "{pixel}");
+    }
+    // From inside a room one looks around.
+    let flight = orbit(&circle(12, around, false));
+    for frame in 0..30 {
+        let key = flight.frame(frame, 30);
+        let outward = key.centre - (around + UP);
+        assert!(key.camera((9, 9)).forward().dot(outward.normalize()) > 0.99, "{outward}");
+    }
+}
+
+#[test]
+fn cameras_in_a_circle_say_what_is_up_even_if_they_lie_on_their_side() {
+    let around = DVec3::new(5.0, -3.0, 0.5);
+    let mut cameras = circle(12, around, true);
+    for camera in &mut cameras {
+        // A quarter turn about the line of sight.
+        let centre = camera.centre();
+        camera.rotation = DMat3::from_rotation_z(0.5 * PI) * camera.rotation;
+        camera.translation = -(camera.rotation * centre);
+    }
+    let flight = orbit(&cameras);
+    for frame in 0..24 {
+        let key = flight.frame(frame, 24);
+        assert!((key.centre.z - around.z - 1.0).abs() < 1e-6, "{}", key.centre);
+        let up = -key.camera((9, 9)).rotation.row(1);
+        assert!(up.z > 0.8, "{up}");
+    }
+}
+
+#[test]
+fn a_spiral_stays_within_the_cameras_and_looks_ahead() {
+    // A wall of cameras, all looking along y at something 4 away.
+    let place = |i: u32| DVec3::new(f64::from(i % 5) - 2.0, 0.0, f64::from(i / 5) - 2.0);
+    let target = DVec3::new(0.0, 4.0, 0.0);
+    let cameras: Vec<Camera> =
+        (0..25).map(|i| Key::looking_at(place(i), target, UP, 0.8).camera((64, 48))).collect();
+    let flight = spiral(&cameras);
+    let mut widest = 0.0_f64;
+    for frame in 0..60 {
+        let key = flight.frame(frame, 60);
+        assert!(key.centre.abs().max_element() < 2.1, "{}", key.centre);
+        widest = widest.max(key.centre.x.abs());
+        let (pixel, depth) = key.camera((64, 48)).project(target);
+        assert!(depth > 0.0 && (pixel.x - 32.0).abs() < 3.0, "{pixel}");
+    }
+    assert!(widest > 1.5, "{widest}");
+}
+
+#[test]
+fn a_single_camera_is_enough() {
+    let one = circle(1, DVec3::ZERO, true);
+    for flight in [orbit(&one), spiral(&one)] {
+        for frame in 0..5 {
+            let key = flight.frame(frame, 5);
+            assert!(key.centre.is_finite() && key.turn.is_finite() && key.fov_y > 0.0, "{key:?}");
+        }
+    }
+}
+
+#[test]
+fn a_flight_passes_its_keys_smoothly() {
+    let key = |x: f64, angle: f64| Key {
+        centre: DVec3::new(x, x * x, 0.0),
+        turn: DQuat::from_rotation_z(angle),
+        fov_y: 1.0 + 0.1 * x,
+    };
+    // The third turn is written as the other of its two quaternions.
+    let mut keys = vec![key(0.0, 0.0), key(1.0, 0.5), key(2.0, 1.5), key(3.0, 3.0)];
+    keys[2].turn = -keys[2].turn;
+    let flight = Flight { keys: keys.clone(), is_loop: false };
+    for (at, key) in keys.iter().enumerate() {
+        let found = flight.frame(10 * at as u32, 31);
+        assert!(found.centre.distance(key.centre) < 1e-9, "{at}: {found:?}");
+        assert!(found.turn.dot(key.turn).abs() > 1.0 - 1e-9, "{at}: {found:?}");
+        assert!((found.fov_y - key.fov_y).abs() < 1e-9, "{at}: {found:?}");
+    }
+    // Steps between frames change little: no stop and no jump at a key.
+    let frames: Vec<Key> = (0..301).map(|frame| flight.frame(frame, 301)).collect();
+    let steps: Vec<DVec3> = frames.windows(2).map(|pair| pair[1].centre - pair[0].centre).collect();
+    for pair in steps.windows(2) {
+        assert!(pair[0].distance(pair[1]) < 0.1 * pair[0].length() + 1e-9, "{pair:?}");
+    }
+    let turns = frames.windows(2).map(|pair| pair[0].turn.angle_between(pair[1].turn));
+    assert!(turns.into_iter().all(|angle| angle < 0.05));
+    // A loop returns.
+    let closed = Flight { keys, is_loop: true };
+    assert!(closed.frame(40, 40).centre.distance(closed.frame(0, 40).centre) < 1e-9);
+    let single = Flight { keys: vec![key(1.0, 1.0)], is_loop: false };
+    assert_eq!(single.frame(0, 1).centre, single.frame(7, 9).centre);
+}
+
+#[test]
+fn paths_of_nerfstudio_are_read() {
+    let path = r#"{"camera_type": "perspective", "render_height": 4, "fps": 24, "is_cycle": true,
+        "camera_path": [{"fov": 90.0, "aspect": 1.5,
+        "camera_to_world": [1, 0, 0, 7, 0, 0, -1, 8, 0, 1, 0, 9, 0, 0, 0, 1]}]}"#;
+    let flight = parse(path.as_bytes()).unwrap();
+    assert!(flight.is_loop);
+    let key = flight.keys[0];
+    assert_eq!(key.centre, DVec3::new(7.0, 8.0, 9.0));
+    let camera = key.camera((40, 40));
+    // Its z axis, (0, −1, 0), points backward, and its y axis, (0, 0, 1), upward.
+    assert!(camera.forward().distance(DVec3::Y) < 1e-9, "{}", camera.forward());
+    assert!((-camera.rotation.row(1)).distance(DVec3::Z) < 1e-9);
+    assert!((camera.fy - 20.0).abs() < 1e-9);
+}
+
+#[test]
+fn what_is_no_path_is_refused_with_the_reason() {
+    let pose = |numbers: &str, fov: &str| {
+        format!(r#"{{"camera_path": [{{"camera_to_world": [{numbers}], "fov": {fov}}}]}}"#)
+    };
+    let unit = "1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1";
+    for (text, reason) in [
+        ("{}".to_owned(), "no camera path"),
+        ("[1, 2".to_owned(), "no camera path"),
+        (r#"{"camera_path": []}"#.to_owned(), "0 cameras"),
+        (pose("1, 2", "50"), "2 numbers"),
+        (pose(unit, "0"), "fov is 0"),
+        (pose(unit, "180"), "fov is 180"),
+        (pose("1,0,0,0, 0,1,0,0, 0,0,-1,0, 0,0,0,1", "50"), "mirrors"),
+        (pose("1,1,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1", "50"), "bends"),
+        (pose("0,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1", "50"), "bends"),
+        (r#"{"camera_type": "fisheye", "camera_path": []}"#.to_owned(), "fisheye"),
+    ] {
+        let refused = parse(text.as_bytes()).unwrap_err();
+        assert!(refused.contains(reason), "{text}: {refused}");
+    }
+    assert!(parse(pose(unit, "50").as_bytes()).is_ok());
+}
