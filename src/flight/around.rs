@@ -11,9 +11,10 @@ use crate::camera::Camera;
 const KEYS: u32 = 48;
 /// Turns of a spiral.
 const TURNS: f64 = 2.0;
-/// Cameras lie in a plane if their squared distances from it are at most this share of those within it. It is
-/// a fifth for points on a hemisphere, and a half for points in a ball.
-const FLAT: f64 = 0.1;
+/// Directions lie in a plane if at most this share of their squares is across it: a roll of 13° on average.
+const FLAT: f64 = 0.05;
+/// And on a line if the second axis has no more than this.
+const LINE: f64 = 0.1;
 /// Share of the cameras within the reach of a spiral.
 const WITHIN: f64 = 0.9;
 
@@ -50,10 +51,11 @@ impl Rig {
         let focus = matrix.inverse() * right;
         let ahead = |camera: &&Camera| (focus - camera.centre()).dot(camera.forward()) > 0.0;
         let looks_inward = 2 * cameras.iter().filter(ahead).count() > cameras.len();
-        let up = flat(cameras, centre).map_or(up, |normal| {
-            // Photographs may have been taken with the camera on its side: then what matters is that
-            // cameras are above what they look at.
-            let sign = if normal.dot(up).abs() > 0.5 { up } else { centre - focus };
+        // Photographs are taken upright, or with the camera on its side: then their other axis is level.
+        let level = [0, 1].map(|axis| flat(cameras.iter().map(move |c| c.rotation.row(axis))));
+        let up = level[0].or(level[1]).map_or(up, |normal| {
+            // Of a camera on its side it is not known which: cameras are mostly above what they look at.
+            let sign = if level[0].is_some() { up } else { centre - focus };
             if normal.dot(sign) < 0.0 { -normal } else { normal }
         });
         let mut fovs: Vec<f64> = cameras
@@ -66,23 +68,21 @@ impl Rig {
     }
 }
 
-/// The normal of the plane that the cameras lie in, if they lie in one.
-fn flat(cameras: &[Camera], centre: DVec3) -> Option<DVec3> {
-    let scatter = cameras.iter().map(|camera| {
-        let d = camera.centre() - centre;
-        DMat3::from_cols(d * d.x, d * d.y, d * d.z)
-    });
+/// The normal of the plane through the origin in which directions lie, if they lie in one and not on a line.
+fn flat(directions: impl Iterator<Item = DVec3> + Clone) -> Option<DVec3> {
+    let scatter = directions.map(|d| DMat3::from_cols(d * d.x, d * d.y, d * d.z));
     let scatter = scatter.fold(DMat3::ZERO, |sum, part| sum + part);
     let total = scatter.x_axis.x + scatter.y_axis.y + scatter.z_axis.z;
-    // Powers of the inverse turn any vector to the axis along which there is least.
-    let inverse = (scatter + DMat3::IDENTITY * (1e-9 * total)).inverse();
-    let mut normal = DVec3::new(0.36, 0.48, 0.8);
-    for _ in 0..64 {
-        normal = (inverse * normal).try_normalize()?;
-    }
-    let along = normal.dot(scatter * normal);
-    // Along the two others together there is the rest.
-    (total > 0.0 && along < FLAT * (total - along)).then_some(normal)
+    // Powers of a matrix turn a vector to the axis along which there is most, and those of the inverse to the
+    // one along which there is least.
+    let axis = |matrix: DMat3| {
+        (0..64).try_fold(DVec3::new(0.36, 0.48, 0.8), |axis, _| (matrix * axis).try_normalize())
+    };
+    let along = |axis: DVec3| axis.dot(scatter * axis) / total;
+    let normal = axis((scatter + DMat3::IDENTITY * (1e-9 * total)).inverse())?;
+    let longest = axis(scatter)?;
+    let across = 1.0 - along(normal) - along(longest);
+    (along(normal) < FLAT && across > LINE).then_some(normal)
 }
 
 /// Once around: about what the cameras look at, at their mean height and distance. Where they look away
