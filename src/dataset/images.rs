@@ -1,6 +1,7 @@
 //! Decodes photographs and masks, and shrinks and undistorts them.
 //!
-//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
+//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated. One piece with its
+//! tests, which are a third of it.
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -77,7 +78,7 @@ pub struct ImageSource {
     pub width: u32,
     /// Height after loading `[px]`.
     pub height: u32,
-    /// Resampling to a pinhole at the size of the file, if the lens has distortion.
+    /// Resampling of the whole file to a pinhole, if the lens has distortion.
     pub undistortion: Option<Undistortion>,
     /// Header of the image file.
     pub header: ImageHeader,
@@ -120,20 +121,36 @@ impl ImageSource {
     /// Most bytes used while loading, including the result.
     #[must_use]
     pub fn working_bytes(&self) -> u64 {
-        let packed = u64::from(self.header.width) * u64::from(self.header.height) * self.channels();
+        let bytes = |(width, height)| u64::from(width) * u64::from(height) * self.channels();
+        let packed = bytes((self.header.width, self.header.height));
         let decode = self.header.file_bytes + self.header.decoded_bytes;
         let pack = self.header.decoded_bytes + packed;
-        let undistort = if self.undistortion.is_some() { 2 * packed } else { packed };
-        let shrink = if self.shrinks() { packed + self.loaded_bytes() } else { packed };
+        let whole = bytes(self.whole_size());
+        let undistort = if self.undistortion.is_some() { packed + whole } else { packed };
+        let shrink = if self.shrinks() { whole + self.loaded_bytes() } else { whole };
         decode.max(pack).max(undistort).max(shrink)
     }
 
     fn channels(&self) -> u64 {
-        3 + u64::from(self.header.has_alpha) + u64::from(self.mask.is_some())
+        3 + u64::from(self.header.has_alpha) + u64::from(self.is_masked())
+    }
+
+    /// Whether its images have a mask, of their own or of what their lens saw.
+    #[must_use]
+    pub fn is_masked(&self) -> bool {
+        self.mask.is_some() || self.undistortion.as_ref().is_some_and(Undistortion::is_masked)
+    }
+
+    /// Width and height before it is shrunk `[px]`.
+    fn whole_size(&self) -> (u32, u32) {
+        match &self.undistortion {
+            Some(undistortion) => (undistortion.pinhole().width, undistortion.pinhole().height),
+            None => (self.header.width, self.header.height),
+        }
     }
 
     fn shrinks(&self) -> bool {
-        (self.width, self.height) != (self.header.width, self.header.height)
+        (self.width, self.height) != self.whole_size()
     }
 
     /// Decodes, undistorts and shrinks. A file without a transparent pixel yields no alpha.
@@ -156,7 +173,7 @@ impl ImageSource {
         }
         let mut image = pack(decoded);
         if let Some(file) = &self.mask {
-            let mask = decode(file)?.into_luma8();
+            let mask = decode_mask(file)?;
             if mask.iter().all(|&weight| weight == 0) {
                 let problem = "the mask hides every pixel";
                 let remedy = "repair it, or remove the photograph and its pose";
@@ -177,6 +194,11 @@ impl ImageSource {
         }
         Ok(image)
     }
+}
+
+/// Decodes a mask: the weights of pixels, at its own size.
+pub(super) fn decode_mask(file: &SourceFile) -> Result<image::GrayImage, DatasetError> {
+    decode(file).map(DynamicImage::into_luma8)
 }
 
 /// Converts to 8 bits per channel, without a copy if it is RGB already.

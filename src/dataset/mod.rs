@@ -11,9 +11,11 @@ mod error;
 mod folders;
 pub mod images;
 mod jpeg;
+pub mod lens;
 pub mod normalise;
 mod options;
 mod paths;
+mod photographs;
 mod pixels;
 mod pose;
 mod prepare;
@@ -41,11 +43,11 @@ use crate::number::grouped;
 pub use builtin::GroundTruth;
 pub use error::DatasetError;
 use folders::Folders;
+use lens::Lens;
 use normalise::Normalisation;
 pub use options::{FarCameras, LoadOptions, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
-use undistort::Lens;
 
 /// A scene ready for training: cameras and points in normalised coordinates.
 #[derive(Debug, Clone)]

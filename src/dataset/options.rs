@@ -18,6 +18,9 @@ pub struct LoadOptions {
     pub split: Split,
     /// What happens to views whose camera is far from all others.
     pub far_cameras: FarCameras,
+    /// Whether undistorted images hold all that the lens saw (`--keep-fov`), with what it did not masked,
+    /// instead of the largest rectangle without such pixels.
+    pub keep_fov: bool,
     /// Folder that keeps built-in scenes as they were rendered; `None`: they are rendered.
     pub cache: Option<PathBuf>,
     /// Whether to read which views show which points ([`Tracks`](super::Tracks)).

@@ -2,13 +2,19 @@
 
 use std::path::Path;
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DVec3};
 
 use super::error::DatasetError;
-use super::undistort::Lens;
+use super::lens::{Lens, Plane};
 
 /// Fields of view accepted for a pinhole camera `[degrees]`.
 const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
+
+/// Widest field of view accepted for a fisheye whose distortion is not counted `[degrees]`: its corners may lie
+/// outside of what it images.
+const WIDEST_FISHEYE: f64 = 720.0;
+/// Largest ω of the FOV model `[rad]`, where tan(ω/2) is 20.
+const MAX_OMEGA: f64 = 3.04;
 
 /// Largest entry of |RᵀR − I| accepted; smaller deviations are corrected.
 const ROTATION_TOLERANCE: f64 = 1e-3;
@@ -64,27 +70,39 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), D
     let fault = |problem: String| {
         Err(DatasetError::malformed(file, camera, problem, "repair the camera's parameters"))
     };
-    let size = DVec2::new(f64::from(lens.width), f64::from(lens.height));
+    let size = lens.size();
     if lens.width == 0 || lens.height == 0 {
         return fault(format!("the size {}x{} px is impossible", lens.width, lens.height));
     }
-    if !lens.principal.is_finite() || lens.distortion.iter().any(|k| !k.is_finite()) {
-        return fault("the principal point or the distortion is not finite".into());
-    }
-    for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
+    for (name, focal) in [("fx", lens.focal.x), ("fy", lens.focal.y)] {
         if !focal.is_finite() || focal <= 0.0 {
             return fault(format!("the focal length {name} = {focal} is not above 0"));
         }
-        let degrees = 2.0 * (0.5 * side / focal).atan().to_degrees();
-        if !FIELD_OF_VIEW.contains(&degrees) {
-            let wide = if degrees > *FIELD_OF_VIEW.end() {
-                "; a lens this wide is a fisheye, which is not supported: undistort its images to a pinhole"
+    }
+    if !lens.is_finite() {
+        return fault("the principal point or the distortion is not finite".into());
+    }
+    if let Plane::Fov(omega) = lens.distortion().plane
+        && omega.abs() > MAX_OMEGA
+    {
+        return fault(format!("omega = {omega} is not within {MAX_OMEGA} of 0"));
+    }
+    for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
+        let (half, most) = match lens.distortion().plane {
+            Plane::Perspective => ((0.5 * side / focal).atan(), *FIELD_OF_VIEW.end()),
+            Plane::Equidistant | Plane::Fov(_) => (0.5 * side / focal, WIDEST_FISHEYE),
+        };
+        let degrees = 2.0 * half.to_degrees();
+        if !(*FIELD_OF_VIEW.start()..=most).contains(&degrees) {
+            let wide = if degrees > most && lens.distortion().plane == Plane::Perspective {
+                "; a lens this wide is a fisheye: name a fisheye model, or undistort its images to a pinhole"
             } else {
                 ""
             };
             return fault(format!(
                 "the focal length {name} = {focal} px at {side} px means a field of view of {degrees:.2} degrees, \
-                 outside of {FIELD_OF_VIEW:?}{wide}"
+                 outside of {:?}{wide}",
+                *FIELD_OF_VIEW.start()..=most
             ));
         }
     }
@@ -93,6 +111,9 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), D
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec2;
+
+    use super::super::lens::Distortion;
     use super::*;
 
     #[test]
@@ -118,14 +139,10 @@ mod tests {
     fn fields_of_view_that_no_pinhole_has_are_refused() {
         let check = |degrees: f64| {
             let focal = 50.0 / (0.5 * degrees.to_radians()).tan();
-            let lens = Lens {
-                width: 100,
-                height: 100,
-                focal: DVec2::splat(focal),
-                // Outside of the image, which is no fault.
-                principal: DVec2::new(-70.0, 130.0),
-                distortion: [0.0; 4],
-            };
+            // A principal point outside of the image is no fault.
+            let principal = DVec2::new(-70.0, 130.0);
+            let none = Distortion::of(Plane::Perspective);
+            let lens = Lens::new((100, 100), DVec2::splat(focal), principal, none);
             check_lens(Path::new("f"), "camera 7", &lens)
         };
         for degrees in [0.51, 1.0, 120.0, 159.9] {

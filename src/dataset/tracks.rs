@@ -39,18 +39,19 @@ impl Tracks {
         (self.len() * track + views * size_of::<u32>()) as u64
     }
 
-    /// The tracks in normalised coordinates and in training views only: `view_of` returns the number
-    /// of a training view from its id in the file.
+    /// The tracks in normalised coordinates and in training views only: `view_of` returns the number of the
+    /// training view that shows a point, from the id of its photograph in the file.
     pub(super) fn in_training_views(
         self,
         normalisation: &Normalisation,
-        view_of: impl Fn(u32) -> Option<u32>,
+        view_of: impl Fn(u32, DVec3) -> Option<u32>,
     ) -> Self {
         let mut kept = Self::default();
         let points = self.positions.into_iter().zip(self.colours);
         for ((position, colour), views) in points.zip(self.views) {
             let position = normalisation.scene_from_world(position);
-            let mut views: Vec<u32> = views.into_iter().filter_map(&view_of).collect();
+            let mut views: Vec<u32> =
+                views.into_iter().filter_map(|id| view_of(id, position)).collect();
             views.sort_unstable();
             views.dedup();
             if position.as_vec3().is_finite() && views.len() >= MIN_VIEWS {
@@ -145,7 +146,7 @@ mod tests {
             colours: vec![[1; 3], [2; 3], [3; 3]],
             views: vec![vec![9, 7, 5, 3, 3], vec![9, 7, 5, 4], vec![1, 3, 5, 7]],
         };
-        let odd = |id: u32| (id % 2 == 1).then_some(id / 2);
+        let odd = |id: u32, _| (id % 2 == 1).then_some(id / 2);
         let kept = tracks.in_training_views(&Normalisation::IDENTITY, odd);
         assert_eq!(kept.views, [vec![1, 2, 3, 4]], "the second has three training views");
     }

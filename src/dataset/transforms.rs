@@ -14,9 +14,10 @@ use serde_json::{Map, Value};
 use super::error::DatasetError;
 use super::folders::Folders;
 use super::images;
+use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
+use super::lens::{Distortion, Lens, Plane};
 use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
-use super::undistort::Lens;
 use super::{Frame, Scene};
 
 /// Largest JSON file read `[bytes]`. (serde_json bounds the depth to 128.)
@@ -25,9 +26,18 @@ const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
 /// File names of initial points that 3DGS and nerfstudio use without naming them in the JSON.
 const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
-/// Names of camera models that are a pinhole with k1, k2, p1, p2.
-const PINHOLES: [&str; 6] =
-    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"];
+/// Names of camera models that are a pinhole with OpenCV's distortion.
+const PINHOLES: [&str; 7] = [
+    "OPENCV",
+    "FULL_OPENCV",
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "RADIAL",
+    "SIMPLE_RADIAL",
+    "PERSPECTIVE",
+];
+/// The name of the one that is a fisheye with k1 to k4.
+const FISHEYE: &str = "OPENCV_FISHEYE";
 
 /// The pair of files that defines its own test split.
 pub(super) const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
@@ -255,7 +265,7 @@ impl<'a> Fields<'a> {
 
     /// The lens, at the size stated in the file, or else at that of the image.
     fn lens(&self, image: &Path, reduced: Option<u32>) -> Result<Lens, DatasetError> {
-        self.refuse_other_lenses()?;
+        let distortion = self.distortion()?;
         let (width, height) = match (self.side("w")?, self.side("h")?) {
             (Some(width), Some(height)) => (width, height),
             _ => {
@@ -280,42 +290,42 @@ impl<'a> Fields<'a> {
         };
         let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
         let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
-        let mut distortion = [0.0; 4];
-        for (value, field) in distortion.iter_mut().zip(["k1", "k2", "p1", "p2"]) {
-            *value = self.number(field)?.unwrap_or(0.0);
-        }
         let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
-        let lens = Lens { width, height, focal, principal, distortion };
+        let lens = Lens::new((width, height), focal, principal, distortion);
         check_lens(self.path, &self.full("intrinsics"), &lens)?;
         Ok(lens)
     }
 
-    fn refuse_other_lenses(&self) -> Result<(), DatasetError> {
-        let refusal = |field: &str, problem: String| {
-            DatasetError::lens(self.path, &self.full(field), problem)
+    /// The plane and its distortion.
+    fn distortion(&self) -> Result<Distortion, DatasetError> {
+        let named = match self.inherited("camera_model") {
+            None => None,
+            Some(Value::String(model)) => Some(model.as_str()),
+            Some(_) => return Err(self.fault("camera_model", "it is not a string")),
         };
-        if let Some(model) = self.inherited("camera_model") {
-            let model =
-                model.as_str().ok_or_else(|| self.fault("camera_model", "it is not a string"))?;
-            if !PINHOLES.contains(&model) {
-                return Err(refusal(
-                    "camera_model",
-                    format!("{model:?} is not one of {}", PINHOLES.join(", ")),
-                ));
-            }
+        let is_fisheye = named == Some(FISHEYE)
+            || self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false));
+        if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
+            let problem = format!("{model:?} is not one of {}, {FISHEYE}", PINHOLES.join(", "));
+            return Err(DatasetError::lens(self.path, &self.full("camera_model"), problem));
         }
-        if self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false)) {
-            return Err(refusal("is_fisheye", "fisheye lenses are not supported".into()));
-        }
-        for field in ["k3", "k4", "k5", "k6"] {
+        let (plane, fields) = match is_fisheye {
+            true => (Plane::Equidistant, &FISHEYE_FIELDS[..]),
+            false => (Plane::Perspective, &OPENCV_FIELDS[..]),
+        };
+        let mut distortion = Distortion::of(plane);
+        for (field, _) in OPENCV_FIELDS {
             let value = self.number(field)?.unwrap_or(0.0);
-            if value != 0.0 {
-                return Err(refusal(
-                    field,
-                    format!("the term {value} is not supported (k1, k2, p1, p2 are)"),
-                ));
+            match fields.iter().find(|(name, _)| *name == field) {
+                Some(&(_, term)) => distortion.set(term, value),
+                // nerfstudio writes all fields, with zeros for those that a model lacks.
+                None if value == 0.0 => {}
+                None => {
+                    let problem = format!("a fisheye has k1 to k4, but no {field} = {value}");
+                    return Err(DatasetError::lens(self.path, &self.full(field), problem));
+                }
             }
         }
-        Ok(())
+        Ok(distortion)
     }
 }

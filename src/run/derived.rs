@@ -27,6 +27,7 @@ impl DataSpec {
                 None => Split::None,
             },
             far_cameras: self.far_cameras,
+            keep_fov: self.keep_fov,
             cache: builtin::folder().filter(|_| !self.no_cache),
             tracks,
         }

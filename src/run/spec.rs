@@ -118,6 +118,15 @@ run_spec! {
         #[arg(long, value_name = "WHAT")]
         far_cameras: FarCameras = FarCameras::LeaveOut, Fixed;
 
+        /// Keep all that a distorted lens saw, and mask what it did not see; by default photographs are cropped
+        /// to the largest rectangle without such pixels. Where the distortion folds over, what can be inverted
+        /// is kept
+        #[arg(
+            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
+            require_equals = true, default_missing_value = "true", hide_possible_values = true
+        )]
+        keep_fov: bool = false, Fixed;
+
         /// Render a built-in scene anew, and do not keep it in the user's cache folder
         #[arg(
             long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,

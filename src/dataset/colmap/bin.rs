@@ -12,10 +12,11 @@ use glam::DVec3;
 
 use super::super::PointCloud;
 use super::super::error::DatasetError;
+use super::super::lens::Lens;
+use super::super::lens::table::LensModel;
 use super::super::paths::MAX_NAME;
 use super::super::tracks::{MAX_VIEWS, TrackSampler};
-use super::super::undistort::Lens;
-use super::model::Model;
+use super::camera;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use crate::foreign;
 
@@ -140,9 +141,9 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
         let id = reader.u32("camera id")?;
         let field = format!("camera {id}");
         let model = i32::from_le_bytes(reader.bytes(&field)?);
-        let model = Model::from_id(path, &field, model)?;
+        let model = LensModel::numbered(path, &field, model)?;
         let size = [reader.u64(&field)?, reader.u64(&field)?];
-        let lens = model.lens(path, &field, size, || reader.f64(&field))?;
+        let lens = camera::lens(model, path, &field, size, || reader.f64(&field))?;
         if cameras.insert(id, lens).is_some() {
             return Err(reader.fault(&field, "the id occurs twice"));
         }

@@ -3,7 +3,7 @@
 //! Rigs and frames of newer versions are ignored: images.bin still holds the poses.
 
 mod bin;
-mod model;
+mod camera;
 mod txt;
 
 use std::collections::HashMap;
@@ -13,10 +13,10 @@ use glam::{DMat3, DVec3};
 
 use super::error::DatasetError;
 use super::folders::Folders;
+use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::tracks::{TrackSampler, Tracks};
-use super::undistort::Lens;
 use super::{Frame, PointCloud, Scene};
 
 const REMEDY: &str = "export the model again with COLMAP";

@@ -11,10 +11,11 @@ use glam::DVec3;
 
 use super::super::PointCloud;
 use super::super::error::DatasetError;
+use super::super::lens::Lens;
+use super::super::lens::table::LensModel;
 use super::super::paths::MAX_NAME;
 use super::super::tracks::TrackSampler;
-use super::super::undistort::Lens;
-use super::model::Model;
+use super::camera;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use crate::foreign;
 
@@ -114,10 +115,10 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, DatasetError> {
         let id: u32 = lines.number(&mut words, "camera id")?;
         let field = format!("camera {id}");
         let model = words.next().ok_or_else(|| lines.fault(&field, "the model is missing"))?;
-        let model = Model::from_name(path, &field, model)?;
+        let model = LensModel::named(path, &field, model)?;
         let size = [lines.number(&mut words, "width")?, lines.number(&mut words, "height")?];
         let next = || lines.number(&mut words, "camera parameters");
-        let lens = model.lens(path, &field, size, next)?;
+        let lens = camera::lens(model, path, &field, size, next)?;
         if words.next().is_some() {
             return Err(lines.fault(&field, "there are more parameters than the model has"));
         }

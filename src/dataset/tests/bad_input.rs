@@ -20,7 +20,14 @@ fn refused(case: &str, made: &Made, options: &LoadOptions, words: &str) {
 type Replacement = (&'static str, &'static str, &'static str);
 
 const CAMERAS: &[Replacement] = &[
-    ("PINHOLE", "OPENCV_FISHEYE", "OPENCV_FISHEYE, camera 1, image_undistorter"),
+    ("PINHOLE", "RAD_TAN_THIN_PRISM_FISHEYE", "PRISM_FISHEYE, camera 1, image_undistorter"),
+    ("PINHOLE 20 12 15 16 10 6", "FOV 20 12 15 16 10 6 nan", "camera 1, distortion, not finite"),
+    ("PINHOLE 20 12 15 16 10 6", "FOV 20 12 15 16 10 6 3.1", "camera 1, omega"),
+    (
+        "PINHOLE 20 12 15 16 10 6",
+        "OPENCV_FISHEYE 20 12 1 1 10 6 0 0 0 0",
+        "camera 1, field of view",
+    ),
     ("PINHOLE", "MAGIC", "MAGIC, image_undistorter"),
     (" 10 6\n", " 10\n", "cameras.txt, line 2"),
     (" 10 6\n", " 10 6 1\n", "cameras.txt, camera 1, more parameters"),
@@ -34,7 +41,7 @@ const CAMERAS: &[Replacement] = &[
     (
         "PINHOLE 20 12 15 16 10 6",
         "RADIAL 20 12 15 10 6 -3 0",
-        "images.txt, distortion, image_undistorter",
+        "images.txt, folds over, largest usable field, --keep-fov, image_undistorter",
     ),
 ];
 
@@ -117,7 +124,7 @@ fn three_points(made: &Made, x: [&str; 3]) {
 type Patch = (&'static str, fn(&mut Vec<u8>), &'static str);
 
 const COLMAP_BINARY: &[Patch] = &[
-    ("cameras", |b| b[12] = 5, "cameras.bin, camera 1, OPENCV_FISHEYE, image_undistorter"),
+    ("cameras", |b| b[12] = 11, "cameras.bin, camera 1, PRISM_FISHEYE, image_undistorter"),
     ("cameras", |b| b[12] = 77, "camera 1, number 77"),
     ("cameras", |b| b[23] = 1, "camera 1, impossible"),
     ("cameras", |b| b.truncate(50), "cameras.bin"),
@@ -201,10 +208,10 @@ const TRANSFORMS: &[Replacement] = &[
     ("/fl_x", "0", "intrinsics, fx"),
     ("/w", "20.5", "w, 20.5"),
     ("/w", "-20", "w, -20"),
-    ("/camera_model", "\"OPENCV_FISHEYE\"", "camera_model, OPENCV_FISHEYE, image_undistorter"),
-    ("/is_fisheye", "true", "is_fisheye, image_undistorter"),
-    ("/k3", "0.1", "k3, image_undistorter"),
-    ("/k1", "-5.0", "distortion, a.png, image_undistorter"),
+    ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, image_undistorter"),
+    ("/camera_model", "7", "camera_model, string"),
+    ("/k1", "-5.0", "folds over, a.png, largest usable field, --keep-fov"),
+    ("/k1", "-1e9", "folds over, a.png, calibrate again"),
     ("/k1", "\"x\"", "k1, number"),
 ];
 
@@ -225,6 +232,11 @@ fn transforms() {
         let made = Made::transforms(|json| set(json, pointer, value));
         refused(&format!("{pointer}: {value}"), &made, &options, words);
     }
+    let made = Made::transforms(|json| {
+        set(json, "/is_fisheye", "true");
+        set(json, "/p2", "0.1");
+    });
+    refused("p2 of a fisheye", &made, &options, "p2, fisheye, 0.1, image_undistorter");
     let long = format!("\"{}\"", "b".repeat(5000));
     let made = Made::transforms(|json| set(json, "/frames/1/file_path", &long));
     refused("long", &made, &options, "frames[1].file_path, 4 KiB");

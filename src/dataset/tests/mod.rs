@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod formats;
+mod lenses;
 mod shared;
 pub(crate) mod write;
 pub(crate) use shared::shared;

@@ -63,7 +63,7 @@ impl Inputs<'_> {
     /// What of the training images stays on a GPU.
     fn kept_photographs(&self, setting: &RunSize) -> KeptPhotographs {
         let train = &self.dataset.train;
-        let with_masks = train.iter().any(|view| view.source.mask.is_some());
+        let with_masks = train.iter().any(|view| view.source.is_masked());
         let one = KeptPhotographs::bytes(self.dataset.largest_image(), with_masks);
         let count = setting.images_on_gpu / one.iter().sum::<u64>().max(1);
         let count = usize::try_from(count).unwrap_or(usize::MAX);

@@ -14,7 +14,8 @@ use serde::{Deserialize, Serialize};
 use super::PREFIX;
 use crate::camera::Camera;
 use crate::dataset::images::{Image8, ImageHeader, ImageSource, SourceFile};
-use crate::dataset::prepare::{assemble, target_size};
+use crate::dataset::photographs::{Photograph, target_size};
+use crate::dataset::prepare::assemble;
 use crate::dataset::tracks::TrackSampler;
 use crate::dataset::{self, Dataset, DatasetError, LoadOptions, PointCloud, View};
 use scene_cache::Entry;
@@ -104,16 +105,18 @@ fn dataset(
     Rendered { about, frames, points }: Rendered,
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
-    let mut views: Vec<(View, bool, Option<u32>)> = (0..)
+    let mut photographs: Vec<Photograph> = (0..)
         .zip(&about.views)
         .zip(frames)
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
             let held_out = view.split == densify_scenegen::Split::Test;
-            (dataset_view(&view.name, camera, frame, options), held_out, Some(number))
+            let views = vec![dataset_view(&view.name, camera, frame, options)];
+            Photograph { views, hidden: Vec::new(), held_out, id: Some(number) }
         })
         .collect();
-    views.sort_by(|a, b| a.0.name.as_bytes().cmp(b.0.name.as_bytes()));
+    let name = |photograph: &Photograph| photograph.views[0].name.clone();
+    photographs.sort_by_cached_key(name);
     let mut sampler = TrackSampler::new();
     let found = points.positions.iter().zip(&points.colours);
     for ((&position, &colour), seen_by) in found.zip(&points.seen_by) {
@@ -129,7 +132,7 @@ fn dataset(
         notes: about.notes,
         ..dataset::Scene::default()
     };
-    assemble(path, views, read, options)
+    assemble(path, photographs, read, options)
 }
 
 /// The trainer's camera of a rendered view.
@@ -166,7 +169,8 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
         decoded_bytes: image.bytes(),
         file_bytes: 0,
     };
-    let (width, height) = target_size(&header, options.resolution, false);
+    let (width, height) =
+        target_size((header.width, header.height), header.width, options.resolution, false);
     View {
         name: format!("{name}.png"),
         camera: camera.resized(width, height),

@@ -1,0 +1,36 @@
+//! COLMAP's cameras: a lens model, a size and the model's parameters.
+
+use std::path::Path;
+
+use glam::DVec2;
+
+use super::super::error::DatasetError;
+use super::super::lens::table::LensModel;
+use super::super::lens::{Distortion, Lens};
+use super::super::pose::check_lens;
+use super::REMEDY;
+
+/// The lens of a camera of this model and size, checked. `next` reads its parameters, one after the other.
+pub(super) fn lens(
+    model: &LensModel,
+    file: &Path,
+    camera: &str,
+    [width, height]: [u64; 2],
+    mut next: impl FnMut() -> Result<f64, DatasetError>,
+) -> Result<Lens, DatasetError> {
+    let side = |side: u64| u32::try_from(side).ok().filter(|&side| side > 0);
+    let (Some(width), Some(height)) = (side(width), side(height)) else {
+        let problem = format!("the size {width}x{height} px is impossible");
+        return Err(DatasetError::malformed(file, camera, problem, REMEDY));
+    };
+    let fx = next()?;
+    let fy = if model.focals == 2 { next()? } else { fx };
+    let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(next()?, next()?));
+    let mut distortion = Distortion::of(model.plane);
+    for &term in model.terms {
+        distortion.set(term, next()?);
+    }
+    let lens = Lens::new((width, height), focal, principal, distortion);
+    check_lens(file, camera, &lens)?;
+    Ok(lens)
+}

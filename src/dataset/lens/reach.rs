@@ -1,0 +1,165 @@
+//! How far from the centre a distortion provably has an inverse.
+//!
+//! A map whose Jacobian has a positive definite symmetric part all over a disc never takes two points of it
+//! to one: along the way from one to the other, what the map gains in that direction grows. The radial part
+//! has the eigenvalues q and (r·q)′ on a circle of radius r, q being its factor; the tangential and the
+//! thin-prism terms take at most 6|p|·r and 2|s|·r from them. So the distortion is invertible up to the first
+//! radius where the smaller of the two no longer exceeds that.
+//!
+//! With q = N/M, polynomials in s = r², this says that M, N − t·M and (N + 2sN′)·M − 2s·N·M′ − t·M² are
+//! positive. Each is bounded from below on whole intervals, so that nothing between samples is missed: after
+//! a shift to the interval's start a polynomial is at least its first coefficient and all negative terms at
+//! the interval's end.
+
+use super::Distortion;
+
+/// Least eigenvalue accepted: where a lens shrinks its image a thousand times, nothing is seen.
+const LEAST: f64 = 1e-3;
+/// Smallest step of the search, as a fraction of its range: a thousandth of a pixel where an image spans it.
+const FINEST: f64 = 1e-8;
+
+impl Distortion {
+    /// Radius on the plane, at most `limit`, up to which the distortion provably has an inverse.
+    pub(super) fn reach(&self, limit: f64) -> f64 {
+        let end = limit * limit;
+        let (mut from, mut step) = (0.0, end);
+        while from < end {
+            let to = (from + step).min(end);
+            if self.is_monotone(from, to) {
+                from = to;
+                step *= 2.0;
+            } else if step > FINEST * end {
+                step *= 0.5;
+            } else {
+                break;
+            }
+        }
+        from.sqrt()
+    }
+
+    /// Whether the distortion is monotone where r² is between `from` and `to`.
+    fn is_monotone(&self, from: f64, to: f64) -> bool {
+        let length = |[a, b]: [f64; 2]| a.hypot(b);
+        let taken = (6.0 * length(self.tangential) + 2.0 * length(self.prism)) * to.sqrt() + LEAST;
+        let with_one = |terms: &[f64]| std::iter::once(1.0).chain(terms.iter().copied()).collect();
+        let (n, m): (Vec<f64>, Vec<f64>) = (with_one(&self.radial), with_one(&self.denominator));
+        let less = |mut a: Vec<f64>, b: &[f64]| -> Vec<f64> {
+            a.resize(a.len().max(b.len()), 0.0);
+            for (sum, value) in a.iter_mut().zip(b) {
+                *sum -= taken * value;
+            }
+            a
+        };
+        // 2s·P′ has the coefficients 2k·c.
+        let twice = |p: &[f64]| -> Vec<f64> {
+            (0..).zip(p).map(|(power, c)| 2.0 * f64::from(power) * c).collect()
+        };
+        let grows: Vec<f64> = n.iter().zip(twice(&n)).map(|(a, b)| a + b).collect();
+        let mut slope = product(&grows, &m);
+        for (sum, value) in slope.iter_mut().zip(product(&n, &twice(&m))) {
+            *sum -= value;
+        }
+        let factor = less(n, &m);
+        let slope = less(slope, &product(&m, &m));
+        [m, factor, slope].iter().all(|p| lowest(p, from, to) > 0.0)
+    }
+}
+
+fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
+    let mut product = vec![0.0; a.len() + b.len() - 1];
+    for (i, x) in a.iter().enumerate() {
+        for (j, y) in b.iter().enumerate() {
+            product[i + j] += x * y;
+        }
+    }
+    product
+}
+
+/// A lower bound of a polynomial, lowest coefficient first, on an interval; NaN where it is not finite.
+fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
+    // Horner's scheme, repeated, shifts it: the coefficients of P(from + x).
+    let mut shifted = polynomial.to_vec();
+    for done in 0..shifted.len() {
+        for power in (done..shifted.len() - 1).rev() {
+            shifted[power] += from * shifted[power + 1];
+        }
+    }
+    let length = to - from;
+    let (mut bound, mut power) = (0.0, 1.0);
+    for (place, &coefficient) in shifted.iter().enumerate() {
+        // The first counts whatever its sign; `min` would hide NaN.
+        let least = if place > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
+        bound += least * power;
+        power *= length;
+    }
+    bound
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::lens::Plane;
+
+    #[test]
+    fn bounds_are_below_all_values_and_tight_on_short_intervals() {
+        let p = [1.0, -3.0, 0.5, 0.25, -0.1];
+        let value = |x: f64| p.iter().rev().fold(0.0, |sum, c| sum * x + c);
+        for from in [0.0, 0.7, 2.0] {
+            for length in [1.0, 0.1, 1e-4] {
+                let bound = lowest(&p, from, from + length);
+                let values = (0..=100).map(|i| value(from + length * f64::from(i) / 100.0));
+                let least = values.fold(f64::INFINITY, f64::min);
+                assert!(bound <= least + 1e-12 && bound > least - 10.0 * length, "{from} {length}");
+            }
+        }
+        assert!(lowest(&[1.0, f64::NAN], 0.0, 1.0).is_nan());
+    }
+
+    #[test]
+    fn the_reach_is_where_the_radial_part_turns_round() {
+        let reach = |radial: [f64; 4], denominator: [f64; 3]| {
+            let plain = Distortion::of(Plane::Perspective);
+            Distortion { radial, denominator, ..plain }.reach(10.0)
+        };
+        assert!((reach([0.0; 4], [0.0; 3]) - 10.0).abs() < 1e-12);
+        assert!((reach([0.3, 0.1, 0.0, 0.0], [0.2, 0.0, 0.0]) - 10.0).abs() < 1e-12);
+        // r + k r³ turns round at r² = −1/(3k).
+        let turns = reach([-0.2, 0.0, 0.0, 0.0], [0.0; 3]);
+        assert!((turns - (1.0 / 0.6_f64).sqrt()).abs() < 2e-3, "{turns}");
+        // r / (1 + k r²) turns round at r² = 1/k; a pole ends it too.
+        let turns = reach([0.0; 4], [0.5, 0.0, 0.0]);
+        assert!((turns - 2.0_f64.sqrt()).abs() < 5e-3, "{turns}");
+        let pole = reach([0.0; 4], [-0.25, 0.0, 0.0]);
+        assert!(pole < 2.0 && pole > 1.99, "{pole}");
+        for bad in [f64::NAN, f64::INFINITY, -f64::MAX] {
+            assert!(reach([bad, 0.0, 0.0, 0.0], [0.0; 3]) < 0.01, "{bad}");
+        }
+    }
+
+    /// Within the reach the Jacobian has a positive definite symmetric part everywhere.
+    #[test]
+    fn what_is_proven_holds() {
+        let plain = Distortion::of(Plane::Perspective);
+        let tangential = Distortion { tangential: [0.03, -0.02], prism: [0.01, 0.04], ..plain };
+        for distortion in [
+            tangential,
+            Distortion { radial: [-0.1, 0.02, -0.003, 0.0], ..tangential },
+            Distortion {
+                radial: [0.3, 0.0, 0.0, 0.0],
+                denominator: [0.2, 0.05, 0.0],
+                ..tangential
+            },
+        ] {
+            let reach = distortion.reach(3.0);
+            assert!(reach > 0.5, "{distortion:?}: {reach}");
+            for (i, j) in (0..=60).flat_map(|i| (0..72).map(move |j| (i, j))) {
+                let (r, turn) = (reach * f64::from(i) / 60.0, f64::from(j) / 72.0);
+                let p = r * glam::DVec2::from_angle(std::f64::consts::TAU * turn);
+                let j = distortion.jacobian(p);
+                let (a, b, c) = (j.x_axis.x, 0.5 * (j.x_axis.y + j.y_axis.x), j.y_axis.y);
+                let least = 0.5 * (a + c) - (0.25 * (a - c) * (a - c) + b * b).sqrt();
+                assert!(least > 0.0, "{distortion:?} at {p}: {least}");
+            }
+        }
+    }
+}
