@@ -13,6 +13,7 @@ mod ssim;
 
 pub use flip::flip;
 pub use psnr::psnr;
+pub(crate) use psnr::psnr_between;
 pub use ssim::ssim;
 
 use std::ops::Range;
