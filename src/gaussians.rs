@@ -92,6 +92,49 @@ impl Gaussians {
         }
     }
 
+    /// The same model with another degree: higher bands are dropped, new ones are zero.
+    #[must_use]
+    pub fn with_degree(mut self, sh_degree: u8) -> Self {
+        if sh_degree != self.sh_degree {
+            let [old, new] = [self.sh_degree, sh_degree].map(|degree| 3 * sh_coefficients(degree));
+            let mut sh = vec![0.0; self.len() * new];
+            for (to, from) in sh.chunks_exact_mut(new).zip(self.sh.chunks_exact(old)) {
+                to[..old.min(new)].copy_from_slice(&from[..old.min(new)]);
+            }
+            (self.sh, self.sh_degree) = (sh, sh_degree);
+        }
+        self
+    }
+
+    /// Appends the rows of another model of the same degree.
+    ///
+    /// # Panics
+    /// When the degrees differ.
+    pub fn append(&mut self, mut other: Self) {
+        assert_eq!(self.sh_degree, other.sh_degree, "degrees of models that are joined");
+        self.means.append(&mut other.means);
+        self.log_scales.append(&mut other.log_scales);
+        self.quats.append(&mut other.quats);
+        self.opacity_logits.append(&mut other.opacity_logits);
+        self.sh.append(&mut other.sh);
+    }
+
+    /// These rows, in this order.
+    ///
+    /// # Panics
+    /// When there is no such row.
+    #[must_use]
+    pub fn gather(&self, rows: &[usize]) -> Self {
+        Self {
+            sh_degree: self.sh_degree,
+            means: rows.iter().map(|&row| self.means[row]).collect(),
+            log_scales: rows.iter().map(|&row| self.log_scales[row]).collect(),
+            quats: rows.iter().map(|&row| self.quats[row]).collect(),
+            opacity_logits: rows.iter().map(|&row| self.opacity_logits[row]).collect(),
+            sh: rows.iter().flat_map(|&row| self.sh_of(row)).copied().collect(),
+        }
+    }
+
     /// Number of rows.
     #[must_use]
     pub fn len(&self) -> usize {

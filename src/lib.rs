@@ -24,8 +24,9 @@
 //! # }
 //! ```
 //!
-//! Features, all on by default: `gpu` (the GPU backend), `scenegen` (built-in scenes and known surfaces),
-//! `selftest` (the float64 renderer and the command that compares with it), `study` (`compare` and `trade`).
+//! Features, all on by default: `formats` (models in other formats than PLY), `gpu` (the GPU backend),
+//! `scenegen` (built-in scenes and known surfaces), `selftest` (the float64 renderer and the command
+//! that compares with it), `study` (`compare` and `trade`).
 
 mod animation;
 pub mod backend;

@@ -101,7 +101,7 @@ enum Command {
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
     Eval(eval::EvalArgs),
-    Export(export::ExportArgs),
+    Export(Box<export::ExportArgs>),
     Render(Box<render::RenderArgs>),
     Compare(study::Comparison),
     Devices(devices::DevicesArgs),
@@ -144,7 +144,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Train(train) => train::run(&train, given, &console),
         Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
-        Command::Export(export) => export::run(&export, &console),
+        Command::Export(export) => export::run(&export, given, &console),
         Command::Render(render) => render::run(&render, given, &console),
         Command::Compare(comparison) => study::compare(&comparison, &console),
         Command::Devices(devices) => devices::run(&devices, &console),
@@ -165,7 +165,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
 
 /// The command line, with the defaults of a run's options in the commands that have them.
 fn command() -> clap::Command {
-    const WITH_RUN_OPTIONS: [&str; 5] = ["train", "plan", "eval", "render", "selftest"];
+    const WITH_RUN_OPTIONS: [&str; 6] = ["train", "plan", "eval", "export", "render", "selftest"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
         command.mut_subcommand(name, flags::with_defaults)
     })

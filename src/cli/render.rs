@@ -23,7 +23,7 @@ use crate::views::ViewSource;
 
 /// Renders a trained scene to PNG files.
 ///
-/// Renders the views held out, or those trained on, of a run or of any .ply of Gaussian splats
+/// Renders the views held out, or those trained on, of a run or of any file of Gaussian splats
 /// (which needs --scene for the cameras); or with --path a flight through the scene, and a film of it.
 ///
 /// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
@@ -32,9 +32,10 @@ use crate::views::ViewSource;
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct RenderArgs {
-    /// Folder that `densify train` wrote, or a .ply of Gaussian splats
+    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
-    /// Folder of the dataset: needed for a .ply, and for a run whose dataset has moved
+    /// Folder of the dataset: needed for a file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Folder for the pictures
@@ -57,7 +58,7 @@ pub(super) struct RenderArgs {
     side_by_side: bool,
     #[command(flatten)]
     film: FilmArgs,
-    /// Nearest distance to a camera at which anything of a .ply is drawn, as a fraction of the
+    /// Nearest distance to a camera at which anything of a file is drawn, as a fraction of the
     /// scene's extent
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
     near: Fraction,
@@ -68,13 +69,13 @@ pub(super) struct RenderArgs {
 }
 
 const EXAMPLES: &str = "\
-Options under Scene are for a .ply; a run brings its own.
+Options under Scene are for a file; a run brings its own.
 
 Examples:
   densify render output/garden-diet -o pictures --side-by-side
   densify render output/garden-diet -o frames --path orbit --video orbit.mp4
   densify render output/garden-diet -o frames --path camera_path.json --size 1920x1080
-  densify render others.ply --scene data/garden --eval -o pictures --depth";
+  densify render others.spz --scene data/garden --eval -o pictures --depth";
 
 pub(super) fn run(
     args: &RenderArgs,
@@ -164,8 +165,13 @@ pub(super) fn write_pictures(
     Ok(())
 }
 
+/// Whether a path is a model by itself: a file, or a folder of SOG.
+pub(super) fn is_model(path: &Path) -> bool {
+    path.is_file() || path.join("meta.json").is_file()
+}
+
 /// Fails where an option was given that a run brings itself.
-fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failure> {
+pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failure> {
     let scene = DataSpec::augment_args(clap::Command::new("scene"));
     let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
     let given = names
@@ -174,7 +180,7 @@ fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failure> {
     match given {
         None => Ok(()),
         Some(name) => Err(Failure::input(format!(
-            "--{} is for a .ply; a run brings its own, so leave it out",
+            "--{} is for a file with --scene; a run brings its own, so leave it out",
             name.replace('_', "-")
         ))),
     }
@@ -185,11 +191,11 @@ fn open_model(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<Opened, Failure> {
-    if !args.model.is_file() {
+    if !is_model(&args.model) {
         refuse_options_of_a_file(matches)?;
     }
     let machine = Machine::open(&args.device, console)?;
-    if !args.model.is_file() {
+    if !is_model(&args.model) {
         RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;
         let moved_to = args.scene.clone();

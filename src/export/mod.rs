@@ -4,7 +4,16 @@
 //! [`Format`] as `ply.rs` does, and its `mod` line below. The command line, the trainer and the
 //! memory ledger know formats only through this module.
 
+#[cfg(feature = "formats")]
+mod compressed_ply;
+#[cfg(feature = "formats")]
+mod glb;
+mod order;
 mod ply;
+#[cfg(feature = "formats")]
+mod sog;
+#[cfg(feature = "formats")]
+mod spz;
 
 use std::io::{self, Write};
 use std::ops::Range;
@@ -36,6 +45,12 @@ pub trait ModelWriter {
     /// Most memory that the writer takes at any time beside the piece it is given `[bytes]`. Part
     /// of what a run promises, so it must hold for every model of this shape.
     fn held_bytes(&self, shape: Shape) -> u64;
+
+    /// Whether rows that lie near each other in space should come one after the other, as what the format packs
+    /// together is to be alike. Rows then change their order in the file.
+    fn is_for_neighbours(&self) -> bool {
+        false
+    }
 
     /// Writes what comes before the rows.
     ///
@@ -122,14 +137,22 @@ impl Format {
         (self.writer)().held_bytes(shape)
     }
 
-    /// Writes a model that is in memory as a whole.
+    /// Writes a model that is in memory as a whole, in the order that suits the format.
     ///
     /// # Errors
     /// Those of [`ModelWriter`].
     pub fn write(&self, model: &Gaussians, out: &mut dyn Write) -> io::Result<()> {
         let mut writer = (self.writer)();
         writer.begin(Shape { rows: model.len(), sh_degree: model.sh_degree }, out)?;
-        writer.rows(model, out)?;
+        match writer.is_for_neighbours() {
+            false => writer.rows(model, out)?,
+            true => {
+                let order = order::along_a_curve(model);
+                for piece in pieces(model.len()) {
+                    writer.rows(&model.gather(&order[piece]), out)?;
+                }
+            }
+        }
         writer.finish(out)
     }
 
@@ -153,6 +176,17 @@ impl Format {
             Ok(writer.finish(out)?)
         })
     }
+}
+
+/// The index of a quaternion's largest component and, in order, the three others, where it has length 1 and that
+/// component is positive.
+#[cfg(feature = "formats")]
+fn smallest_three(quat: [f32; 4]) -> (usize, [f32; 3]) {
+    let largest = (1..4).fold(0, |most, i| if quat[i].abs() > quat[most].abs() { i } else { most });
+    let length = quat.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+    let unit = 1.0f32.copysign(quat[largest]) / length;
+    let mut others = (0..4).filter(|&i| i != largest).map(|i| quat[i] * unit);
+    (largest, std::array::from_fn(|_| others.next().unwrap_or_default()))
 }
 
 #[cfg(test)]

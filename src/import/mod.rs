@@ -1,9 +1,31 @@
-//! Readers of models and points by other programs, one folder per format.
+//! Readers of models and points by other programs, one file or folder per format.
+//!
+//! [`read_model`] recognises a format by its content. What a file says of its own size is never believed: the
+//! bytes are there before anything is allocated for them, and what is compressed may unfold so far and no further
+//! ([`model::largest`]).
 
+#[cfg(feature = "formats")]
+mod beside;
+#[cfg(feature = "formats")]
+pub(crate) mod gltf;
+mod model;
 pub mod ply;
+#[cfg(feature = "formats")]
+pub(crate) mod sog;
+#[cfg(feature = "formats")]
+mod splat;
+#[cfg(feature = "formats")]
+pub(crate) mod spz;
+#[cfg(feature = "formats")]
+mod turn;
+#[cfg(feature = "formats")]
+mod unfold;
+#[cfg(feature = "formats")]
+mod zip;
 
 use glam::DVec3;
 
+pub use model::{SplatFile, read_model};
 /// A coloured point cloud in structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
@@ -35,3 +57,7 @@ impl PointCloud {
         before - self.positions.len()
     }
 }
+
+#[cfg(all(test, feature = "formats"))]
+#[allow(clippy::float_cmp, reason = "results are exact")]
+mod tests;

@@ -8,7 +8,7 @@ const BITS: u32 = 10;
 
 /// Where on the curve a point lies. Coordinates are squeezed into (−1, 1), so that no bounds are needed
 /// and outliers spoil nothing; the scene's extent is about 1.
-pub(super) fn place(point: [f64; 3]) -> u32 {
+pub(crate) fn place(point: [f64; 3]) -> u32 {
     let [x, y, z] = point.map(|x| {
         let squeezed = x / (1.0 + x.abs());
         // What is not finite is 0.

@@ -4,7 +4,7 @@
 //! mean square distance to the 3 nearest neighbours, opacity 0.1, colour in band 0. All in f64 and
 //! relative to the scene's size, so that remote and tiny scenes lose no precision.
 
-mod curve;
+pub(crate) mod curve;
 mod random;
 
 use densify_policies::neighbours::Neighbours;

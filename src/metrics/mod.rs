@@ -15,6 +15,7 @@ mod ssim;
 pub use flip::flip;
 pub use lpips::{Lpips, LpipsError, Network};
 pub use psnr::psnr;
+pub(crate) use psnr::psnr_between;
 pub use ssim::ssim;
 
 use std::ops::Range;

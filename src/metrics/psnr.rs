@@ -22,6 +22,15 @@ pub fn psnr(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
     Ok(0.0 - 10.0 * (squared / (3.0 * weight)).log10())
 }
 
+/// PSNR `[dB]` of two renders of one view, both clamped to `[0, 1]`; infinite when they are equal.
+#[must_use]
+pub(crate) fn psnr_between(a: &[f32], b: &[f32]) -> f64 {
+    assert_eq!(a.len(), b.len(), "renders of one view");
+    let value = |v: f32| f64::from(v.clamp(0.0, 1.0));
+    let squares = a.iter().zip(b).map(|(a, b)| (value(*a) - value(*b)).powi(2)).sum::<f64>();
+    0.0 - 10.0 * (squares / a.len() as f64).log10()
+}
+
 /// Weighted squared error and weight of one row of pixels.
 fn row(pair: &Pair<'_>, y: usize) -> [f64; 2] {
     let mut sum = [0.0; 2];
@@ -52,6 +61,12 @@ mod tests {
             let measured = psnr(&[value; 105], &black, [0.0; 3]).unwrap();
             assert!((measured - expected).abs() < 1e-6, "{value}: {measured} for {expected}");
         }
+    }
+
+    #[test]
+    fn renders_are_compared_as_they_are_shown() {
+        assert!((psnr_between(&[0.5, 0.1], &[0.4, 0.2]) - 20.0).abs() < 1e-5);
+        assert_eq!(psnr_between(&[1.5, 0.1], &[1.0, 0.1]), f64::INFINITY);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use crate::dataset::{Dataset, View, builtin};
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
-use crate::import::ply::read_splats;
+use crate::import;
 use crate::metrics::geometry::{self, Geometry, KnownScene};
 use crate::output::{model_path, saved_iterations};
 use crate::views::DatasetViews;
@@ -30,6 +30,35 @@ impl Machine {
         observer.say(format_args!("device   {}", device.describe()));
         use_threads(spec.threads);
         Ok(Self { threads: spec.threads.map(|threads| threads.0 as usize), device })
+    }
+
+    /// A backend with a model in the dataset's own coordinates, to render its views. `near` is a distance
+    /// `[scene units]`.
+    pub(crate) fn backend(
+        &self,
+        dataset: &Dataset,
+        model: Gaussians,
+        near: f32,
+    ) -> Result<Box<dyn Backend>, Failure> {
+        self.backend_for(dataset, model, near, Needs::default())
+    }
+
+    fn backend_for(
+        &self,
+        dataset: &Dataset,
+        model: Gaussians,
+        near: f32,
+        needs: Needs,
+    ) -> Result<Box<dyn Backend>, Failure> {
+        let model = dataset.normalisation.model_from_world(model);
+        let options = Setup {
+            near,
+            threads: self.threads,
+            largest_image: dataset.largest_image(),
+            needs,
+            ..Setup::new(model.len().max(1))
+        };
+        Ok(self.device.backend(&model, &options)?)
     }
 }
 
@@ -93,16 +122,11 @@ pub(crate) fn open(
     observer: &dyn Observer,
 ) -> Result<Opened, Failure> {
     let dataset = load(dataset, &data, observer)?;
-    let model = dataset.normalisation.model_from_world(read_model(model, observer)?);
-    let options = Setup {
-        near: (near * dataset.extent()) as f32,
-        threads: machine.threads,
-        largest_image: dataset.largest_image(),
-        needs,
-        ..Setup::new(model.len().max(1))
-    };
-    let backend = machine.device.backend(&model, &options)?;
-    Ok(Opened { sh_degree: model.sh_degree, backend, dataset, data })
+    let model = read_model(model, observer)?;
+    let sh_degree = model.sh_degree;
+    let near = (near * dataset.extent()) as f32;
+    let backend = machine.backend_for(&dataset, model, near, needs)?;
+    Ok(Opened { sh_degree, backend, dataset, data })
 }
 
 /// Reads the dataset at `path`; says what there is to say.
@@ -118,9 +142,9 @@ pub(crate) fn load(
     Ok(dataset)
 }
 
-/// Reads a .ply of Gaussian splats by any program, in its own coordinates; says what was wrong with it.
+/// Reads a file of Gaussian splats by any program, in its own coordinates; says what was wrong with it.
 pub(crate) fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
-    let file = read_splats(path)?;
+    let file = import::read_model(path)?;
     for (number, what) in [
         (file.dropped, "left out: a value is not finite"),
         (file.repaired, "with a zero quaternion, read as unrotated"),
@@ -157,16 +181,21 @@ impl Opened {
 
     /// The views of a split.
     pub(crate) fn views(&self, split: Split) -> Result<DatasetViews, Failure> {
-        let views: &[View] = match split {
-            Split::Train => &self.dataset.train,
-            Split::Test => &self.dataset.test,
-        };
-        if views.is_empty() {
-            return Err(Failure::input(
-                "no view was held out (a run holds views out with --eval or --test-every K); \
-                 use --split train",
-            ));
-        }
-        Ok(DatasetViews::new(views.to_vec(), 0, 1))
+        views_of(&self.dataset, split)
     }
+}
+
+/// The views of a split of a dataset.
+pub(crate) fn views_of(dataset: &Dataset, split: Split) -> Result<DatasetViews, Failure> {
+    let views: &[View] = match split {
+        Split::Train => &dataset.train,
+        Split::Test => &dataset.test,
+    };
+    if views.is_empty() {
+        return Err(Failure::input(
+            "no view was held out (a run holds views out with --eval or --test-every K); \
+             use --split train",
+        ));
+    }
+    Ok(DatasetViews::new(views.to_vec(), 0, 1))
 }

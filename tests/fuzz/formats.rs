@@ -11,7 +11,8 @@ use densify::backend::Setup;
 use densify::backend::cpu::CpuBackend;
 use densify::checkpoint::Checkpoint;
 use densify::dataset::{Dataset, LoadOptions};
-use densify::import::ply::{read_points, read_splats};
+use densify::import::ply::read_points;
+use densify::import::read_model;
 use densify::run::RunConfig;
 use densify_scenegen::{Options, PointOptions, Scene, Source};
 
@@ -19,7 +20,7 @@ use densify_scenegen::{Options, PointOptions, Scene, Source};
 pub type Format = (&'static str, fn(&[u8]) -> bool);
 
 /// All of them. The names are those of the fuzz targets in `Cargo.toml` and of the corpora's folders.
-pub const FORMATS: [Format; 10] = [
+pub const FORMATS: [Format; 15] = [
     ("colmap_bin", colmap_bin),
     ("colmap_txt", colmap_txt),
     ("transforms", transforms),
@@ -30,6 +31,11 @@ pub const FORMATS: [Format; 10] = [
     ("checkpoint", checkpoint),
     ("config", config),
     ("image", image),
+    ("spz", spz),
+    ("sog", sog),
+    ("sog_folder", sog_folder),
+    ("splat", splat),
+    ("splat_glb", splat_glb),
 ];
 
 /// Reads bytes as a file of a format.
@@ -76,19 +82,56 @@ fn image(bytes: &[u8]) -> bool {
     dataset(&[("transforms.json", listing), ("images/0.png", bytes), ("images/1.png", bytes)])
 }
 
-/// A PLY file, as a model and as a cloud of points.
+/// A PLY file, as a model, compressed or not, and as a cloud of points.
 fn ply(bytes: &[u8]) -> bool {
     within(&[("model.ply", bytes)], |folder| {
         let path = folder.join("model.ply");
-        let model = read_splats(&path);
-        if let Ok(file) = &model {
-            assert_eq!(file.gaussians.opacity_logits.len(), file.gaussians.len());
-        }
+        let model = model(&path);
         let points = read_points(&path);
         if let Ok(points) = &points {
             assert_eq!(points.colours.len(), points.positions.len());
         }
-        model.is_ok() || points.is_ok()
+        model || points.is_ok()
+    })
+}
+
+/// SPZ of any version.
+fn spz(bytes: &[u8]) -> bool {
+    within(&[("model.spz", bytes)], |folder| model(&folder.join("model.spz")))
+}
+
+/// SOG as an archive.
+fn sog(bytes: &[u8]) -> bool {
+    within(&[("model.sog", bytes)], |folder| model(&folder.join("model.sog")))
+}
+
+/// SOG as `meta.json` and its pictures.
+fn sog_folder(bytes: &[u8]) -> bool {
+    let names =
+        ["meta.json", "means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"];
+    let names = names.into_iter().chain(["shN_centroids.webp", "shN_labels.webp"]);
+    let files: Vec<_> = names.zip(split(bytes)).collect();
+    within(&files, model)
+}
+
+/// `.splat`.
+fn splat(bytes: &[u8]) -> bool {
+    within(&[("model.splat", bytes)], |folder| model(&folder.join("model.splat")))
+}
+
+/// A glTF file of splats, binary or text.
+fn splat_glb(bytes: &[u8]) -> bool {
+    within(&[("model.glb", bytes)], |folder| model(&folder.join("model.glb")))
+}
+
+fn model(path: &Path) -> bool {
+    read_model(path).is_ok_and(|file| {
+        let model = file.gaussians;
+        let coefficients = 3 * (usize::from(model.sh_degree) + 1).pow(2);
+        assert_eq!(model.opacity_logits.len(), model.len());
+        assert_eq!(model.sh.len(), coefficients * model.len());
+        assert!(model.means.iter().flatten().all(|v| v.is_finite()));
+        true
     })
 }
 

@@ -4,23 +4,23 @@
 //! unknown properties are skipped. Nothing is allocated from a declared count alone.
 
 mod header;
+#[cfg(feature = "formats")]
+pub(crate) mod packed;
 mod points;
 mod rows;
 mod splats;
 
-use std::fmt::Display;
 use std::path::Path;
 
+use super::model::malformed;
 use crate::dataset::DatasetError;
 
+#[cfg(feature = "formats")]
+pub(super) use packed::read_packed;
 pub use points::read_points;
+pub(super) use splats::is_packed;
+pub use splats::read_splats;
 pub(crate) use splats::splat_properties;
-pub use splats::{SplatFile, read_splats};
-
-/// The file contradicts the format at a line, an element or a property.
-fn malformed(path: &Path, field: impl Display, problem: impl Display) -> DatasetError {
-    DatasetError::malformed(path, field, problem, "export the file again")
-}
 
 /// The vertices lack a property that the purpose needs.
 fn missing(path: &Path, property: &str, remedy: &str) -> DatasetError {

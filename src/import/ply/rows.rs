@@ -20,6 +20,8 @@ pub(super) struct Ply<'a> {
     pub(super) header: Header,
     /// Bytes of data.
     data: u64,
+    /// Elements that have been read or skipped.
+    passed: usize,
 }
 
 impl<'a> Ply<'a> {
@@ -29,7 +31,7 @@ impl<'a> Ply<'a> {
         let mut input = BufReader::with_capacity(1 << 16, file);
         let header = Header::read(path, &mut input)?;
         let data = length.saturating_sub(header.length);
-        Ok(Self { path, input, header, data })
+        Ok(Self { path, input, header, data, passed: 0 })
     }
 
     /// The element of this name.
@@ -39,7 +41,7 @@ impl<'a> Ply<'a> {
     }
 
     /// Calls `each` with the values of `columns` for every row of `wanted`, after skipping the
-    /// elements before it.
+    /// elements before it. Of several, that which is first in the file must be read first.
     pub(super) fn each_row(
         &mut self,
         wanted: &Element,
@@ -47,10 +49,13 @@ impl<'a> Ply<'a> {
         mut each: impl FnMut(&[f64]),
     ) -> Result<(), DatasetError> {
         let elements = std::mem::take(&mut self.header.elements);
-        for element in elements.iter().take_while(|element| element.name != wanted.name) {
+        let place = elements.iter().position(|element| element.name == wanted.name);
+        let skipped = elements.get(self.passed..place.unwrap_or(0)).unwrap_or_default();
+        for element in skipped {
             self.rows(element, &[], &mut |_| ())?;
         }
         self.rows(wanted, columns, &mut each)?;
+        self.passed += skipped.len() + 1;
         self.header.elements = elements;
         Ok(())
     }

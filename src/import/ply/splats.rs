@@ -8,41 +8,17 @@ use super::header::Element;
 use super::rows::Ply;
 use super::{malformed, missing};
 use crate::dataset::DatasetError;
-use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients};
-
-/// Fraction of the rows that may be unusable.
-const MAX_BAD_ROWS: f64 = 0.01;
-/// Squared length below which a quaternion counts as zero: 1e-6 of a unit quaternion.
-const ZERO_QUATERNION: f32 = 1e-12;
-
-/// A model read from a file, and what was wrong with the file.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SplatFile {
-    /// The rows, in the file's order and coordinates, bit for bit.
-    pub gaussians: Gaussians,
-    /// Rows dropped because a value was not finite.
-    pub dropped: usize,
-    /// Rows whose zero quaternion was replaced by the identity.
-    pub repaired: usize,
-}
+use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
+use crate::import::SplatFile;
+use crate::import::model::{Row, Rows};
 
 /// Reads a splat PLY by any program that keeps the original property names.
 ///
 /// # Errors
-/// When the file is unreadable or contradicts itself, a property is missing, the layout is the
-/// compressed one, or more than 1 % of the rows are not finite.
+/// When the file is unreadable or contradicts itself, a property is missing (as in the compressed
+/// layout, which [`read_model`](crate::import::read_model) reads), or more than 1 % of the rows are not finite.
 pub fn read_splats(path: &Path) -> Result<SplatFile, DatasetError> {
     let mut ply = Ply::open(path)?;
-    let packed = |element: &Element| {
-        element.name == "chunk" || element.properties.iter().any(|p| p.name == "packed_position")
-    };
-    if ply.header.elements.iter().any(packed) {
-        return Err(DatasetError(format!(
-            "{} is a compressed splat PLY (element chunk, packed properties), which densify does not read; \
-             export it as an uncompressed .ply, e.g. with SuperSplat or splat-transform",
-            path.display()
-        )));
-    }
     let vertices = ply.element("vertex")?;
     let sh_degree = sh_degree(path, &vertices)?;
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
@@ -50,27 +26,24 @@ pub fn read_splats(path: &Path) -> Result<SplatFile, DatasetError> {
         .map(|name| column(path, &vertices, &name))
         .collect::<Result<Vec<_>, _>>()?;
 
-    let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
-    let (mut total, mut dropped, mut repaired) = (0_usize, 0, 0);
+    let mut rows = Rows::new(sh_degree);
     let mut values = vec![0f32; columns.len()];
+    let mut sh = Vec::with_capacity(3 + rest);
     ply.each_row(&vertices, &columns, |row| {
-        total += 1;
         for (value, &wide) in values.iter_mut().zip(row) {
             *value = wide as f32;
         }
-        if values.iter().any(|value| !value.is_finite()) {
-            dropped += 1;
-            return;
-        }
-        repaired += usize::from(push(&mut gaussians, &values, rest));
+        push(&mut rows, &values, &mut sh, rest);
     })?;
-    if dropped as f64 > MAX_BAD_ROWS * total as f64 {
-        return Err(DatasetError(format!(
-            "{}: {dropped} of {total} rows are not finite, more than 1 %; the file is damaged: export it again",
-            path.display()
-        )));
-    }
-    Ok(SplatFile { gaussians, dropped, repaired })
+    rows.finish(path)
+}
+
+/// Whether the layout is the compressed one.
+pub(in crate::import) fn is_packed(path: &Path) -> Result<bool, DatasetError> {
+    let packed = |element: &Element| {
+        element.name == "chunk" || element.properties.iter().any(|p| p.name == "packed_position")
+    };
+    Ok(Ply::open(path)?.header.elements.iter().any(packed))
 }
 
 /// Names of the properties of a row, without the normals, in the order of [`push`].
@@ -91,24 +64,26 @@ pub(crate) fn splat_properties(sh_degree: u8) -> impl Iterator<Item = String> {
     .flatten()
 }
 
-/// Appends a row of [`splat_properties`]; says whether the quaternion had to be replaced.
-fn push(gaussians: &mut Gaussians, values: &[f32], rest: usize) -> bool {
+/// Takes a row of [`splat_properties`]. `sh` is scratch.
+fn push(rows: &mut Rows, values: &[f32], sh: &mut Vec<f32>, rest: usize) {
     let (position, values) = values.split_at(3);
     let (dc, values) = values.split_at(3);
     let (bands, values) = values.split_at(rest);
-    let &[opacity, s0, s1, s2, w, x, y, z] = values else {
+    let &[opacity_logit, s0, s1, s2, w, x, y, z] = values else {
         unreachable!("a row of the layout ends with 8 values, not {}", values.len())
     };
-    gaussians.means.push([position[0], position[1], position[2]]);
-    gaussians.sh.extend_from_slice(dc);
+    sh.clear();
+    sh.extend_from_slice(dc);
     for k in 0..rest / 3 {
-        gaussians.sh.extend([0, 1, 2].map(|channel| bands[channel * (rest / 3) + k]));
+        sh.extend([0, 1, 2].map(|channel| bands[channel * (rest / 3) + k]));
     }
-    gaussians.opacity_logits.push(opacity);
-    gaussians.log_scales.push([s0, s1, s2]);
-    let is_zero = w * w + x * x + y * y + z * z < ZERO_QUATERNION;
-    gaussians.quats.push(if is_zero { [1.0, 0.0, 0.0, 0.0] } else { [w, x, y, z] });
-    is_zero
+    rows.push(Row {
+        mean: [position[0], position[1], position[2]],
+        log_scale: [s0, s1, s2],
+        quat: [w, x, y, z],
+        opacity_logit,
+        sh,
+    });
 }
 
 fn column(path: &Path, vertices: &Element, name: &str) -> Result<usize, DatasetError> {
@@ -118,10 +93,15 @@ fn column(path: &Path, vertices: &Element, name: &str) -> Result<usize, DatasetE
 }
 
 fn sh_degree(path: &Path, vertices: &Element) -> Result<u8, DatasetError> {
-    let rest = vertices.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
-    let fits = |degree: &u8| 3 * (sh_coefficients(*degree) - 1) == rest;
-    (0..=MAX_SH_DEGREE).find(fits).ok_or_else(|| {
+    degree_of(vertices).map_err(|rest| {
         let problem = format!("there are {rest} of them, but degrees 0 to 3 have 0, 9, 24 or 45");
         malformed(path, "f_rest_*", problem)
     })
+}
+
+/// The degree for which an element has coefficients beyond band 0, or how many it has.
+pub(super) fn degree_of(element: &Element) -> Result<u8, usize> {
+    let rest = element.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
+    let fits = |degree: &u8| 3 * (sh_coefficients(*degree) - 1) == rest;
+    (0..=MAX_SH_DEGREE).find(fits).ok_or(rest)
 }

@@ -44,3 +44,43 @@ fn export_writes_the_model_of_a_run_or_a_file() {
     export(&run, &again, "--overwrite").ok();
     assert!(read(&again) == read(&newest));
 }
+
+#[test]
+fn every_format_is_written_compared_and_read_again() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 20, "--budget 320 --eval --quiet").ok();
+    let folder = root.path().join("all");
+    let flags = format!("--format all --scene {} --backend cpu", text(scene.path()));
+    let call_all = || call(&format!("export {} -o {} {flags}", text(&run), text(&folder)));
+    let outcome = call_all().ok();
+    let line = |name: &str| {
+        let found = outcome.stdout.lines().find(|line| line.starts_with(&format!("{name} ")));
+        found.unwrap_or_else(|| panic!("no line of {name}: {outcome:?}")).to_owned()
+    };
+    assert!(line("ply").ends_with("same") && line("glb").ends_with("same"), "{outcome:?}");
+    for name in ["compressed-ply", "spz", "sog"] {
+        let psnr: f64 = line(name).split_whitespace().last().unwrap().parse().unwrap();
+        // What the issue asks of trained scenes; this one has hardly begun.
+        assert!(psnr > 42.0, "{}", line(name));
+    }
+    let saved = read(&densify::output::model_path(&run, 20));
+    let name = run.file_name().unwrap().to_str().unwrap();
+    let at = |ending: &str| folder.join(format!("{name}.{ending}"));
+    assert!(read(&at("ply")) == saved);
+    let again = root.path().join("again.ply");
+    for ending in ["glb", "spz", "sog", "compressed.ply"] {
+        call(&format!("export {} -o {} --overwrite", text(&at(ending)), text(&again))).ok();
+        assert_eq!(read(&again).len(), saved.len(), "{ending}");
+        // What is cut short is refused by name, and nothing is written.
+        let whole = read(&at(ending));
+        let (cut, lost) = (root.path().join("cut"), root.path().join("lost.ply"));
+        std::fs::write(&cut, &whole[..whole.len() / 2]).unwrap();
+        let refused = call(&format!("export {} -o {}", text(&cut), text(&lost)));
+        refused.refused(ending, &["cut", "export the file again"]);
+        assert!(!lost.exists());
+    }
+    call_all().refused("again", &["exists", "--overwrite"]);
+    let near = format!("export {} -o {} --near 0.1", text(&run), text(&again));
+    call(&near).refused("near", &["--near", "a run brings its own"]);
+}

@@ -1,0 +1,177 @@
+//! `densify export`: writes a trained model in other formats.
+
+mod table;
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use clap::{ArgMatches, Args};
+
+use super::console::Console;
+use super::render::{is_model, refuse_options_of_a_file};
+use crate::export::{Format, find, find_by_extension, formats};
+use crate::failure::Failure;
+use crate::gaussians::Gaussians;
+use crate::number::grouped;
+use crate::output::{OutputError, model_path, write_atomically};
+use crate::run::finished::{iteration, read_model};
+use crate::run::{DataSpec, DeviceSpec, Fraction};
+use table::{Line, Truth};
+
+/// The name that stands for every format.
+const ALL: &str = "all";
+
+/// Writes a trained model in another format, or in all.
+///
+/// The model keeps the coordinates of the dataset. A file appears only when it is complete. With
+/// --format all, or --scene, prints what each format takes; with --scene also how near the pictures of
+/// each, read back, are to those of the model itself, over the views held out.
+#[derive(Debug, Args)]
+#[command(after_help = after_help())]
+pub(super) struct ExportArgs {
+    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    #[arg(value_name = "RUN_OR_MODEL")]
+    model: PathBuf,
+    /// File to write; with --format all, a folder
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Format of the file, or all `[default: the one with FILE's extension]`
+    #[arg(long, value_name = "NAME")]
+    format: Option<String>,
+    /// Saved iteration of the run `[default: the last]`
+    #[arg(long, value_name = "N")]
+    iteration: Option<u32>,
+    /// Replace files that exist
+    #[arg(long)]
+    overwrite: bool,
+    /// Folder of the dataset whose held-out views to compare; every 8th photograph where neither the
+    /// dataset nor an option says which
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
+    /// Nearest distance to a camera at which anything of a file is drawn, as a fraction of the
+    /// scene's extent
+    #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
+    near: Fraction,
+    #[command(flatten)]
+    device: DeviceSpec,
+    #[command(flatten)]
+    data: DataSpec,
+}
+
+fn after_help() -> String {
+    let mut text = "Formats:\n".to_owned();
+    for Format { name, extension, summary, .. } in formats() {
+        let _ = writeln!(text, "  {name:14}  .{extension:14}  {summary}");
+    }
+    text + "
+Options under Scene are for a file with --scene; a run brings its own.
+
+Examples:
+  densify export output/garden-diet -o garden.ply
+  densify export output/garden-diet --iteration 7000 -o early.spz
+  densify export output/garden-diet --format all -o garden --scene data/garden
+  densify export others.sog --format ply -o again.ply --overwrite"
+}
+
+pub(super) fn run(
+    args: &ExportArgs,
+    matches: &ArgMatches,
+    console: &Console,
+) -> Result<(), Failure> {
+    let source = source(args)?;
+    let is_run = source != args.model;
+    if is_run || args.scene.is_none() {
+        refuse_options_of_a_file(matches)?;
+    }
+    let files = files(args)?;
+    for (_, path) in &files {
+        check_output(path, args.overwrite)?;
+    }
+    let model = read_model(&source, console)?;
+    let mut truth = match &args.scene {
+        None => None,
+        Some(scene) => Some(Truth::open(args, is_run, scene, &model, console)?),
+    };
+    let mut lines = Vec::new();
+    for (format, path) in &files {
+        write(format, path, &model)?;
+        let psnr = match &mut truth {
+            None => None,
+            Some(truth) => Some(truth.compare(read_model(path, console)?)?),
+        };
+        console.result(format_args!(
+            "{} Gaussians in {} ({})",
+            grouped(model.len()),
+            path.display(),
+            format.name
+        ));
+        lines.push(Line::of(format.name, path, psnr)?);
+    }
+    if truth.is_some() || lines.len() > 1 {
+        console.result(table::table(&lines, model.len()));
+    }
+    Ok(())
+}
+
+/// The file that is exported.
+fn source(args: &ExportArgs) -> Result<PathBuf, Failure> {
+    match is_model(&args.model) {
+        true if args.iteration.is_some() => {
+            Err(Failure::input("--iteration is for a run's folder; a file has only one model"))
+        }
+        true => Ok(args.model.clone()),
+        false => Ok(model_path(&args.model, iteration(&args.model, args.iteration)?)),
+    }
+}
+
+/// Formats, each with its file.
+fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> {
+    match args.format.as_deref() {
+        Some(ALL) => {
+            let name = args.model.file_name().unwrap_or("model".as_ref()).to_string_lossy();
+            let stem = name.split('.').next().filter(|stem| !stem.is_empty()).unwrap_or("model");
+            let file =
+                |format: &'static Format| args.output.join(format!("{stem}.{}", format.extension));
+            Ok(formats().into_iter().map(|format| (format, file(format))).collect())
+        }
+        Some(name) => {
+            let format =
+                find(name).map_err(|error| Failure::input(format!("--format: {error}, {ALL}")))?;
+            Ok(vec![(format, args.output.clone())])
+        }
+        None => {
+            let format = find_by_extension(&args.output).map_err(|error| {
+                Failure::input(format!("-o: {error}, and name it with --format NAME"))
+            })?;
+            Ok(vec![(format, args.output.clone())])
+        }
+    }
+}
+
+fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure> {
+    write_atomically(path, |out| format.write(model, out)).map_err(|error| match error {
+        // What the format has no room for, not what the disk has none for.
+        OutputError::Io { source, .. } if is_unfit(&source) => {
+            Failure::input(format!("{}: {source}", path.display()))
+        }
+        error => error.into(),
+    })
+}
+
+fn is_unfit(error: &std::io::Error) -> bool {
+    error.raw_os_error().is_none() && error.kind() == std::io::ErrorKind::InvalidInput
+}
+
+/// Fails where something is in the way of the output.
+fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
+    let path_text = path.display();
+    match path.symlink_metadata() {
+        Ok(_) if path.is_dir() => {
+            Err(Failure::input(format!("-o: {path_text} is a folder; name a file")))
+        }
+        Ok(_) if !overwrite => Err(Failure::input(format!(
+            "-o: {path_text} exists; choose another file, or replace it with --overwrite"
+        ))),
+        _ => Ok(()),
+    }
+}

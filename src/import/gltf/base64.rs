@@ -1,0 +1,47 @@
+//! Decodes base64 (RFC 4648, section 4), with or without padding.
+
+/// The bytes; `None` where the text is not base64.
+pub(super) fn decode(text: &str) -> Option<Vec<u8>> {
+    let text = text.trim_end_matches('=').as_bytes();
+    let mut bytes = Vec::with_capacity(text.len() / 4 * 3 + 2);
+    for four in text.chunks(4) {
+        let mut word = 0;
+        for &symbol in four {
+            word = word << 6 | u32::from(value(symbol)?);
+        }
+        let whole = word << (6 * (4 - four.len()));
+        // A symbol by itself holds no byte.
+        let count = four.len().checked_sub(1).filter(|&count| count > 0)?;
+        bytes.extend_from_slice(&whole.to_be_bytes()[1..=count]);
+    }
+    Some(bytes)
+}
+
+fn value(symbol: u8) -> Option<u8> {
+    Some(match symbol {
+        b'A'..=b'Z' => symbol - b'A',
+        b'a'..=b'z' => symbol - b'a' + 26,
+        b'0'..=b'9' => symbol - b'0' + 52,
+        b'+' => 62,
+        b'/' => 63,
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_examples_of_the_standard() {
+        for (text, bytes) in
+            [("", ""), ("Zg==", "f"), ("Zm8=", "fo"), ("Zm9v", "foo"), ("Zm9vYmE", "fooba")]
+        {
+            assert_eq!(decode(text).unwrap(), bytes.as_bytes(), "{text}");
+        }
+        assert_eq!(decode("+/8="), Some(vec![0xfb, 0xff]));
+        for wrong in ["Z", "Zm9vY", "Zm-v", "Zm 9v"] {
+            assert_eq!(decode(wrong), None, "{wrong}");
+        }
+    }
+}
