@@ -78,7 +78,7 @@ impl Flight {
             log_fov += (0.5 * key.fov_y).tan().ln() * weight;
             // q and −q are the same turn.
             let sign = if key.turn.dot(near[1].turn) < 0.0 { -weight } else { weight };
-            turn = turn + key.turn * sign;
+            turn += key.turn * sign;
         }
         let turn = if turn.length_squared() > 1e-12 { turn.normalize() } else { near[1].turn };
         Key { centre, turn, fov_y: 2.0 * log_fov.exp().atan() }

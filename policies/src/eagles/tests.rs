@@ -1,5 +1,7 @@
 //! Tests of the rules of `eagles`, each worked out by hand.
 
+#![expect(clippy::float_cmp, reason = "values are exact, or rounded before they are compared")]
+
 use super::*;
 use crate::event::{Event, Outcome, assert_conforms, build, due_steps};
 use crate::parameters::REFERENCE_ITERATIONS;

@@ -214,7 +214,7 @@ impl Stage {
                     for (x, to) in to.iter_mut().enumerate() {
                         for &value in &from[2 * x..2 * x + window] {
                             // `max` would lose a NaN.
-                            if !(*to >= value) {
+                            if value > *to || value.is_nan() {
                                 *to = value;
                             }
                         }
