@@ -25,7 +25,7 @@ pub(super) fn is_splat(start: &[u8], length: u64) -> bool {
         [x, y, z].iter().all(|v| v.abs() < PLAUSIBLE)
             && scales.iter().all(|v| (0.0..PLAUSIBLE).contains(v))
     };
-    length % ROW as u64 == 0 && !rows.is_empty() && rows.iter().all(plausible)
+    length.is_multiple_of(ROW as u64) && !rows.is_empty() && rows.iter().all(plausible)
 }
 
 /// Reads a file, row by row.

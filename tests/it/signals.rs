@@ -238,7 +238,7 @@ fn every_signal_whatever_else_is_asked_for() {
 
 /// 8-neighbour Laplacian of the luma of a pixel, clipped, borders repeated.
 fn edge(target: &Image8, pixel: usize) -> f64 {
-    let (width, height) = (target.width as i64, target.height as i64);
+    let (width, height) = (i64::from(target.width), i64::from(target.height));
     let luma = |x: i64, y: i64| {
         let at = 3 * (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize;
         let [r, g, b] = [0, 1, 2].map(|i| f64::from(target.rgb[at + i]));

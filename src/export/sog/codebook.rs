@@ -16,7 +16,8 @@ impl Codebook {
     pub(super) fn fit(values: &[f32], weight: impl Fn(usize) -> f32) -> Self {
         let least = values.iter().copied().fold(f32::INFINITY, f32::min);
         let most = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        if !(most > least) {
+        // All are equal, or there are none.
+        if most <= least {
             return Self(vec![least; ENTRIES]);
         }
         let (least, extent) = (f64::from(least), f64::from(most) - f64::from(least));

@@ -7,6 +7,9 @@ use serde::Deserialize;
 use crate::dataset::DatasetError;
 use crate::import::model::malformed;
 
+/// How a number is read from its bytes.
+type ReadNumber<'a> = Box<dyn Fn(&[u8]) -> f32 + 'a>;
+
 /// An array of numbers.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
@@ -72,7 +75,7 @@ impl Buffers<'_> {
         };
         let bytes = self.view(view)?.get(accessor.byte_offset..).unwrap_or_default();
         let scale = |most: f32| if accessor.normalized { 1.0 / most } else { 1.0 };
-        let (size, number): (usize, Box<dyn Fn(&[u8]) -> f32>) = match accessor.component_type {
+        let (size, number): (usize, ReadNumber<'_>) = match accessor.component_type {
             5120 => (1, Box::new(move |b| (f32::from(b[0] as i8) * scale(127.0)).max(-127.0))),
             5121 => (1, Box::new(move |b| f32::from(b[0]) * scale(255.0))),
             5122 => (

@@ -255,7 +255,7 @@ fn splats(
         // What other programs changed holds, not what they left.
         let log_scale = log_scales.as_ref().map(|logs| three(logs));
         let logit = logits.as_ref().map(|logits| logits[row]);
-        let fits = |log: &[f32; 3]| log.map(f32::exp) == scale;
+        let fits = |log: &[f32; 3]| log.map(|x| x.exp().to_bits()) == scale.map(f32::to_bits);
         rows.push(Row {
             mean: three(&means),
             log_scale: log_scale.filter(fits).unwrap_or_else(|| scale.map(log_of_scale)),

@@ -152,7 +152,7 @@ fn render_writes_pictures_of_the_views() {
 
     let train = root.path().join("train");
     for flag in ["-r 1", "--background white", "--near 0.1"] {
-        let words = ["is for a .ply", "a run brings its own"];
+        let words = ["is for a file", "a run brings its own"];
         call(&format!("render {} -o {} {flag}", text(&run), text(&pictures))).refused(flag, &words);
     }
     let limits = "--fail-below psnr=99 --fail-above flip=1";

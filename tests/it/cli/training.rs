@@ -81,14 +81,16 @@ fn check_summary(run: &Path, policy: &str, held_out: u64) -> Value {
 }
 
 /// Fails unless the run has learned, the test views too.
-fn check_loss(run: &Path, least_psnr: f64) {
+fn check_loss(run: &Path, policy: &str, least_psnr: f64) {
     let log = records(&run.join("stats/train.jsonl"));
     assert_eq!(log.len(), ITERATIONS as usize / 10);
     assert_eq!(count(&log[log.len() - 1], "step"), u64::from(ITERATIONS));
     let loss = |at: usize| number(&log[at], "loss");
     let (first, last) = (loss(0), loss(log.len() - 1));
-    // `vanilla` has reset opacities in between, so that it has little time to recover.
-    assert!(last < 0.9 * first, "the loss went from {first} to {last}");
+    // `vanilla` has reset opacities in between, so that it has little time to recover. `eagles` begins with
+    // small images, whose loss is small.
+    let is_comparable = policy != "eagles";
+    assert!(!is_comparable || last < 0.9 * first, "{policy}: the loss went from {first} to {last}");
     assert!(log.iter().all(|record| count(record, "rows") <= BUDGET));
     let scores = json(&run.join("results.json"));
     let psnr = number(&scores[format!("ours_{ITERATIONS}")], "PSNR");
@@ -103,7 +105,7 @@ fn check(scene: &Photographs, policy: &str, flags: &str, least_psnr: f64) -> Out
     check_tree(&run);
     let summary = check_summary(&run, policy, 2);
     check_events(&run, &summary);
-    check_loss(&run, least_psnr);
+    check_loss(&run, policy, least_psnr);
     outcome
 }
 
