@@ -7,18 +7,12 @@ use std::path::Path;
 
 use crate::dataset::DatasetError;
 use crate::foreign;
-use crate::gaussians::{Gaussians, logit, sh_coefficients};
+use crate::gaussians::{Gaussians, sh_coefficients};
 
 /// Fraction of the rows that may be unusable.
 const MAX_BAD_ROWS: f64 = 0.01;
 /// Squared length below which a quaternion counts as zero: 1e-6 of a unit quaternion.
 const ZERO_QUATERNION: f32 = 1e-12;
-/// Opacities of quantised formats stay this far from 0 and 1, whose logits are infinite; other readers take the same.
-const OPACITY_MARGIN: f32 = 1e-6;
-/// Most bytes that any file may unfold to.
-const UNFOLDED: u64 = 64 << 20;
-/// Most bytes that a byte of a larger file may unfold to: models take 2 to 5, those with little colour up to 20.
-const RATIO: u64 = 100;
 
 /// A model read from a file, and what was wrong with the file.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +28,11 @@ pub struct SplatFile {
 /// Most bytes that a file of this many may be unfolded to.
 #[cfg(feature = "formats")]
 pub(super) fn largest(file_bytes: u64) -> u64 {
+    /// Most bytes that any file may unfold to.
+    const UNFOLDED: u64 = 64 << 20;
+    /// Most bytes that a byte of a larger file may unfold to: models take 2 to 5, those with little colour up
+    /// to 20.
+    const RATIO: u64 = 100;
     UNFOLDED.max(file_bytes.saturating_mul(RATIO))
 }
 
@@ -192,7 +191,9 @@ impl Rows {
 /// Logit of a quantised opacity in `[0, 1]`.
 #[cfg(feature = "formats")]
 pub(super) fn quantised_logit(opacity: f32) -> f32 {
-    logit(opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN))
+    /// Opacities stay this far from 0 and 1, whose logits are infinite; other readers take the same.
+    const MARGIN: f32 = 1e-6;
+    crate::gaussians::logit(opacity.clamp(MARGIN, 1.0 - MARGIN))
 }
 
 /// Logarithm of a standard deviation; a flat Gaussian, whose would be −∞, gets that of the compressed PLY, −20.
