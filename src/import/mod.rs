@@ -2,7 +2,7 @@
 //!
 //! [`read_model`] recognises a format by its content. What a file says of its own size is never believed: the
 //! bytes are there before anything is allocated for them, and what is compressed may unfold so far and no further
-//! ([`model::largest`]).
+//! (`model.rs` says how far).
 
 #[cfg(feature = "formats")]
 mod beside;

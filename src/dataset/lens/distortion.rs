@@ -80,7 +80,7 @@ impl Distortion {
     }
 
     /// The point of the plane, at most `reach` from the centre, that goes to `target`; `None` if there is
-    /// none. `reach` is at most [`Self::reach`].
+    /// none. `reach` is at most that of this distortion.
     #[must_use]
     pub fn inverse(&self, target: DVec2, reach: f64) -> Option<DVec2> {
         let mut p = target.clamp_length_max(reach);

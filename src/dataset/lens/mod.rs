@@ -1,7 +1,7 @@
 //! Lenses: from the direction of a ray to its place in the image, and back.
 //!
 //! A lens model is a [`Plane`] onto which rays fall by their angle from the axis, and a [`Distortion`] of that
-//! plane; [`table`] has all of them. Nothing beyond the radius that is proven invertible is used ([`reach`]).
+//! plane; `table.rs` has all of them. Nothing beyond the radius that is proven invertible is used (`reach.rs`).
 
 mod cut;
 mod distortion;
