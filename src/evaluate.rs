@@ -105,8 +105,8 @@ pub enum EvaluateError {
     Stopped,
 }
 
-/// Renders every view and compares it with its image, by LPIPS too where there is a network. `after_view` is called after each view and may
-/// stop the evaluation.
+/// Renders every view and compares it with its image, by LPIPS too where there is a network. `after_view` is
+/// called after each view and may stop the evaluation.
 pub fn evaluate(
     backend: &mut dyn Backend,
     views: &impl ViewSource,

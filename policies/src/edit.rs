@@ -1,4 +1,5 @@
-//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets.
+//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets. One
+//! piece: they are one vocabulary, and most of it is what each word means.
 
 use serde::{Deserialize, Serialize};
 

@@ -11,7 +11,7 @@ use super::render::{Extras, write_pictures};
 use crate::animation::{self, Animation};
 use crate::camera::Camera;
 use crate::failure::{Failure, OTHER};
-use crate::flight::{self, Flight};
+use crate::flight;
 use crate::pictures::picture;
 use crate::run::finished::Opened;
 
@@ -157,7 +157,7 @@ pub(super) fn run(
     let background = opened.data.background.fixed();
     let mut depths = extras.depths(&dataset.normalisation);
     for frame in 0..frames {
-        let camera = camera(&flight, (frame, frames), size);
+        let camera = flight.frame(frame, frames).camera(size);
         let camera = match in_world {
             true => opened.dataset.normalisation.scene_from_world_camera(&camera),
             false => camera,
@@ -182,10 +182,6 @@ pub(super) fn run(
     let path = args.video.as_deref().unwrap_or(output);
     console.result(format_args!("film in {}", path.display()));
     Ok(())
-}
-
-fn camera(flight: &Flight, (frame, frames): (u32, u32), size: (u32, u32)) -> Camera {
-    flight.frame(frame, frames).camera(size)
 }
 
 fn ffmpeg(arguments: &[&std::ffi::OsStr]) -> std::io::Result<std::process::ExitStatus> {

@@ -58,14 +58,21 @@ pub(super) struct RenderArgs {
     side_by_side: bool,
     #[command(flatten)]
     film: FilmArgs,
+    #[command(flatten)]
+    rendering: RenderingArgs,
+}
+
+/// How a model is rendered, and with which dataset if it brings none.
+#[derive(Debug, Args)]
+pub(super) struct RenderingArgs {
     /// Nearest distance to a camera at which anything of a file is drawn, as a fraction of the
     /// scene's extent
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
-    near: Fraction,
+    pub(super) near: Fraction,
     #[command(flatten)]
-    device: DeviceSpec,
+    pub(super) device: DeviceSpec,
     #[command(flatten)]
-    data: DataSpec,
+    pub(super) data: DataSpec,
 }
 
 const EXAMPLES: &str = "\
@@ -194,7 +201,7 @@ fn open_model(
     if !is_model(&args.model) {
         refuse_options_of_a_file(matches)?;
     }
-    let machine = Machine::open(&args.device, console)?;
+    let machine = Machine::open(&args.rendering.device, console)?;
     if !is_model(&args.model) {
         RunConfig::read(&args.model)?;
         let iteration = iteration(&args.model, args.iteration)?;
@@ -210,8 +217,8 @@ fn open_model(
     if args.iteration.is_some() {
         return Err(Failure::input("--iteration is for a run's folder; a file has only one model"));
     }
-    let data = args.data.clone();
-    open(&args.model, scene, data, (args.near.0, machine), Needs::default(), console)
+    let RenderingArgs { near, data, .. } = &args.rendering;
+    open(&args.model, scene, data.clone(), (near.0, machine), Needs::default(), console)
 }
 
 /// A file name without ending for each view. Names come from data files: no part of one may lead

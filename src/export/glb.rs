@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use super::{Format, ModelWriter, Shape};
 use crate::gaussians::{Gaussians, sh_coefficients, sigmoid};
-use crate::import::gltf::{LOG_SCALE, OPACITY_LOGIT, SPLATS, TURN, coefficient};
+use crate::import::gltf::{LOG_SCALE, OPACITY_LOGIT, SHAPES, SPLATS, TURN, coefficient};
 
 pub(super) const FORMAT: Format = Format {
     name: "glb",
@@ -106,7 +106,7 @@ impl GlbWriter {
         let mut attributes = serde_json::Map::new();
         for ((name, width), column) in names.zip(widths).zip(&self.columns) {
             let bytes = size_of::<f32>() * column.len();
-            let shape = ["", "SCALAR", "VEC2", "VEC3", "VEC4"][width];
+            let shape = SHAPES[width];
             attributes.insert(name, json!(views.len()));
             accessors.push(json!({
                 "bufferView": views.len(), "componentType": 5126, "count": column.len() / width,

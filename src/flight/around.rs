@@ -44,7 +44,7 @@ impl Rig {
         let (mut matrix, mut right) = (DMat3::IDENTITY * 1e-9, centre * 1e-9);
         for camera in cameras {
             let f = camera.forward();
-            let across = DMat3::IDENTITY - DMat3::from_cols(f * f.x, f * f.y, f * f.z);
+            let across = DMat3::IDENTITY - outer(f);
             matrix += across;
             right += across * camera.centre();
         }
@@ -68,10 +68,14 @@ impl Rig {
     }
 }
 
+/// d·dᵀ.
+fn outer(d: DVec3) -> DMat3 {
+    DMat3::from_cols(d * d.x, d * d.y, d * d.z)
+}
+
 /// The normal of the plane through the origin in which directions lie, if they lie in one and not on a line.
 fn flat(directions: impl Iterator<Item = DVec3> + Clone) -> Option<DVec3> {
-    let scatter = directions.map(|d| DMat3::from_cols(d * d.x, d * d.y, d * d.z));
-    let scatter = scatter.fold(DMat3::ZERO, |sum, part| sum + part);
+    let scatter = directions.map(outer).fold(DMat3::ZERO, |sum, part| sum + part);
     let total = scatter.x_axis.x + scatter.y_axis.y + scatter.z_axis.z;
     // Powers of a matrix turn a vector to the axis along which there is most, and those of the inverse to the
     // one along which there is least.

@@ -1,6 +1,5 @@
 //! Camera paths as files: nerfstudio's JSON, as its viewer saves it.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
@@ -60,17 +59,12 @@ struct SavedKey {
 /// finite poses and fields of view between 0 and 180 degrees.
 pub fn read(path: &Path) -> Result<Flight, FlightError> {
     let io = |source| FlightError::Read { path: path.to_owned(), source };
-    let mut bytes = Vec::new();
-    let file = foreign::open(path).map_err(io)?;
-    file.take(MOST_BYTES + 1).read_to_end(&mut bytes).map_err(io)?;
-    parse(&bytes).map_err(|problem| FlightError::Malformed { path: path.to_owned(), problem })
+    let text = foreign::read_text(path, MOST_BYTES).map_err(io)?;
+    parse(&text).map_err(|problem| FlightError::Malformed { path: path.to_owned(), problem })
 }
 
-pub(super) fn parse(bytes: &[u8]) -> Result<Flight, String> {
-    if bytes.len() as u64 > MOST_BYTES {
-        return Err("it is longer than 64 MiB; save a shorter path".to_owned());
-    }
-    let saved: Saved = serde_json::from_slice(bytes)
+pub(super) fn parse(text: &str) -> Result<Flight, String> {
+    let saved: Saved = serde_json::from_str(text)
         .map_err(|e| format!("it is no camera path of nerfstudio ({e}); save one in its viewer"))?;
     if let Some(kind) = saved.camera_type.filter(|kind| !kind.eq_ignore_ascii_case("perspective")) {
         return Err(format!("camera_type is {kind:?}; only perspective cameras can be rendered"));

@@ -140,7 +140,7 @@ fn paths_of_nerfstudio_are_read() {
     let path = r#"{"camera_type": "perspective", "render_height": 4, "fps": 24, "is_cycle": true,
         "camera_path": [{"fov": 90.0, "aspect": 1.5,
         "camera_to_world": [1, 0, 0, 7, 0, 0, -1, 8, 0, 1, 0, 9, 0, 0, 0, 1]}]}"#;
-    let flight = parse(path.as_bytes()).unwrap();
+    let flight = parse(path).unwrap();
     assert!(flight.is_loop);
     let key = flight.keys[0];
     assert_eq!(key.centre, DVec3::new(7.0, 8.0, 9.0));
@@ -169,8 +169,8 @@ fn what_is_no_path_is_refused_with_the_reason() {
         (pose("0,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1", "50"), "bends"),
         (r#"{"camera_type": "fisheye", "camera_path": []}"#.to_owned(), "fisheye"),
     ] {
-        let refused = parse(text.as_bytes()).unwrap_err();
+        let refused = parse(&text).unwrap_err();
         assert!(refused.contains(reason), "{text}: {refused}");
     }
-    assert!(parse(pose(unit, "50").as_bytes()).is_ok());
+    assert!(parse(&pose(unit, "50")).is_ok());
 }

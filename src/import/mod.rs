@@ -59,5 +59,4 @@ impl PointCloud {
 }
 
 #[cfg(all(test, feature = "formats"))]
-#[allow(clippy::float_cmp, reason = "results are exact")]
 mod tests;

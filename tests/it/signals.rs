@@ -1,4 +1,5 @@
-//! The signals that training accumulates, against the reference's loss gradient.
+//! The signals that training accumulates, against the reference's loss gradient. One piece, as
+//! all tests share the views and their references.
 
 use densify::backend::{LearningRates, StepInput, Storage};
 use densify::camera::Camera;

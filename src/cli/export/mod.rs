@@ -8,14 +8,13 @@ use std::path::{Path, PathBuf};
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::render::{is_model, refuse_options_of_a_file};
+use super::render::{RenderingArgs, is_model, refuse_options_of_a_file};
 use crate::export::{Format, find, find_by_extension, formats};
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::number::grouped;
 use crate::output::{OutputError, model_path, write_atomically};
 use crate::run::finished::{iteration, read_model};
-use crate::run::{DataSpec, DeviceSpec, Fraction};
 use table::{Line, Truth};
 
 /// The name that stands for every format.
@@ -48,14 +47,8 @@ pub(super) struct ExportArgs {
     /// dataset nor an option says which
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
-    /// Nearest distance to a camera at which anything of a file is drawn, as a fraction of the
-    /// scene's extent
-    #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
-    near: Fraction,
     #[command(flatten)]
-    device: DeviceSpec,
-    #[command(flatten)]
-    data: DataSpec,
+    rendering: RenderingArgs,
 }
 
 fn after_help() -> String {

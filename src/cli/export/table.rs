@@ -55,10 +55,10 @@ impl Truth {
                 let spec = RunConfig::read(&args.model)?.spec;
                 (spec.data, spec.start.near.0)
             }
-            false => (args.data.clone(), args.near.0),
+            false => (args.rendering.data.clone(), args.rendering.near.0),
         };
         data.eval = data.test_every.is_none();
-        let machine = Machine::open(&args.device, console)?;
+        let machine = Machine::open(&args.rendering.device, console)?;
         let dataset = load(scene, &data, console)?;
         let near = (near * dataset.extent()) as f32;
         let backend = machine.backend(&dataset, model.clone(), near)?;

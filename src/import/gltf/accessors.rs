@@ -7,6 +7,9 @@ use serde::Deserialize;
 use crate::dataset::DatasetError;
 use crate::import::model::malformed;
 
+/// Names of elements with so many numbers.
+pub(crate) const SHAPES: [&str; 5] = ["", "SCALAR", "VEC2", "VEC3", "VEC4"];
+
 /// How a number is read from its bytes.
 type ReadNumber<'a> = Box<dyn Fn(&[u8]) -> f32 + 'a>;
 
@@ -66,7 +69,7 @@ impl Buffers<'_> {
         let wrong = |problem: &str| malformed(self.path, name, problem);
         let accessor =
             self.accessors.get(index).ok_or_else(|| wrong("there is no such accessor"))?;
-        let shape = ["", "SCALAR", "VEC2", "VEC3", "VEC4"][width];
+        let shape = SHAPES[width];
         if accessor.shape != shape {
             return Err(wrong(&format!("it is not {shape}")));
         }

@@ -19,6 +19,7 @@ use super::model::{Row, Rows, largest, log_of_scale, malformed, quantised_logit}
 use super::{SplatFile, beside, spz, unfold};
 use crate::dataset::DatasetError;
 use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients, sigmoid};
+pub(crate) use accessors::SHAPES;
 use accessors::{Accessor, Buffers, View};
 pub(crate) use nodes::TURN;
 
