@@ -6,7 +6,7 @@
 
 use std::io::{self, Write};
 
-use super::{Format, ModelWriter, Shape};
+use super::{Format, MAX_LOG_SCALE, ModelWriter, Shape};
 use crate::gaussians::{Gaussians, dc_to_rgb, sh_coefficients, sigmoid};
 use crate::import::ply::packed::{BOUNDS, CHUNK, WORDS};
 
@@ -19,8 +19,6 @@ pub(super) const FORMAT: Format = Format {
 
 inventory::submit! { FORMAT }
 
-/// Logarithms of scales are kept within this, as infinite ones would leave no others of their chunk.
-const MAX_LOG_SCALE: f32 = 20.0;
 /// Numbers of a row that are packed with those of its chunk: position, logarithm of scale, colour, opacity, and
 /// quaternion.
 const PACKED: usize = 14;

@@ -178,6 +178,10 @@ impl Format {
     }
 }
 
+/// Formats that quantise keep logarithms of scales within this: infinite ones would leave no room for others.
+#[cfg(feature = "formats")]
+const MAX_LOG_SCALE: f32 = 20.0;
+
 /// The index of a quaternion's largest component and, in order, the three others, where it has length 1 and that
 /// component is positive.
 #[cfg(feature = "formats")]

@@ -188,6 +188,14 @@ impl Rows {
     }
 }
 
+/// The unit quaternion of three components in their order and the place of the fourth, the largest.
+#[cfg(feature = "formats")]
+pub(super) fn from_smallest_three(largest: usize, others: [f32; 3]) -> [f32; 4] {
+    let rest = (1.0 - others.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    let mut next = others.into_iter();
+    std::array::from_fn(|i| if i == largest { rest } else { next.next().unwrap_or(0.0) })
+}
+
 /// Logit of a quantised opacity in `[0, 1]`.
 #[cfg(feature = "formats")]
 pub(super) fn quantised_logit(opacity: f32) -> f32 {

@@ -11,7 +11,7 @@ use std::path::Path;
 use image::{ImageDecoder, ImageFormat, ImageReader};
 use serde::Deserialize;
 
-use super::model::{Row, Rows, largest, malformed, quantised_logit};
+use super::model::{Row, Rows, from_smallest_three, largest, malformed, quantised_logit};
 use super::zip::Archive;
 use super::{SplatFile, beside};
 use crate::dataset::DatasetError;
@@ -199,9 +199,7 @@ fn quaternion(bytes: [usize; 3], tag: u8) -> [f32; 4] {
         return [1.0, 0.0, 0.0, 0.0];
     };
     let small = bytes.map(|v| (v as f32 / 127.5 - 1.0) * std::f32::consts::FRAC_1_SQRT_2);
-    let rest = (1.0 - small.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    let mut next = small.into_iter();
-    std::array::from_fn(|i| if i == largest { rest } else { next.next().unwrap_or(0.0) })
+    from_smallest_three(largest, small)
 }
 
 /// Decodes a WebP or PNG, whose size is looked at first.

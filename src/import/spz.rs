@@ -13,7 +13,7 @@ use flate2::bufread::GzDecoder;
 use ruzstd::decoding::StreamingDecoder;
 
 use super::SplatFile;
-use super::model::{Row, Rows, largest, malformed, quantised_logit};
+use super::model::{Row, Rows, from_smallest_three, largest, malformed, quantised_logit};
 use super::unfold::{exactly, fault, to_the_end};
 use crate::dataset::DatasetError;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
@@ -185,23 +185,15 @@ fn unpack(path: &Path, layout: &Layout, arrays: &[Vec<u8>]) -> Result<SplatFile,
 /// Of version 2: x, y, z in a byte each. Since 3: the largest component's index in order (x, y, z, w), then sign and
 /// nine bits of each other, up to 1/√2.
 fn quaternion(bytes: &[u8]) -> [f32; 4] {
-    let rest = |others: &[f32]| (1.0 - others.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    if let &[x, y, z] = bytes {
-        let [x, y, z] = [x, y, z].map(|v| f32::from(v) / 127.5 - 1.0);
-        return [rest(&[x, y, z]), x, y, z];
-    }
-    let word = u32::from_le_bytes(std::array::from_fn(|i| bytes[i]));
-    let others = [20, 10, 0].map(|shift| {
-        let size = (word >> shift & 511) as f32 / 511.0 * std::f32::consts::FRAC_1_SQRT_2;
-        if word >> (shift + 9) & 1 == 1 { -size } else { size }
-    });
-    let mut next = others.into_iter();
-    let largest = (word >> 30) as usize;
-    let [x, y, z, w] =
-        std::array::from_fn(
-            |i| {
-                if i == largest { rest(&others) } else { next.next().unwrap_or(0.0) }
-            },
-        );
+    let [x, y, z, w] = if let &[x, y, z] = bytes {
+        from_smallest_three(3, [x, y, z].map(|v| f32::from(v) / 127.5 - 1.0))
+    } else {
+        let word = u32::from_le_bytes(std::array::from_fn(|i| bytes[i]));
+        let others = [20, 10, 0].map(|shift| {
+            let size = (word >> shift & 511) as f32 / 511.0 * std::f32::consts::FRAC_1_SQRT_2;
+            if word >> (shift + 9) & 1 == 1 { -size } else { size }
+        });
+        from_smallest_three((word >> 30) as usize, others)
+    };
     [w, x, y, z]
 }

@@ -11,7 +11,7 @@ use std::io::{self, Write};
 
 use serde_json::json;
 
-use super::{Format, ModelWriter, Shape};
+use super::{Format, MAX_LOG_SCALE, ModelWriter, Shape};
 use crate::gaussians::{Gaussians, sh_coefficients, sigmoid};
 use crate::import::sog::PALETTE_WIDTH;
 use codebook::Codebook;
@@ -32,8 +32,6 @@ inventory::submit! { FORMAT }
 const MAX_SIDE: usize = 16_383;
 /// Most entries of the palette: a label has 16 bits.
 const MAX_PALETTE: usize = 1 << 16;
-/// Logarithms of scales are kept within this: infinite ones would spoil the codebook.
-const MAX_LOG_SCALE: f32 = 20.0;
 
 /// Holds all rows: codebooks and palette are fitted to all of them.
 #[derive(Default)]

@@ -15,7 +15,7 @@ use super::{malformed, missing};
 use crate::dataset::DatasetError;
 use crate::gaussians::{rgb_to_dc, sh_coefficients};
 use crate::import::SplatFile;
-use crate::import::model::{Row, Rows, quantised_logit};
+use crate::import::model::{Row, Rows, from_smallest_three, quantised_logit};
 
 /// Rows that share a chunk.
 pub(crate) const CHUNK: usize = 256;
@@ -144,10 +144,7 @@ fn three(word: u32) -> [f32; 3] {
 fn quaternion(word: u32) -> [f32; 4] {
     let small =
         [20, 10, 0].map(|shift| (share(word >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
-    let largest = (1.0 - small.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    let mut quat = small.into_iter();
-    let which = (word >> 30) as usize;
-    std::array::from_fn(|i| if i == which { largest } else { quat.next().unwrap_or(0.0) })
+    from_smallest_three((word >> 30) as usize, small)
 }
 
 /// A coefficient between −4 and 4: the middle of the byte's interval, and the ends at the ends.
