@@ -72,8 +72,8 @@ impl SourceFile {
 pub struct ImageSource {
     /// The image file.
     pub file: SourceFile,
-    /// A greyscale image of the weights of pixels in the loss (black: ignored), if there is one.
-    pub mask: Option<SourceFile>,
+    /// The weights of its pixels in the loss, if there is a file of them.
+    pub mask: Option<Mask>,
     /// Width after loading `[px]`.
     pub width: u32,
     /// Height after loading `[px]`.
@@ -84,6 +84,26 @@ pub struct ImageSource {
     pub header: ImageHeader,
     /// Pixels already in memory, at the size of the header; then no file is read.
     pub rendered: Option<SharedImage>,
+}
+
+/// A greyscale image of the weights of pixels in the loss.
+#[derive(Debug, Clone)]
+pub struct Mask {
+    /// The image file.
+    pub file: SourceFile,
+    /// Whether white is ignored, not black.
+    pub inverted: bool,
+}
+
+impl Mask {
+    /// Decodes it at its own size; 0 is ignored, whichever colour of the file that is.
+    pub(super) fn weights(&self) -> Result<image::GrayImage, DatasetError> {
+        let mut mask = decode(&self.file)?.into_luma8();
+        if self.inverted {
+            mask.iter_mut().for_each(|weight| *weight = 255 - *weight);
+        }
+        Ok(mask)
+    }
 }
 
 /// The header of an image file.
@@ -172,12 +192,13 @@ impl ImageSource {
             return Err(DatasetError::size(&self.file.path, found, (header.width, header.height)));
         }
         let mut image = pack(decoded);
-        if let Some(file) = &self.mask {
-            let mask = decode_mask(file)?;
+        if let Some(mask) = &self.mask {
+            let path = &mask.file.path;
+            let mask = mask.weights()?;
             if mask.iter().all(|&weight| weight == 0) {
                 let problem = "the mask hides every pixel";
                 let remedy = "repair it, or remove the photograph and its pose";
-                return Err(DatasetError::malformed(&file.path, "the mask", problem, remedy));
+                return Err(DatasetError::malformed(path, "the mask", problem, remedy));
             }
             image.mask = Some(if mask.dimensions() == (header.width, header.height) {
                 mask.into_raw()
@@ -194,11 +215,6 @@ impl ImageSource {
         }
         Ok(image)
     }
-}
-
-/// Decodes a mask: the weights of pixels, at its own size.
-pub(super) fn decode_mask(file: &SourceFile) -> Result<image::GrayImage, DatasetError> {
-    decode(file).map(DynamicImage::into_luma8)
 }
 
 /// Converts to 8 bits per channel, without a copy if it is RGB already.
@@ -332,7 +348,7 @@ mod tests {
         image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
             .save(&mask)
             .unwrap();
-        let mask = Some(SourceFile::found(mask).unwrap());
+        let mask = Some(Mask { file: SourceFile::found(mask).unwrap(), inverted: false });
         let source = ImageSource { mask, width: 2, height: 2, ..ImageSource::whole(path) };
         let loaded = source.load().unwrap();
         assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
@@ -346,11 +362,16 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let [path, mask] = ["a.png", "m.png"].map(|name| folder.path().join(name));
         RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
-        image::GrayImage::new(4, 4).save(&mask).unwrap();
-        let mask = Some(SourceFile::found(mask).unwrap());
-        let source = ImageSource { mask, ..ImageSource::whole(path) };
-        let message = source.load().unwrap_err().to_string();
-        assert!(message.contains("m.png") && message.contains("hides every pixel"), "{message}");
+        for (colour, inverted) in [(0, false), (255, true)] {
+            image::GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
+            let mask = Some(Mask { file: SourceFile::found(mask.clone()).unwrap(), inverted });
+            let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
+            let message = source.load().unwrap_err().to_string();
+            assert!(
+                message.contains("m.png") && message.contains("hides every pixel"),
+                "{message}"
+            );
+        }
     }
 
     #[cfg(unix)]

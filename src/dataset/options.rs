@@ -21,6 +21,8 @@ pub struct LoadOptions {
     /// Whether undistorted images hold all that the lens saw (`--keep-fov`), with what it did not masked,
     /// instead of the largest rectangle without such pixels.
     pub keep_fov: bool,
+    /// Whether masks are white, not black, where pixels are ignored (`--invert-masks`).
+    pub invert_masks: bool,
     /// Folder that keeps built-in scenes as they were rendered; `None`: they are rendered.
     pub cache: Option<PathBuf>,
     /// Whether to read which views show which points ([`Tracks`](super::Tracks)).

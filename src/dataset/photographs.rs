@@ -7,7 +7,7 @@ use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
 use super::error::DatasetError;
-use super::images::{self, ImageHeader, ImageSource, SourceFile};
+use super::images::{self, ImageHeader, ImageSource, Mask, SourceFile};
 use super::lens::{Cut, CutFault, Lens};
 use super::undistort::{Pinhole, Undistortion};
 use super::{Frame, LoadOptions, Resolution, View};
@@ -36,6 +36,12 @@ pub(super) fn photographs(
     options: &LoadOptions,
     notes: &mut Vec<String>,
 ) -> Result<Vec<Photograph>, DatasetError> {
+    if options.invert_masks && frames.iter().all(|frame| frame.mask.is_none()) {
+        let problem = "no photograph has a mask";
+        let remedy =
+            "put masks into `masks/`, each as NAME.png after its photograph, or leave the flag out";
+        return Err(DatasetError::malformed(listing, "--invert-masks", problem, remedy));
+    }
     // All first, then the first error: the message does not depend on the threads.
     let checked: Vec<_> = frames.par_iter().map(|frame| checked(listing, frame)).collect();
     let checked: Vec<(ImageHeader, Lens)> = checked.into_iter().collect::<Result<_, _>>()?;
@@ -67,7 +73,7 @@ pub(super) fn photographs(
     let cut_of = runs.iter().zip(&cuts).flat_map(|((_, run), cut)| run.iter().map(move |_| cut));
     let each = frames.iter().zip(&checked).zip(cut_of);
     each.map(|((frame, (header, lens)), cut)| {
-        photograph(frame, header, lens, cut.as_ref(), options.resolution)
+        photograph(frame, header, lens, cut.as_ref(), options)
     })
     .collect()
 }
@@ -157,10 +163,11 @@ fn photograph(
     header: &ImageHeader,
     lens: &Lens,
     cut: Option<&Cut>,
-    resolution: Option<Resolution>,
+    options: &LoadOptions,
 ) -> Result<Photograph, DatasetError> {
     let file = SourceFile::found(frame.image.clone())?;
     let mask = frame.mask.clone().map(SourceFile::found).transpose()?;
+    let mask = mask.map(|file| Mask { file, inverted: options.invert_masks });
     let view = |face: &str, undistortion: Option<Undistortion>| {
         let whole = Pinhole {
             width: lens.width,
@@ -187,7 +194,8 @@ fn photograph(
             translation,
         };
         let size = (pinhole.width, pinhole.height);
-        let (width, height) = target_size(size, header.width, resolution, frame.reduced.is_some());
+        let (width, height) =
+            target_size(size, header.width, options.resolution, frame.reduced.is_some());
         View {
             name: face_name(&frame.name, face),
             camera: camera.resized(width, height),
@@ -214,10 +222,10 @@ fn photograph(
 fn hidden(views: &[View], lens: &Lens) -> Result<Vec<bool>, DatasetError> {
     /// Most pixels along a side of a mask that are asked which of several views they are in.
     const ASKED: u32 = 512;
-    let Some(file) = views.first().and_then(|view| view.source.mask.as_ref()) else {
+    let Some(mask) = views.first().and_then(|view| view.source.mask.as_ref()) else {
         return Ok(Vec::new());
     };
-    let mask = images::decode_mask(file)?;
+    let mask = mask.weights()?;
     let (width, height) = mask.dimensions();
     let lens = lens.resized(width, height);
     let stride = if views.len() > 1 { (width.max(height) / ASKED).max(1) } else { 1 };

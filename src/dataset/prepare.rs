@@ -81,8 +81,12 @@ pub(super) fn assemble(
         }
     }
     if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
+        let (ignored, remedy) = match options.invert_masks {
+            true => ("white", "leave --invert-masks out"),
+            false => ("black", "give --invert-masks"),
+        };
         return Err(DatasetError(format!(
-            "no view is left to train on: masks hide every pixel of all {} (black is ignored); invert or \
+            "no view is left to train on: masks hide every pixel of all {} ({ignored} is ignored); {remedy}, or \
              remove the masks",
             hidden_names.len()
         )));

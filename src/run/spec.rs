@@ -127,6 +127,13 @@ run_spec! {
         )]
         keep_fov: bool = false, Fixed;
 
+        /// Masks are white where photographs are to be ignored; by default black is ignored
+        #[arg(
+            long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,
+            require_equals = true, default_missing_value = "true", hide_possible_values = true
+        )]
+        invert_masks: bool = false, Fixed;
+
         /// Render a built-in scene anew, and do not keep it in the user's cache folder
         #[arg(
             long, value_name = "true|false", action = ArgAction::Set, num_args = 0..=1,

@@ -61,6 +61,17 @@ const IMAGES: &[Replacement] = &[
 const POINTS: &[Replacement] = &[(" 3 20 30", " 300 20 30", "points3D.txt, line 5, 300")];
 
 #[test]
+fn masks_to_invert_must_be_there() {
+    let options = LoadOptions { invert_masks: true, ..LoadOptions::default() };
+    refused(
+        "no mask",
+        &Made::colmap_txt(),
+        &options,
+        "--invert-masks, no photograph has a mask, NAME.png",
+    );
+}
+
+#[test]
 fn colmap_text() {
     for (file, cases) in
         [("cameras.txt", CAMERAS), ("images.txt", IMAGES), ("points3D.txt", POINTS)]

@@ -169,6 +169,10 @@ fn masks_are_found() {
         assert_eq!(data.train[0].source.load().unwrap().mask, None, "{mask}");
         let found = data.train[1].source.load().unwrap().mask.unwrap();
         assert_eq!((found[0], found[19]), (0, 255), "{mask}");
+        let inverted = LoadOptions { invert_masks: true, ..LoadOptions::default() };
+        let data = load_with(&made, inverted);
+        let found = data.train[1].source.load().unwrap().mask.unwrap();
+        assert_eq!((found[0], found[19]), (255, 0), "{mask}");
     }
 }
 

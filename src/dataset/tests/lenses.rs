@@ -183,7 +183,9 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
         grey(&made, name, |_| 0);
     }
     let message = Dataset::load(made.path(), &options).unwrap_err().to_string();
-    assert!(message.contains("all 3") && message.contains("invert"), "{message}");
+    assert!(message.contains("all 3") && message.contains("give --invert-masks"), "{message}");
+    let inverted = LoadOptions { invert_masks: true, ..options.clone() };
+    assert_eq!(load(&made, &inverted).train.len(), 1);
     // One face of a wide photograph: what lies left of its middle is hidden.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     grey(&made, "b.png", |x| if x < 10 { 0 } else { 255 });
