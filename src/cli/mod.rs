@@ -14,6 +14,7 @@
 //! }
 //! ```
 
+mod compress;
 mod console;
 #[cfg(feature = "gpu")]
 mod devices;
@@ -75,6 +76,8 @@ Examples:
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
+  densify compress output/garden-diet --to 5MiB -o garden.sog
+                                                           a smaller file of it
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
@@ -101,6 +104,7 @@ enum Command {
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
     Eval(eval::EvalArgs),
+    Compress(Box<compress::CompressArgs>),
     Export(Box<export::ExportArgs>),
     Render(Box<render::RenderArgs>),
     Compare(study::Comparison),
@@ -144,6 +148,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Train(train) => train::run(&train, given, &console),
         Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
+        Command::Compress(compress) => compress::run(&compress, given, &console),
         Command::Export(export) => export::run(&export, given, &console),
         Command::Render(render) => render::run(&render, given, &console),
         Command::Compare(comparison) => study::compare(&comparison, &console),
@@ -165,7 +170,8 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
 
 /// The command line, with the defaults of a run's options in the commands that have them.
 fn command() -> clap::Command {
-    const WITH_RUN_OPTIONS: [&str; 6] = ["train", "plan", "eval", "export", "render", "selftest"];
+    const WITH_RUN_OPTIONS: [&str; 7] =
+        ["train", "plan", "compress", "eval", "export", "render", "selftest"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
         command.mut_subcommand(name, flags::with_defaults)
     })

@@ -8,14 +8,14 @@ use densify_policies::policy::DensityPolicy;
 use super::Run;
 use super::config::{Resolved, RunConfig};
 use super::observer::Observer;
-use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS, ignored, random_count};
+use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS};
 use super::resume::{self, Resumed};
 use super::spec::RunSpec;
+use super::start::{Start, first_model, fits};
 use super::values::{Assignment, ImageCache, InitChoice, Rows, ShDegree, assignments};
 use crate::checkpoint::Fingerprint;
 use crate::failure::Failure;
-use crate::gaussians::Gaussians;
-use crate::init::{initialise, random_points, restart};
+use crate::init::restart;
 use crate::memory::RunSize;
 use crate::number::grouped;
 use crate::schedule::RateOptions;
@@ -49,20 +49,25 @@ pub(super) fn build(
     let setting = size.setting;
     resolve::check_grant(&inputs, &setting, resumed.is_some())?;
     let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
-    let (mut model, init, init_points) = match checkpoint {
+    let Start { mut model, init, points: init_points } = match checkpoint {
         None => first_model(&inputs, &setting, observer)?,
-        Some(checkpoint) => {
-            let start = &spec.start;
-            let init = start.init.unwrap_or_else(|| inputs.init());
-            (checkpoint.blank_model()?, init, start.init_points.map(|points| points.0))
-        }
+        Some(checkpoint) => Start {
+            model: checkpoint.blank_model()?,
+            init: inputs.init(),
+            points: spec.start.init_points.map(|points| points.0),
+        },
+    };
+    let file = match &init {
+        InitChoice::Model(file) => Some(file.clone()),
+        InitChoice::Points | InitChoice::Random => None,
     };
     let initial_rows =
         checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
     let scene = inputs.info(setting.rows, initial_rows)?;
     let policy = inputs.entry.build(&inputs.parameters, &scene)?;
     let declared = policy.needs(&scene);
-    if checkpoint.is_none() {
+    // A model keeps its opacities and sizes, whatever the policy's paper starts with.
+    if checkpoint.is_none() && file.is_none() {
         restart(&mut model, &declared.start);
     }
     let rates = spec.learning_rates(&declared.rates)?;
@@ -92,11 +97,17 @@ pub(super) fn build(
     resolve::check(&inputs, &setting, &ledger)?;
     observer.say(format_args!("{}", inputs.promise(&ledger)));
     let measuring = inputs.measuring(&setting, inputs.threads());
-    let backend = inputs.device.backend(&model, &inputs.backend_options(&setting, needs))?;
+    let mut backend = inputs.device.backend(&model, &inputs.backend_options(&setting, needs))?;
+    drop(model);
+    if let Some(file) = file.as_ref().filter(|_| checkpoint.is_none()) {
+        let view = (spec.data.background.fixed(), setting.sh_degree);
+        fits(file, backend.as_mut(), &inputs.dataset, view, observer)?;
+    }
     let options = TrainOptions {
         iterations: spec.schedule.iterations.0,
         seed: spec.schedule.seed,
         sh_degree: setting.sh_degree,
+        has_all_bands: file.is_some(),
         background: spec.data.background,
         rates,
         prefetch: AHEAD,
@@ -187,49 +198,6 @@ fn as_written(mut table: toml::Table) -> toml::Table {
         }
     }
     table
-}
-
-/// The initial model in the coordinates of training, and how it was made.
-fn first_model(
-    inputs: &Inputs<'_>,
-    setting: &RunSize,
-    observer: &dyn Observer,
-) -> Result<(Gaussians, InitChoice, Option<usize>), Failure> {
-    let (choice, given) = (inputs.init(), inputs.spec.start.init_points);
-    let (dataset, seed) = (&inputs.dataset, inputs.spec.schedule.seed);
-    let random;
-    let (points, count) = match choice {
-        InitChoice::Points if given.is_some() => {
-            return Err(Failure::input(
-                "--init-points is for a random start; leave it out, or use --init random",
-            ));
-        }
-        InitChoice::Points => (&dataset.points, None),
-        InitChoice::Random => {
-            let count = given.map_or_else(|| random_count(setting.rows), |points| points.0);
-            let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
-            let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
-            random = random_points(count, &cameras, opaque, seed);
-            (&random, Some(count))
-        }
-    };
-    let (model, report) = initialise(points, setting.rows, setting.sh_degree, seed)?;
-    for (number, reason) in [
-        (report.unusable, "non-finite points ignored"),
-        (report.duplicates, "duplicate points ignored"),
-        (report.over_budget, "points beyond the budget left out, drawn by the seed"),
-    ] {
-        if number > 0 {
-            observer.say(format_args!("{}", ignored(number, reason)));
-        }
-    }
-    let source = if count.is_some() { "random points" } else { "points of the scene" };
-    observer.say(format_args!(
-        "start    {} Gaussians from {} {source}",
-        grouped(model.len()),
-        grouped(report.points)
-    ));
-    Ok((model, choice, count))
 }
 
 fn announce(config: &RunConfig, output: &Path, summary: &str, observer: &dyn Observer) {

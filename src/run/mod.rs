@@ -14,6 +14,7 @@ mod resolve;
 mod resume;
 mod session;
 mod spec;
+mod start;
 mod summary;
 mod values;
 
@@ -38,6 +39,7 @@ pub use values::{
 use crate::checkpoint::Fingerprint;
 use crate::dataset::Dataset;
 use crate::failure::Failure;
+use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
 use crate::trainer::Trainer;
 use crate::views::DatasetViews;
@@ -95,6 +97,24 @@ impl Run {
     /// The trainer.
     pub fn trainer(&mut self) -> &mut Trainer<DatasetViews> {
         &mut self.trainer
+    }
+
+    /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates.
+    ///
+    /// # Errors
+    /// When a view cannot be read, the device fails, or the observer asks to stop.
+    pub(crate) fn model_after_training(
+        mut self,
+        observer: &dyn Observer,
+    ) -> Result<Gaussians, Failure> {
+        while self.trainer.steps_done() < self.last {
+            if let Some(Interrupt { name, exit_code }) = observer.interrupt() {
+                let message = format!("stopped by {name}; nothing was written");
+                return Err(Failure { code: exit_code, message });
+            }
+            self.trainer.step()?;
+        }
+        Ok(self.dataset.normalisation.world_from_model(self.trainer.model()?))
     }
 
     /// Trains to the end and writes everything that a run leaves; returns its folder.

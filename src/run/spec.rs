@@ -158,9 +158,13 @@ run_spec! {
         #[arg(value_name = "SCENE")]
         scene: Option<PathBuf> = None, Free;
 
-        /// Where the first Gaussians are placed (default: points where the dataset has any, else
+        /// What the first Gaussians are: one on each of the dataset's points, at random places, or those of a
+        /// model in the dataset's coordinates, by any program (default: points where the dataset has any, else
         /// random)
-        #[arg(long, value_name = "HOW")]
+        ///
+        /// Of a model with more Gaussians than the budget, those stay that show most in the training views. Its
+        /// colours are cut to --sh-degree, or given room to it
+        #[arg(long, value_name = "points|random|MODEL")]
         init: Option<InitChoice> = None, Fixed;
 
         /// Number of random points to start from (default: half the budget, at most 100k)

@@ -2,9 +2,9 @@
 //! and in a file, and what is out of range.
 
 use std::fmt::Display;
+use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::ValueEnum;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use toml::{Table, Value};
@@ -87,14 +87,16 @@ pub enum ShDegree {
     Auto(Option<u8>),
 }
 
-/// How the first Gaussians are placed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+/// `--init`: what the first Gaussians are.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub enum InitChoice {
-    /// On the points of the dataset's reconstruction
+    /// One on each point of the dataset's reconstruction.
     Points,
-    /// At random, where the cameras look
+    /// At random places, where the cameras look.
     Random,
+    /// Those of this file, which is in the dataset's coordinates. The path is absolute, so that it holds
+    /// wherever the run goes on.
+    Model(PathBuf),
 }
 
 /// A word before an optional number: `auto`, `auto:50k`.
@@ -182,6 +184,31 @@ impl FromStr for ShDegree {
     }
 }
 
+impl FromStr for InitChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "points" => Ok(Self::Points),
+            "random" => Ok(Self::Random),
+            "" => Err("give points, random, or a file of Gaussian splats".to_owned()),
+            path => std::path::absolute(path)
+                .map(Self::Model)
+                .map_err(|error| format!("`{path}` is no path: {error}")),
+        }
+    }
+}
+
+impl Serialize for InitChoice {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::Points => "points".serialize(serializer),
+            Self::Random => "random".serialize(serializer),
+            Self::Model(path) => path.serialize(serializer),
+        }
+    }
+}
+
 impl Serialize for Budget {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         match self {
@@ -245,6 +272,7 @@ number_or_text! {
     [] Resolution;
     [] Budget;
     [] ShDegree;
+    [] InitChoice;
 }
 
 /// One `NAME=VALUE` of an option that may be repeated; NAME may have parts, separated by a dot.

@@ -232,7 +232,8 @@ impl<V: ViewSource> Trainer<V> {
 
     /// The spherical-harmonic degree in use at a step.
     fn sh_degree(&self, step: u32) -> u8 {
-        schedule::sh_degree(step, self.options.iterations, self.options.sh_degree)
+        let TrainOptions { iterations, sh_degree, has_all_bands, .. } = self.options;
+        if has_all_bands { sh_degree } else { schedule::sh_degree(step, iterations, sh_degree) }
     }
 
     fn backend_error(&self, step: u32, source: BackendError) -> TrainError {

@@ -13,6 +13,9 @@ pub struct TrainOptions {
     pub seed: u64,
     /// Highest spherical-harmonic degree trained, <= the model's.
     pub sh_degree: u8,
+    /// Whether that degree is in use from the first step on, as a model that is trained already needs; else
+    /// it rises from 0.
+    pub has_all_bands: bool,
     /// Colour behind the Gaussians.
     pub background: Background,
     /// Learning rates.

@@ -156,7 +156,7 @@ fn is_unfit(error: &std::io::Error) -> bool {
 }
 
 /// Fails where something is in the way of the output.
-fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
+pub(super) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
     let path_text = path.display();
     match path.symlink_metadata() {
         Ok(_) if path.is_dir() => {

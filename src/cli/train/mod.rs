@@ -122,7 +122,7 @@ impl<'a> Follower<'a> {
     }
 
     /// From here on a signal stops the run in order.
-    fn listen(&self) {
+    pub(in crate::cli) fn listen(&self) {
         *self.interrupts.borrow_mut() = Some(Interrupts::listen());
     }
 }

@@ -7,12 +7,14 @@ use glam::DVec3;
 
 use super::{DECODERS, Inputs};
 use crate::backend::{KeptPhotographs, MomentStorage, ROWS_AT_A_TIME, Setup, Shortcuts, Storage};
+use crate::dataset::images::ImageDemand;
 use crate::dataset::{Dataset, View};
 use crate::export::{PLY, Shape};
 use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, RunSize, Section};
 use crate::metrics::{geometry, scratch_bytes};
 use crate::run::measuring::Measuring;
+use crate::run::start::first_bytes;
 use crate::trainer::AutoChoices;
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
@@ -91,6 +93,10 @@ impl Inputs<'_> {
             let bytes = self.degree.bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
         }
+        if let Some(model) = self.brought {
+            let bytes = first_bytes(model, self, setting, threads);
+            ledger.add_to(Section::Before, "the model it starts from", bytes);
+        }
         let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
         // Points, their order, neighbours in f64, and the rows before the backend has them.
         let first = self.initial_rows(setting.rows) as u64;
@@ -104,10 +110,12 @@ impl Inputs<'_> {
         let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
         pass("export of the model, checkpoint", 2 * piece * row + held);
         let measures_test = !self.dataset.test.is_empty();
-        if measures_test || self.required != AutoChoices::default() {
+        if measures_test || self.required != AutoChoices::default() || self.brought.is_some() {
             let (width, height) = self.dataset.largest_image();
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
-            let image = if measures_test { test.held(0) + test.decoding(1) } else { 0 };
+            let of = |images: &ImageDemand| images.held(0) + images.decoding(1);
+            let tested = if measures_test { of(&test) } else { 0 };
+            let image = tested.max(if self.brought.is_some() { of(&train) } else { 0 });
             // While it is asked which rows are missed: their order, and their opacities twice or, when
             // that is done, a plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);

@@ -18,8 +18,9 @@ pub use size::DEFAULT_BUDGET;
 pub(super) use size::{Size, check, check_grant};
 
 use super::config::RunConfig;
-use super::observer::Observer;
+use super::observer::{Observer, Silent};
 use super::spec::RunSpec;
+use super::start::Brought;
 use super::values::{Budget, InitChoice, ShDegree, Threads};
 use crate::backend::Accumulation;
 use crate::backend::{BackendKind, Device};
@@ -54,7 +55,9 @@ pub(super) struct Inputs<'a> {
     /// What the run is to find out by itself.
     pub(super) required: AutoChoices,
     /// What training and test images take.
-    images: [ImageDemand; 2],
+    pub(super) images: [ImageDemand; 2],
+    /// The model that the run starts from, if it is one.
+    brought: Option<Brought>,
     /// Rows that a start on the dataset's points would have, were there no limit.
     usable: usize,
     /// Resident memory when the dataset was loaded, and the most until then.
@@ -83,6 +86,12 @@ impl<'a> Inputs<'a> {
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
         let usable = usable_points(&dataset.points);
         let images = images(&dataset);
+        let brought = match (&spec.start.init, saved) {
+            (Some(InitChoice::Model(file)), None) => Some(Brought::find(file, observer)?),
+            // A run that goes on has its rows; the file may be gone.
+            (Some(InitChoice::Model(file)), Some(_)) => Brought::find(file, &Silent).ok(),
+            _ => None,
+        };
         // Tracks have a line of their own, and are given back.
         let resident = resident().map(|now| now.saturating_sub(dataset.tracks.bytes()));
         let peak = peak_resident();
@@ -102,6 +111,7 @@ impl<'a> Inputs<'a> {
             degree,
             required,
             images,
+            brought,
             usable,
             resident,
             peak,
@@ -128,11 +138,11 @@ impl<'a> Inputs<'a> {
         Ok(Self { spec, entry, parameters, knobs, dataset, degree, images, device, ..*self })
     }
 
-    /// How the first rows are placed.
+    /// What the first rows are.
     pub(super) fn init(&self) -> InitChoice {
         let start = &self.spec.start;
-        match start.init {
-            Some(init) => init,
+        match &start.init {
+            Some(init) => init.clone(),
             None if self.dataset.points.is_empty() || start.init_points.is_some() => {
                 InitChoice::Random
             }
@@ -143,6 +153,7 @@ impl<'a> Inputs<'a> {
     /// Rows that the scene starts with, were there no limit; `None` where the limit decides.
     fn start(&self) -> Option<usize> {
         match self.init() {
+            InitChoice::Model(_) => self.brought.map(|model| model.rows),
             InitChoice::Points => Some(self.usable),
             InitChoice::Random => self.spec.start.init_points.map(|points| points.0),
         }

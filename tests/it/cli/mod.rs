@@ -4,6 +4,7 @@ mod accumulation;
 #[cfg(unix)]
 mod caching;
 mod comparing;
+mod compressing;
 mod configuring;
 mod exporting;
 mod faults;
@@ -17,6 +18,7 @@ mod memory;
 mod requiring;
 mod resuming;
 mod same;
+mod starting;
 mod trading;
 mod training;
 
@@ -110,6 +112,11 @@ fn scratch() -> (TempDir, PathBuf) {
 
 fn read(path: &Path) -> Vec<u8> {
     std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// The Gaussians of a file.
+fn gaussians(file: &Path) -> densify::gaussians::Gaussians {
+    densify::import::read_model(file).expect("a model").gaussians
 }
 
 fn read_text(path: &Path) -> String {

@@ -1,0 +1,187 @@
+//! `densify compress`.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use clap::{ArgMatches, Args};
+
+use super::console::Console;
+use super::export::check_output;
+use super::render::{RenderingArgs, is_model, refuse_options_of_a_file};
+use super::train::Follower;
+use crate::compress::{Attempt, Compressed, Options, Target, compress};
+use crate::export::{Format, find, find_by_extension};
+use crate::failure::Failure;
+use crate::number::{self, grouped, percent};
+use crate::output::model_path;
+use crate::run::finished::iteration;
+use crate::run::{RunConfig, Whole};
+
+/// Makes a trained model smaller: as many Gaussians as asked, or a file no larger than asked.
+///
+/// Prunes the Gaussians that show least in the training views, at most half of them at once, and trains the others on
+/// in between. For a file it tries the model's degree of colour and lower ones, which leave room for more Gaussians, and
+/// keeps what shows the training views best as the file has it. Views held out are measured too, and decide nothing.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct CompressArgs {
+    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    #[arg(value_name = "RUN_OR_MODEL")]
+    model: PathBuf,
+    /// Most bytes of the file, such as 5MiB or 800kB, or a number of Gaussians, such as 20k
+    #[arg(long, value_name = "SIZE|ROWS")]
+    to: Size,
+    /// File to write; its extension says in which format, as for `densify export`
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Format of the file `[default: the one with FILE's extension]`
+    #[arg(long, value_name = "NAME")]
+    format: Option<String>,
+    /// Replace a file that exists
+    #[arg(long)]
+    overwrite: bool,
+    /// Training steps of each attempt
+    #[arg(short, long, value_name = "N", default_value = "2000")]
+    iterations: Whole<1, { u32::MAX }>,
+    /// Everything random follows from this number
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    seed: u64,
+    /// Saved iteration of the run `[default: the last]`
+    #[arg(long, value_name = "N")]
+    iteration: Option<u32>,
+    /// Folder of the dataset: needed for a file, and for a run whose dataset has moved
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
+    #[command(flatten)]
+    rendering: RenderingArgs,
+}
+
+const EXAMPLES: &str = "\
+Options under Scene are for a file; a run brings its own.
+
+Examples:
+  densify compress output/garden-diet --to 5MiB -o garden.sog
+  densify compress output/garden-diet --to 20k -o small.ply
+  densify compress others.ply --scene data/garden --to 800kB -o garden.spz";
+
+/// What `--to` may be.
+#[derive(Debug, Clone, Copy)]
+struct Size(Target);
+
+impl FromStr for Size {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let is_bytes = text.trim_end().ends_with(['b', 'B']);
+        let target = match is_bytes {
+            true => number::bytes(text).map(Target::Bytes),
+            false => number::rows(text).map(Target::Rows),
+        };
+        let wrong = |error| {
+            format!("{error}; give a size such as 5MiB, or a number of Gaussians such as 20k")
+        };
+        target.map(Self).map_err(wrong)
+    }
+}
+
+pub(super) fn run(
+    args: &CompressArgs,
+    matches: &ArgMatches,
+    console: &Console,
+) -> Result<(), Failure> {
+    let format = format(args)?;
+    check_output(&args.output, args.overwrite)?;
+    let RenderingArgs { near, device, data } = &args.rendering;
+    let (model, scene, data, near) = if is_model(&args.model) {
+        if args.iteration.is_some() {
+            return Err(Failure::input(
+                "--iteration is for a run's folder; a file has only one model",
+            ));
+        }
+        let Some(scene) = args.scene.clone() else {
+            return Err(Failure::input(format!(
+                "{} is a file, which has no photographs; name its dataset with --scene DIR",
+                args.model.display()
+            )));
+        };
+        (args.model.clone(), scene, data.clone(), *near)
+    } else {
+        refuse_options_of_a_file(matches)?;
+        let config = RunConfig::read(&args.model)?;
+        let file = model_path(&args.model, iteration(&args.model, args.iteration)?);
+        let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
+        (file, scene, config.spec.data, config.spec.start.near)
+    };
+    let options = Options {
+        model: &model,
+        scene: &scene,
+        data,
+        near,
+        device: device.clone(),
+        to: args.to.0,
+        iterations: args.iterations.0,
+        seed: args.seed,
+        format,
+        output: &args.output,
+    };
+    let follower = Follower::new(console);
+    follower.listen();
+    let compressed = compress(&options, &follower)?;
+    console.result(table(&compressed));
+    console.result(format_args!("{} ({})", args.output.display(), format.name));
+    Ok(())
+}
+
+fn format(args: &CompressArgs) -> Result<&'static Format, Failure> {
+    match args.format.as_deref() {
+        Some(name) => find(name).map_err(|error| Failure::input(format!("--format: {error}"))),
+        None => find_by_extension(&args.output).map_err(|error| {
+            Failure::input(format!("-o: {error}, and name it with --format NAME"))
+        }),
+    }
+}
+
+/// The curve of size against quality.
+fn table(compressed: &Compressed) -> String {
+    let Compressed { whole, attempts, best } = compressed;
+    let mut text = format!(
+        "\n{:<9} {:>10} {:>7} {:>13} {:>11} {:>11}",
+        "", "Gaussians", "degree", "bytes", "train [dB]", "test [dB]"
+    );
+    let mut line = |name: &str, it: &Attempt, of_whole: &str| {
+        let test = it.test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
+        let bytes = grouped(usize::try_from(it.bytes).unwrap_or(usize::MAX));
+        text += &format!(
+            "\n{name:<9} {:>10} {:>7} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
+            grouped(it.rows),
+            it.sh_degree,
+            it.train
+        );
+    };
+    line("whole PLY", whole, "");
+    for (place, attempt) in attempts.iter().enumerate() {
+        let share = percent(attempt.bytes as f64 / whole.bytes as f64);
+        line(
+            if place == *best { "written" } else { "tried" },
+            attempt,
+            &format!("  {share} of the PLY"),
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_bytes_and_numbers_are_gaussians() {
+        let of = |text: &str| text.parse::<Size>().map(|size| size.0);
+        assert_eq!(of("5MiB"), Ok(Target::Bytes(5 << 20)));
+        assert_eq!(of("800kB"), Ok(Target::Bytes(800_000)));
+        assert_eq!(of("20k"), Ok(Target::Rows(20_000)));
+        for wrong in ["", "much", "-3", "0"] {
+            assert!(of(wrong).is_err_and(|error| error.contains("20k")), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! How many Gaussians a file of a given size holds.
+
+use std::io::{self, Write};
+
+use super::{Options, Target};
+use crate::export::Format;
+use crate::failure::{Failure, OTHER};
+use crate::gaussians::Gaussians;
+use crate::number::grouped;
+
+/// Share of the size that the first estimate fills: training changes how well the rows pack.
+const FILLED: f64 = 0.98;
+/// Estimates until the number of rows is taken as it is.
+const ESTIMATES: usize = 6;
+/// Share of the rows that is left out at a time where the file is still too large.
+const TRIMMED: f64 = 0.01;
+
+/// Counts what is written to it.
+#[derive(Default)]
+struct Counted(u64);
+
+impl Write for Counted {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0 += bytes.len() as u64;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The size of a model's file in a format.
+pub(super) fn bytes(format: &Format, model: &Gaussians) -> Result<u64, Failure> {
+    let mut counted = Counted::default();
+    format.write(model, &mut counted).map_err(|error| Failure {
+        code: OTHER,
+        message: format!("cannot write the model as {}: {error}", format.name),
+    })?;
+    Ok(counted.0)
+}
+
+/// Fails where the model cannot become what is asked for.
+pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Failure> {
+    match options.to {
+        _ if model.is_empty() => {
+            Err(Failure::input(format!("{}: the model has no Gaussian", options.model.display())))
+        }
+        Target::Rows(rows) if rows > model.len() => Err(Failure::input(format!(
+            "--to {rows}: {} has only {} Gaussians; give fewer, or a size such as 5MiB",
+            options.model.display(),
+            grouped(model.len())
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// How many rows of this model, as it is, make a file of the target; `None` where not even one does.
+pub(super) fn rows(options: &Options<'_>, model: &Gaussians) -> Result<Option<usize>, Failure> {
+    let most = match options.to {
+        Target::Rows(rows) => return Ok(Some(rows.min(model.len()))),
+        Target::Bytes(most) => most,
+    };
+    let mut rows = model.len();
+    let mut size = bytes(options.format, model)?;
+    if size <= most {
+        return Ok(Some(rows));
+    }
+    for _ in 0..ESTIMATES {
+        let next = (rows as f64 * (FILLED * most as f64 / size as f64)) as usize;
+        rows = next.clamp(1, model.len());
+        size = bytes(options.format, &spread(model, rows))?;
+        let filled = size as f64 / most as f64;
+        if (FILLED - 0.01..=1.0).contains(&filled) || (rows == 1 && size > most) {
+            break;
+        }
+    }
+    Ok((size <= most || rows > 1).then_some(rows))
+}
+
+/// So many rows, evenly from first to last, which is through space.
+fn spread(model: &Gaussians, rows: usize) -> Gaussians {
+    let at = |place: usize| (place as u64 * model.len() as u64 / rows as u64) as usize;
+    model.gather(&(0..rows).map(at).collect::<Vec<_>>())
+}
+
+/// The model with as few rows left out, the faintest and smallest first, as make its file small enough, and the file's
+/// size; `None` where no row is left.
+pub(super) fn trimmed(
+    options: &Options<'_>,
+    mut model: Gaussians,
+) -> Result<Option<(Gaussians, u64)>, Failure> {
+    loop {
+        let size = bytes(options.format, &model)?;
+        let most = match options.to {
+            Target::Bytes(most) if size > most => most,
+            _ => return Ok(Some((model, size))),
+        };
+        // As far over as the file is, so many rows too many; and a little more.
+        let over = 1.0 - most as f64 / size as f64 + TRIMMED;
+        let left = ((model.len() as f64 * (1.0 - over)) as usize).min(model.len() - 1);
+        if left == 0 {
+            return Ok(None);
+        }
+        let shown = |row: usize| {
+            let mut log_scales = model.log_scales[row];
+            log_scales.sort_unstable_by(f32::total_cmp);
+            let opacity = crate::gaussians::sigmoid(model.opacity_logits[row]);
+            f64::from(opacity.ln() + log_scales[1] + log_scales[2])
+        };
+        let shown: Vec<f64> = (0..model.len()).map(shown).collect();
+        model = model.gather(&crate::importance::largest(&shown, left));
+    }
+}
+
+/// What to say where not even one Gaussian fits.
+pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
+    let one = bytes(options.format, &model.gather(&[0]).with_degree(0)).unwrap_or_default();
+    Failure::input(format!(
+        "--to: no model fits; one Gaussian takes {one} bytes as {}; give more",
+        options.format.name
+    ))
+}

@@ -1,0 +1,49 @@
+//! How well a model shows the photographs.
+
+use super::{Attempt, Options};
+use crate::dataset::Dataset;
+use crate::evaluate::Split;
+use crate::failure::Failure;
+use crate::gaussians::Gaussians;
+use crate::metrics::psnr;
+use crate::run::Observer;
+use crate::run::finished::{Machine, load, views_of};
+use crate::views::ViewSource;
+
+/// The photographs, and what models are rendered on.
+pub(super) struct Judge {
+    dataset: Dataset,
+    machine: Machine,
+    /// Distance `[scene units]`.
+    near: f32,
+    background: [f32; 3],
+}
+
+impl Judge {
+    pub(super) fn open(options: &Options<'_>, observer: &dyn Observer) -> Result<Self, Failure> {
+        let machine = Machine::open(&options.device, observer)?;
+        let dataset = load(options.scene, &options.data, observer)?;
+        let near = (options.near.0 * dataset.extent()) as f32;
+        Ok(Self { dataset, machine, near, background: options.data.background.fixed() })
+    }
+
+    /// Measures a model whose file has this size.
+    pub(super) fn attempt(&self, model: Gaussians, bytes: u64) -> Result<Attempt, Failure> {
+        let (rows, sh_degree) = (model.len(), model.sh_degree);
+        let mut backend = self.machine.backend(&self.dataset, model, self.near)?;
+        let mut mean = |split: Split| {
+            let views = views_of(&self.dataset, split)?;
+            let mut sum = 0.0;
+            for view in 0..views.count() {
+                views.prefetch(&(view + 1..views.count().min(view + 3)).collect::<Vec<_>>());
+                let image = views.image(view).map_err(Failure::input)?;
+                let shown = backend.render(views.camera(view), self.background, sh_degree)?;
+                sum += psnr(&shown.rgb, &image, self.background).map_err(Failure::input)?;
+            }
+            Ok::<_, Failure>(sum / views.count() as f64)
+        };
+        let train = mean(Split::Train)?;
+        let test = if self.dataset.test.is_empty() { None } else { Some(mean(Split::Test)?) };
+        Ok(Attempt { rows, sh_degree, bytes, train, test })
+    }
+}

@@ -1,0 +1,154 @@
+//! A smaller model of a scene: fewer Gaussians and less colour, trained on, in a file no larger than asked.
+//!
+//! Gaussians are pruned by how much they show in the training views, at most half of them at once, and the rest
+//! trained on in between (`tune.rs`). Colour that depends on the view is dropped from each Gaussian by itself where
+//! nobody would see it (`colour.rs`). How much of a file colour is worth depends on the scene, so several degrees of it
+//! are tried, each with as many Gaussians as then fit (`fit.rs`), and the one is kept whose file, read back, shows the
+//! training views best (`judge.rs`).
+
+mod colour;
+mod fit;
+mod judge;
+mod tune;
+
+use std::path::Path;
+
+use tempfile::TempPath;
+
+use crate::export::{Format, PLY};
+use crate::failure::Failure;
+use crate::number::grouped;
+use crate::output::{OutputError, write_atomically};
+use crate::run::finished::read_model;
+use crate::run::{DataSpec, DeviceSpec, Fraction, Observer};
+use judge::Judge;
+
+/// What a model is to shrink to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Target {
+    /// A file of at most so many bytes.
+    Bytes(u64),
+    /// So many Gaussians.
+    Rows(usize),
+}
+
+/// What is compressed, and how.
+#[derive(Debug, Clone)]
+pub struct Options<'a> {
+    /// The file of the model.
+    pub model: &'a Path,
+    /// The dataset that it shows.
+    pub scene: &'a Path,
+    /// How the dataset is read.
+    pub data: DataSpec,
+    /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's extent.
+    pub near: Fraction,
+    /// Where to compute.
+    pub device: DeviceSpec,
+    /// What the result is to be.
+    pub to: Target,
+    /// Training steps of each attempt, >= 1.
+    pub iterations: u32,
+    /// Seed of these.
+    pub seed: u64,
+    /// The format of the file.
+    pub format: &'static Format,
+    /// The file.
+    pub output: &'a Path,
+}
+
+/// A model that was made.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Attempt {
+    /// Gaussians in it.
+    pub rows: usize,
+    /// Highest degree of colour in it.
+    pub sh_degree: u8,
+    /// The size of its file.
+    pub bytes: u64,
+    /// Mean PSNR of the training views `[dB]`.
+    pub train: f64,
+    /// Mean PSNR of the views held out `[dB]`, if there are any.
+    pub test: Option<f64>,
+}
+
+/// What came of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Compressed {
+    /// The model as it was, and the PLY that training writes of it.
+    pub whole: Attempt,
+    /// What was tried, in that order.
+    pub attempts: Vec<Attempt>,
+    /// Which of them is in the file.
+    pub best: usize,
+}
+
+/// Compresses a model, and writes its file.
+///
+/// # Errors
+/// When a file cannot be used, nothing fits, the device or the disk fails, or the observer asks to stop; then nothing is
+/// written.
+pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compressed, Failure> {
+    let judge = Judge::open(options, observer)?;
+    let model = read_model(options.model, observer)?;
+    fit::check(options, &model)?;
+    let whole = judge.attempt(model.clone(), fit::bytes(PLY, &model)?)?;
+    let scratch = scratch(options.output)?;
+    let mut attempts: Vec<Attempt> = Vec::new();
+    let mut best: Option<(usize, crate::gaussians::Gaussians)> = None;
+    for degree in degrees(model.sh_degree, options.to) {
+        let start = colour::reduced(model.clone(), degree);
+        let Some(rows) = fit::rows(options, &start)? else { continue };
+        let is_whole = rows == model.len() && degree == model.sh_degree;
+        let tuned = match is_whole {
+            true => start,
+            false => colour::reduced(tune::tune(start, rows, options, &scratch, observer)?, degree),
+        };
+        let Some((small, bytes)) = fit::trimmed(options, tuned)? else { continue };
+        // What the file says, not what was written.
+        write_atomically(&scratch, |out| options.format.write(&small, out))?;
+        let attempt = judge.attempt(read_model(&scratch, observer)?, bytes)?;
+        observer.say(format_args!(
+            "tried    {} Gaussians of degree {degree}: {} bytes, {:.2} dB",
+            grouped(attempt.rows),
+            grouped(usize::try_from(bytes).unwrap_or(usize::MAX)),
+            attempt.train
+        ));
+        let is_best = best.as_ref().is_none_or(|&(at, _)| attempt.train > attempts[at].train);
+        attempts.push(attempt);
+        if is_best {
+            best = Some((attempts.len() - 1, small));
+        }
+        if is_whole {
+            break;
+        }
+    }
+    let Some((best, small)) = best else { return Err(fit::too_small(options, &model)) };
+    write_atomically(options.output, |out| options.format.write(&small, out))?;
+    Ok(Compressed { whole, attempts, best })
+}
+
+/// A file for what is between two steps, in the folder that has room for the result; gone with this value.
+fn scratch(output: &Path) -> Result<TempPath, Failure> {
+    let folder = match output.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    let made = std::fs::create_dir_all(folder)
+        .and_then(|()| tempfile::NamedTempFile::with_prefix_in(".densify-", folder));
+    Ok(made.map_err(OutputError::io("write to the folder", folder))?.into_temp_path())
+}
+
+/// Degrees of colour that are tried, the model's own first.
+fn degrees(own: u8, to: Target) -> Vec<u8> {
+    match to {
+        Target::Rows(_) => vec![own],
+        // Bands 2 and 3 go together: what two thirds of the third's room buy is little.
+        Target::Bytes(_) => {
+            [own].into_iter().chain([1, 0].into_iter().filter(|it| *it < own)).collect()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

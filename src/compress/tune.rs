@@ -1,0 +1,104 @@
+//! Prunes a model step by step, and trains what is left.
+
+use std::path::Path;
+
+use super::Options;
+use crate::export::PLY;
+use crate::failure::Failure;
+use crate::gaussians::Gaussians;
+use crate::output::write_atomically;
+use crate::run::{Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Whole};
+
+/// A policy that, set so, neither adds nor prunes.
+const POLICY: &str = "vanilla";
+const STILL: [&str; 3] =
+    ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
+
+/// So many rows of the model, those that show most, trained on.
+///
+/// # Errors
+/// As a run's, and when the observer asks to stop.
+pub(super) fn tune(
+    mut model: Gaussians,
+    rows: usize,
+    options: &Options<'_>,
+    scratch: &Path,
+    observer: &dyn Observer,
+) -> Result<Gaussians, Failure> {
+    let stages = stages(model.len(), rows, options.iterations);
+    for (stage, &(budget, iterations)) in stages.iter().enumerate() {
+        observer.say(format_args!(
+            "training {budget} Gaussians of degree {} for {iterations} iterations ({} of {})",
+            model.sh_degree,
+            stage + 1,
+            stages.len()
+        ));
+        write_atomically(scratch, |out| PLY.write(&model, out))?;
+        let spec = described(&model, (budget, iterations), options, scratch)?;
+        drop(model);
+        let run = Run::prepare(&spec)?;
+        model = run.model_after_training(observer)?;
+    }
+    Ok(model)
+}
+
+/// Bounds, each at least half of the one before, and the training steps under each; the last has two shares.
+fn stages(whole: usize, rows: usize, iterations: u32) -> Vec<(usize, u32)> {
+    let ratio = whole as f64 / rows.max(1) as f64;
+    let count = (ratio.log2().ceil() as u32).clamp(1, iterations);
+    let share = iterations / (count + 1);
+    let stage = |number: u32| match number == count {
+        true => (rows, iterations - share * (count - 1)),
+        false => {
+            ((whole as f64 / ratio.powf(f64::from(number) / f64::from(count))) as usize, share)
+        }
+    };
+    (1..=count).map(stage).filter(|(_, steps)| *steps > 0).collect()
+}
+
+/// The description of a stage.
+fn described(
+    model: &Gaussians,
+    (budget, iterations): (usize, u32),
+    options: &Options<'_>,
+    scratch: &Path,
+) -> Result<RunSpec, Failure> {
+    let mut spec = RunSpec { data: options.data.clone(), ..RunSpec::default() };
+    spec.device = options.device.clone();
+    spec.start.scene = Some(options.scene.to_owned());
+    let file = std::path::absolute(scratch).map_err(Failure::input)?;
+    spec.start.init = Some(InitChoice::Model(file));
+    spec.start.near = options.near;
+    spec.size.budget = Some(Budget::Rows(budget));
+    spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));
+    POLICY.clone_into(&mut spec.density.policy);
+    let set = |text: &&str| text.parse::<Assignment>().map_err(Failure::input);
+    spec.density.policy_set = STILL.iter().map(set).collect::<Result<_, _>>()?;
+    spec.schedule.iterations = Whole(iterations);
+    spec.schedule.seed = options.seed;
+    Ok(spec)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_stage_prunes_more_than_half() {
+        assert_eq!(stages(1_000, 1_000, 300), [(1_000, 300)]);
+        assert_eq!(stages(1_000, 600, 300), [(600, 300)]);
+        assert_eq!(stages(1_000, 250, 300), [(500, 100), (250, 200)]);
+        for (whole, rows, iterations) in [(90_000, 1_000, 2_000), (7, 3, 10), (8, 1, 4), (5, 1, 1)]
+        {
+            let stages = stages(whole, rows, iterations);
+            assert_eq!(stages.last().map(|stage| stage.0), Some(rows));
+            assert_eq!(stages.iter().map(|stage| stage.1).sum::<u32>(), iterations);
+            let bounds = [whole].into_iter().chain(stages.iter().map(|stage| stage.0));
+            let bounds: Vec<usize> = bounds.collect();
+            assert!(
+                iterations < 3 || bounds.windows(2).all(|w| w[0] <= 2 * w[1] + 1),
+                "{bounds:?}"
+            );
+        }
+    }
+}

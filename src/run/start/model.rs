@@ -1,0 +1,201 @@
+//! A start from a model that there is already, by whatever program.
+
+use std::path::Path;
+
+use glam::DVec3;
+
+use crate::backend::{Backend, MomentStorage, Setup, Storage};
+use crate::dataset::Dataset;
+use crate::evaluate::Split;
+use crate::failure::Failure;
+use crate::gaussians::{Gaussians, sh_coefficients};
+use crate::importance::{importance, largest, needs};
+use crate::memory::RunSize;
+use crate::metrics::psnr;
+use crate::number::grouped;
+use crate::run::finished::{read_model, views_of};
+use crate::run::observer::Observer;
+use crate::run::resolve::Inputs;
+use crate::views::ViewSource;
+
+/// A model of which fewer Gaussians than this share lie in any training view is in other coordinates.
+const LEAST_IN_VIEW: f64 = 0.1;
+/// Training views in which a model is compared with the photographs.
+const COMPARED: usize = 4;
+/// Pairs per row while importance is measured; views with more are rendered in bands.
+const PAIRS_PER_ROW: usize = 3;
+
+/// What is known of a model before the size of the run is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::run) struct Brought {
+    pub(in crate::run) rows: usize,
+    pub(in crate::run) sh_degree: u8,
+}
+
+impl Brought {
+    /// Reads the file once, to be sure that it is sound before anything is decided.
+    ///
+    /// # Errors
+    /// When it is no model, or has no row.
+    pub(in crate::run) fn find(file: &Path, observer: &dyn Observer) -> Result<Self, Failure> {
+        let model = read_model(file, observer).map_err(of_flag)?;
+        if model.is_empty() {
+            return Err(Failure::input(format!(
+                "--init {}: the model has no Gaussian; give another one, points or random",
+                file.display()
+            )));
+        }
+        Ok(Self { rows: model.len(), sh_degree: model.sh_degree })
+    }
+
+    /// Bytes of its rows as they are read.
+    fn bytes(self) -> u64 {
+        (self.rows * size_of::<f32>() * (11 + 3 * sh_coefficients(self.sh_degree))) as u64
+    }
+}
+
+fn of_flag(failure: Failure) -> Failure {
+    Failure { message: format!("--init: {}", failure.message), ..failure }
+}
+
+/// Bytes that such a model takes before the run has its own rows: as it is read, into arrays that grow, or while its
+/// importance is measured where it exceeds the budget.
+pub(in crate::run) fn first_bytes(
+    brought: Brought,
+    inputs: &Inputs<'_>,
+    setting: &RunSize,
+    threads: usize,
+) -> u64 {
+    let reading = 3 * brought.bytes();
+    if brought.rows <= setting.rows {
+        return reading;
+    }
+    let options = to_measure(brought.rows, inputs, setting);
+    let backend = inputs.device.promise(brought.sh_degree, &options, threads).on_host();
+    let [train, _] = inputs.images;
+    let image = train.held(0) + train.decoding(1);
+    // The model beside its copy in the backend, then beside the rows that are kept.
+    reading.max(brought.bytes() + backend + image + crate::importance::bytes(brought.rows))
+}
+
+/// The backend that measures the importance of so many rows.
+fn to_measure(rows: usize, inputs: &Inputs<'_>, setting: &RunSize) -> Setup {
+    let needs = needs();
+    let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(inputs.device.most_pairs(&needs));
+    Setup {
+        budget: rows,
+        tile_cap: Some(pairs.max(rows)),
+        // Nothing is differentiated, and no moment matters.
+        record_cap: rows,
+        storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
+        ..inputs.backend_options(setting, needs)
+    }
+}
+
+/// The model of a file in the coordinates of training, with at most the rows of the run and with its degree.
+///
+/// # Errors
+/// When the file cannot be read, the device fails, or no training view shows the model.
+pub(super) fn load(
+    file: &Path,
+    inputs: &Inputs<'_>,
+    setting: &RunSize,
+    observer: &dyn Observer,
+) -> Result<Gaussians, Failure> {
+    let dataset = &inputs.dataset;
+    // What is wrong with it was said when it was found.
+    let model = read_model(file, &crate::run::observer::Silent).map_err(of_flag)?;
+    let mut model = dataset.normalisation.model_from_world(model);
+    let seen = in_view(&model, dataset);
+    if (seen as f64) < LEAST_IN_VIEW * model.len() as f64 {
+        return Err(Failure::input(format!(
+            "--init {}: only {} of its {} Gaussians lie in any training view; it must be in the coordinates of \
+             the dataset: export it untransformed, or transform it back",
+            file.display(),
+            grouped(seen),
+            grouped(model.len())
+        )));
+    }
+    let whole = model.len();
+    if whole > setting.rows {
+        let views = views_of(dataset, Split::Train)?;
+        let options = to_measure(whole, inputs, setting);
+        let mut backend = inputs.device.backend(&model, &options)?;
+        let background = inputs.spec.data.background.fixed();
+        let importance = importance(backend.as_mut(), &views, background, model.sh_degree)?;
+        drop(backend);
+        model = model.gather(&largest(&importance, setting.rows));
+    }
+    let (degree, own) = (setting.sh_degree, model.sh_degree);
+    observer.say(format_args!("start    {} Gaussians of {}", grouped(whole), file.display()));
+    if whole > setting.rows {
+        observer.say(format_args!(
+            "note: {} Gaussians beyond the budget left out: those with the least blend weight in the training views",
+            grouped(whole - setting.rows)
+        ));
+    }
+    if own > degree {
+        observer.say(format_args!(
+            "note: colours of degree {own} are cut to {degree}; --sh-degree {own} keeps them"
+        ));
+    }
+    Ok(model.with_degree(degree))
+}
+
+/// How many rows have their centre in a training view.
+fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
+    let shows = |mean: &[f32; 3]| {
+        let point = DVec3::from(mean.map(f64::from));
+        dataset.train.iter().any(|view| {
+            let camera = &view.camera;
+            let (pixel, depth) = camera.project(point);
+            let within = |x: f64, size: u32| (0.0..f64::from(size)).contains(&x);
+            depth > 0.0 && within(pixel.x, camera.width) && within(pixel.y, camera.height)
+        })
+    };
+    model.means.iter().filter(|mean| shows(mean)).count()
+}
+
+/// Says so where the model that a run starts from fits the photographs worse than a plain colour does: then it
+/// is hardly in the coordinates of the dataset.
+///
+/// # Errors
+/// When a view cannot be read or rendered.
+pub(in crate::run) fn fits(
+    file: &Path,
+    backend: &mut dyn Backend,
+    dataset: &Dataset,
+    (background, sh_degree): ([f32; 3], u8),
+    observer: &dyn Observer,
+) -> Result<(), Failure> {
+    let views = views_of(dataset, Split::Train)?;
+    let count = views.count().min(COMPARED);
+    let mut worse = 0;
+    for place in 0..count {
+        let view = place * views.count() / count;
+        let image = views.image(view).map_err(Failure::input)?;
+        let rendering = backend.render(views.camera(view), background, sh_degree)?;
+        let plain = plain(&image, background);
+        let [model, plain] = [&rendering.rgb, &plain].map(|rgb| psnr(rgb, &image, background));
+        worse += usize::from(model.map_err(Failure::input)? < plain.map_err(Failure::input)?);
+    }
+    if 2 * worse > count {
+        observer.say(format_args!(
+            "note: --init {}: in {worse} of {count} training views it fits the photograph worse than a plain colour; \
+             its coordinates may not be those of the dataset (axes, scale, or origin)",
+            file.display()
+        ));
+    }
+    Ok(())
+}
+
+/// An image of the photograph's mean colour. Shape: `[height, width, 3]`.
+fn plain(image: &crate::dataset::images::Image8, background: [f32; 3]) -> Vec<f32> {
+    let shown = crate::pictures::photograph(image, background);
+    let pixels = shown.as_raw().len() / 3;
+    let sum = |channel: usize| {
+        shown.as_raw().iter().skip(channel).step_by(3).map(|&v| f64::from(v)).sum::<f64>()
+    };
+    let mean = [0, 1, 2].map(|channel| (sum(channel) / (255.0 * pixels as f64)) as f32);
+    mean.repeat(pixels)
+}

@@ -1,0 +1,63 @@
+//! `densify compress`: files no larger than asked, and what is refused.
+
+use densify::output::model_path;
+
+use super::{call, files, gaussians, read, scratch, text, train};
+use crate::photographs::Photographs;
+
+#[test]
+fn what_is_written_is_no_larger_than_asked() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 100, "--budget 300 --eval --quiet").ok();
+    let whole = read(&model_path(&run, 100)).len();
+    let rows = gaussians(&model_path(&run, 100)).len();
+    let compress = |to: &str, name: &str, flags: &str| {
+        let output = root.path().join(name);
+        let words = format!(
+            "compress {} --to {to} -o {} --iterations 30 --backend cpu {flags}",
+            text(&run),
+            text(&output)
+        );
+        (call(&words), output)
+    };
+    // Half of the bytes, in the same format: by fewer Gaussians, or by less colour.
+    let (outcome, ply) = compress(&format!("{}B", whole / 2), "half.ply", "");
+    let outcome = outcome.ok();
+    let size = read(&ply).len();
+    assert!(size <= whole / 2 && size > whole / 4, "{size} of {whole}");
+    let written: Vec<_> = outcome.stdout.lines().filter(|l| l.starts_with("written ")).collect();
+    assert_eq!(written.len(), 1, "{outcome:?}");
+    assert!(outcome.stdout.contains("tried "), "the other degree was tried: {outcome:?}");
+    // The same call gives the same bytes.
+    let (outcome, again) = compress(&format!("{}B", whole / 2), "again.ply", "--threads 1");
+    outcome.ok();
+    assert!(read(&again) == read(&ply));
+    // A number of Gaussians.
+    let third = rows / 3;
+    let (outcome, few) = compress(&third.to_string(), "few.ply", "");
+    assert!(outcome.ok().stdout.contains(&format!("training {third} Gaussians")));
+    assert_eq!(gaussians(&few).len(), third);
+    // Already small enough: nothing is trained, nothing is lost.
+    let (outcome, same) = compress("1MiB", "same.ply", "");
+    assert!(!outcome.ok().stdout.contains("training"));
+    assert_eq!(read(&same).len(), whole);
+
+    let before = files(root.path()).len();
+    for (to, name, flags, words) in [
+        ("100B", "tiny.ply", "", &["--to", "no model fits"][..]),
+        ("1M", "tiny.ply", "", &["--to 1000000", "has only"]),
+        ("much", "tiny.ply", "", &["much", "5MiB"]),
+        ("1MiB", "tiny.doc", "", &["-o", "tiny.doc"]),
+        ("1MiB", "same.ply", "", &["exists", "--overwrite"]),
+        ("1MiB", "tiny.ply", "--near 0.1", &["--near", "leave it out"]),
+    ] {
+        let (outcome, _) = compress(to, name, flags);
+        outcome.refused(name, words);
+    }
+    let alone = text(&ply).to_owned();
+    let outcome =
+        call(&format!("compress {alone} --to 50 -o {}", text(&root.path().join("x.ply"))));
+    outcome.refused("a file alone", &["--scene"]);
+    assert_eq!(files(root.path()).len(), before, "nothing is left behind");
+}

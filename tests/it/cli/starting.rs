@@ -1,0 +1,141 @@
+//! `--init MODEL`: a run that starts from a model there is already, and what cannot be started from.
+
+use std::path::Path;
+
+use super::{
+    Outcome, call, count, files, json, model, read, records, resume, scratch, text, train,
+};
+use crate::photographs::Photographs;
+
+/// A policy that does nothing: `vanilla` without growth.
+const STILL: &str = "--policy vanilla --policy-set vanilla.grow_every=0 --policy-set vanilla.reset_every=0 \
+                     --policy-set vanilla.white_reset_at=0";
+
+/// The loss of a run's first step that is recorded.
+fn first_loss(run: &Path) -> f64 {
+    records(&run.join("stats/train.jsonl"))[0]["loss"].as_f64().expect("a loss")
+}
+
+/// Writes a model as PLY.
+fn write(model: &Gaussians, file: &Path) {
+    let mut bytes = Vec::new();
+    densify::export::PLY.write(model, &mut bytes).expect("it is written");
+    std::fs::write(file, bytes).expect("it is written");
+}
+
+fn refused(outcome: &Outcome, root: &Path, words: &[&str]) {
+    outcome.refused("--init", words);
+    assert!(!root.join("no").exists());
+}
+
+#[test]
+fn a_run_goes_on_from_any_model() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 150, &format!("--budget 300 --quiet {STILL}")).ok();
+    let ply = model_path(&run, 150);
+    let init = |file: &Path, run: &str, flags: &str| {
+        let flags = format!("--init {} --quiet {STILL} {flags}", text(file));
+        let run = root.path().join(run);
+        (train(scene.path(), &run, 20, &flags), run)
+    };
+
+    // It starts where the other ended, and its colours depend on the view from the first step on.
+    let (outcome, again) = init(&ply, "again", "--budget 300");
+    outcome.ok();
+    let [from_points, from_model] = [&run, &again].map(|run| first_loss(run));
+    assert!(from_model < 0.5 * from_points, "{from_model} after {from_points}");
+    let rows = |run: &Path, iteration| gaussians(&model_path(run, iteration)).len();
+    assert_eq!(rows(&again, 20), rows(&run, 150));
+
+    // So does a file of another format.
+    #[cfg(feature = "formats")]
+    {
+        let spz = root.path().join("model.spz");
+        call(&format!("export {} -o {}", text(&run), text(&spz))).ok();
+        let (outcome, other) = init(&spz, "other", "--budget 300");
+        outcome.ok();
+        assert!(first_loss(&other) < 1.1 * from_model + 0.01, "{}", first_loss(&other));
+    }
+
+    // Stopped before it has a checkpoint, or with one and without the file, it ends in the same bytes.
+    let whole = read(&model_path(&again, 20));
+    let gone = root.path().join("gone.ply");
+    std::fs::copy(&ply, &gone).unwrap();
+    let (outcome, part) = init(&gone, "part", "--budget 300 --checkpoint-every 10");
+    outcome.ok();
+    for file in ["point_cloud/iteration_20", "checkpoints/iteration_20.safetensors"] {
+        let path = part.join(file);
+        let _ = if path.is_dir() {
+            std::fs::remove_dir_all(&path)
+        } else {
+            std::fs::remove_file(&path)
+        };
+    }
+    std::fs::remove_file(&gone).unwrap();
+    let outcome = resume(scene.path(), &part, "").ok();
+    assert!(read(&model_path(&part, 20)) == whole, "{outcome:?}");
+    resume(scene.path(), &part, &format!("--init {}", text(&ply))).refused("another", &["--init"]);
+}
+
+#[test]
+fn of_too_large_a_model_those_stay_that_show() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 60, &format!("--budget 300 --quiet {STILL}")).ok();
+    let mut large = gaussians(&model_path(&run, 60));
+    let seen = large.len();
+    // As many again that no pixel shows: they are in view, and transparent.
+    let rows: Vec<usize> = (0..seen).collect();
+    let mut faint = large.gather(&rows);
+    faint.opacity_logits.fill(-9.0);
+    large.append(faint);
+    let file = root.path().join("large.ply");
+    write(&large, &file);
+    let cut = root.path().join("cut");
+    let flags = format!("--init {} --budget {seen} {STILL}", text(&file));
+    let outcome = train(scene.path(), &cut, 1, &flags).ok();
+    let said = format!("{seen} Gaussians beyond the budget left out");
+    assert!(outcome.stdout.contains(&said), "{outcome:?}");
+    // One step changes little: those that stay are the visible ones.
+    let visible = |logit: &&f32| **logit > -8.0;
+    let kept = gaussians(&model_path(&cut, 1));
+    assert_eq!(kept.opacity_logits.iter().filter(visible).count(), seen);
+    let summary = json(&cut.join("stats/summary.json"));
+    assert!(count(&summary, "peak_rows") <= seen as u64);
+    assert!(count(&summary, "peak_bytes") <= count(&summary, "ledger_bytes"), "{summary}");
+}
+
+#[test]
+fn what_cannot_be_started_from_is_refused_or_named() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 60, &format!("--budget 300 --quiet {STILL}")).ok();
+    let file = model_path(&run, 60);
+    let start = |file: &Path, flags: &str| {
+        let flags = format!("--budget 300 --init {} {flags}", text(file));
+        train(scene.path(), &root.path().join("no"), 2, &flags)
+    };
+    let absent = root.path().join("absent.ply");
+    refused(&start(&absent, ""), root.path(), &["--init", "absent.ply"]);
+    let photograph = scene.file("images/view_00.png");
+    refused(&start(&photograph, ""), root.path(), &["--init", "view_00.png"]);
+    refused(&start(&file, "--init-points 9"), root.path(), &["--init-points 9", "random"]);
+    let cut = root.path().join("cut.ply");
+    std::fs::write(&cut, &read(&file)[..2_000]).unwrap();
+    refused(&start(&cut, ""), root.path(), &["--init", "cut.ply"]);
+
+    // In other coordinates: far away no view shows it; turned about it shows the wrong things.
+    let moved = |name: &str, map: fn([f32; 3]) -> [f32; 3]| {
+        let mut model = gaussians(&file);
+        for mean in &mut model.means {
+            *mean = map(*mean);
+        }
+        let path = root.path().join(name);
+        write(&model, &path);
+        path
+    };
+    let far = moved("far.ply", |[x, y, z]| [x + 1e4, y, z]);
+    refused(&start(&far, ""), root.path(), &["far.ply", "0 of its", "coordinates"]);
+    assert!(!files(root.path()).keys().any(|name| name.starts_with("no/")));
+}
