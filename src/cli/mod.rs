@@ -35,7 +35,15 @@ mod selftest;
 #[cfg(feature = "study")]
 mod study;
 mod train;
-#[cfg(not(all(feature = "gpu", feature = "scenegen", feature = "selftest", feature = "study")))]
+#[cfg(feature = "view")]
+mod view;
+#[cfg(not(all(
+    feature = "gpu",
+    feature = "scenegen",
+    feature = "selftest",
+    feature = "study",
+    feature = "view"
+)))]
 mod without;
 
 use std::ffi::OsString;
@@ -53,6 +61,8 @@ use without::scenegen;
 use without::selftest;
 #[cfg(not(feature = "study"))]
 use without::study;
+#[cfg(not(feature = "view"))]
+use without::view;
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
 ///
@@ -74,6 +84,7 @@ Examples:
   densify plan data/garden --memory 512MiB                 how large a model that memory holds
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
+  densify view output/garden-diet                          the model in the browser
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
@@ -110,6 +121,7 @@ enum Command {
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
     Trade(study::Trade),
+    View(Box<view::ViewArgs>),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -153,6 +165,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
         Command::Trade(trade) => study::trade(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
+        Command::View(view) => view::run(&view, given, &console),
     };
     match done.and_then(|()| console.finish()) {
         Ok(()) => 0,
@@ -165,7 +178,8 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
 
 /// The command line, with the defaults of a run's options in the commands that have them.
 fn command() -> clap::Command {
-    const WITH_RUN_OPTIONS: [&str; 6] = ["train", "plan", "eval", "export", "render", "selftest"];
+    const WITH_RUN_OPTIONS: [&str; 7] =
+        ["train", "plan", "eval", "export", "render", "selftest", "view"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
         command.mut_subcommand(name, flags::with_defaults)
     })

@@ -67,7 +67,7 @@ use moments::Moments;
 use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
 use project::Splat;
-use rasterize::TileCanvas;
+use rasterize::{Beside, TileCanvas};
 use rasterize_bwd::TileGradient;
 use signals::Accumulators;
 use simd::WIDTH;
@@ -211,7 +211,7 @@ impl CpuBackend {
     /// One training step, on a thread of the pool.
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, .. } = *input;
-        let frame = self.forward(camera, background, input.sh_degree, false)?;
+        let frame = self.forward(camera, background, input.sh_degree, Beside::Nothing)?;
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel =
@@ -318,7 +318,16 @@ impl Backend for CpuBackend {
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, background, sh_degree, true)?;
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn counts_rows(&self) -> bool {
+        true
+    }
+
+    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
         Ok(self.rendering(&frame))
     }
 
