@@ -71,8 +71,13 @@ impl Machine {
         near: f32,
         largest_image: (u32, u32),
     ) -> Result<Box<dyn Backend>, BackendError> {
-        let options =
-            Setup { near, threads: self.threads, largest_image, ..Setup::new(model.len().max(1)) };
+        let options = Setup {
+            near,
+            threads: self.threads,
+            largest_image,
+            only_renders: true,
+            ..Setup::new(model.len().max(1))
+        };
         self.device.backend(model, &options)
     }
 }

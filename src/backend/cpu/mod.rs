@@ -153,7 +153,7 @@ impl CpuBackend {
         let signals = Accumulators::new(budget, &options.needs);
         let (stride, sums) = (signals.layout().stride(), signals.sums());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
-        let blocks = budget.div_ceil(WIDTH);
+        let (blocks, trained) = (budget.div_ceil(WIDTH), options.trained());
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
         let mut params = Parameters::zeros(budget, per_row, storage.parameters);
@@ -168,8 +168,8 @@ impl CpuBackend {
             near: options.near,
             shortcuts: options.shortcuts,
             params,
-            moments: Moments::zeros(budget, per_row, storage.moments),
-            ages: vec![0; blocks * WIDTH],
+            moments: Moments::zeros(trained, per_row, storage.moments),
+            ages: vec![0; trained.next_multiple_of(WIDTH)],
             bias: BiasCorrection::new(),
             summed: Summed::new(budget, per_row, options.needs.cadence),
             masks: Masks::new(budget, options.needs.mask),
@@ -188,7 +188,7 @@ impl CpuBackend {
             loss: LossBuffers::new(),
             records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
-            sums: vec![0.0; blocks * WIDTH * sums],
+            sums: vec![0.0; trained.next_multiple_of(WIDTH) * sums],
             clock: StageClock::default(),
         })
     }

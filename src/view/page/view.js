@@ -49,6 +49,7 @@ function pose() {
 function changed() {
   version += 1;
   changedAt = performance.now();
+  stage.dataset.state = "moving";
   wake();
 }
 

@@ -19,6 +19,7 @@ mod resuming;
 mod same;
 mod trading;
 mod training;
+mod view;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
