@@ -207,7 +207,7 @@ mod tests {
             (pose(3, 1e30), "too far"),
             (pose(3, 1e308), "too far"),
             (json!({ "camera": { "camera_to_world": [1, 2], "fov": 50 } }), "2 numbers"),
-            (json!({ "camera": { "camera_to_world": [1; 17], "fov": 50 } }), "17 numbers"),
+            (json!({ "camera": { "camera_to_world": vec![1; 17], "fov": 50 } }), "17 numbers"),
             (json!({ "camera": { "camera_to_world": [1, "a"], "fov": 50 } }), "no picture"),
         ] {
             let refused = asked(changes.clone()).expect_err(&changes.to_string());

@@ -134,12 +134,12 @@ mod tests {
         let desk = Desk::default();
         let waiting = |count: usize| {
             while desk.queue().waiting.len() < count {
-                thread::yield_now()
+                thread::yield_now();
             }
         };
         let newest_is = |number: usize| {
             while desk.queue().waiting[0].wanted != wish("a", number) {
-                thread::yield_now()
+                thread::yield_now();
             }
         };
         thread::scope(|scope| {

@@ -28,7 +28,7 @@ pub(in crate::view) struct Request {
     pub(in crate::view) content_type: Option<String>,
     pub(in crate::view) body: Vec<u8>,
     /// Whether the connection ends with its answer.
-    pub(super) is_last: bool,
+    pub(in crate::view) is_last: bool,
 }
 
 #[cfg(test)]
