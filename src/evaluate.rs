@@ -9,7 +9,8 @@ use crate::metrics::{Lpips, MetricError, flip, psnr, ssim};
 use crate::views::{ViewError, ViewSource};
 
 /// Part of a dataset.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Split {
     /// The views held out
     Test,

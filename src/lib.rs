@@ -26,7 +26,7 @@
 //!
 //! Features, all on by default: `formats` (models in other formats than PLY), `gpu` (the GPU backend),
 //! `scenegen` (built-in scenes and known surfaces), `selftest` (the float64 renderer and the command
-//! that compares with it), `study` (`compare` and `trade`).
+//! that compares with it), `study` (`compare` and `trade`), `view` (a page in the browser).
 
 mod animation;
 pub mod backend;
@@ -59,5 +59,7 @@ pub(crate) mod study;
 pub mod trainer;
 #[cfg(feature = "selftest")]
 pub mod verify;
+#[cfg(feature = "view")]
+pub(crate) mod view;
 pub mod views;
 mod without;

@@ -4,6 +4,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, imageops};
+use rayon::prelude::*;
 
 use crate::backend::Rendering;
 use crate::dataset::images::Image8;
@@ -16,11 +17,11 @@ pub(crate) fn to_u8(value: f32) -> u8 {
 
 /// The colours of a rendering.
 pub(crate) fn picture(Rendering { width, height, rgb, .. }: &Rendering) -> RgbImage {
-    let pixel = |x: u32, y: u32| {
-        let at = 3 * (y as usize * *width as usize + x as usize);
-        Rgb([rgb[at], rgb[at + 1], rgb[at + 2]].map(to_u8))
-    };
-    RgbImage::from_fn(*width, *height, pixel)
+    let mut image = RgbImage::new(*width, *height);
+    let row = 3 * *width as usize;
+    let rows = image.par_chunks_exact_mut(row.max(1)).zip(rgb.par_chunks_exact(row.max(1)));
+    rows.for_each(|(to, from)| to.iter_mut().zip(from).for_each(|(to, &from)| *to = to_u8(from)));
+    image
 }
 
 /// A photograph over a background.

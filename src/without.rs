@@ -1,4 +1,4 @@
-//! What a program says that was built without one of the features `formats`, `gpu`, `scenegen`, `selftest` and `study`.
+//! What a program says that was built without one of the features `formats`, `gpu`, `scenegen`, `selftest`, `study` and `view`.
 
 /// Why `what` cannot be done.
 pub(crate) fn without(feature: &str, what: &str) -> String {

@@ -293,6 +293,20 @@ pub trait Backend: Send {
         sh_degree: u8,
     ) -> Result<Rendering, BackendError>;
 
+    /// Whether [`render_counts`](Self::render_counts) counts.
+    fn counts_rows(&self) -> bool {
+        false
+    }
+
+    /// Renders a view and, where the backend [can](Self::counts_rows), counts the rows that are blended into
+    /// each pixel: in place of depth.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
+        self.render(camera, [0.0; 3], 0)
+    }
+
     /// Copies the model to the host.
     ///
     /// # Errors

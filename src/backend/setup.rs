@@ -33,6 +33,9 @@ pub struct Setup {
     pub shortcuts: Shortcuts,
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Whether nothing but rendering will be asked for: then there is no room for what only training needs
+    /// (native backend).
+    pub only_renders: bool,
 }
 
 impl Setup {
@@ -51,7 +54,13 @@ impl Setup {
             storage: Storage::default(),
             shortcuts: Shortcuts::default(),
             needs: Needs::default(),
+            only_renders: false,
         }
+    }
+
+    /// Rows that may be trained.
+    pub(super) fn trained(&self) -> usize {
+        if self.only_renders { 0 } else { self.budget }
     }
 }
 

@@ -7,14 +7,14 @@ use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::export::check_output;
-use super::render::{RenderingArgs, is_model, refuse_options_of_a_file};
+use super::render::{RenderingArgs, refuse_options_of_a_file};
 use super::train::Follower;
 use crate::compress::{Attempt, Compressed, Options, Target, compress};
 use crate::export::{Format, find, find_by_extension};
 use crate::failure::Failure;
 use crate::number::{self, grouped, percent};
 use crate::output::model_path;
-use crate::run::finished::iteration;
+use crate::run::finished::{is_model, iteration};
 use crate::run::{RunConfig, Whole};
 
 /// Makes a trained model smaller: as many Gaussians as asked, or a file no larger than asked.

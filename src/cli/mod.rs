@@ -36,7 +36,15 @@ mod selftest;
 #[cfg(feature = "study")]
 mod study;
 mod train;
-#[cfg(not(all(feature = "gpu", feature = "scenegen", feature = "selftest", feature = "study")))]
+#[cfg(feature = "view")]
+mod view;
+#[cfg(not(all(
+    feature = "gpu",
+    feature = "scenegen",
+    feature = "selftest",
+    feature = "study",
+    feature = "view"
+)))]
 mod without;
 
 use std::ffi::OsString;
@@ -54,6 +62,8 @@ use without::scenegen;
 use without::selftest;
 #[cfg(not(feature = "study"))]
 use without::study;
+#[cfg(not(feature = "view"))]
+use without::view;
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
 ///
@@ -75,6 +85,7 @@ Examples:
   densify plan data/garden --memory 512MiB                 how large a model that memory holds
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
+  densify view output/garden-diet                          the model in the browser
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compress output/garden-diet --to 5MiB -o garden.sog
                                                            a smaller file of it
@@ -114,6 +125,7 @@ enum Command {
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
     Trade(study::Trade),
+    View(Box<view::ViewArgs>),
 }
 
 /// Runs the command line of this process. For `main` functions, here and in other crates.
@@ -158,6 +170,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
         Command::Trade(trade) => study::trade(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
+        Command::View(view) => view::run(&view, given, &console),
     };
     match done.and_then(|()| console.finish()) {
         Ok(()) => 0,
@@ -170,8 +183,8 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
 
 /// The command line, with the defaults of a run's options in the commands that have them.
 fn command() -> clap::Command {
-    const WITH_RUN_OPTIONS: [&str; 7] =
-        ["train", "plan", "compress", "eval", "export", "render", "selftest"];
+    const WITH_RUN_OPTIONS: [&str; 8] =
+        ["train", "plan", "compress", "eval", "export", "render", "selftest", "view"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
         command.mut_subcommand(name, flags::with_defaults)
     })

@@ -17,7 +17,7 @@ use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::output::write_json;
 use crate::pictures::{photograph, picture, side_by_side, to_u8, write_png};
-use crate::run::finished::{Machine, Opened, iteration, open, open_run};
+use crate::run::finished::{Machine, Opened, is_model, iteration, open, open_run};
 use crate::run::{DataSpec, DeviceSpec, Fraction, RunConfig};
 use crate::views::ViewSource;
 
@@ -170,11 +170,6 @@ pub(super) fn write_pictures(
         depths.largest.insert(format!("{name}.depth.png"), f64::from(largest) * depths.units);
     }
     Ok(())
-}
-
-/// Whether a path is a model by itself: a file, or a folder of SOG.
-pub(super) fn is_model(path: &Path) -> bool {
-    path.is_file() || path.join("meta.json").is_file()
 }
 
 /// Fails where an option was given that a run brings itself.

@@ -18,7 +18,7 @@ pub(super) struct Absent {
 
 /// Defines what `cli` calls of a module whose commands need a feature.
 macro_rules! absent {
-    ($module:ident, $feature:literal, $($run:ident($args:ident) $command:literal),*) => {
+    ($module:ident, $feature:literal, $($run:ident($args:ident $(, $more:ty)*) $command:literal),*) => {
         #[cfg(not(feature = $feature))]
         pub(super) mod $module {
             $(
@@ -26,6 +26,7 @@ macro_rules! absent {
 
                 pub(in crate::cli) fn $run(
                     _: &$args,
+                    $(_: $more,)*
                     _: &super::Console,
                 ) -> Result<(), super::Failure> {
                     Err(super::Failure::input(super::without($feature, $command)))
@@ -39,3 +40,4 @@ absent!(devices, "gpu", run(DevicesArgs) "densify devices");
 absent!(scenegen, "scenegen", run(ScenegenArgs) "densify scenegen");
 absent!(selftest, "selftest", run(SelftestArgs) "densify selftest");
 absent!(study, "study", compare(Comparison) "densify compare", trade(Trade) "densify trade");
+absent!(view, "view", run(ViewArgs, &clap::ArgMatches) "densify view");

@@ -16,8 +16,8 @@ pub(super) fn reduced(model: Gaussians, degree: u8) -> Gaussians {
         for band in (1..=model.sh_degree).rev() {
             let (from, to) = (3 * sh_coefficients(band - 1), 3 * sh_coefficients(band));
             left -= most(band, &row[from..to]);
-            // NaN too: what is not a number stays as it is.
-            if !(left >= 0.0) {
+            // What is not a number stays as it is.
+            if left < 0.0 || left.is_nan() {
                 break;
             }
             row[from..to].fill(0.0);

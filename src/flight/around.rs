@@ -68,6 +68,27 @@ impl Rig {
     }
 }
 
+/// What cameras agree about.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bearings {
+    /// Which way is up, of length 1.
+    pub up: DVec3,
+    /// The point nearest to all lines of sight.
+    pub focus: DVec3,
+    /// Whether most of the cameras have it before them.
+    pub looks_inward: bool,
+}
+
+/// What these cameras agree about.
+///
+/// # Panics
+/// Without cameras.
+#[must_use]
+pub fn bearings(cameras: &[Camera]) -> Bearings {
+    let Rig { up, focus, looks_inward, .. } = Rig::of(cameras);
+    Bearings { up, focus, looks_inward }
+}
+
 /// d·dᵀ.
 fn outer(d: DVec3) -> DMat3 {
     DMat3::from_cols(d * d.x, d * d.y, d * d.z)

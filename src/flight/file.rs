@@ -74,20 +74,24 @@ pub(super) fn parse(text: &str) -> Result<Flight, String> {
         return Err(format!("camera_path has {count} cameras; 1 to {MOST_KEYS} are possible"));
     }
     let keys = saved.camera_path.iter().enumerate().map(|(at, saved)| {
-        key(saved).map_err(|problem| format!("camera {at} of camera_path: {problem}"))
+        key(&saved.camera_to_world, saved.fov)
+            .map_err(|problem| format!("camera {at} of camera_path: {problem}"))
     });
     Ok(Flight { keys: keys.collect::<Result<_, String>>()?, is_loop: saved.is_cycle })
 }
 
-fn key(saved: &SavedKey) -> Result<Key, String> {
-    let SavedKey { camera_to_world: numbers, fov } = saved;
-    let Ok(rows) = <[f64; 16]>::try_from(&numbers[..]) else {
+/// A camera of a path: `camera_to_world` row after row, 4×4, with axes right, up and backward; `fov` in degrees.
+///
+/// # Errors
+/// When the pose is not finite or not a pose, or the field of view is not between 0 and 180 degrees.
+pub fn key(numbers: &[f64], fov: f64) -> Result<Key, String> {
+    let Ok(rows) = <[f64; 16]>::try_from(numbers) else {
         return Err(format!("camera_to_world has {} numbers, not 16", numbers.len()));
     };
     if rows.iter().any(|number| !number.is_finite()) {
         return Err("camera_to_world is not finite".to_owned());
     }
-    if !(*fov > 0.0 && *fov < 180.0) {
+    if !(fov > 0.0 && fov < 180.0) {
         return Err(format!("fov is {fov}; it must be between 0 and 180 degrees"));
     }
     let pose = DMat4::from_cols_array(&rows).transpose();

@@ -6,8 +6,8 @@ mod file;
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::camera::Camera;
-pub use around::{orbit, spiral};
-pub use file::{FlightError, read};
+pub use around::{Bearings, bearings, orbit, spiral};
+pub use file::{FlightError, key, read};
 
 /// A camera on a path.
 #[derive(Debug, Clone, Copy, PartialEq)]

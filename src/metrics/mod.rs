@@ -13,6 +13,8 @@ mod psnr;
 mod ssim;
 
 pub use flip::flip;
+#[cfg(feature = "view")]
+pub(crate) use flip::flip_map;
 pub use lpips::{Lpips, LpipsError, Network};
 pub use psnr::psnr;
 pub(crate) use psnr::psnr_between;

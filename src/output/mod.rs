@@ -25,7 +25,7 @@ mod tensorboard;
 
 pub use atomic::{WriteError, write_atomically, write_atomically_from};
 pub use cameras::cameras_json;
-pub use folder::{CHECKPOINTS, Guard, RunFolder, model_path, saved_iterations};
+pub use folder::{CHECKPOINTS, Guard, RunFolder, is_in_use, model_path, saved_iterations};
 pub use records::{
     RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,

@@ -72,9 +72,7 @@ pub(super) fn build(
     }
     let rates = spec.learning_rates(&declared.rates)?;
     let parameters = inputs.entry.effective(&inputs.parameters, &scene)?;
-    let steps = inputs.entry.step_parameters().iter().map(|step| step.name());
-    let steps = steps.filter_map(|name| Some(format!("{name} {}", parameters.get(name)?)));
-    let steps: Vec<String> = steps.collect();
+    let steps = steps(&inputs, &parameters);
     let mut config = decided(&inputs, setting, (init, init_points), rates, &parameters)?;
     config.resolved.sh_degree_lowered = match saved {
         Some(saved) => saved.resolved.sh_degree_lowered,
@@ -90,7 +88,7 @@ pub(super) fn build(
     }
     announce(&config, &output, inputs.entry.summary, observer);
     if !steps.is_empty() {
-        observer.say(format_args!("steps    {}", steps.join(", ")));
+        observer.say(format_args!("steps    {steps}"));
     }
     let needs = inputs.backend_needs(policy.needs(&scene));
     let ledger = inputs.ledger(&setting, &needs);
@@ -198,6 +196,13 @@ fn as_written(mut table: toml::Table) -> toml::Table {
         }
     }
     table
+}
+
+/// The policy's parameters that are steps, as this run has them.
+fn steps(inputs: &Inputs<'_>, parameters: &toml::Table) -> String {
+    let names = inputs.entry.step_parameters().iter().map(|step| step.name());
+    let said = names.filter_map(|name| Some(format!("{name} {}", parameters.get(name)?)));
+    said.collect::<Vec<_>>().join(", ")
 }
 
 fn announce(config: &RunConfig, output: &Path, summary: &str, observer: &dyn Observer) {

@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
+#[cfg(feature = "view")]
+use crate::backend::BackendError;
 use crate::backend::{Backend, Device, Setup};
 use crate::dataset::{Dataset, View, builtin};
 use crate::evaluate::Split;
@@ -60,6 +62,24 @@ impl Machine {
         };
         Ok(self.device.backend(&model, &options)?)
     }
+
+    /// A backend with a model in scene coordinates.
+    #[cfg(feature = "view")]
+    pub(crate) fn backend_in_scene(
+        &self,
+        model: &Gaussians,
+        near: f32,
+        largest_image: (u32, u32),
+    ) -> Result<Box<dyn Backend>, BackendError> {
+        let options = Setup {
+            near,
+            threads: self.threads,
+            largest_image,
+            only_renders: true,
+            ..Setup::new(model.len().max(1))
+        };
+        self.device.backend(model, &options)
+    }
 }
 
 /// A model with the dataset it belongs to, ready to render.
@@ -68,6 +88,11 @@ pub(crate) struct Opened {
     pub(crate) data: DataSpec,
     pub(crate) sh_degree: u8,
     pub(crate) backend: Box<dyn Backend>,
+}
+
+/// Whether a path is a model by itself: a file, or a folder of SOG.
+pub(crate) fn is_model(path: &Path) -> bool {
+    path.is_file() || path.join("meta.json").is_file()
 }
 
 /// The iteration asked for, or the last one saved.

@@ -27,7 +27,7 @@ pub(super) fn tile_cap(options: &Setup) -> usize {
 
 /// As many as there are entries, at most.
 pub(super) fn record_cap(options: &Setup) -> usize {
-    options.record_cap.clamp(1, tile_cap(options))
+    if options.only_renders { 1 } else { options.record_cap.clamp(1, tile_cap(options)) }
 }
 
 /// Bytes per buffer for these options.
@@ -39,18 +39,19 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let stride = signals.layout().stride();
     let per_row = planes(sh_degree);
     let padded = budget.next_multiple_of(WIDTH) as u64;
+    let trained = options.trained().next_multiple_of(WIDTH) as u64;
     let (width, height) = options.largest_image;
     let grid = Grid::new(width, height);
     let float = size_of::<f32>() as u64;
     let mut ledger = Ledger::default();
     let parameters = Parameters::bytes(budget, per_row, options.storage.parameters);
     ledger.add_to(Section::Model, "parameters", parameters);
-    let moments = Moments::bytes(budget, per_row, options.storage.moments);
+    let moments = Moments::bytes(options.trained(), per_row, options.storage.moments);
     ledger.add_to(Section::Model, "optimiser moments", moments);
     ledger.add_to(
         Section::Model,
         "optimiser ages and bias tables",
-        padded * 2 + BiasCorrection::bytes(),
+        trained * 2 + BiasCorrection::bytes(),
     );
     if Summed::is_wanted(needs.cadence) {
         let bytes = Summed::bytes(budget, per_row, needs.cadence);
@@ -77,7 +78,7 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         "projected splats",
         budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
     );
-    let sums = padded * signals.sums() as u64 * float;
+    let sums = trained * signals.sums() as u64 * float;
     ledger.add_to(Section::Gradients, "splat gradients, signals at events", sums);
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
     let records = record_cap(options) as u64 * stride as u64 * float;
@@ -105,9 +106,12 @@ pub(super) fn reserve(ledger: &Ledger) -> Result<(), BackendError> {
 
 #[cfg(test)]
 mod tests {
+    use glam::{DMat3, DVec3};
+
     use super::*;
     use crate::backend::cpu::CpuBackend;
-    use crate::backend::{MomentStorage, ParameterStorage, Storage};
+    use crate::backend::{Backend, MomentStorage, ParameterStorage, Storage};
+    use crate::camera::Camera;
     use crate::gaussians::Gaussians;
 
     #[test]
@@ -143,6 +147,31 @@ mod tests {
             let seen = size_of_val(&visible[..]);
             assert_eq!(line("projected splats"), bytes(size_of_val(&splats[..]) + seen));
         }
+    }
+
+    #[test]
+    fn what_only_renders_has_no_room_for_training_and_draws_the_same() {
+        let model = Gaussians {
+            sh_degree: 0,
+            means: vec![[0.0, 0.1, 2.0], [0.3, 0.0, 3.0]],
+            log_scales: vec![[-1.5; 3]; 2],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+            opacity_logits: vec![2.0; 2],
+            sh: vec![0.5, 0.1, -0.4, -0.2, 0.9, 0.3],
+        };
+        let camera = Camera::centred((40, 30), (30.0, 30.0), DMat3::IDENTITY, DVec3::ZERO);
+        let made = [false, true].map(|only_renders| {
+            let options = Setup { only_renders, threads: Some(1), ..Setup::new(2) };
+            let mut backend = CpuBackend::new(&model, &options).unwrap();
+            let bytes = backend.moments.held() as usize
+                + size_of_val(&backend.ages[..])
+                + size_of_val(&backend.sums[..])
+                + size_of_val(&backend.records[..]);
+            (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
+        });
+        let [(trains, promised, expected), (bytes, less, found)] = made;
+        assert!(bytes < 64 && trains - bytes == (promised - less) as usize, "{bytes} of {trains}");
+        assert!(found == expected);
     }
 
     /// Around 2³¹ and 2³² rows, and as many as a slot can name and more.

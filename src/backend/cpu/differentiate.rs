@@ -2,7 +2,7 @@
 
 use super::loss::ImageTerms;
 use super::optimise::Differentiate;
-use super::rasterize::DARK;
+use super::rasterize::{Beside, DARK};
 use super::tiles::Grid;
 use super::{CpuBackend, ModelGradient, for_each_pixel, scalars};
 use crate::backend::signals::RecordLayout;
@@ -25,7 +25,7 @@ impl Differentiable for CpuBackend {
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);
         }
-        let frame = self.forward(camera, background, sh_degree, true)?;
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
             gradient.planes = [DARK; 5];

@@ -67,7 +67,7 @@ use moments::Moments;
 use parameters::Parameters;
 use passes::{for_each_pixel, scalars};
 use project::Splat;
-use rasterize::TileCanvas;
+use rasterize::{Beside, TileCanvas};
 use rasterize_bwd::TileGradient;
 use signals::Accumulators;
 use simd::WIDTH;
@@ -153,7 +153,7 @@ impl CpuBackend {
         let signals = Accumulators::new(budget, &options.needs);
         let (stride, sums) = (signals.layout().stride(), signals.sums());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
-        let blocks = budget.div_ceil(WIDTH);
+        let (blocks, trained) = (budget.div_ceil(WIDTH), options.trained());
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
         let mut params = Parameters::zeros(budget, per_row, storage.parameters);
@@ -168,8 +168,8 @@ impl CpuBackend {
             near: options.near,
             shortcuts: options.shortcuts,
             params,
-            moments: Moments::zeros(budget, per_row, storage.moments),
-            ages: vec![0; blocks * WIDTH],
+            moments: Moments::zeros(trained, per_row, storage.moments),
+            ages: vec![0; trained.next_multiple_of(WIDTH)],
             bias: BiasCorrection::new(),
             summed: Summed::new(budget, per_row, options.needs.cadence),
             masks: Masks::new(budget, options.needs.mask),
@@ -188,7 +188,7 @@ impl CpuBackend {
             loss: LossBuffers::new(),
             records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
-            sums: vec![0.0; blocks * WIDTH * sums],
+            sums: vec![0.0; trained.next_multiple_of(WIDTH) * sums],
             clock: StageClock::default(),
         })
     }
@@ -211,7 +211,7 @@ impl CpuBackend {
     /// One training step, on a thread of the pool.
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, .. } = *input;
-        let frame = self.forward(camera, background, input.sh_degree, false)?;
+        let frame = self.forward(camera, background, input.sh_degree, Beside::Nothing)?;
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel =
@@ -318,7 +318,16 @@ impl Backend for CpuBackend {
         background: [f32; 3],
         sh_degree: u8,
     ) -> Result<Rendering, BackendError> {
-        let frame = self.forward(camera, background, sh_degree, true)?;
+        let frame = self.forward(camera, background, sh_degree, Beside::Depth)?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn counts_rows(&self) -> bool {
+        true
+    }
+
+    fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
+        let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
         Ok(self.rendering(&frame))
     }
 

@@ -14,7 +14,9 @@ use super::batch::{BATCH, Batch, CORNER_X, CORNER_Y, LANE_X, LANE_Y};
 use super::loss::ImageTerms;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
-use super::rasterize::{ALPHA_MAX, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace};
+use super::rasterize::{
+    ALPHA_MAX, Beside, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TilePlace,
+};
 use super::rasterize_bwd::gather_all;
 use super::records::{Sums, TileRecords, parts};
 use super::simd::{V, WIDTH};
@@ -46,7 +48,7 @@ impl CpuBackend {
         assert_same_size(camera, target);
         // Stage times stay those of training.
         let clock = std::mem::take(&mut self.clock);
-        let frame = self.forward(camera, background, input.sh_degree, false);
+        let frame = self.forward(camera, background, input.sh_degree, Beside::Nothing);
         let measured = frame.map(|frame| {
             let loss =
                 scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))

@@ -14,7 +14,8 @@ use super::loss::{ImageTerms, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
-    Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace, in_plane,
+    Beside, Blending, CANVAS_PLANES, DARK, DEPTH, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
+    in_plane,
 };
 use super::rasterize_bwd::{Blended, RasterizeBwd, TileGradient, gather};
 use super::records::{Sums, parts as parts_of_records};
@@ -70,7 +71,7 @@ impl CpuBackend {
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
-        with_depth: bool,
+        beside: Beside,
     ) -> Result<Frame, BackendError> {
         if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
             return Err(BackendError::ImageTooLarge {
@@ -131,7 +132,7 @@ impl CpuBackend {
                         list: lists.of_tile(i),
                         place: TilePlace::new(&grid, band.start + i),
                         background,
-                        with_depth,
+                        beside,
                         dominant,
                         blending,
                         canvas,

@@ -37,6 +37,17 @@ impl From<Shortcuts> for Blending {
     }
 }
 
+/// What is summed over the rows of a pixel beside its colour, in the plane of depth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Beside {
+    /// Nothing.
+    Nothing,
+    /// Depth, by the weights of blending.
+    Depth,
+    /// One for each.
+    Count,
+}
+
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth.
 pub(super) const CANVAS_PLANES: usize = 5;
 pub(super) const TRANSMITTANCE: usize = 3;
@@ -143,7 +154,7 @@ pub(super) struct Rasterize<'a> {
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
-    pub(super) with_depth: bool,
+    pub(super) beside: Beside,
     /// Pixels of each row in which none has a larger blend weight, to which the tile adds its own; empty
     /// if they are not counted. Whole numbers, so that it does not matter which tile is first.
     pub(super) dominant: &'a [AtomicU32],
@@ -158,7 +169,7 @@ impl WithSimd for Rasterize<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         // Halves or quarters of a patch go in twos: what is the same for both is loaded once. One kernel
         // has all that is rarely wanted.
-        let with_more = self.with_depth || !self.dominant.is_empty();
+        let with_more = self.beside != Beside::Nothing || !self.dominant.is_empty();
         match (with_more, matches!(S::F32_LANES, 4 | 8)) {
             (true, true) => self.run::<S, true, 2>(s),
             (true, false) => self.run::<S, true, 1>(s),
@@ -173,7 +184,8 @@ impl Rasterize<'_> {
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn run<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
-        let Self { splats, list, place, background, dominant, canvas, blending, .. } = self;
+        let Self { splats, list, place, background, dominant, canvas, blending, beside } = self;
+        let counts = beside == Beside::Count;
         let c = |x: f32| V::splat(s, x);
         let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));
@@ -263,7 +275,10 @@ impl Rasterize<'_> {
                             g[n] = w.mul_add(c(splat.colour[1]), g[n]);
                             b[n] = w.mul_add(c(splat.colour[2]), b[n]);
                             if WITH_MORE {
-                                at_depth[n] = w.mul_add(c(splat.depth), at_depth[n]);
+                                at_depth[n] = match counts {
+                                    false => w.mul_add(c(splat.depth), at_depth[n]),
+                                    true => at_depth[n] + zero.lt(w).keep(c(1.0)),
+                                };
                                 let here = s.splat_u32s(first + i as u32);
                                 let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];
                                 let largest_at = &mut S::as_mut_simd_u32s(largest_at).0[0];

@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::render::{RenderingArgs, is_model, refuse_options_of_a_file};
+use super::render::{RenderingArgs, refuse_options_of_a_file};
 use crate::export::{Format, find, find_by_extension, formats};
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::number::grouped;
 use crate::output::{OutputError, model_path, write_atomically};
-use crate::run::finished::{iteration, read_model};
+use crate::run::finished::{is_model, iteration, read_model};
 use table::{Line, Truth};
 
 /// The name that stands for every format.

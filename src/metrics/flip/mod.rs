@@ -53,24 +53,50 @@ const RGB_OF_XYZ: [[f64; 3]; 3] = [
 /// When the sizes differ or the target's mask ignores every pixel.
 pub fn flip(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f64, MetricError> {
     let pair = Pair::new(rendered, target, background)?;
-    let filters = Filters::new();
-    let largest = largest_distance();
     // One sum per block of rows, added in order: the same bits at any thread count.
-    let sums = by_blocks(pair.height, |rows| {
-        let pixels = rows.start * pair.width..rows.end * pair.width;
-        let [truth, render] =
-            [false, true].map(|r| responses(&pair, &filters, rows.start, rows.end, r));
-        pixels.zip(truth.iter().zip(&render)).fold([0.0; 2], |sum, (p, (a, b))| {
+    let sums = differences(&pair, |pixels| {
+        pixels.fold([0.0; 2], |sum, (p, difference)| {
             let weight = pair.weight(p);
-            if weight > 0.0 {
-                [sum[0] + weight * difference(a, b, largest), sum[1] + weight]
-            } else {
-                sum
-            }
+            if weight > 0.0 { [sum[0] + weight * difference, sum[1] + weight] } else { sum }
         })
     });
     let [error, weight] = total(&sums)?;
     Ok(error / weight)
+}
+
+/// The FLIP error of each pixel, in `[0, 1]`; 0 where the mask ignores it. Shape: `[height, width]`.
+///
+/// # Errors
+/// When the sizes differ.
+#[cfg(feature = "view")]
+pub(crate) fn flip_map(
+    rendered: &[f32],
+    target: &Image8,
+    background: [f32; 3],
+) -> Result<Vec<f64>, MetricError> {
+    let pair = Pair::new(rendered, target, background)?;
+    let blocks =
+        differences(&pair, |pixels| pixels.map(|(_, difference)| difference).collect::<Vec<f64>>());
+    Ok(blocks.concat())
+}
+
+/// What `of_block` makes of each block of rows, in order, from its pixels and their errors; that of a pixel
+/// which the mask ignores is 0.
+fn differences<T: Send>(
+    pair: &Pair<'_>,
+    of_block: impl Fn(&mut dyn Iterator<Item = (usize, f64)>) -> T + Sync,
+) -> Vec<T> {
+    let filters = Filters::new();
+    let largest = largest_distance();
+    by_blocks(pair.height, |rows| {
+        let pixels = rows.start * pair.width..rows.end * pair.width;
+        let [truth, render] =
+            [false, true].map(|r| responses(pair, &filters, rows.start, rows.end, r));
+        let both = pixels.zip(truth.iter().zip(&render));
+        let error =
+            |(p, (a, b))| (p, if pair.weight(p) > 0.0 { difference(a, b, largest) } else { 0.0 });
+        of_block(&mut both.map(error))
+    })
 }
 
 /// Most memory for a block of this width `[bytes]`: in `f64` eight planes of the rows that its kernels

@@ -56,6 +56,12 @@ pub fn saved_iterations(run: &Path) -> Result<Vec<u32>, OutputError> {
     Ok(saved)
 }
 
+/// Whether a process trains in a folder.
+#[must_use]
+pub fn is_in_use(run: &Path) -> bool {
+    FolderLock::check(run).is_err()
+}
+
 /// The folder that a run writes to, locked against other processes for as long as this value lives.
 ///
 /// A new run writes in place. A run that replaces another writes to a hidden folder inside and takes

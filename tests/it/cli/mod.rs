@@ -21,6 +21,7 @@ mod same;
 mod starting;
 mod trading;
 mod training;
+mod view;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,0 +1,92 @@
+//! `densify view`.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
+
+use clap::{ArgMatches, Args};
+
+use super::console::Console;
+use super::interrupt::Interrupts;
+use super::render::{RenderingArgs, refuse_options_of_a_file};
+use crate::failure::Failure;
+use crate::number::grouped;
+use crate::run::finished::Machine;
+use crate::view::{self, FIRST_PORT, Looked, Place, Server};
+
+/// Shows a model, or a scene, in the browser.
+///
+/// Serves a page on this machine, whose pictures are those of `densify render`: turn the model with mouse,
+/// fingers or keys, go to the cameras of the photographs, compare render and photograph, see depth, opacity,
+/// and single Gaussians, and save a camera path for `densify render --path`. Two runs are shown with a slider
+/// between them. Ctrl-C ends it.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct ViewArgs {
+    /// Folder that `densify train` wrote, a file of Gaussian splats, or a dataset (or scene:NAME), of which the
+    /// points are shown
+    #[arg(value_name = "RUN|MODEL|SCENE")]
+    what: PathBuf,
+    /// Another run or model of the same scene, to compare with
+    #[arg(value_name = "RUN|MODEL")]
+    other: Option<PathBuf>,
+    /// Folder of the dataset: brings cameras and photographs to a file, and is needed for a run whose dataset
+    /// has moved
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
+    /// Saved iteration of the run `[default: the last]`
+    #[arg(long, value_name = "N")]
+    iteration: Option<u32>,
+    /// Port of the page `[default: the first free one from 8080 on]`
+    #[arg(long, value_name = "N", help_heading = "Page")]
+    port: Option<u16>,
+    /// Address of this machine to serve the page on. With another than its own loopback, such as 0.0.0.0, others
+    /// on the network who know the page's whole address, with its random part, can look too, unencrypted
+    #[arg(long, value_name = "ADDRESS", default_value_t = Ipv4Addr::LOCALHOST.into(), help_heading = "Page")]
+    host: IpAddr,
+    #[command(flatten)]
+    rendering: RenderingArgs,
+}
+
+const EXAMPLES: &str = "\
+Options under Scene are for a file or a scene; a run brings its own. On another machine, without --host:
+ssh -L 8080:127.0.0.1:8080 NAME, then http://127.0.0.1:8080/ here.
+
+Examples:
+  densify view output/garden-diet
+  densify view output/garden-diet output/garden-mcmc
+  densify view others.spz --scene data/garden --eval
+  densify view scene:room --port 9000";
+
+pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
+    const _: () = assert!(FIRST_PORT == 8080, "the help says so");
+    if view::is_run(&args.what) {
+        refuse_options_of_a_file(matches)?;
+    }
+    // The port first: it is known at once, and a model may take long to read.
+    let server = Server::open(Place { host: args.host, port: args.port })?;
+    let RenderingArgs { near, device, data } = &args.rendering;
+    let machine = Machine::open(device, console)?;
+    let looked = Looked {
+        what: &args.what,
+        other: args.other.as_deref(),
+        scene: args.scene.clone(),
+        iteration: args.iteration,
+        near: near.0,
+        data: data.clone(),
+    };
+    let stage = view::open(looked, machine, console)?;
+    for (name, rows) in stage.models() {
+        console.say(format_args!("model    {name}: {} rows", grouped(rows)));
+    }
+    // From here on a signal ends the page, not the process in the midst of it.
+    let interrupts = Interrupts::listen();
+    console.result(format_args!("page     {}", server.url()));
+    if server.is_public() {
+        console.say(
+            "note: whoever knows this address can look; from another machine, put the name of this one before \
+             the port",
+        );
+    }
+    console.say("         Ctrl-C ends it");
+    server.serve(stage, &|| interrupts.received().is_some())
+}

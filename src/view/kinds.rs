@@ -1,0 +1,106 @@
+//! The kinds of pictures that there are.
+
+use serde::{Deserialize, Serialize};
+
+/// What a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Kind {
+    /// The model, as `densify render` draws it.
+    Render,
+    /// The photograph that was taken there.
+    Photograph,
+    /// The visible difference between the two, by FLIP.
+    Difference,
+    /// The distance along the optical axis.
+    Depth,
+    /// How opaque the model is.
+    Opacity,
+    /// How many rows are blended into each pixel.
+    Count,
+    /// Every row in a colour of its own.
+    Rows,
+    /// Rows coloured by their opacity.
+    RowOpacity,
+    /// Rows coloured by their longest axis.
+    RowSize,
+    /// Rows coloured by how long they are for their width.
+    RowShape,
+}
+
+/// How a kind is called and explained on the page.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(super) struct Legend {
+    pub(super) kind: Kind,
+    label: &'static str,
+    /// What is seen, in a sentence.
+    about: &'static str,
+    needs_photograph: bool,
+    /// What the colours stand for, where they stand for numbers.
+    unit: Option<&'static str>,
+}
+
+impl Kind {
+    pub(super) const ALL: [Self; 10] = [
+        Self::Render,
+        Self::Photograph,
+        Self::Difference,
+        Self::Depth,
+        Self::Opacity,
+        Self::Count,
+        Self::Rows,
+        Self::RowOpacity,
+        Self::RowSize,
+        Self::RowShape,
+    ];
+
+    /// Whether it is there only where a photograph was taken.
+    pub(super) fn needs_photograph(self) -> bool {
+        matches!(self, Self::Photograph | Self::Difference)
+    }
+
+    pub(super) fn legend(self) -> Legend {
+        let (label, about, unit) = match self {
+            Self::Render => {
+                ("Render", "The model, drawn as densify render and densify eval draw it.", None)
+            }
+            Self::Photograph => {
+                ("Photograph", "What the camera saw there, at the size that was trained on.", None)
+            }
+            Self::Difference => (
+                "Difference (FLIP)",
+                "How visible the difference between render and photograph is.",
+                Some("FLIP"),
+            ),
+            Self::Depth => (
+                "Depth",
+                "The mean distance along the optical axis, in the dataset's own units.",
+                Some("units"),
+            ),
+            Self::Opacity => {
+                ("Opacity", "How much of what lies behind the model it hides.", Some("opacity"))
+            }
+            Self::Count => (
+                "Rows per pixel",
+                "How many Gaussians are blended into a pixel: what a picture costs.",
+                Some("rows"),
+            ),
+            Self::Rows => ("Rows apart", "Every Gaussian in a colour of its own.", None),
+            Self::RowOpacity => {
+                ("Opacity of rows", "Every Gaussian coloured by its opacity.", Some("opacity"))
+            }
+            Self::RowSize => (
+                "Size of rows",
+                "Every Gaussian coloured by its longest standard deviation, on a logarithmic scale.",
+                Some("units"),
+            ),
+            Self::RowShape => (
+                "Shape of rows",
+                "Every Gaussian coloured by its longest axis over its middle one, on a logarithmic scale: \
+                 needles are bright.",
+                Some("to 1"),
+            ),
+        };
+        Legend { kind: self, label, about, needs_photograph: self.needs_photograph(), unit }
+    }
+}

@@ -1,0 +1,99 @@
+//! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
+//!
+//! One thread has the models. Connections bring wishes to its [`desk`], which keeps the newest of each page,
+//! and take pictures away. Everything that a browser sends is checked before ([`door`], [`asked`]); no path of
+//! the disk is served. Prints nothing.
+
+mod asked;
+mod describe;
+mod desk;
+mod door;
+mod http;
+mod kinds;
+mod open;
+mod paint;
+mod pictures;
+mod ramp;
+mod routes;
+mod stage;
+
+use std::thread;
+
+use desk::{Closing, Desk};
+use door::Door;
+pub(crate) use door::{FIRST_PORT, Place};
+pub(crate) use open::{Looked, is_run, open};
+use routes::Routes;
+pub(crate) use stage::Stage;
+
+use crate::failure::{Failure, OTHER};
+
+/// A page that can be opened.
+pub(crate) struct Server {
+    door: Door,
+}
+
+impl Server {
+    /// Takes the port.
+    ///
+    /// # Errors
+    /// When it is another program's, or the address is not this machine's.
+    pub(crate) fn open(place: Place) -> Result<Self, Failure> {
+        Ok(Self { door: Door::open(place)? })
+    }
+
+    /// What to type into a browser on this machine.
+    pub(crate) fn url(&self) -> String {
+        self.door.url()
+    }
+
+    /// Whether other machines reach the page.
+    pub(crate) fn is_public(&self) -> bool {
+        self.door.is_public()
+    }
+
+    /// Serves the page until `is_over`.
+    ///
+    /// # Errors
+    /// When the network fails, or what renders.
+    pub(crate) fn serve(
+        &self,
+        mut stage: Stage,
+        is_over: &dyn Fn() -> bool,
+    ) -> Result<(), Failure> {
+        let desk = Desk::default();
+        let routes = Routes {
+            door: &self.door,
+            desk: &desk,
+            extent: stage.extent(),
+            description: describe::describe(&stage).to_string(),
+        };
+        let failed = |message: String| Failure { code: OTHER, message };
+        thread::scope(|scope| {
+            let desk = &desk;
+            let renders = scope.spawn(move || {
+                let _closing = Closing(desk);
+                while let Some(ticket) = desk.next() {
+                    let made = pictures::make(&mut stage, &ticket.wanted);
+                    ticket.reply(made);
+                }
+            });
+            let answer = |request: &http::Request| routes.answer(request);
+            let is_over = || is_over() || renders.is_finished();
+            // Wishes that wait are told that it is over, or their connections would not end.
+            let ends = || {
+                let ends = is_over();
+                if ends {
+                    desk.close();
+                }
+                ends
+            };
+            let served = http::serve(&self.door.listener, &answer, &ends);
+            desk.close();
+            let rendered = renders.join();
+            served
+                .map_err(|error| failed(format!("the page cannot be served any more: {error}")))?;
+            rendered.map_err(|_| failed("what renders has failed; this is a bug".into()))
+        })
+    }
+}

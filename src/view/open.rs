@@ -1,0 +1,247 @@
+//! From what was named, a run, a model or a scene, to what is looked at.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+
+use super::paint::ends;
+use super::stage::{Shown, Stage};
+use crate::camera::Camera;
+use crate::dataset::normalise::{EXTENT, Normalisation};
+use crate::dataset::{Dataset, PointCloud, builtin};
+use crate::failure::Failure;
+use crate::flight::Key;
+use crate::gaussians::{Gaussians, logit};
+use crate::init::{initialise, random_points};
+use crate::output::{CONFIG_FILE, is_in_use, model_path, saved_iterations};
+use crate::run::finished::{Machine, is_model, iteration, load, read_model};
+use crate::run::{DataSpec, Observer, RunConfig};
+
+/// Most points of a scene that are shown as Gaussians.
+const MOST_POINTS: usize = 500_000;
+/// Points of a scene that brings none.
+const RANDOM_POINTS: usize = 20_000;
+/// Opacity and size of points, relative to how training starts: it starts as mist.
+const POINT_OPACITY: f32 = 0.9;
+const POINT_SIZE: f32 = 0.5;
+/// Vertical field of view where no camera says one `[rad]`.
+const FOV: f64 = 0.8;
+
+/// What is named to look at.
+pub(crate) struct Looked<'a> {
+    /// A run, a model or a scene.
+    pub(crate) what: &'a Path,
+    /// Another run or model of the same scene.
+    pub(crate) other: Option<&'a Path>,
+    /// Where the dataset is, if what is looked at does not say.
+    pub(crate) scene: Option<PathBuf>,
+    /// Which saved model of a run.
+    pub(crate) iteration: Option<u32>,
+    /// Near plane of a file, as a fraction of the scene's extent.
+    pub(crate) near: f64,
+    /// How the dataset of a file, or a scene, is read.
+    pub(crate) data: DataSpec,
+}
+
+/// Whether a path is the folder of a run.
+pub(crate) fn is_run(path: &Path) -> bool {
+    path.join(CONFIG_FILE).is_file()
+}
+
+/// Opens it.
+///
+/// # Errors
+/// When a file cannot be read, or the device does not suffice.
+pub(crate) fn open(
+    looked: Looked<'_>,
+    machine: Machine,
+    observer: &dyn Observer,
+) -> Result<Stage, Failure> {
+    let Looked { what, other, scene, iteration, near, data } = looked;
+    if iteration.is_some() && !is_run(what) {
+        return Err(Failure::input("--iteration is for a run's folder; leave it out"));
+    }
+    let mut stage = if is_model(what) {
+        let model = read_model(what, observer)?;
+        let mut stage = match scene {
+            Some(scene) => of_dataset(machine, what, load(&scene, &data, observer)?, &data),
+            None => without_cameras(machine, what, &model, &data)?,
+        };
+        stage.show(name(what), model, near)?;
+        stage
+    } else if is_run(what) {
+        let (model, config, iteration) = of_run(what, iteration, observer)?;
+        let has_moved = scene.is_some();
+        let path = scene.unwrap_or_else(|| config.scene_path());
+        let dataset = load(&path, &config.spec.data, observer).map_err(|failure| {
+            match has_moved || path.is_dir() || builtin::name(&path).is_some() {
+                true => failure,
+                false => failure.and("if the dataset has moved, say where it is with --scene"),
+            }
+        })?;
+        let mut stage = of_dataset(machine, what, dataset, &config.spec.data);
+        let called = format!("{}, iteration {iteration}", name(what));
+        stage.show(called, model, config.spec.start.near.0)?;
+        stage
+    } else {
+        if scene.is_some() {
+            return Err(no_run(what).and("--scene is for a run or a model"));
+        }
+        if other.is_some() {
+            return Err(no_run(what).and("only runs and models can be compared"));
+        }
+        let dataset = load(what, &data, observer).map_err(|failure| match builtin::name(what) {
+            Some(_) => failure,
+            None => no_run(what).and(&failure.message),
+        })?;
+        return of_points(machine, what, dataset, &data, near);
+    };
+    if let Some(other) = other {
+        let called = name(other);
+        if is_model(other) {
+            stage.show(called, read_model(other, observer)?, near)?;
+        } else {
+            let (model, config, iteration) = of_run(other, None, observer)?;
+            let called = format!("{called}, iteration {iteration}");
+            stage.show(called, model, config.spec.start.near.0)?;
+        }
+    }
+    Ok(stage)
+}
+
+/// The last part of a path: what lies above is nobody's business.
+fn name(path: &Path) -> String {
+    let last = path.canonicalize().ok();
+    let last = last.as_deref().unwrap_or(path).file_name().unwrap_or(path.as_os_str());
+    last.to_string_lossy().into_owned()
+}
+
+fn no_run(path: &Path) -> Failure {
+    let path = path.display();
+    Failure::input(format!(
+        "{path} is neither a run (it holds no {CONFIG_FILE}) nor a file of Gaussian splats nor a scene; name the \
+         folder that `densify train` wrote, a model, or a dataset"
+    ))
+}
+
+/// A model that a run has saved, while it trains too.
+fn of_run(
+    run: &Path,
+    asked: Option<u32>,
+    observer: &dyn Observer,
+) -> Result<(Gaussians, RunConfig, u32), Failure> {
+    let config = RunConfig::read(run)?;
+    let trains = is_in_use(run);
+    if trains && saved_iterations(run).is_err() {
+        let run = run.display();
+        return Err(Failure::input(format!(
+            "{run} is being trained and has saved no model yet; wait until it has, or train with \
+             --save-iterations 1000,2000 to look at it before its end"
+        )));
+    }
+    let iteration = iteration(run, asked)?;
+    if trains {
+        let run = run.display();
+        observer.say(format_args!(
+            "note: {run} is being trained; what is shown is its model of iteration {iteration}"
+        ));
+    }
+    let model = read_model(&model_path(run, iteration), observer)?;
+    Ok((model, config, iteration))
+}
+
+fn of_dataset(machine: Machine, what: &Path, dataset: Dataset, data: &DataSpec) -> Stage {
+    let Dataset { train, test, points, normalisation, .. } = dataset;
+    let views = [test, train];
+    Stage::new(machine, name(what), normalisation, data.background.fixed(), views, points)
+}
+
+/// A model alone: the middle of its rows is the middle of what is looked at.
+fn without_cameras(
+    machine: Machine,
+    what: &Path,
+    model: &Gaussians,
+    data: &DataSpec,
+) -> Result<Stage, Failure> {
+    if model.is_empty() {
+        let what = what.display();
+        return Err(Failure::input(format!(
+            "{what} holds no Gaussian: there is nothing to look at"
+        )));
+    }
+    let along = |axis: usize| -> Vec<f64> {
+        model.means.iter().map(|mean| f64::from(mean[axis])).collect()
+    };
+    let middle = |axis: usize| {
+        let mut values = along(axis);
+        let half = values.len() / 2;
+        *values.select_nth_unstable_by(half, f64::total_cmp).1
+    };
+    let centre = DVec3::new(middle(0), middle(1), middle(2));
+    // Backgrounds reach far; most rows are on what was photographed.
+    let mut away: Vec<f64> =
+        model.means.iter().map(|mean| DVec3::from(mean.map(f64::from)).distance(centre)).collect();
+    let most = (away.len() - 1) * 4 / 5;
+    let radius = *away.select_nth_unstable_by(most, f64::total_cmp).1;
+    let radius = if radius > 0.0 { radius } else { ends(&away).end.max(1.0) };
+    let scale = 1.0 / radius;
+    let normalisation = match scale.is_normal() && centre.is_finite() {
+        true => Normalisation { centre, scale },
+        false => Normalisation::IDENTITY,
+    };
+    let none = || [Vec::new(), Vec::new()];
+    let points = PointCloud::default();
+    let background = data.background.fixed();
+    let mut stage = Stage::new(machine, name(what), normalisation, background, none(), points);
+    // A little from above, y pointing down as structure from motion has it.
+    let turn = DMat3::from_rotation_x(-0.25);
+    let centre = turn * DVec3::new(0.0, 0.0, -2.5);
+    let key = Key::looking_at(centre, DVec3::ZERO, DVec3::NEG_Y, FOV);
+    let camera: Camera = key.camera((1024, 768));
+    stage.start = Some(camera);
+    Ok(stage)
+}
+
+/// A scene that has not been trained: its points.
+fn of_points(
+    machine: Machine,
+    what: &Path,
+    dataset: Dataset,
+    data: &DataSpec,
+    near: f64,
+) -> Result<Stage, Failure> {
+    let cameras = || dataset.train.iter().map(|view| view.camera).collect::<Vec<Camera>>();
+    let is_random = dataset.points.is_empty();
+    let drawn = if is_random {
+        random_points(RANDOM_POINTS, &cameras(), false, 0)
+    } else {
+        PointCloud::default()
+    };
+    let points = if is_random { &drawn } else { &dataset.points };
+    let (mut model, _) = initialise(points, MOST_POINTS, 0, 0)?;
+    model.opacity_logits.fill(logit(POINT_OPACITY));
+    model.log_scales.as_flattened_mut().iter_mut().for_each(|scale| *scale += POINT_SIZE.ln());
+    let called = match is_random {
+        true => format!("{}: random points, as it has none of its own", name(what)),
+        false => format!("{}: its points", name(what)),
+    };
+    let mut stage = of_dataset(machine, what, dataset, data);
+    stage.show_in_scene(called, &model, near)?;
+    Ok(stage)
+}
+
+impl Stage {
+    /// Shows a model that is in the dataset's own coordinates.
+    fn show(&mut self, name: String, model: Gaussians, near: f64) -> Result<(), Failure> {
+        let model = self.normalisation.model_from_world(model);
+        self.show_in_scene(name, &model, near)
+    }
+
+    /// The same in scene coordinates. The near plane is a fraction of the scene's extent.
+    fn show_in_scene(&mut self, name: String, model: &Gaussians, near: f64) -> Result<(), Failure> {
+        let (sh_degree, near) = (model.sh_degree, (near * EXTENT) as f32);
+        let backend = self.machine.backend_in_scene(model, near, (1, 1))?;
+        self.models.push(Shown { name, backend, sh_degree, near, paint: None });
+        Ok(())
+    }
+}

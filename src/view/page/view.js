@@ -1,0 +1,703 @@
+// The page of densify view: it asks for pictures, shows them, and moves the camera. One file, so that nothing is
+// to be built; its parts, in order: small vectors, the camera, asking and showing, marks, moving, the panel.
+"use strict";
+
+const byId = (id) => document.getElementById(id);
+const stage = byId("stage"), picture = byId("picture"), marks = byId("marks");
+
+// ---- Small vectors. A camera's axes are right, up and back, as in camera paths.
+
+const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
+const scale = (a, s) => a.map((x) => x * s);
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const length = (a) => Math.sqrt(dot(a, a));
+const unit = (a) => scale(a, 1 / (length(a) || 1));
+const radians = (degrees) => degrees * Math.PI / 180;
+const clamp = (x, least, most) => Math.min(Math.max(x, least), most);
+
+/** Turns a vector about an axis of length 1. */
+function turned(v, axis, angle) {
+  const c = Math.cos(angle), s = Math.sin(angle);
+  return add(add(scale(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
+}
+
+// ---- The camera.
+
+let scene;
+/** Where we are: centre, axes, vertical field of view in degrees, and how far away what we turn about is. */
+const camera = { at: [0, 0, 0], right: [1, 0, 0], up: [0, 1, 0], back: [0, 0, 1], fov: 50, away: 1 };
+/** The view whose camera we are at, or nothing: { split, number }. */
+let view = null;
+/** Counts changes of what is to be seen, and when the last was made. */
+let version = 0, changedAt = 0;
+
+/** Takes over a pose from the scene's description or a camera path. */
+function setPose({ camera_to_world: m, fov }) {
+  [camera.right, camera.up, camera.back] = [0, 1, 2].map((i) => unit([m[i], m[4 + i], m[8 + i]]));
+  camera.at = [m[3], m[7], m[11]];
+  camera.fov = fov;
+}
+
+/** The camera as camera paths have it. */
+function pose() {
+  const { right: r, up: u, back: b, at } = camera;
+  const m = [0, 1, 2].flatMap((i) => [r[i], u[i], b[i], at[i]]);
+  return { camera_to_world: [...m, 0, 0, 0, 1], fov: camera.fov };
+}
+
+function changed() {
+  version += 1;
+  changedAt = performance.now();
+  stage.dataset.state = "moving";
+  wake();
+}
+
+/** Leaves the camera of a view, so that one may move: what is seen stays as large as it is. */
+function leaveView() {
+  if (!view) return;
+  const fitted = fit(shape(), area());
+  const half = Math.tan(radians(camera.fov) / 2) * area()[1] / fitted[1];
+  camera.fov = clamp(2 * Math.atan(half) * 180 / Math.PI, 10, 120);
+  view = null;
+  byId("view").value = "";
+  showControls();
+}
+
+function turnAll(axis, angle) {
+  for (const name of ["right", "up", "back"]) camera[name] = unit(turned(camera[name], axis, angle));
+}
+
+/** Turns about what is before us: by `x` about the scene's vertical, by `y` about our own horizontal. */
+function orbit(x, y) {
+  leaveView();
+  const pivot = add(camera.at, camera.back, -camera.away);
+  turnAll(scene.up, -x);
+  // Not over the poles, where left and right would change places.
+  const height = Math.asin(clamp(dot(camera.back, scene.up), -1, 1));
+  const wished = clamp(height + y, -1.5, 1.5);
+  if (Math.abs(height) < 1.5 || Math.abs(wished) < Math.abs(height)) turnAll(camera.right, -(wished - height));
+  camera.at = add(pivot, camera.back, camera.away);
+  changed();
+}
+
+/** Turns the head. */
+function look(x, y) {
+  leaveView();
+  const height = Math.asin(clamp(-dot(camera.back, scene.up), -1, 1));
+  turnAll(scene.up, x);
+  const wished = clamp(height + y, -1.5, 1.5);
+  if (Math.abs(height) < 1.5 || Math.abs(wished) < Math.abs(height)) turnAll(camera.right, wished - height);
+  changed();
+}
+
+/** Shifts the scene by parts of the picture's height. */
+function pan(x, y) {
+  leaveView();
+  const reach = 2 * Math.tan(radians(camera.fov) / 2) * camera.away;
+  camera.at = add(add(camera.at, camera.right, -x * reach), camera.up, y * reach);
+  changed();
+}
+
+/** Goes nearer (below 1) to what is before us, or away from it. */
+function dolly(factor) {
+  leaveView();
+  const least = 0.02 * scene.radius;
+  const away = clamp(camera.away * factor, least, 1e3 * scene.radius);
+  // Near to it we go on through it.
+  const step = away > least ? camera.away - away : 0.1 * least;
+  camera.at = add(camera.at, camera.back, -step);
+  camera.away = away;
+  changed();
+}
+
+// ---- Asking for pictures and showing them.
+
+/** This page's name for itself: of each page only the newest wish is kept. */
+const page = Array.from(crypto.getRandomValues(new Uint8Array(12)), (x) => x.toString(16).padStart(2, "0")).join("");
+/** So long after the last change the picture is asked for in full [ms]. */
+const REST = 60;
+/** What a picture may take while we move [ms]. */
+const PACE = 45;
+/** The two pictures that are shown, each a bitmap with what is known of it, and what they show. */
+const shown = [null, null];
+let coarse = 0.5, complete = -1, border = 0.5, wakeUp = () => {}, paces = [];
+
+const wake = () => wakeUp();
+/** Waits for a change, but no longer than this [ms]. */
+const pause = (most) => new Promise((resolve) => {
+  wakeUp = resolve;
+  if (most < Infinity) setTimeout(resolve, most);
+});
+const sides = () => [choice(byId("left").value), choice(byId("right").value)];
+const choice = (value) => value ? { kind: value.split(":")[0], model: Number(value.split(":")[1]) } : null;
+const kindOf = (name) => scene.kinds.find((kind) => kind.kind === name);
+const area = () => [stage.clientWidth, stage.clientHeight];
+
+/** Width and height of what the camera sees. */
+function shape() {
+  if (!view) return area();
+  const { width, height } = scene.views[view.split][view.number];
+  return [width, height];
+}
+
+/** The largest size of this shape in an area. */
+function fit([width, height], within) {
+  const s = Math.min(within[0] / width, within[1] / height);
+  return [width * s, height * s];
+}
+
+/** How many pixels to ask for. */
+function wantedSize(isMoving) {
+  let [width, height] = fit(shape(), area()).map((side) => side * devicePixelRatio * byId("sharpness").value);
+  const { side, pixels } = scene.limits;
+  // A photograph is no sharper than its own size, and what is compared with it is what is measured.
+  if (sides().some((side) => side && kindOf(side.kind).needs_photograph)) {
+    [width, height] = shape().map((own) => own * byId("sharpness").value);
+  }
+  const most = Math.min(1, side / width, side / height, Math.sqrt(pixels / (width * height)));
+  const s = most * (isMoving ? coarse : 1);
+  return [width, height].map((wanted) => Math.max(1, Math.floor(wanted * s)));
+}
+
+async function ask(place, { kind, model }, isMoving) {
+  const [width, height] = wantedSize(isMoving);
+  const from = view ? { view } : { camera: pose() };
+  const begun = performance.now();
+  const answer = await fetch("frame", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ page, place, kind, model, width, height, moving: isMoving, ...from }),
+  });
+  // A newer wish of this page has taken the place of this one.
+  if (answer.status === 409) return null;
+  if (!answer.ok) throw new Error(await answer.text());
+  const number = (name) => answer.headers.has(name) ? Number(answer.headers.get(name)) : null;
+  const range = answer.headers.get("X-Range");
+  const bitmap = await createImageBitmap(await answer.blob());
+  return {
+    bitmap, kind, model,
+    mean: number("X-Mean"), distance: number("X-Distance"), milliseconds: number("X-Milliseconds"),
+    range: range && range.split(" ").map(Number), took: performance.now() - begun,
+  };
+}
+
+/** Asks for pictures as long as the page is open: coarse ones while something changes, then a sharp one. */
+async function keepAsking() {
+  for (;;) {
+    if (complete === version) {
+      await pause(Infinity);
+      continue;
+    }
+    const rest = REST - (performance.now() - changedAt);
+    const isMoving = rest > 0 || isFlying();
+    const asked = version;
+    const [left, right] = sides();
+    try {
+      const frames = [await ask(0, left, isMoving), right && await ask(1, right, isMoving)];
+      if (!frames[0]) continue;
+      for (const [i, frame] of frames.entries()) {
+        shown[i]?.bitmap.close();
+        shown[i] = frame;
+      }
+      trouble("");
+      draw();
+      pace(frames, isMoving);
+      if (!isMoving) complete = asked;
+      stage.dataset.pictures = Number(stage.dataset.pictures || 0) + 1;
+      stage.dataset.size = `${frames[0].bitmap.width}x${frames[0].bitmap.height}`;
+      stage.dataset.state = complete === version ? "sharp" : "moving";
+      // What is in the middle is what one turns about next.
+      if (complete === version && frames[0].distance) camera.away = frames[0].distance;
+      if (complete === version) stage.dataset.rested = Math.round(performance.now() - changedAt);
+    } catch (error) {
+      const isGone = error instanceof TypeError;
+      trouble(isGone ? "densify view does not answer; start it again, and this page goes on." : error.message);
+      stage.dataset.state = "trouble";
+      if (!isGone) complete = asked;
+      await new Promise((resolve) => setTimeout(resolve, 1000));
+    }
+    // While nothing new is wanted, the sharp picture waits for the hand to rest.
+    if (complete !== version && asked === version && !isFlying()) {
+      const left = REST - (performance.now() - changedAt);
+      if (left > 0) await pause(left);
+    }
+  }
+}
+
+/** Says what the picture took, and adapts the coarse size so that movement stays fluent. */
+function pace(frames, isMoving) {
+  const took = frames.reduce((sum, frame) => sum + (frame ? frame.took : 0), 0);
+  const { bitmap, milliseconds } = frames[0];
+  const size = `${bitmap.width} × ${bitmap.height}`;
+  if (isMoving) {
+    coarse = clamp(coarse * clamp(Math.sqrt(PACE / took), 0.8, 1.1), 0.12, 1);
+    paces = [...paces.slice(-11), took];
+    const mean = paces.reduce((sum, x) => sum + x, 0) / paces.length;
+    stage.dataset.rate = (1000 / mean).toFixed(1);
+    byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
+  } else {
+    byId("status").textContent = `${size} · sharp · drawn in ${milliseconds.toFixed(0)} ms`;
+  }
+}
+
+function trouble(message) {
+  byId("trouble").hidden = !message;
+  byId("trouble").textContent = message;
+}
+
+/** Puts the pictures on the stage, with marks over them. */
+function draw() {
+  const ratio = devicePixelRatio;
+  const [width, height] = area();
+  for (const canvas of [picture, marks]) {
+    const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+  }
+  const out = picture.getContext("2d");
+  out.setTransform(1, 0, 0, 1, 0, 0);
+  out.clearRect(0, 0, picture.width, picture.height);
+  out.imageSmoothingQuality = "high";
+  const isSplit = Boolean(shown[1]);
+  shown.forEach((frame, side) => {
+    if (!frame) return;
+    const { bitmap } = frame;
+    const [w, h] = fit([bitmap.width, bitmap.height], [picture.width, picture.height]);
+    const [x, y] = [(picture.width - w) / 2, (picture.height - h) / 2];
+    const cut = border * picture.width;
+    out.save();
+    out.beginPath();
+    if (isSplit) out.rect(side ? cut : 0, 0, side ? picture.width - cut : cut, picture.height);
+    else out.rect(0, 0, picture.width, picture.height);
+    out.clip();
+    out.drawImage(bitmap, x, y, w, h);
+    out.restore();
+  });
+  byId("divider").hidden = !isSplit;
+  byId("divider").style.left = `${100 * border}%`;
+  byId("divider").setAttribute("aria-valuenow", Math.round(100 * border));
+  for (const [side, id] of [[0, "left-name"], [1, "right-name"]]) {
+    byId(id).hidden = !isSplit;
+    if (isSplit && shown[side]) byId(id).textContent = caption(shown[side]);
+  }
+  if (shown[0]) describe();
+  drawMarks(ratio);
+}
+
+function caption({ kind, model }) {
+  const { label, needs_photograph: isPhotograph } = kindOf(kind);
+  const of = scene.models.length > 1 && !(isPhotograph && kind === "photograph") ? `, ${scene.models[model].name}` : "";
+  return label + of;
+}
+
+/** What the colours mean: of the first picture whose colours stand for numbers. */
+function describe() {
+  const frame = shown.find((frame) => frame && frame.range) || shown[0];
+  const { about, unit: name, label } = kindOf(frame.kind);
+  byId("about").textContent = about;
+  byId("legend").hidden = !frame.range;
+  byId("mean").hidden = frame.mean === null;
+  const brief = (x) => Math.abs(x) >= 1e5 || (x && Math.abs(x) < 1e-3) ? x.toExponential(1) : String(Number(x.toPrecision(3)));
+  if (frame.range) {
+    byId("least").textContent = brief(frame.range[0]);
+    byId("most").textContent = brief(frame.range[1]) + (frame.kind === "difference" ? " and more" : "");
+    byId("unit").textContent = name;
+  }
+  if (frame.mean !== null) byId("mean").textContent = `${label}: ${brief(frame.mean)} on average.`;
+}
+
+// ---- Marks: cameras and points, drawn here over the picture.
+
+/** From the world to the stage: x and y in parts of the stage, and depth; on `marks`, in its pixels. */
+function projector() {
+  const fitted = fit(shape(), [marks.width, marks.height]);
+  const focal = fitted[1] / 2 / Math.tan(radians(camera.fov) / 2);
+  const { right, up, back, at } = camera;
+  return (world) => {
+    const d = add(world, at, -1);
+    const z = -dot(d, back);
+    return [marks.width / 2 + focal * dot(d, right) / z, marks.height / 2 - focal * dot(d, up) / z, z];
+  };
+}
+
+/** The corners of a camera's frustum after its centre, in the world. */
+function frustum({ camera_to_world: m, fov, width, height }) {
+  const axis = (i) => [m[i], m[4 + i], m[8 + i]];
+  const centre = axis(3), size = 0.06 * scene.radius;
+  const y = Math.tan(radians(fov) / 2) * size, x = y * width / height;
+  const corner = (sx, sy) => add(add(add(centre, axis(0), sx * x), axis(1), sy * y), axis(2), -size);
+  return [centre, corner(-1, 1), corner(1, 1), corner(1, -1), corner(-1, -1)];
+}
+
+function drawMarks(ratio) {
+  const out = marks.getContext("2d");
+  out.clearRect(0, 0, marks.width, marks.height);
+  const project = projector();
+  const least = 0.01 * scene.radius;
+  if (byId("points").checked) {
+    const size = 2 * ratio;
+    scene.points.positions.forEach((point, i) => {
+      const [x, y, z] = project(point);
+      if (z < least) return;
+      const [r, g, b] = scene.points.colours[i];
+      out.fillStyle = `rgb(${r} ${g} ${b})`;
+      out.fillRect(x - size / 2, y - size / 2, size, size);
+    });
+  }
+  if (!byId("frusta").checked) return;
+  const style = getComputedStyle(document.documentElement);
+  out.lineWidth = 1.5 * ratio;
+  for (const [split, colour] of [["train", "--trained"], ["test", "--held"]]) {
+    out.strokeStyle = style.getPropertyValue(colour);
+    out.beginPath();
+    scene.views[split].forEach((at, number) => {
+      // From within one sees its own frame only.
+      if (view && view.split === split && view.number === number) return;
+      const corners = frustum(at).map(project);
+      if (corners.some(([, , z]) => z < least)) return;
+      const line = (a, b) => { out.moveTo(a[0], a[1]); out.lineTo(b[0], b[1]); };
+      for (let i = 1; i <= 4; i += 1) {
+        line(corners[0], corners[i]);
+        line(corners[i], corners[i % 4 + 1]);
+      }
+    });
+    out.stroke();
+  }
+}
+
+/** The drawn camera at a place of the stage, if there is one. */
+function cameraAt(x, y) {
+  if (!byId("frusta").checked) return null;
+  const project = projector(), ratio = devicePixelRatio;
+  let found = null, nearest = 14;
+  for (const split of ["test", "train"]) {
+    scene.views[split].forEach((at, number) => {
+      const [px, py, z] = project(frustum(at)[0]);
+      const distance = Math.hypot(px / ratio - x, py / ratio - y);
+      if (z > 0 && distance < nearest) [found, nearest] = [{ split, number }, distance];
+    });
+  }
+  return found;
+}
+
+// ---- Moving.
+
+const hands = new Map();
+let travelled = 0;
+
+marks.addEventListener("pointerdown", (event) => {
+  marks.setPointerCapture(event.pointerId);
+  hands.set(event.pointerId, [event.offsetX, event.offsetY]);
+  marks.classList.add("dragging");
+  travelled = 0;
+});
+
+marks.addEventListener("pointermove", (event) => {
+  const before = hands.get(event.pointerId);
+  if (!before) return;
+  const now = [event.offsetX, event.offsetY];
+  const [dx, dy] = add(now, before, -1);
+  if (!dx && !dy) return;
+  const height = area()[1];
+  travelled += Math.hypot(dx, dy);
+  if (travelled < 4 && hands.size === 1) return;
+  if (hands.size === 2) {
+    // Two fingers: their middle shifts, their distance goes nearer.
+    const other = [...hands].find(([id]) => id !== event.pointerId)[1];
+    const spread = (a) => Math.max(10, Math.hypot(a[0] - other[0], a[1] - other[1]));
+    dolly(spread(before) / spread(now));
+    pan(dx / 2 / height, dy / 2 / height);
+  } else {
+    const mode = document.querySelector("input[name=drag]:checked").value;
+    const shifts = event.shiftKey || event.buttons & 6 || mode === "pan";
+    if (shifts) pan(dx / height, dy / height);
+    else if (mode === "look") look(radians(camera.fov) * dx / height, radians(camera.fov) * dy / height);
+    else orbit(4 * dx / height, 4 * dy / height);
+  }
+  hands.set(event.pointerId, now);
+});
+
+function lift(event) {
+  if (!hands.delete(event.pointerId)) return;
+  if (!hands.size) marks.classList.remove("dragging");
+  const found = travelled < 4 && event.type === "pointerup" && cameraAt(event.offsetX, event.offsetY);
+  if (found) goTo(found);
+}
+marks.addEventListener("pointerup", lift);
+marks.addEventListener("pointercancel", lift);
+marks.addEventListener("contextmenu", (event) => event.preventDefault());
+marks.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  dolly(Math.exp(clamp(event.deltaY * (event.deltaMode ? 30 : 1), -300, 300) * 0.0015));
+}, { passive: false });
+
+/** Keys that are held: what each does to right, up and back. */
+const FLIGHT = { w: [0, 0, -1], s: [0, 0, 1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, 1, 0], q: [0, -1, 0] };
+const held = new Set();
+const isFlying = () => held.size > 0 || flight !== null;
+let ticked = 0;
+
+function fly(now) {
+  if (!held.size) return;
+  const seconds = Math.min(0.1, (now - ticked) / 1000);
+  ticked = now;
+  const sum = [...held].reduce((sum, key) => add(sum, FLIGHT[key]), [0, 0, 0]);
+  const step = 0.6 * scene.radius * 2 ** Number(byId("speed").value) * seconds;
+  leaveView();
+  ["right", "up", "back"].forEach((name, i) => { camera.at = add(camera.at, camera[name], step * sum[i]); });
+  changed();
+  requestAnimationFrame(fly);
+}
+
+const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+
+document.addEventListener("keydown", (event) => {
+  const { target, key } = event;
+  if (!scene || event.ctrlKey || event.metaKey || event.altKey || byId("guide").open) return;
+  if (target.matches("select, input, [role=slider]")) return;
+  const low = key.toLowerCase();
+  if (FLIGHT[low]) {
+    if (!held.size) { ticked = performance.now(); requestAnimationFrame(fly); }
+    held.add(low);
+  } else if (STEPS[key]) {
+    const [x, y] = STEPS[key];
+    if (event.shiftKey) pan(-0.05 * x, -0.05 * y);
+    else orbit(0.06 * x, 0.06 * y);
+  } else if (key === "+" || key === "=") dolly(0.9);
+  else if (key === "-") dolly(1 / 0.9);
+  else if (key === "[") step(-1);
+  else if (key === "]") step(1);
+  else if (low === "r") goHome();
+  else if (low === "k") addKey();
+  else if (low === "h" || key === "?") byId("guide").showModal();
+  else return;
+  event.preventDefault();
+});
+document.addEventListener("keyup", (event) => { held.delete(event.key.toLowerCase()); changedAt = performance.now(); wake(); });
+addEventListener("blur", () => held.clear());
+
+// ---- The border between two pictures.
+
+const divider = byId("divider");
+const setBorder = (share) => { border = clamp(share, 0, 1); draw(); };
+divider.addEventListener("pointerdown", (event) => divider.setPointerCapture(event.pointerId));
+divider.addEventListener("pointermove", (event) => {
+  if (!divider.hasPointerCapture(event.pointerId)) return;
+  setBorder((event.clientX - stage.getBoundingClientRect().left) / area()[0]);
+});
+divider.addEventListener("keydown", (event) => {
+  const to = { ArrowLeft: border - 0.02, ArrowRight: border + 0.02, Home: 0, End: 1 }[event.key];
+  if (to === undefined) return;
+  setBorder(to);
+  event.preventDefault();
+});
+
+// ---- Cameras of the photographs.
+
+/** All views in the order of the list. */
+const allViews = () => ["test", "train"].flatMap((split) => scene.views[split].map((_, number) => ({ split, number })));
+
+function goTo(to) {
+  view = to;
+  const at = scene.views[to.split][to.number];
+  setPose(at);
+  byId("view").value = `${to.split}:${to.number}`;
+  showControls();
+  changed();
+}
+
+function step(by) {
+  const all = allViews();
+  if (!all.length) return;
+  const now = view ? all.findIndex(({ split, number }) => split === view.split && number === view.number) : -1;
+  goTo(all[now < 0 ? (by > 0 ? 0 : all.length - 1) : (now + by + all.length) % all.length]);
+}
+
+function goHome() {
+  const all = allViews();
+  camera.away = scene.radius;
+  if (all.length) goTo(all[0]);
+  else { setPose(scene.start); camera.away = length(add(camera.at, scene.pivot, -1)); showControls(); changed(); }
+}
+
+// ---- Camera paths, in nerfstudio's format, which densify render reads.
+
+const keys = [];
+let flight = null;
+
+function addKey() {
+  keys.push({ ...pose(), aspect: area()[0] / area()[1] });
+  showPath();
+}
+
+function showPath() {
+  const count = keys.length;
+  byId("path-state").textContent = count
+    ? `${count} ${count === 1 ? "camera" : "cameras"}. Saved, densify render RUN -o frames --path FILE flies along them.`
+    : "Add cameras; densify render --path FILE flies along them.";
+  byId("remove").disabled = !count;
+  byId("save").disabled = !count;
+  byId("play").disabled = count < 2;
+  byId("play").textContent = flight ? "Stop" : "Fly along";
+}
+
+/** A turn as a quaternion (w, x, y, z). */
+function quaternion({ camera_to_world: m }) {
+  const s = (a, b, c) => Math.sqrt(Math.max(0, 1 + a * m[0] + b * m[5] + c * m[10])) / 2;
+  const sign = (x, of) => of < 0 ? -x : x;
+  return [s(1, 1, 1), sign(s(1, -1, -1), m[9] - m[6]), sign(s(-1, 1, -1), m[2] - m[8]), sign(s(-1, -1, 1), m[4] - m[1])];
+}
+
+/** Sets the camera to a place on the path, in intervals from its first camera: a Catmull-Rom spline. */
+function setOnPath(place) {
+  const loops = byId("loop").checked, count = keys.length;
+  const first = Math.min(Math.floor(place), loops ? count - 1 : count - 2), t = place - first;
+  const key = (i) => keys[loops ? (i + count) % count : clamp(i, 0, count - 1)];
+  const near = [first - 1, first, first + 1, first + 2].map(key);
+  const t2 = t * t, t3 = t2 * t;
+  const weights = [2 * t2 - t - t3, 3 * t3 - 5 * t2 + 2, t + 4 * t2 - 3 * t3, t3 - t2].map((w) => w / 2);
+  const mix = (values) => values.reduce((sum, value, i) => add(sum, value, weights[i]), values[0].map(() => 0));
+  const turns = near.map(quaternion), along = turns[1];
+  const signed = turns.map((q) => q.reduce((sum, x, i) => sum + x * along[i], 0) < 0 ? scale(q, -1) : q);
+  const mean = mix(signed), size = Math.hypot(...mean) || 1;
+  const [w, x, y, z] = scale(mean, 1 / size);
+  camera.right = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)];
+  camera.up = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)];
+  camera.back = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
+  camera.at = mix(near.map(({ camera_to_world: m }) => [m[3], m[7], m[11]]));
+  camera.fov = near[1].fov + (near[2].fov - near[1].fov) * t;
+}
+
+function play() {
+  flight = flight ? null : performance.now();
+  view = null;
+  byId("view").value = "";
+  showControls();
+  showPath();
+  const next = (now) => {
+    if (flight === null) return;
+    const intervals = keys.length - (byId("loop").checked ? 0 : 1);
+    // Two seconds from camera to camera.
+    const place = Math.max(0, now - flight) / 2000;
+    if (place >= intervals) flight = null;
+    setOnPath(Math.min(place, intervals));
+    changed();
+    if (flight === null) { showPath(); showControls(); }
+    else requestAnimationFrame(next);
+  };
+  if (flight !== null) requestAnimationFrame(next);
+}
+
+function savePath() {
+  const [width, height] = area().map((side) => Math.round(side * devicePixelRatio));
+  const path = {
+    camera_type: "perspective", render_width: width, render_height: height, fps: 30,
+    seconds: 2 * keys.length, is_cycle: byId("loop").checked, camera_path: keys,
+  };
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([JSON.stringify(path, null, 1)], { type: "application/json" }));
+  link.download = "camera_path.json";
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+// ---- The panel.
+
+function showControls() {
+  byId("fov").value = Math.round(camera.fov);
+  byId("fov-value").textContent = `${Math.round(camera.fov)}°`;
+  byId("speed-value").textContent = `× ${Number(2 ** byId("speed").value).toPrecision(2)}`;
+  // Away from the photographs there is none to compare with.
+  for (const select of [byId("left"), byId("right")]) {
+    for (const option of select.options) {
+      if (option.value && kindOf(choice(option.value).kind).needs_photograph) option.disabled = !view;
+    }
+    if (select.selectedOptions[0]?.disabled) select.value = select.options[0].value;
+  }
+}
+
+function fill() {
+  document.title = `${scene.title} · densify view`;
+  byId("title").textContent = scene.title;
+  for (const { name, rows } of scene.models) {
+    const item = document.createElement("li");
+    item.textContent = `${name}: ${rows.toLocaleString("en")} Gaussians`;
+    byId("models").append(item);
+  }
+  const option = (value, text) => new Option(text, value);
+  byId("right").append(option("", "nothing"));
+  const isOfModel = (kind) => kind !== "photograph";
+  scene.models.forEach(({ name }, model) => {
+    for (const { kind, label } of scene.kinds) {
+      if (model && !isOfModel(kind)) continue;
+      const text = scene.models.length > 1 && isOfModel(kind) ? `${label}, ${name}` : label;
+      byId("left").append(option(`${kind}:${model}`, text));
+      byId("right").append(option(`${kind}:${model}`, text));
+    }
+  });
+  if (scene.models.length > 1) byId("right").value = "render:1";
+  byId("view").append(option("", "anywhere"));
+  for (const [split, label] of [["test", "Held out"], ["train", "Trained on"]]) {
+    if (!scene.views[split].length) continue;
+    const group = document.createElement("optgroup");
+    group.label = label;
+    scene.views[split].forEach(({ name }, number) => group.append(option(`${split}:${number}`, name)));
+    byId("view").append(group);
+  }
+  byId("cameras").hidden = !allViews().length;
+  byId("points-label").hidden = !scene.points.positions.length;
+  byId("ramp").style.background = `linear-gradient(to right, ${scene.ramp.map((c) => `rgb(${c.join(" ")})`).join(", ")})`;
+}
+
+function listen() {
+  const on = (id, event, action) => byId(id).addEventListener(event, action);
+  for (const id of ["left", "right", "sharpness"]) on(id, "change", changed);
+  for (const id of ["frusta", "points"]) on(id, "change", draw);
+  on("view", "change", () => {
+    const [split, number] = byId("view").value.split(":");
+    if (split) goTo({ split, number: Number(number) });
+    else { leaveView(); changed(); }
+  });
+  on("before", "click", () => step(-1));
+  on("after", "click", () => step(1));
+  on("home", "click", goHome);
+  on("fov", "input", () => { leaveView(); camera.fov = Number(byId("fov").value); showControls(); changed(); });
+  on("speed", "input", showControls);
+  on("add", "click", addKey);
+  on("remove", "click", () => { keys.pop(); showPath(); });
+  on("play", "click", play);
+  on("save", "click", savePath);
+  on("help", "click", () => byId("guide").showModal());
+  on("fold", "click", () => {
+    const isFolded = document.body.classList.toggle("folded");
+    byId("fold").textContent = isFolded ? "Show panel" : "Hide panel";
+    byId("fold").setAttribute("aria-expanded", String(!isFolded));
+  });
+  on("guide", "close", () => {
+    try { localStorage.setItem("densify-view", "seen"); } catch { /* A browser that keeps nothing shows it again. */ }
+    marks.focus();
+  });
+  new ResizeObserver(() => { draw(); changed(); }).observe(stage);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+}
+
+async function open() {
+  try {
+    const answer = await fetch("scene");
+    if (!answer.ok) throw new Error(await answer.text());
+    scene = await answer.json();
+  } catch (error) {
+    trouble(`The scene cannot be read: ${error.message}`);
+    return;
+  }
+  fill();
+  goHome();
+  showPath();
+  listen();
+  let isNew = true;
+  try { isNew = localStorage.getItem("densify-view") === null; } catch { /* Then it is new. */ }
+  if (isNew) byId("guide").showModal();
+  keepAsking();
+}
+
+open();

@@ -1,0 +1,241 @@
+//! From a wish to a JPEG: renders, measures, colours, and encodes.
+
+use std::ops::Range;
+use std::time::Instant;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::{ExtendedColorType, Rgb, RgbImage, imageops};
+
+use super::asked::{Viewpoint, Wanted};
+use super::desk::Unmade;
+use super::kinds::Kind;
+use super::paint::{self, ends};
+use super::ramp;
+use super::stage::Stage;
+use crate::backend::Rendering;
+use crate::camera::Camera;
+use crate::dataset::images::Image8;
+use crate::evaluate::Split;
+use crate::metrics::flip_map;
+use crate::pictures::{photograph, picture, to_u8};
+use crate::views::ViewSource;
+
+/// Quality of a picture that stays: at least 38 dB from what was rendered, and 45 dB mostly.
+const STILL: u8 = 95;
+/// Quality of one that the next will replace at once.
+const MOVING: u8 = 80;
+/// What the light end of the scale of differences stands for. The whole range reaches to 1, where hardly
+/// anything ever is.
+const MOST_FLIP: f64 = 0.5;
+/// Where the model hides less than this, it has no depth to show.
+const LEAST_ALPHA: f32 = 0.02;
+
+/// A picture as it is sent.
+#[derive(Debug, Clone)]
+pub(super) struct Frame {
+    pub(super) jpeg: Vec<u8>,
+    pub(super) size: (u32, u32),
+    /// What the ends of its scale of colours stand for, if it has one.
+    pub(super) range: Option<Range<f64>>,
+    /// The mean of what is shown, where that says something.
+    pub(super) mean: Option<f64>,
+    /// How far away the model is in the middle, in the dataset's own units, if there is any there.
+    pub(super) distance: Option<f64>,
+    /// What it took to make `[ms]`.
+    pub(super) milliseconds: f64,
+}
+
+/// A picture before it is encoded.
+struct Drawn {
+    image: RgbImage,
+    range: Option<Range<f64>>,
+    mean: Option<f64>,
+    distance: Option<f64>,
+}
+
+/// Makes the picture.
+pub(super) fn make(stage: &mut Stage, wanted: &Wanted) -> Result<Frame, Unmade> {
+    let begun = Instant::now();
+    let Drawn { image, range, mean, distance } = draw(stage, wanted).map_err(Unmade::Failed)?;
+    let quality = if wanted.is_moving { MOVING } else { STILL };
+    let mut jpeg = Vec::new();
+    let (size, colours) = (image.dimensions(), ExtendedColorType::Rgb8);
+    JpegEncoder::new_with_quality(&mut jpeg, quality)
+        .encode(image.as_raw(), size.0, size.1, colours)
+        .map_err(|error| Unmade::Failed(error.to_string()))?;
+    let milliseconds = 1e3 * begun.elapsed().as_secs_f64();
+    Ok(Frame { jpeg, size, range, mean, distance, milliseconds })
+}
+
+fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
+    let camera = camera(stage, wanted);
+    match (wanted.kind, wanted.from) {
+        (Kind::Photograph, Viewpoint::View(split, number)) => {
+            let image = shot(stage, (split, number), &camera)?;
+            Ok(plain(photograph(&image, stage.background)))
+        }
+        (Kind::Difference, Viewpoint::View(split, number)) => {
+            let image = shot(stage, (split, number), &camera)?;
+            let rendering = render(stage, wanted.model, &camera)?;
+            let map = flip_map(&rendering.rgb, &image, stage.background)
+                .map_err(|error| error.to_string())?;
+            let mean = map.iter().sum::<f64>() / map.len().max(1) as f64;
+            let value = |at: usize| (map[at] / MOST_FLIP) as f32;
+            let image = coloured(&rendering, value, |_| true);
+            let distance = distance(stage, &rendering);
+            Ok(Drawn { image, range: Some(0.0..MOST_FLIP), mean: Some(mean), distance })
+        }
+        (Kind::Rows | Kind::RowOpacity | Kind::RowSize | Kind::RowShape, _) => {
+            let units = 1.0 / stage.normalisation.scale;
+            let painted = stage.paint(wanted.model).map_err(|error| error.to_string())?;
+            let range = painted.show(wanted.kind, units).map_err(|error| error.to_string())?;
+            let rendering = painted
+                .backend
+                .render(&camera, paint::BACKGROUND, 0)
+                .map_err(|error| error.to_string())?;
+            let distance = distance(stage, &rendering);
+            Ok(Drawn { range, distance, ..plain(picture(&rendering)) })
+        }
+        (Kind::Count, _) => {
+            let backend = &mut stage.models[wanted.model].backend;
+            let rendering = backend.render_counts(&camera).map_err(|error| error.to_string())?;
+            let counts: Vec<f64> = rendering.depth.iter().copied().map(f64::from).collect();
+            let most = ends(&counts).end.max(1.0);
+            let mean = counts.iter().sum::<f64>() / counts.len().max(1) as f64;
+            let image = coloured(&rendering, |at| (counts[at] / most) as f32, |_| true);
+            Ok(Drawn { image, range: Some(0.0..most), mean: Some(mean), distance: None })
+        }
+        (Kind::Depth, _) => {
+            let rendering = render(stage, wanted.model, &camera)?;
+            Ok(depth(stage, &rendering))
+        }
+        (Kind::Opacity, _) => {
+            let rendering = render(stage, wanted.model, &camera)?;
+            let Rendering { width, height, alpha, .. } = &rendering;
+            let grey =
+                |x: u32, y: u32| Rgb([to_u8(alpha[y as usize * *width as usize + x as usize]); 3]);
+            let image = RgbImage::from_fn(*width, *height, grey);
+            Ok(Drawn { distance: distance(stage, &rendering), ..plain(image) })
+        }
+        (Kind::Render | Kind::Photograph | Kind::Difference, _) => {
+            let rendering = render(stage, wanted.model, &camera)?;
+            Ok(Drawn { distance: distance(stage, &rendering), ..plain(picture(&rendering)) })
+        }
+    }
+}
+
+fn plain(image: RgbImage) -> Drawn {
+    Drawn { image, range: None, mean: None, distance: None }
+}
+
+/// The camera to render with. That of a view keeps its shape; at its own size the picture is the one that is
+/// measured.
+fn camera(stage: &Stage, wanted: &Wanted) -> Camera {
+    match wanted.from {
+        Viewpoint::Free(key) => {
+            stage.normalisation.scene_from_world_camera(&key.camera(wanted.size))
+        }
+        Viewpoint::View(split, number) => {
+            let camera = stage.view(split, number).camera;
+            let (width, height) = fitted((camera.width, camera.height), wanted);
+            match (width, height) == (camera.width, camera.height) {
+                true => camera,
+                false => camera.resized(width, height),
+            }
+        }
+    }
+}
+
+/// A size of the same shape that fits what is wanted; of photographs not larger than it was.
+fn fitted(own: (u32, u32), Wanted { size, kind, .. }: &Wanted) -> (u32, u32) {
+    let [width, height] = [own.0, own.1].map(f64::from);
+    let scale = (f64::from(size.0) / width).min(f64::from(size.1) / height);
+    let side = |side: f64, most: u32| ((side * scale).round() as u32).clamp(1, most);
+    match scale >= 1.0 && kind.needs_photograph() {
+        true => own,
+        false => (side(width, size.0), side(height, size.1)),
+    }
+}
+
+fn render(stage: &mut Stage, model: usize, camera: &Camera) -> Result<Rendering, String> {
+    let shown = &mut stage.models[model];
+    let made = shown.backend.render(camera, stage.background, shown.sh_degree);
+    made.map_err(|error| error.to_string())
+}
+
+/// What the camera saw, at the size of the picture.
+fn shot(stage: &Stage, (split, number): (Split, usize), camera: &Camera) -> Result<Image8, String> {
+    let image = stage.photographs(split).image(number).map_err(|error| error.to_string())?;
+    if (image.width, image.height) == (camera.width, camera.height) {
+        return Ok((*image).clone());
+    }
+    // Flattened first, so that what is transparent is blended as it is at full size.
+    let flat = photograph(&image, stage.background);
+    let filter = imageops::FilterType::Triangle;
+    let small = imageops::resize(&flat, camera.width, camera.height, filter);
+    let (width, height) = small.dimensions();
+    Ok(Image8 { width, height, rgb: small.into_raw(), alpha: None, mask: None })
+}
+
+/// A picture of numbers; those that are not there are dark.
+fn coloured(
+    Rendering { width, height, .. }: &Rendering,
+    value: impl Fn(usize) -> f32,
+    is_there: impl Fn(usize) -> bool,
+) -> RgbImage {
+    RgbImage::from_fn(*width, *height, |x, y| {
+        let at = y as usize * *width as usize + x as usize;
+        Rgb(if is_there(at) { ramp::colour(value(at)).map(to_u8) } else { [0; 3] })
+    })
+}
+
+/// Depth over opacity: the mean distance of what is seen. What is near is light.
+fn depth(stage: &Stage, rendering: &Rendering) -> Drawn {
+    let Rendering { alpha, depth, .. } = rendering;
+    let is_there = |at: usize| alpha[at] >= LEAST_ALPHA;
+    let mean = |at: usize| f64::from(depth[at] / alpha[at]);
+    let seen: Vec<f64> = (0..alpha.len()).filter(|&at| is_there(at)).map(mean).collect();
+    let range = ends(&seen);
+    let width = (range.end - range.start).max(f64::MIN_POSITIVE);
+    let image = coloured(rendering, |at| ((range.end - mean(at)) / width) as f32, is_there);
+    let units = 1.0 / stage.normalisation.scale;
+    // From dark to light, as the scale is.
+    let range = Some(range.end * units..range.start * units);
+    Drawn { image, range, mean: None, distance: distance(stage, rendering) }
+}
+
+/// The distance in the middle, in the dataset's own units.
+fn distance(
+    stage: &Stage,
+    Rendering { width, height, alpha, depth, .. }: &Rendering,
+) -> Option<f64> {
+    let at = (*height / 2) as usize * *width as usize + (*width / 2) as usize;
+    let mean = f64::from(depth[at] / alpha[at]) / stage.normalisation.scale;
+    (alpha[at] > 0.5 && mean.is_finite()).then_some(mean)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_view_keeps_its_shape_and_a_photograph_is_never_enlarged() {
+        let wanted = |size: (u32, u32), kind: Kind| Wanted {
+            owner: ("a".to_owned(), 0),
+            kind,
+            model: 0,
+            size,
+            is_moving: false,
+            from: Viewpoint::View(Split::Test, 0),
+        };
+        for kind in [Kind::Render, Kind::Photograph] {
+            let fitted = |own, size| fitted(own, &wanted(size, kind));
+            assert_eq!(fitted((640, 480), (640, 480)), (640, 480));
+            assert_eq!(fitted((640, 480), (320, 4000)), (320, 240));
+            assert_eq!(fitted((5187, 3361), (1000, 100)), (154, 100));
+            assert_eq!(fitted((5000, 2), (10, 10)), (10, 1));
+            let enlarged = if kind == Kind::Render { (4000, 3000) } else { (640, 480) };
+            assert_eq!(fitted((640, 480), (4000, 4000)), enlarged);
+        }
+    }
+}

@@ -1,0 +1,143 @@
+//! Which request gets what. No path names a file: what is served is built in, or made on request.
+
+use super::asked::{self, Wanted};
+use super::desk::{Desk, Unmade};
+use super::door::Door;
+use super::http::{Answer, Method, Request};
+use super::pictures::Frame;
+use super::stage::Extent;
+
+const PAGE: &str = include_str!("page/index.html");
+const STYLE: &str = include_str!("page/view.css");
+const SCRIPT: &str = include_str!("page/view.js");
+
+/// What answers need.
+pub(super) struct Routes<'a> {
+    pub(super) door: &'a Door,
+    pub(super) desk: &'a Desk,
+    pub(super) extent: Extent,
+    /// The [description](super::describe) of what is shown, as JSON.
+    pub(super) description: String,
+}
+
+impl Routes<'_> {
+    /// The answer to a request.
+    pub(super) fn answer(&self, request: &Request) -> Answer {
+        let path = match self.door.admit(request) {
+            Ok(path) => path,
+            Err(refusal) => return refusal,
+        };
+        let text = |kind, text: &'static str| Answer::of(kind, text.as_bytes());
+        let known = ["", "view.css", "view.js", "scene", "frame"];
+        match (request.method, path) {
+            (Method::Post, "frame") => match asked::read(&request.body, &self.extent) {
+                Ok(wanted) => self.frame(wanted),
+                Err(refusal) => refusal,
+            },
+            (Method::Get | Method::Head, "") => text("text/html; charset=utf-8", PAGE),
+            (Method::Get | Method::Head, "view.css") => text("text/css; charset=utf-8", STYLE),
+            (Method::Get | Method::Head, "view.js") => {
+                text("text/javascript; charset=utf-8", SCRIPT)
+            }
+            (Method::Get | Method::Head, "scene") => {
+                Answer::of("application/json", self.description.clone().into_bytes())
+            }
+            (_, path) if known.contains(&path) => {
+                Answer::refusal(405, "this is asked for in another way")
+            }
+            _ => Answer::refusal(404, "there is nothing here"),
+        }
+    }
+
+    fn frame(&self, wanted: Wanted) -> Answer {
+        match self.desk.ask(wanted) {
+            Ok(frame) => sent(frame),
+            Err(Unmade::Superseded) => {
+                Answer::refusal(409, "a newer picture was asked for meanwhile")
+            }
+            Err(Unmade::Failed(why)) => Answer::refusal(500, why),
+            Err(Unmade::Over) => Answer::refusal(503, "densify view has ended; start it again"),
+        }
+    }
+}
+
+/// A picture, with what is known of it in the head.
+fn sent(frame: Frame) -> Answer {
+    let Frame { jpeg, size: (width, height), range, mean, distance, milliseconds } = frame;
+    let mut answer = Answer::of("image/jpeg", jpeg)
+        .with("X-Size", format!("{width}x{height}"))
+        .with("X-Milliseconds", format!("{milliseconds:.1}"));
+    if let Some(range) = range {
+        answer = answer.with("X-Range", format!("{} {}", range.start, range.end));
+    }
+    let numbers = [("X-Mean", mean), ("X-Distance", distance)];
+    for (name, value) in numbers.into_iter().filter_map(|(name, it)| Some((name, it?))) {
+        answer = answer.with(name, value);
+    }
+    answer
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+    use crate::dataset::normalise::Normalisation;
+    use crate::view::door::Place;
+
+    #[test]
+    fn only_what_is_built_in_is_served() {
+        let door = Door::open(Place { host: Ipv4Addr::LOCALHOST.into(), port: Some(0) }).unwrap();
+        let extent = Extent {
+            models: 1,
+            views: [0, 0],
+            normalisation: Normalisation::IDENTITY,
+            counts: true,
+        };
+        let desk = Desk::default();
+        desk.close();
+        let routes = Routes { door: &door, desk: &desk, extent, description: "{}".into() };
+        let status = |request: &Request| routes.answer(request).status();
+        let get = |path: &str| status(&Request::get(path, "localhost", None));
+        for path in ["/", "/view.css", "/view.js", "/scene"] {
+            assert_eq!(get(path), 200, "{path}");
+        }
+        for path in [
+            "/etc/passwd",
+            "/../Cargo.toml",
+            "//",
+            "/view.js/",
+            "/%2e%2e/",
+            "/?",
+            "*",
+            "",
+            "/page/view.js",
+        ] {
+            assert_eq!(get(path), 404, "{path}");
+        }
+        assert_eq!(get("/frame"), 405);
+        let post = |path: &str, body: &str| {
+            status(&Request {
+                method: Method::Post,
+                content_type: Some("application/json".into()),
+                body: body.into(),
+                ..Request::get(path, "localhost", None)
+            })
+        };
+        assert_eq!(post("/scene", "{}"), 405);
+        assert_eq!(post("/frame", "{}"), 400);
+        let wish = r#"{"page": "a", "kind": "render", "width": 9, "height": 9, "camera":
+            {"camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1], "fov": 50}}"#;
+        assert_eq!(post("/frame", wish), 503);
+    }
+
+    #[test]
+    fn the_page_loads_nothing_of_others() {
+        for text in [PAGE, STYLE, SCRIPT] {
+            for word in ["http://", "https://", "//cdn", "@import", "eval("] {
+                let strange = text.replace("http://www.w3.org/", "");
+                assert!(!strange.contains(word), "{word}");
+            }
+        }
+    }
+}

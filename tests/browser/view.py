@@ -1,0 +1,227 @@
+"""Drives the page of `densify view` in a real browser: Chromium without a window, through chromedriver.
+
+    python view.py DENSIFY RUN [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
+
+RUN must hold views out. WebDriver is JSON over HTTP, for which Python's own library is enough.
+"""
+
+import base64
+import json
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+STEPS = 50
+PATIENCE = 60.0
+# A small picture of what the stage shows: enough to tell pictures apart, and from empty ones.
+PROBE = """
+const small = document.createElement("canvas");
+small.width = small.height = 48;
+const out = small.getContext("2d", { willReadFrequently: true });
+out.drawImage(document.getElementById("picture"), 0, 0, 48, 48);
+const { data } = out.getImageData(0, 0, 48, 48);
+const light = [];
+for (let i = 0; i < data.length; i += 4) light.push(data[i] + data[i + 1] + data[i + 2]);
+const mean = light.reduce((a, b) => a + b) / light.length;
+return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join() };
+"""
+
+
+class Browser:
+    """A session of chromedriver."""
+
+    def __init__(self) -> None:
+        self.driver = subprocess.Popen(["chromedriver", "--port=0"], stdout=subprocess.PIPE, text=True)
+        assert self.driver.stdout
+        line = next(line for line in self.driver.stdout if "started successfully on port" in line)
+        port = line.rsplit("port", 1)[1].strip(" .\n")
+        self.base = f"http://127.0.0.1:{port}"
+        options = {"args": ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--window-size=1280,800"]}
+        wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"}}
+        session = self.call("POST", "/session", {"capabilities": {"alwaysMatch": wanted}})
+        self.session = f"/session/{session['sessionId']}"
+
+    def call(self, method: str, path: str, body: object = None) -> object:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"}, method=method)
+        try:
+            with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+                return json.load(answer)["value"]
+        except urllib.error.HTTPError as error:
+            raise SystemExit(f"{method} {path}: {error.read().decode()}") from error
+
+    def open(self, url: str) -> None:
+        self.call("POST", f"{self.session}/url", {"url": url})
+
+    def run(self, script: str, *arguments: object) -> object:
+        return self.call("POST", f"{self.session}/execute/sync", {"script": script, "args": list(arguments)})
+
+    def command(self, name: str, **parameters: object) -> None:
+        """A command of the DevTools."""
+        self.call("POST", f"{self.session}/goog/cdp/execute", {"cmd": name, "params": parameters})
+
+    def until(self, condition: str, what: str) -> None:
+        end = time.monotonic() + PATIENCE
+        while not self.run(f"return Boolean({condition})"):
+            assert time.monotonic() < end, f"{what}: {self.run('return document.body.innerText')}"
+            time.sleep(0.02)
+
+    def is_sharp(self) -> None:
+        self.until("document.getElementById('stage').dataset.state === 'sharp'", "no sharp picture")
+
+    def choose(self, name: str, value: str) -> None:
+        """Chooses from a list, as a hand does."""
+        script = "const list = document.getElementById(arguments[0]); list.value = arguments[1];"
+        script += "list.dispatchEvent(new Event('change', { bubbles: true })); return list.value;"
+        assert self.run(script, name, value) == value, f"{name} has no {value}"
+        self.is_sharp()
+
+    def press(self, *names: str) -> None:
+        actions = [{"type": kind, "value": name} for name in names for kind in ("keyDown", "keyUp")]
+        self.call("POST", f"{self.session}/actions", {"actions": [{"type": "key", "id": "keys", "actions": actions}]})
+
+    def hand(self, *actions: dict) -> None:
+        pointer = {"type": "pointer", "id": "hand", "parameters": {"pointerType": "mouse"}, "actions": list(actions)}
+        self.call("POST", f"{self.session}/actions", {"actions": [pointer]})
+
+    def log(self, kind: str) -> list[dict]:
+        return self.call("POST", f"{self.session}/se/log", {"type": kind})
+
+    def picture(self, path: Path) -> None:
+        path.write_bytes(base64.b64decode(self.call("GET", f"{self.session}/screenshot")))
+
+    def close(self) -> None:
+        self.call("DELETE", self.session)
+        self.driver.terminate()
+        self.driver.wait()
+
+
+def check(browser: Browser, url: str, folder: Path | None) -> None:
+    def keep(name: str) -> None:
+        if folder:
+            browser.picture(folder / f"{name}.png")
+
+    def size(width: int, height: int) -> None:
+        browser.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def theme(name: str) -> None:
+        browser.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
+
+    size(1280, 800)
+    theme("dark")
+    browser.open(url)
+    browser.is_sharp()
+    # The first time it says what is seen; the key that everything begins with closes that.
+    assert browser.run("return document.getElementById('guide').open"), "no help at first"
+    keep("first")
+    browser.press("\ue007")
+    assert not browser.run("return document.getElementById('guide').open"), "Enter does not close the help"
+
+    browser.choose("view", "test:0")
+    keep("test-camera")
+    browser.choose("left", "photograph:0")
+    browser.choose("right", "render:0")
+    # What the photograph's camera saw, and what is drawn there, at the photograph's own size.
+    own = browser.run("const { width, height } = scene.views.test[0]; return `${width}x${height}`")
+    found = browser.run("return document.getElementById('stage').dataset.size")
+    assert found == own, f"{found} instead of {own}"
+    before = browser.run(PROBE)
+    browser.run("document.getElementById('divider').focus()")
+    browser.press("\ue011")  # Home
+    after = browser.run(PROBE)
+    assert before["light"] != after["light"], "the border does not move"
+    assert browser.run("return document.getElementById('divider').getAttribute('aria-valuenow')") == "0"
+    browser.press(*["\ue014"] * 20)  # Right
+    keep("compare")
+    browser.choose("left", "difference:0")
+    assert browser.run("return document.getElementById('mean').textContent").startswith("Difference (FLIP): 0.")
+    keep("difference")
+    browser.choose("right", "")
+    theme("light")
+    browser.run("document.getElementById('frusta').click()")
+    for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
+        browser.choose("left", f"{kind}:0")
+        assert browser.run(PROBE)["spread"] > 4, f"{kind} is empty"
+    keep("rows")
+    browser.choose("left", "render:0")
+
+    # Turning: every picture differs, and none is empty.
+    seen: set[str] = set()
+    middle = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": 440, "y": 380}
+    browser.hand(middle, {"type": "pointerDown", "button": 0})
+    for step in range(STEPS):
+        count = browser.run("return Number(document.getElementById('stage').dataset.pictures)")
+        browser.hand({"type": "pointerMove", "duration": 0, "origin": "pointer", "x": 11, "y": 3 if step % 2 else -2})
+        browser.until(f"Number(document.getElementById('stage').dataset.pictures) > {count}", f"no picture at step {step}")
+        found = browser.run(PROBE)
+        assert found["spread"] > 4, f"picture {step} is empty"
+        seen.add(found["light"])
+    assert len(seen) == STEPS, f"{STEPS} steps gave {len(seen)} pictures"
+    browser.hand({"type": "pointerUp", "button": 0})
+    browser.is_sharp()
+    keep("anywhere")
+    pace = "const { rate, rested } = document.getElementById('stage').dataset; return [rate, rested]"
+    # Flying by key, as fast as pictures come.
+    keys = lambda kind: [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": "s"}]}]
+    browser.run("document.getElementById('marks').focus()")
+    browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyDown")})
+    time.sleep(1.5)
+    browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyUp")})
+    browser.is_sharp()
+    rate, rested = browser.run(pace)
+    print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
+    browser.press("k", "r", "]", "k")
+    assert not browser.run("return document.getElementById('save').disabled"), "no camera path to save"
+    assert browser.run("return keys.length") == 2
+
+    # Where there is little room.
+    size(360, 740)
+    browser.is_sharp()
+    for element in ["html", "#panel"]:
+        width = browser.run("return document.querySelector(arguments[0]).scrollWidth", element)
+        assert width <= 360, f"{element} is {width} px wide"
+    keep("phone")
+    browser.run("document.getElementById('help').click()")
+    width = browser.run("return document.getElementById('guide').scrollWidth")
+    assert width <= 360, f"the help is {width} px wide"
+    keep("phone-help")
+    theme("dark")
+    browser.run("document.getElementById('guide').close()")
+    browser.run("document.getElementById('fold').click()")
+    browser.is_sharp()
+    keep("phone-dark")
+
+    severe = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    assert not severe, "\n".join(severe)
+    events = [json.loads(entry["message"])["message"] for entry in browser.log("performance")]
+    urls = {event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"}
+    assert f"{url}frame" in urls, "no request is known"
+    strange = [it for it in urls if not it.startswith((url, "data:", "blob:" + url.rstrip("/")))]
+    assert not strange, f"requests beyond the page: {strange}"
+
+
+def main(densify: str, run: str, folder: str | None = None) -> None:
+    if folder:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    program = subprocess.Popen([densify, "view", run, "--port", "0", "--backend", "cpu"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert program.stdout
+        line = next(line for line in program.stdout if line.startswith("page "))
+        browser = Browser()
+        try:
+            check(browser, line.split()[1], Path(folder) if folder else None)
+        finally:
+            browser.close()
+        program.send_signal(signal.SIGINT)
+        assert program.wait(PATIENCE) == 0, "Ctrl-C does not end it well"
+    finally:
+        program.kill()
+    print("the page shows a test camera, compares, turns, flies, fits 360 px, and asks nobody else")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,341 @@
+//! `densify view`: the page over a plain connection, what it refuses, and how it ends.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::Duration;
+
+use image::RgbImage;
+use serde_json::{Value, json};
+
+use super::{call, json, scratch, text, train};
+use crate::photographs::{Photographs, SIZE};
+
+/// A page that is being served.
+struct Page {
+    program: Child,
+    said: BufReader<ChildStdout>,
+    /// Address and port.
+    place: String,
+    /// What the path begins with and ends in: `/`, or `/` and a secret and `/`.
+    path: String,
+    /// What it said before.
+    before: String,
+}
+
+/// What came back.
+#[derive(Debug)]
+struct Reply {
+    status: u16,
+    head: String,
+    body: Vec<u8>,
+}
+
+impl Reply {
+    fn text(&self) -> String {
+        String::from_utf8_lossy(&self.body).into_owned()
+    }
+
+    fn picture(&self) -> RgbImage {
+        assert_eq!(self.status, 200, "{}", self.text());
+        let format = image::ImageFormat::Jpeg;
+        image::load_from_memory_with_format(&self.body, format).expect("a JPEG").into_rgb8()
+    }
+}
+
+impl Page {
+    fn open(words: &str) -> Self {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_densify"))
+            .args(format!("view {words} --port 0 --backend cpu").split_whitespace())
+            .env_remove("RUST_LOG")
+            .env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"))
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("it starts");
+        let mut said = BufReader::new(program.stdout.take().expect("a pipe"));
+        let (mut line, mut before) = (String::new(), String::new());
+        while !line.starts_with("page ") {
+            before.push_str(&line);
+            line.clear();
+            let length = said.read_line(&mut line).expect("text");
+            assert!(length > 0, "it has ended: {:?}", program.wait());
+        }
+        let url = line.trim_start_matches("page").trim();
+        let rest = url.strip_prefix("http://").expect("an address");
+        let (place, path) = rest.split_once('/').expect("a path");
+        Self { program, said, place: place.to_owned(), path: format!("/{path}"), before }
+    }
+
+    fn connect(&self) -> TcpStream {
+        let stream = TcpStream::connect(&self.place).expect("it listens");
+        stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a time");
+        stream
+    }
+
+    /// Sends bytes, and reads until the connection ends.
+    fn send(&self, request: &[u8]) -> Reply {
+        let mut stream = self.connect();
+        stream.write_all(request).expect("it reads");
+        let mut bytes = Vec::new();
+        stream.read_to_end(&mut bytes).expect("it answers");
+        let end = bytes.windows(4).position(|four| four == b"\r\n\r\n").expect("a head") + 4;
+        let head = String::from_utf8(bytes[..end].to_vec()).expect("a head is text");
+        let status = head.split(' ').nth(1).and_then(|word| word.parse().ok());
+        Reply { status: status.expect("a status"), body: bytes.split_off(end), head }
+    }
+
+    fn get(&self, path: &str) -> Reply {
+        let Self { place, .. } = self;
+        self.send(
+            format!("GET {path} HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\r\n").as_bytes(),
+        )
+    }
+
+    fn post(&self, more: &str, body: &str) -> Reply {
+        let Self { place, path, .. } = self;
+        let request = format!(
+            "POST {path}frame HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\
+             Content-Type: application/json\r\nContent-Length: {}\r\n{more}\r\n{body}",
+            body.len()
+        );
+        self.send(request.as_bytes())
+    }
+
+    fn frame(&self, wish: &Value) -> Reply {
+        self.post("", &wish.to_string())
+    }
+
+    /// Ends it as Ctrl-C does; returns what else it said.
+    #[cfg(unix)]
+    fn end(mut self) -> String {
+        let pid = self.program.id().to_string();
+        let sent = Command::new("kill").args(["-INT", &pid]).status().expect("a shell's program");
+        assert!(sent.success());
+        let mut rest = String::new();
+        self.said.read_to_string(&mut rest).expect("text");
+        assert_eq!(self.program.wait().expect("it ends").code(), Some(0));
+        rest
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        let _ = self.program.kill();
+        let _ = self.program.wait();
+    }
+}
+
+fn run_of(scene: &Photographs, run: &Path) {
+    train(scene.path(), run, 40, "--budget 320 --eval --quiet").ok();
+}
+
+/// The view of a split, at most so large.
+fn wish(kind: &str, split: &str, number: usize, size: (u32, u32)) -> Value {
+    let view = json!({ "split": split, "number": number });
+    json!({ "page": "test", "kind": kind, "width": size.0, "height": size.1, "view": view })
+}
+
+/// Decibels between two pictures of one size.
+fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
+    assert_eq!(a.dimensions(), b.dimensions());
+    let squares = a.iter().zip(b.iter()).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));
+    let mean = squares.sum::<f64>() / a.len() as f64;
+    10.0 * (255.0 * 255.0 / mean.max(1e-9)).log10()
+}
+
+#[test]
+fn the_picture_of_a_camera_is_that_which_render_writes() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let pictures = root.path().join("pictures");
+    call(&format!("render {} -o {} --backend cpu", text(&run), text(&pictures))).ok();
+    let page = Page::open(text(&run));
+    let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
+    assert_eq!(described["views"]["test"][1]["name"], "view_08.png");
+    for (number, name) in [(0, "view_00"), (1, "view_08")] {
+        let found = page.frame(&wish("render", "test", number, SIZE));
+        let written = image::open(pictures.join(format!("{name}.png"))).expect("a PNG").into_rgb8();
+        let near = psnr(&found.picture(), &written);
+        assert!(near >= 38.0, "{name}: {near} dB");
+        // The photograph is as near to its file, and resembles the render less.
+        let file = image::open(scene.file(&format!("images/{name}.png"))).expect("a PNG");
+        let shown = page.frame(&wish("photograph", "test", number, (4000, 1000))).picture();
+        let near = psnr(&shown, &file.into_rgb8());
+        assert!(near >= 38.0, "{name}: the photograph is {near} dB from its file");
+        // From the same place by its pose alone: these cameras have their principal point in the middle.
+        let at = &described["views"]["test"][number];
+        let camera = json!({ "camera_to_world": at["camera_to_world"], "fov": at["fov"] });
+        let free = json!({ "page": "test", "kind": "render", "width": SIZE.0, "height": SIZE.1, "camera": camera });
+        let near = psnr(&page.frame(&free).picture(), &written);
+        assert!(near >= 36.0, "{name}: {near} dB by its pose");
+    }
+    let sizes = [((24, 99), (24, 20)), ((96, 80), (96, 80))];
+    for (wanted, size) in sizes {
+        assert_eq!(page.frame(&wish("render", "train", 0, wanted)).picture().dimensions(), size);
+    }
+    let kinds =
+        ["difference", "depth", "opacity", "count", "rows", "row_opacity", "row_size", "row_shape"];
+    let mut seen: Vec<Vec<u8>> = Vec::new();
+    for kind in kinds {
+        let reply = page.frame(&wish(kind, "test", 0, SIZE));
+        assert_eq!(reply.picture().dimensions(), SIZE, "{kind}");
+        assert_eq!(reply.head.contains("X-Range: "), !matches!(kind, "opacity" | "rows"), "{kind}");
+        assert!(!seen.contains(&reply.body), "{kind} is as another");
+        seen.push(reply.body);
+    }
+    // The mean difference is the FLIP that training measured of this view.
+    let head = page.frame(&wish("difference", "test", 0, SIZE)).head;
+    let mean = head.lines().find_map(|line| line.strip_prefix("X-Mean: ")).expect("a mean");
+    let flip = json(&run.join("per_view.json"))["ours_40"]["FLIP"]["view_00.png"].clone();
+    let apart = (mean.parse::<f64>().expect("a number") - flip.as_f64().expect("a number")).abs();
+    assert!(apart < 2e-3, "{mean} is not {flip}");
+    #[cfg(unix)]
+    assert_eq!(page.end().trim(), "Ctrl-C ends it");
+}
+
+#[test]
+fn what_a_stranger_sends_is_refused_and_changes_nothing() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    run_of(&scene, &run);
+    let page = Page::open(text(&run));
+    let sound = wish("render", "test", 0, SIZE);
+    let first = page.frame(&sound).picture();
+    let place = &page.place;
+    let refused = |reply: &Reply, status: u16, word: &str| {
+        assert_eq!(reply.status, status, "{reply:?}");
+        assert!(reply.text().contains(word) && reply.body.len() < 400, "{}", reply.text());
+    };
+    let mut large = sound.clone();
+    large["width"] = 100_000.into();
+    refused(&page.frame(&large), 400, "100000x");
+    refused(&page.post("Origin: http://evil.example\r\n", &sound.to_string()), 403, "another page");
+    refused(&page.post("Origin: null\r\n", &sound.to_string()), 403, "another page");
+    assert_eq!(page.post(&format!("Origin: http://{place}\r\n"), &sound.to_string()).status, 200);
+    refused(&page.post("", &" ".repeat(5000)), 413, "too long");
+    refused(&page.post("", "{}"), 400, "page");
+    let evil = "GET / HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n";
+    refused(&page.send(evil.as_bytes()), 403, "its own machine");
+    let config = text(&run.join("config.toml")).to_owned();
+    for path in [&*config, "/../config.toml", "/%2e%2e/%2e%2e/etc/passwd", "/config.toml", "//"] {
+        refused(&page.get(path), 404, "nothing here");
+    }
+    refused(&page.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n"), 400, "no HTTP");
+    refused(&page.send(format!("GET /{} HTTP/1.1\r\n", "a".repeat(9000)).as_bytes()), 431, "long");
+    // Guests that say nothing, or do not end, keep nobody out.
+    let mut idle: Vec<TcpStream> = (0..1000).map(|_| page.connect()).collect();
+    for stream in idle.iter_mut().step_by(3) {
+        let _ = stream.write_all(b"POST /frame HTTP/1.1\r\nHost: local");
+    }
+    assert!(page.frame(&sound).picture() == first, "it is the same picture");
+    let page_text = page.get("/").text();
+    assert!(page_text.contains("<title>densify view</title>"), "{page_text}");
+    #[cfg(unix)]
+    page.end();
+}
+
+#[test]
+fn a_network_sees_the_page_only_with_its_secret() {
+    let page = Page::open("tests/fuzz/corpus/ply/twelve.ply --host 0.0.0.0");
+    let secret = page.path.trim_matches('/').to_owned();
+    assert_eq!(secret.len(), 32, "{}", page.path);
+    assert_eq!(page.get("/").status, 404);
+    assert_eq!(page.get("/scene").status, 404);
+    assert_eq!(page.get(&format!("/{}/scene", "0".repeat(32))).status, 404);
+    let described: Value =
+        serde_json::from_slice(&page.get(&format!("/{secret}/scene")).body).expect("JSON");
+    // A model without cameras: a start from its bounds, and nothing that needs a photograph.
+    assert!(described["start"]["fov"].is_number(), "{described}");
+    let kinds = described["kinds"].as_array().expect("kinds");
+    assert!(kinds.iter().all(|kind| kind["needs_photograph"] == false), "{described}");
+    let start = &described["start"];
+    let camera = json!({ "camera_to_world": start["camera_to_world"], "fov": start["fov"] });
+    let free =
+        json!({ "page": "a", "kind": "render", "width": 64, "height": 48, "camera": camera });
+    let picture = page.frame(&free).picture();
+    let (least, most) = picture.iter().fold((255, 0), |(a, b), &v| (a.min(v), b.max(v)));
+    assert!(most - least > 20, "the model is in the picture");
+    assert_eq!(page.frame(&wish("render", "test", 0, (9, 9))).status, 400);
+}
+
+#[test]
+fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    let page = Page::open(&format!("{} --eval", text(scene.path())));
+    let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
+    assert!(described["models"][0]["name"].as_str().expect("a name").ends_with("its points"));
+    assert!(described["points"]["all"].as_u64() > Some(100), "{}", described["points"]["all"]);
+    page.frame(&wish("render", "test", 0, SIZE)).picture();
+    run_of(&scene, &run);
+    let other = root.path().join("other");
+    train(scene.path(), &other, 4, "--budget 320 --eval --quiet").ok();
+    let page = Page::open(&format!("{} {}", text(&run), text(&other)));
+    let of = |model: u32| {
+        let mut wish = wish("render", "test", 0, SIZE);
+        wish["model"] = model.into();
+        page.frame(&wish)
+    };
+    assert!(psnr(&of(0).picture(), &of(1).picture()) < 35.0, "two models, two pictures");
+    assert_eq!(of(2).status, 400);
+}
+
+#[test]
+fn what_cannot_be_shown_is_said_with_the_remedy() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let run_text = text(&run).to_owned();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let port = taken.local_addr().expect("an address").port();
+    let empty = root.path().join("empty");
+    std::fs::create_dir(&empty).expect("a folder");
+    let model = densify::output::model_path(&run, 40);
+    let model = text(&model);
+    for (words, expected) in [
+        (
+            format!("{run_text} --port {port}"),
+            vec!["--port", "another program", "leave --port out"],
+        ),
+        (format!("{run_text} --port 70000"), vec!["--port"]),
+        (format!("{run_text} --host nowhere"), vec!["--host"]),
+        (format!("{run_text} --host 192.0.2.1"), vec!["--host 192.0.2.1", "this machine"]),
+        (format!("{run_text} --iteration 7"), vec!["--iteration 7", "40"]),
+        (format!("{run_text} -r 2"), vec!["a run brings its own"]),
+        (format!("{model} --iteration 40"), vec!["--iteration", "run"]),
+        (format!("{run_text} {}", text(&empty)), vec!["holds no run", "config.toml"]),
+        (text(&empty).to_owned(), vec!["neither a run", "nor a scene"]),
+        ("nowhere".to_owned(), vec!["nowhere", "neither a run"]),
+        (format!("{} {run_text}", text(scene.path())), vec!["only runs and models"]),
+    ] {
+        call(&format!("view {words} --backend cpu")).refused(&words, &expected);
+    }
+}
+
+/// A run that another process writes is shown as it was last saved, or refused with a word.
+#[cfg(unix)]
+#[test]
+fn a_run_that_is_being_trained_is_shown_as_last_saved() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    // What a process that trains holds.
+    let lock = std::fs::File::create(run.join("densify.lock")).expect("a file");
+    lock.lock().expect("a lock");
+    let page = Page::open(text(&run));
+    assert!(
+        page.before.contains("is being trained") && page.before.contains("iteration 40"),
+        "{}",
+        page.before
+    );
+    page.frame(&wish("render", "test", 0, SIZE)).picture();
+    page.end();
+    let unsaved = root.path().join("unsaved");
+    super::copy_unfinished(&run, &unsaved, 40);
+    let lock = std::fs::File::create(unsaved.join("densify.lock")).expect("a file");
+    lock.lock().expect("a lock");
+    let refused = call(&format!("view {} --backend cpu", text(&unsaved)));
+    refused.refused("nothing is saved", &["is being trained", "--save-iterations"]);
+}
