@@ -232,8 +232,8 @@ mod tests {
             refused.code == 2 && refused.message.contains(&format!("--port {port}")),
             "{refused}"
         );
-        let two = [(); 2].map(|()| Door::open(Place { host, port: None }).unwrap().address);
-        assert_ne!(two[0], two[1]);
+        let two = [(); 2].map(|()| Door::open(Place { host, port: None }).unwrap());
+        assert_ne!(two[0].address, two[1].address);
         let elsewhere = Place { host: Ipv4Addr::new(192, 0, 2, 7).into(), port: Some(0) };
         let refused = Door::open(elsewhere).unwrap_err();
         assert!(refused.code == 2 && refused.message.contains("--host 192.0.2.7"), "{refused}");
