@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use crate::backend::{Backend, MomentStorage, Setup, Storage};
 use crate::dataset::Dataset;
@@ -153,7 +154,7 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
             depth > 0.0 && within(pixel.x, camera.width) && within(pixel.y, camera.height)
         })
     };
-    model.means.iter().filter(|mean| shows(mean)).count()
+    model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
 /// Says so where the model that a run starts from fits the photographs worse than a plain colour does: then it

@@ -2,8 +2,11 @@
 
 use std::path::Path;
 
+use densify::gaussians::Gaussians;
+use densify::output::model_path;
+
 use super::{
-    Outcome, call, count, files, json, model, read, records, resume, scratch, text, train,
+    Outcome, call, count, files, gaussians, json, read, records, resume, scratch, text, train,
 };
 use crate::photographs::Photographs;
 
