@@ -173,6 +173,7 @@ mod event;
 pub mod igs;
 pub mod lightgaussian;
 pub mod mcmc;
+pub mod merit;
 pub mod mini_splatting;
 mod needs;
 pub mod neighbours;
