@@ -42,10 +42,14 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     let mut opacity = vec![0.5; 60];
     opacity[7] = 0.004;
     opacity[9] = f32::NAN;
-    let faint = run(&event.with(Signal::Opacity, &opacity), "curve_until = 8500");
+    let faint = run(&event.clone().with(Signal::Opacity, &opacity), "curve_until = 8500");
     // Their slots are reused.
     assert_eq!((faint.pruned, faint.ops.rows_after), (vec![7, 9], 100));
     assert_eq!((faint.ops.counts.removed, faint.cloned.len()), (2, 42));
+    // They have no children.
+    let late = Event { step: 8600, ..event.with(Signal::Opacity, &opacity) };
+    let done = run(&late, "curve_until = 8500");
+    assert_eq!((done.cloned.len(), done.ops.counts.denied), (58, 0));
 }
 
 #[test]
@@ -77,10 +81,14 @@ fn what_hardly_shows_is_replaced_as_much_as_there_is_of_it() {
     let young = event.clone().with(Signal::Age, &age);
     assert_eq!(run(&young, set).pruned, [0, 2]);
     assert_eq!(run(&young, &format!("{set}\nprotect = 99")).pruned, [0, 1, 2]);
-    // NaN is neither below nor counted.
-    importance[5..].fill(f32::NAN);
-    // 0.1, 0.2, 0.29, 0.31, 1: the median is 0.29, and nothing is below 0.087.
-    assert!(run(&event.with(Signal::WeightMax, &importance), set).pruned.is_empty());
+    // Nor is one that is pruned anyway: it is born anew, beside the two.
+    let mut opacity = vec![0.5; 20];
+    opacity[0] = 0.004;
+    let faint = run(&event.clone().with(Signal::Opacity, &opacity), set);
+    assert_eq!((faint.pruned, faint.ops.rows_after), (vec![0, 1, 2], 20));
+    // NaN is neither below nor counted: the fifth of nine is 1.0.
+    importance[9..].fill(f32::NAN);
+    assert_eq!(run(&event.with(Signal::WeightMax, &importance), set).pruned, [0, 1, 2]);
 }
 
 #[test]
@@ -95,6 +103,9 @@ fn the_least_important_go_but_no_parents() {
     // Newborns only if there are no others, the oldest first.
     let young = event.with(Signal::Age, &[500.0, 500.0, 10.0, 30.0, 20.0, 200.0]);
     assert_eq!(run(&young, "rho = 48.0").pruned, [3, 5]);
+    // An epoch of ten steps is over.
+    let scene = SceneInfo { train_views: 10, ..young.scene.clone() };
+    assert_eq!(run(&Event { scene, ..young }, "rho = 48.0").pruned, [2, 3]);
 }
 
 #[test]
