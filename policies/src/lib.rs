@@ -7,7 +7,7 @@
 //! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown; [`compact_3dgs`], which
 //! learns what to prune; [`eagles`], which prunes the least influential and begins with small images;
 //! [`mini_splatting`], which samples by importance; [`reduced_3dgs`], which prunes where many Gaussians
-//! share a pixel. It knows no renderer, no image and no device.
+//! share a pixel; [`merit`], our own, which replaces what hardly shows. It knows no renderer, no image and no device.
 //!
 //! # For users of gsplat
 //!
@@ -173,6 +173,7 @@ mod event;
 pub mod igs;
 pub mod lightgaussian;
 pub mod mcmc;
+pub mod merit;
 pub mod mini_splatting;
 mod needs;
 pub mod neighbours;

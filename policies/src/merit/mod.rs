@@ -1,0 +1,235 @@
+//! # merit — replaces what hardly shows, as much as there is of it
+//!
+//! Fills the budget slowly and then keeps replacing: Gaussians that hardly show anywhere make room for
+//! children of those that photographs pull at from several sides. A scene in which much is badly placed
+//! replaces much, one in which all Gaussians earn their place little.
+//!
+//! Source: our own; docs/merit.md has the figures. The turnover, the gradient with its colour term and the
+//! guard against near views are from *Gaussians on a Diet* (arXiv 2604.20046, our `diet`); the absolute
+//! gradient, splits along the longest axis and the square-root curve from *Improving Densification in 3D
+//! Gaussian Splatting* (Deng et al. 2025, our `igs`).
+//!
+//! ## Method
+//!
+//! **Events** come every `grow_every` steps between `grow_from` and `grow_until`.
+//!
+//! **How many.** The model may have S + (F − S) · √x Gaussians, S those at the start, F the budget and x the
+//! part of the way from `grow_from` to `curve_until`, at most 1. Births fill what is missing; no threshold
+//! holds them back.
+//!
+//! Beyond that, Gaussians are replaced: as many as are less important than `replaceable` times the median
+//! importance, and are no newborns. In all events together these are at least `rho` · F, whether there are
+//! so many or not, and at most `most_rho` · F, an equal part in each event. Importance is the largest
+//! blend weight α·T over all pixels of the training views of the previous and the current epoch.
+//!
+//! **Births** go to the Gaussians with the largest g = g_p + `colour_weight` · g_c. g_c is the norm of the loss
+//! gradient with respect to the colour, g_p that with respect to the projected mean (NDC), with absolute
+//! values summed over pixels where `gradient` is `abs`. Both are averaged over the views since the last event;
+//! views nearer than `full_depth` are weighted by the square of the ratio. Gaussians that fewer than
+//! `least_views` of these views have seen get no children.
+//!
+//! **Deaths.** Gaussians less opaque than `min_opacity` are pruned. Where there is no room for the births, the
+//! least important Gaussians go, parents excepted. Newborns (younger than an epoch, at most `protect` steps)
+//! go only if there are no others, the oldest first.
+//!
+//! **Children.** A Gaussian larger than `small` is split along its longest axis: with d = `split_share`, two
+//! halves at ±3d standard deviations, their longest axis 1 − d times the parent's, the others √(1 − d²) times,
+//! their opacity `child_opacity` times the parent's. A smaller one is cloned where it is.
+//!
+//! Each event is one plan that prunes before it grows, so the budget holds at every instant. Opacities are
+//! never reset, the loss has no further terms, and learning rates are the trainer's.
+//!
+//! ## Parameters
+//!
+//! | name | default | range | unit | meaning |
+//! |---|---|---|---|---|
+//! | grow_from | 500 | >= 0 | step | start of events (exclusive) |
+//! | grow_until | 15000 | >= 0 | step | end of events (exclusive) |
+//! | grow_every | 100 | >= 0 | steps | interval of events; 0: never |
+//! | curve_until | 12000 | >= 0 | step | when the curve reaches the budget |
+//! | rho | 0.25 | >= 0 | budget | fewest Gaussians that are replaced in all |
+//! | replaceable | 0.3 | >= 0 | median importance | less important ones are replaced; 0: only `rho` |
+//! | most_rho | 2.0 | >= 0 | budget | most Gaussians that are replaced in all |
+//! | gradient | "abs" | abs, screen | | screen gradient, of absolute values or as it is |
+//! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |
+//! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
+//! | least_views | 3 | >= 0 | views | fewest views of a parent |
+//! | protect | 100 | 0 to 65535 | steps | longest protection of newborns; 0: none |
+//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; 0: all are split |
+//! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
+//! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the opacity in a split |
+//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
+//!
+//! ## Ablations
+//!
+//! Slow filling is switched off by `curve_until = 0`, turnover by `rho = 0` and `replaceable = 0`, its measure by
+//! `replaceable = 0` alone, absolute gradients by `gradient = "screen"`, the colour gradient by
+//! `colour_weight = 0`, the guard against near views by `full_depth = 0`, the demand for several views by
+//! `least_views = 0`, clones by `small = 0`, protection by `protect = 0`.
+//!
+//! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
+//! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
+
+use crate::adc::{Window, clone_at, spare_one, split_long_axis};
+use crate::parameters::StepParameter::{self, Interval, Step};
+use crate::plan::{EditPlan, Offspring, Reset};
+use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
+use crate::registry::ConfiguredPolicy;
+use crate::rng::PolicyRng;
+use crate::sample::{largest, smallest};
+
+mod curve;
+mod parameters;
+mod score;
+
+pub use parameters::{Gradient, MeritParams};
+
+crate::register_policy!(
+    "merit",
+    Merit,
+    summary: "replaces what hardly shows, as much as there is of it",
+    source: "our own, docs/merit.md",
+    doc: include_str!("mod.rs"),
+);
+
+/// Births where gradients are large, deaths of what hardly shows.
+#[derive(Debug)]
+pub struct Merit {
+    params: MeritParams,
+    events: Window,
+    /// Rows younger than this are protected `[steps]`.
+    protected_age: f32,
+}
+
+impl ConfiguredPolicy for Merit {
+    type Params = MeritParams;
+
+    const STEP_PARAMETERS: &'static [StepParameter] =
+        &[Step("grow_from"), Step("grow_until"), Interval("grow_every"), Step("curve_until")];
+
+    fn new(params: MeritParams, scene: &SceneInfo) -> PolicyResult<Self> {
+        params.check()?;
+        let MeritParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
+        Ok(Self {
+            events: Window { from, until, every },
+            protected_age: params.protect.min(scene.train_views) as f32,
+            params,
+        })
+    }
+}
+
+impl DensityPolicy for Merit {
+    fn needs(&self, scene: &SceneInfo) -> Needs {
+        let mut signals = SignalSet::from([
+            Signal::VisibleCount,
+            Signal::Opacity,
+            Signal::WeightMax,
+            self.params.gradient.signal(),
+        ]);
+        for (is_read, signal) in [
+            (self.params.colour_weight > 0.0, Signal::ColourGradient),
+            (self.params.small > 0.0, Signal::ScaleMax),
+            (self.protected_age > 0.0, Signal::Age),
+        ] {
+            if is_read {
+                signals = signals.with(signal);
+            }
+        }
+        let full_depth = (self.params.full_depth * f64::from(scene.extent)) as f32;
+        Needs { signals, full_depth, ..Needs::default() }
+    }
+
+    fn is_due(&self, step: u32) -> bool {
+        self.events.is_due(step)
+    }
+
+    fn plan(&mut self, now: &Snapshot<'_>, _rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
+        plan.cause("grow");
+        let opacity = now.signal(Signal::Opacity)?;
+        let least = self.params.min_opacity as f32;
+        // Also what is not a number.
+        let is_alive = |row: u32| opacity[row as usize] >= least;
+        let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|&row| !is_alive(row)).collect();
+        spare_one(&mut dead, opacity);
+        plan.prune_all(dead);
+
+        let births =
+            self.missing(now.step, now.scene.initial_rows, plan) + self.turnover(now, plan)?;
+        let parents = self.parents(now, plan, births)?;
+        let without_room = parents.len().saturating_sub(plan.room());
+        self.prune_least(now, plan, &parents, without_room)?;
+        for row in parents {
+            // Where there is still no room, the plan counts it as denied.
+            let _ = plan.grow(row, self.offspring(now, row as usize)?);
+        }
+        plan.reset(Reset::Signals);
+        Ok(())
+    }
+}
+
+impl Merit {
+    /// Whether a row is old enough to be replaced. `age` is empty where nothing is protected.
+    fn is_old(&self, age: &[f32], row: u32) -> bool {
+        age.get(row as usize).is_none_or(|age| *age >= self.protected_age)
+    }
+
+    /// Ages, if newborns are protected.
+    fn ages<'a>(&self, now: &Snapshot<'a>) -> PolicyResult<&'a [f32]> {
+        if self.protected_age > 0.0 { now.signal(Signal::Age) } else { Ok(&[]) }
+    }
+
+    /// The rows that get children, the largest gradient first.
+    fn parents(
+        &self,
+        now: &Snapshot<'_>,
+        plan: &EditPlan,
+        births: usize,
+    ) -> PolicyResult<Vec<u32>> {
+        let gradient = self.gradient(now)?;
+        let views = now.signal(Signal::VisibleCount)?;
+        let least = self.params.least_views as f32;
+        let may = |row: &u32| {
+            let index = *row as usize;
+            plan.is_free(*row) && gradient[index] > 0.0 && views[index] >= least
+        };
+        let rows: Vec<u32> = (0..now.rows() as u32).filter(may).collect();
+        Ok(largest(rows, &gradient, births))
+    }
+
+    /// Prunes the `count` least important rows that are no parents; newborns only where there are no
+    /// others, the oldest first.
+    fn prune_least(
+        &self,
+        now: &Snapshot<'_>,
+        plan: &mut EditPlan,
+        parents: &[u32],
+        count: usize,
+    ) -> PolicyResult {
+        let mut is_parent = vec![false; now.rows()];
+        for &row in parents {
+            is_parent[row as usize] = true;
+        }
+        let age = self.ages(now)?;
+        let others =
+            (0..now.rows() as u32).filter(|&row| plan.is_free(row) && !is_parent[row as usize]);
+        let (old, new): (Vec<u32>, Vec<u32>) = others.partition(|&row| self.is_old(age, row));
+        let pruned = smallest(old, now.signal(Signal::WeightMax)?, count);
+        let missing = count - pruned.len();
+        plan.prune_all(pruned);
+        plan.prune_all(largest(new, age, missing));
+        Ok(())
+    }
+
+    /// The children of a row.
+    fn offspring(&self, now: &Snapshot<'_>, row: usize) -> PolicyResult<Offspring> {
+        let MeritParams { small, split_share, child_opacity, .. } = self.params;
+        let small = (small * f64::from(now.scene.extent)) as f32;
+        if small > 0.0 && now.signal(Signal::ScaleMax)?[row] <= small {
+            return Ok(clone_at([0.0; 3]));
+        }
+        Ok(split_long_axis(split_share as f32, child_opacity as f32))
+    }
+}
+
+#[cfg(test)]
+mod tests;
