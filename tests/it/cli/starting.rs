@@ -138,7 +138,13 @@ fn what_cannot_be_started_from_is_refused_or_named() {
         write(&model, &path);
         path
     };
-    let far = moved("far.ply", |[x, y, z]| [x + 1e4, y, z]);
-    refused(&start(&far, ""), root.path(), &["far.ply", "0 of its", "coordinates"]);
+    let above = moved("above.ply", |[x, y, z]| [x, y + 1e4, z]);
+    refused(&start(&above, ""), root.path(), &["above.ply", "0 of its", "coordinates"]);
     assert!(!files(root.path()).keys().any(|name| name.starts_with("no/")));
+    // Far away, but before some camera: there it is, and it shows nothing of the photographs.
+    let far = moved("far.ply", |[x, y, z]| [x + 1e4, y, z]);
+    let outcome = start(&far, "");
+    assert!(outcome.stdout.contains("worse than a plain colour"), "{outcome:?}");
+    let outcome = start(&file, "--overwrite");
+    assert!(!outcome.ok().stdout.contains("plain colour"));
 }
