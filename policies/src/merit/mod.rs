@@ -15,7 +15,7 @@
 //!
 //! **How many.** The model may have S + (F − S) · √x Gaussians, S those at the start, F the budget and x the
 //! part of the way from `grow_from` to `curve_until`, at most 1. Births fill what is missing; no threshold
-//! holds them back. By default the curve goes on beyond the last event, where it is half way.
+//! holds them back. By default the curve goes on beyond the last event.
 //!
 //! Beyond that, Gaussians are replaced: as many as are less important than `replaceable` times the median
 //! importance, and are no newborns. In all events together these are at least `rho` · F, whether there are
@@ -47,7 +47,7 @@
 //! | grow_from | 500 | >= 0 | step | start of events (exclusive) |
 //! | grow_until | 15000 | >= 0 | step | end of events (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of events; 0: never |
-//! | curve_until | 51429 | >= 0 | step | when the curve reaches the budget |
+//! | curve_until | 30000 | >= 0 | step | when the curve reaches the budget |
 //! | rho | 0.25 | >= 0 | budget | fewest Gaussians that are replaced in all |
 //! | replaceable | 0.3 | >= 0 | median importance | less important ones are replaced; 0: only `rho` |
 //! | most_rho | 2.0 | >= 0 | budget | most Gaussians that are replaced in all |

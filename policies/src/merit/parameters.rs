@@ -55,8 +55,7 @@ impl Default for MeritParams {
             grow_from: 500,
             grow_until: 15_000,
             grow_every: 100,
-            // Measured as step 12,000 of 7,000: at the end of all events the curve is half way.
-            curve_until: 51_429,
+            curve_until: 30_000,
             rho: 0.25,
             replaceable: 0.3,
             most_rho: 2.0,
