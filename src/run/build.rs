@@ -57,10 +57,7 @@ pub(super) fn build(
             points: spec.start.init_points.map(|points| points.0),
         },
     };
-    let file = match &init {
-        InitChoice::Model(file) => Some(file.clone()),
-        InitChoice::Points | InitChoice::Random => None,
-    };
+    let file = init.file().cloned();
     let initial_rows =
         checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
     let scene = inputs.info(setting.rows, initial_rows)?;

@@ -184,6 +184,17 @@ impl FromStr for ShDegree {
     }
 }
 
+impl InitChoice {
+    /// The file, of a start from a model.
+    #[must_use]
+    pub fn file(&self) -> Option<&PathBuf> {
+        match self {
+            Self::Model(file) => Some(file),
+            Self::Points | Self::Random => None,
+        }
+    }
+}
+
 impl FromStr for InitChoice {
     type Err = String;
 
