@@ -126,7 +126,7 @@ fn wires() {
         // A third or a fifth of the Gaussians shows less of a wire.
         let least = match policy {
             "lightgaussian" => [0.16, 0.25],
-            "mini-splatting" => [0.08, 0.11],
+            "mini-splatting" => [0.07, 0.08],
             _ => [0.2, 0.27],
         };
         recall(outcome, 2.0) > least[0] && recall(outcome, 4.0) > least[1]
