@@ -119,8 +119,7 @@ pub fn evaluate(
     let count = views.count();
     let mut scores = Vec::new();
     for view in 0..count {
-        let ahead: Vec<usize> = (view + 1..count.min(view + 3)).collect();
-        views.prefetch(&ahead);
+        views.prefetch_after(view);
         let name = || views.name(view).to_owned();
         let image =
             views.image(view).map_err(|source| EvaluateError::View { view: name(), source })?;

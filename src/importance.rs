@@ -9,9 +9,11 @@ use crate::views::ViewSource;
 /// What a backend must have been made for.
 #[must_use]
 pub fn needs() -> Needs {
-    let request =
-        AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightSum], points: 0 };
-    Needs { aux: Some(request), ..Needs::default() }
+    Needs { aux: Some(request()), ..Needs::default() }
+}
+
+fn request() -> AuxRequest {
+    AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightSum], points: 0 }
 }
 
 /// Bytes that [`importance`] takes beside the backend and an image, for a model of so many rows.
@@ -31,11 +33,11 @@ pub fn importance(
     background: [f32; 3],
     sh_degree: u8,
 ) -> Result<Vec<f64>, EvaluateError> {
-    let Needs { aux: Some(request), .. } = needs() else { return Ok(Vec::new()) };
+    let request = request();
     let mut sums = vec![0.0; backend.rows()];
     for view in 0..views.count() {
         let name = || views.name(view).to_owned();
-        views.prefetch(&(view + 1..views.count().min(view + 3)).collect::<Vec<_>>());
+        views.prefetch_after(view);
         let image =
             views.image(view).map_err(|source| EvaluateError::View { view: name(), source })?;
         let input = AuxInput {

@@ -27,6 +27,12 @@ pub trait ViewSource: Send {
     fn prefetch(&self, upcoming: &[usize]) {
         let _ = upcoming;
     }
+
+    /// Announces the views after this one, for whoever takes all in their order.
+    fn prefetch_after(&self, view: usize) {
+        let ahead: Vec<usize> = (view + 1..self.count().min(view + 3)).collect();
+        self.prefetch(&ahead);
+    }
 }
 
 /// Views of a dataset, with a cache of decoded images.

@@ -112,6 +112,23 @@ pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
     sum.iter().zip(views).map(mean).collect()
 }
 
+/// Adds `weight` times the mean over views of the colour gradient.
+///
+/// # Errors
+/// When the policy has not declared it.
+pub(crate) fn add_colour_gradient(
+    gradient: &mut [f32],
+    now: &Snapshot<'_>,
+    weight: f32,
+) -> PolicyResult {
+    let views = now.signal(Signal::VisibleCount)?;
+    let colour = mean_over_views(now.signal(Signal::ColourGradient)?, views);
+    for (g, c) in gradient.iter_mut().zip(colour) {
+        *g += weight * c;
+    }
+    Ok(())
+}
+
 /// A clone: a copy at `offset` from the parent `[scene units]`, which stays as it is.
 #[must_use]
 pub fn clone_at(offset: [f32; 3]) -> Offspring {

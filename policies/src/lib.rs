@@ -7,7 +7,8 @@
 //! [`lightgaussian`] and [`radsplat`], which prune what `vanilla` has grown; [`compact_3dgs`], which
 //! learns what to prune; [`eagles`], which prunes the least influential and begins with small images;
 //! [`mini_splatting`], which samples by importance; [`reduced_3dgs`], which prunes where many Gaussians
-//! share a pixel; [`merit`], our own, which replaces what hardly shows. It knows no renderer, no image and no device.
+//! share a pixel; [`merit`], our own, which replaces what hardly shows. It knows no renderer, no image and
+//! no device.
 //!
 //! # For users of gsplat
 //!

@@ -6,15 +6,14 @@ use std::str::FromStr;
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
-use super::export::check_output;
+use super::export::{check_output, format_of};
 use super::render::{RenderingArgs, refuse_options_of_a_file};
 use super::train::Follower;
 use crate::compress::{Attempt, Compressed, Options, Target, compress};
-use crate::export::{Format, find, find_by_extension};
+use crate::export::{Format, find};
 use crate::failure::Failure;
 use crate::number::{self, grouped, percent};
-use crate::output::model_path;
-use crate::run::finished::{is_model, iteration};
+use crate::run::finished::{is_model, model_file};
 use crate::run::{RunConfig, Whole};
 
 /// Makes a trained model smaller: as many Gaussians as asked, or a file no larger than asked.
@@ -92,25 +91,20 @@ pub(super) fn run(
     let format = format(args)?;
     check_output(&args.output, args.overwrite)?;
     let RenderingArgs { near, device, data } = &args.rendering;
-    let (model, scene, data, near) = if is_model(&args.model) {
-        if args.iteration.is_some() {
-            return Err(Failure::input(
-                "--iteration is for a run's folder; a file has only one model",
-            ));
-        }
+    let model = model_file(&args.model, args.iteration)?;
+    let (scene, data, near) = if is_model(&args.model) {
         let Some(scene) = args.scene.clone() else {
             return Err(Failure::input(format!(
                 "{} is a file, which has no photographs; name its dataset with --scene DIR",
                 args.model.display()
             )));
         };
-        (args.model.clone(), scene, data.clone(), *near)
+        (scene, data.clone(), *near)
     } else {
         refuse_options_of_a_file(matches)?;
         let config = RunConfig::read(&args.model)?;
-        let file = model_path(&args.model, iteration(&args.model, args.iteration)?);
         let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
-        (file, scene, config.spec.data, config.spec.start.near)
+        (scene, config.spec.data, config.spec.start.near)
     };
     let options = Options {
         model: &model,
@@ -135,9 +129,7 @@ pub(super) fn run(
 fn format(args: &CompressArgs) -> Result<&'static Format, Failure> {
     match args.format.as_deref() {
         Some(name) => find(name).map_err(|error| Failure::input(format!("--format: {error}"))),
-        None => find_by_extension(&args.output).map_err(|error| {
-            Failure::input(format!("-o: {error}, and name it with --format NAME"))
-        }),
+        None => format_of(&args.output),
     }
 }
 

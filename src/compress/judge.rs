@@ -35,7 +35,7 @@ impl Judge {
             let views = views_of(&self.dataset, split)?;
             let mut sum = 0.0;
             for view in 0..views.count() {
-                views.prefetch(&(view + 1..views.count().min(view + 3)).collect::<Vec<_>>());
+                views.prefetch_after(view);
                 let image = views.image(view).map_err(Failure::input)?;
                 let shown = backend.render(views.camera(view), self.background, sh_degree)?;
                 sum += psnr(&shown.rgb, &image, self.background).map_err(Failure::input)?;

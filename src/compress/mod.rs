@@ -17,6 +17,7 @@ use tempfile::TempPath;
 
 use crate::export::{Format, PLY};
 use crate::failure::Failure;
+use crate::gaussians::Gaussians;
 use crate::number::grouped;
 use crate::output::{OutputError, write_atomically};
 use crate::run::finished::read_model;
@@ -95,7 +96,7 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let whole = judge.attempt(model.clone(), fit::bytes(PLY, &model)?)?;
     let scratch = scratch(options.output)?;
     let mut attempts: Vec<Attempt> = Vec::new();
-    let mut best: Option<(usize, crate::gaussians::Gaussians)> = None;
+    let mut best: Option<(usize, Gaussians)> = None;
     for degree in degrees(model.sh_degree, options.to) {
         let start = colour::reduced(model.clone(), degree);
         let Some(rows) = fit::rows(options, &start)? else { continue };

@@ -41,7 +41,8 @@ fn rig(centres: &[DVec3]) -> (DVec3, f64) {
     (centre, centres.iter().map(|c| c.distance(centre)).fold(0.0, f64::max))
 }
 
-fn median(mut values: Vec<f64>) -> Option<f64> {
+/// The middle of these values, the upper one of two.
+pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

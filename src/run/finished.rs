@@ -113,6 +113,25 @@ pub(crate) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> 
     }
 }
 
+/// The file of what is named: a model, or a run's of the iteration asked for, or its last.
+pub(crate) fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> {
+    match is_model(named) {
+        true if asked.is_some() => {
+            Err(Failure::input("--iteration is for a run's folder; a file has only one model"))
+        }
+        true => Ok(named.to_owned()),
+        false => Ok(model_path(named, iteration(named, asked)?)),
+    }
+}
+
+/// Says what to do where the dataset of a run is no longer at `path`, which the user has not named.
+pub(crate) fn or_moved(failure: Failure, path: &Path) -> Failure {
+    match path.is_dir() || builtin::name(path).is_some() {
+        true => failure,
+        false => failure.and("if the dataset has moved, say where it is with --scene"),
+    }
+}
+
 /// Opens the model of a run with its dataset, or with that dataset at `moved_to`, in a backend for
 /// `needs`.
 pub(crate) fn open_run(
@@ -128,13 +147,8 @@ pub(crate) fn open_run(
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
     let near = config.spec.start.near.0;
-    open(&model, &path, config.spec.data, (near, machine), needs, observer).map_err(|failure| {
-        if was_moved || path.is_dir() || builtin::name(&path).is_some() {
-            failure
-        } else {
-            failure.and("if the dataset has moved, say where it is with --scene")
-        }
-    })
+    open(&model, &path, config.spec.data, (near, machine), needs, observer)
+        .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
 /// Opens a model, by whatever program, with a dataset. The near plane is a fraction of the extent.

@@ -7,14 +7,14 @@ use glam::{DMat3, DVec3};
 use super::paint::ends;
 use super::stage::{Shown, Stage};
 use crate::camera::Camera;
-use crate::dataset::normalise::{EXTENT, Normalisation};
+use crate::dataset::normalise::{EXTENT, Normalisation, median};
 use crate::dataset::{Dataset, PointCloud, builtin};
 use crate::failure::Failure;
 use crate::flight::Key;
 use crate::gaussians::{Gaussians, logit};
 use crate::init::{initialise, random_points};
 use crate::output::{CONFIG_FILE, is_in_use, model_path, saved_iterations};
-use crate::run::finished::{Machine, is_model, iteration, load, read_model};
+use crate::run::finished::{Machine, is_model, iteration, load, or_moved, read_model};
 use crate::run::{DataSpec, Observer, RunConfig};
 
 /// Most points of a scene that are shown as Gaussians.
@@ -73,12 +73,8 @@ pub(crate) fn open(
         let (model, config, iteration) = of_run(what, iteration, observer)?;
         let has_moved = scene.is_some();
         let path = scene.unwrap_or_else(|| config.scene_path());
-        let dataset = load(&path, &config.spec.data, observer).map_err(|failure| {
-            match has_moved || path.is_dir() || builtin::name(&path).is_some() {
-                true => failure,
-                false => failure.and("if the dataset has moved, say where it is with --scene"),
-            }
-        })?;
+        let dataset = load(&path, &config.spec.data, observer)
+            .map_err(|failure| if has_moved { failure } else { or_moved(failure, &path) })?;
         let mut stage = of_dataset(machine, what, dataset, &config.spec.data);
         let called = format!("{}, iteration {iteration}", name(what));
         stage.show(called, model, config.spec.start.near.0)?;
@@ -169,13 +165,9 @@ fn without_cameras(
             "{what} holds no Gaussian: there is nothing to look at"
         )));
     }
-    let along = |axis: usize| -> Vec<f64> {
-        model.means.iter().map(|mean| f64::from(mean[axis])).collect()
-    };
     let middle = |axis: usize| {
-        let mut values = along(axis);
-        let half = values.len() / 2;
-        *values.select_nth_unstable_by(half, f64::total_cmp).1
+        let along = model.means.iter().map(|mean| f64::from(mean[axis]));
+        median(along.collect()).unwrap_or_default()
     };
     let centre = DVec3::new(middle(0), middle(1), middle(2));
     // Backgrounds reach far; most rows are on what was photographed.

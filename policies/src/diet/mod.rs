@@ -145,7 +145,7 @@
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
 
-use crate::adc::{PruneLimits, Window, mean_over_views, spare_one};
+use crate::adc::{PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
@@ -371,11 +371,7 @@ impl Diet {
         let views = now.signal(Signal::VisibleCount)?;
         let mut gradient = mean_over_views(now.signal(Signal::ScreenGradient)?, views);
         if self.params.mixed_gradient {
-            let colour = mean_over_views(now.signal(Signal::ColourGradient)?, views);
-            let weight = self.params.colour_weight as f32;
-            for (g, c) in gradient.iter_mut().zip(colour) {
-                *g += weight * c;
-            }
+            add_colour_gradient(&mut gradient, now, self.params.colour_weight as f32)?;
         } else {
             for g in &mut gradient {
                 *g *= 2.0;

@@ -1,7 +1,7 @@
 //! What a row's gradients say of its need for children.
 
 use super::Merit;
-use crate::adc::mean_over_views;
+use crate::adc::{add_colour_gradient, mean_over_views};
 use crate::policy::{PolicyResult, Signal, Snapshot};
 
 impl Merit {
@@ -11,11 +11,7 @@ impl Merit {
         let screen = now.signal(self.params.gradient.signal())?;
         let mut gradient = mean_over_views(screen, views);
         if self.params.colour_weight > 0.0 {
-            let weight = self.params.colour_weight as f32;
-            let colour = mean_over_views(now.signal(Signal::ColourGradient)?, views);
-            for (g, c) in gradient.iter_mut().zip(colour) {
-                *g += weight * c;
-            }
+            add_colour_gradient(&mut gradient, now, self.params.colour_weight as f32)?;
         }
         Ok(gradient)
     }

@@ -13,8 +13,8 @@ use crate::export::{Format, find, find_by_extension, formats};
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::number::grouped;
-use crate::output::{OutputError, model_path, write_atomically};
-use crate::run::finished::{is_model, iteration, read_model};
+use crate::output::{OutputError, write_atomically};
+use crate::run::finished::{model_file, read_model};
 use table::{Line, Truth};
 
 /// The name that stands for every format.
@@ -71,7 +71,7 @@ pub(super) fn run(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
-    let source = source(args)?;
+    let source = model_file(&args.model, args.iteration)?;
     let is_run = source != args.model;
     if is_run || args.scene.is_none() {
         refuse_options_of_a_file(matches)?;
@@ -106,17 +106,6 @@ pub(super) fn run(
     Ok(())
 }
 
-/// The file that is exported.
-fn source(args: &ExportArgs) -> Result<PathBuf, Failure> {
-    match is_model(&args.model) {
-        true if args.iteration.is_some() => {
-            Err(Failure::input("--iteration is for a run's folder; a file has only one model"))
-        }
-        true => Ok(args.model.clone()),
-        false => Ok(model_path(&args.model, iteration(&args.model, args.iteration)?)),
-    }
-}
-
 /// Formats, each with its file.
 fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> {
     match args.format.as_deref() {
@@ -133,12 +122,16 @@ fn files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Failure> 
             Ok(vec![(format, args.output.clone())])
         }
         None => {
-            let format = find_by_extension(&args.output).map_err(|error| {
-                Failure::input(format!("-o: {error}, and name it with --format NAME"))
-            })?;
+            let format = format_of(&args.output)?;
             Ok(vec![(format, args.output.clone())])
         }
     }
+}
+
+/// The format that the name of an output says.
+pub(super) fn format_of(output: &Path) -> Result<&'static Format, Failure> {
+    find_by_extension(output)
+        .map_err(|error| Failure::input(format!("-o: {error}, and name it with --format NAME")))
 }
 
 fn write(format: &Format, path: &Path, model: &Gaussians) -> Result<(), Failure> {

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use crate::backend::{Backend, MomentStorage, Setup, Storage};
 use crate::dataset::Dataset;
+use crate::dataset::images::Image8;
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::gaussians::{Gaussians, sh_coefficients};
@@ -14,8 +15,9 @@ use crate::importance::{importance, largest, needs};
 use crate::memory::RunSize;
 use crate::metrics::psnr;
 use crate::number::grouped;
+use crate::pictures::photograph;
 use crate::run::finished::{read_model, views_of};
-use crate::run::observer::Observer;
+use crate::run::observer::{Observer, Silent};
 use crate::run::resolve::Inputs;
 use crate::views::ViewSource;
 
@@ -105,7 +107,7 @@ pub(super) fn load(
 ) -> Result<Gaussians, Failure> {
     let dataset = &inputs.dataset;
     // What is wrong with it was said when it was found.
-    let model = read_model(file, &crate::run::observer::Silent).map_err(of_flag)?;
+    let model = read_model(file, &Silent).map_err(of_flag)?;
     let mut model = dataset.normalisation.model_from_world(model);
     let seen = in_view(&model, dataset);
     if (seen as f64) < LEAST_IN_VIEW * model.len() as f64 {
@@ -191,8 +193,8 @@ pub(in crate::run) fn fits(
 }
 
 /// An image of the photograph's mean colour. Shape: `[height, width, 3]`.
-fn plain(image: &crate::dataset::images::Image8, background: [f32; 3]) -> Vec<f32> {
-    let shown = crate::pictures::photograph(image, background);
+fn plain(image: &Image8, background: [f32; 3]) -> Vec<f32> {
+    let shown = photograph(image, background);
     let pixels = shown.as_raw().len() / 3;
     let sum = |channel: usize| {
         shown.as_raw().iter().skip(channel).step_by(3).map(|&v| f64::from(v)).sum::<f64>()
