@@ -93,7 +93,7 @@ fn adam_band(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= frame.model.x || state.short != 0u {
+    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
     let is_rest = now.a > 0u;
@@ -124,7 +124,7 @@ fn adam_geometry(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= frame.model.x || state.short != 0u {
+    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
     let steps = is_set(MAIN_STEPS);

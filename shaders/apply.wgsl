@@ -263,14 +263,14 @@ const OPACITY_LEAST: f32 = 2e-4;
 
 // Takes something off opacities and scales; now.a: rows, now.b: bits of what opacities lose, now.c: bits of
 // the logarithm of the factor of scales, now.d: where the numbers of views that have shown each row begin in
-// `signals`, or NONE if rows decay that none has shown too.
+// `signals`, or NONE if rows decay that none has shown too. The first number of `ops`: the first row.
 @compute @workgroup_size(256)
 fn decay(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= now.a {
+    if row < ops[0] || row >= now.a {
         return;
     }
     if now.d != NONE && !(signals[now.d + row] > 0.0) {
@@ -291,14 +291,14 @@ fn decay(
 }
 
 // Bounds all opacities and forgets their moments; now.a: rows, now.b: bits of the largest logit,
-// now.c: whether gradients of the opacity wait for a step.
+// now.c: whether gradients of the opacity wait for a step. The first number of `ops`: the first row.
 @compute @workgroup_size(256)
 fn clamp_opacity(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= now.a {
+    if row < ops[0] || row >= now.a {
         return;
     }
     let at = 12u * row + 10u;

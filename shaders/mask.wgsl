@@ -20,7 +20,7 @@ fn step_masks(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= frame.model.x || state.short != 0u {
+    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
     let start = bitcast<f32>(now.a);

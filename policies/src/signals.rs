@@ -286,6 +286,28 @@ impl Signals {
         self.range(signal).map(|range| &mut self.values[range])
     }
 
+    /// Without the first `rows` rows, in the same memory.
+    ///
+    /// # Panics
+    /// When there are fewer.
+    #[must_use]
+    pub fn without_first(mut self, rows: usize) -> Self {
+        assert!(rows <= self.rows, "without {rows} of {} rows", self.rows);
+        if rows == 0 {
+            return self;
+        }
+        let left = self.rows - rows;
+        let (mut from, mut to) = (0, 0);
+        for width in self.present.iter().map(Signal::width) {
+            self.values.copy_within(from + width * rows..from + width * self.rows, to);
+            from += width * self.rows;
+            to += width * left;
+        }
+        self.values.truncate(to);
+        self.rows = left;
+        self
+    }
+
     fn range(&self, signal: Signal) -> Option<Range<usize>> {
         let mut start = 0;
         for present in self.present.iter() {

@@ -27,6 +27,8 @@ struct Frame {
     score: vec4<f32>,
     // Seed, step, bits of what is due (see adam.wgsl), kind of target (see loss.wgsl).
     draw: vec4<u32>,
+    // Rows at the front that never change; unused ×3.
+    frozen: vec4<u32>,
     // Planes of the signals' accumulators, by their numbers; NONE where not asked for.
     planes: array<vec4<u32>, 8>,
 }

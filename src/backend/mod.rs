@@ -159,7 +159,8 @@ fn assert_same_size(camera: &Camera, image: &Image8) {
 }
 
 /// Panics unless a plan fits the rows; in release builds too, as this is the promise.
-fn assert_fits(ops: &RowOps, rows: usize, budget: usize) {
+fn assert_fits(ops: &RowOps, frozen: usize, rows: usize, budget: usize) {
+    assert_eq!(ops.first_row, frozen, "a plan for another number of frozen rows");
     assert_eq!(ops.rows_before, rows, "a plan for another number of rows");
     assert_eq!(ops.budget, budget, "a plan for another budget");
     assert!(ops.rows_after <= budget, "{} rows over the budget", ops.rows_after);

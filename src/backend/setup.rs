@@ -9,6 +9,8 @@ use super::cpu::InstructionSet;
 pub struct Setup {
     /// Most rows there may ever be, >= 1 and >= the model's.
     pub budget: usize,
+    /// Rows at the front that are rendered, and never change: no optimiser steps them.
+    pub frozen: usize,
     /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
     pub near: f32,
     /// Most (row, tile) pairs held at a time, beyond which an image is processed in bands; `None`: 16
@@ -44,6 +46,7 @@ impl Setup {
     pub fn new(budget: usize) -> Self {
         Self {
             budget,
+            frozen: 0,
             near: 0.01,
             tile_cap: None,
             record_cap: usize::MAX,

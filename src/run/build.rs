@@ -11,7 +11,7 @@ use super::observer::Observer;
 use super::resolve::{self, DECODERS, Inputs, Size, TEST_DECODERS};
 use super::resume::{self, Resumed};
 use super::spec::RunSpec;
-use super::start::{Start, first_model, fits};
+use super::start::{Start, behind_frozen, first_model, fits};
 use super::values::{Assignment, ImageCache, InitChoice, Rows, ShDegree, assignments};
 use crate::checkpoint::Fingerprint;
 use crate::failure::Failure;
@@ -57,7 +57,7 @@ pub(super) fn build(
             points: spec.start.init_points.map(|points| points.0),
         },
     };
-    let file = init.file().cloned();
+    let file = init.file().map(Path::to_owned);
     let initial_rows =
         checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
     let scene = inputs.info(setting.rows, initial_rows)?;
@@ -66,6 +66,9 @@ pub(super) fn build(
     // A model keeps its opacities and sizes, whatever the policy's paper starts with.
     if checkpoint.is_none() && file.is_none() {
         restart(&mut model, &declared.start);
+    }
+    if checkpoint.is_none() {
+        model = behind_frozen(&inputs, setting.sh_degree, model, observer)?;
     }
     let rates = spec.learning_rates(&declared.rates)?;
     let parameters = inputs.entry.effective(&inputs.parameters, &scene)?;
@@ -94,20 +97,11 @@ pub(super) fn build(
     let measuring = inputs.measuring(&setting, inputs.threads());
     let mut backend = inputs.device.backend(&model, &inputs.backend_options(&setting, needs))?;
     drop(model);
-    if let Some(file) = file.as_ref().filter(|_| checkpoint.is_none()) {
+    if let Some(file) = file.as_deref().filter(|_| checkpoint.is_none()) {
         let view = (spec.data.background.fixed(), setting.sh_degree);
         fits(file, backend.as_mut(), &inputs.dataset, view, observer)?;
     }
-    let options = TrainOptions {
-        iterations: spec.schedule.iterations.0,
-        seed: spec.schedule.seed,
-        sh_degree: setting.sh_degree,
-        has_all_bands: file.is_some(),
-        background: spec.data.background,
-        rates,
-        prefetch: AHEAD,
-        on_nan: spec.schedule.on_nan,
-    };
+    let options = train_options(&inputs, &setting, rates);
     let (name, required) = (inputs.entry.name, inputs.required);
     let mut dataset = inputs.dataset;
     let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
@@ -132,6 +126,23 @@ pub(super) fn build(
         last,
         session,
     })
+}
+
+/// What the trainer acts on.
+fn train_options(inputs: &Inputs<'_>, setting: &RunSize, rates: RateOptions) -> TrainOptions {
+    let RunSpec { schedule, data, .. } = inputs.spec;
+    TrainOptions {
+        iterations: schedule.iterations.0,
+        seed: schedule.seed,
+        sh_degree: setting.sh_degree,
+        frozen: inputs.frozen_rows(),
+        // Models that are trained already show all that they have.
+        has_all_bands: inputs.init_model.is_some() || inputs.frozen.is_some(),
+        background: data.background,
+        rates,
+        prefetch: AHEAD,
+        on_nan: schedule.on_nan,
+    }
 }
 
 /// The run with nothing open that was open in its description.
@@ -178,6 +189,8 @@ fn decided(
         adapter: inputs.device.adapter().map(str::to_owned),
         accumulation: inputs.device.accumulation().map(|way| way.name().to_owned()),
         sh_degree_from: inputs.degree.source,
+        init_model: inputs.init_model,
+        frozen: inputs.frozen,
         ..Resolved::default()
     };
     Ok(RunConfig { densify: env!("CARGO_PKG_VERSION").to_owned(), spec, resolved })

@@ -40,6 +40,20 @@ pub struct Resolved {
     pub sh_degree_from: DegreeSource,
     /// Whether `--memory` has made the degree lower than was wanted.
     pub sh_degree_lowered: bool,
+    /// The model that the run began from.
+    pub init_model: Option<ModelSize>,
+    /// The model whose Gaussians never change.
+    pub frozen: Option<ModelSize>,
+}
+
+/// How large a model is that a file holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelSize {
+    /// Its Gaussians.
+    pub rows: usize,
+    /// Its spherical-harmonic degree.
+    pub sh_degree: u8,
 }
 
 /// What decided the spherical-harmonic degree of a run.

@@ -20,7 +20,7 @@ mod values;
 
 use std::path::PathBuf;
 
-pub use config::{DegreeSource, Resolved, RunConfig};
+pub use config::{DegreeSource, ModelSize, Resolved, RunConfig};
 pub use observer::{Interrupt, Observer, Silent};
 pub use overlay::Partial;
 pub use report::{LeftOut, Requirements};
@@ -33,7 +33,8 @@ pub use spec::{
     ScheduleSpec, SizeSpec, StartSpec,
 };
 pub use values::{
-    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree, Threads, Whole,
+    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, ModelFile, Rows, ShDegree,
+    Threads, Whole,
 };
 
 use crate::checkpoint::Fingerprint;

@@ -12,8 +12,8 @@ use clap::{ArgAction, Args};
 use serde::{Deserialize, Serialize};
 
 use super::values::{
-    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree, Threads,
-    Whole, as_table,
+    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, ModelFile, Rows, ShDegree,
+    Threads, Whole, as_table,
 };
 use crate::backend::BackendChoice;
 use crate::dataset::{FarCameras, Resolution};
@@ -166,6 +166,12 @@ run_spec! {
         /// colours are cut to --sh-degree, or given room to it
         #[arg(long, value_name = "points|random|MODEL")]
         init: Option<InitChoice> = None, Fixed;
+
+        /// A model in the dataset's coordinates, by any program, whose Gaussians are rendered but never change: no
+        /// policy removes or moves them, and no step trains them. What --init gives is trained beside them; the
+        /// budget counts both
+        #[arg(long, value_name = "MODEL")]
+        freeze: Option<ModelFile> = None, Fixed;
 
         /// Number of random points to start from (default: half the budget, at most 100k)
         #[arg(long, value_name = "N")]

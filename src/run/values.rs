@@ -2,7 +2,7 @@
 //! and in a file, and what is out of range.
 
 use std::fmt::Display;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use serde::de::Error as _;
@@ -87,6 +87,11 @@ pub enum ShDegree {
     Auto(Option<u8>),
 }
 
+/// A file with a model. The path is absolute, so that it holds wherever the run goes on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct ModelFile(pub PathBuf);
+
 /// `--init`: what the first Gaussians are.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum InitChoice {
@@ -94,9 +99,8 @@ pub enum InitChoice {
     Points,
     /// At random places, where the cameras look.
     Random,
-    /// Those of this file, which is in the dataset's coordinates. The path is absolute, so that it holds
-    /// wherever the run goes on.
-    Model(PathBuf),
+    /// Those of this file, which is in the dataset's coordinates.
+    Model(ModelFile),
 }
 
 /// A word before an optional number: `auto`, `auto:50k`.
@@ -187,11 +191,23 @@ impl FromStr for ShDegree {
 impl InitChoice {
     /// The file, of a start from a model.
     #[must_use]
-    pub fn file(&self) -> Option<&PathBuf> {
+    pub fn file(&self) -> Option<&Path> {
         match self {
-            Self::Model(file) => Some(file),
+            Self::Model(file) => Some(&file.0),
             Self::Points | Self::Random => None,
         }
+    }
+}
+
+impl FromStr for ModelFile {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text.is_empty() {
+            return Err("give a file of Gaussian splats".to_owned());
+        }
+        let path = std::path::absolute(text);
+        path.map(Self).map_err(|error| format!("`{text}` is no path: {error}"))
     }
 }
 
@@ -203,9 +219,7 @@ impl FromStr for InitChoice {
             "points" => Ok(Self::Points),
             "random" => Ok(Self::Random),
             "" => Err("give points, random, or a file of Gaussian splats".to_owned()),
-            path => std::path::absolute(path)
-                .map(Self::Model)
-                .map_err(|error| format!("`{path}` is no path: {error}")),
+            path => path.parse().map(Self::Model),
         }
     }
 }
@@ -215,7 +229,7 @@ impl Serialize for InitChoice {
         match self {
             Self::Points => "points".serialize(serializer),
             Self::Random => "random".serialize(serializer),
-            Self::Model(path) => path.serialize(serializer),
+            Self::Model(file) => file.serialize(serializer),
         }
     }
 }

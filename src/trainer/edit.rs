@@ -18,16 +18,22 @@ impl<V: ViewSource> Trainer<V> {
         self.views_time = self.views_time.saturating_add(start.elapsed());
         let signals = self.backend.take_signals(self.needs.signals);
         let signals = signals.map_err(|e| self.backend_error(step, e))?;
-        let limit = self.row_limit();
-        let scene = SceneInfo { budget: limit, ..self.scene.clone() };
+        let signals = signals.without_first(self.options.frozen);
+        let mut plan = self.new_plan().allowing(&self.needs);
+        let scene = SceneInfo { budget: plan.budget(), ..self.scene.clone() };
         let candidates = self.backend.candidates();
         let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
-        let mut plan = EditPlan::new(self.backend.rows(), limit).allowing(&self.needs);
         let rng = PolicyRng::new(self.options.seed, step);
         let planned = call_policy(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
         self.backend.give_back(signals);
         planned.map_err(|source| self.policy_error(step, source))?;
         self.execute(step, plan)
+    }
+
+    /// An empty plan for the rows that are not frozen.
+    pub(super) fn new_plan(&self) -> EditPlan {
+        let frozen = self.options.frozen;
+        EditPlan::new(self.backend.rows() - frozen, self.row_limit() - frozen)
     }
 
     /// Executes a plan. A plan that changes no row and had nothing refused is not an event.
@@ -38,6 +44,7 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<Option<EditEvent>, TrainError> {
         let mut ops = plan.compile();
         self.check_plan(step, &ops)?;
+        ops = ops.behind(self.options.frozen);
         // The backend checks the budget, which the trainer's own limit may be below.
         ops.budget = self.backend.budget();
         self.backend
@@ -58,7 +65,8 @@ impl<V: ViewSource> Trainer<V> {
     /// Checks the budget and all invariants once more, so that a broken plan is an error here and not a
     /// panic in the backend.
     fn check_plan(&self, step: u32, ops: &RowOps) -> Result<(), TrainError> {
-        let (rows, budget) = (self.backend.rows(), self.row_limit());
+        let frozen = self.options.frozen;
+        let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
         let reason = if ops.rows_before != rows || ops.budget != budget {
             let RowOps { rows_before, budget: planned, .. } = ops;
             format!(

@@ -1,7 +1,5 @@
 //! Removes rows with non-finite values; many of them end the run.
 
-use densify_policies::plan::EditPlan;
-
 use super::{EditEvent, OnNan, TrainError, Trainer};
 use crate::views::ViewSource;
 
@@ -25,12 +23,15 @@ impl<V: ViewSource> Trainer<V> {
             tracing::warn!(step, row = row.row, "non-finite value: {row}");
         }
         let few = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
-        if self.options.on_nan == OnNan::Stop || !few {
+        // What does not change cannot become unsound.
+        let frozen = self.options.frozen as u32;
+        let is_frozen = unsound.iter().any(|row| row.row < frozen);
+        if self.options.on_nan == OnNan::Stop || !few || is_frozen {
             return Err(TrainError::Unsound { step, count, rows, first: first.to_string() });
         }
-        let mut plan = EditPlan::new(rows, self.row_limit());
+        let mut plan = self.new_plan();
         plan.cause("not finite");
-        plan.prune_all(unsound.into_iter().map(|row| row.row));
+        plan.prune_all(unsound.into_iter().map(|row| row.row - frozen));
         self.execute(step, plan)
     }
 }

@@ -13,6 +13,8 @@ pub struct TrainOptions {
     pub seed: u64,
     /// Highest spherical-harmonic degree trained, <= the model's.
     pub sh_degree: u8,
+    /// Rows at the front of the model that never change, and that no policy knows of.
+    pub frozen: usize,
     /// Whether that degree is in use from the first step on, as a model that is trained already needs; else
     /// it rises from 0.
     pub has_all_bands: bool,

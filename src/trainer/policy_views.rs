@@ -12,7 +12,8 @@ use crate::views::ViewSource;
 impl<V: ViewSource> Trainer<V> {
     /// Renders the auxiliary views for the policy's event after `step`, one by one.
     pub(super) fn show_aux_views(&mut self, step: u32) -> Result<(), TrainError> {
-        let (rows, budget) = (self.backend.rows(), self.row_limit());
+        let frozen = self.options.frozen;
+        let (rows, budget) = (self.backend.rows() - frozen, self.row_limit() - frozen);
         let count = call_policy(|| self.policy.aux_views(step, rows, budget));
         let count = count.map_err(|e| self.policy_error(step, e))? as usize;
         let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
@@ -31,7 +32,10 @@ impl<V: ViewSource> Trainer<V> {
                 sh_degree: degree,
                 request: &request,
             });
-            let measured = measured.map_err(|e| self.backend_error(step, e))?;
+            let mut measured = measured.map_err(|e| self.backend_error(step, e))?;
+            for (_, column) in &mut measured.columns {
+                column.drain(..frozen);
+            }
             self.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
             let view = AuxView { step, rows, loss, columns, points };

@@ -30,8 +30,10 @@ pub(super) fn check_options(
         return bad(format!("learning rate `{rate}` must be a positive number"));
     }
     let (rows, budget) = (backend.rows(), backend.budget());
-    if budget != scene.budget || rows > budget {
-        return bad(format!("{rows} rows, budget {budget} (scene: {})", scene.budget));
+    let frozen = options.frozen;
+    if budget != scene.budget + frozen || rows > budget || rows < frozen {
+        let of_scene = scene.budget;
+        return bad(format!("{rows} rows, {frozen} frozen, budget {budget} (scene: {of_scene})"));
     }
     Ok(())
 }

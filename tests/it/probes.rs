@@ -58,6 +58,7 @@ fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussi
         background: Background::Black,
         rates: RateOptions::default(),
         prefetch: 0,
+        frozen: 0,
         has_all_bands: false,
         on_nan: OnNan::Stop,
     };

@@ -138,6 +138,7 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
         background: Background::Black,
         rates,
         prefetch: 0,
+        frozen: 0,
         has_all_bands: false,
         on_nan: OnNan::Stop,
     };

@@ -9,14 +9,16 @@ use crate::edit::{
 use crate::signals::SignalSet;
 
 /// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it; no slot
-/// at or beyond the budget is ever written.
+/// at or beyond the budget is ever written, and none before `first_row`.
 ///
 /// A backend executes in pass 1 `families` (the parent is read once, then its children and the
 /// parent itself are written), `updates` and `seeds`: no slot is written twice, and no written slot is
 /// read by another entry. In pass 2 it executes `moves`, then brings the rows into [`order`](Self::order),
-/// then it executes `decay` and `clamp_opacity` over all rows and the resets.
+/// then it executes `decay` and `clamp_opacity` over all rows from `first_row` on and the resets.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RowOps {
+    /// The first row that the plan concerns: those before it are [frozen](Self::behind).
+    pub first_row: usize,
     /// Rows before the edit.
     pub rows_before: usize,
     /// Rows after the edit, <= budget.
@@ -141,6 +143,28 @@ impl RowOps {
             && self.clamp_opacity.is_none())
     }
 
+    /// The same plan for a model in which so many frozen rows, of which the plan knows nothing, stand before those
+    /// that it was made for.
+    #[must_use]
+    pub fn behind(mut self, frozen: usize) -> Self {
+        let by = frozen as u32;
+        self.first_row += frozen;
+        self.rows_before += frozen;
+        self.rows_after += frozen;
+        self.budget += frozen;
+        for family in &mut self.families {
+            family.parent += by;
+        }
+        self.child_slots.iter_mut().for_each(|slot| *slot += by);
+        self.updates.iter_mut().for_each(|(row, _)| *row += by);
+        self.seeds.iter_mut().for_each(|(slot, _)| *slot += by);
+        for (from, to) in &mut self.moves {
+            *from += by;
+            *to += by;
+        }
+        self
+    }
+
     /// The order in which rows stand in the end: row i of the model is what pass 2 left in slot `order[i]`. A
     /// permutation of `0..rows_after`; empty where nothing changes place.
     ///
@@ -234,10 +258,14 @@ impl RowOps {
     }
 
     fn check_totals(&self) -> Result<(), BrokenOps> {
-        let Self { rows_before, rows_after, budget, counts, .. } = self;
+        let Self { first_row, rows_before, rows_after, budget, counts, .. } = self;
         let added = self.child_slots.len() + self.seeds.len();
         require(rows_after <= budget || (rows_after <= rows_before && added == 0), || {
             format!("{rows_after} rows after, budget {budget}")
+        })?;
+        let removable = rows_before.saturating_sub(*first_row);
+        require(counts.removed <= removable, || {
+            format!("{} of {removable} rows removed", counts.removed)
         })?;
         let expected = rows_before.checked_sub(counts.removed).map(|kept| kept + added);
         require(expected == Some(*rows_after) && counts.added == added, || {
@@ -284,7 +312,9 @@ impl RowOps {
             require((*rows_after..*rows_before).contains(&(from as usize)), || {
                 format!("move from row {from}, not in the tail {rows_after}..{rows_before}")
             })?;
-            require((to as usize) < *rows_after, || format!("move to row {to} of {rows_after}"))?;
+            require((self.first_row..*rows_after).contains(&(to as usize)), || {
+                format!("move to row {to} of {}..{rows_after}", self.first_row)
+            })?;
             moved.claim("moved row", from)?;
             claimed.claim("hole", to)?;
         }
@@ -303,14 +333,16 @@ impl RowOps {
     }
 
     fn check_live(&self, role: &str, row: u32) -> Result<(), BrokenOps> {
-        require((row as usize) < self.rows_before, || {
-            format!("{role} {row} of {} rows", self.rows_before)
+        let Self { first_row, rows_before, .. } = self;
+        require((*first_row..*rows_before).contains(&(row as usize)), || {
+            format!("{role} {row}, rows {first_row}..{rows_before}")
         })
     }
 
     fn check_new_slot(&self, role: &str, slot: u32) -> Result<(), BrokenOps> {
-        require((slot as usize) < self.rows_after.min(self.budget), || {
-            format!("{role} in slot {slot}, {} rows after, budget {}", self.rows_after, self.budget)
+        let Self { first_row, rows_after, budget, .. } = self;
+        require((*first_row..*rows_after.min(budget)).contains(&(slot as usize)), || {
+            format!("{role} in slot {slot}, rows {first_row}..{rows_after} after, budget {budget}")
         })
     }
 }

@@ -102,6 +102,34 @@ fn every_corruption_is_found() {
 }
 
 #[test]
+fn frozen_rows_are_out_of_reach() {
+    let behind = || shrinking().behind(4);
+    let ops = behind();
+    assert_eq!(ops.check(), Ok(()));
+    assert_eq!((ops.first_row, ops.rows_before, ops.rows_after, ops.budget), (4, 14, 11, 14));
+    assert_eq!((ops.families[0].parent, ops.updates[0].0, ops.seeds[0].0), (13, 11, 6));
+    assert_eq!((&ops.child_slots[..], &ops.moves[..]), (&[5][..], &[(11, 7), (13, 9)][..]));
+    assert_eq!(ops.order()[..4], [0, 1, 2, 3]);
+    type Corruption = (&'static str, fn(&mut RowOps));
+    let corruptions: &[Corruption] = &[
+        ("a parent", |ops| ops.families[0].parent = 2),
+        ("a child", |ops| ops.child_slots[0] = 2),
+        ("an update", |ops| ops.updates[0].0 = 2),
+        ("a seed", |ops| ops.seeds[0].0 = 2),
+        ("a move", |ops| ops.moves[0].1 = 2),
+        ("all removed", |ops| {
+            *ops = RowOps { first_row: 4, rows_before: 4, ..RowOps::default() };
+            ops.counts.removed = 4;
+        }),
+    ];
+    for (name, corrupt) in corruptions {
+        let mut ops = behind();
+        corrupt(&mut ops);
+        assert!(ops.check().is_err(), "{name} is not found");
+    }
+}
+
+#[test]
 fn a_hole_left_on_top_is_found() {
     let mut plan = EditPlan::new(3, 5);
     plan.prune(0).unwrap();

@@ -295,6 +295,7 @@ impl EditPlan {
             denied: self.denied,
         };
         let ops = RowOps {
+            first_row: 0,
             rows_before,
             rows_after,
             budget: self.budget,

@@ -1,5 +1,7 @@
 //! Stage 9: executes a compiled plan in place. The only code that changes the number of rows.
 
+use std::ops::Range;
+
 use densify_policies::plan::{
     Decay, OPACITY_LEAST, Offspring, OpacityRule, ParentFate, Placement, RowOps, ScaleRule, Seed,
     UNTURNED,
@@ -58,10 +60,10 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
     }
     model.reorder(&ops.order());
     if let Some(decay) = ops.decay {
-        model.decay(decay, ops.rows_after);
+        model.decay(decay, ops.first_row..ops.rows_after);
     }
     if let Some(most) = ops.clamp_opacity {
-        for row in 0..ops.rows_after {
+        for row in ops.first_row..ops.rows_after {
             let clamped = model.params.get(row, plane::OPACITY).min(logit(most));
             model.params.set(row, plane::OPACITY, clamped);
             model.moments.forget(row, plane::OPACITY);
@@ -156,10 +158,10 @@ impl Model<'_> {
         }
     }
 
-    fn decay(&mut self, decay: Decay, rows: usize) {
+    fn decay(&mut self, decay: Decay, rows: Range<usize>) {
         let seen = self.signals.planes().current(Signal::VisibleCount);
         let shrunk = (1.0 - decay.scale).ln();
-        for row in 0..rows {
+        for row in rows {
             let was_seen = seen.is_some_and(|plane| self.signals.blocks.get(row, plane) > 0.0);
             if decay.seen_only && !was_seen {
                 continue;

@@ -52,14 +52,15 @@ impl Masks {
         self.term.map_or(0.0, |term| sigmoid(term.start + self.blocks.get(row, OFFSET)))
     }
 
-    /// Cut for the optimiser's tasks.
+    /// Cut for the optimiser's tasks; the term is the mean over the rows that are `trained`.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
+        trained: usize,
     ) -> impl IndexedParallelIterator<Item = Option<MaskTask<'_>>> {
         let term = self.term;
         self.blocks.tasks(rows).map(move |blocks| {
-            let weight = term?.weight / rows.max(1) as f32;
+            let weight = term?.weight / trained.max(1) as f32;
             Some(MaskTask { term: term?, weight, blocks })
         })
     }

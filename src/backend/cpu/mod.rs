@@ -94,6 +94,8 @@ pub struct CpuBackend {
     threads: Arc<Threads>,
     ledger: Ledger,
     budget: usize,
+    /// Rows at the front that never change.
+    frozen: usize,
     rows: usize,
     sh_degree: u8,
     near: f32,
@@ -163,6 +165,7 @@ impl CpuBackend {
             threads: Arc::new(threads),
             ledger,
             budget,
+            frozen: options.frozen,
             rows: model.len(),
             sh_degree: model.sh_degree,
             near: options.near,
@@ -287,7 +290,7 @@ impl Backend for CpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.rows, self.budget);
+        assert_fits(ops, self.frozen, self.rows, self.budget);
         let mut model = apply::Model {
             params: &mut self.params,
             moments: &mut self.moments,

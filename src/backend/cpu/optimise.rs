@@ -57,8 +57,10 @@ pub(super) struct Optimise<'a> {
     pub(super) terms: Option<Terms>,
     /// Noise on the means, if there is any.
     pub(super) noise: Option<Noise>,
-    /// Row of the first block's first lane, and number of rows from there on.
+    /// Row of the first block's first lane, and numbers of rows from there on: of those that never change, and of
+    /// all.
     pub(super) first_row: usize,
+    pub(super) frozen: usize,
     pub(super) rows: usize,
 }
 
@@ -78,8 +80,18 @@ impl WithSimd for Optimise<'_> {
         let is_narrow = stored.is_narrow() || moments.is_narrow();
         let mut scratch = Scratch::ZERO;
         let mut moment_scratch = [Scratch::ZERO; 2];
+        let mut kept = Scratch::ZERO;
         for (b, &seen) in visible.iter().enumerate() {
+            let frozen = self.frozen.saturating_sub(b * WIDTH).min(WIDTH);
+            if frozen == WIDTH {
+                continue;
+            }
+            // What is not seen has no gradient.
+            let seen = seen & (u16::MAX << frozen);
             let params = stored.open(b, trained, &mut scratch);
+            if frozen > 0 {
+                kept.0[..trained * WIDTH].copy_from_slice(&params[..trained * WIDTH]);
+            }
             let per_block = WIDTH * layout.stride();
             let sums = &sums[b * per_block..(b + 1) * per_block];
             if seen != 0 || !was_zero {
@@ -130,6 +142,12 @@ impl WithSimd for Optimise<'_> {
                 if let Some(noise) = &noise {
                     let first = self.first_row + b * WIDTH;
                     noise.add(params, first, self.rows.saturating_sub(b * WIDTH).min(WIDTH));
+                }
+            }
+            // Terms, masks, noise and limits know nothing of frozen rows.
+            if frozen > 0 {
+                for plane in (0..trained * WIDTH).step_by(WIDTH) {
+                    params[plane..plane + frozen].copy_from_slice(&kept.0[plane..plane + frozen]);
                 }
             }
             if is_narrow && (due.main || due.rest) {

@@ -317,8 +317,8 @@ impl CpuBackend {
             threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
         } = self;
         let dominant = &self.dominant[..self.rows.min(self.dominant.len())];
-        let (rows, arch) = (self.rows, *arch);
-        let terms = Terms::new(input.loss_terms, rows);
+        let (rows, frozen, arch) = (self.rows, self.frozen, *arch);
+        let terms = Terms::new(input.loss_terms, rows - frozen);
         let noise = input.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
         let (planes, layout) = (signals.planes(), signals.layout());
@@ -331,7 +331,7 @@ impl CpuBackend {
         let parts = (
             params.tasks(rows),
             moments.tasks(rows),
-            masks.tasks(rows),
+            masks.tasks(rows, rows - frozen),
             ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
             parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),
@@ -363,6 +363,7 @@ impl CpuBackend {
                         terms,
                         noise,
                         first_row: task * ROWS_PER_TASK,
+                        frozen: frozen.saturating_sub(task * ROWS_PER_TASK),
                         rows: rows - task * ROWS_PER_TASK,
                     });
                 },

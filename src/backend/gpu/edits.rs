@@ -279,24 +279,27 @@ impl GpuBackend {
         self.copy_rows(&moves, &[Edited::Computed, Edited::Inherited, Edited::Cleared]);
         self.reorder(&ops.order());
         if let Some(decay) = ops.decay {
-            self.decay(decay, ops.rows_after as u32);
+            self.decay(decay, ops.first_row as u32, ops.rows_after as u32);
         }
         if let Some(most) = ops.clamp_opacity {
             let rows = ops.rows_after as u32;
             let waits = u32::from(self.sizes.waits()[0]);
             let now = [rows, logit(most).to_bits(), waits, 0];
-            self.execute(&[0], |to| to.run(launches.get("clamp_opacity"), now, rows.div_ceil(256)));
+            let first = ops.first_row as u32;
+            self.execute(&[first], |to| {
+                to.run(launches.get("clamp_opacity"), now, rows.div_ceil(256));
+            });
         }
         self.clear_planes(&self.planes.of_all(ops.reset_signals));
         self.rows = ops.rows_after;
     }
 
-    fn decay(&self, decay: Decay, rows: u32) {
+    fn decay(&self, decay: Decay, first: u32, rows: u32) {
         let seen = self.planes.current(Signal::VisibleCount).filter(|_| decay.seen_only);
         let seen = seen.map_or(NOTHING, |plane| (plane as u64 * self.sizes.budget) as u32);
         let shrunk = (1.0 - decay.scale).ln();
         let now = [rows, decay.opacity.to_bits(), shrunk.to_bits(), seen];
-        self.execute(&[0], |to| to.run(self.launches.get("decay"), now, rows.div_ceil(256)));
+        self.execute(&[first], |to| to.run(self.launches.get("decay"), now, rows.div_ceil(256)));
     }
 
     /// Sets planes of the signals to 0.

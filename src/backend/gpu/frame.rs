@@ -31,6 +31,7 @@ pub(super) struct Frame {
     pub(super) noise: [f32; 4],
     pub(super) score: [f32; 4],
     pub(super) draw: [u32; 4],
+    pub(super) frozen: [u32; 4],
     pub(super) planes: [[u32; 4]; 8],
 }
 
@@ -138,7 +139,7 @@ impl Frame {
     /// Adds what an optimiser step needs.
     pub(super) fn for_step(&mut self, input: &StepInput<'_>, due: u32, planes: &SignalPlanes) {
         let StepInput { rates, loss_terms: terms, noise, .. } = input;
-        let rows = self.model[0].max(1) as f32;
+        let rows = (self.model[0] - self.frozen[0]).max(1) as f32;
         self.rates = [rates.mean, rates.log_scale, rates.quat, rates.opacity];
         self.more_rates =
             [rates.sh_dc, rates.sh_rest, terms.opacity / rows, terms.scale / (3.0 * rows)];

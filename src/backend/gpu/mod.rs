@@ -78,6 +78,8 @@ pub struct GpuBackend {
     launches: Launches,
     ledger: Ledger,
     budget: usize,
+    /// Rows at the front that never change.
+    frozen: usize,
     rows: usize,
     near: f32,
     shortcuts: Shortcuts,
@@ -125,6 +127,7 @@ impl GpuBackend {
             buffers,
             launches,
             budget,
+            frozen: options.frozen,
             rows: model.len(),
             near: options.near,
             shortcuts,
@@ -186,7 +189,9 @@ impl GpuBackend {
     fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
         let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
         let of_model = [self.rows as u32, degree, self.sizes.cap as u32, self.budget as u32];
-        Frame::of_view(camera, background, self.near, of_model)
+        let mut frame = Frame::of_view(camera, background, self.near, of_model);
+        frame.frozen[0] = self.frozen as u32;
+        frame
     }
 }
 
@@ -265,7 +270,7 @@ impl Backend for GpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.rows, self.budget);
+        assert_fits(ops, self.frozen, self.rows, self.budget);
         self.edit(ops, seed, step);
         if ops.reset_candidates {
             self.candidates.clear();

@@ -202,7 +202,8 @@ impl Passes<'_> {
         to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
     }
 
-    /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends.
+    /// Stages 6 to 8. Colour steps before the geometry, on which its gradient depends. Of `mask` the weight is that
+    /// of one row.
     pub(super) fn optimise(
         &self,
         to: &mut Recorder<'_>,
@@ -217,7 +218,6 @@ impl Passes<'_> {
             to.run(l.get("accumulate"), [0; 4], groups);
         }
         if let Some(MaskTerm { start, rate, weight, threshold }) = mask {
-            let weight = weight / self.shape.rows.max(1) as f32;
             let now = [start, rate, weight, logit(threshold)].map(f32::to_bits);
             to.run(l.get("step_masks"), now, groups);
         }

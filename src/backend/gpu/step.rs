@@ -2,6 +2,8 @@
 
 use std::time::Instant;
 
+use densify_policies::policy::MaskTerm;
+
 use super::frame::{due, target as of_target};
 use super::observe::DrawnView;
 use super::passes::{Passes, Recorder};
@@ -48,7 +50,9 @@ impl GpuBackend {
                 self.write_at("pixel gradient", 4 * size_of::<f32>() as u64 * pixels, &weights);
             }
         }
-        let (degree, signals, mask) = (frame.model[1] as u8, self.planes.count > 0, self.mask);
+        let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
+        let trained = (self.rows - self.frozen).max(1) as f32;
+        let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.backward(to);
             passes.optimise(to, degree, signals, mask);

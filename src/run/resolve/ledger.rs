@@ -14,7 +14,7 @@ use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, RunSize, Section};
 use crate::metrics::{geometry, scratch_bytes};
 use crate::run::measuring::Measuring;
-use crate::run::start::first_bytes;
+use crate::run::start::{first_bytes, reading_bytes};
 use crate::trainer::AutoChoices;
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
@@ -41,6 +41,7 @@ impl Inputs<'_> {
     /// How the backend is made for a size.
     pub(in crate::run) fn backend_options(&self, setting: &RunSize, needs: Needs) -> Setup {
         Setup {
+            frozen: self.frozen_rows(),
             near: (self.spec.start.near.0 * self.dataset.extent()) as f32,
             tile_cap: Some(setting.tile_cap),
             record_cap: self.record_cap(setting),
@@ -93,13 +94,16 @@ impl Inputs<'_> {
             let bytes = self.degree.bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
         }
-        if let Some(model) = self.brought {
+        if let Some(model) = self.init_model {
             let bytes = first_bytes(model, self, setting, threads);
             ledger.add_to(Section::Before, "the model it starts from", bytes);
         }
+        if let Some(model) = self.frozen {
+            ledger.add_to(Section::Before, "the frozen model", reading_bytes(model));
+        }
         let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
         // Points, their order, neighbours in f64, and the rows before the backend has them.
-        let first = self.initial_rows(setting.rows) as u64;
+        let first = (self.initial_rows(setting.rows) + self.frozen_rows()) as u64;
         let points =
             self.spec.start.init_points.map_or(self.dataset.points.len(), |points| points.0) as u64;
         pass("first rows", points.max(first) * (POINT + 16) + first * (row + 96));
@@ -110,12 +114,12 @@ impl Inputs<'_> {
         let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
         pass("export of the model, checkpoint", 2 * piece * row + held);
         let measures_test = !self.dataset.test.is_empty();
-        if measures_test || self.required != AutoChoices::default() || self.brought.is_some() {
+        if measures_test || self.required != AutoChoices::default() || self.init_model.is_some() {
             let (width, height) = self.dataset.largest_image();
             let rendering = u64::from(width) * u64::from(height) * 5 * float;
             let of = |images: &ImageDemand| images.held(0) + images.decoding(1);
             let tested = if measures_test { of(&test) } else { 0 };
-            let image = tested.max(if self.brought.is_some() { of(&train) } else { 0 });
+            let image = tested.max(if self.init_model.is_some() { of(&train) } else { 0 });
             // While it is asked which rows are missed: their order, and their opacities twice or, when
             // that is done, a plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);

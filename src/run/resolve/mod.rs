@@ -9,6 +9,8 @@ mod size;
 #[cfg(test)]
 mod tests;
 
+use std::path::Path;
+
 use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::PolicyEntry;
 use toml::Table;
@@ -17,10 +19,10 @@ pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
 pub(super) use size::{Size, check, check_grant};
 
-use super::config::RunConfig;
-use super::observer::{Observer, Silent};
-use super::spec::RunSpec;
-use super::start::Brought;
+use super::config::{ModelSize, RunConfig};
+use super::observer::Observer;
+use super::spec::{RunSpec, StartSpec};
+use super::start::size_of_model;
 use super::values::{Budget, InitChoice, ShDegree, Threads};
 use crate::backend::Accumulation;
 use crate::backend::{BackendKind, Device};
@@ -57,7 +59,9 @@ pub(super) struct Inputs<'a> {
     /// What training and test images take.
     pub(super) images: [ImageDemand; 2],
     /// The model that the run starts from, if it is one.
-    brought: Option<Brought>,
+    pub(super) init_model: Option<ModelSize>,
+    /// The model whose Gaussians never change, if there is one.
+    pub(super) frozen: Option<ModelSize>,
     /// Rows that a start on the dataset's points would have, were there no limit.
     usable: usize,
     /// Resident memory when the dataset was loaded, and the most until then.
@@ -74,7 +78,7 @@ impl<'a> Inputs<'a> {
     ) -> Result<Self, Failure> {
         let (entry, parameters) = spec.policy()?;
         let mut knobs = spec.knobs()?;
-        check_full(spec)?;
+        check_automatic(spec)?;
         let device = open(spec, &mut knobs, observer)?;
         use_threads(spec.device.threads);
         let scene = spec.scene()?;
@@ -86,11 +90,17 @@ impl<'a> Inputs<'a> {
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
         let usable = usable_points(&dataset.points);
         let images = images(&dataset);
-        let brought = match (&spec.start.init, saved) {
-            (Some(InitChoice::Model(file)), None) => Some(Brought::find(file, observer)?),
-            // A run that goes on has its rows; the file may be gone.
-            (Some(InitChoice::Model(file)), Some(_)) => Brought::find(file, &Silent).ok(),
-            _ => None,
+        let StartSpec { init, freeze, .. } = &spec.start;
+        let size = |flag, file: Option<&Path>| {
+            file.map(|file| size_of_model(flag, file, observer)).transpose()
+        };
+        let (init_model, frozen) = match saved {
+            // It has their rows; the files may be gone.
+            Some(saved) => (saved.resolved.init_model, saved.resolved.frozen),
+            None => (
+                size("--init", init.as_ref().and_then(InitChoice::file))?,
+                size("--freeze", freeze.as_ref().map(|file| &*file.0))?,
+            ),
         };
         // Tracks have a line of their own, and are given back.
         let resident = resident().map(|now| now.saturating_sub(dataset.tracks.bytes()));
@@ -111,7 +121,8 @@ impl<'a> Inputs<'a> {
             degree,
             required,
             images,
-            brought,
+            init_model,
+            frozen,
             usable,
             resident,
             peak,
@@ -153,23 +164,30 @@ impl<'a> Inputs<'a> {
     /// Rows that the scene starts with, were there no limit; `None` where the limit decides.
     fn start(&self) -> Option<usize> {
         match self.init() {
-            InitChoice::Model(_) => self.brought.map(|model| model.rows),
+            InitChoice::Model(_) => self.init_model.map(|model| model.rows),
             InitChoice::Points => Some(self.usable),
             InitChoice::Random => self.spec.start.init_points.map(|points| points.0),
         }
     }
 
+    /// Rows to start with beside the frozen ones.
     fn initial_rows(&self, budget: usize) -> usize {
-        self.start().unwrap_or_else(|| random_count(budget)).min(budget)
+        let room = budget.saturating_sub(self.frozen_rows());
+        self.start().unwrap_or_else(|| random_count(room)).min(room)
     }
 
-    /// The scene as policies see it.
+    /// Rows that never change.
+    pub(super) fn frozen_rows(&self) -> usize {
+        self.frozen.map_or(0, |model| model.rows)
+    }
+
+    /// The scene as policies see it, who know nothing of frozen rows.
     pub(super) fn info(&self, budget: usize, initial_rows: usize) -> Result<SceneInfo, Failure> {
         Ok(SceneInfo {
             extent: self.dataset.extent() as f32,
             train_views: u32::try_from(self.dataset.train.len())
                 .map_err(|_| Failure::input("the scene has more than 4 billion views"))?,
-            budget,
+            budget: budget.saturating_sub(self.frozen_rows()).max(1),
             initial_rows,
             iterations: self.spec.schedule.iterations.0,
             white_background: self.spec.data.background == Background::White,
@@ -261,8 +279,8 @@ fn check_knobs(knobs: &Knobs, kind: BackendKind) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Fails where `--full` and an automatic reduction are both given.
-fn check_full(spec: &RunSpec) -> Result<(), Failure> {
+/// Fails where what is automatic contradicts `--full` or `--freeze`.
+fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
     let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
     let is_auto_degree = matches!(spec.size.sh_degree, Some(ShDegree::Auto(_)));
     for (is_given, option, other) in [
@@ -275,6 +293,12 @@ fn check_full(spec: &RunSpec) -> Result<(), Failure> {
                  {other}"
             )));
         }
+    }
+    if is_auto_budget && spec.start.freeze.is_some() {
+        return Err(Failure::input(
+            "--budget auto asks of all Gaussians what each is worth, and --freeze keeps some whatever it is; give \
+             --budget a number of Gaussians",
+        ));
     }
     Ok(())
 }

@@ -19,7 +19,7 @@ pub const DEFAULT_BUDGET: usize = 200_000;
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget, where memory is not given.
 const PAIRS_PER_ROW: usize = 16;
-/// Fewer rows are no model of a scene, unless fewer are asked for.
+/// Fewer rows that are trained are no model of a scene, unless fewer are asked for.
 const LEAST_ROWS: usize = 1_000;
 /// What "give --memory" is rounded up to.
 pub(super) const MIB: u64 = 1 << 20;
@@ -68,6 +68,14 @@ impl Size {
     /// When nothing fits, with what would.
     pub(in crate::run) fn choose(inputs: &Inputs<'_>) -> Result<Self, Failure> {
         match (solve(inputs)?, inputs.memory()) {
+            (Some(size), _) if size.setting.rows <= inputs.frozen_rows() => {
+                Err(Failure::input(format!(
+                    "--freeze: its {} Gaussians leave no room in a budget of {}, which counts them too; give a larger \
+                 --budget, or --freeze fewer",
+                    grouped(inputs.frozen_rows()),
+                    grouped(size.setting.rows)
+                )))
+            }
             (Some(size), _) => Ok(size),
             (None, memory) => Err(too_little(inputs, &request(inputs, memory.unwrap_or(0))?)?),
         }
@@ -138,6 +146,11 @@ impl Inputs<'_> {
             format!("\n  {:<11} {} of --memory", "left", Bytes(left))
         });
         format!("memory promised\n{ledger}{left}")
+    }
+
+    /// Fewer rows are no model of a scene, unless fewer are asked for.
+    fn least_rows(&self) -> usize {
+        LEAST_ROWS + self.frozen_rows()
     }
 
     /// Most rows, where a number is given.
@@ -271,7 +284,7 @@ pub(super) fn rows_at(
 ) -> Result<Option<usize>, Failure> {
     let request = SizeRequest {
         sh_degree: sh_degree..=sh_degree,
-        least_rows: LEAST_ROWS.min(planned),
+        least_rows: inputs.least_rows().min(planned),
         most_rows: inputs.device.largest_budget(sh_degree),
         ..request(inputs, memory)?
     };
@@ -290,13 +303,13 @@ fn request(inputs: &Inputs<'_>, memory: u64) -> Result<SizeRequest, Failure> {
     let possible = inputs.device.largest_budget(*degrees.end());
     Ok(SizeRequest {
         memory,
-        least_rows: LEAST_ROWS,
-        enough_rows: inputs.start().unwrap_or(LEAST_ROWS),
+        least_rows: inputs.least_rows(),
+        enough_rows: inputs.start().unwrap_or(LEAST_ROWS) + inputs.frozen_rows(),
         most_rows: inputs.budget().map_or(possible, |budget| budget.min(possible)),
         sh_degree: degrees,
         tile_cap: inputs.tile_cap(),
         pairs: inputs.knobs.pairs_per_row.map_or(PAIRS, |pairs| [pairs; 3]),
-        most_pairs: most_pairs(inputs, LEAST_ROWS)?,
+        most_pairs: most_pairs(inputs, inputs.least_rows())?,
         // The host's memory, where the device's is bounded.
         image_cache: match inputs.device.kind() {
             BackendKind::Gpu => Some(inputs.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE)),
@@ -314,14 +327,14 @@ fn most_pairs(inputs: &Inputs<'_>, rows: usize) -> Result<usize, Failure> {
 
 /// What to say where not even the least model fits: what it would take, and what fits, each tried.
 fn too_little(inputs: &Inputs<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
-    let rows = LEAST_ROWS.min(request.most_rows);
+    let rows = inputs.least_rows().min(request.most_rows);
     let degree = *request.sh_degree.start();
     let given = Bytes(request.memory);
     let Some(least) = min_memory(request, MIB, |setting| bytes(inputs, setting))? else {
         return Ok(Failure::input(format!("--memory {given}: no size of a run can be computed")));
     };
     let mut found = remedies(inputs, inputs.spec, &Change::NEW, |it| Ok(solve(it)?.is_some()));
-    let fewer = SizeRequest { least_rows: 1, ..request.clone() };
+    let fewer = SizeRequest { least_rows: 1 + inputs.frozen_rows(), ..request.clone() };
     if let Some(fewer) = fit(&fewer, |setting| bytes(inputs, setting))? {
         found.push(format!("--budget {}", fewer.setting.rows));
     }

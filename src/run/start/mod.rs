@@ -2,7 +2,7 @@
 
 mod model;
 
-pub(super) use model::{Brought, first_bytes, fits};
+pub(super) use model::{behind_frozen, first_bytes, fits, reading_bytes, size_of_model};
 
 use super::observer::Observer;
 use super::resolve::{Inputs, ignored, random_count};
@@ -21,13 +21,14 @@ pub(super) struct Start {
     pub(super) points: Option<usize>,
 }
 
-/// The model that a new run starts from.
+/// The model that a new run starts from, without frozen rows.
 pub(super) fn first_model(
     inputs: &Inputs<'_>,
     setting: &RunSize,
     observer: &dyn Observer,
 ) -> Result<Start, Failure> {
     let (init, given) = (inputs.init(), inputs.spec.start.init_points);
+    let room = setting.rows - inputs.frozen_rows();
     if let Some(points) = given.filter(|_| init != InitChoice::Random) {
         return Err(Failure::input(format!(
             "--init-points {}: it is for a random start; leave it out, or use --init random",
@@ -38,19 +39,19 @@ pub(super) fn first_model(
     let random;
     let (points, count) = match &init {
         InitChoice::Model(file) => {
-            let model = model::load(file, inputs, setting, observer)?;
+            let model = model::load(&file.0, inputs, setting, observer)?;
             return Ok(Start { model, init, points: None });
         }
         InitChoice::Points => (&dataset.points, None),
         InitChoice::Random => {
-            let count = given.map_or_else(|| random_count(setting.rows), |points| points.0);
+            let count = given.map_or_else(|| random_count(room), |points| points.0);
             let cameras: Vec<_> = dataset.train.iter().map(|view| view.camera).collect();
             let opaque = !dataset.train.iter().any(|view| view.source.header.has_alpha);
             random = random_points(count, &cameras, opaque, seed);
             (&random, Some(count))
         }
     };
-    let (model, report) = initialise(points, setting.rows, setting.sh_degree, seed)?;
+    let (model, report) = initialise(points, room, setting.sh_degree, seed)?;
     for (number, reason) in [
         (report.unusable, "non-finite points ignored"),
         (report.duplicates, "duplicate points ignored"),

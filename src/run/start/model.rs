@@ -16,9 +16,11 @@ use crate::memory::RunSize;
 use crate::metrics::psnr;
 use crate::number::grouped;
 use crate::pictures::photograph;
+use crate::run::config::ModelSize;
 use crate::run::finished::{read_model, views_of};
 use crate::run::observer::{Observer, Silent};
 use crate::run::resolve::Inputs;
+use crate::run::values::ModelFile;
 use crate::views::ViewSource;
 
 /// A model of which fewer Gaussians than this share lie in any training view is in other coordinates.
@@ -28,57 +30,58 @@ const COMPARED: usize = 4;
 /// Pairs per row while importance is measured; views with more are rendered in bands.
 const PAIRS_PER_ROW: usize = 3;
 
-/// What is known of a model before the size of the run is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::run) struct Brought {
-    pub(in crate::run) rows: usize,
-    pub(in crate::run) sh_degree: u8,
-}
-
-impl Brought {
-    /// Reads the file once, to be sure that it is sound before anything is decided.
-    ///
-    /// # Errors
-    /// When it is no model, or has no row.
-    pub(in crate::run) fn find(file: &Path, observer: &dyn Observer) -> Result<Self, Failure> {
-        let model = read_model(file, observer).map_err(of_flag)?;
-        if model.is_empty() {
-            return Err(Failure::input(format!(
-                "--init {}: the model has no Gaussian; give another one, points or random",
-                file.display()
-            )));
-        }
-        Ok(Self { rows: model.len(), sh_degree: model.sh_degree })
+/// How large the model of a file is. Reads it, to be sure that it is sound before anything is decided.
+///
+/// # Errors
+/// When it is no model, or has no row. Names the flag.
+pub(in crate::run) fn size_of_model(
+    flag: &str,
+    file: &Path,
+    observer: &dyn Observer,
+) -> Result<ModelSize, Failure> {
+    let model = read(flag, file, observer)?;
+    if model.is_empty() {
+        return Err(Failure::input(format!(
+            "{flag} {}: the model has no Gaussian; give another one, or leave {flag} out",
+            file.display()
+        )));
     }
-
-    /// Bytes of its rows as they are read.
-    fn bytes(self) -> u64 {
-        (self.rows * size_of::<f32>() * (11 + 3 * sh_coefficients(self.sh_degree))) as u64
-    }
+    Ok(ModelSize { rows: model.len(), sh_degree: model.sh_degree })
 }
 
-fn of_flag(failure: Failure) -> Failure {
-    Failure { message: format!("--init: {}", failure.message), ..failure }
+fn read(flag: &str, file: &Path, observer: &dyn Observer) -> Result<Gaussians, Failure> {
+    read_model(file, observer)
+        .map_err(|failure| Failure { message: format!("{flag}: {}", failure.message), ..failure })
 }
 
-/// Bytes that such a model takes before the run has its own rows: as it is read, into arrays that grow, or while its
-/// importance is measured where it exceeds the budget.
+/// Bytes of a model's rows as they are read.
+fn bytes_of(model: ModelSize) -> u64 {
+    (model.rows * size_of::<f32>() * (11 + 3 * sh_coefficients(model.sh_degree))) as u64
+}
+
+/// Bytes that reading a model takes, into arrays that grow.
+pub(in crate::run) fn reading_bytes(model: ModelSize) -> u64 {
+    3 * bytes_of(model)
+}
+
+/// Bytes that the model of `--init` takes before the run has its own rows: as it is read, or while its importance is
+/// measured where it exceeds the budget.
 pub(in crate::run) fn first_bytes(
-    brought: Brought,
+    model: ModelSize,
     inputs: &Inputs<'_>,
     setting: &RunSize,
     threads: usize,
 ) -> u64 {
-    let reading = 3 * brought.bytes();
-    if brought.rows <= setting.rows {
+    let reading = reading_bytes(model);
+    if model.rows + inputs.frozen_rows() <= setting.rows {
         return reading;
     }
-    let options = to_measure(brought.rows, inputs, setting);
-    let backend = inputs.device.promise(brought.sh_degree, &options, threads).on_host();
+    let options = to_measure(model.rows, inputs, setting);
+    let backend = inputs.device.promise(model.sh_degree, &options, threads).on_host();
     let [train, _] = inputs.images;
     let image = train.held(0) + train.decoding(1);
     // The model beside its copy in the backend, then beside the rows that are kept.
-    reading.max(brought.bytes() + backend + image + crate::importance::bytes(brought.rows))
+    reading.max(bytes_of(model) + backend + image + crate::importance::bytes(model.rows))
 }
 
 /// The backend that measures the importance of so many rows.
@@ -87,6 +90,7 @@ fn to_measure(rows: usize, inputs: &Inputs<'_>, setting: &RunSize) -> Setup {
     let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(inputs.device.most_pairs(&needs));
     Setup {
         budget: rows,
+        frozen: 0,
         tile_cap: Some(pairs.max(rows)),
         // Nothing is differentiated, and no moment matters.
         record_cap: rows,
@@ -95,7 +99,8 @@ fn to_measure(rows: usize, inputs: &Inputs<'_>, setting: &RunSize) -> Setup {
     }
 }
 
-/// The model of a file in the coordinates of training, with at most the rows of the run and with its degree.
+/// The model of `--init` in the coordinates of training, with at most the rows that the run has for it and with its
+/// degree.
 ///
 /// # Errors
 /// When the file cannot be read, the device fails, or no training view shows the model.
@@ -107,7 +112,7 @@ pub(super) fn load(
 ) -> Result<Gaussians, Failure> {
     let dataset = &inputs.dataset;
     // What is wrong with it was said when it was found.
-    let model = read_model(file, &Silent).map_err(of_flag)?;
+    let model = read("--init", file, &Silent)?;
     let mut model = dataset.normalisation.model_from_world(model);
     let seen = in_view(&model, dataset);
     if (seen as f64) < LEAST_IN_VIEW * model.len() as f64 {
@@ -119,30 +124,73 @@ pub(super) fn load(
             grouped(model.len())
         )));
     }
-    let whole = model.len();
-    if whole > setting.rows {
+    let (whole, room) = (model.len(), setting.rows - inputs.frozen_rows());
+    if whole > room {
         let views = views_of(dataset, Split::Train)?;
         let options = to_measure(whole, inputs, setting);
         let mut backend = inputs.device.backend(&model, &options)?;
         let background = inputs.spec.data.background.fixed();
         let importance = importance(backend.as_mut(), &views, background, model.sh_degree)?;
         drop(backend);
-        model = model.gather(&largest(&importance, setting.rows));
+        model = model.gather(&largest(&importance, room));
     }
-    let (degree, own) = (setting.sh_degree, model.sh_degree);
     observer.say(format_args!("start    {} Gaussians of {}", grouped(whole), file.display()));
-    if whole > setting.rows {
+    if whole > room {
         observer.say(format_args!(
             "note: {} Gaussians beyond the budget left out: those with the least blend weight in the training views",
-            grouped(whole - setting.rows)
+            grouped(whole - room)
         ));
     }
+    Ok(with_degree(model, setting.sh_degree, observer))
+}
+
+/// Cuts colours, and says so, or gives them room.
+fn with_degree(model: Gaussians, degree: u8, observer: &dyn Observer) -> Gaussians {
+    let own = model.sh_degree;
     if own > degree {
         observer.say(format_args!(
             "note: colours of degree {own} are cut to {degree}; --sh-degree {own} keeps them"
         ));
     }
-    Ok(model.with_degree(degree))
+    model.with_degree(degree)
+}
+
+/// The model behind that of `--freeze`, if there is one: in the coordinates of training, with the degree of the run.
+///
+/// # Errors
+/// When the file cannot be read, or is not what it was, or no training view shows the model.
+pub(in crate::run) fn behind_frozen(
+    inputs: &Inputs<'_>,
+    sh_degree: u8,
+    others: Gaussians,
+    observer: &dyn Observer,
+) -> Result<Gaussians, Failure> {
+    let Some(ModelFile(file)) = &inputs.spec.start.freeze else {
+        return Ok(others);
+    };
+    let model = read("--freeze", file, &Silent)?;
+    let mut model = inputs.dataset.normalisation.model_from_world(model);
+    let (rows, expected) = (model.len(), inputs.frozen_rows());
+    if rows != expected {
+        return Err(Failure::input(format!(
+            "--freeze {}: it has {} Gaussians, but had {} before; begin a new run",
+            file.display(),
+            grouped(rows),
+            grouped(expected)
+        )));
+    }
+    if in_view(&model, &inputs.dataset) == 0 {
+        return Err(Failure::input(format!(
+            "--freeze {}: none of its {} Gaussians lies in any training view; it must be in the coordinates of the \
+             dataset: export it untransformed, or transform it back",
+            file.display(),
+            grouped(rows)
+        )));
+    }
+    observer.say(format_args!("frozen   {} Gaussians of {}", grouped(rows), file.display()));
+    model = with_degree(model, sh_degree, observer);
+    model.append(others);
+    Ok(model)
 }
 
 /// How many rows have their centre in a training view.

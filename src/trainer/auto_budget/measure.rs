@@ -1,6 +1,5 @@
 //! Measures the probes at the end of an interval, and removes the rows that hardly change them.
 
-use densify_policies::plan::EditPlan;
 use densify_policies::policy::Signal;
 
 use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_loss, interval_steps, signals};
@@ -53,7 +52,7 @@ impl<V: ViewSource> Trainer<V> {
             // The policy may not replace the removed rows.
             auto.limit = after;
             if !least.is_empty() {
-                let mut plan = EditPlan::new(rows, self.row_limit());
+                let mut plan = self.new_plan();
                 plan.cause("auto budget");
                 plan.prune_all(least);
                 event = self.execute(step, plan)?;

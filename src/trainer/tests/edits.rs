@@ -15,6 +15,27 @@ fn edits_are_reported_and_the_budget_holds() {
 }
 
 #[test]
+fn frozen_rows_count_for_the_budget_and_policies_know_nothing_of_them() {
+    let case = Case { rows: 5, aux_views: 1, ..CASE };
+    let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
+    let options = TrainOptions { frozen: 3, ..OPTIONS };
+    let refused = build(&case, 3, scene(&case, 3), options);
+    assert!(matches!(refused, Err(TrainError::BadOption(why)) if why.contains("3 frozen")));
+    let (mut trainer, log, _) = build(&case, 3, info, options).unwrap();
+    let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
+    let short: Vec<_> =
+        events.iter().map(|e| (e.step, e.before, e.added, e.denied, e.after)).collect();
+    assert_eq!(short, [(2, 5, 2, 0, 7), (4, 7, 3, 1, 10), (6, 10, 0, 7, 10), (8, 10, 0, 7, 10)]);
+    assert!(log.lock().unwrap().iter().any(|call| call.starts_with("observe")));
+    // The audit removes others, and a frozen row that is unsound ends the run.
+    let case = Case { unsound: 1, behaviour: Behaviour::Nothing, ..case };
+    let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
+    let (mut trainer, ..) = build(&case, 3, info, options).unwrap();
+    let error = (0..9).find_map(|_| trainer.step().err()).expect("it ends");
+    assert!(matches!(error, TrainError::Unsound { .. }), "{error}");
+}
+
+#[test]
 fn a_plan_that_changes_nothing_is_not_an_event() {
     let (mut trainer, log, _) = trainer(&Case { behaviour: Behaviour::Nothing, ..CASE });
     assert!((0..9).all(|_| trainer.step().unwrap().events.is_empty()));

@@ -329,6 +329,7 @@ const OPTIONS: TrainOptions = TrainOptions {
         fade_from: 1.0,
     },
     prefetch: 2,
+    frozen: 0,
     has_all_bands: false,
     on_nan: OnNan::Prune,
 };

@@ -141,6 +141,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         background: Background::Black,
         rates: RateOptions::for_run(iterations),
         prefetch: 1,
+        frozen: 0,
         has_all_bands: false,
         on_nan: OnNan::Stop,
     };

@@ -1,4 +1,5 @@
-//! `--init MODEL`: a run that starts from a model there is already, and what cannot be started from.
+//! `--init MODEL` and `--freeze MODEL`: a run that starts from a model there is already, or beside one that stays as
+//! it is, and what cannot be started from.
 
 use std::path::Path;
 
@@ -79,6 +80,60 @@ fn a_run_goes_on_from_any_model() {
     let outcome = resume(scene.path(), &part, "").ok();
     assert!(read(&model_path(&part, 20)) == whole, "{outcome:?}");
     resume(scene.path(), &part, &format!("--init {}", text(&ply))).refused("another", &["--init"]);
+}
+
+#[test]
+fn frozen_gaussians_stay_as_they_are_through_a_stop_too() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 60, &format!("--budget 100 --quiet {STILL}")).ok();
+    let ply = model_path(&run, 60);
+    let frozen = gaussians(&ply).len();
+    let copy = root.path().join("copy.ply");
+    std::fs::copy(&ply, &copy).unwrap();
+    let beside = root.path().join("beside");
+    let flags = "--budget 260 --checkpoint-every 100 --policy-set diet.grow_every=20";
+    let outcome =
+        train(scene.path(), &beside, 300, &format!("--freeze {} {flags}", text(&copy))).ok();
+    assert!(outcome.stdout.contains(&format!("frozen   {frozen} Gaussians of ")), "{outcome:?}");
+    let after = gaussians(&model_path(&beside, 300));
+    let summary = json(&beside.join("stats/summary.json"));
+    let rows: Vec<usize> = (0..frozen).collect();
+    // What a file rounds is beyond the last bit of what it was read as.
+    let [was, is] = [gaussians(&ply), after.gather(&rows)];
+    let close = |a: &[f32], b: &[f32]| {
+        a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 2e-6 * a.abs().max(1.0))
+    };
+    assert!(close(was.means.as_flattened(), is.means.as_flattened()));
+    assert!(close(was.log_scales.as_flattened(), is.log_scales.as_flattened()));
+    assert!(close(&was.opacity_logits, &is.opacity_logits) && close(&was.sh, &is.sh));
+    assert!(after.len() > frozen + 100 && after.len() <= 260, "{} rows", after.len());
+    assert!(count(&summary, "peak_rows") <= 260, "{summary}");
+    assert!(count(&summary, "peak_bytes") <= count(&summary, "ledger_bytes"), "{summary}");
+
+    // It goes on to the same bytes where the file is gone.
+    let whole = read(&model_path(&beside, 300));
+    std::fs::remove_dir_all(beside.join("point_cloud/iteration_300")).unwrap();
+    std::fs::remove_file(beside.join("checkpoints/iteration_300.safetensors")).unwrap();
+    std::fs::remove_file(&copy).unwrap();
+    resume(scene.path(), &beside, "").ok();
+    assert!(read(&model_path(&beside, 300)) == whole);
+
+    // What cannot be.
+    let no = |flags: &str, words: &[&str]| {
+        let outcome = train(scene.path(), &root.path().join("no"), 2, flags);
+        outcome.refused("--freeze", words);
+        assert!(!root.path().join("no").exists());
+    };
+    no(&format!("--freeze {} --budget {frozen}", text(&ply)), &["leave no room", "--budget"]);
+    no(&format!("--freeze {} --budget auto:200", text(&ply)), &["--budget auto"]);
+    no(&format!("--freeze {}", text(&copy)), &["copy.ply"]);
+    let mut above = gaussians(&ply);
+    above.means.iter_mut().for_each(|mean| mean[1] += 1e4);
+    write(&above, &copy);
+    no(&format!("--freeze {}", text(&copy)), &["copy.ply", "none of its", "coordinates"]);
+    resume(scene.path(), &beside, &format!("--freeze {}", text(&ply)))
+        .refused("another", &["--freeze"]);
 }
 
 #[test]
