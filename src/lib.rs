@@ -30,6 +30,7 @@
 
 mod animation;
 pub mod backend;
+pub mod blocks;
 pub mod camera;
 pub mod checkpoint;
 pub mod cli;

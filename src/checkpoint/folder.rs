@@ -29,6 +29,12 @@ fn list(run: &Path) -> Vec<(u32, PathBuf)> {
     found
 }
 
+/// The step of the newest checkpoint of a run, which may be damaged.
+#[must_use]
+pub fn newest_step(run: &Path) -> Option<u32> {
+    list(run).first().map(|(step, _)| *step)
+}
+
 /// The newest undamaged checkpoint of a run, if there is one, and why newer ones were rejected, newest
 /// first.
 #[must_use]

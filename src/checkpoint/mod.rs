@@ -24,7 +24,7 @@ mod read;
 mod write;
 
 pub use fingerprint::{Fingerprint, ViewsFingerprint};
-pub use folder::{checkpoint_path, newest, remove_older};
+pub use folder::{checkpoint_path, newest, newest_step, remove_older};
 pub use format::VERSION;
 pub use read::Checkpoint;
 pub use write::write;

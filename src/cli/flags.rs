@@ -1,7 +1,9 @@
 //! The options of a run as flags: their defaults in the help, and which of them a call gives.
 
+use std::ffi::OsString;
+
 use clap::parser::ValueSource;
-use clap::{Arg, ArgMatches, Command};
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use toml::{Table, Value};
 
 use crate::failure::Failure;
@@ -30,6 +32,19 @@ pub(super) fn given(matches: &ArgMatches, spec: &RunSpec) -> Result<Partial, Fai
     Partial::given(spec, |name| matches.value_source(name) == Some(ValueSource::CommandLine))
 }
 
+/// The options of a run in words like those after `densify train`, but for the scene; `of` is the command that has
+/// them.
+pub(super) fn words(words: &[String], of: &'static str) -> Result<Partial, Failure> {
+    let command = Command::new(of).no_binary_name(true).disable_help_flag(true);
+    let command = with_defaults(RunSpec::augment_args(command));
+    let usage =
+        |error: clap::Error| Failure::input(error.to_string().trim().trim_start_matches("error: "));
+    let words = words.iter().map(OsString::from);
+    let matches = command.try_get_matches_from(words).map_err(usage)?;
+    let spec = RunSpec::from_arg_matches(&matches).map_err(usage)?;
+    given(&matches, &spec)
+}
+
 /// Fails where `--policy-set` among these flags names another policy than that of the run.
 pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failure> {
     let policy = &spec.density.policy;
@@ -47,8 +62,6 @@ pub(super) fn check_policy(flags: &Partial, spec: &RunSpec) -> Result<(), Failur
 #[cfg(test)]
 pub(super) fn markdown() -> String {
     use std::fmt::Write as _;
-
-    use clap::Args;
 
     use crate::run::{OPTIONS, OnResume};
 
@@ -98,6 +111,16 @@ mod tests {
     use std::path::Path;
 
     use super::*;
+
+    #[test]
+    fn only_what_is_given_is_given() {
+        let given = ["--near", "0.04", "--eval", "--knob", "alpha_min=1/64", "--lr=opacity=0.05"];
+        let found = words(&given.map(str::to_owned), "train").unwrap();
+        let names: Vec<&str> = found.iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["eval", "knob", "lr", "near"]);
+        let spec = found.describe().unwrap();
+        assert!(spec.data.eval && spec.schedule.iterations.0 == 24_000);
+    }
 
     #[test]
     fn the_options_table_is_current() {

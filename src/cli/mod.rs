@@ -14,6 +14,7 @@
 //! }
 //! ```
 
+mod blocks;
 mod compress;
 mod console;
 #[cfg(feature = "gpu")]
@@ -89,6 +90,8 @@ Examples:
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compress output/garden-diet --to 5MiB -o garden.sog
                                                            a smaller file of it
+  densify blocks plan data/city -o city --rows 2M --memory 8GiB
+                                                           a scene too large for one machine
   densify compare data/garden --policies vanilla,diet --budget 200k
                                                            which policy does best here
   densify policies diet                                    what a policy does, and its parameters
@@ -107,6 +110,7 @@ Examples:
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(Box<train::TrainArgs>),
+    Blocks(Box<blocks::BlocksArgs>),
     /// Says what a run would take in memory, without training.
     ///
     /// Takes the options of `densify train` and prints what that would promise: the ledger, buffer by
@@ -158,6 +162,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
     let (_, given) = matches.subcommand().unwrap_or(("", &matches));
     let done = match arguments.command {
         Command::Train(train) => train::run(&train, given, &console),
+        Command::Blocks(args) => blocks::run(&args, &console),
         Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, &console),
         Command::Compress(compress) => compress::run(&compress, given, &console),

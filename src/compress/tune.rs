@@ -8,7 +8,7 @@ use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::output::write_atomically;
 use crate::run::{
-    Assignment, Budget, InitChoice, ModelFile, Observer, Run, RunSpec, ShDegree, Whole,
+    AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Whole,
 };
 
 /// A policy that, set so, neither adds nor prunes.
@@ -69,7 +69,7 @@ fn described(
     spec.device = options.device.clone();
     spec.start.scene = Some(options.scene.to_owned());
     let file = std::path::absolute(scratch).map_err(Failure::input)?;
-    spec.start.init = Some(InitChoice::Model(ModelFile(file)));
+    spec.start.init = Some(InitChoice::Model(AbsolutePath(file)));
     spec.start.near = options.near;
     spec.size.budget = Some(Budget::Rows(budget));
     spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));

@@ -23,6 +23,7 @@ mod resample;
 mod tracks;
 mod transforms;
 pub mod undistort;
+mod wanted;
 
 #[cfg(test)]
 #[allow(

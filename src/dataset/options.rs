@@ -16,6 +16,8 @@ pub struct LoadOptions {
     pub resolution: Option<Resolution>,
     /// Which views are held out.
     pub split: Split,
+    /// File that names the views to use, one in each line (`--views`); `None`: all.
+    pub views: Option<PathBuf>,
     /// What happens to views whose camera is far from all others.
     pub far_cameras: FarCameras,
     /// Whether undistorted images hold all that the lens saw (`--keep-fov`), with what it did not masked,

@@ -9,6 +9,7 @@ use super::error::DatasetError;
 use super::normalise::{self, Normalisation};
 use super::photographs::{Photograph, photographs};
 use super::pose::POSE_REMEDY;
+use super::wanted::{self, Wanted};
 use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Scene, Split, View};
 
 /// Fraction of the points that may be unusable.
@@ -54,6 +55,7 @@ pub(super) fn assemble(
         Split::Eval if !own_split => Some(Split::EVAL_EVERY as usize),
         Split::None | Split::Eval => None,
     };
+    let mut wanted = options.views.as_deref().map(Wanted::read).transpose()?;
     // Numbers of the training views of a photograph, by the id that tracks use.
     let mut numbers_of = HashMap::new();
     let (mut train, mut test) = (Vec::<View>::new(), Vec::new());
@@ -71,6 +73,7 @@ pub(super) fn assemble(
             views.into_iter().zip(hidden).partition(|(_, hidden)| *hidden);
         hidden_names.extend(out.into_iter().map(|(view, _)| view.name));
         let views: Vec<View> = views.into_iter().map(|(view, _)| view).collect();
+        let Some(views) = wanted::of(&mut wanted, views) else { continue };
         if every.map_or(held_out, |every| index % every == 0) {
             test.extend(views);
         } else {
@@ -80,6 +83,7 @@ pub(super) fn assemble(
             train.extend(views);
         }
     }
+    wanted.map_or(Ok(()), |wanted| wanted.check(&train))?;
     if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
         let (ignored, remedy) = match options.invert_masks {
             true => ("white", "leave --invert-masks out"),

@@ -26,6 +26,7 @@ impl DataSpec {
                 None if self.eval => Split::Eval,
                 None => Split::None,
             },
+            views: self.views.as_ref().map(|file| file.0.clone()),
             far_cameras: self.far_cameras,
             keep_fov: self.keep_fov,
             invert_masks: self.invert_masks,

@@ -24,8 +24,8 @@ pub use config::{DegreeSource, ModelSize, Resolved, RunConfig};
 pub use observer::{Interrupt, Observer, Silent};
 pub use overlay::Partial;
 pub use report::{LeftOut, Requirements};
-pub(crate) use resolve::use_threads;
 pub use resolve::{Alternatives, DEFAULT_BUDGET, Plan, plan};
+pub(crate) use resolve::{promised, use_threads};
 pub use resume::{Resumed, start};
 pub use session::Occupied;
 pub use spec::{
@@ -33,7 +33,7 @@ pub use spec::{
     ScheduleSpec, SizeSpec, StartSpec,
 };
 pub use values::{
-    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, ModelFile, Rows, ShDegree,
+    AbsolutePath, Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree,
     Threads, Whole,
 };
 

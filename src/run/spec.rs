@@ -12,7 +12,7 @@ use clap::{ArgAction, Args};
 use serde::{Deserialize, Serialize};
 
 use super::values::{
-    Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, ModelFile, Rows, ShDegree,
+    AbsolutePath, Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree,
     Threads, Whole, as_table,
 };
 use crate::backend::BackendChoice;
@@ -113,6 +113,11 @@ run_spec! {
         #[arg(long, value_name = "DIR")]
         images: Option<PathBuf> = None, Free;
 
+        /// Use only the views that this file names, one in each line; the others are split into training and
+        /// test views all the same, and then left out
+        #[arg(long, value_name = "FILE")]
+        views: Option<AbsolutePath> = None, Fixed;
+
         /// What happens to views whose camera is more than 10 times as far from the others as usual, if
         /// they are no more than one in 20: structure from motion places some by mistake
         #[arg(long, value_name = "WHAT")]
@@ -171,7 +176,7 @@ run_spec! {
         /// policy removes or moves them, and no step trains them. What --init gives is trained beside them; the
         /// budget counts both
         #[arg(long, value_name = "MODEL")]
-        freeze: Option<ModelFile> = None, Fixed;
+        freeze: Option<AbsolutePath> = None, Fixed;
 
         /// Number of random points to start from (default: half the budget, at most 100k)
         #[arg(long, value_name = "N")]

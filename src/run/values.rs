@@ -87,10 +87,10 @@ pub enum ShDegree {
     Auto(Option<u8>),
 }
 
-/// A file with a model. The path is absolute, so that it holds wherever the run goes on.
+/// A file, by its absolute path, so that it holds wherever the run goes on.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
-pub struct ModelFile(pub PathBuf);
+pub struct AbsolutePath(pub PathBuf);
 
 /// `--init`: what the first Gaussians are.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -100,7 +100,7 @@ pub enum InitChoice {
     /// At random places, where the cameras look.
     Random,
     /// Those of this file, which is in the dataset's coordinates.
-    Model(ModelFile),
+    Model(AbsolutePath),
 }
 
 /// A word before an optional number: `auto`, `auto:50k`.
@@ -199,12 +199,12 @@ impl InitChoice {
     }
 }
 
-impl FromStr for ModelFile {
+impl FromStr for AbsolutePath {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
         if text.is_empty() {
-            return Err("give a file of Gaussian splats".to_owned());
+            return Err("give a file".to_owned());
         }
         let path = std::path::absolute(text);
         path.map(Self).map_err(|error| format!("`{text}` is no path: {error}"))

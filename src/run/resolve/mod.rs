@@ -15,6 +15,7 @@ use densify_policies::policy::{Needs, SceneInfo, SignalSet};
 use densify_policies::registry::PolicyEntry;
 use toml::Table;
 
+pub(crate) use plan::promised;
 pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
 pub(super) use size::{Size, check, check_grant};

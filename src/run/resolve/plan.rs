@@ -3,11 +3,12 @@
 use std::fmt;
 
 use super::size::{self, MIB, RESOLUTIONS, Size};
-use super::{Inputs, RunSpec};
+use super::{Inputs, ModelSize, RunConfig, RunSpec};
 use crate::dataset::Resolution;
 use crate::failure::Failure;
 use crate::memory::Ledger;
 use crate::number::grouped;
+use crate::run::config::Resolved;
 use crate::run::observer::Observer;
 use crate::run::values::ByteCount;
 
@@ -45,6 +46,23 @@ pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     let memory = spec.size.memory.map_or(limited.next_multiple_of(MIB), |it| it.0);
     let alternatives = alternatives(&inputs, memory, rows)?;
     Ok(Plan { ledger, lines, alternatives })
+}
+
+/// The rows that fit, and what a run takes whose models of `--init` and `--freeze` are not there yet.
+///
+/// # Errors
+/// As [`plan`].
+pub(crate) fn promised(
+    spec: &RunSpec,
+    [init_model, frozen]: [Option<ModelSize>; 2],
+    observer: &dyn Observer,
+) -> Result<(usize, Ledger), Failure> {
+    let resolved = Resolved { init_model, frozen, ..Resolved::default() };
+    let config = RunConfig { densify: String::new(), spec: spec.clone(), resolved };
+    let inputs = Inputs::load(spec, Some(&config), observer)?;
+    let setting = Size::choose(&inputs)?.setting;
+    let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows)?);
+    Ok((setting.rows, ledger))
 }
 
 /// What `memory` holds, as the solver finds it for such a run without `--budget`; `planned` rows are a model.

@@ -20,7 +20,7 @@ use crate::run::config::ModelSize;
 use crate::run::finished::{read_model, views_of};
 use crate::run::observer::{Observer, Silent};
 use crate::run::resolve::Inputs;
-use crate::run::values::ModelFile;
+use crate::run::values::AbsolutePath;
 use crate::views::ViewSource;
 
 /// A model of which fewer Gaussians than this share lie in any training view is in other coordinates.
@@ -165,7 +165,7 @@ pub(in crate::run) fn behind_frozen(
     others: Gaussians,
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
-    let Some(ModelFile(file)) = &inputs.spec.start.freeze else {
+    let Some(AbsolutePath(file)) = &inputs.spec.start.freeze else {
         return Ok(others);
     };
     let model = read("--freeze", file, &Silent)?;

@@ -1,6 +1,7 @@
 //! The program as its users meet it: arguments in, exit code, messages and files out.
 
 mod accumulation;
+mod blocks;
 #[cfg(unix)]
 mod caching;
 mod comparing;

@@ -1,0 +1,96 @@
+//! Which views see which points: by the tracks of a reconstruction, or else by what lies in their images.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::Ground;
+use crate::camera::Camera;
+use crate::dataset::Dataset;
+use crate::failure::Failure;
+
+/// Fewer tracks say too little.
+const ENOUGH_TRACKS: usize = 500;
+/// Most points that are looked at, evenly chosen.
+const MOST_POINTS: usize = 20_000;
+
+/// Points on the ground, and the training views that see each.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Sight {
+    /// Shape: `[points]`.
+    pub(super) at: Vec<[f64; 2]>,
+    /// Numbers of training views. Shape: `[points]`, then views.
+    pub(super) seen_by: Vec<Vec<u32>>,
+    /// Whether tracks say so; else a view is taken to see whatever lies in its image.
+    pub(super) is_tracked: bool,
+}
+
+impl Sight {
+    /// What the views of a dataset see.
+    ///
+    /// # Errors
+    /// When the dataset has no points.
+    pub(super) fn of(dataset: &Dataset, ground: &Ground) -> Result<Self, Failure> {
+        let world = |point: DVec3| ground.at(dataset.normalisation.world_from_scene(point));
+        let tracks = &dataset.tracks;
+        if tracks.positions.len() >= ENOUGH_TRACKS {
+            return Ok(Self {
+                at: tracks.positions.iter().map(|&point| world(point)).collect(),
+                seen_by: tracks.views.clone(),
+                is_tracked: true,
+            });
+        }
+        let points = &dataset.points.positions;
+        if points.is_empty() {
+            return Err(Failure::input(format!(
+                "{}: the dataset has no points, by which a scene is divided; make a reconstruction with points \
+                 (COLMAP), or train it as a whole",
+                dataset.root.display()
+            )));
+        }
+        let stride = points.len().div_ceil(MOST_POINTS);
+        let some: Vec<DVec3> = points.iter().step_by(stride).copied().collect();
+        let cameras: Vec<Camera> = dataset.train.iter().map(|view| view.camera).collect();
+        let views_of = |point: &DVec3| {
+            let numbers = (0u32..).zip(&cameras);
+            numbers.filter(|(_, camera)| shows(camera, *point, 0.0)).map(|it| it.0).collect()
+        };
+        Ok(Self {
+            at: some.iter().map(|&point| world(point)).collect(),
+            seen_by: some.par_iter().map(views_of).collect(),
+            is_tracked: false,
+        })
+    }
+
+    /// The work of each point: how many views see it.
+    pub(super) fn work(&self) -> Vec<f64> {
+        self.seen_by.iter().map(|views| views.len() as f64).collect()
+    }
+
+    /// Of how many of the points that `is_inside` each of so many views sees how many, and how many it sees at all.
+    pub(super) fn counts(
+        &self,
+        views: usize,
+        is_inside: impl Fn([f64; 2]) -> bool,
+    ) -> Vec<[u32; 2]> {
+        let mut counts = vec![[0; 2]; views];
+        for (at, seen_by) in self.at.iter().zip(&self.seen_by) {
+            let inside = u32::from(is_inside(*at));
+            for &view in seen_by {
+                let [within, all] = &mut counts[view as usize];
+                *within += inside;
+                *all += 1;
+            }
+        }
+        counts
+    }
+}
+
+/// Whether a point lies in the image of a camera, or as near to it as a share of its sides.
+pub(super) fn shows(camera: &Camera, point: DVec3, beside: f64) -> bool {
+    let (pixel, depth) = camera.project(point);
+    let within = |x: f64, size: u32| {
+        let (size, beside) = (f64::from(size), beside * f64::from(size));
+        (-beside..size + beside).contains(&x)
+    };
+    depth > 0.0 && within(pixel.x, camera.width) && within(pixel.y, camera.height)
+}

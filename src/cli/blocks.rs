@@ -1,0 +1,278 @@
+//! `densify blocks`: a scene in blocks, each a run of its own.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+
+use super::console::Console;
+use super::export::{check_output, format_of};
+use super::flags::words;
+use super::train::Follower;
+use crate::blocks::engine::{Engine, Submission, submit};
+use crate::blocks::{self, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status};
+use crate::failure::Failure;
+use crate::memory::Bytes;
+use crate::number::{self, grouped};
+use crate::run::{ByteCount, Fraction, Rows, Threads};
+
+/// Trains a large scene in blocks, on one machine or on a cluster, and merges them.
+///
+/// The ground is divided into cells of equal work. A coarse run sees the whole scene; each block then starts from its
+/// part of the coarse model, with what else its views show frozen around it, and trains its share of the Gaussians. The
+/// merged model never has more than was asked for, and the memory of every task is known before it starts.
+#[derive(Debug, Args)]
+pub(super) struct BlocksArgs {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Plan(PlanArgs),
+    Submit(SubmitArgs),
+    Run(RunArgs),
+    Status(StatusArgs),
+    Merge(MergeArgs),
+}
+
+/// Divides a scene, and writes a folder with everything that the tasks need.
+///
+/// Prints what each task takes; DIR/plan.svg shows the blocks from above.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+struct PlanArgs {
+    /// Folder of the dataset, or scene:NAME for a built-in scene
+    #[arg(value_name = "SCENE")]
+    scene: PathBuf,
+    /// Folder to write the plan to
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Most Gaussians of the merged model: 2M, 500k
+    #[arg(long, value_name = "N", required_unless_present = "bytes", conflicts_with = "bytes")]
+    rows: Option<Rows>,
+    /// Most bytes of the merged model as PLY: 500MB
+    #[arg(long, value_name = "SIZE")]
+    bytes: Option<ByteCount>,
+    /// Number of blocks: strips along the longer side of the ground (4), or strips and blocks in each (3x2); auto: as
+    /// few as fit --memory
+    #[arg(long, value_name = "auto|K|KxL", default_value = "auto")]
+    blocks: Grid,
+    /// Most memory of a task: 8GiB
+    #[arg(long, value_name = "SIZE", required_if_eq("blocks", "auto"))]
+    memory: Option<ByteCount>,
+    /// Budget of the coarse run `[default: a tenth of the merged model, at least 1,000]`
+    #[arg(long, value_name = "N")]
+    coarse_rows: Option<Rows>,
+    /// How far beyond its cell a block trains, as a share of a cell's usual width
+    #[arg(long, value_name = "FRACTION", default_value = "0.1")]
+    margin: Fraction,
+    /// Options of `densify train` for every run, after `--`; --iterations are those of one run over the whole scene, of
+    /// which each block trains the share that its views are of all
+    #[arg(last = true, value_name = "TRAIN OPTIONS")]
+    train: Vec<String>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  densify blocks plan data/city -o city --rows 2M --memory 8GiB -- -r 2 --eval
+  densify blocks plan data/city -o city --bytes 500MB --blocks 3x2 -- --policy diet --threads 8
+  densify blocks submit city --engine slurm
+  densify blocks status city";
+
+/// Starts the tasks of a plan that are not complete, here, or on a cluster whose machines share the folder.
+#[derive(Debug, Args)]
+struct SubmitArgs {
+    /// Folder of the plan
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// What starts them
+    #[arg(long, value_name = "ENGINE", default_value = "local")]
+    engine: Engine,
+    /// Print the files for the engine, and start nothing
+    #[arg(long)]
+    dry_run: bool,
+    /// Hand in again what is not complete
+    #[arg(long)]
+    again: bool,
+    /// Ask HyperQueue for memory too: its workers must offer the resource `mem`, in bytes, else tasks wait for ever
+    #[arg(long)]
+    mem_resource: bool,
+}
+
+/// Runs one task of a plan, or what is left of it: engines call this.
+#[derive(Debug, Args)]
+struct RunArgs {
+    /// Folder of the plan
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// coarse, the name of a block, or merge
+    #[arg(value_name = "TASK")]
+    task: String,
+    /// Processor threads, in place of the plan's; the result does not depend on it
+    #[arg(long, value_name = "N")]
+    threads: Option<Threads>,
+}
+
+/// Says how far each task is, from the folder alone.
+#[derive(Debug, Args)]
+struct StatusArgs {
+    /// Folder of the plan
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+}
+
+/// Merges the blocks into one model: of each the Gaussians in its cell.
+#[derive(Debug, Args)]
+struct MergeArgs {
+    /// Folder of the plan
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// File to write; its extension says in which format, as for `densify export`
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Merge the blocks that are complete, and name the others
+    #[arg(long)]
+    partial: bool,
+    /// Replace a file that exists
+    #[arg(long)]
+    overwrite: bool,
+}
+
+pub(super) fn run(args: &BlocksArgs, console: &Console) -> Result<(), Failure> {
+    match &args.command {
+        Command::Plan(args) => run_plan(args, console),
+        Command::Submit(args) => run_submit(args, console),
+        Command::Run(args) => run_task(args, console),
+        Command::Status(args) => run_status(args, console),
+        Command::Merge(args) => run_merge(args, console),
+    }
+}
+
+fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
+    let size = match (args.rows, args.bytes) {
+        (Some(rows), _) => Size::Rows(rows.0),
+        (None, Some(bytes)) => Size::Bytes(bytes.0),
+        (None, None) => return Err(Failure::input("give --rows or --bytes")),
+    };
+    let options = PlanOptions {
+        scene: args.scene.clone(),
+        output: args.output.clone(),
+        size,
+        memory: args.memory.map(|bytes| bytes.0),
+        grid: args.blocks,
+        coarse_rows: args.coarse_rows.map(|rows| rows.0),
+        margin: args.margin.0,
+        given: words(&args.train, "densify blocks plan ... --")?,
+    };
+    let blocks = plan(&options, console)?;
+    console.result(table(&blocks));
+    console.result(format_args!("everything in {}", args.output.display()));
+    Ok(())
+}
+
+/// What each task does and takes.
+fn table(blocks: &Blocks) -> String {
+    let mut text = format!(
+        "{:<14} {:>11} {:>7} {:>11} {:>7} {:>11}",
+        "task", "Gaussians", "views", "iterations", "work", "memory"
+    );
+    let coarse = &blocks.coarse;
+    let _ = write!(
+        text,
+        "\n{:<14} {:>11} {:>7} {:>11} {:>7} {:>11}",
+        "coarse",
+        grouped(coarse.rows),
+        "all",
+        grouped(coarse.iterations as usize),
+        "",
+        Bytes(coarse.memory).to_string()
+    );
+    for block in &blocks.block {
+        let _ = write!(
+            text,
+            "\n{:<14} {:>11} {:>7} {:>11} {:>5.1} % {:>11}",
+            block.name,
+            grouped(block.rows),
+            grouped(block.views),
+            grouped(block.iterations as usize),
+            100.0 * block.work,
+            Bytes(block.memory).to_string()
+        );
+    }
+    let _ = write!(
+        text,
+        "\n{:<14} {:>11} {:>7} {:>11} {:>7} {:>11}",
+        "merge",
+        grouped(blocks.rows),
+        "",
+        "",
+        "",
+        Bytes(blocks.merge_memory).to_string()
+    );
+    text
+}
+
+fn run_submit(args: &SubmitArgs, console: &Console) -> Result<(), Failure> {
+    if args.mem_resource && args.engine != Engine::Hq {
+        return Err(Failure::input("--mem-resource is for --engine hq; leave it out"));
+    }
+    let blocks = Blocks::read(&args.folder)?;
+    let submission = Submission {
+        engine: args.engine,
+        dry_run: args.dry_run,
+        again: args.again,
+        with_memory: args.mem_resource,
+    };
+    let follower = Follower::new(console);
+    follower.listen();
+    submit(&args.folder, &blocks, submission, &follower)
+}
+
+fn run_task(args: &RunArgs, console: &Console) -> Result<(), Failure> {
+    let blocks = Blocks::read(&args.folder)?;
+    let task = blocks.task(&args.task)?;
+    let follower = Follower::new(console);
+    follower.listen();
+    blocks::run(&args.folder, &blocks, task, args.threads.map(|threads| threads.0), &follower)
+}
+
+fn run_status(args: &StatusArgs, console: &Console) -> Result<(), Failure> {
+    let blocks = Blocks::read(&args.folder)?;
+    let mut counts = [0; 2];
+    for (task, state) in status(&args.folder, &blocks) {
+        counts[usize::from(state == State::Complete)] += 1;
+        let of = match task {
+            Task::Coarse => blocks.coarse.iterations,
+            Task::Block(place) => blocks.block[place].iterations,
+            Task::Merge => 0,
+        };
+        let state = match state {
+            State::Waiting => "waiting".to_owned(),
+            State::Running(step) => format!("running, saved {step} of {of} steps"),
+            State::Stopped(step) => format!("stopped, saved {step} of {of} steps"),
+            State::Complete => "complete".to_owned(),
+        };
+        console.result(format_args!("{:<14} {state}", blocks.name(task)));
+    }
+    console.result(format_args!("{} complete, {} to go", counts[1], counts[0]));
+    Ok(())
+}
+
+fn run_merge(args: &MergeArgs, console: &Console) -> Result<(), Failure> {
+    let format = format_of(&args.output)?;
+    check_output(&args.output, args.overwrite)?;
+    let blocks = Blocks::read(&args.folder)?;
+    let merged = merge(&args.folder, &blocks, &args.output, format, args.partial, console)?;
+    if !merged.missing.is_empty() {
+        console.say(format_args!("note: left out, not complete: {}", merged.missing.join(", ")));
+    }
+    console.result(format_args!(
+        "{} ({}): {} Gaussians, {}",
+        args.output.display(),
+        format.name,
+        number::grouped(merged.rows),
+        Bytes(merged.bytes)
+    ));
+    Ok(())
+}
