@@ -7,6 +7,8 @@ use super::{EngineFile, asked, command_of, mebibytes, quoted};
 use crate::blocks::{Blocks, Task};
 use crate::failure::Failure;
 
+/// How often a task that was killed begins again by itself.
+const RESTARTS: u32 = 5;
 const REMEDY: &str =
     "Slurm's programs must be on this machine's PATH; else choose --engine local or hq";
 
@@ -63,7 +65,17 @@ fn script(
     };
     let words = command_of(folder, "")?;
     let words: Vec<String> = words[..4].iter().map(|word| quoted(word)).collect();
-    let _ = writeln!(text, "exec {} {task}", words.join(" "));
+    let _ = write!(
+        text,
+        "{} {task}\n\
+         code=$?\n\
+         # Killed, such as for memory or by its machine: it goes on from its last checkpoint, up to {RESTARTS} times.\n\
+         if [ $code -ge 128 ] && [ \"${{SLURM_RESTART_COUNT:-0}}\" -lt {RESTARTS} ]; then\n    \
+         scontrol requeue \"$SLURM_JOB_ID\" && sleep 60\n\
+         fi\n\
+         exit $code\n",
+        words.join(" ")
+    );
     Ok(EngineFile { path: folder.join("slurm").join(format!("{name}.sh")), text })
 }
 
@@ -73,7 +85,7 @@ pub(super) fn hand_in(files: &[EngineFile]) -> Result<Vec<String>, Failure> {
     for EngineFile { path, .. } in files {
         let path = path.to_string_lossy();
         let after = jobs.last().map(|job| format!("--dependency=afterok:{job}"));
-        let mut arguments = vec!["--parsable", "--kill-on-invalid-dep=yes"];
+        let mut arguments = vec!["--parsable"];
         arguments.extend(after.as_deref());
         arguments.push(&path);
         let said = asked("sbatch", &arguments, REMEDY).map_err(|failure| match &jobs[..] {
