@@ -23,6 +23,8 @@ use std::path::PathBuf;
 pub use config::{DegreeSource, Resolved, RunConfig};
 pub use observer::{Interrupt, Observer, Silent};
 pub use overlay::Partial;
+#[cfg(feature = "study")]
+pub(crate) use report::Reductions;
 pub use report::{LeftOut, Requirements};
 pub(crate) use resolve::use_threads;
 pub use resolve::{Alternatives, DEFAULT_BUDGET, Plan, plan};

@@ -13,8 +13,8 @@ use crate::failure::Failure;
 use crate::flight::Key;
 use crate::gaussians::{Gaussians, logit};
 use crate::init::{initialise, random_points};
-use crate::output::{CONFIG_FILE, is_in_use, model_path, saved_iterations};
-use crate::run::finished::{Machine, is_model, iteration, load, or_moved, read_model};
+use crate::output::{CONFIG_FILE, model_path};
+use crate::run::finished::{Machine, is_model, iteration_so_far, load, or_moved, read_model};
 use crate::run::{DataSpec, Observer, RunConfig};
 
 /// Most points of a scene that are shown as Gaussians.
@@ -127,21 +127,7 @@ fn of_run(
     observer: &dyn Observer,
 ) -> Result<(Gaussians, RunConfig, u32), Failure> {
     let config = RunConfig::read(run)?;
-    let trains = is_in_use(run);
-    if trains && saved_iterations(run).is_err() {
-        let run = run.display();
-        return Err(Failure::input(format!(
-            "{run} is being trained and has saved no model yet; wait until it has, or train with \
-             --save-iterations 1000,2000 to look at it before its end"
-        )));
-    }
-    let iteration = iteration(run, asked)?;
-    if trains {
-        let run = run.display();
-        observer.say(format_args!(
-            "note: {run} is being trained; what is shown is its model of iteration {iteration}"
-        ));
-    }
+    let (iteration, _) = iteration_so_far(run, asked, observer)?;
     let model = read_model(&model_path(run, iteration), observer)?;
     Ok((model, config, iteration))
 }

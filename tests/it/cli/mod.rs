@@ -15,6 +15,7 @@ mod killing;
 mod knobs;
 mod looking;
 mod memory;
+mod reporting;
 mod requiring;
 mod resuming;
 mod same;
