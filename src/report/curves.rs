@@ -77,7 +77,7 @@ fn names(runs: &[Told]) -> Markup {
         format!("#{r:02X}{g:02X}{b:02X}")
     };
     html! {
-        ul.names.curve {
+        ul.names {
             @for (at, run) in runs.iter().enumerate() {
                 li {
                     svg viewBox="0 0 16 6" aria-hidden="true" {

@@ -95,7 +95,7 @@ fn sums(events: &[EditEvent]) -> Vec<(String, Sum)> {
     }
     let mut sums: Vec<(String, Sum)> =
         by_cause.into_iter().map(|(cause, sum)| (cause.to_owned(), sum)).collect();
-    sums.sort_by(|a, b| b.1.edits.cmp(&a.1.edits));
+    sums.sort_by_key(|(_, sum)| std::cmp::Reverse(sum.edits));
     let others = sums.len().saturating_sub(MOST_CAUSES);
     sums.truncate(MOST_CAUSES);
     if sums.len() > 1 {

@@ -63,8 +63,8 @@ pub(super) fn page(runs: &[Told], groups: &Groups, shown: &[Shown]) -> Result<St
 fn introduction(groups: &Groups) -> Markup {
     let scenes: Vec<&str> = groups.scenes.iter().map(|scene| &*scene.label).collect();
     html! {
-        "3D Gaussian Splatting of " strong { (scenes.join(", ")) } ", trained with densify "
-        (env!("CARGO_PKG_VERSION")) ". Everything is in this file; nothing is loaded from elsewhere."
+        "3D Gaussian Splatting of " strong { (scenes.join(", ")) }
+        ", by densify. Everything is in this file; nothing is loaded from elsewhere."
     }
 }
 

@@ -116,7 +116,7 @@ impl Told {
 /// number.
 fn names(folders: &[PathBuf]) -> Vec<String> {
     let last = |folder: &Path, parts: usize| {
-        let all: Vec<_> = folder.components().map(|part| part.as_os_str()).collect();
+        let all: Vec<_> = folder.components().map(std::path::Component::as_os_str).collect();
         let parts = all[all.len().saturating_sub(parts)..].iter().collect::<PathBuf>();
         foreign::one_line(&parts.to_string_lossy())
     };

@@ -8,7 +8,7 @@ use crate::evaluate::Mean;
 use crate::html::{Column, table};
 use crate::memory::Bytes;
 use crate::number::{duration, grouped, percent};
-use crate::study::difference::{Difference, INTERVALS, Pair};
+use crate::study::difference::{Difference, Pair};
 
 const NOTHING: &str = "–";
 
@@ -125,7 +125,12 @@ pub(super) fn of_groups(runs: &[Told], groups: &Groups) -> Option<Markup> {
             @if groups.scenes.len() > 1 { p { strong { (scene.label) } } }
             (of_scene(scene, runs))
         }
-        p.note { "Differences are taken between runs of the same seed. " (INTERVALS) "." }
+        p.note {
+            "Brackets are 95 % intervals of the mean by Student's t, from three seeds on."
+            @if groups.scenes.iter().any(|scene| scene.groups.len() > 1) {
+                " Differences are taken between runs of the same seed."
+            }
+        }
     })
 }
 

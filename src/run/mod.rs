@@ -21,7 +21,7 @@ mod values;
 use std::path::PathBuf;
 
 pub use config::{DegreeSource, Resolved, RunConfig};
-pub use observer::{Interrupt, Observer, Silent};
+pub use observer::{Between, Interrupt, Observer, Silent};
 pub use overlay::Partial;
 #[cfg(feature = "study")]
 pub(crate) use report::Reductions;
@@ -94,6 +94,18 @@ impl Run {
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
+    }
+
+    /// What it is, with nothing open.
+    #[cfg(feature = "view")]
+    pub(crate) fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
+    /// The dataset, without its points.
+    #[cfg(feature = "view")]
+    pub(crate) fn dataset(&self) -> &Dataset {
+        &self.dataset
     }
 
     /// The trainer.

@@ -12,7 +12,7 @@ const RESAMPLES: usize = 10_000;
 const FEWEST: usize = 3;
 
 /// What [`Difference`] does, for reports.
-pub(crate) const INTERVALS: &str = "Brackets are 95 % intervals of the mean: Student's t over seeds; over several scenes \
+pub(super) const INTERVALS: &str = "Brackets are 95 % intervals of the mean: Student's t over seeds; over several scenes \
     scenes and then their seeds are resampled, and the standard error is multiplied by Student's t, as scenes are few. \
     Below three seeds, or three scenes, there is none";
 

@@ -26,8 +26,8 @@ use crate::run::{Observer, Partial};
 use contender::Contender;
 
 /// Options of a run that are the comparison's to set.
-const OWN_OPTIONS: [&str; 7] =
-    ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations"];
+const OWN_OPTIONS: [&str; 8] =
+    ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations", "view"];
 /// What stands for all policies.
 const ALL: &str = "all";
 /// Measurements along each run, for the curves.

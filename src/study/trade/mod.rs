@@ -22,8 +22,8 @@ use levels::{Factor, factors};
 use report::Report;
 
 /// Options of a run that are the study's to set.
-const OWN_OPTIONS: [&str; 7] =
-    ["scene", "budget", "seed", "iterations", "output", "knob", "preset"];
+const OWN_OPTIONS: [&str; 8] =
+    ["scene", "budget", "seed", "iterations", "output", "knob", "preset", "view"];
 
 /// The factor of a run in which no knob is changed, which is one with the preset `exact`.
 const BASE: &str = "";

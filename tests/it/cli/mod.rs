@@ -23,6 +23,7 @@ mod starting;
 mod trading;
 mod training;
 mod view;
+mod watching;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
