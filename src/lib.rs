@@ -26,10 +26,11 @@
 //!
 //! Features, all on by default: `formats` (models in other formats than PLY), `gpu` (the GPU backend),
 //! `scenegen` (built-in scenes and known surfaces), `selftest` (the float64 renderer and the command
-//! that compares with it), `study` (`compare` and `trade`), `view` (a page in the browser).
+//! that compares with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).
 
 mod animation;
 pub mod backend;
+mod base64;
 pub mod blocks;
 pub mod camera;
 pub mod checkpoint;
@@ -42,6 +43,8 @@ pub mod failure;
 pub mod flight;
 mod foreign;
 pub mod gaussians;
+#[cfg(feature = "study")]
+mod html;
 pub mod import;
 pub mod importance;
 pub mod init;
@@ -51,6 +54,8 @@ pub mod metrics;
 mod number;
 pub mod output;
 mod pictures;
+#[cfg(feature = "study")]
+mod report;
 pub mod run;
 pub mod schedule;
 pub mod sh;

@@ -30,6 +30,8 @@ mod plan;
 mod policies;
 mod progress;
 mod render;
+#[cfg(feature = "study")]
+mod report;
 #[cfg(feature = "scenegen")]
 mod scenegen;
 #[cfg(feature = "selftest")]
@@ -61,10 +63,10 @@ use without::devices;
 use without::scenegen;
 #[cfg(not(feature = "selftest"))]
 use without::selftest;
-#[cfg(not(feature = "study"))]
-use without::study;
 #[cfg(not(feature = "view"))]
 use without::view;
+#[cfg(not(feature = "study"))]
+use without::{report, study};
 
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
 ///
@@ -87,6 +89,7 @@ Examples:
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            the same views as PNG files
   densify view output/garden-diet                          the model in the browser
+  densify report output/garden-diet -o garden.html         scores, curves and pictures as one file
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compress output/garden-diet --to 5MiB -o garden.sog
                                                            a smaller file of it
@@ -122,6 +125,7 @@ enum Command {
     Compress(Box<compress::CompressArgs>),
     Export(Box<export::ExportArgs>),
     Render(Box<render::RenderArgs>),
+    Report(report::ReportArgs),
     Compare(study::Comparison),
     Devices(devices::DevicesArgs),
     Knobs(knobs::KnobsArgs),
@@ -168,6 +172,7 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
         Command::Compress(compress) => compress::run(&compress, given, &console),
         Command::Export(export) => export::run(&export, given, &console),
         Command::Render(render) => render::run(&render, given, &console),
+        Command::Report(report) => report::run(&report, &console),
         Command::Compare(comparison) => study::compare(&comparison, &console),
         Command::Devices(devices) => devices::run(&devices, &console),
         Command::Knobs(knobs) => knobs::run(&knobs, &console),
@@ -188,8 +193,8 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
 
 /// The command line, with the defaults of a run's options in the commands that have them.
 fn command() -> clap::Command {
-    const WITH_RUN_OPTIONS: [&str; 8] =
-        ["train", "plan", "compress", "eval", "export", "render", "selftest", "view"];
+    const WITH_RUN_OPTIONS: [&str; 9] =
+        ["train", "plan", "compress", "eval", "export", "render", "report", "selftest", "view"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
         command.mut_subcommand(name, flags::with_defaults)
     })

@@ -63,7 +63,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
         refuse_options_of_a_file(matches)?;
     }
     // The port first: it is known at once, and a model may take long to read.
-    let server = Server::open(Place { host: args.host, port: args.port })?;
+    let server = Server::open(Place { host: args.host, port: args.port, has_secret: false })?;
     let RenderingArgs { near, device, data } = &args.rendering;
     let machine = Machine::open(device, console)?;
     let looked = Looked {

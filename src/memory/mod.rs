@@ -69,7 +69,7 @@ pub enum Section {
 }
 
 impl Section {
-    const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Model => "model",
             Self::Gradients => "gradients",

@@ -30,6 +30,8 @@ pub use records::{
     RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
     write_scores,
 };
+#[cfg(feature = "study")]
+pub(crate) use records::{all_scores, events_of, psnr_by_view, read_stats, steps_of, summary_of};
 pub use tensorboard::TensorBoard;
 
 pub use crate::evaluate::Mean;

@@ -154,8 +154,8 @@ fn decided(
     parameters: &toml::Table,
 ) -> Result<RunConfig, Failure> {
     let mut spec = inputs.spec.clone();
-    // It is where the file is.
-    spec.output.output = None;
+    // It is where the file is, and who looks is no part of it.
+    (spec.output.output, spec.output.view) = (None, None);
     let name = inputs.entry.name;
     let budget = spec.size.budget.unwrap_or(super::Budget::Rows(setting.rows));
     spec.size.budget = Some(budget.limited_to(setting.rows));

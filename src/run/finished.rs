@@ -14,6 +14,8 @@ use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::import;
 use crate::metrics::geometry::{self, Geometry, KnownScene};
+#[cfg(any(feature = "study", feature = "view"))]
+use crate::output::is_in_use;
 use crate::output::{model_path, saved_iterations};
 use crate::views::DatasetViews;
 
@@ -111,6 +113,32 @@ pub(crate) fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> 
             )))
         }
     }
+}
+
+/// The iteration asked for, or the last one saved, of a run that may be training: then says so. Also whether it
+/// is.
+#[cfg(any(feature = "study", feature = "view"))]
+pub(crate) fn iteration_so_far(
+    run: &Path,
+    asked: Option<u32>,
+    observer: &dyn Observer,
+) -> Result<(u32, bool), Failure> {
+    let trains = is_in_use(run);
+    if trains && saved_iterations(run).is_err() {
+        let run = run.display();
+        return Err(Failure::input(format!(
+            "{run} is being trained and has saved no model yet; wait until it has, or train with \
+             --save-iterations 1000,2000 to look at it before its end"
+        )));
+    }
+    let iteration = iteration(run, asked)?;
+    if trains {
+        let run = run.display();
+        observer.say(format_args!(
+            "note: {run} is being trained; what is shown is its model of iteration {iteration}"
+        ));
+    }
+    Ok((iteration, trains))
 }
 
 /// The file of what is named: a model, or a run's of the iteration asked for, or its last.

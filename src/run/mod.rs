@@ -21,8 +21,10 @@ mod values;
 use std::path::PathBuf;
 
 pub use config::{DegreeSource, ModelSize, Resolved, RunConfig};
-pub use observer::{Interrupt, Observer, Silent};
+pub use observer::{Between, Interrupt, Observer, Silent};
 pub use overlay::Partial;
+#[cfg(feature = "study")]
+pub(crate) use report::Reductions;
 pub use report::{LeftOut, Requirements};
 pub use resolve::{Alternatives, DEFAULT_BUDGET, Plan, plan};
 pub(crate) use resolve::{promised, use_threads};
@@ -93,6 +95,18 @@ impl Run {
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
+    }
+
+    /// What it is, with nothing open.
+    #[cfg(feature = "view")]
+    pub(crate) fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
+    /// The dataset, without its points.
+    #[cfg(feature = "view")]
+    pub(crate) fn dataset(&self) -> &Dataset {
+        &self.dataset
     }
 
     /// The trainer.

@@ -2,6 +2,11 @@
 
 use std::fmt;
 
+use crate::backend::Backend;
+use crate::evaluate::Mean;
+use crate::output::StepRecord;
+use crate::trainer::EditEvent;
+
 /// A signal that asks a run to end in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Interrupt {
@@ -9,6 +14,15 @@ pub struct Interrupt {
     pub name: &'static str,
     /// The exit code of a process that it ends.
     pub exit_code: u8,
+}
+
+/// What a run does where an observer has looked at its model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Between {
+    /// The next step.
+    Step,
+    /// It writes a checkpoint, and asks again.
+    Checkpoint,
 }
 
 /// Follows a run. All methods do nothing unless they are implemented.
@@ -21,6 +35,23 @@ pub trait Observer {
 
     /// A step is done.
     fn step(&self, _step: u32, _loss: f32, _rows: usize) {}
+
+    /// A record of the log, over the steps since the one before.
+    fn recorded(&self, _record: &StepRecord) {}
+
+    /// The rows were edited.
+    fn edited(&self, _event: &EditEvent) {}
+
+    /// The test views were measured.
+    fn tested(&self, _step: u32, _mean: &Mean) {}
+
+    /// A checkpoint was written, or this is why it could not be.
+    fn kept(&self, _step: u32, _trouble: Option<&str>) {}
+
+    /// Before every step the model may be looked at: what is rendered here changes nothing. Training waits.
+    fn between(&self, _model: &mut dyn Backend) -> Between {
+        Between::Step
+    }
 
     /// Training has ended, or failed.
     fn end(&self) {}

@@ -1,10 +1,18 @@
 //! `stats/requirements.json`: what a run left out automatically, on what evidence, and at what cost.
 
-use serde::Serialize;
+#[cfg(feature = "study")]
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
 
 use super::config::{DegreeSource, RunConfig};
 use crate::gaussians::MAX_SH_DEGREE;
+#[cfg(feature = "study")]
+use crate::output::{OutputError, read_stats};
 use crate::trainer::{AutoBudget, MIN_GAIN};
+
+/// The file, in the folder of the run.
+pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
 
 /// The report of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -23,8 +31,25 @@ pub struct Requirements {
     pub left_out: Vec<LeftOut>,
 }
 
+/// What `stats/requirements.json` says was left out.
+#[cfg(feature = "study")]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub(crate) struct Reductions {
+    /// Whether automatic reductions were disabled.
+    pub(crate) full: bool,
+    pub(crate) left_out: Vec<LeftOut>,
+}
+
+#[cfg(feature = "study")]
+impl Reductions {
+    /// Of a run; `None` where the file does not exist.
+    pub(crate) fn read(run: &Path) -> Result<Option<Self>, OutputError> {
+        read_stats(&run.join(REQUIREMENTS))
+    }
+}
+
 /// Something that was left out.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
     /// What was left out.
     pub what: String,

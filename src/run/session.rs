@@ -9,7 +9,7 @@ use cpu_time::ProcessTime;
 
 use super::Run;
 use super::measuring::measure;
-use super::observer::{Interrupt, Observer};
+use super::observer::{Between, Interrupt, Observer};
 use super::records::{Logs, Totals};
 use crate::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
 use crate::evaluate::{EvaluateError, Split, evaluate};
@@ -186,6 +186,7 @@ impl<'a> Session<'a> {
         }
         self.observer.begin(done, last, budget);
         let stepped = (done + 1..=last).try_for_each(|step| {
+            self.rest();
             if let Some(interrupt) = self.observer.interrupt() {
                 return Err(self.interrupted(interrupt));
             }
@@ -195,6 +196,24 @@ impl<'a> Session<'a> {
         });
         self.observer.end();
         stepped.and_then(|()| self.check_drawn())
+    }
+
+    /// Lets the observer look at the model, and writes the checkpoints that it asks for.
+    fn rest(&mut self) {
+        while self.observer.between(self.run.trainer.backend()) == Between::Checkpoint {
+            self.keep_or_say();
+        }
+    }
+
+    /// Writes a checkpoint; where it cannot be written training goes on, as the run is worth more, and the one
+    /// before is still there.
+    fn keep_or_say(&mut self) {
+        let step = self.run.trainer.steps_done();
+        let trouble = self.keep().err().map(|error| {
+            tracing::error!(step, "the checkpoint could not be written, training goes on: {error}");
+            format!("the checkpoint of step {step} could not be written: {error}")
+        });
+        self.observer.kept(step, trouble.as_deref());
     }
 
     /// Fails where the model draws nothing in most of the last views: that is no result.
@@ -229,13 +248,7 @@ impl<'a> Session<'a> {
             self.test(step, step == duties.last)?;
         }
         if due && !there(checkpoint_path(&self.folder, step)) {
-            // The run is worth more than its checkpoint; the one before is still there.
-            if let Err(error) = self.keep() {
-                tracing::error!(
-                    step,
-                    "the checkpoint could not be written, training goes on: {error}"
-                );
-            }
+            self.keep_or_say();
         }
         Ok(())
     }
@@ -315,8 +328,9 @@ impl<'a> Session<'a> {
     }
 
     fn record(&mut self, report: &StepReport) -> Result<(), OutputError> {
-        let Self { logs, totals, run, .. } = self;
+        let Self { logs, totals, run, observer, .. } = self;
         for event in &report.events {
+            observer.edited(event);
             logs.events.append(event)?;
         }
         totals.step(&report.output, run.dataset.train.len());
@@ -325,6 +339,7 @@ impl<'a> Session<'a> {
         let ends = [run.config.spec.schedule.iterations.0, run.last].contains(&step);
         if step.is_multiple_of(RECORD_EVERY) || ends {
             let record = totals.record(step, report.rows);
+            observer.recorded(&record);
             logs.steps.append(&record)?;
             logs.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
         }
@@ -366,6 +381,7 @@ impl<'a> Session<'a> {
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
         self.logs.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
         self.totals.tested.insert(step, mean);
+        self.observer.tested(step, &mean);
         if !is_last {
             self.observer.say(format_args!(
                 "step {step}: test PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}"

@@ -318,6 +318,14 @@ run_spec! {
         #[arg(short, long, value_name = "DIR")]
         output: Option<PathBuf> = None, Free;
 
+        /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
+        /// curves and edits, that can pause, keep and stop the run (default port: the first free one from 8080
+        /// on). The run is the same with it and without; of --memory the page takes a part
+        #[arg(
+            long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0"
+        )]
+        view: Option<u16> = None, Free;
+
         /// Iterations after which to save the model, besides the last
         #[arg(long, value_name = "N", num_args = 1.., value_delimiter = ',')]
         save_iterations: Vec<u32> = Vec::new(), Free;

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::Run;
-use super::report::Requirements;
+use super::report::{REQUIREMENTS, Requirements};
 use super::session::Session;
 use crate::memory::Bytes;
 use crate::number::{duration, grouped};
@@ -39,7 +39,7 @@ impl Session<'_> {
             test_views: test.count(),
             test: self.totals.tested.clone(),
         };
-        write_json(&self.folder.join("stats/requirements.json"), &self.requirements())?;
+        write_json(&self.folder.join(REQUIREMENTS), &self.requirements())?;
         write_json(&self.folder.join("stats/summary.json"), &summary)
     }
 

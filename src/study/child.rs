@@ -2,13 +2,12 @@
 //! that describes it.
 
 use std::fmt::Display;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use crate::dataset::{GroundTruth, builtin};
 use crate::failure::{Failure, OTHER};
-use crate::output::{Summary, write_atomically};
+use crate::output::{Summary, summary_of, write_atomically};
 use crate::run::{Partial, RunSpec};
 
 /// A run of a study, by its description, and the folder that it writes.
@@ -93,9 +92,10 @@ fn wait_for(command: &mut Command) -> Result<(), Failure> {
 
 /// `stats/summary.json` of a run.
 pub(super) fn summary(run: &Path) -> Result<Summary, Failure> {
-    let path = run.join("stats/summary.json");
-    let read = fs::read(&path).and_then(|text| Ok(serde_json::from_slice(&text)?));
-    read.map_err(|e| Failure { code: OTHER, message: format!("{}: {e}", path.display()) })
+    summary_of(run)?.ok_or_else(|| Failure {
+        code: OTHER,
+        message: format!("{}: there is no stats/summary.json", run.display()),
+    })
 }
 
 /// Whether the surface of a scene is known.

@@ -25,17 +25,17 @@ pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
 
 /// A difference between two runs of the same scene and seed.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Pair<'a> {
-    pub(super) scene: &'a str,
-    pub(super) seed: u32,
-    pub(super) difference: f64,
+pub(crate) struct Pair<'a> {
+    pub(crate) scene: &'a str,
+    pub(crate) seed: u32,
+    pub(crate) difference: f64,
 }
 
 /// The mean of paired differences.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Difference {
+pub(crate) struct Difference {
     /// Over scenes, of means over seeds.
-    pub(super) mean: f64,
+    pub(crate) mean: f64,
     /// 95 % interval of the mean ([`INTERVALS`]).
     pub(super) interval: Option<[f64; 2]>,
     pub(super) pairs: usize,
@@ -51,7 +51,7 @@ pub(super) struct Difference {
 
 impl Difference {
     /// The statistics of these pairs; `None` where there are none.
-    pub(super) fn new(pairs: &[Pair<'_>]) -> Option<Self> {
+    pub(crate) fn new(pairs: &[Pair<'_>]) -> Option<Self> {
         let mut by_scene: BTreeMap<&str, BTreeMap<u32, Vec<f64>>> = BTreeMap::new();
         for pair in pairs {
             let seeds = by_scene.entry(pair.scene).or_default();
@@ -80,13 +80,13 @@ impl Difference {
     }
 
     /// `+0.12 [+0.05, +0.19]`; `+0.12, two runs` where there is no interval.
-    pub(super) fn show(&self, digits: usize) -> String {
+    pub(crate) fn show(&self, digits: usize) -> String {
         let low_and_high = |[low, high]: [f64; 2]| format!("{low:+.digits$}, {high:+.digits$}");
         format!("{:+.digits$}{}", self.mean, self.within(low_and_high))
     }
 
     /// What follows the mean: the interval as `show` writes it, or why there is none.
-    pub(super) fn within(&self, show: impl Fn([f64; 2]) -> String) -> String {
+    pub(crate) fn within(&self, show: impl Fn([f64; 2]) -> String) -> String {
         let why = match (self.scenes, self.seeds, self.pairs == self.seeds) {
             (2.., ..) => "two scenes",
             (_, 1, true) => "one run",

@@ -9,12 +9,14 @@ mod cell;
 mod child;
 mod columns;
 mod compare;
-mod difference;
+pub(crate) mod difference;
 mod journal;
 mod markdown;
+pub(crate) mod panel;
 mod plot;
 mod record;
 mod trade;
+pub(crate) mod window;
 
 use std::path::{Path, PathBuf};
 
@@ -23,6 +25,7 @@ pub(crate) use trade::Trade;
 
 use crate::dataset::builtin;
 use crate::failure::Failure;
+use crate::html;
 use crate::output::write_atomically;
 use crate::run::Observer;
 use cell::Cell;
@@ -82,10 +85,12 @@ impl<'a> Study<'a> {
         Ok(outcomes)
     }
 
-    /// Writes the report `name`.md.
+    /// Writes the report, as `name`.md, and as `name`.html with its pictures in it.
     fn finish(&self, name: &str, text: &str, summary: String) -> Result<Finished, Failure> {
         let report = self.output.join(name).with_extension("md");
         write_atomically(&report, |out| out.write_all(text.as_bytes()))?;
+        let page = html::from_markdown(text, &|file| html::embed_file(&self.output.join(file)))?;
+        write_atomically(&report.with_extension("html"), |out| out.write_all(page.as_bytes()))?;
         Ok(Finished { summary, report })
     }
 }

@@ -118,6 +118,11 @@ fn check(asked: Asked, extent: &Extent) -> Result<Wanted, String> {
     if kind == Kind::Count && !extent.counts {
         return Err("rows per pixel are not counted on a GPU; start with --backend cpu".into());
     }
+    if kind.paints() && !extent.paints {
+        return Err(
+            "rows are not painted while a run trains; look at the run with densify view".into()
+        );
+    }
     let (size, is_moving) = ((width, height), moving);
     Ok(Wanted { owner: (page, place), kind, model, size, is_moving, from })
 }
@@ -142,7 +147,7 @@ mod tests {
 
     fn extent() -> Extent {
         let normalisation = Normalisation { centre: glam::DVec3::ZERO, scale: 0.5 };
-        Extent { models: 2, views: [3, 0], normalisation, counts: false }
+        Extent { models: 2, views: [3, 0], normalisation, counts: false, paints: false }
     }
 
     fn asked(changes: Value) -> Result<Wanted, String> {
@@ -195,6 +200,7 @@ mod tests {
             (json!({ "model": 2 }), "model"),
             (json!({ "kind": "shadow" }), "no picture"),
             (json!({ "kind": "count" }), "GPU"),
+            (json!({ "kind": "row_size" }), "trains"),
             (json!({ "path": "/etc/passwd" }), "unknown field"),
             (json!({ "camera": null }), "either"),
             (json!({ "view": { "split": "test", "number": 0 } }), "either"),

@@ -52,16 +52,20 @@ pub(super) fn describe(stage: &Stage) -> Value {
     let stride = stage.points.len().div_ceil(MOST_POINTS).max(1);
     let positions = stage.points.positions.iter().step_by(stride).map(|&at| point(at));
     let colours = stage.points.colours.iter().step_by(stride);
-    let models = stage.models.iter().map(|model| {
-        json!({ "name": model.name, "rows": model.backend.rows(), "degree": model.sh_degree })
-    });
+    let models = stage
+        .models
+        .iter()
+        .map(|model| json!({ "name": model.name, "rows": model.rows, "degree": model.sh_degree }));
     let extent = stage.extent();
     let has_views = extent.views.iter().any(|&views| views > 0);
     let kinds = Kind::ALL.into_iter().filter(|kind| {
-        (has_views || !kind.needs_photograph()) && (extent.counts || *kind != Kind::Count)
+        (has_views || !kind.needs_photograph())
+            && (extent.counts || *kind != Kind::Count)
+            && (extent.paints || !kind.paints())
     });
     json!({
         "title": stage.title,
+        "live": stage.largest.is_some(),
         "models": models.collect::<Vec<Value>>(),
         "kinds": kinds.map(Kind::legend).collect::<Vec<_>>(),
         "ramp": ramp::STOPS,

@@ -2,6 +2,7 @@
 
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use super::asked::Wanted;
 use super::pictures::Frame;
@@ -13,6 +14,8 @@ pub(super) enum Unmade {
     Superseded,
     /// It could not be made, for this reason.
     Failed(String),
+    /// Too many others wait.
+    Crowded,
     /// Nothing is made any more.
     Over,
 }
@@ -43,9 +46,16 @@ struct Queue {
 pub(super) struct Desk {
     queue: Mutex<Queue>,
     bell: Condvar,
+    /// Most wishes that wait; as many as there are connections without.
+    most: Option<usize>,
 }
 
 impl Desk {
+    /// A desk at which no more wishes wait than this.
+    pub(super) fn bounded(most: usize) -> Self {
+        Self { most: Some(most), ..Self::default() }
+    }
+
     fn queue(&self) -> MutexGuard<'_, Queue> {
         // Each change is whole before anything can fail.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
@@ -63,6 +73,9 @@ impl Desk {
             let owner = &ticket.wanted.owner;
             // The newer wish has the place of the older one, so that who moves does not wait for ever.
             match queue.waiting.iter().position(|older| older.wanted.owner == *owner) {
+                None if self.most.is_some_and(|most| queue.waiting.len() >= most) => {
+                    return Err(Unmade::Crowded);
+                }
                 None => queue.waiting.push(ticket),
                 Some(place) => {
                     let older = std::mem::replace(&mut queue.waiting[place], ticket);
@@ -86,6 +99,21 @@ impl Desk {
             }
             queue = self.bell.wait(queue).unwrap_or_else(PoisonError::into_inner);
         }
+    }
+
+    /// The next wish, if one is there or comes within this time.
+    pub(super) fn next_within(&self, patience: Duration) -> Option<Ticket> {
+        let mut queue = self.queue();
+        if queue.waiting.is_empty() && !queue.is_over && !patience.is_zero() {
+            let waited = self.bell.wait_timeout(queue, patience);
+            queue = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        if queue.waiting.is_empty() { None } else { Some(queue.waiting.remove(0)) }
+    }
+
+    /// Whether nothing is made any more.
+    pub(super) fn is_over(&self) -> bool {
+        self.queue().is_over
     }
 
     /// Takes no more wishes; those that wait are told.
@@ -127,6 +155,28 @@ mod tests {
             is_moving: true,
             from: Viewpoint::View(Split::Test, number),
         }
+    }
+
+    #[test]
+    fn a_bounded_desk_turns_away_who_would_wait_too_long() {
+        let desk = Desk::bounded(1);
+        assert!(desk.next_within(Duration::ZERO).is_none());
+        thread::scope(|scope| {
+            let first = scope.spawn(|| desk.ask(wish("a", 0)));
+            while desk.queue().waiting.is_empty() {
+                thread::yield_now();
+            }
+            assert_eq!(desk.ask(wish("b", 0)).unwrap_err(), Unmade::Crowded);
+            // A newer wish of who waits has its place.
+            let second = scope.spawn(|| desk.ask(wish("a", 1)));
+            assert_eq!(first.join().unwrap().unwrap_err(), Unmade::Superseded);
+            let ticket = desk.next_within(Duration::ZERO).unwrap();
+            ticket.reply(Err(Unmade::Failed("made".into())));
+            assert_eq!(second.join().unwrap().unwrap_err(), Unmade::Failed("made".into()));
+            assert!(!desk.is_over());
+            desk.close();
+            assert!(desk.is_over() && desk.next_within(Duration::from_secs(60)).is_none());
+        });
     }
 
     #[test]

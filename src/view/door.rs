@@ -2,7 +2,7 @@
 //!
 //! A page of another origin that a browser has open can send requests here too. On this machine alone, names
 //! that lead elsewhere are refused (a stranger's name may be made to lead here) and so is what another origin
-//! sends. Towards a network the address holds a secret as well.
+//! sends. Towards a network, and where a run can be stopped, the address holds a secret as well.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 
@@ -21,6 +21,8 @@ pub(crate) struct Place {
     pub(crate) host: IpAddr,
     /// The port; the first that is free without.
     pub(crate) port: Option<u16>,
+    /// Whether the address holds a secret on this machine alone, too: for what does more than show.
+    pub(crate) has_secret: bool,
 }
 
 /// An open place.
@@ -28,7 +30,9 @@ pub(crate) struct Place {
 pub(super) struct Door {
     pub(super) listener: TcpListener,
     address: SocketAddr,
-    /// What the path begins with, where others reach the address.
+    /// Whether other machines reach it.
+    is_public: bool,
+    /// What the path begins with, where others reach the address or more is done than shown.
     secret: Option<String>,
 }
 
@@ -38,7 +42,7 @@ impl Door {
     /// # Errors
     /// When the port is taken, or the address is not this machine's.
     pub(super) fn open(place: Place) -> Result<Self, Failure> {
-        let Place { host, port } = place;
+        let Place { host, port, has_secret } = place;
         let bind = |port: u16| {
             let listener = TcpListener::bind((host, port))?;
             Ok((listener.local_addr()?, listener))
@@ -63,8 +67,9 @@ impl Door {
                 free.map_or_else(|| bind(0), Ok).map_err(|error| refused(0, error))?
             }
         };
-        let secret = if host.is_loopback() { None } else { Some(secret()?) };
-        Ok(Self { listener, address, secret })
+        let is_public = !host.is_loopback();
+        let secret = if is_public || has_secret { Some(secret()?) } else { None };
+        Ok(Self { listener, address, is_public, secret })
     }
 
     /// What to type into a browser on this machine.
@@ -83,7 +88,7 @@ impl Door {
 
     /// Whether other machines reach it.
     pub(super) fn is_public(&self) -> bool {
-        self.secret.is_some()
+        self.is_public
     }
 
     /// What a request is for, without the leading `/` and the secret.
@@ -92,9 +97,9 @@ impl Door {
     /// A refusal where it may not ask.
     pub(super) fn admit<'a>(&self, request: &'a Request) -> Result<&'a str, Answer> {
         let forbidden = |why: &str| Err(Answer::refusal(403, why));
-        if self.secret.is_none() && !is_this_machine(&request.host) {
+        if !self.is_public && !is_this_machine(&request.host) {
             return forbidden(
-                "this page is for browsers on its own machine; open http://localhost/ with its port",
+                "this page is for browsers on its own machine; open the address that densify has printed",
             );
         }
         // A form of another page, or its script, says where it is from.
@@ -109,7 +114,7 @@ impl Door {
         {
             return Err(Answer::refusal(415, "send application/json"));
         }
-        let nothing = "there is nothing here; use the whole address that densify view has printed";
+        let nothing = "there is nothing here; use the whole address that densify has printed";
         let path = match (request.path.strip_prefix('/'), &self.secret) {
             (Some(path), Some(secret)) => {
                 path.split_at_checked(secret.len()).and_then(|(given, rest)| {
@@ -154,7 +159,7 @@ mod tests {
     use super::*;
 
     fn door(host: IpAddr) -> Door {
-        Door::open(Place { host, port: Some(0) }).unwrap()
+        Door::open(Place { host, port: Some(0), has_secret: false }).unwrap()
     }
 
     fn request(path: &str, host: &str, origin: Option<&str>) -> Request {
@@ -223,18 +228,34 @@ mod tests {
     }
 
     #[test]
+    fn what_stops_a_run_has_a_secret_and_is_for_this_machine_alone() {
+        let host = Ipv4Addr::LOCALHOST.into();
+        let door = Door::open(Place { host, port: Some(0), has_secret: true }).unwrap();
+        assert!(!door.is_public());
+        let secret = door.secret.clone().unwrap();
+        let ask = |path: &str, host: &str| {
+            door.admit(&request(path, host, None)).map(str::to_owned).map_err(|no| no.status())
+        };
+        assert_eq!(ask(&format!("/{secret}/order"), "localhost:8080"), Ok("order".to_owned()));
+        assert_eq!(ask("/order", "localhost:8080"), Err(404));
+        assert_eq!(ask(&format!("/{secret}/order"), "evil.example"), Err(403));
+    }
+
+    #[test]
     fn a_port_in_use_is_named_and_without_one_the_next_is_taken() {
         let first = door(Ipv4Addr::LOCALHOST.into());
         let port = first.address.port();
         let host = Ipv4Addr::LOCALHOST.into();
-        let refused = Door::open(Place { host, port: Some(port) }).unwrap_err();
+        let refused = Door::open(Place { host, port: Some(port), has_secret: false }).unwrap_err();
         assert!(
             refused.code == 2 && refused.message.contains(&format!("--port {port}")),
             "{refused}"
         );
-        let two = [(); 2].map(|()| Door::open(Place { host, port: None }).unwrap());
+        let two =
+            [(); 2].map(|()| Door::open(Place { host, port: None, has_secret: false }).unwrap());
         assert_ne!(two[0].address, two[1].address);
-        let elsewhere = Place { host: Ipv4Addr::new(192, 0, 2, 7).into(), port: Some(0) };
+        let elsewhere =
+            Place { host: Ipv4Addr::new(192, 0, 2, 7).into(), port: Some(0), has_secret: false };
         let refused = Door::open(elsewhere).unwrap_err();
         assert!(refused.code == 2 && refused.message.contains("--host 192.0.2.7"), "{refused}");
     }

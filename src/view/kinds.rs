@@ -59,6 +59,11 @@ impl Kind {
         matches!(self, Self::Photograph | Self::Difference)
     }
 
+    /// Whether rows are in other colours than their own.
+    pub(super) fn paints(self) -> bool {
+        matches!(self, Self::Rows | Self::RowOpacity | Self::RowSize | Self::RowShape)
+    }
+
     pub(super) fn legend(self) -> Legend {
         let (label, about, unit) = match self {
             Self::Render => {

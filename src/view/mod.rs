@@ -1,15 +1,17 @@
 //! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
 //!
-//! One thread has the models. Connections bring wishes to its [`desk`], which keeps the newest of each page,
-//! and take pictures away. Everything that a browser sends is checked before ([`door`], [`asked`]); no path of
+//! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
+//! [`desk`], which keeps the newest of each page, and take pictures away. Everything that a browser sends is checked before ([`door`], [`asked`]); no path of
 //! the disk is served. Prints nothing.
 
 mod asked;
+mod board;
 mod describe;
 mod desk;
 mod door;
 mod http;
 mod kinds;
+pub(crate) mod live;
 mod open;
 mod paint;
 mod pictures;
@@ -26,6 +28,7 @@ pub(crate) use open::{Looked, is_run, open};
 use routes::Routes;
 pub(crate) use stage::Stage;
 
+use crate::backend::Backend;
 use crate::failure::{Failure, OTHER};
 
 /// A page that can be opened.
@@ -67,14 +70,18 @@ impl Server {
             desk: &desk,
             extent: stage.extent(),
             description: describe::describe(&stage).to_string(),
+            board: None,
         };
         let failed = |message: String| Failure { code: OTHER, message };
         thread::scope(|scope| {
             let desk = &desk;
             let renders = scope.spawn(move || {
                 let _closing = Closing(desk);
+                let mut backends = std::mem::take(&mut stage.backends);
+                let mut backends: Vec<&mut dyn Backend> =
+                    backends.iter_mut().map(|backend| &mut **backend as &mut dyn Backend).collect();
                 while let Some(ticket) = desk.next() {
-                    let made = pictures::make(&mut stage, &ticket.wanted);
+                    let made = pictures::make(&mut stage, &mut backends, &ticket.wanted);
                     ticket.reply(made);
                 }
             });

@@ -13,8 +13,8 @@ use crate::failure::Failure;
 use crate::flight::Key;
 use crate::gaussians::{Gaussians, logit};
 use crate::init::{initialise, random_points};
-use crate::output::{CONFIG_FILE, is_in_use, model_path, saved_iterations};
-use crate::run::finished::{Machine, is_model, iteration, load, or_moved, read_model};
+use crate::output::{CONFIG_FILE, model_path};
+use crate::run::finished::{Machine, is_model, iteration_so_far, load, or_moved, read_model};
 use crate::run::{DataSpec, Observer, RunConfig};
 
 /// Most points of a scene that are shown as Gaussians.
@@ -67,7 +67,7 @@ pub(crate) fn open(
             Some(scene) => of_dataset(machine, what, load(&scene, &data, observer)?, &data),
             None => without_cameras(machine, what, &model, &data)?,
         };
-        stage.show(name(what), model, near)?;
+        stage.show(name_of(what), model, near)?;
         stage
     } else if is_run(what) {
         let (model, config, iteration) = of_run(what, iteration, observer)?;
@@ -76,7 +76,7 @@ pub(crate) fn open(
         let dataset = load(&path, &config.spec.data, observer)
             .map_err(|failure| if has_moved { failure } else { or_moved(failure, &path) })?;
         let mut stage = of_dataset(machine, what, dataset, &config.spec.data);
-        let called = format!("{}, iteration {iteration}", name(what));
+        let called = format!("{}, iteration {iteration}", name_of(what));
         stage.show(called, model, config.spec.start.near.0)?;
         stage
     } else {
@@ -93,7 +93,7 @@ pub(crate) fn open(
         return of_points(machine, what, dataset, &data, near);
     };
     if let Some(other) = other {
-        let called = name(other);
+        let called = name_of(other);
         if is_model(other) {
             stage.show(called, read_model(other, observer)?, near)?;
         } else {
@@ -106,7 +106,7 @@ pub(crate) fn open(
 }
 
 /// The last part of a path: what lies above is nobody's business.
-fn name(path: &Path) -> String {
+pub(super) fn name_of(path: &Path) -> String {
     let last = path.canonicalize().ok();
     let last = last.as_deref().unwrap_or(path).file_name().unwrap_or(path.as_os_str());
     last.to_string_lossy().into_owned()
@@ -127,21 +127,7 @@ fn of_run(
     observer: &dyn Observer,
 ) -> Result<(Gaussians, RunConfig, u32), Failure> {
     let config = RunConfig::read(run)?;
-    let trains = is_in_use(run);
-    if trains && saved_iterations(run).is_err() {
-        let run = run.display();
-        return Err(Failure::input(format!(
-            "{run} is being trained and has saved no model yet; wait until it has, or train with \
-             --save-iterations 1000,2000 to look at it before its end"
-        )));
-    }
-    let iteration = iteration(run, asked)?;
-    if trains {
-        let run = run.display();
-        observer.say(format_args!(
-            "note: {run} is being trained; what is shown is its model of iteration {iteration}"
-        ));
-    }
+    let (iteration, _) = iteration_so_far(run, asked, observer)?;
     let model = read_model(&model_path(run, iteration), observer)?;
     Ok((model, config, iteration))
 }
@@ -149,7 +135,7 @@ fn of_run(
 fn of_dataset(machine: Machine, what: &Path, dataset: Dataset, data: &DataSpec) -> Stage {
     let Dataset { train, test, points, normalisation, .. } = dataset;
     let views = [test, train];
-    Stage::new(machine, name(what), normalisation, data.background.fixed(), views, points)
+    Stage::new(machine, name_of(what), normalisation, data.background.fixed(), views, points)
 }
 
 /// A model alone: the middle of its rows is the middle of what is looked at.
@@ -184,7 +170,7 @@ fn without_cameras(
     let none = || [Vec::new(), Vec::new()];
     let points = PointCloud::default();
     let background = data.background.fixed();
-    let mut stage = Stage::new(machine, name(what), normalisation, background, none(), points);
+    let mut stage = Stage::new(machine, name_of(what), normalisation, background, none(), points);
     // A little from above, y pointing down as structure from motion has it.
     let turn = DMat3::from_rotation_x(-0.25);
     let centre = turn * DVec3::new(0.0, 0.0, -2.5);
@@ -214,8 +200,8 @@ fn of_points(
     model.opacity_logits.fill(logit(POINT_OPACITY));
     model.log_scales.as_flattened_mut().iter_mut().for_each(|scale| *scale += POINT_SIZE.ln());
     let called = match is_random {
-        true => format!("{}: random points, as it has none of its own", name(what)),
-        false => format!("{}: its points", name(what)),
+        true => format!("{}: random points, as it has none of its own", name_of(what)),
+        false => format!("{}: its points", name_of(what)),
     };
     let mut stage = of_dataset(machine, what, dataset, data);
     stage.show_in_scene(called, &model, near)?;
@@ -233,7 +219,7 @@ impl Stage {
     fn show_in_scene(&mut self, name: String, model: &Gaussians, near: f64) -> Result<(), Failure> {
         let (sh_degree, near) = (model.sh_degree, (near * EXTENT) as f32);
         let backend = self.machine.backend_in_scene(model, near, (1, 1))?;
-        self.models.push(Shown { name, backend, sh_degree, near, paint: None });
+        self.add(Shown { name, rows: model.len(), sh_degree, near, paint: None }, backend);
         Ok(())
     }
 }

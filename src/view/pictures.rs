@@ -12,7 +12,7 @@ use super::kinds::Kind;
 use super::paint::{self, ends};
 use super::ramp;
 use super::stage::Stage;
-use crate::backend::Rendering;
+use crate::backend::{Backend, Rendering};
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::evaluate::Split;
@@ -53,10 +53,15 @@ struct Drawn {
     distance: Option<f64>,
 }
 
-/// Makes the picture.
-pub(super) fn make(stage: &mut Stage, wanted: &Wanted) -> Result<Frame, Unmade> {
+/// Makes the picture. The models are in these backends.
+pub(super) fn make(
+    stage: &mut Stage,
+    backends: &mut [&mut dyn Backend],
+    wanted: &Wanted,
+) -> Result<Frame, Unmade> {
     let begun = Instant::now();
-    let Drawn { image, range, mean, distance } = draw(stage, wanted).map_err(Unmade::Failed)?;
+    let Drawn { image, range, mean, distance } =
+        draw(stage, backends[wanted.model], wanted).map_err(Unmade::Failed)?;
     let quality = if wanted.is_moving { MOVING } else { STILL };
     let mut jpeg = Vec::new();
     let (size, colours) = (image.dimensions(), ExtendedColorType::Rgb8);
@@ -67,7 +72,7 @@ pub(super) fn make(stage: &mut Stage, wanted: &Wanted) -> Result<Frame, Unmade> 
     Ok(Frame { jpeg, size, range, mean, distance, milliseconds })
 }
 
-fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
+fn draw(stage: &mut Stage, backend: &mut dyn Backend, wanted: &Wanted) -> Result<Drawn, String> {
     let camera = camera(stage, wanted);
     match (wanted.kind, wanted.from) {
         (Kind::Photograph, Viewpoint::View(split, number)) => {
@@ -76,7 +81,7 @@ fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
         }
         (Kind::Difference, Viewpoint::View(split, number)) => {
             let image = shot(stage, (split, number), &camera)?;
-            let rendering = render(stage, wanted.model, &camera)?;
+            let rendering = render(stage, backend, wanted.model, &camera)?;
             let map = flip_map(&rendering.rgb, &image, stage.background)
                 .map_err(|error| error.to_string())?;
             let mean = map.iter().sum::<f64>() / map.len().max(1) as f64;
@@ -87,7 +92,7 @@ fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
         }
         (Kind::Rows | Kind::RowOpacity | Kind::RowSize | Kind::RowShape, _) => {
             let units = 1.0 / stage.normalisation.scale;
-            let painted = stage.paint(wanted.model).map_err(|error| error.to_string())?;
+            let painted = stage.paint(wanted.model, backend).map_err(|error| error.to_string())?;
             let range = painted.show(wanted.kind, units).map_err(|error| error.to_string())?;
             let rendering = painted
                 .backend
@@ -97,7 +102,6 @@ fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
             Ok(Drawn { range, distance, ..plain(picture(&rendering)) })
         }
         (Kind::Count, _) => {
-            let backend = &mut stage.models[wanted.model].backend;
             let rendering = backend.render_counts(&camera).map_err(|error| error.to_string())?;
             let counts: Vec<f64> = rendering.depth.iter().copied().map(f64::from).collect();
             let most = ends(&counts).end.max(1.0);
@@ -106,11 +110,11 @@ fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
             Ok(Drawn { image, range: Some(0.0..most), mean: Some(mean), distance: None })
         }
         (Kind::Depth, _) => {
-            let rendering = render(stage, wanted.model, &camera)?;
+            let rendering = render(stage, backend, wanted.model, &camera)?;
             Ok(depth(stage, &rendering))
         }
         (Kind::Opacity, _) => {
-            let rendering = render(stage, wanted.model, &camera)?;
+            let rendering = render(stage, backend, wanted.model, &camera)?;
             let Rendering { width, height, alpha, .. } = &rendering;
             let grey =
                 |x: u32, y: u32| Rgb([to_u8(alpha[y as usize * *width as usize + x as usize]); 3]);
@@ -118,7 +122,7 @@ fn draw(stage: &mut Stage, wanted: &Wanted) -> Result<Drawn, String> {
             Ok(Drawn { distance: distance(stage, &rendering), ..plain(image) })
         }
         (Kind::Render | Kind::Photograph | Kind::Difference, _) => {
-            let rendering = render(stage, wanted.model, &camera)?;
+            let rendering = render(stage, backend, wanted.model, &camera)?;
             Ok(Drawn { distance: distance(stage, &rendering), ..plain(picture(&rendering)) })
         }
     }
@@ -131,6 +135,7 @@ fn plain(image: RgbImage) -> Drawn {
 /// The camera to render with. That of a view keeps its shape; at its own size the picture is the one that is
 /// measured.
 fn camera(stage: &Stage, wanted: &Wanted) -> Camera {
+    let wanted = &Wanted { size: within(wanted.size, stage.largest), ..wanted.clone() };
     match wanted.from {
         Viewpoint::Free(key) => {
             stage.normalisation.scene_from_world_camera(&key.camera(wanted.size))
@@ -146,6 +151,17 @@ fn camera(stage: &Stage, wanted: &Wanted) -> Camera {
     }
 }
 
+/// A size of the same shape that is no larger than the largest, where there is one.
+fn within((width, height): (u32, u32), largest: Option<(u32, u32)>) -> (u32, u32) {
+    let Some(most) = largest.filter(|most| width > most.0 || height > most.1) else {
+        return (width, height);
+    };
+    let scale = [(most.0, width), (most.1, height)];
+    let [x, y] = scale.map(|(most, wanted)| f64::from(most) / f64::from(wanted));
+    let side = |side: u32, most: u32| ((f64::from(side) * x.min(y)) as u32).clamp(1, most);
+    (side(width, most.0), side(height, most.1))
+}
+
 /// A size of the same shape that fits what is wanted; of photographs not larger than it was.
 fn fitted(own: (u32, u32), Wanted { size, kind, .. }: &Wanted) -> (u32, u32) {
     let [width, height] = [own.0, own.1].map(f64::from);
@@ -157,9 +173,13 @@ fn fitted(own: (u32, u32), Wanted { size, kind, .. }: &Wanted) -> (u32, u32) {
     }
 }
 
-fn render(stage: &mut Stage, model: usize, camera: &Camera) -> Result<Rendering, String> {
-    let shown = &mut stage.models[model];
-    let made = shown.backend.render(camera, stage.background, shown.sh_degree);
+fn render(
+    stage: &Stage,
+    backend: &mut dyn Backend,
+    model: usize,
+    camera: &Camera,
+) -> Result<Rendering, String> {
+    let made = backend.render(camera, stage.background, stage.models[model].sh_degree);
     made.map_err(|error| error.to_string())
 }
 
@@ -217,6 +237,20 @@ fn distance(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pictures_of_a_run_in_training_are_no_larger_than_its_photographs() {
+        for (wanted, fitted) in [
+            ((64, 48), (64, 48)),
+            ((1280, 800), (640, 400)),
+            ((800, 1280), (300, 480)),
+            ((4096, 1), (640, 1)),
+            ((641, 480), (640, 479)),
+        ] {
+            assert_eq!(within(wanted, Some((640, 480))), fitted);
+            assert_eq!(within(wanted, None), wanted);
+        }
+    }
 
     #[test]
     fn a_view_keeps_its_shape_and_a_photograph_is_never_enlarged() {

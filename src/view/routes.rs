@@ -1,6 +1,9 @@
 //! Which request gets what. No path names a file: what is served is built in, or made on request.
 
+use serde::Deserialize;
+
 use super::asked::{self, Wanted};
+use super::board::{Board, Order};
 use super::desk::{Desk, Unmade};
 use super::door::Door;
 use super::http::{Answer, Method, Request};
@@ -10,6 +13,7 @@ use super::stage::Extent;
 const PAGE: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/view.css");
 const SCRIPT: &str = include_str!("page/view.js");
+const LIVE_SCRIPT: &str = include_str!("page/live.js");
 
 /// What answers need.
 pub(super) struct Routes<'a> {
@@ -18,6 +22,14 @@ pub(super) struct Routes<'a> {
     pub(super) extent: Extent,
     /// The [description](super::describe) of what is shown, as JSON.
     pub(super) description: String,
+    /// What is said of a run in training, and asked of it.
+    pub(super) board: Option<&'a Board>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Asked {
+    order: Order,
 }
 
 impl Routes<'_> {
@@ -28,8 +40,22 @@ impl Routes<'_> {
             Err(refusal) => return refusal,
         };
         let text = |kind, text: &'static str| Answer::of(kind, text.as_bytes());
-        let known = ["", "view.css", "view.js", "scene", "frame"];
+        let json = |text: String| Answer::of("application/json", text.into_bytes());
+        let known = ["", "view.css", "view.js", "live.js", "scene", "frame"];
+        let known_of_training = ["progress", "order"];
         match (request.method, path) {
+            (Method::Post, "order") if let Some(board) = self.board => {
+                match serde_json::from_slice(&request.body) {
+                    Ok(Asked { order }) => {
+                        board.order(order);
+                        json("{}".to_owned())
+                    }
+                    Err(error) => Answer::refusal(400, format_args!("this is no order: {error}")),
+                }
+            }
+            (Method::Get | Method::Head, "progress") if let Some(board) = self.board => {
+                json(board.json())
+            }
             (Method::Post, "frame") => match asked::read(&request.body, &self.extent) {
                 Ok(wanted) => self.frame(wanted),
                 Err(refusal) => refusal,
@@ -39,10 +65,14 @@ impl Routes<'_> {
             (Method::Get | Method::Head, "view.js") => {
                 text("text/javascript; charset=utf-8", SCRIPT)
             }
-            (Method::Get | Method::Head, "scene") => {
-                Answer::of("application/json", self.description.clone().into_bytes())
+            (Method::Get | Method::Head, "live.js") => {
+                text("text/javascript; charset=utf-8", LIVE_SCRIPT)
             }
-            (_, path) if known.contains(&path) => {
+            (Method::Get | Method::Head, "scene") => json(self.description.clone()),
+            (_, path)
+                if known.contains(&path)
+                    || self.board.is_some() && known_of_training.contains(&path) =>
+            {
                 Answer::refusal(405, "this is asked for in another way")
             }
             _ => Answer::refusal(404, "there is nothing here"),
@@ -55,8 +85,9 @@ impl Routes<'_> {
             Err(Unmade::Superseded) => {
                 Answer::refusal(409, "a newer picture was asked for meanwhile")
             }
+            Err(Unmade::Crowded) => Answer::refusal(503, "too many pages look at once; close some"),
             Err(Unmade::Failed(why)) => Answer::refusal(500, why),
-            Err(Unmade::Over) => Answer::refusal(503, "densify view has ended; start it again"),
+            Err(Unmade::Over) => Answer::refusal(503, "densify has ended; start it again"),
         }
     }
 }
@@ -87,19 +118,31 @@ mod tests {
 
     #[test]
     fn only_what_is_built_in_is_served() {
-        let door = Door::open(Place { host: Ipv4Addr::LOCALHOST.into(), port: Some(0) }).unwrap();
+        let door = Door::open(Place {
+            host: Ipv4Addr::LOCALHOST.into(),
+            port: Some(0),
+            has_secret: false,
+        })
+        .unwrap();
         let extent = Extent {
             models: 1,
             views: [0, 0],
             normalisation: Normalisation::IDENTITY,
             counts: true,
+            paints: true,
         };
         let desk = Desk::default();
         desk.close();
-        let routes = Routes { door: &door, desk: &desk, extent, description: "{}".into() };
+        let routes = Routes {
+            door: &door,
+            desk: &desk,
+            extent: extent.clone(),
+            description: "{}".into(),
+            board: None,
+        };
         let status = |request: &Request| routes.answer(request).status();
         let get = |path: &str| status(&Request::get(path, "localhost", None));
-        for path in ["/", "/view.css", "/view.js", "/scene"] {
+        for path in ["/", "/view.css", "/view.js", "/live.js", "/scene"] {
             assert_eq!(get(path), 200, "{path}");
         }
         for path in [
@@ -112,6 +155,8 @@ mod tests {
             "*",
             "",
             "/page/view.js",
+            "/progress",
+            "/order",
         ] {
             assert_eq!(get(path), 404, "{path}");
         }
@@ -129,11 +174,43 @@ mod tests {
         let wish = r#"{"page": "a", "kind": "render", "width": 9, "height": 9, "camera":
             {"camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1], "fov": 50}}"#;
         assert_eq!(post("/frame", wish), 503);
+        // A run in training says more, and takes orders: those that there are.
+        let board = Board::default();
+        let live = Routes {
+            door: &door,
+            desk: &desk,
+            extent,
+            description: "{}".into(),
+            board: Some(&board),
+        };
+        let send = |body: &str| {
+            live.answer(&Request {
+                method: Method::Post,
+                content_type: Some("application/json".into()),
+                body: body.into(),
+                ..Request::get("/order", "localhost", None)
+            })
+        };
+        for (body, status) in [
+            ("{}", 400),
+            (r#"{"order": "explode"}"#, 400),
+            (r#"{"order": "stop", "now": true}"#, 400),
+            ("stop", 400),
+        ] {
+            assert_eq!(send(body).status(), status, "{body}");
+        }
+        assert!(!board.stops());
+        assert_eq!(send(r#"{"order": "stop"}"#).status(), 200);
+        assert!(board.stops(), "the order is not taken");
+        let progress = live.answer(&Request::get("/progress", "localhost", None));
+        let said: serde_json::Value = serde_json::from_slice(progress.body()).unwrap();
+        assert_eq!(said["state"], "preparing");
+        assert_eq!(live.answer(&Request::get("/order", "localhost", None)).status(), 405);
     }
 
     #[test]
     fn the_page_loads_nothing_of_others() {
-        for text in [PAGE, STYLE, SCRIPT] {
+        for text in [PAGE, STYLE, SCRIPT, LIVE_SCRIPT] {
             for word in ["http://", "https://", "//cdn", "@import", "eval("] {
                 let strange = text.replace("http://www.w3.org/", "");
                 assert!(!strange.contains(word), "{word}");

@@ -1,5 +1,11 @@
 //! `densify train`.
 
+#[cfg(feature = "view")]
+mod page;
+#[cfg(not(feature = "view"))]
+#[path = "without_page.rs"]
+mod page;
+
 use std::cell::RefCell;
 use std::fmt;
 use std::path::PathBuf;
@@ -49,7 +55,8 @@ Examples:
   densify train data/chair --background white --init-points 50k
   densify train data/room --iterations 3000 --policy diet --policy-set diet.rho=0.2
   densify train --config output/garden-diet/config.toml -o runs/again
-  densify train data/garden --resume";
+  densify train data/garden --resume
+  densify train data/garden --view            and look at it meanwhile";
 
 impl TrainArgs {
     /// The run that this call describes, by file or by flag; with the checkpoint that it goes on from, if it
@@ -86,13 +93,17 @@ pub(super) fn run(
     if occupied != Occupied::Resume {
         RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
+    // The port first: it is known at once, and a scene may take long to read.
+    let page = spec.output.view.map(page::open).transpose()?;
     let run = Run::prepare_observed(&spec, resumed, &follower)?;
     if occupied != Occupied::Resume {
         announce_preset(&spec, console)?;
     }
     follower.listen();
-    run.train(occupied, &follower)?;
-    Ok(())
+    match page {
+        None => run.train(occupied, &follower).map(drop),
+        Some(page) => page::train(&page, run, occupied, &follower, console),
+    }
 }
 
 /// Says what the preset was measured to cost and gain, where the run is as long as it was then.

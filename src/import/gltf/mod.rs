@@ -5,7 +5,6 @@
 //! has, mostly y down. As splat-transform does, a half turn about z leads from one to the other.
 
 mod accessors;
-mod base64;
 mod nodes;
 
 use std::collections::BTreeMap;
@@ -17,6 +16,7 @@ use serde_json::Value;
 
 use super::model::{Row, Rows, largest, log_of_scale, malformed, quantised_logit};
 use super::{SplatFile, beside, spz, unfold};
+use crate::base64;
 use crate::dataset::DatasetError;
 use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients, sigmoid};
 pub(crate) use accessors::SHAPES;

@@ -16,6 +16,8 @@ use crate::metrics::{geometry, scratch_bytes};
 use crate::run::measuring::Measuring;
 use crate::run::start::{first_bytes, reading_bytes};
 use crate::trainer::AutoChoices;
+#[cfg(feature = "view")]
+use crate::view::live as page;
 
 /// What the program takes for itself: its code as far as it runs, and the stacks of its threads.
 /// Measured at 10 to 13 MiB, and at about 14 MiB in builds for tests (profile `dev`).
@@ -113,6 +115,16 @@ impl Inputs<'_> {
         let piece = budget.min(ROWS_AT_A_TIME as u64);
         let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
         pass("export of the model, checkpoint", 2 * piece * row + held);
+        #[cfg(feature = "view")]
+        if self.spec.output.view.is_some() {
+            let photograph =
+                train.held(0).max(test.held(0)) + train.decoding(1).max(test.decoding(1));
+            let image = self.dataset.largest_image();
+            pass("a picture for the page", page::passing_bytes(image, photograph, threads));
+            let views = self.dataset.train.len() + self.dataset.test.len();
+            ledger.add_to(Section::Renderer, "the page", page::lasting_bytes(image, views));
+        }
+        let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
         let measures_test = !self.dataset.test.is_empty();
         if measures_test || self.required != AutoChoices::default() || self.init_model.is_some() {
             let (width, height) = self.dataset.largest_image();

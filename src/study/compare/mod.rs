@@ -26,8 +26,8 @@ use crate::run::{Observer, Partial};
 use contender::Contender;
 
 /// Options of a run that are the comparison's to set.
-const OWN_OPTIONS: [&str; 7] =
-    ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations"];
+const OWN_OPTIONS: [&str; 8] =
+    ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations", "view"];
 /// What stands for all policies.
 const ALL: &str = "all";
 /// Measurements along each run, for the curves.
@@ -47,7 +47,7 @@ Examples:
 ///
 /// Every policy runs with every budget and every seed, one run after another. A run that is
 /// finished is not run again: call the same command to go on after an interruption. The folder then
-/// holds compare.md (tables and pictures), compare.jsonl (a record per run), plots as SVG, and the
+/// holds compare.md (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run), plots as SVG, and the
 /// runs themselves.
 ///
 /// Quality is measured on views held out. Differences are taken between runs of the same scene,

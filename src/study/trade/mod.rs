@@ -22,8 +22,8 @@ use levels::{Factor, factors};
 use report::Report;
 
 /// Options of a run that are the study's to set.
-const OWN_OPTIONS: [&str; 7] =
-    ["scene", "budget", "seed", "iterations", "output", "knob", "preset"];
+const OWN_OPTIONS: [&str; 8] =
+    ["scene", "budget", "seed", "iterations", "output", "knob", "preset", "view"];
 
 /// The factor of a run in which no knob is changed, which is one with the preset `exact`.
 const BASE: &str = "";
@@ -41,7 +41,7 @@ Examples:
 /// the same seeds.
 ///
 /// A run that is finished is not run again: call the same command to go on after an interruption. The
-/// folder then holds trade.md (tables and plots), trade.jsonl (a record per line), plots as SVG, and
+/// folder then holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per line), plots as SVG, and
 /// the runs themselves.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]

@@ -12,7 +12,7 @@ use super::conversation::converse;
 use super::{Answer, Request};
 
 /// Connections at a time: a browser opens six to a page.
-pub(super) const SEATS: usize = 64;
+pub(in crate::view) const SEATS: usize = 64;
 /// Bytes of the stack of a connection's thread.
 const STACK: usize = 256 << 10;
 /// How often it is asked whether to end.

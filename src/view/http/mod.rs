@@ -11,7 +11,7 @@ mod conversation;
 mod head;
 
 pub(super) use answer::Answer;
-pub(super) use connections::serve;
+pub(super) use connections::{SEATS, serve};
 pub(super) use head::{Method, Request};
 
 #[cfg(test)]

@@ -53,6 +53,12 @@ function changed() {
   wake();
 }
 
+/** Asks for a new picture of what has not moved: the model has changed. */
+function lookAgain() {
+  version += 1;
+  wake();
+}
+
 /** Leaves the camera of a view, so that one may move: what is seen stays as large as it is. */
 function leaveView() {
   if (!view) return;
@@ -212,7 +218,8 @@ async function keepAsking() {
       if (complete === version) stage.dataset.rested = Math.round(performance.now() - changedAt);
     } catch (error) {
       const isGone = error instanceof TypeError;
-      trouble(isGone ? "densify view does not answer; start it again, and this page goes on." : error.message);
+      const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page goes on.";
+      trouble(isGone ? gone : error.message);
       stage.dataset.state = "trouble";
       if (!isGone) complete = asked;
       await new Promise((resolve) => setTimeout(resolve, 1000));
@@ -698,6 +705,7 @@ async function open() {
   try { isNew = localStorage.getItem("densify-view") === null; } catch { /* Then it is new. */ }
   if (isNew) byId("guide").showModal();
   keepAsking();
+  if (scene.live) followTraining(lookAgain);
 }
 
 open();

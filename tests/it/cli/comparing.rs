@@ -53,6 +53,11 @@ fn every_run_is_there_once_and_in_the_table() {
         let bytes = read(&output.join(picture));
         assert!(bytes.starts_with(b"<svg") || bytes.starts_with(b"\x89PNG"), "{picture}");
     }
+    // The same as one file.
+    let page = read_text(&output.join("compare.html"));
+    super::reporting::stands_for_itself(&page);
+    assert_eq!(page.matches("src=\"data:image/").count(), 5);
+    assert!(page.contains("<td>vanilla</td>") && page.contains("near = 0.04"), "{page}");
 
     // Again: nothing runs, and nothing changes.
     let before = files(&output);

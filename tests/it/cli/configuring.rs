@@ -58,7 +58,7 @@ fn a_run_has_every_option_in_its_file() {
     let config = config(&run);
     // What is not set is what there is nothing to set to.
     let unset = ["test_every", "images", "resolution", "init_points", "memory", "preset"];
-    let elsewhere = ["gpu", "threads", "output"];
+    let elsewhere = ["gpu", "threads", "output", "view"];
     for option in OPTIONS {
         let is_unset = unset.contains(&option.name) || elsewhere.contains(&option.name);
         assert_eq!(config.contains_key(option.name), !is_unset, "{}", option.name);

@@ -16,6 +16,7 @@ mod killing;
 mod knobs;
 mod looking;
 mod memory;
+mod reporting;
 mod requiring;
 mod resuming;
 mod same;
@@ -23,6 +24,7 @@ mod starting;
 mod trading;
 mod training;
 mod view;
+mod watching;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -51,6 +51,9 @@ fn every_level_is_measured_once_and_in_the_table() {
     let picture = table.split("](").nth(1).and_then(|rest| rest.split(')').next());
     let picture = read(&output.join(picture.expect("a plot")));
     assert!(picture.starts_with(b"<svg"));
+    let page = read_text(&output.join("trade.html"));
+    super::reporting::stands_for_itself(&page);
+    assert!(page.contains("<td>alpha_min</td>") && page.contains("src=\"data:image/svg+xml"));
 
     // Again: nothing runs, and nothing changes.
     let before = files(&output);

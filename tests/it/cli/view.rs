@@ -13,31 +13,31 @@ use super::{call, json, scratch, text, train};
 use crate::photographs::{Photographs, SIZE};
 
 /// A page that is being served.
-struct Page {
-    program: Child,
-    said: BufReader<ChildStdout>,
+pub(super) struct Page {
+    pub(super) program: Child,
+    pub(super) said: BufReader<ChildStdout>,
     /// Address and port.
-    place: String,
+    pub(super) place: String,
     /// What the path begins with and ends in: `/`, or `/` and a secret and `/`.
-    path: String,
+    pub(super) path: String,
     /// What it said before.
     before: String,
 }
 
 /// What came back.
 #[derive(Debug)]
-struct Reply {
-    status: u16,
+pub(super) struct Reply {
+    pub(super) status: u16,
     head: String,
-    body: Vec<u8>,
+    pub(super) body: Vec<u8>,
 }
 
 impl Reply {
-    fn text(&self) -> String {
+    pub(super) fn text(&self) -> String {
         String::from_utf8_lossy(&self.body).into_owned()
     }
 
-    fn picture(&self) -> RgbImage {
+    pub(super) fn picture(&self) -> RgbImage {
         assert_eq!(self.status, 200, "{}", self.text());
         let format = image::ImageFormat::Jpeg;
         image::load_from_memory_with_format(&self.body, format).expect("a JPEG").into_rgb8()
@@ -46,11 +46,17 @@ impl Reply {
 
 impl Page {
     fn open(words: &str) -> Self {
+        Self::of(&format!("view {words} --port 0 --backend cpu"))
+    }
+
+    /// The page of a command.
+    pub(super) fn of(command: &str) -> Self {
         let mut program = Command::new(env!("CARGO_BIN_EXE_densify"))
-            .args(format!("view {words} --port 0 --backend cpu").split_whitespace())
+            .args(command.split_whitespace())
             .env_remove("RUST_LOG")
             .env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"))
             .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
             .spawn()
             .expect("it starts");
         let mut said = BufReader::new(program.stdout.take().expect("a pipe"));
@@ -67,25 +73,31 @@ impl Page {
         Self { program, said, place: place.to_owned(), path: format!("/{path}"), before }
     }
 
-    fn connect(&self) -> TcpStream {
+    pub(super) fn connect(&self) -> TcpStream {
         let stream = TcpStream::connect(&self.place).expect("it listens");
         stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a time");
         stream
     }
 
     /// Sends bytes, and reads until the connection ends.
-    fn send(&self, request: &[u8]) -> Reply {
-        let mut stream = self.connect();
-        stream.write_all(request).expect("it reads");
-        let mut bytes = Vec::new();
-        stream.read_to_end(&mut bytes).expect("it answers");
-        let end = bytes.windows(4).position(|four| four == b"\r\n\r\n").expect("a head") + 4;
-        let head = String::from_utf8(bytes[..end].to_vec()).expect("a head is text");
-        let status = head.split(' ').nth(1).and_then(|word| word.parse().ok());
-        Reply { status: status.expect("a status"), body: bytes.split_off(end), head }
+    pub(super) fn send(&self, request: &[u8]) -> Reply {
+        self.try_send(request).expect("it listens, reads and answers")
     }
 
-    fn get(&self, path: &str) -> Reply {
+    /// The same; nothing where the page has ended.
+    fn try_send(&self, request: &[u8]) -> Option<Reply> {
+        let mut stream = TcpStream::connect(&self.place).ok()?;
+        stream.set_read_timeout(Some(Duration::from_secs(60))).ok()?;
+        stream.write_all(request).ok()?;
+        let mut bytes = Vec::new();
+        stream.read_to_end(&mut bytes).ok()?;
+        let end = bytes.windows(4).position(|four| four == b"\r\n\r\n")? + 4;
+        let head = String::from_utf8(bytes[..end].to_vec()).expect("a head is text");
+        let status = head.split(' ').nth(1).and_then(|word| word.parse().ok());
+        Some(Reply { status: status.expect("a status"), body: bytes.split_off(end), head })
+    }
+
+    pub(super) fn get(&self, path: &str) -> Reply {
         let Self { place, .. } = self;
         self.send(
             format!("GET {path} HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\r\n").as_bytes(),
@@ -93,16 +105,21 @@ impl Page {
     }
 
     fn post(&self, more: &str, body: &str) -> Reply {
+        self.try_post("frame", more, body).expect("it answers")
+    }
+
+    /// Asks for something of the page; nothing where it has ended.
+    pub(super) fn try_post(&self, what: &str, more: &str, body: &str) -> Option<Reply> {
         let Self { place, path, .. } = self;
         let request = format!(
-            "POST {path}frame HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\
+            "POST {path}{what} HTTP/1.1\r\nHost: {place}\r\nConnection: close\r\n\
              Content-Type: application/json\r\nContent-Length: {}\r\n{more}\r\n{body}",
             body.len()
         );
-        self.send(request.as_bytes())
+        self.try_send(request.as_bytes())
     }
 
-    fn frame(&self, wish: &Value) -> Reply {
+    pub(super) fn frame(&self, wish: &Value) -> Reply {
         self.post("", &wish.to_string())
     }
 
@@ -131,7 +148,7 @@ fn run_of(scene: &Photographs, run: &Path) {
 }
 
 /// The view of a split, at most so large.
-fn wish(kind: &str, split: &str, number: usize, size: (u32, u32)) -> Value {
+pub(super) fn wish(kind: &str, split: &str, number: usize, size: (u32, u32)) -> Value {
     let view = json!({ "split": split, "number": number });
     json!({ "page": "test", "kind": kind, "width": size.0, "height": size.1, "view": view })
 }

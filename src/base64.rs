@@ -1,7 +1,7 @@
-//! Decodes base64 (RFC 4648, section 4), with or without padding.
+//! Base64 (RFC 4648, section 4): read with or without padding, written with it.
 
 /// The bytes; `None` where the text is not base64.
-pub(super) fn decode(text: &str) -> Option<Vec<u8>> {
+pub(crate) fn decode(text: &str) -> Option<Vec<u8>> {
     let text = text.trim_end_matches('=').as_bytes();
     let mut bytes = Vec::with_capacity(text.len() / 4 * 3 + 2);
     for four in text.chunks(4) {
@@ -28,6 +28,22 @@ fn value(symbol: u8) -> Option<u8> {
     })
 }
 
+/// The text of some bytes.
+#[cfg(feature = "study")]
+pub(crate) fn encode(bytes: &[u8]) -> String {
+    const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for three in bytes.chunks(3) {
+        let byte = |at: usize| u32::from(three.get(at).copied().unwrap_or(0));
+        let word = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for at in 0..4 {
+            let symbol = SYMBOLS[(word >> (18 - 6 * at)) as usize & 63];
+            text.push(if at > three.len() { '=' } else { char::from(symbol) });
+        }
+    }
+    text
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -40,6 +56,12 @@ mod tests {
             assert_eq!(decode(text).unwrap(), bytes.as_bytes(), "{text}");
         }
         assert_eq!(decode("+/8="), Some(vec![0xfb, 0xff]));
+        #[cfg(feature = "study")]
+        for (bytes, text) in
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")]
+        {
+            assert_eq!(encode(bytes.as_bytes()), text);
+        }
         for wrong in ["Z", "Zm9vY", "Zm-v", "Zm 9v"] {
             assert_eq!(decode(wrong), None, "{wrong}");
         }

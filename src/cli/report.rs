@@ -1,0 +1,75 @@
+//! `densify report`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::console::Console;
+use super::export::check_output;
+use crate::failure::Failure;
+use crate::memory::Bytes;
+use crate::output::OutputError;
+use crate::report::{self, Wanted};
+use crate::run::DeviceSpec;
+
+/// Writes what a run, or several, arrived at as one HTML file.
+///
+/// The file needs nothing beside it and loads nothing: it can be mailed, and opens in any browser. It holds the
+/// scores, the worst and the best views held out with a slider between photograph and render, a turn around the
+/// scene, curves of loss, Gaussians, PSNR and memory, the edits, what was left out, and the settings. Of several
+/// runs, those that differ by their seed alone are averaged, with 95 % intervals from three on; the first of each
+/// are shown, over each other where they are of the same scene.
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct ReportArgs {
+    /// Folders that `densify train` wrote
+    #[arg(value_name = "RUN", required = true)]
+    runs: Vec<PathBuf>,
+    /// File to write; its name ends in .html
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Replace a file that exists
+    #[arg(long)]
+    overwrite: bool,
+    /// Saved iteration of the runs `[default: the last of each]`
+    #[arg(long, value_name = "N")]
+    iteration: Option<u32>,
+    /// Folder of the dataset, where it is no longer where it was
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
+    #[command(flatten)]
+    device: DeviceSpec,
+}
+
+const EXAMPLES: &str = "\
+Paths of this machine are not in the file, but the names of the runs' folders, of the dataset's and of its
+photographs are.
+
+Examples:
+  densify report output/garden-diet -o garden.html
+  densify report output/garden-diet output/garden-mcmc -o garden.html
+  densify report output/seed0 output/seed1 output/seed2 -o seeds.html --overwrite";
+
+pub(super) fn run(args: &ReportArgs, console: &Console) -> Result<(), Failure> {
+    let file = &args.output;
+    let is_html = file.extension().is_some_and(|ending| {
+        ["html", "htm"].iter().any(|known| ending.eq_ignore_ascii_case(known))
+    });
+    if !is_html {
+        let file = file.display();
+        return Err(Failure::input(format!(
+            "-o: {file}: a report is HTML; name a file that ends in .html"
+        )));
+    }
+    check_output(file, args.overwrite)?;
+    let wanted = Wanted {
+        runs: &args.runs,
+        iteration: args.iteration,
+        scene: args.scene.as_deref(),
+        device: &args.device,
+    };
+    report::write(&wanted, file, console)?;
+    let size = file.metadata().map_err(OutputError::io("read", file))?.len();
+    console.result(format_args!("report   {} ({})", file.display(), Bytes(size)));
+    Ok(())
+}

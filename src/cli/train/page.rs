@@ -1,0 +1,28 @@
+//! The page of a run in training.
+
+use std::net::Ipv4Addr;
+
+use super::Follower;
+use crate::cli::console::Console;
+use crate::failure::Failure;
+use crate::run::{Occupied, Run};
+use crate::view::{Place, Server};
+
+/// Takes the port; 0 is the first that is free.
+pub(super) fn open(port: u16) -> Result<Server, Failure> {
+    let port = (port != 0).then_some(port);
+    Server::open(Place { host: Ipv4Addr::LOCALHOST.into(), port, has_secret: true })
+}
+
+/// Trains the run, and serves its page meanwhile.
+pub(super) fn train(
+    page: &Server,
+    run: Run,
+    occupied: Occupied,
+    follower: &Follower<'_>,
+    console: &Console,
+) -> Result<(), Failure> {
+    // Without its address the page is of no use, so a quiet run says it too.
+    console.result(format_args!("page     {}", page.url()));
+    page.follow(run, follower, |run, observer| run.train(occupied, observer).map(drop))
+}

@@ -1,0 +1,149 @@
+//! What the folder of a run says.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use super::Wanted;
+use crate::evaluate::Mean;
+use crate::failure::Failure;
+use crate::foreign;
+use crate::metrics::geometry::Geometry;
+use crate::output::{
+    StepRecord, Summary, all_scores, events_of, geometry_of, psnr_by_view, steps_of, summary_of,
+};
+use crate::run::finished::{is_model, iteration_so_far};
+use crate::run::{Observer, Reductions, RunConfig};
+use crate::trainer::EditEvent;
+
+/// A run, as its folder tells it.
+pub(super) struct Told {
+    pub(super) folder: PathBuf,
+    /// The folder's name, with as much of what is above as tells it from others.
+    pub(super) name: String,
+    pub(super) config: RunConfig,
+    /// Of the model that is shown.
+    pub(super) iteration: u32,
+    /// Whether it is being trained.
+    pub(super) trains: bool,
+    /// What it says at its end; not while it trains, as it may be that of an earlier stop.
+    pub(super) summary: Option<Summary>,
+    pub(super) steps: Vec<StepRecord>,
+    pub(super) events: Vec<EditEvent>,
+    /// What was left out automatically, once the run has ended.
+    pub(super) reductions: Option<Reductions>,
+    /// Mean scores on the test views by iteration.
+    pub(super) scores: BTreeMap<u32, Mean>,
+    /// PSNR of the test views with this model, by name `[dB]`.
+    pub(super) by_view: BTreeMap<String, f64>,
+    pub(super) geometry: Option<Geometry>,
+}
+
+impl Told {
+    /// Reads all runs, in the order in which they are named.
+    pub(super) fn read_all(
+        wanted: &Wanted<'_>,
+        observer: &dyn Observer,
+    ) -> Result<Vec<Self>, Failure> {
+        let mut whole: Vec<PathBuf> = Vec::new();
+        for run in wanted.runs {
+            let place = run.canonicalize().unwrap_or_else(|_| run.clone());
+            if whole.contains(&place) {
+                let run = run.display();
+                return Err(Failure::input(format!("{run} is named twice; name it once")));
+            }
+            whole.push(place);
+        }
+        let names = names(&whole);
+        let told = wanted.runs.iter().zip(names);
+        told.map(|(run, name)| Self::read(run, name, wanted.iteration, observer)).collect()
+    }
+
+    fn read(
+        folder: &Path,
+        name: String,
+        asked: Option<u32>,
+        observer: &dyn Observer,
+    ) -> Result<Self, Failure> {
+        if is_model(folder) {
+            let folder = folder.display();
+            return Err(Failure::input(format!(
+                "{folder} is a model; a report is of a run: name the folder that `densify train` wrote"
+            )));
+        }
+        let config = RunConfig::read(folder)?;
+        let (iteration, trains) = iteration_so_far(folder, asked, observer)?;
+        Ok(Self {
+            folder: folder.to_owned(),
+            name,
+            config,
+            iteration,
+            trains,
+            summary: if trains { None } else { summary_of(folder)? },
+            steps: steps_of(folder)?,
+            events: events_of(folder)?,
+            reductions: if trains { None } else { Reductions::read(folder)? },
+            scores: all_scores(folder)?,
+            by_view: psnr_by_view(folder, iteration)?,
+            geometry: geometry_of(folder, iteration)?,
+        })
+    }
+
+    /// The scores of the model that is shown, where it was measured.
+    pub(super) fn score(&self) -> Option<Mean> {
+        self.scores.get(&self.iteration).copied()
+    }
+
+    /// Rows at the end, as far as it has come.
+    pub(super) fn rows(&self) -> Option<usize> {
+        let so_far = self.steps.last().map(|step| step.rows);
+        self.summary.as_ref().map(|summary| summary.rows).or(so_far)
+    }
+
+    /// Most resident memory `[bytes]`, as far as is known.
+    pub(super) fn peak_bytes(&self) -> Option<u64> {
+        let so_far = self.steps.iter().filter_map(|step| step.resident_bytes).max();
+        self.summary.as_ref().and_then(|summary| summary.peak_bytes).or(so_far)
+    }
+
+    /// Wall time of all steps `[s]`.
+    pub(super) fn seconds(&self) -> Option<f64> {
+        let so_far = self.steps.last().map(|step| step.seconds);
+        self.summary.as_ref().map(|summary| summary.seconds).or(so_far)
+    }
+}
+
+/// A name for each folder: its last part; where two have the same, with the part above it; and then with a
+/// number.
+fn names(folders: &[PathBuf]) -> Vec<String> {
+    let last = |folder: &Path, parts: usize| {
+        let all: Vec<_> = folder.components().map(std::path::Component::as_os_str).collect();
+        let parts = all[all.len().saturating_sub(parts)..].iter().collect::<PathBuf>();
+        foreign::one_line(&parts.to_string_lossy())
+    };
+    let short: Vec<String> = folders.iter().map(|folder| last(folder, 1)).collect();
+    let is_taken = |names: &[String], at: usize| {
+        names.iter().enumerate().any(|(other, name)| other != at && *name == names[at])
+    };
+    let longer =
+        |at: usize| if is_taken(&short, at) { last(&folders[at], 2) } else { short[at].clone() };
+    let names: Vec<String> = (0..folders.len()).map(longer).collect();
+    let numbered = |at: usize| match is_taken(&names, at) {
+        true => format!("{} ({})", names[at], at + 1),
+        false => names[at].clone(),
+    };
+    (0..folders.len()).map(numbered).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_are_called_by_as_little_as_tells_them_apart() {
+        let of = |folders: &[&str]| names(&folders.iter().map(PathBuf::from).collect::<Vec<_>>());
+        assert_eq!(of(&["/home/me/out/a", "/home/me/out/b"]), ["a", "b"]);
+        assert_eq!(of(&["/x/one/run", "/x/two/run", "/x/b"]), ["one/run", "two/run", "b"]);
+        assert_eq!(of(&["/x/one/run", "/y/one/run"]), ["one/run (1)", "one/run (2)"]);
+        assert_eq!(of(&["/x/a\u{1b}[1m"]), ["a\\u{1b}[1m"]);
+    }
+}

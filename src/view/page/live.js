@@ -1,0 +1,112 @@
+// The page of a run in training: how far it is, its curves and edits, and orders to it.
+"use strict";
+
+/** How often the run is asked how it is [ms]. */
+const ASK_EVERY = 1000;
+/** Least time between two pictures of a model that changes [ms]. */
+const LOOK_EVERY = 2000;
+
+/** Begins where the scene says that it is of a run in training. `look` asks for a new picture. */
+function followTraining(look) {
+  const section = byId("training");
+  section.hidden = false;
+  let before = null, lookedAt = 0, lookedStep = -1;
+  const number = (value) => value.toLocaleString("en");
+
+  const order = async (what) => {
+    const answer = await fetch("order", {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ order: what }),
+    });
+    if (!answer.ok) byId("training-trouble").textContent = await answer.text();
+    await ask();
+  };
+  byId("pause").addEventListener("click", () => order(before?.state === "paused" ? "continue" : "pause"));
+  byId("one-step").addEventListener("click", () => order("step"));
+  byId("checkpoint").addEventListener("click", () => order("checkpoint"));
+  byId("stop").addEventListener("click", () => {
+    if (confirm("Stop training? It leaves a checkpoint, and densify train --resume goes on from there.")) order("stop");
+  });
+
+  async function ask() {
+    let now;
+    try {
+      const answer = await fetch("progress");
+      if (!answer.ok) throw new Error(await answer.text());
+      now = await answer.json();
+    } catch {
+      byId("training-state").textContent = "Training has ended, or densify was stopped. The run’s folder has what came of it.";
+      for (const id of ["pause", "one-step", "checkpoint", "stop"]) byId(id).disabled = true;
+      section.dataset.state = "gone";
+      return false;
+    }
+    say(now);
+    const isDue = performance.now() - lookedAt >= LOOK_EVERY || now.state === "paused";
+    if (now.step !== lookedStep && isDue && stage.dataset.state === "sharp") {
+      [lookedAt, lookedStep] = [performance.now(), now.step];
+      look();
+    }
+    before = now;
+    return true;
+  }
+
+  function say(now) {
+    const { state, step, last, rows, budget, seconds, points, tests, edits, checkpoint } = now;
+    section.dataset.state = state;
+    section.dataset.step = step;
+    byId("training-progress").max = last;
+    byId("training-progress").value = step;
+    const words = { preparing: "Preparing", training: "Training", paused: "Paused", stopping: "Stopping", ended: "Measuring and saving" };
+    const left = step && state === "training" ? `, about ${spoken(seconds / step * (last - step))} left` : "";
+    byId("training-state").textContent = `${words[state]}: step ${number(step)} of ${number(last)}${left}.`;
+    const loss = points.at(-1)?.loss;
+    const psnr = tests.at(-1)?.[1];
+    byId("training-numbers").textContent = [
+      loss === undefined ? "" : `Loss ${loss.toFixed(4)}. `,
+      `${number(rows)} of at most ${number(budget)} Gaussians.`,
+      typeof psnr === "number" ? ` Test PSNR ${psnr.toFixed(2)} dB.` : "",
+      checkpoint === null ? "" : ` Checkpoint of step ${number(checkpoint)}.`,
+    ].join("");
+    byId("training-trouble").textContent = now.trouble ?? "";
+    byId("pause").textContent = state === "paused" ? "Continue" : "Pause";
+    const isOver = state === "stopping" || state === "ended";
+    for (const id of ["pause", "one-step", "checkpoint", "stop"]) byId(id).disabled = isOver;
+    curve("loss-curve", points.map((p) => [p.step, p.loss]), last, (y) => y.toPrecision(3));
+    curve("rows-curve", points.map((p) => [p.step, p.rows]), last, (y) => number(Math.round(y)));
+    curve("psnr-curve", tests, last, (y) => `${y.toFixed(2)} dB`);
+    const log = byId("edits");
+    log.replaceChildren(...edits.slice(-20).reverse().map((edit) => {
+      const row = document.createElement("tr");
+      for (const cell of [number(edit.step), edit.cause || "–", `+${number(edit.added)}`, `−${number(edit.removed)}`, number(edit.after)]) {
+        row.append(Object.assign(document.createElement("td"), { textContent: cell }));
+      }
+      return row;
+    }));
+    byId("no-edits").hidden = edits.length > 0;
+  }
+
+  /** A number of seconds in words. */
+  function spoken(seconds) {
+    if (seconds < 90) return `${Math.ceil(seconds)} s`;
+    return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${(seconds / 3600).toFixed(1)} h`;
+  }
+
+  /** Draws points over the whole length of the run, with the newest value in words. */
+  function curve(id, all, last, word) {
+    const figure = byId(id), points = all.filter(([, y]) => Number.isFinite(y));
+    figure.hidden = points.length === 0;
+    if (!points.length) return;
+    const values = points.map(([, y]) => y);
+    const least = Math.min(...values), most = Math.max(...values), range = most - least || 1;
+    const place = ([x, y]) => `${(100 * x / last).toFixed(2)},${(38 - 36 * (y - least) / range).toFixed(2)}`;
+    figure.querySelector("polyline").setAttribute("points", points.map(place).join(" "));
+    figure.querySelector("output").textContent = word(points.at(-1)[1]);
+    figure.querySelector(".ends").textContent = `${word(least)} to ${word(most)}`;
+  }
+
+  const again = async () => {
+    if (await ask()) setTimeout(again, document.hidden ? 5 * ASK_EVERY : ASK_EVERY);
+  };
+  again();
+}

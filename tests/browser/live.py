@@ -1,0 +1,99 @@
+"""Drives the page of `densify train --view` in a real browser: what it shows of a run in training, and its orders.
+
+    python live.py DENSIFY RUN [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
+
+Trains a built-in scene into RUN, which must not exist.
+"""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from view import PATIENCE, PROBE, Browser
+
+STEPS = 3000
+STATE = "document.getElementById('training').dataset"
+
+
+def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
+    def keep(name: str) -> None:
+        if folder:
+            browser.picture(folder / f"{name}.png")
+
+    def size(width: int, height: int) -> None:
+        browser.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def step() -> int:
+        return int(browser.run(f"return {STATE}.step"))
+
+    def click(name: str) -> None:
+        browser.run("document.getElementById(arguments[0]).click()", name)
+
+    size(1280, 800)
+    browser.open(url)
+    browser.is_sharp()
+    browser.press("\ue007")
+    # Curves and edits grow while it trains, and the picture follows it.
+    browser.until(f"Number({STATE}.step) > 300", "training does not go on")
+    browser.until("document.querySelector('#psnr-curve polyline').points.length > 1", "no test was shown")
+    browser.until("document.getElementById('edits').rows.length > 0", "no edit was shown")
+    before = browser.run("return Number(document.getElementById('stage').dataset.pictures)")
+    browser.until(f"Number(document.getElementById('stage').dataset.pictures) > {before}", "the picture does not follow")
+    assert browser.run(PROBE)["spread"] > 4, "the picture is empty"
+    keep("live")
+
+    click("pause")
+    browser.until(f"{STATE}.state === 'paused'", "it is not paused")
+    assert browser.run("return document.getElementById('pause').textContent") == "Continue"
+    paused = step()
+    time.sleep(1.5)
+    assert step() == paused, "a paused run goes on"
+    click("one-step")
+    browser.until(f"Number({STATE}.step) === {paused + 1}", "one step is not one")
+    click("checkpoint")
+    browser.until("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "no checkpoint is shown")
+    assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
+    browser.is_sharp()
+    browser.choose("left", "depth:0")
+    browser.run("document.querySelector('details').open = true")
+    keep("live-paused")
+    size(360, 740)
+    width = browser.run("return document.getElementById('panel').scrollWidth")
+    assert width <= 360, f"the panel is {width} px wide"
+    keep("live-phone")
+    click("pause")
+    browser.until(f"Number({STATE}.step) > {paused + 20}", "it does not continue")
+    browser.run("window.confirm = () => true")
+    click("stop")
+    browser.until(f"['stopping', 'gone'].includes({STATE}.state)", "it does not stop")
+    browser.until(f"{STATE}.state === 'gone'", "the page does not say that training has ended")
+    keep("live-ended")
+    messages = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    strange = [it for it in messages if "ERR_CONNECTION" not in it and "Failed to load" not in it]
+    assert not strange, "\n".join(strange)
+
+
+def main(densify: str, run: str, folder: str | None = None) -> None:
+    if folder:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    command = [densify, "train", "scene:spheres", "-o", run, "--view", "--iterations", str(STEPS), "--budget", "4k", "--eval"]
+    tests = ["--test-iterations", "100,200,300,400,500", "--backend", "cpu"]
+    program = subprocess.Popen(command + tests, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        assert program.stdout
+        line = next(line for line in program.stdout if line.startswith("page "))
+        browser = Browser()
+        try:
+            check(browser, line.split()[1], Path(run), Path(folder) if folder else None)
+        finally:
+            browser.close()
+        code = program.wait(PATIENCE)
+        assert code == 130, f"a stopped run ends with {code}"
+    finally:
+        program.kill()
+    print("the page of a run in training shows curves and edits, follows it, and pauses, steps, keeps and stops it")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

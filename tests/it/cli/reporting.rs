@@ -1,0 +1,351 @@
+//! `densify report`: what is in the file, that it stands for itself, and what is refused.
+
+use std::path::{Path, PathBuf};
+
+use image::RgbImage;
+use serde_json::json;
+
+use super::{Outcome, call, densify, files, json, read, read_text, scratch, text, train};
+use crate::photographs::{Photographs, SIZE, VIEWS};
+
+/// Every address that a page names.
+fn sources(page: &str) -> Vec<&str> {
+    page.split("src=\"").skip(1).filter_map(|rest| rest.split('"').next()).collect()
+}
+
+/// Fails where a page refers to anything outside itself, or runs another script than its own.
+#[track_caller]
+pub(super) fn stands_for_itself(page: &str) {
+    for word in ["http:", "https:", "url(", "@import", "<link", "<iframe", "<object", "href="] {
+        assert!(!page.contains(word), "{word} is in the page");
+    }
+    for source in sources(page) {
+        assert!(source.starts_with("data:image/"), "{}", &source[..source.len().min(80)]);
+    }
+    assert_eq!(page.matches("<script").count(), 1, "one script of its own");
+    assert_eq!(page.matches("<img ").count(), sources(page).len(), "a picture from elsewhere");
+    assert!(page.contains("default-src 'none'"), "the browser may fetch something");
+}
+
+/// The bytes of base64 with padding.
+fn decoded(text: &str) -> Vec<u8> {
+    const SYMBOLS: &str = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut bytes = Vec::new();
+    for four in text.as_bytes().chunks(4) {
+        let value = |&symbol: &u8| SYMBOLS.find(char::from(symbol)).unwrap_or(0) as u32;
+        let word = four.iter().map(value).fold(0, |word, value| word << 6 | value);
+        let padding = four.iter().filter(|&&symbol| symbol == b'=').count();
+        bytes.extend_from_slice(&word.to_be_bytes()[1..4 - padding]);
+    }
+    bytes
+}
+
+fn picture(uri: &str) -> RgbImage {
+    let (_, data) = uri.split_once(";base64,").expect("base64");
+    image::load_from_memory(&decoded(data)).expect("a picture").into_rgb8()
+}
+
+/// Decibels between two pictures of one size.
+fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
+    assert_eq!(a.dimensions(), b.dimensions());
+    let square = |(a, b): (&u8, &u8)| (f64::from(*a) - f64::from(*b)).powi(2);
+    let mean = a.iter().zip(b.iter()).map(square).sum::<f64>() / a.len() as f64;
+    10.0 * (255.0 * 255.0 / mean).log10()
+}
+
+fn report(runs: &[&Path], file: &Path, more: &str) -> Outcome {
+    let runs = runs.iter().map(|run| text(run));
+    let words: Vec<&str> = std::iter::once("report")
+        .chain(runs)
+        .chain(["-o", text(file), "--backend", "cpu"])
+        .chain(more.split_whitespace())
+        .collect();
+    densify(&words)
+}
+
+fn run_of(scene: &Path, run: &Path, more: &str) {
+    train(scene, run, 40, &format!("--budget 320 --eval --quiet {more}")).ok();
+}
+
+/// Copies a scene to a folder, with its first photograph under another name.
+fn copied(scene: &Photographs, to: PathBuf, renamed: &str) -> PathBuf {
+    for (name, bytes) in files(scene.path()) {
+        let path = to.join(name.replace("view_00.png", renamed));
+        let text = String::from_utf8(bytes);
+        let bytes = match text {
+            Ok(text) => text.replace("view_00.png", renamed).into_bytes(),
+            Err(error) => error.into_bytes(),
+        };
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+        std::fs::write(path, bytes).expect("a copy");
+    }
+    to
+}
+
+#[test]
+fn a_report_holds_what_the_run_arrived_at_and_needs_nothing_else() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(scene.path(), &run, "--test-iterations 10,20,30");
+    let file = root.path().join("new/report.html");
+    let said = report(&[&run], &file, "").ok().stdout;
+    assert!(said.contains("report   ") && said.contains("KiB"), "{said}");
+    let page = read_text(&file);
+    stands_for_itself(&page);
+    assert!(page.len() < 400_000, "{} bytes of two small views", page.len());
+
+    let score = &json(&run.join("results.json"))["ours_40"];
+    let number = |key: &str, digits: usize| format!("{:.digits$}", score[key].as_f64().unwrap());
+    let mut expected = vec![
+        format!("{} dB", number("PSNR", 2)),
+        number("SSIM", 4),
+        number("FLIP", 4),
+        "of at most 320".into(),
+        "worst".into(),
+        "best".into(),
+        "the promise was kept".into(),
+        "Nothing".into(),
+        "sh_degree".into(),
+        "min_opacity".into(),
+    ];
+    // The curves: loss, Gaussians, PSNR with a dot for each measurement, memory with the promise dashed.
+    expected.extend(["Loss", "PSNR of the test views", "what was promised"].map(String::from));
+    for words in &expected {
+        assert!(page.contains(words.as_str()), "{words} is not in the report");
+    }
+    assert_eq!(page.matches("<figure class=\"curve\">").count(), 4);
+    assert!(page.matches("<circle").count() >= 4 && page.matches("<polyline").count() >= 4);
+    // No place of this machine is told.
+    assert!(!page.contains(text(root.path())) && !page.contains(text(scene.path())));
+
+    // The pictures are the photograph's and the model's: a pair and a window of each for either view held out,
+    // and a turn.
+    let sources = sources(&page);
+    assert_eq!(sources.len(), 2 * 4 + 24);
+    let pictures = root.path().join("pictures");
+    call(&format!("render {} -o {} --backend cpu", text(&run), text(&pictures))).ok();
+    let worst = page.split("<figcaption><strong>").nth(1).expect("a caption");
+    let name = worst.split(".png").next().expect("a name");
+    let photograph = image::open(scene.file(&format!("images/{name}.png"))).unwrap().into_rgb8();
+    let render = image::open(pictures.join(format!("{name}.png"))).unwrap().into_rgb8();
+    let [shown, rendered, crop] = [0, 1, 2].map(|at| picture(sources[at]));
+    assert_eq!(shown.dimensions(), SIZE);
+    assert!(psnr(&shown, &photograph) > 32.0, "{}", psnr(&shown, &photograph));
+    assert!(psnr(&rendered, &render) > 32.0, "{}", psnr(&rendered, &render));
+    assert_eq!(crop.dimensions(), (SIZE.0 / 4, SIZE.1 / 4));
+    let turn: Vec<RgbImage> = sources[8..].iter().map(|uri| picture(uri)).collect();
+    assert!(turn.windows(2).all(|pair| pair[0] != pair[1]), "the turn stands still");
+
+    // The same again, to the byte; and never over a file unasked.
+    report(&[&run], &file, "").refused("again", &["-o", "exists", "--overwrite"]);
+    report(&[&run], &file, "--overwrite --threads 1").ok();
+    assert!(page == read_text(&file), "the same run makes another report");
+}
+
+#[cfg(unix)]
+#[test]
+fn names_that_are_markup_stay_names() {
+    let evil = "<script>alert(1)<img src=x onerror=alert(2)>\"'&";
+    let scene = Photographs::colmap_text();
+    let root = tempfile::tempdir().expect("a folder");
+    let scene = copied(&scene, root.path().join(evil), "<i>\"&00.png");
+    let run = root.path().join(format!("run{evil}"));
+    densify(&[
+        "train",
+        text(&scene),
+        "-o",
+        text(&run),
+        "--iterations",
+        "20",
+        "--eval",
+        "--budget",
+        "320",
+        "--sh-degree",
+        "1",
+        "--quiet",
+    ])
+    .ok();
+    let other = root.path().join("other");
+    densify(&[
+        "train",
+        text(&scene),
+        "-o",
+        text(&other),
+        "--config",
+        text(&run.join("config.toml")),
+        "--seed",
+        "1",
+        "--quiet",
+    ])
+    .ok();
+    // What a policy says of itself, and what a file may say that somebody has changed.
+    let log = run.join("stats/events.jsonl");
+    let event = json!({ "step": 20, "before": 1, "removed": 0, "added": 0, "updated": 0, "denied": 0,
+        "after": 1, "cause": "</td><script>alert(3)</script>\u{1b}[31m" });
+    std::fs::write(&log, format!("{event}\n")).expect("a log");
+    let left = json!({ "full": false, "left_out": [
+        { "what": "<b>rows</b>", "evidence": "<u>some</u>", "loss": "none" }] });
+    std::fs::write(run.join("stats/requirements.json"), left.to_string()).expect("a file");
+    let file = root.path().join("report.html");
+    report(&[&run, &other], &file, "").ok();
+    let page = read_text(&file);
+    stands_for_itself(&page);
+    for markup in ["<img src=x", "<i>", "<b>", "<u>", "\u{1b}"] {
+        assert!(!page.contains(markup), "{markup} is markup in the report");
+    }
+    for shown in [
+        "&lt;script&gt;alert(1)&lt;img src=x onerror=alert(2)&gt;&quot;'&amp;",
+        "<strong>&lt;i&gt;&quot;&amp;00.png</strong>",
+        "&lt;/td&gt;&lt;script&gt;alert(3)&lt;/script&gt;\\u{1b}[31m",
+        "<strong>&lt;b&gt;rows&lt;/b&gt;</strong>: &lt;u&gt;some",
+    ] {
+        assert!(page.contains(shown), "{shown} is not in the report");
+    }
+}
+
+#[test]
+fn seeds_are_averaged_policies_compared_and_scenes_told_apart() {
+    let scene = Photographs::colmap_text();
+    let root = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| root.path().join(name);
+    let mut runs = Vec::new();
+    for policy in ["diet", "vanilla"] {
+        for seed in 0..3 {
+            let run = at(&format!("{policy}{seed}"));
+            run_of(scene.path(), &run, &format!("--policy {policy} --seed {seed}"));
+            runs.push(run);
+        }
+    }
+    let file = at("seeds.html");
+    let all: Vec<&Path> = runs.iter().map(PathBuf::as_path).collect();
+    report(&all, &file, "").ok();
+    let page = read_text(&file);
+    stands_for_itself(&page);
+    assert!(page.contains("report of 6 runs") && page.contains("Means over seeds"));
+    // The mean of three seeds, with its interval.
+    let of = |run: &Path| json(&run.join("results.json"))["ours_40"]["PSNR"].as_f64().unwrap();
+    let mean = runs[..3].iter().map(|run| of(run)).sum::<f64>() / 3.0;
+    assert!(page.contains(&format!("{mean:.2} [")), "{mean} is not in the report");
+    let difference = (0..3).map(|seed| of(&runs[3 + seed]) - of(&runs[seed])).sum::<f64>() / 3.0;
+    assert!(page.contains(&format!("{difference:+.2} [")), "{difference} is not in the report");
+    // Shown are the first of each policy: over each other, to choose from.
+    let choices = page
+        .split("<select class=\"right\">")
+        .nth(1)
+        .and_then(|rest| rest.split("</select>").next());
+    let choices: Vec<&str> = choices.expect("a choice").split("</option>").collect();
+    assert_eq!(choices.len(), 4, "{choices:?}");
+    assert!(choices[1].ends_with("diet0") && choices[2].ends_with("vanilla0"), "{choices:?}");
+    assert_eq!(sources(&page).len(), 2 * (3 + 3) + 2 * 24);
+    assert!(page.contains("<td>policy</td><td>diet</td>"), "what differs is not said");
+
+    // Other photographs, and the same read another way, are scenes of their own.
+    let elsewhere = copied(&scene, at("garden"), "view_00.png");
+    run_of(&elsewhere, &at("garden-run"), "");
+    train(&elsewhere, &at("garden-all"), 40, "--budget 320 --quiet --test-every 4").ok();
+    let file = at("scenes.html");
+    report(&[&runs[0], &at("garden-run"), &at("garden-all")], &file, "").ok();
+    let page = read_text(&file);
+    stands_for_itself(&page);
+    for words in
+        ["3 runs of 3 scenes", "Views of garden<", "Views of garden, read another way (2)<"]
+    {
+        assert!(page.contains(words), "{words} is not in the report");
+    }
+    let file = at("moved.html");
+    let refused =
+        report(&[&runs[0], &at("garden-run")], &file, &format!("--scene {}", text(scene.path())));
+    refused.refused("two scenes at one place", &["--scene", "garden"]);
+    assert!(!file.exists());
+}
+
+#[test]
+fn runs_without_test_views_show_what_they_trained_on() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 20, "--budget 320 --quiet").ok();
+    let file = root.path().join("report.htm");
+    // The dataset has moved meanwhile.
+    let moved = copied(&scene, root.path().join("moved"), "view_00.png");
+    drop(scene);
+    report(&[&run], &file, "").refused("it has moved", &["--scene"]);
+    report(&[&run], &file, &format!("--scene {}", text(&moved))).ok();
+    let page = read_text(&file);
+    stands_for_itself(&page);
+    for words in
+        ["No view was held out", &format!("{VIEWS} views trained on"), "second worst", "--eval"]
+    {
+        assert!(page.contains(words), "{words} is not in the report");
+    }
+    assert_eq!(sources(&page).len(), 4 * 4 + 24);
+}
+
+#[test]
+fn what_cannot_be_reported_is_said_with_the_remedy() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(scene.path(), &run, "");
+    let file = root.path().join("report.html");
+    let at = |name: &str| root.path().join(name);
+    std::fs::create_dir(at("empty")).expect("a folder");
+    let unsaved = at("unsaved");
+    super::copy_unfinished(&run, &unsaved, 40);
+    let model = densify::output::model_path(&run, 40);
+    for (runs, more, expected) in [
+        (vec![&*at("empty")], "", vec!["empty", "holds no run", "config.toml"]),
+        (vec![Path::new("nowhere")], "", vec!["nowhere", "holds no run"]),
+        (vec![&*unsaved], "", vec!["unsaved", "no saved model"]),
+        (vec![&*model], "", vec!["point_cloud.ply", "a model", "densify train"]),
+        (vec![&*run, &*run], "", vec!["named twice"]),
+        (vec![&*run], "--iteration 7", vec!["--iteration 7", "40"]),
+        (vec![&*run], "--scene nowhere", vec!["nowhere"]),
+    ] {
+        report(&runs, &file, more).refused(&format!("{runs:?} {more}"), &expected);
+    }
+    report(&[&run], &at("report.pdf"), "").refused("no HTML", &["-o", "report.pdf", ".html"]);
+    report(&[&run], &at("empty"), "").refused("a folder", &["-o", ".html"]);
+    std::fs::create_dir(at("folder.html")).expect("a folder");
+    report(&[&run], &at("folder.html"), "--overwrite").refused("a folder", &["is a folder"]);
+    assert!(!densify(&["report", text(&run)]).stderr.is_empty(), "-o is needed");
+    // A log that was changed by hand.
+    let log = run.join("stats/train.jsonl");
+    let sound = read(&log);
+    std::fs::write(&log, [&sound[..], b"{\"step\": true}\n"].concat()).expect("a log");
+    report(&[&run], &file, "").refused("a bad line", &["train.jsonl", "line 5", "by hand"]);
+    std::fs::write(run.join("results.json"), r#"{"theirs": {}}"#).expect("scores");
+    std::fs::write(&log, sound).expect("a log");
+    report(&[&run], &file, "").refused("strange scores", &["results.json", "theirs"]);
+    assert!(!file.exists(), "half a report was written");
+}
+
+/// A run that another process writes is reported as far as it has come.
+#[cfg(unix)]
+#[test]
+fn a_run_that_is_being_trained_is_reported_as_last_saved() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(scene.path(), &run, "--save-iterations 20 --test-iterations 20");
+    let so_far = root.path().join("so-far");
+    super::copy_unfinished(&run, &so_far, 40);
+    // The line that is being written now.
+    let log = so_far.join("stats/train.jsonl");
+    std::fs::write(&log, [&read(&log)[..], b"{\"step\": 50, \"lo"].concat()).expect("a log");
+    let lock = std::fs::File::create(so_far.join("densify.lock")).expect("a file");
+    lock.lock().expect("a lock");
+    let file = root.path().join("report.html");
+    let said = report(&[&so_far], &file, "").ok().stdout;
+    assert!(said.contains("is being trained"), "{said}");
+    let page = read_text(&file);
+    assert!(
+        page.contains("is being trained: it has come to iteration 40 of 40"),
+        "the reader is not told"
+    );
+    assert!(page.contains("model of iteration 20."));
+    assert!(!page.contains("promise was kept"), "nothing is known of its end");
+    let score = json(&so_far.join("results.json"))["ours_20"]["PSNR"].as_f64().unwrap();
+    assert!(page.contains(&format!("{score:.2} dB")), "{score}");
+    std::fs::remove_dir_all(so_far.join("point_cloud")).expect("models");
+    report(&[&so_far], &file, "--overwrite")
+        .refused("nothing is saved", &["is being trained", "--save-iterations"]);
+    assert_eq!(page, read_text(&file), "the older report is gone");
+}

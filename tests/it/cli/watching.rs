@@ -1,0 +1,279 @@
+//! `train --view`: the page of a run in training, its orders, and that the run is the same with it.
+
+use std::io::Read;
+use std::net::TcpStream;
+use std::path::Path;
+use std::thread;
+
+use serde_json::{Value, json};
+
+use super::view::{Page, wish};
+use super::{call, count, json, model, read, read_text, records, resume, scratch, text, train};
+use crate::photographs::{Photographs, SIZE};
+
+/// Enough that a run does not end before it can be paused.
+const ITERATIONS: u32 = 1_500;
+
+fn watched(scene: &Path, run: &Path, flags: &str) -> Page {
+    let fixed = format!("--sh-degree 1 --iterations {ITERATIONS} --budget 320 --backend cpu");
+    Page::of(&format!("train {} -o {} --view {fixed} {flags}", text(scene), text(run)))
+}
+
+impl Page {
+    fn order(&self, what: &str) {
+        let reply = self.try_post("order", "", &json!({ "order": what }).to_string());
+        let reply = reply.expect("it answers");
+        assert_eq!(reply.status, 200, "{}", reply.text());
+    }
+
+    fn progress(&self) -> Value {
+        let reply = self.get(&format!("{}progress", self.path));
+        serde_json::from_slice(&reply.body).unwrap_or_else(|e| panic!("{e}: {}", reply.text()))
+    }
+
+    /// Waits until the run is paused after the last step that it was told to take; returns that.
+    fn paused(&self) -> u64 {
+        loop {
+            let now = self.progress();
+            // A step that was ordered is counted before it is taken.
+            if now["state"] == "paused" && self.progress()["step"] == now["step"] {
+                return count(&now, "step");
+            }
+            thread::yield_now();
+        }
+    }
+
+    /// Waits for the end of the program; returns its exit code and what it said.
+    fn ended(mut self) -> (Option<i32>, String) {
+        let mut said = String::new();
+        self.said.read_to_string(&mut said).expect("text");
+        let mut errors = self.program.stderr.take().expect("a pipe");
+        errors.read_to_string(&mut said).expect("text");
+        (self.program.wait().expect("it ends").code(), said)
+    }
+}
+
+/// A camera that goes around the scene, as who looks moves it.
+fn moving(at: u32) -> Value {
+    let (sine, cosine) = (f64::from(at) * 0.1).sin_cos();
+    let pose = [
+        [cosine, 0.0, sine, 4.0 * sine],
+        [0.0, 1.0, 0.0, 0.0],
+        [-sine, 0.0, cosine, 4.0 * cosine],
+        [0.0, 0.0, 0.0, 1.0],
+    ];
+    let camera = json!({ "camera_to_world": pose.as_flattened(), "fov": 50 });
+    json!({ "page": "moving", "kind": "render", "width": 640, "height": 480, "moving": true, "camera": camera })
+}
+
+#[test]
+fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
+    let scene = Photographs::colmap_text();
+    // A policy that looks at signals, one that adds noise, and one that renders views of its own.
+    for policy in ["diet", "mcmc", "taming"] {
+        let flags =
+            format!("--policy {policy} --eval --test-iterations 500 --checkpoint-every 600");
+        let (_root, alone) = scratch();
+        train(
+            scene.path(),
+            &alone,
+            ITERATIONS,
+            &format!("--budget 320 --quiet --backend cpu {flags}"),
+        )
+        .ok();
+        let (_root, seen) = scratch();
+        let page = watched(scene.path(), &seen, &flags);
+        page.order("pause");
+        let first = page.paused();
+        assert!(first < u64::from(ITERATIONS), "it has ended before it could be paused");
+        // A model that rests looks the same twice, and another after a step.
+        let look = || page.frame(&wish("render", "test", 0, SIZE)).body;
+        let before = look();
+        assert!(before == look(), "{policy}: the model changes while it rests");
+        page.order("step");
+        while count(&page.progress(), "step") == first {
+            thread::yield_now();
+        }
+        assert_eq!(page.paused(), first + 1, "{policy}: one step is not one");
+        assert!(before != look(), "{policy}: a step changes nothing");
+        page.order("checkpoint");
+        let kept = seen.join(format!("checkpoints/iteration_{}.safetensors", first + 1));
+        while !kept.is_file() {
+            thread::yield_now();
+        }
+        page.order("continue");
+        // From here on somebody looks all the time, in every way.
+        let mut pictures = 0;
+        let kinds = ["render", "depth", "opacity", "count", "difference", "photograph"];
+        for at in 0.. {
+            let wish = match at % 3 {
+                0 => wish(kinds[at as usize / 3 % kinds.len()], "test", 1, SIZE),
+                _ => moving(at),
+            };
+            match page.try_post("frame", "", &wish.to_string()) {
+                Some(reply) if reply.status == 200 => {
+                    // No picture is larger than those that the run promised room for.
+                    let (width, height) = reply.picture().dimensions();
+                    assert!(width <= SIZE.0 && height <= SIZE.1, "{width}x{height}");
+                    pictures += 1;
+                }
+                _ => break,
+            }
+        }
+        assert!(pictures > 100, "{policy}: {pictures} pictures were seen");
+        let (code, said) = page.ended();
+        assert_eq!(code, Some(0), "{said}");
+        assert!(model(&seen, ITERATIONS) == model(&alone, ITERATIONS), "{policy}: another model");
+        let same =
+            ["stats/events.jsonl", "results.json", "per_view.json", "config.toml", "cameras.json"];
+        for name in same {
+            assert!(read(&seen.join(name)) == read(&alone.join(name)), "{policy}: another {name}");
+        }
+        let losses = |run: &Path| -> Vec<Value> {
+            records(&run.join("stats/train.jsonl"))
+                .iter()
+                .map(|step| step["loss"].clone())
+                .collect()
+        };
+        assert_eq!(losses(&seen), losses(&alone), "{policy}: other losses");
+        // All that was looked at had room in what was promised.
+        let summary = json(&seen.join("stats/summary.json"));
+        let lines = summary["ledger"]["lines"].as_array().expect("lines");
+        for what in ["the page", "a picture for the page"] {
+            assert!(lines.iter().any(|line| line["what"] == what), "{what} is not in the ledger");
+        }
+        if let Some(peak) = summary["peak_bytes"].as_u64() {
+            assert!(peak <= count(&summary, "ledger_bytes"), "{policy}: {summary}");
+        }
+    }
+}
+
+#[test]
+fn the_page_says_how_training_goes() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let page = watched(scene.path(), &run, "--eval --test-iterations 100");
+    while page.progress()["tests"].as_array().is_none_or(Vec::is_empty) {
+        thread::yield_now();
+    }
+    page.order("pause");
+    let step = page.paused();
+    let now = page.progress();
+    assert_eq!((&now["last"], &now["budget"]), (&ITERATIONS.into(), &320.into()), "{now}");
+    let points = now["points"].as_array().expect("points");
+    assert_eq!(points.len() as u64, step / 10, "{now}");
+    let log = records(&run.join("stats/train.jsonl"));
+    for (point, record) in points.iter().zip(&log) {
+        for key in ["step", "loss", "rows"] {
+            assert_eq!(point[key], record[key], "{key}");
+        }
+    }
+    let edits = now["edits"].as_array().expect("edits");
+    let events = records(&run.join("stats/events.jsonl"));
+    assert!(!edits.is_empty() && *edits == events[events.len() - edits.len()..], "{now}");
+    let psnr = json(&run.join("results.json"))["ours_100"]["PSNR"].clone();
+    assert_eq!(now["tests"], json!([[100, psnr]]), "{now}");
+    let described: Value =
+        serde_json::from_slice(&page.get(&format!("{}scene", page.path)).body).expect("JSON");
+    assert_eq!(described["live"], true);
+    let kinds: Vec<&str> = described["kinds"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .filter_map(|kind| kind["kind"].as_str())
+        .collect();
+    assert_eq!(kinds, ["render", "photograph", "difference", "depth", "opacity", "count"]);
+    let painted = page.frame(&wish("row_size", "test", 0, SIZE));
+    assert_eq!(painted.status, 400, "{}", painted.text());
+
+    // Stopped, it leaves a checkpoint, and goes on to the same end.
+    page.order("stop");
+    let (code, said) = page.ended();
+    assert_eq!(code, Some(130), "{said}");
+    let words = format!("stopped by the page after step {step}");
+    assert!(said.contains(&words) && said.contains("--resume"), "{said}");
+    let (_root, whole) = scratch();
+    let flags = "--budget 320 --eval --test-iterations 100 --quiet --backend cpu";
+    train(scene.path(), &whole, ITERATIONS, flags).ok();
+    resume(scene.path(), &run, "--quiet").ok();
+    assert!(model(&run, ITERATIONS) == model(&whole, ITERATIONS), "it ends another way");
+}
+
+#[test]
+fn strangers_stop_no_run_and_idle_guests_slow_none() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let page = watched(scene.path(), &run, "");
+    assert_eq!(page.path.trim_matches('/').len(), 32, "{}", page.path);
+    page.order("pause");
+    let step = page.paused();
+    let stop = json!({ "order": "stop" }).to_string();
+    let sent = |path: &str, more: &str| {
+        let whole = format!("{path}order");
+        let request = format!(
+            "POST {whole} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\nContent-Length: {}\r\n{more}\r\n{stop}",
+            page.place,
+            stop.len()
+        );
+        page.send(request.as_bytes()).status
+    };
+    let json = "Content-Type: application/json\r\n";
+    let wrong = format!("/{}/", "0".repeat(32));
+    for (path, more, status) in [
+        ("/", json.to_owned(), 404),
+        (&*wrong, json.to_owned(), 404),
+        (&*page.path, format!("{json}Origin: http://evil.example\r\n"), 403),
+        (&*page.path, format!("{json}Origin: null\r\n"), 403),
+        (&*page.path, "Content-Type: text/plain\r\n".to_owned(), 415),
+    ] {
+        assert_eq!(sent(path, &more), status, "{path} {more}");
+    }
+    for order in ["{}", "{\"order\": \"explode\"}", "{\"order\": \"stop\", \"path\": \"/\"}"] {
+        assert_eq!(page.try_post("order", "", order).expect("it answers").status, 400, "{order}");
+    }
+    assert_eq!(page.get(&format!("{}order", page.path)).status, 405);
+    let now = page.progress();
+    assert_eq!(
+        (&now["state"], count(&now, "step")),
+        (&"paused".into(), step),
+        "a stranger was heard"
+    );
+    // A thousand guests who say nothing take no more than was promised, and training goes on to its end.
+    let idle: Vec<TcpStream> = (0..1000).map(|_| page.connect()).collect();
+    page.order("continue");
+    let (code, said) = page.ended();
+    drop(idle);
+    assert_eq!(code, Some(0), "{said}");
+    let (_root, alone) = scratch();
+    train(scene.path(), &alone, ITERATIONS, "--budget 320 --quiet --backend cpu").ok();
+    assert!(model(&run, ITERATIONS) == model(&alone, ITERATIONS), "another model");
+    let summary = super::json(&run.join("stats/summary.json"));
+    if let Some(peak) = summary["peak_bytes"].as_u64() {
+        assert!(peak <= count(&summary, "ledger_bytes"), "{summary}");
+    }
+}
+
+#[test]
+fn a_page_that_cannot_be_served_is_refused_before_anything_is_written() {
+    let scene = Photographs::colmap_text();
+    let (_root, run) = scratch();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let port = taken.local_addr().expect("an address").port();
+    for (flag, words) in [
+        (format!("--view={port}"), vec![port.to_string(), "another program".to_owned()]),
+        ("--view=70000".to_owned(), vec!["--view".to_owned()]),
+        ("--view=here".to_owned(), vec!["--view".to_owned()]),
+    ] {
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        train(scene.path(), &run, 40, &flag).refused(&flag, &words);
+        assert!(!run.exists(), "{flag}");
+    }
+    // The plan counts it.
+    let plan = |flag: &str| {
+        call(&format!("plan {} --budget 320 --backend cpu {flag}", text(scene.path()))).ok().stdout
+    };
+    assert!(plan("--view").contains("the page") && !plan("").contains("the page"));
+    // It is of this call, not of the run.
+    train(scene.path(), &run, 10, "--budget 320 --view --quiet --backend cpu").ok();
+    assert!(!read_text(&run.join("config.toml")).contains("\nview = "));
+}
