@@ -80,7 +80,8 @@ pub(super) fn build(
     if let Some(resumed) = &resumed {
         resume::check(&config, resumed, &fingerprint, &output)?;
     }
-    for line in inputs.degree.line().into_iter().chain(size.lines(&inputs)) {
+    let chosen = inputs.degree.line().into_iter().chain(inputs.exposure.line());
+    for line in chosen.chain(size.lines(&inputs)) {
         observer.say(format_args!("{line}"));
     }
     announce(&config, &output, inputs.entry.summary, observer);
@@ -108,6 +109,7 @@ pub(super) fn build(
         prefetch: AHEAD,
         on_nan: spec.schedule.on_nan,
     };
+    let exposures = inputs.exposure.first(spec, &inputs.dataset);
     let (name, required) = (inputs.entry.name, inputs.required);
     let mut dataset = inputs.dataset;
     let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
@@ -115,7 +117,7 @@ pub(super) fn build(
     dataset.points = crate::dataset::PointCloud::default();
     let policy: Box<dyn DensityPolicy> = policy;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let mut trainer = trainer.requiring(required);
+    let mut trainer = trainer.requiring(required).exposing(exposures);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
@@ -178,6 +180,8 @@ fn decided(
         adapter: inputs.device.adapter().map(str::to_owned),
         accumulation: inputs.device.accumulation().map(|way| way.name().to_owned()),
         sh_degree_from: inputs.degree.source,
+        exposure_from: inputs.exposure.source,
+        has_exposures: inputs.exposure.is_on,
         ..Resolved::default()
     };
     Ok(RunConfig { densify: env!("CARGO_PKG_VERSION").to_owned(), spec, resolved })

@@ -20,7 +20,7 @@ mod values;
 
 use std::path::PathBuf;
 
-pub use config::{DegreeSource, Resolved, RunConfig};
+pub use config::{DegreeSource, ExposureSource, Resolved, RunConfig};
 pub use observer::{Interrupt, Observer, Silent};
 pub use overlay::Partial;
 pub use report::{LeftOut, Requirements};

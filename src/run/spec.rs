@@ -17,6 +17,7 @@ use super::values::{
 };
 use crate::backend::BackendChoice;
 use crate::dataset::{FarCameras, Resolution};
+use crate::exposure::{ExposureChoice, ExposureModel};
 use crate::schedule::{Background, REFERENCE_ITERATIONS};
 use crate::trainer::OnNan;
 
@@ -270,6 +271,16 @@ run_spec! {
         #[arg(long, value_name = "NAME=VALUE")]
         #[serde(with = "as_table")]
         knob: Vec<Assignment> = Vec::new(), Fixed;
+
+        /// Whether each training photograph has an exposure of its own, which is learned beside the model: a factor
+        /// and an offset per colour channel. Test views are then measured as they are, and again after the best
+        /// such fit. auto needs the tracks of a reconstruction
+        #[arg(long, value_name = "WHEN")]
+        exposure: ExposureChoice = ExposureChoice::Off, Fixed;
+
+        /// What an exposure may do to colours
+        #[arg(long, value_name = "MODEL")]
+        exposure_model: ExposureModel = ExposureModel::Channels, Fixed;
 
         /// What happens to Gaussians with a non-finite value; they are looked for every 100 iterations
         /// at least
