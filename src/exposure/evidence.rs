@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::spread::{MIN_TRACKS, TrackColours, median};
 
 /// From this spread on, exposures are learned `[stops]`; docs/tradeoffs.md has the scenes.
-pub const MIN_STOPS: f64 = 0.1;
+pub const MIN_STOPS: f64 = 0.3;
 /// Gains must leave at most this share of the difference between the colours.
 pub const MOST_LEFT: f64 = 0.8;
 /// Stops per doubling of an encoded value: the sRGB curve is nearly the power 1/2.4.
@@ -33,8 +33,8 @@ pub struct ExposureSpread {
 }
 
 impl ExposureSpread {
-    /// Measures it; also returns the gains of all views, with mean 1 over the views, and 1 where too few
-    /// colours are known.
+    /// Measures it; also returns the gains of all views, whose product is 1, and 1 where too few colours are
+    /// known.
     #[must_use]
     pub fn measure(colours: &TrackColours) -> (Self, Vec<[f32; 3]>) {
         let known: Vec<usize> = (0..colours.views()).filter(|&view| colours.knows(view)).collect();
@@ -52,7 +52,7 @@ impl ExposureSpread {
             let stops = logarithm(gains);
             std::array::from_fn(|channel| (stops[channel] - middle[channel]).powi(2))
         });
-        let factor = mean(&|gains| gains.map(f64::from));
+        let factor = middle.map(|stops| (stops / STOPS).exp2());
         let gains = (0..colours.views())
             .map(|view| match colours.knows(view) {
                 true => std::array::from_fn(|channel| {

@@ -1,8 +1,8 @@
 //! The exposures of the training views, learned beside the model.
 //!
-//! A brighter model and darker exposures show the same, so the mean over the views is held at the identity:
-//! what is learned of a view is its difference from the mean. A weak pull to the identity decides what its
-//! photographs do not. A view steps when its photograph is trained on, with moments of its own; the host
+//! A brighter model and darker exposures show the same, so the mean over the views stays what it was at the
+//! start: what is learned of a view is its difference from the mean. A weak pull to the identity decides what
+//! its photographs do not. A view steps when its photograph is trained on, with moments of its own; the host
 //! does it, in a fixed order, so that runs repeat.
 
 use serde::{Deserialize, Serialize};
@@ -33,6 +33,8 @@ const PULL: f32 = 0.005;
 #[serde(deny_unknown_fields)]
 pub struct Exposures {
     model: ExposureModel,
+    /// Mean difference of the views from the identity, which stays: near 0. Shape: `[12]`.
+    mean: [f32; NUMBERS],
     views: Vec<ViewExposure>,
 }
 
@@ -40,8 +42,8 @@ pub struct Exposures {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ViewExposure {
-    /// Difference from the identity, before the mean over the views is taken from it: the matrix row by row, then
-    /// the offset. Shape: `[12]`.
+    /// Difference from the identity, before the mean over the views is brought to that of the start: the matrix
+    /// row by row, then the offset. Shape: `[12]`.
     values: [f32; NUMBERS],
     /// Adam's moments. Shape: `[12]` each.
     first: [f32; NUMBERS],
@@ -61,7 +63,9 @@ impl Exposures {
             }
             ViewExposure { values, first: [0.0; NUMBERS], second: [0.0; NUMBERS], age: 0 }
         };
-        Self { model, views: gains.iter().map(view).collect() }
+        let views: Vec<_> = gains.iter().map(view).collect();
+        let mean = mean(&views).map(|mean| mean as f32);
+        Self { model, mean, views }
     }
 
     /// What they take on the host `[bytes]`.
@@ -90,15 +94,9 @@ impl Exposures {
 
     /// A view's difference from the identity.
     fn difference(&self, view: usize) -> [f32; NUMBERS] {
-        let mut sums = [0.0_f64; NUMBERS];
-        for view in &self.views {
-            for (sum, value) in sums.iter_mut().zip(view.values) {
-                *sum += f64::from(value);
-            }
-        }
-        let count = self.views.len() as f64;
+        let moved = mean(&self.views);
         let own = &self.views[view].values;
-        std::array::from_fn(|i| (f64::from(own[i]) - sums[i] / count) as f32)
+        std::array::from_fn(|i| (f64::from(own[i]) - moved[i] + f64::from(self.mean[i])) as f32)
     }
 
     /// One step of a view, at this share of the run. A gradient that is not finite changes nothing.
@@ -141,11 +139,22 @@ impl Exposures {
             ));
         }
         let numbers = |view: &ViewExposure| [view.values, view.first, view.second].concat();
-        match self.views.iter().flat_map(numbers).all(f32::is_finite) {
+        match self.views.iter().flat_map(numbers).chain(self.mean).all(f32::is_finite) {
             true => Ok(()),
             false => Err("its exposures hold a number that is not finite".to_owned()),
         }
     }
+}
+
+/// Mean of the views' values, in their order.
+fn mean(views: &[ViewExposure]) -> [f64; NUMBERS] {
+    let mut sums = [0.0; NUMBERS];
+    for view in views {
+        for (sum, value) in sums.iter_mut().zip(view.values) {
+            *sum += f64::from(value);
+        }
+    }
+    sums.map(|sum| sum / views.len().max(1) as f64)
 }
 
 /// Whether a number is learned: with one factor per channel only the diagonal is, beside the offsets.
@@ -189,11 +198,12 @@ mod tests {
     #[test]
     fn exposures_are_learned_and_their_mean_stays() {
         let mut exposures = Exposures::new(ExposureModel::Channels, &[[1.2, 1.0, 0.9]; 2]);
-        assert_eq!(exposures.of(0), ColourTransform::IDENTITY, "only differences count");
+        assert!((exposures.of(0).matrix[0][0] - 1.2).abs() < 1e-6, "{exposures:?}");
         let mut to = [ColourTransform::IDENTITY; 2];
         for (to, sign) in to.iter_mut().zip([1.0, -1.0]) {
             to.matrix[1][1] += 0.3 * sign;
             to.offset[1] += 0.015 * sign;
+            to.matrix[0][0] += 0.2;
             to.matrix[0][1] += 0.5;
         }
         for step in 0..400 {

@@ -41,7 +41,7 @@ fn exposures_go_with_their_views() {
     for (gain, view) in noted.iter().zip(&shown) {
         assert!((gain - gains[*view][1]).abs() < 0.05, "view {view}: {gain}");
     }
-    // All gradients are upwards, and the mean stays, so that who steps first is below the others then.
+    // A step makes a factor smaller, and the mean stays, so that the others become larger.
     assert!(noted[1..3].iter().zip(&shown[1..]).all(|(gain, view)| *gain > gains[*view][1]));
     let state = new.state().unwrap();
     assert_eq!(state.exposures.as_ref(), new.exposures());
