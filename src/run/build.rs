@@ -80,8 +80,7 @@ pub(super) fn build(
     if let Some(resumed) = &resumed {
         resume::check(&config, resumed, &fingerprint, &output)?;
     }
-    let chosen = inputs.degree.line().into_iter().chain(inputs.exposure.line());
-    for line in chosen.chain(size.lines(&inputs)) {
+    for line in inputs.choices().chain(size.lines(&inputs)) {
         observer.say(format_args!("{line}"));
     }
     announce(&config, &output, inputs.entry.summary, observer);

@@ -16,7 +16,7 @@ use super::values::{
     Whole, as_table,
 };
 use crate::backend::BackendChoice;
-use crate::dataset::{FarCameras, Resolution};
+use crate::dataset::{FarCameras, MaskMode, Resolution};
 use crate::exposure::{ExposureChoice, ExposureModel};
 use crate::schedule::{Background, REFERENCE_ITERATIONS};
 use crate::trainer::OnNan;
@@ -134,6 +134,11 @@ run_spec! {
             require_equals = true, default_missing_value = "true", hide_possible_values = true
         )]
         invert_masks: bool = false, Fixed;
+
+        /// What the pixels are that masks hide. To carve an object out, background needs a colour behind it that the
+        /// object does not have, or --background random
+        #[arg(long, value_name = "MODE")]
+        mask_mode: MaskMode = MaskMode::Ignore, Fixed;
 
         /// Render a built-in scene anew, and do not keep it in the user's cache folder
         #[arg(

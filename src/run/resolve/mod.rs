@@ -168,6 +168,11 @@ impl<'a> Inputs<'a> {
         })
     }
 
+    /// What there is to say of what the scene's colours have decided.
+    pub(super) fn choices(&self) -> impl Iterator<Item = String> {
+        self.degree.line().into_iter().chain(self.exposure.line())
+    }
+
     /// What the first rows are.
     pub(super) fn init(&self) -> InitChoice {
         let start = &self.spec.start;
