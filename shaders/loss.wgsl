@@ -18,6 +18,8 @@
 @group(0) @binding(7) var<storage, read_write> tile_sums: array<vec2<f32>>;
 // Error per pixel, where candidates are asked for.
 @group(0) @binding(8) var<storage, read_write> error: array<f32>;
+// See exposure.wgsl.
+@group(0) @binding(9) var<storage, read> exposure: array<vec4<f32>>;
 
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
@@ -30,6 +32,7 @@ const HAS_ALPHA: u32 = 1u;
 const HAS_MASK: u32 = 2u;
 const WITH_ERROR: u32 = 4u;
 const BY_PIXEL: u32 = 8u;
+const EXPOSED: u32 = 16u;
 
 // Weights of the kth of eighteen values in a row, in the windows around the sixth to the thirteenth, from
 // those of the value before it: what a table of them would be asked for eight times, it is asked once.
@@ -63,7 +66,11 @@ fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
     var target_value = f32((word >> (8u * channel)) & 0xffu) * (1.0 / 255.0);
     if (frame.draw.w & HAS_ALPHA) != 0u {
         let a = f32(word >> 24u) * (1.0 / 255.0);
-        target_value = a * target_value + (1.0 - a) * frame.background[channel];
+        var behind = frame.background[channel];
+        if (frame.draw.w & EXPOSED) != 0u {
+            behind = exposure[3][channel];
+        }
+        target_value = a * target_value + (1.0 - a) * behind;
     }
     return vec2((canvas[at][channel] - target_value) * weight_of(at), target_value);
 }

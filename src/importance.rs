@@ -47,6 +47,7 @@ pub fn importance(
             camera: views.camera(view),
             target: &image,
             background,
+            exposure: None,
             sh_degree,
             request: &request,
         };

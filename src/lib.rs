@@ -39,6 +39,7 @@ pub mod compress;
 pub mod dataset;
 pub mod evaluate;
 pub mod export;
+pub mod exposure;
 pub mod failure;
 pub mod flight;
 mod foreign;

@@ -67,6 +67,7 @@ pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> St
         camera,
         target,
         background: [0.0; 3],
+        exposure: None,
         sh_degree: 3,
         rates: RATES,
         loss_terms: LossTerms::default(),

@@ -13,6 +13,7 @@ use crate::mesh::{FileCamera, Model, Reflection};
 use crate::panorama::Panorama;
 use crate::points::{InitPoints, PointCollector, PointOptions};
 use crate::presets::{PRESETS, Staging, open_sky, sun};
+use crate::random::Draws;
 use crate::rig::{Rig, RigKind};
 use crate::shade::{Ambient, Lighting, TriangleFlags};
 use crate::sky::Sky;
@@ -59,6 +60,10 @@ pub struct Options {
     /// Factor on all light. `None` chooses one for files with their own lights or sky, and is 1
     /// otherwise.
     pub exposure: Option<f32>,
+    /// How far, at most, the exposure of a training view is from the others' `[stops]`, from 0 to 8; more than
+    /// 0 also changes the light of its red and its blue by up to 10 %.
+    #[serde(default)]
+    pub exposure_jitter: f32,
     /// Initial points.
     pub points: PointOptions,
     /// Seed of everything random.
@@ -81,11 +86,19 @@ impl Default for Options {
             shadows: true,
             lambert: false,
             exposure: None,
+            exposure_jitter: 0.0,
             points: PointOptions::default(),
             seed: 0,
         }
     }
 }
+
+/// With [`Options::exposure_jitter`]: how far the light of red and of blue is changed at most, as a fraction.
+const WHITE_BALANCE: f32 = 0.1;
+/// Largest [`Options::exposure_jitter`] `[stops]`.
+const MOST_JITTER: f32 = 8.0;
+/// Stream of the random exposures.
+const EXPOSURES: u64 = 0x0065_7870_6f73_6564;
 
 /// A view's part in training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -238,7 +251,22 @@ impl Scene {
     /// Renders a view. The same at any number of threads.
     #[must_use]
     pub fn render(&self, view: usize) -> Frame {
-        self.tracer().render(&self.views[view].camera, view as u64)
+        self.tracer().render(&self.views[view].camera, view as u64, self.gains(view))
+    }
+
+    /// The factors on the light of each channel in a training view, where [exposures
+    /// differ](Options::exposure_jitter).
+    #[must_use]
+    pub fn gains(&self, view: usize) -> Option<[f32; 3]> {
+        let stops = self.options.exposure_jitter;
+        if stops == 0.0 || self.views[view].split == Split::Test {
+            return None;
+        }
+        let mut draws = Draws::new(self.options.seed, &[EXPOSURES, view as u64]);
+        let mut either = || 2.0 * draws.unit() - 1.0;
+        let gain = (stops * either()).exp2();
+        let [red, blue] = [either(), either()].map(|change| 1.0 + WHITE_BALANCE * change);
+        Some([gain * red, gain, gain * blue])
     }
 
     /// Gathers initial points from training views as they are rendered.
@@ -275,6 +303,11 @@ fn check(options: &Options) -> Result<(), Error> {
     }
     if options.points.count > 1 << 28 {
         return Err(Error::option("--points", "there can be at most 2^28 points"));
+    }
+    if !(0.0..=MOST_JITTER).contains(&options.exposure_jitter) {
+        let stops = options.exposure_jitter;
+        let problem = format!("{stops} stops are not in 0..={MOST_JITTER}");
+        return Err(Error::option("--exposure-jitter", problem));
     }
     if options.exposure.is_some_and(|e| !(e > 0.0 && e.is_finite())) {
         return Err(Error::option("--exposure", "it must be positive"));

@@ -7,6 +7,8 @@ use std::collections::HashMap;
 use densify_policies::policy::{Candidate, CandidateRequest, ErrorMode};
 
 use super::{StateError, Tensor};
+use crate::dataset::images::Image8;
+use crate::exposure::ColourTransform;
 
 /// The list, and what goes into it.
 #[derive(Debug)]
@@ -14,6 +16,26 @@ pub(super) struct Candidates {
     request: Option<CandidateRequest>,
     list: Vec<Candidate>,
     ranking: Vec<Ranked>,
+}
+
+/// What a photograph shows of the scene.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shown<'a> {
+    pub(super) target: &'a Image8,
+    pub(super) background: [f32; 3],
+    pub(super) exposure: Option<&'a ColourTransform>,
+}
+
+impl<'a> Shown<'a> {
+    /// The scene's colour in a pixel (x, y), without the photograph's exposure.
+    pub(super) fn colours(self) -> impl Fn(usize, usize) -> [f32; 3] + Sync + 'a {
+        let Self { target, background, exposure } = self;
+        let back = exposure.map(ColourTransform::inverse);
+        move |x, y| {
+            let seen = target.composited(x, y, background);
+            back.map_or(seen, |back| back.apply(seen))
+        }
+    }
 }
 
 /// Error and number of a pixel of one view.

@@ -30,6 +30,7 @@ use densify_policies::policy::{
 
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
+use crate::exposure::{ColourGradient, ColourTransform};
 use crate::gaussians::{Gaussians, ModelArray};
 use crate::memory::Ledger;
 pub use accumulation::Accumulation;
@@ -74,6 +75,9 @@ pub struct StepInput<'a> {
     pub target: &'a Image8,
     /// Background colour, sRGB-encoded in `[0, 1]`; a target with alpha is composited on it too.
     pub background: [f32; 3],
+    /// How the image was exposed, in a backend [made](Setup::exposures) for it: the loss sees the rendering
+    /// so transformed, but for the background.
+    pub exposure: Option<&'a ColourTransform>,
     /// Spherical-harmonic degree evaluated and trained now, <= the model's.
     pub sh_degree: u8,
     /// Step sizes.
@@ -103,6 +107,8 @@ pub struct AuxInput<'a> {
     pub target: &'a Image8,
     /// Background colour, sRGB-encoded in `[0, 1]`.
     pub background: [f32; 3],
+    /// As [`StepInput::exposure`].
+    pub exposure: Option<&'a ColourTransform>,
     /// Spherical-harmonic degree evaluated now, <= the model's.
     pub sh_degree: u8,
     /// What to measure.
@@ -135,6 +141,8 @@ pub struct StepOutput {
     pub entries: u64,
     /// Passes in which the tile lists were processed; 1 unless the cap made it more.
     pub bands: u32,
+    /// Derivatives of the loss by the exposure, where there is one.
+    pub exposure: Option<ColourGradient>,
 }
 
 /// A rendered view.

@@ -35,6 +35,8 @@ pub struct Setup {
     pub shortcuts: Shortcuts,
     /// Signals and candidates to collect.
     pub needs: Needs,
+    /// Whether steps and measured views may have exposures of their own.
+    pub exposures: bool,
     /// Whether nothing but rendering will be asked for: then there is no room for what only training needs
     /// (native backend).
     pub only_renders: bool,
@@ -57,6 +59,7 @@ impl Setup {
             storage: Storage::default(),
             shortcuts: Shortcuts::default(),
             needs: Needs::default(),
+            exposures: false,
             only_renders: false,
         }
     }

@@ -89,6 +89,10 @@ fn header() -> Header {
         },
         trainer: crate::trainer::TrainerState {
             auto_budget: None,
+            exposures: Some(crate::exposure::Exposures::new(
+                crate::exposure::ExposureModel::Matrix,
+                &[[0.1, 1.0 / 3.0, f32::MIN_POSITIVE]; 3],
+            )),
             step: 17,
             initial_rows: 9,
             peak_rows: ROWS,

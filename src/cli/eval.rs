@@ -8,7 +8,7 @@ use clap::Args;
 
 use super::console::Console;
 use super::limits::{self, Limit};
-use crate::evaluate::{Mean, Split, evaluate};
+use crate::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
 use crate::failure::Failure;
 use crate::metrics::Lpips;
 use crate::metrics::geometry::{self, Geometry};
@@ -42,6 +42,10 @@ pub(super) struct EvalArgs {
     /// of densify, docs/metrics.md says how to write the file)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
+    /// Measure each view a second time, with the factor and the offset per channel that fit its photograph best
+    /// (always where the run has learned exposures)
+    #[arg(long)]
+    fit_exposure: bool,
     /// Exit with code 4 where a value is smaller: psnr, ssim, flip, lpips, or the path of a number in
     /// geometry.json, such as centres.f_score_one_percent; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
@@ -63,7 +67,7 @@ Examples:
 pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     let run = &args.run;
     // A folder without config.toml is no run, whatever else it holds.
-    RunConfig::read(run)?;
+    let config = RunConfig::read(run)?;
     let lpips = args.lpips.as_deref().map(Lpips::open).transpose();
     let lpips = lpips.map_err(|e| Failure::input(format!("--lpips: {e}")))?;
     let iteration = iteration(run, args.iteration)?;
@@ -75,7 +79,7 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     limits::check_keys(knows_geometry, lpips.is_some(), &args.fail_below, &args.fail_above)?;
     let background = opened.data.background.fixed();
     let width = opened.dataset.train.iter().chain(&opened.dataset.test);
-    let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
+    let width = width.map(|view| view.name.chars().count()).max().unwrap_or(0).max(6);
     let column = if lpips.is_some() { "   LPIPS" } else { "" };
     console.result(format_args!("{:width$}  PSNR [dB]    SSIM    FLIP{column}", "view"));
     let line = |name: &str, psnr: f64, ssim: f64, flip: f64, lpips: Option<f64>| {
@@ -83,12 +87,17 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
         console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
-    let scores = evaluate(backend, &views, background, degree, lpips.as_ref(), |view| {
+    let fits_exposure = args.fit_exposure || config.resolved.has_exposures;
+    let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };
+    let scores = evaluate(backend, &views, background, degree, comparison, |view| {
         line(&view.name, view.psnr, view.ssim, view.flip, view.lpips);
         ControlFlow::Continue(())
     })?;
     let mean = Mean::of(&scores);
     line("mean", mean.psnr, mean.ssim, mean.flip, mean.lpips);
+    if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {
+        line("fitted", psnr, ssim, flip, lpips);
+    }
     write_scores(run, args.split, iteration, &scores)?;
     let geometry = opened.geometry(&views, &|| false)?;
     if let Some(measured) = &geometry {

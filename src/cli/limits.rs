@@ -73,7 +73,8 @@ pub(super) fn check_keys(
     above: &[Limit],
 ) -> Result<(), Failure> {
     let example = Geometry { thin: vec![ThinRecall::default()], ..Geometry::default() };
-    let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips: knows_lpips.then_some(0.0) };
+    let lpips = knows_lpips.then_some(0.0);
+    let mean = Mean { psnr: 0.0, ssim: 0.0, flip: 0.0, lpips, fitted: None };
     let known = values(&mean, knows_geometry.then_some(&example));
     for (limits, flag) in [(below, "--fail-below"), (above, "--fail-above")] {
         for Limit { key, .. } in limits {
@@ -140,7 +141,7 @@ mod tests {
 
     #[test]
     fn values_beyond_their_limits_are_named() {
-        let mean = Mean { psnr: 24.5, ssim: 0.9, flip: 0.1, lpips: None };
+        let mean = Mean { psnr: 24.5, ssim: 0.9, flip: 0.1, lpips: None, fitted: None };
         let mut values = values(&mean, None);
         flatten("", &serde_json::json!({ "depth": { "rmse": 0.02 }, "thin": [null] }), &mut values);
         let limit = |text: &str| vec![text.parse::<Limit>().unwrap()];

@@ -89,6 +89,10 @@ pub(super) struct ScenegenArgs {
     /// Factor on all light [default: 1; chosen where the mesh file brings lights, and with --sky]
     #[arg(long, value_name = "FACTOR", help_heading = "Light")]
     exposure: Option<f32>,
+    /// Expose each training view differently: by up to so many stops, with a white balance of up to 10 %. Test
+    /// views and points are not changed; scene.json has the factors
+    #[arg(long, value_name = "STOPS", help_heading = "Light", default_value_t = 0.0)]
+    exposure_jitter: f32,
 
     /// Initial points to make: on surfaces with detail that at least three views see
     #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
@@ -187,6 +191,7 @@ impl ScenegenArgs {
             shadows: !self.no_shadows,
             lambert: self.lambert,
             exposure: self.exposure,
+            exposure_jitter: self.exposure_jitter,
             points: PointOptions {
                 count: self.points,
                 noise: self.point_noise,

@@ -31,6 +31,21 @@ pub(super) struct ImageFile {
     pub(super) fell_back: bool,
 }
 
+/// The file of a mask.
+#[derive(Debug, Clone)]
+pub(super) struct MaskFile {
+    pub(super) path: PathBuf,
+    /// Whether every value but 0 hides a pixel, instead of 0 alone doing it wholly.
+    pub(super) hides_all_but_black: bool,
+}
+
+impl MaskFile {
+    /// A mask that hides where it is black.
+    pub(super) fn of(path: PathBuf) -> Self {
+        Self { path, hides_all_but_black: false }
+    }
+}
+
 impl Folders {
     pub(super) fn new(
         root: &Root,
@@ -86,18 +101,25 @@ impl Folders {
         Ok(None)
     }
 
-    /// The mask of an image, if there is one: `masks/NAME.png`, with or without the extension of NAME.
-    pub(super) fn mask(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
+    /// The mask of an image, if there is one: `masks/NAME.png`, with or without the extension of NAME; or
+    /// `dynamic_mask_NAME.png` beside the image, as instant-ngp has it, where all but black is hidden.
+    pub(super) fn mask(&self, named: DataPath<'_>) -> Result<Option<MaskFile>, DatasetError> {
         let inside = self.inside_images(named.value);
         let stem = Path::new(&inside).with_extension("").to_string_lossy().into_owned();
         for value in
             [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")]
         {
             if let Some(path) = self.root.existing(DataPath { value: &value, ..named })? {
-                return Ok(Some(path));
+                return Ok(Some(MaskFile::of(path)));
             }
         }
-        Ok(None)
+        let image = self.below_root(named.value);
+        let image = Path::new(&image);
+        let Some(stem) = image.file_stem().and_then(|stem| stem.to_str()) else { return Ok(None) };
+        let beside = image.with_file_name(format!("dynamic_mask_{stem}.png"));
+        let value = beside.to_string_lossy();
+        let path = self.root.existing(DataPath { value: &value, ..named })?;
+        Ok(path.map(|path| MaskFile { path, hides_all_but_black: true }))
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {

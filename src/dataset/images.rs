@@ -13,6 +13,7 @@ use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
 use super::jpeg;
+use super::options::MaskMode;
 pub use super::pixels::{Image8, SharedImage};
 use super::resample;
 use super::undistort::Undistortion;
@@ -72,7 +73,7 @@ impl SourceFile {
 pub struct ImageSource {
     /// The image file.
     pub file: SourceFile,
-    /// The weights of its pixels in the loss, if there is a file of them.
+    /// What of it is hidden, if there is a file of that.
     pub mask: Option<Mask>,
     /// Width after loading `[px]`.
     pub width: u32,
@@ -86,24 +87,41 @@ pub struct ImageSource {
     pub rendered: Option<SharedImage>,
 }
 
-/// A greyscale image of the weights of pixels in the loss.
+/// A greyscale image of what is to be seen: the weights of pixels in the loss, or their coverage.
 #[derive(Debug, Clone)]
 pub struct Mask {
     /// The image file.
     pub file: SourceFile,
-    /// Whether white is ignored, not black.
-    pub inverted: bool,
+    /// Which of its values hide a pixel.
+    pub hides: Hides,
+    /// What hidden pixels are.
+    pub mode: MaskMode,
 }
 
 impl Mask {
-    /// Decodes it at its own size; 0 is ignored, whichever colour of the file that is.
+    /// Decodes it at its own size; 0 is hidden, whichever colour of the file that is.
     pub(super) fn weights(&self) -> Result<image::GrayImage, DatasetError> {
         let mut mask = decode(&self.file)?.into_luma8();
-        if self.inverted {
-            mask.iter_mut().for_each(|weight| *weight = 255 - *weight);
+        match self.hides {
+            Hides::Black => {}
+            Hides::White => mask.iter_mut().for_each(|weight| *weight = 255 - *weight),
+            Hides::AllButBlack => {
+                mask.iter_mut().for_each(|weight| *weight = if *weight == 0 { 255 } else { 0 });
+            }
         }
         Ok(mask)
     }
+}
+
+/// Which values of a mask hide a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Hides {
+    /// Black wholly, grey in part.
+    Black,
+    /// White wholly, grey in part.
+    White,
+    /// All but black, wholly.
+    AllButBlack,
 }
 
 /// The header of an image file.
@@ -152,13 +170,20 @@ impl ImageSource {
     }
 
     fn channels(&self) -> u64 {
-        3 + u64::from(self.header.has_alpha) + u64::from(self.is_masked())
+        3 + u64::from(self.header.has_alpha || self.is_carved()) + u64::from(self.is_masked())
     }
 
     /// Whether its images have a mask, of their own or of what their lens saw.
     #[must_use]
     pub fn is_masked(&self) -> bool {
-        self.mask.is_some() || self.undistortion.as_ref().is_some_and(Undistortion::is_masked)
+        let is_ignored = |mask: &Mask| mask.mode == MaskMode::Ignore;
+        self.mask.as_ref().is_some_and(is_ignored)
+            || self.undistortion.as_ref().is_some_and(Undistortion::is_masked)
+    }
+
+    /// Whether a mask makes its images transparent.
+    fn is_carved(&self) -> bool {
+        self.mask.as_ref().is_some_and(|mask| mask.mode == MaskMode::Background)
     }
 
     /// Width and height before it is shrunk `[px]`.
@@ -193,19 +218,23 @@ impl ImageSource {
         }
         let mut image = pack(decoded);
         if let Some(mask) = &self.mask {
-            let path = &mask.file.path;
+            let (path, mode) = (&mask.file.path, mask.mode);
             let mask = mask.weights()?;
             if mask.iter().all(|&weight| weight == 0) {
                 let problem = "the mask hides every pixel";
                 let remedy = "repair it, or remove the photograph and its pose";
                 return Err(DatasetError::malformed(path, "the mask", problem, remedy));
             }
-            image.mask = Some(if mask.dimensions() == (header.width, header.height) {
+            let mask = if mask.dimensions() == (header.width, header.height) {
                 mask.into_raw()
             } else {
                 let from = mask.dimensions();
                 resample::shrink_channel(mask.as_raw(), from, (header.width, header.height))
-            });
+            };
+            match mode {
+                MaskMode::Ignore => image.mask = Some(mask),
+                MaskMode::Background => image.alpha = carved(image.alpha, mask),
+            }
         }
         if let Some(undistortion) = &self.undistortion {
             image = undistortion.apply(&image);
@@ -215,6 +244,14 @@ impl ImageSource {
         }
         Ok(image)
     }
+}
+
+/// The coverage of an image of which a mask hides some; none where all is covered.
+fn carved(alpha: Option<Vec<u8>>, mut mask: Vec<u8>) -> Option<Vec<u8>> {
+    for (m, a) in mask.iter_mut().zip(alpha.iter().flatten()) {
+        *m = ((u32::from(*m) * u32::from(*a) + 127) / 255) as u8;
+    }
+    mask.iter().any(|&m| m < 255).then_some(mask)
 }
 
 /// Converts to 8 bits per channel, without a copy if it is RGB already.
@@ -348,7 +385,7 @@ mod tests {
         image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
             .save(&mask)
             .unwrap();
-        let mask = Some(Mask { file: SourceFile::found(mask).unwrap(), inverted: false });
+        let mask = Some(mask_of(mask, Hides::Black));
         let source = ImageSource { mask, width: 2, height: 2, ..ImageSource::whole(path) };
         let loaded = source.load().unwrap();
         assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
@@ -357,14 +394,43 @@ mod tests {
         assert!(source.working_bytes() >= 4 * 4 * 4 + loaded.bytes());
     }
 
+    fn mask_of(path: PathBuf, hides: Hides) -> Mask {
+        Mask { file: SourceFile::found(path).unwrap(), hides, mode: MaskMode::Ignore }
+    }
+
+    /// What a mask hides is as transparent as what the photograph has transparent.
+    #[test]
+    fn what_is_to_be_carved_is_transparent() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, plain, mask] = ["a.png", "b.png", "m.png"].map(|name| folder.path().join(name));
+        let alpha = |x, _| image::Rgba([10_u8, 20, 30, if x == 0 { 102 } else { 255 }]);
+        ImageBuffer::from_fn(2, 2, alpha).save(&path).unwrap();
+        RgbImage::from_pixel(2, 2, [10, 20, 30].into()).save(&plain).unwrap();
+        image::GrayImage::from_fn(2, 2, |_, y| [if y == 0 { 0 } else { 255 }].into())
+            .save(&mask)
+            .unwrap();
+        for (path, hides, expected) in [
+            (&path, Hides::Black, Some(vec![0, 0, 102, 255])),
+            (&path, Hides::White, Some(vec![102, 255, 0, 0])),
+            (&plain, Hides::Black, Some(vec![0, 0, 255, 255])),
+        ] {
+            let mask = Some(Mask { mode: MaskMode::Background, ..mask_of(mask.clone(), hides) });
+            let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
+            let loaded = source.load().unwrap();
+            assert_eq!((&loaded.alpha, &loaded.mask), (&expected, &None), "{hides:?}");
+            assert!(!source.is_masked());
+            assert_eq!(loaded.bytes(), source.loaded_bytes());
+        }
+    }
+
     #[test]
     fn a_mask_that_hides_everything_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let [path, mask] = ["a.png", "m.png"].map(|name| folder.path().join(name));
         RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
-        for (colour, inverted) in [(0, false), (255, true)] {
+        for (colour, hides) in [(0, Hides::Black), (255, Hides::White), (1, Hides::AllButBlack)] {
             image::GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
-            let mask = Some(Mask { file: SourceFile::found(mask.clone()).unwrap(), inverted });
+            let mask = Some(mask_of(mask.clone(), hides));
             let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
             let message = source.load().unwrap_err().to_string();
             assert!(

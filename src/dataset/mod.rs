@@ -43,10 +43,10 @@ use crate::memory::Bytes;
 use crate::number::grouped;
 pub use builtin::GroundTruth;
 pub use error::DatasetError;
-use folders::Folders;
+use folders::{Folders, MaskFile};
 use lens::Lens;
 use normalise::Normalisation;
-pub use options::{FarCameras, LoadOptions, Resolution, Split};
+pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
 pub use tracks::{MIN_VIEWS, Tracks};
 
@@ -113,7 +113,7 @@ struct Frame {
     image: PathBuf,
     /// The divisor of the folder `images_K` that the image is in.
     reduced: Option<u32>,
-    mask: Option<PathBuf>,
+    mask: Option<MaskFile>,
     lens: Lens,
     rotation: DMat3,
     translation: DVec3,

@@ -25,6 +25,8 @@ pub struct LoadOptions {
     pub keep_fov: bool,
     /// Whether masks are white, not black, where pixels are ignored (`--invert-masks`).
     pub invert_masks: bool,
+    /// What masked pixels are (`--mask-mode`).
+    pub mask_mode: MaskMode,
     /// Folder that keeps built-in scenes as they were rendered; `None`: they are rendered.
     pub cache: Option<PathBuf>,
     /// Whether to read which views show which points ([`Tracks`](super::Tracks)).
@@ -51,6 +53,17 @@ pub enum FarCameras {
     LeaveOut,
     /// They are kept.
     Keep,
+}
+
+/// What the pixels are that a mask hides.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum MaskMode {
+    /// Unknown: they do not count, and anything may be there
+    #[default]
+    Ignore,
+    /// Empty: they are trained to show --background, which carves away what is not in the mask
+    Background,
 }
 
 /// Which views are held out for tests.

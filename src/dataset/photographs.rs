@@ -7,10 +7,10 @@ use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
 use super::error::DatasetError;
-use super::images::{self, ImageHeader, ImageSource, Mask, SourceFile};
+use super::images::{self, Hides, ImageHeader, ImageSource, Mask, SourceFile};
 use super::lens::{Cut, CutFault, Lens};
 use super::undistort::{Pinhole, Undistortion};
-use super::{Frame, LoadOptions, Resolution, View};
+use super::{Frame, LoadOptions, MaskMode, Resolution, View};
 use crate::camera::Camera;
 
 /// Share of a photograph that may be cropped without a word.
@@ -36,11 +36,13 @@ pub(super) fn photographs(
     options: &LoadOptions,
     notes: &mut Vec<String>,
 ) -> Result<Vec<Photograph>, DatasetError> {
-    if options.invert_masks && frames.iter().all(|frame| frame.mask.is_none()) {
+    let carves = options.mask_mode == MaskMode::Background;
+    let flag = if options.invert_masks { "--invert-masks" } else { "--mask-mode background" };
+    if (options.invert_masks || carves) && frames.iter().all(|frame| frame.mask.is_none()) {
         let problem = "no photograph has a mask";
         let remedy =
             "put masks into `masks/`, each as NAME.png after its photograph, or leave the flag out";
-        return Err(DatasetError::malformed(listing, "--invert-masks", problem, remedy));
+        return Err(DatasetError::malformed(listing, flag, problem, remedy));
     }
     // All first, then the first error: the message does not depend on the threads.
     let checked: Vec<_> = frames.par_iter().map(|frame| checked(listing, frame)).collect();
@@ -93,6 +95,7 @@ fn checked(listing: &Path, frame: &Frame) -> Result<(ImageHeader, Lens), Dataset
         return Err(DatasetError::size(&frame.image, size, expected));
     }
     if let Some(mask) = &frame.mask {
+        let mask = &mask.path;
         let found = images::probe(mask)?;
         let found = (found.width, found.height);
         if !proportional(found, size) {
@@ -166,8 +169,16 @@ fn photograph(
     options: &LoadOptions,
 ) -> Result<Photograph, DatasetError> {
     let file = SourceFile::found(frame.image.clone())?;
-    let mask = frame.mask.clone().map(SourceFile::found).transpose()?;
-    let mask = mask.map(|file| Mask { file, inverted: options.invert_masks });
+    let mask = frame.mask.as_ref().map(|mask| {
+        let hides = match (mask.hides_all_but_black, options.invert_masks) {
+            (false, false) | (true, true) => Hides::Black,
+            (false, true) => Hides::White,
+            (true, false) => Hides::AllButBlack,
+        };
+        let file = SourceFile::found(mask.path.clone())?;
+        Ok::<_, DatasetError>(Mask { file, hides, mode: options.mask_mode })
+    });
+    let mask = mask.transpose()?;
     let view = |face: &str, undistortion: Option<Undistortion>| {
         let whole = Pinhole {
             width: lens.width,

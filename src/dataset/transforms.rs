@@ -12,7 +12,7 @@ use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value};
 
 use super::error::DatasetError;
-use super::folders::Folders;
+use super::folders::{Folders, MaskFile};
 use super::images;
 use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
 use super::lens::{Distortion, Lens, Plane};
@@ -106,7 +106,7 @@ pub(super) fn read(
                 let missing = || {
                     DatasetError::missing_image(&path, &field, &root.path().join(relative(value)))
                 };
-                Some(root.existing(named)?.ok_or_else(missing)?)
+                Some(MaskFile::of(root.existing(named)?.ok_or_else(missing)?))
             }
             None => folders.mask(named)?,
         };

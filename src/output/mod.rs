@@ -5,6 +5,7 @@
 //!   config.toml                                  everything needed to repeat the run
 //!   cameras.json                                 all cameras, world coordinates
 //!   point_cloud/iteration_N/point_cloud.ply      the model
+//!   point_cloud/iteration_N/exposure.json        how the training views were exposed
 //!   checkpoints/iteration_N.safetensors          to continue the run from
 //!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
 //!   results.json  per_view.json                  test scores, as the original trainer lays them out

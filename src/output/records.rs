@@ -11,7 +11,7 @@ use serde_json::{Map, Value};
 
 use super::disk::{Operation, WatchedFile, attempt};
 use super::{OutputError, write_atomically};
-use crate::evaluate::{Mean, Split, ViewScore};
+use crate::evaluate::{FittedScore, Mean, Split, ViewScore};
 #[cfg(feature = "study")]
 use crate::foreign;
 use crate::memory::Ledger;
@@ -181,6 +181,19 @@ pub fn write_scores(
     if !lpips.is_empty() {
         views["LPIPS"] = lpips.into();
     }
+    let fitted: [(&str, fn(&FittedScore) -> Option<f64>); 4] = [
+        ("PSNR_fitted", |v| Some(v.psnr)),
+        ("SSIM_fitted", |v| Some(v.ssim)),
+        ("FLIP_fitted", |v| Some(v.flip)),
+        ("LPIPS_fitted", |v| v.lpips),
+    ];
+    for (name, score) in fitted {
+        let pair = |view: &ViewScore| Some((view.name.clone(), score(&view.fitted?)?.into()));
+        let column: Map<String, Value> = scores.iter().filter_map(pair).collect();
+        if !column.is_empty() {
+            views[name] = column.into();
+        }
+    }
     insert_entry(&run.join(per_view), iteration, views)?;
     let mean = serde_json::to_value(Mean::of(scores)).unwrap_or_default();
     insert_entry(&run.join(results), iteration, mean)
@@ -327,6 +340,7 @@ mod tests {
             ssim: 0.5,
             flip: 0.25,
             lpips: None,
+            fitted: None,
         };
         [view("b.png", psnr), view("a/c.png", psnr + 2.0)]
     }
@@ -346,6 +360,14 @@ mod tests {
         });
         assert_eq!(read("results.json"), expected);
         assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);
+        let fitted = FittedScore { psnr: 40.0, ssim: 0.75, flip: 0.125, lpips: None };
+        let views = scores(10.0).map(|view| ViewScore { fitted: Some(fitted), ..view });
+        write_scores(root.path(), Split::Test, 8, &views).unwrap();
+        let names = ["PSNR", "SSIM", "FLIP", "PSNR_fitted", "SSIM_fitted", "FLIP_fitted"];
+        let values = [11.0, 0.5, 0.25, 40.0, 0.75, 0.125];
+        let expected: Value = names.iter().zip(values).map(|(n, v)| (*n, v)).collect();
+        assert_eq!(read("results.json")["ours_8"], expected);
+        assert_eq!(read("per_view.json")["ours_8"]["SSIM_fitted"]["b.png"], 0.75);
         std::fs::write(root.path().join("results.json"), "[").unwrap();
         write_scores(root.path(), Split::Train, 7, &scores(1.0)).unwrap();
         let message =
@@ -376,8 +398,13 @@ mod tests {
 
     #[test]
     fn a_perfect_score_is_read_back() {
-        let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0, lpips: None };
+        let perfect = Mean { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0, lpips: None, fitted: None };
         let text = serde_json::to_string(&perfect).unwrap();
         assert_eq!(serde_json::from_str::<Mean>(&text).unwrap(), perfect);
+        assert!(!text.contains("fitted"), "{text}");
+        let score = FittedScore { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0, lpips: Some(0.5) };
+        let both = Mean { fitted: Some(score), ..perfect };
+        let text = serde_json::to_string(&both).unwrap();
+        assert_eq!(serde_json::from_str::<Mean>(&text).unwrap(), both);
     }
 }

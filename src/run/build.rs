@@ -83,7 +83,7 @@ pub(super) fn build(
     if let Some(resumed) = &resumed {
         resume::check(&config, resumed, &fingerprint, &output)?;
     }
-    for line in inputs.degree.line().into_iter().chain(size.lines(&inputs)) {
+    for line in inputs.choices().chain(size.lines(&inputs)) {
         observer.say(format_args!("{line}"));
     }
     announce(&config, &output, inputs.entry.summary, observer);
@@ -102,6 +102,7 @@ pub(super) fn build(
         fits(file, backend.as_mut(), &inputs.dataset, view, observer)?;
     }
     let options = train_options(&inputs, &setting, rates);
+    let exposures = inputs.exposure.first(spec, &inputs.dataset);
     let (name, required) = (inputs.entry.name, inputs.required);
     let mut dataset = inputs.dataset;
     let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
@@ -109,7 +110,7 @@ pub(super) fn build(
     dataset.points = crate::dataset::PointCloud::default();
     let policy: Box<dyn DensityPolicy> = policy;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let mut trainer = trainer.requiring(required);
+    let mut trainer = trainer.requiring(required).exposing(exposures);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
@@ -191,6 +192,8 @@ fn decided(
         sh_degree_from: inputs.degree.source,
         init_model: inputs.init_model,
         frozen: inputs.frozen,
+        exposure_from: inputs.exposure.source,
+        has_exposures: inputs.exposure.is_on,
         ..Resolved::default()
     };
     Ok(RunConfig { densify: env!("CARGO_PKG_VERSION").to_owned(), spec, resolved })

@@ -8,6 +8,7 @@ use toml::{Table, Value};
 use super::overlay::{FOUND_OUT, Partial};
 use super::spec::RunSpec;
 use super::values::ShDegree;
+use crate::exposure::evidence::ExposureSpread;
 use crate::failure::Failure;
 use crate::output::{CONFIG_FILE, OutputError, write_atomically};
 use crate::spread::Spread;
@@ -40,6 +41,10 @@ pub struct Resolved {
     pub sh_degree_from: DegreeSource,
     /// Whether `--memory` has made the degree lower than was wanted.
     pub sh_degree_lowered: bool,
+    /// What decided whether exposures are learned.
+    pub exposure_from: ExposureSource,
+    /// Whether they are.
+    pub has_exposures: bool,
     /// The model that the run began from.
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
@@ -54,6 +59,19 @@ pub struct ModelSize {
     pub rows: usize,
     /// Its spherical-harmonic degree.
     pub sh_degree: u8,
+}
+
+/// What decided whether each photograph has an exposure of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExposureSource {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training.
+    Tracks(ExposureSpread),
+    /// Nothing: too few tracks are known, so exposures are not learned.
+    Undecided,
 }
 
 /// What decided the spherical-harmonic degree of a run.

@@ -30,6 +30,7 @@ impl DataSpec {
             far_cameras: self.far_cameras,
             keep_fov: self.keep_fov,
             invert_masks: self.invert_masks,
+            mask_mode: self.mask_mode,
             cache: builtin::folder().filter(|_| !self.no_cache),
             tracks,
         }

@@ -20,7 +20,7 @@ mod values;
 
 use std::path::PathBuf;
 
-pub use config::{DegreeSource, ModelSize, Resolved, RunConfig};
+pub use config::{DegreeSource, ExposureSource, ModelSize, Resolved, RunConfig};
 pub use observer::{Between, Interrupt, Observer, Silent};
 pub use overlay::Partial;
 #[cfg(feature = "study")]

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::config::{DegreeSource, RunConfig};
+use super::config::{DegreeSource, ExposureSource, RunConfig};
 use crate::gaussians::MAX_SH_DEGREE;
 #[cfg(feature = "study")]
 use crate::output::{OutputError, read_stats};
@@ -23,6 +23,10 @@ pub struct Requirements {
     pub sh_degree: u8,
     /// What decided the degree.
     pub sh_degree_from: DegreeSource,
+    /// Whether each photograph has an exposure of its own.
+    pub exposures: bool,
+    /// What decided it.
+    pub exposures_from: ExposureSource,
     /// Measurements of `--budget auto`.
     pub rows: Option<AutoBudget>,
     /// Number of training views not rendered for scores, as others are nearly the same.
@@ -70,6 +74,7 @@ impl Requirements {
     ) -> Self {
         let left_out = [
             degree_left_out(config),
+            exposures_left_out(config),
             auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget())),
             auto_budget.and_then(rows_removed),
             (unscored_views > 0).then(|| unscored(unscored_views)),
@@ -78,6 +83,8 @@ impl Requirements {
             full: config.spec.size.full,
             sh_degree: config.sh_degree(),
             sh_degree_from: config.resolved.sh_degree_from,
+            exposures: config.resolved.has_exposures,
+            exposures_from: config.resolved.exposure_from,
             rows: auto_budget.cloned(),
             unscored_views,
             left_out: left_out.into_iter().flatten().collect(),
@@ -124,6 +131,18 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
              1.4 dB on matt scenes all the same (docs/tradeoffs.md)",
             found.rms
         ),
+    })
+}
+
+fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {
+    let ExposureSource::Tracks(found) = config.resolved.exposure_from else { return None };
+    (!config.resolved.has_exposures).then(|| LeftOut {
+        what: "an exposure for each photograph".to_owned(),
+        evidence: format!(
+            "by the colours of {} points, those of {} views differ by {:.2} stops (rms)",
+            found.tracks, found.views, found.stops
+        ),
+        loss: "its loss was not measured".to_owned(),
     })
 }
 

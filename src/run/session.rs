@@ -12,16 +12,19 @@ use super::measuring::measure;
 use super::observer::{Between, Interrupt, Observer};
 use super::records::{Logs, Totals};
 use crate::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
-use crate::evaluate::{EvaluateError, Split, evaluate};
+use crate::evaluate::{Comparison, EvaluateError, Split, evaluate};
 use crate::export::{PLY, Shape};
+use crate::exposure::named_transforms;
 use crate::failure::{Failure, INPUT, OTHER};
 use crate::output::{
     CHECKPOINTS, CONFIG_FILE, Guard, Mean, OutputError, RunFolder, cameras_json, model_path,
-    saved_iterations, write_atomically, write_scores,
+    saved_iterations, write_atomically, write_json, write_scores,
 };
 use crate::trainer::{StepReport, TrainError};
 use crate::views::ViewSource;
 
+/// Name of the file beside a model that says how its training views were exposed.
+const EXPOSURES: &str = "exposure.json";
 /// Steps between two records of the log.
 const RECORD_EVERY: u32 = 10;
 
@@ -355,6 +358,11 @@ impl<'a> Session<'a> {
         PLY.write_file(&path, shape, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?))
         })?;
+        if let Some(exposures) = self.run.trainer.exposures() {
+            let names = self.run.dataset.train.iter().map(|view| &*view.name);
+            let named = named_transforms(exposures, names);
+            write_json(&path.with_file_name(EXPOSURES), &named)?;
+        }
         Ok(path)
     }
 
@@ -366,7 +374,9 @@ impl<'a> Session<'a> {
         }
         let (background, degree) = (config.spec.data.background.fixed(), config.sh_degree());
         let observer = self.observer;
-        let scores = evaluate(trainer.backend(), test, background, degree, None, |_| {
+        let fits_exposure = config.resolved.has_exposures;
+        let comparison = Comparison { lpips: None, fits_exposure };
+        let scores = evaluate(trainer.backend(), test, background, degree, comparison, |_| {
             observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
         });
         let scores = match (scores, self.observer.interrupt()) {
@@ -380,6 +390,9 @@ impl<'a> Session<'a> {
         let Mean { psnr, ssim, flip, .. } = mean;
         let scalars = [("test/psnr", psnr), ("test/ssim", ssim), ("test/flip", flip)];
         self.logs.board.scalars(step, &scalars.map(|(name, value)| (name, value as f32)))?;
+        if let Some(fitted) = mean.fitted {
+            self.logs.board.scalars(step, &[("test/psnr fitted", fitted.psnr as f32)])?;
+        }
         self.totals.tested.insert(step, mean);
         self.observer.tested(step, &mean);
         if !is_last {

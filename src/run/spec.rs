@@ -16,7 +16,8 @@ use super::values::{
     Threads, Whole, as_table,
 };
 use crate::backend::BackendChoice;
-use crate::dataset::{FarCameras, Resolution};
+use crate::dataset::{FarCameras, MaskMode, Resolution};
+use crate::exposure::{ExposureChoice, ExposureModel};
 use crate::schedule::{Background, REFERENCE_ITERATIONS};
 use crate::trainer::OnNan;
 
@@ -138,6 +139,11 @@ run_spec! {
             require_equals = true, default_missing_value = "true", hide_possible_values = true
         )]
         invert_masks: bool = false, Fixed;
+
+        /// What the pixels are that masks hide. To carve an object out, background needs a colour behind it that the
+        /// object does not have, or --background random
+        #[arg(long, value_name = "MODE")]
+        mask_mode: MaskMode = MaskMode::Ignore, Fixed;
 
         /// Render a built-in scene anew, and do not keep it in the user's cache folder
         #[arg(
@@ -281,6 +287,16 @@ run_spec! {
         #[arg(long, value_name = "NAME=VALUE")]
         #[serde(with = "as_table")]
         knob: Vec<Assignment> = Vec::new(), Fixed;
+
+        /// Whether each training photograph has an exposure of its own, which is learned beside the model: a factor
+        /// and an offset per colour channel. Test views are then measured as they are, and again after the best
+        /// such fit. auto needs the tracks of a reconstruction
+        #[arg(long, value_name = "WHEN")]
+        exposure: ExposureChoice = ExposureChoice::Off, Fixed;
+
+        /// What an exposure may do to colours
+        #[arg(long, value_name = "MODEL")]
+        exposure_model: ExposureModel = ExposureModel::Channels, Fixed;
 
         /// What happens to Gaussians with a non-finite value; they are looked for every 100 iterations
         /// at least

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::Run;
 use super::report::{REQUIREMENTS, Requirements};
 use super::session::Session;
+use crate::evaluate::FittedScore;
 use crate::memory::Bytes;
 use crate::number::{duration, grouped};
 use crate::output::{Mean, OutputError, Summary, model_path, write_json};
@@ -54,11 +55,17 @@ impl Session<'_> {
     pub(super) fn report(&self, path: &Path) {
         let Run { config, trainer, test, ledger, .. } = &self.run;
         let steps = trainer.steps_done();
-        if let Some(Mean { psnr, ssim, flip, .. }) = self.totals.tested.get(&steps) {
+        if let Some(Mean { psnr, ssim, flip, fitted, .. }) = self.totals.tested.get(&steps) {
             let views = test.count();
             self.observer.say(format_args!(
                 "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
             ));
+            if let Some(FittedScore { psnr, ssim, flip, .. }) = fitted {
+                self.observer.say(format_args!(
+                    "fitted   PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}, with the best exposure of \
+                     each view"
+                ));
+            }
         }
         self.observer.say(format_args!(
             "rows     {}, at most {} of {}",

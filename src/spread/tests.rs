@@ -8,11 +8,16 @@ use glam::{DMat3, DVec3};
 use super::*;
 use crate::camera::Camera;
 use crate::dataset::builtin::PREFIX;
-use crate::dataset::images::{ImageHeader, ImageSource, SourceFile};
-use crate::dataset::{Dataset, LoadOptions};
+use crate::dataset::images::{Image8, ImageHeader, ImageSource, SourceFile};
+use crate::dataset::{Dataset, DatasetError, LoadOptions, View};
+use crate::exposure::evidence::ExposureSpread;
 
 const SIZE: u32 = 60;
 const VIEWS: usize = 8;
+
+fn measured(tracks: &Tracks, views: &[View]) -> Result<Spread, DatasetError> {
+    Ok(measure(tracks, &TrackColours::read(tracks, views)?))
+}
 
 /// Views of a wall of 20 x 20 coloured squares, 3 px wide each, from one place; `shade` is what a view
 /// makes of a square's colour.
@@ -57,10 +62,41 @@ fn posed(image: Image8) -> View {
 fn colours_that_stay_ask_for_degree_0_whatever_the_exposure() {
     for exposures in [[1.0; VIEWS], [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05]] {
         let (tracks, views) = scene(|view, _, value| value * exposures[view]);
-        let found = measure(&tracks, &views).unwrap();
+        let found = measured(&tracks, &views).unwrap();
         assert_eq!(found.tracks, tracks.len());
         assert!(found.twentieth < 0.75, "rounding to whole steps: {found:?}");
     }
+}
+
+/// The gains of the views are found, and decide that exposures are learned; colours that change by view
+/// without a common factor do not.
+#[test]
+fn exposures_are_found_where_gains_explain_the_colours() {
+    let exposures = [1.0, 0.8, 1.1, 0.7, 1.0, 1.2, 0.9, 1.05];
+    let found = |shade: &dyn Fn(usize, usize, f32) -> f32| {
+        let (tracks, views) = scene(shade);
+        let (found, gains) = ExposureSpread::measure(&TrackColours::read(&tracks, &views).unwrap());
+        assert_eq!((found.tracks, found.views), (tracks.len(), VIEWS));
+        // As many tracks as decide.
+        (ExposureSpread { tracks: MIN_TRACKS, ..found }, gains)
+    };
+    let (differ, gains) = found(&|view, _, value| value * exposures[view]);
+    assert_eq!(differ.decides(VIEWS), Some(true), "{differ:?}");
+    assert!((differ.stops - 0.6).abs() < 0.05 && differ.with_gains < 1.0, "{differ:?}");
+    let mean = exposures.iter().map(|e: &f32| e.ln()).sum::<f32>() / VIEWS as f32;
+    for (gains, exposure) in gains.iter().zip(exposures) {
+        assert!(gains.iter().all(|gain| (gain - exposure / mean.exp()).abs() < 0.01), "{gains:?}");
+    }
+    let (alike, gains) = found(&|_, _, value| value);
+    assert_eq!(alike.decides(VIEWS), Some(false), "{alike:?}");
+    assert!(gains.iter().flatten().all(|gain| (gain - 1.0).abs() < 1e-6), "{gains:?}");
+    // Each square has a factor of its own in each view.
+    let (noise, _) = found(&|view, square, value| {
+        value * (0.6 + 0.1 * ((view * 31 + square * 17 + view * square * 7) % 9) as f32)
+    });
+    assert_eq!(noise.decides(VIEWS), Some(false), "{noise:?}");
+    assert_eq!(differ.decides(2 * VIEWS), None, "of half of the views nothing is known");
+    assert_eq!(ExposureSpread { tracks: 499, ..differ }.decides(VIEWS), None);
 }
 
 #[test]
@@ -72,7 +108,7 @@ fn colours_that_change_with_the_view_ask_for_more() {
             _ => value,
         };
         let (tracks, views) = scene(shade);
-        let found = Spread { tracks: MIN_TRACKS, ..measure(&tracks, &views).unwrap() };
+        let found = Spread { tracks: MIN_TRACKS, ..measured(&tracks, &views).unwrap() };
         assert_eq!(found.degree(), Some(degree), "{strength}: {found:?}");
     }
 }
@@ -82,7 +118,7 @@ fn what_stands_before_a_point_in_a_quarter_of_its_views_is_left_out() {
     let hidden = |share: usize| {
         let (tracks, views) =
             scene(|view, _, value| if view < share { 255.0 - value } else { value });
-        measure(&tracks, &views).unwrap().twentieth
+        measured(&tracks, &views).unwrap().twentieth
     };
     assert!(hidden(2) < 0.75, "{}", hidden(2));
     assert!(hidden(4) > 4.0, "{}", hidden(4));
@@ -91,17 +127,17 @@ fn what_stands_before_a_point_in_a_quarter_of_its_views_is_left_out() {
 #[test]
 fn points_that_are_not_on_a_surface_decide_nothing() {
     let (mut tracks, views) = scene(|_, _, value| value);
-    let on = measure(&tracks, &views).unwrap();
+    let on = measured(&tracks, &views).unwrap();
     assert!(on.on_surface > 0.99, "{on:?}");
     for colour in tracks.colours.iter_mut().step_by(3) {
         *colour = colour.map(|value| 255 - value);
     }
-    let some = Spread { tracks: MIN_TRACKS, ..measure(&tracks, &views).unwrap() };
+    let some = Spread { tracks: MIN_TRACKS, ..measured(&tracks, &views).unwrap() };
     assert!(some.degree().is_some(), "{some:?}");
     let none = Spread { on_surface: 0.49, ..some };
     assert_eq!(none.degree(), None);
     assert_eq!(Spread { tracks: MIN_TRACKS - 1, ..some }.degree(), None);
-    assert_eq!(measure(&Tracks::default(), &views).unwrap().degree(), None);
+    assert_eq!(measured(&Tracks::default(), &views).unwrap().degree(), None);
 }
 
 #[test]
@@ -111,7 +147,7 @@ fn built_in_scenes_ask_for_what_their_materials_need() {
         let options = LoadOptions { tracks: true, ..LoadOptions::default() };
         let path = format!("{PREFIX}{name}");
         let loaded = Dataset::load(Path::new(&path), &options).unwrap();
-        let found = measure(&loaded.tracks, &loaded.train).unwrap();
+        let found = measured(&loaded.tracks, &loaded.train).unwrap();
         let degree = found.degree();
         assert!(degree.is_some_and(|degree| degrees.contains(&degree)), "{name}: {found:?}");
     }

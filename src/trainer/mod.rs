@@ -27,6 +27,7 @@ use densify_policies::policy::{
 
 use crate::backend::{Backend, BackendError, StepInput};
 use crate::dataset::images::SharedImage;
+use crate::exposure::Exposures;
 use crate::schedule;
 use crate::views::ViewSource;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth_signals};
@@ -63,6 +64,8 @@ pub struct Trainer<V> {
     /// Training views that `--budget auto` measures; empty without it.
     probes: Vec<usize>,
     auto_budget: Option<AutoBudget>,
+    /// How each training view was exposed, where that is learned.
+    exposures: Option<Exposures>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -96,6 +99,7 @@ impl<V: ViewSource> Trainer<V> {
             scored: (0..count).collect(),
             probes: Vec::new(),
             auto_budget: None,
+            exposures: None,
         })
     }
 
@@ -111,6 +115,19 @@ impl<V: ViewSource> Trainer<V> {
         }
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
         self.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
+        self
+    }
+
+    /// Lets the run learn how each training view was exposed, beginning with these; to be called before the
+    /// first step. The backend must have been made for it.
+    ///
+    /// # Panics
+    /// When there is not one for each view: a bug in the caller.
+    #[must_use]
+    pub fn exposing(mut self, exposures: Option<Exposures>) -> Self {
+        let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
+        assert_eq!(count, self.views.count(), "exposures of other views");
+        self.exposures = exposures;
         self
     }
 
@@ -134,12 +151,14 @@ impl<V: ViewSource> Trainer<V> {
         let (loss_terms, noise) = self.terms(step)?;
         let (camera, image) = self.at_resolution(step, view, image)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
+        let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
         let input = StepInput {
             step,
             view,
             camera: &camera,
             target: &image,
             background: background.at(seed, step),
+            exposure: exposure.as_ref(),
             sh_degree: self.sh_degree(step),
             rates: rates.at(step, iterations, self.scene.extent),
             loss_terms,
@@ -152,6 +171,9 @@ impl<V: ViewSource> Trainer<V> {
         if !output.loss.is_finite() {
             let view = self.views.name(view).to_owned();
             return Err(TrainError::Diverged { step, view, loss: output.loss });
+        }
+        if let Some((exposures, gradient)) = self.exposures.as_mut().zip(output.exposure) {
+            exposures.step(view, &gradient, f64::from(step) / f64::from(iterations));
         }
         let is_due =
             call_policy(|| self.policy.is_due(step)).map_err(|e| self.policy_error(step, e))?;

@@ -22,6 +22,7 @@ impl<V: ViewSource> Trainer<V> {
         let (options, degree) = (self.options, self.sh_degree(step));
         for view in self.draw_scored(count, step) {
             let image = self.image(step, view)?;
+            let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
             let measured = self.backend.observe(&AuxInput {
                 step,
                 view,
@@ -29,6 +30,7 @@ impl<V: ViewSource> Trainer<V> {
                 camera: self.views.camera(view),
                 target: &image,
                 background: options.background.at(options.seed, step),
+                exposure: exposure.as_ref(),
                 sh_degree: degree,
                 request: &request,
             });

@@ -39,9 +39,16 @@ impl<V: ViewSource> Trainer<V> {
         let mut measured = Vec::with_capacity(self.probes.len());
         for view in self.probes.clone() {
             let image = self.image(step, view)?;
-            let rendering = self.backend.render(self.views.camera(view), background, sh_degree);
-            let rendering = rendering.map_err(|source| self.backend_error(step, source))?;
+            let exposure = self.exposures.as_ref().map(|exposures| exposures.of(view));
+            let behind = exposure.map_or(background, |exposure| exposure.behind(background));
+            let rendering = self.backend.render(self.views.camera(view), behind, sh_degree);
+            let mut rendering = rendering.map_err(|source| self.backend_error(step, source))?;
             self.extra_forwards += 1;
+            if let Some(exposure) = exposure {
+                for colour in rendering.rgb.as_chunks_mut::<3>().0 {
+                    *colour = exposure.apply(*colour);
+                }
+            }
             let ratio = psnr(&rendering.rgb, &image, background).map_err(|source| {
                 let view = self.views.name(view).to_owned();
                 TrainError::View { step, view, source: Box::new(source) }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::{AutoBudget, Trainer};
 use crate::backend::{Backend, BackendError};
+use crate::exposure::Exposures;
 use crate::gaussians::Gaussians;
 use crate::views::ViewSource;
 
@@ -12,6 +13,12 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn growth(&self) -> Option<&AutoBudget> {
         self.auto_budget.as_ref()
+    }
+
+    /// How the training views were exposed, where that is learned.
+    #[must_use]
+    pub fn exposures(&self) -> Option<&Exposures> {
+        self.exposures.as_ref()
     }
 
     /// Number of training views that are not rendered for the policy's scores, as others are nearly the

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::policy_views::call_policy;
 use super::{AutoBudget, EditEvent, Trainer};
+use crate::exposure::Exposures;
 use crate::schedule;
 use crate::views::ViewSource;
 
@@ -36,6 +37,9 @@ pub struct TrainerState {
     /// The row limit of `--budget auto` and its measurements.
     #[serde(default)]
     pub auto_budget: Option<AutoBudget>,
+    /// How each training view was exposed, as far as it is learned.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposures: Option<Exposures>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -51,6 +55,7 @@ impl<V: ViewSource> Trainer<V> {
             events: self.events.clone(),
             policy: call_policy(|| self.policy.save())?,
             auto_budget: self.auto_budget.clone(),
+            exposures: self.exposures.clone(),
         })
     }
 
@@ -58,9 +63,17 @@ impl<V: ViewSource> Trainer<V> {
     /// backend must hold the model and the backend state of the same step.
     ///
     /// # Errors
-    /// [`PolicyError`] if the policy rejects its state; then the trainer must not be used.
+    /// [`PolicyError`] if the policy rejects its state, or the exposures are of other views; then the trainer
+    /// must not be used.
     pub fn resume(&mut self, state: TrainerState) -> Result<(), PolicyError> {
         call_policy(|| self.policy.restore(state.policy)).and_then(|done| done)?;
+        let like = match (&state.exposures, &self.exposures) {
+            (Some(saved), Some(own)) => saved.check_like(own),
+            (None, None) => Ok(()),
+            _ => Err("it has exposures, or this run has, but not both".to_owned()),
+        };
+        like.map_err(PolicyError::Other)?;
+        self.exposures = state.exposures;
         self.step = state.step;
         self.scene.initial_rows = state.initial_rows;
         self.peak_rows = self.peak_rows.max(state.peak_rows);

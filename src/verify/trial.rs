@@ -193,6 +193,7 @@ pub(super) fn step(
         camera,
         target,
         background,
+        exposure: None,
         sh_degree,
         rates: RATES,
         loss_terms: LossTerms::default(),

@@ -257,7 +257,10 @@ mod tests {
         };
         (0..1000).for_each(|step| board.edit(&event(step)));
         (0..1000).for_each(|step| {
-            board.tested(step, &Mean { psnr: 1.0 / 3.0, ssim: 0.0, flip: 0.0, lpips: None });
+            board.tested(
+                step,
+                &Mean { psnr: 1.0 / 3.0, ssim: 0.0, flip: 0.0, lpips: None, fitted: None },
+            );
         });
         let text = board.json();
         let said: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -78,6 +78,7 @@ fn observe(
         camera: &scene.camera,
         target: &scene.target,
         background: BACKGROUND,
+        exposure: None,
         sh_degree: 2,
         request,
     };

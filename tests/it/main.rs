@@ -3,7 +3,7 @@
 //! Most run once on each of the backends of `subject`: the native one with every instruction set, and every
 //! adapter. `central` checks the float64 renderer of `densify::verify` by central differences, and `oracle`
 //! holds it and the backends against stored float64 renders; `extremes` runs the cases of the selftest and
-//! says where every extreme is tested; `agreement` holds every backend to the native one; `properties` are
+//! says where every extreme is tested; `exposure` is of photographs that are exposed differently; `agreement` holds every backend to the native one; `properties` are
 //! of any scene; `sameness` and `resuming` compare bits; `edits` applies any plan to a backend and to a
 //! plain vector; `frozen` is about rows that never change; `spatial` is a policy that reads and
 //! edits where rows are. `cli` runs the program on photographs of a small scene, and holds policies to surfaces that
@@ -17,6 +17,7 @@ mod central;
 mod cli;
 mod declared;
 mod edits;
+mod exposure;
 mod extremes;
 mod frozen;
 mod fuzz;

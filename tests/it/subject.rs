@@ -155,6 +155,7 @@ pub(crate) fn step_input<'a>(
         camera,
         target,
         background: GREY,
+        exposure: None,
         sh_degree,
         rates: RATES,
         loss_terms: LossTerms::default(),

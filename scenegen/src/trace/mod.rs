@@ -32,6 +32,8 @@ pub struct Frame {
     pub height: u32,
     /// sRGB colour and straight alpha, which is coverage. Shape: `[height, width, 4]`.
     pub rgba: Vec<u8>,
+    /// The same as a camera shows it that exposes each view differently, if it does. Same shape.
+    pub exposed: Option<Vec<u8>>,
     /// Camera z of the first surface with alpha of at least 0.5, through the pixel's centre; 0
     /// where there is none. Shape: `[height, width]`.
     pub depth: Vec<f32>,
@@ -108,6 +110,7 @@ impl Frame {
             width,
             height,
             rgba: vec![0; 4 * pixels],
+            exposed: None,
             depth: vec![0.0; pixels],
             normals: vec![[0.0; 3]; pixels],
             triangles: vec![u32::MAX; pixels],
@@ -116,17 +119,27 @@ impl Frame {
 }
 
 impl Tracer<'_> {
-    /// Renders a view, whose number seeds its random numbers.
-    pub(crate) fn render(&self, camera: &Camera, view: u64) -> Frame {
+    /// Renders a view, whose number seeds its random numbers; also with these factors on the light of each
+    /// channel.
+    pub(crate) fn render(&self, camera: &Camera, view: u64, gains: Option<[f32; 3]>) -> Frame {
         let mut frame = Frame::empty(camera.width, camera.height);
         let row = camera.width as usize;
+        let mut exposed = vec![0; if gains.is_some() { frame.rgba.len() } else { 0 }];
+        let gains = gains.map(Vec3::from);
+        // Nothing where there are no factors.
+        let per_band = if gains.is_some() { 4 * BAND * row } else { 0 };
+        let mut rest = &mut exposed[..];
+        let exposed_bands: Vec<&mut [u8]> = (0..(camera.height as usize).div_ceil(BAND))
+            .map(|_| rest.split_off_mut(..per_band.min(rest.len())).unwrap_or_default())
+            .collect();
         let bands = frame
             .rgba
             .par_chunks_mut(4 * BAND * row)
+            .zip(exposed_bands)
             .zip(frame.depth.par_chunks_mut(BAND * row))
             .zip(frame.normals.par_chunks_mut(BAND * row))
             .zip(frame.triangles.par_chunks_mut(BAND * row));
-        bands.enumerate().for_each(|(band, (((rgba, depth), normals), triangles))| {
+        bands.enumerate().for_each(|(band, ((((rgba, exposed), depth), normals), triangles))| {
             let top = band * BAND;
             let rows = depth.len() / row;
             for left in (0..row).step_by(TILE) {
@@ -139,8 +152,12 @@ impl Tracer<'_> {
                     let i = y * row + x;
                     let pixel = DVec2::new(x as f64, (top + y) as f64);
                     let draws = Draws::new(self.seed, &[view, ((top + y) * row + x) as u64]);
-                    let (colour, met) = self.pixel(camera, pixel, draws);
-                    rgba[4 * i..4 * i + 4].copy_from_slice(&colour);
+                    let (light, coverage, met) = self.pixel(camera, pixel, draws);
+                    rgba[4 * i..4 * i + 4].copy_from_slice(&encoded(light, coverage));
+                    if let Some(gains) = gains {
+                        exposed[4 * i..4 * i + 4]
+                            .copy_from_slice(&encoded(light * gains, coverage));
+                    }
                     let direction = camera.direction(pixel + 0.5);
                     if let Some(first) = self.first_solid(camera.centre, direction, met) {
                         depth[i] = first.0 as f32;
@@ -150,6 +167,7 @@ impl Tracer<'_> {
                 }
             }
         });
+        frame.exposed = gains.map(|_| exposed);
         frame
     }
 
@@ -172,9 +190,9 @@ impl Tracer<'_> {
         ShadedSurface { surface: self.surface, model: self.model, flags: self.flags }
     }
 
-    /// Colour and alpha of a pixel, whose upper left corner is at `corner`; also a triangle that one
+    /// Light and coverage of a pixel, whose upper left corner is at `corner`; also a triangle that one
     /// of its rays met, by place in leaf order.
-    fn pixel(&self, camera: &Camera, corner: DVec2, draws: Draws) -> ([u8; 4], Option<u32>) {
+    fn pixel(&self, camera: &Camera, corner: DVec2, draws: Draws) -> (Vec3, f32, Option<u32>) {
         let grid = self.lighting.grid;
         let (mut colour, mut alpha) = (Vec3::ZERO, 0.0);
         let mut sampling = Sampling { draws, met: None, hid: None };
@@ -193,12 +211,10 @@ impl Tracer<'_> {
             alpha += a;
         }
         if alpha <= 0.0 {
-            return ([0; 4], sampling.met);
+            return (Vec3::ZERO, 0.0, sampling.met);
         }
         let straight = colour * (self.exposure / alpha);
-        let coverage = alpha / (grid * grid) as f32;
-        let a = (coverage.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-        ([encode(straight.x), encode(straight.y), encode(straight.z), a], sampling.met)
+        (straight, alpha / (grid * grid) as f32, sampling.met)
     }
 
     /// Sums over rays: colour, weighted with alpha, and alpha.
@@ -283,6 +299,15 @@ impl Tracer<'_> {
             last = hit;
         }
     }
+}
+
+/// A pixel of an image: sRGB and straight alpha; nothing where nothing is covered.
+fn encoded(light: Vec3, coverage: f32) -> [u8; 4] {
+    if coverage <= 0.0 {
+        return [0; 4];
+    }
+    let a = (coverage.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+    [encode(light.x), encode(light.y), encode(light.z), a]
 }
 
 /// Mean radiance of a pixel grid over a view, for choosing an exposure: one ray per `step` pixels.

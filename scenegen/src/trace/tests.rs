@@ -19,7 +19,7 @@ fn render(model: &Model, camera: &Camera, sky: Sky, ambient: Ambient) -> Frame {
     let flags = TriangleFlags::all(&surface, model);
     let lighting = Lighting::new(&model.lights, &surface, sky, (ambient, true, 4));
     let (surface, flags, lighting) = (&surface, &flags[..], &lighting);
-    Tracer { surface, model, flags, lighting, exposure: 1.0, seed: 1 }.render(camera, 0)
+    Tracer { surface, model, flags, lighting, exposure: 1.0, seed: 1 }.render(camera, 0, None)
 }
 
 fn above(height: f64) -> Camera {

@@ -137,7 +137,8 @@ fn readable(folder: &Path) -> Result<(), Error> {
 
 fn write_frame(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
     let path = root.join("images").join(format!("{name}.png"));
-    write_png(&path, frame.width, frame.height, &frame.rgba)?;
+    let image = frame.exposed.as_ref().unwrap_or(&frame.rgba);
+    write_png(&path, frame.width, frame.height, image)?;
     exr::write_depth(&root.join("depth").join(format!("{name}.exr")), frame)?;
     npy::write_depth(&root.join("depth").join(format!("{name}.npy")), frame)?;
     exr::write_normals(&root.join("normals").join(format!("{name}.exr")), frame)

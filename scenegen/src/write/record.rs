@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::write_file;
 use crate::error::Error;
@@ -22,6 +22,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
         "ambient": scene.ambient,
         "sky": scene.sky,
         "exposure": scene.exposure,
+        "view_exposures": exposures(scene),
         "samples_per_pixel": scene.options.grid * scene.options.grid,
         "mesh": {
             "triangles": model.triangles.len(),
@@ -48,4 +49,12 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
         },
     });
     write_file(&root.join(NAME), format!("{record:#}").as_bytes())
+}
+
+/// The exposures of the views that differ, by name; null where none does.
+fn exposures(scene: &Scene) -> Value {
+    let named = scene.views.iter().enumerate();
+    let named = named.filter_map(|(at, view)| Some((view.name.clone(), json!(scene.gains(at)?))));
+    let named: serde_json::Map<String, Value> = named.collect();
+    if named.is_empty() { Value::Null } else { named.into() }
 }

@@ -28,6 +28,60 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
+/// Training views are exposed by the factors that the record has; test views, depth and points stay.
+#[test]
+fn exposures_differ_in_training_views_alone() {
+    let plain = small();
+    let options = Options { exposure_jitter: 1.0, ..plain.options.clone() };
+    let scene = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset");
+    let root = tempfile::tempdir().expect("folder");
+    let [a, b] = [(&plain, "plain"), (&scene, "exposed")].map(|(scene, name)| {
+        let target = root.path().join(name);
+        write(scene, &target, false, |_| ()).expect("write");
+        target
+    });
+    let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
+    for name in ["images/test/r_001.png", "depth/train/r_001.exr", "points3d.ply"] {
+        assert!(read(&a, name) == read(&b, name), "{name}");
+    }
+    let record: Value = serde_json::from_slice(&read(&b, "scene.json")).expect("JSON");
+    let pixels = |folder: &Path, number: usize| {
+        let path = folder.join(format!("images/train/r_{number:03}.png"));
+        image::open(path).expect("PNG").into_rgba8().into_raw()
+    };
+    let light = |value: u8| {
+        let v = f64::from(value) / 255.0;
+        if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+    };
+    let mut stops = Vec::new();
+    for number in 0..4 {
+        let factors = &record["view_exposures"][format!("train/r_{number:03}")];
+        let factors = [0, 1, 2].map(|c| factors[c].as_f64().expect("a factor"));
+        stops.push(factors[1].log2());
+        assert!(factors[1].log2().abs() <= 1.0, "{factors:?}");
+        for c in [0, 2] {
+            assert!((factors[c] / factors[1] - 1.0).abs() <= 0.1 + 1e-6, "{factors:?}");
+        }
+        let (plain, exposed) = (pixels(&a, number), pixels(&b, number));
+        let pairs = plain.chunks_exact(4).zip(exposed.chunks_exact(4));
+        let mut compared = 0;
+        for (plain, exposed) in pairs.filter(|(plain, _)| plain[3] > 0) {
+            assert_eq!(plain[3], exposed[3], "coverage stays");
+            for c in 0..3 {
+                // Where nothing is clipped, and steps of eight bits are small.
+                if exposed[c] < 255 && plain[c] < 255 && plain[c] > 60 && exposed[c] > 60 {
+                    let ratio = light(exposed[c]) / light(plain[c]) / factors[c];
+                    assert!((ratio - 1.0).abs() < 0.05, "{number}: {plain:?} {exposed:?}");
+                    compared += 1;
+                }
+            }
+        }
+        assert!(compared > 50, "{compared}");
+    }
+    stops.sort_by(f64::total_cmp);
+    assert!(stops[3] - stops[0] > 0.2, "{stops:?}");
+}
+
 #[test]
 fn everything_is_written_and_nothing_else_stays() {
     let scene = small();

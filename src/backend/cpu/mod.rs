@@ -14,6 +14,7 @@ mod blocks;
 mod budget;
 mod candidates;
 mod differentiate;
+mod exposure;
 mod footprint;
 mod instructions;
 mod loss;
@@ -48,7 +49,7 @@ use densify_policies::policy::{Candidate, SignalSet, Signals};
 use densify_policies::rng::PolicyRng;
 use pulp::Arch;
 
-use super::candidates::{Candidates, error_weights};
+use super::candidates::{Candidates, Shown, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
     AuxInput, AuxOutput, Backend, BackendError, Rendering, Setup, Shortcuts, StateArray,
@@ -213,16 +214,23 @@ impl CpuBackend {
 
     /// One training step, on a thread of the pool.
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, .. } = *input;
-        let frame = self.forward(camera, background, input.sh_degree, Beside::Nothing)?;
+        let StepInput { camera, target, background, exposure, .. } = *input;
+        let behind = exposure.map_or(background, |exposure| exposure.behind(background));
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing)?;
+        if let Some(exposure) = exposure {
+            self.expose(&frame.grid, exposure);
+        }
         let picks = self.candidates.open(input.step, self.rows);
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let by_pixel =
             self.signals.layout().has(Field::Error).then_some(self.signals.planes().score);
         let terms = ImageTerms { error: weights, by_pixel };
         let value = self.image_loss(&frame.grid, target, background, terms);
+        let by_exposure =
+            exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
         if let Some((request, count)) = picks {
-            self.collect_candidates(&frame, target, &request, count);
+            let shown = Shown { target, background, exposure };
+            self.collect_candidates(&frame, shown, &request, count);
         }
         self.backward(&frame, self.signals.layout());
         self.optimise(&frame, input);
@@ -231,6 +239,7 @@ impl CpuBackend {
             visible: frame.visible,
             entries: frame.entries,
             bands: frame.bands.len() as u32,
+            exposure: by_exposure,
             ..scalars(value)
         })
     }

@@ -23,6 +23,7 @@ use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
 use crate::backend::assert_same_size;
+use crate::backend::candidates::Shown;
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::dataset::images::Image8;
 
@@ -44,12 +45,16 @@ pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
 impl CpuBackend {
     /// Measures one view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
-        let AuxInput { camera, target, background, request, .. } = *input;
+        let AuxInput { camera, target, background, exposure, request, .. } = *input;
+        let behind = exposure.map_or(background, |exposure| exposure.behind(background));
         assert_same_size(camera, target);
         // Stage times stay those of training.
         let clock = std::mem::take(&mut self.clock);
-        let frame = self.forward(camera, background, input.sh_degree, Beside::Nothing);
+        let frame = self.forward(camera, behind, input.sh_degree, Beside::Nothing);
         let measured = frame.map(|frame| {
+            if let Some(exposure) = exposure {
+                self.expose(&frame.grid, exposure);
+            }
             let loss =
                 scalars(self.image_loss(&frame.grid, target, background, ImageTerms::default()))
                     .loss;
@@ -83,7 +88,9 @@ impl CpuBackend {
             });
         }
         let pixels = draw_pixels(&alpha, grid.width, input);
-        self.surface_points(frame, input.target, &pixels, DepthMode::MaxWeight)
+        let AuxInput { target, background, exposure, .. } = *input;
+        let shown = Shown { target, background, exposure };
+        self.surface_points(frame, shown, &pixels, DepthMode::MaxWeight)
     }
 
     /// Writes the pixel map to its plane.

@@ -23,6 +23,7 @@ use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
 use super::{BLOCKS_PER_TASK, CpuBackend, MAX_SIDE, ROWS_PER_TASK};
+use crate::backend::candidates::Shown;
 use crate::backend::signals::RecordLayout;
 use crate::backend::{BackendError, Rendering, StepInput, StepOutput};
 use crate::camera::Camera;
@@ -214,7 +215,7 @@ impl CpuBackend {
     pub(super) fn collect_candidates(
         &mut self,
         frame: &Frame,
-        target: &Image8,
+        shown: Shown<'_>,
         request: &CandidateRequest,
         count: usize,
     ) {
@@ -238,7 +239,7 @@ impl CpuBackend {
             threads.install(|| candidates::rank(threads, ranking, size, most, error))
         };
         let worst = candidates.worst_by(size, count, request.spaced, rank, error);
-        for candidate in self.surface_points(frame, target, &worst, request.depth) {
+        for candidate in self.surface_points(frame, shown, &worst, request.depth) {
             self.candidates.push(candidate);
         }
     }
@@ -248,11 +249,12 @@ impl CpuBackend {
     pub(super) fn surface_points(
         &mut self,
         frame: &Frame,
-        target: &Image8,
+        shown: Shown<'_>,
         pixels: &[(usize, usize, f32)],
         mode: DepthMode,
     ) -> Vec<Candidate> {
-        let Frame { grid, bands, background, view, .. } = frame;
+        let Frame { grid, bands, view, .. } = frame;
+        let colour = shown.colours();
         let shortcuts = self.shortcuts;
         let Self { threads, lists, splats, params, visible, .. } = self;
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
@@ -277,7 +279,7 @@ impl CpuBackend {
                         .and_then(|row| candidates::closest_approach(params, row, view, at));
                     *slot = surface.map(|(position, depth)| Candidate {
                         position: position.to_array(),
-                        colour: target.composited(x, y, *background),
+                        colour: colour(x, y),
                         pixel_size: depth / focal,
                         error,
                     });

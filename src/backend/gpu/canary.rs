@@ -78,6 +78,7 @@ fn run(
             camera,
             target,
             background: BACKGROUND,
+            exposure: None,
             sh_degree: 1,
             rates,
             loss_terms: LossTerms::default(),

@@ -68,6 +68,7 @@ impl State {
             visible: visible as usize,
             entries: self.entries(),
             bands,
+            exposure: None,
         }
     }
 }
@@ -83,13 +84,14 @@ pub(super) mod due {
     pub(in super::super) const NOISE: u32 = 64;
 }
 
-/// Bits of `Frame::draw[3]`: what the target has, and whether the error per pixel is wanted for candidates and
-/// for signals.
+/// Bits of `Frame::draw[3]`: what the target has, whether the error per pixel is wanted for candidates and for
+/// signals, and whether the image is exposed.
 pub(super) mod target {
     pub(in super::super) const HAS_ALPHA: u32 = 1;
     pub(in super::super) const HAS_MASK: u32 = 2;
     pub(in super::super) const WITH_ERROR: u32 = 4;
     pub(in super::super) const BY_PIXEL: u32 = 8;
+    pub(in super::super) const EXPOSED: u32 = 16;
 }
 
 const _: () = assert!(Signal::ALL.len() <= 4 * 8, "a place in `Frame::planes` for each signal");

@@ -184,6 +184,7 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Instead>>> {
         ("rasterize_bwd", both(&|i| vec![list(i)])),
         ("similarity", vec![vec![("gradient", "pixel gradient")]]),
         ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
+        ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
         ("adam_geometry", vec![adam(0)]),
         // Borrows the sums of the sorts, which are not needed then and are long enough.

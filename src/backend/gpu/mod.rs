@@ -17,6 +17,7 @@ mod canary;
 mod device;
 mod differentiate;
 mod edits;
+mod exposure;
 mod frame;
 mod launches;
 mod observe;
@@ -93,6 +94,8 @@ pub struct GpuBackend {
     /// before they are needed again. By view: place among those kept, size, and the bits that say what it
     /// has.
     kept: HashMap<usize, (u64, [u32; 2], u32)>,
+    /// Sums of the last step by its exposure, if it had one; see `shaders/exposure.wgsl`.
+    exposure_sums: [[f32; 4]; 4],
     /// Bands that are encoded for the next view.
     bands: u32,
     laps: Vec<(&'static str, Duration)>,
@@ -137,6 +140,7 @@ impl GpuBackend {
             waiting: Waiting::default(),
             candidates: Candidates::new(options.needs.candidates),
             kept: HashMap::new(),
+            exposure_sums: [[0.0; 4]; 4],
             bands: 1,
             laps: Vec::new(),
         };

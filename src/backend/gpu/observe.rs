@@ -12,10 +12,9 @@ use super::frame::Frame;
 use super::passes::{Search, Shape};
 use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
-use crate::backend::candidates::ranked;
+use crate::backend::candidates::{Shown, ranked};
 use crate::backend::pixel_map::{draw_pixels, pixel_map, radius_px};
 use crate::backend::{AuxInput, AuxOutput, BackendError, assert_same_size};
-use crate::dataset::images::Image8;
 
 /// √(½·log₂ e): folded into the splats' factors.
 const FOLD: f32 = 0.849_321_8;
@@ -24,7 +23,7 @@ const FOLD: f32 = 0.849_321_8;
 pub(super) struct DrawnView<'a> {
     pub(super) frame: Frame,
     pub(super) shape: Shape,
-    pub(super) target: &'a Image8,
+    pub(super) shown: Shown<'a>,
 }
 
 impl GpuBackend {
@@ -128,9 +127,9 @@ impl GpuBackend {
         pixels: &[(usize, usize, f32)],
         mode: DepthMode,
     ) -> Result<Vec<Candidate>, BackendError> {
-        let DrawnView { frame, shape, target } = drawn;
+        let DrawnView { frame, shape, shown } = drawn;
+        let colour = shown.colours();
         let [width, ..] = frame.image;
-        let [r, g, b, _] = frame.background;
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
         let which = u32::from(mode == DepthMode::Median);
         let mut found = Vec::new();
@@ -148,7 +147,7 @@ impl GpuBackend {
                 if depth > 0.0 {
                     found.push(Candidate {
                         position: [px, py, pz],
-                        colour: target.composited(x, y, [r, g, b]),
+                        colour: colour(x, y),
                         pixel_size: depth / focal,
                         error,
                     });
@@ -160,18 +159,23 @@ impl GpuBackend {
 
     /// Measures one view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
-        let AuxInput { camera, target, background, request, .. } = *input;
+        let AuxInput { camera, target, background, exposure, request, .. } = *input;
         assert_same_size(camera, target);
         self.fit_image(camera.width, camera.height)?;
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.bring_photograph(input.view, target);
+        self.bring_exposure(&mut frame, exposure);
         let (state, shape) = self.run(&frame, |passes, to| {
             passes.forward(to);
+            if exposure.is_some() {
+                passes.expose(to, camera.width * camera.height);
+            }
             passes.loss(to, [0.0; 2]);
         })?;
         let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height)?;
-        let drawn = DrawnView { frame, shape, target };
+        let shown = Shown { target, background, exposure };
+        let drawn = DrawnView { frame, shape, shown };
         let points = if request.points == 0 {
             Vec::new()
         } else {

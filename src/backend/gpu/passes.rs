@@ -4,6 +4,7 @@
 use densify_policies::policy::MaskTerm;
 use wgpu::ComputePass;
 
+use super::exposure::groups;
 use super::launches::{Launch, Launches};
 use super::sizes::BLOCK;
 use crate::gaussians::logit;
@@ -167,6 +168,18 @@ impl Passes<'_> {
         }
         let groups = (self.shape.tiles + 1).div_ceil(256);
         to.run(l.nth("find_tiles", self.sorted()), [0; 4], groups);
+    }
+
+    /// Gives the rendered image, of so many pixels, the photograph's exposure.
+    pub(super) fn expose(&self, to: &mut Recorder<'_>, pixels: u32) {
+        to.run(self.launches.get("expose"), [0; 4], groups(pixels.into()) as u32);
+    }
+
+    /// Takes the gradients of an exposed image back, and adds up those by the exposure.
+    pub(super) fn expose_bwd(&self, to: &mut Recorder<'_>, pixels: u32) {
+        let l = self.launches;
+        to.run(l.get("expose_bwd"), [0; 4], groups(pixels.into()) as u32);
+        to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
     /// Stage 4, with the weights of |e| and 1 − SSIM in the error per pixel.

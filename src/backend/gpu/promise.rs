@@ -35,6 +35,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let cap = cap.min(MOST_ENTRIES).max(budget as u64);
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
     sizes.photographs = options.photographs;
+    sizes.exposures = options.exposures;
     // They lie in one buffer, which nothing binds.
     let one = sizes.photograph_bytes().iter().sum::<u64>();
     let most = usize::try_from(device.summary.largest_buffer / one).unwrap_or(usize::MAX);

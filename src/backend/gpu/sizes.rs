@@ -3,6 +3,7 @@
 use densify_policies::policy::{Cadence, ErrorMode, Needs};
 use wgpu::BufferUsages;
 
+use super::exposure;
 use super::frame::{Frame, State, grid};
 use super::rows::{Holds, RowArray, row_arrays};
 use crate::backend::Accumulation;
@@ -46,6 +47,8 @@ pub(super) struct Sizes {
     pub(super) with_error: bool,
     /// Whether pixels weigh more at edges.
     pub(super) with_edges: bool,
+    /// Whether photographs have exposures.
+    pub(super) exposures: bool,
 }
 
 /// A buffer to allocate.
@@ -82,6 +85,7 @@ impl Sizes {
             masks: needs.mask.is_some(),
             with_edges: needs.error_score.edge > 0.0,
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
+            exposures: false,
         }
     }
 
@@ -144,6 +148,12 @@ impl Sizes {
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
+        }
+        if self.exposures {
+            add(Section::Renderer, "exposure", "exposure", exposure::TRANSFORM);
+            let sums = exposure::SUMS * exposure::groups(pixels);
+            add(Section::Renderer, "exposure", "exposure sums", sums);
+            add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);
         }
         add(Section::Images, "photograph on the device", "truth", 4 * pixels);
         add(Section::Images, "photograph on the device", "mask", pixels.next_multiple_of(4));

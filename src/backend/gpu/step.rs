@@ -8,7 +8,7 @@ use super::frame::{due, target as of_target};
 use super::observe::DrawnView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
-use crate::backend::candidates::error_weights;
+use crate::backend::candidates::{Shown, error_weights};
 use crate::backend::pixel_map::edge_weights;
 use crate::backend::signals::Field;
 use crate::backend::{BackendError, StepInput, StepOutput, assert_same_size};
@@ -33,13 +33,14 @@ impl GpuBackend {
 
     /// Forward pass, loss, backward pass and optimiser.
     pub(super) fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, .. } = *input;
+        let StepInput { camera, target, background, exposure, .. } = *input;
         assert_same_size(camera, target);
         let start = Instant::now();
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.bring_photograph(input.view, target);
+        self.bring_exposure(&mut frame, exposure);
         frame.for_step(input, due, &self.planes);
         if self.sizes.records.has(Field::Error) {
             frame.draw[3] |= of_target::BY_PIXEL;
@@ -53,6 +54,18 @@ impl GpuBackend {
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
         let trained = (self.rows - self.frozen).max(1) as f32;
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
+        let pixels = camera.width * camera.height;
+        // Up to dL/dpixel.
+        let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>, weights| {
+            passes.forward(to);
+            if exposure.is_some() {
+                passes.expose(to, pixels);
+            }
+            passes.loss(to, weights);
+            if exposure.is_some() {
+                passes.expose_bwd(to, pixels);
+            }
+        };
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.backward(to);
             passes.optimise(to, degree, signals, mask);
@@ -64,20 +77,19 @@ impl GpuBackend {
             }
             let search = self.search(&request, count, frame.image);
             let (state, shape) = self.run(&frame, |passes, to| {
-                passes.forward(to);
-                passes.loss(to, weights.unwrap_or_default());
+                compare(passes, to, weights.unwrap_or_default());
                 if let Some(search) = &search {
                     passes.worst(to, search);
                 }
             })?;
-            let drawn = DrawnView { frame, shape, target };
+            let shown = Shown { target, background, exposure };
+            let drawn = DrawnView { frame, shape, shown };
             self.collect_candidates(&drawn, &request, count, search)?;
             self.go_on(shape, step);
             state
         } else {
             let run = self.run(&frame, |passes, to| {
-                passes.forward(to);
-                passes.loss(to, [0.0; 2]);
+                compare(passes, to, [0.0; 2]);
                 step(passes, to);
             })?;
             run.0
@@ -85,6 +97,7 @@ impl GpuBackend {
         self.waiting = waiting;
         self.laps.clear();
         self.laps.push(("device", start.elapsed()));
-        Ok(state.output())
+        let by_exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
+        Ok(StepOutput { exposure: by_exposure, ..state.output() })
     }
 }

@@ -1,5 +1,6 @@
 //! Submits a view's passes, and again with more bands where there were too few.
 
+use super::exposure::SUMS;
 use super::frame::{Frame, State};
 use super::passes::{Passes, Recorder, Shape};
 use super::{GpuBackend, readback};
@@ -28,10 +29,19 @@ impl GpuBackend {
             let pass = encoder.begin_compute_pass(&Default::default());
             encode(&passes, &mut Recorder { pass });
             let staging = self.buffers.get("read");
-            let bytes = size_of::<State>() as u64;
-            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, bytes);
-            let bytes = readback::finish(&self.device, staging, encoder, bytes)?;
-            let state: State = bytemuck::pod_read_unaligned(&bytes);
+            let of_state = size_of::<State>() as u64;
+            encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, of_state);
+            let of_sums = if self.sizes.exposures { SUMS } else { 0 };
+            if of_sums > 0 {
+                let sums = self.buffers.get("exposure total");
+                encoder.copy_buffer_to_buffer(sums, 0, staging, of_state, of_sums);
+            }
+            let bytes = readback::finish(&self.device, staging, encoder, of_state + of_sums)?;
+            let (state, sums) = bytes.split_at(size_of::<State>());
+            let state: State = bytemuck::pod_read_unaligned(state);
+            if of_sums > 0 {
+                self.exposure_sums = bytemuck::pod_read_unaligned(sums);
+            }
             if state.broken_off != 0 {
                 return Err(self.broken_off());
             }

@@ -69,6 +69,13 @@ fn masks_to_invert_must_be_there() {
         &options,
         "--invert-masks, no photograph has a mask, NAME.png",
     );
+    let options = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+    refused(
+        "nothing to carve",
+        &Made::colmap_txt(),
+        &options,
+        "--mask-mode background, no photograph has a mask, NAME.png",
+    );
 }
 
 #[test]

@@ -173,6 +173,32 @@ fn masks_are_found() {
         let data = load_with(&made, inverted);
         let found = data.train[1].source.load().unwrap().mask.unwrap();
         assert_eq!((found[0], found[19]), (255, 0), "{mask}");
+        let carves = LoadOptions { mask_mode: MaskMode::Background, ..LoadOptions::default() };
+        let source = &load_with(&made, carves).train[1].source;
+        let found = source.load().unwrap();
+        let alpha = found.alpha.as_ref().unwrap();
+        assert_eq!((alpha[0], alpha[19], &found.mask), (0, 255, &None), "{mask}");
+        assert_eq!(found.bytes(), source.loaded_bytes());
+    }
+}
+
+/// instant-ngp hides where its masks are anything but black.
+#[test]
+fn dynamic_masks_are_found_beside_photographs() {
+    for (made, mask) in [
+        (Made::colmap_txt(), "images/dynamic_mask_b.png"),
+        (Made::transforms(|_| ()), "images/dynamic_mask_b.png"),
+    ] {
+        image::GrayImage::from_fn(20, 12, |x, _| [if x < 10 { 0 } else { 1 }].into())
+            .save(made.file(mask))
+            .unwrap();
+        for (invert_masks, expected) in [(false, (255, 0)), (true, (0, 1))] {
+            let options = LoadOptions { invert_masks, ..LoadOptions::default() };
+            let data = load_with(&made, options);
+            assert_eq!(data.train[0].source.load().unwrap().mask, None);
+            let found = data.train[1].source.load().unwrap().mask.unwrap();
+            assert_eq!((found[0], found[19]), expected, "{invert_masks}");
+        }
     }
 }
 

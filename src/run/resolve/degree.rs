@@ -3,13 +3,12 @@
 use std::ops::RangeInclusive;
 
 use crate::dataset::Dataset;
-use crate::failure::Failure;
 use crate::gaussians::MAX_SH_DEGREE;
 use crate::number::grouped;
 use crate::run::config::{DegreeSource, RunConfig};
 use crate::run::spec::RunSpec;
 use crate::run::values::ShDegree;
-use crate::spread::{self, MIN_TRACKS};
+use crate::spread::{self, MIN_TRACKS, TrackColours};
 
 /// The degree of a run, before its memory is known.
 #[derive(Debug, Clone)]
@@ -18,8 +17,6 @@ pub(in crate::run) struct Degree {
     pub(in crate::run) range: RangeInclusive<u8>,
     /// Who decided it.
     pub(in crate::run) source: DegreeSource,
-    /// Bytes that deciding it took beside an image.
-    pub(in crate::run) bytes: u64,
 }
 
 impl Degree {
@@ -28,33 +25,30 @@ impl Degree {
     }
 
     /// Decides it: from the configuration of a run that goes on, else as the options say, else from
-    /// the tracks of the dataset where it has enough.
+    /// the colours of the dataset's tracks, where it has enough.
     pub(in crate::run) fn decide(
         spec: &RunSpec,
         saved: Option<&RunConfig>,
         dataset: &Dataset,
-    ) -> Result<Self, Failure> {
-        let given = |range| Self { range, source: DegreeSource::Given, bytes: 0 };
+        colours: Option<&TrackColours>,
+    ) -> Self {
+        let given = |range| Self { range, source: DegreeSource::Given };
         match spec.size.sh_degree {
             // As a resumed run had it, or decided before.
             Some(ShDegree::Fixed(degree) | ShDegree::Auto(Some(degree))) => {
                 let source = saved.map_or(DegreeSource::Given, |run| run.resolved.sh_degree_from);
-                Ok(Self { range: degree..=degree, source, bytes: 0 })
+                Self { range: degree..=degree, source }
             }
-            None if spec.size.full => Ok(given(MAX_SH_DEGREE..=MAX_SH_DEGREE)),
-            None => Ok(given(0..=MAX_SH_DEGREE)),
+            None if spec.size.full => given(MAX_SH_DEGREE..=MAX_SH_DEGREE),
+            None => given(0..=MAX_SH_DEGREE),
             Some(ShDegree::Auto(None)) => {
-                let bytes = dataset.tracks.bytes() + spread::bytes(&dataset.tracks);
-                let found = match dataset.tracks.len() {
-                    ..MIN_TRACKS => None,
-                    _ => Some(spread::measure(&dataset.tracks, &dataset.train)?),
-                };
+                let found = colours.map(|colours| spread::measure(&dataset.tracks, colours));
                 let decided = found.and_then(|found| Some((found.degree()?, found)));
                 let (degree, source) = match decided {
                     Some((degree, spread)) => (degree, DegreeSource::Spread(spread)),
                     None => (MAX_SH_DEGREE, DegreeSource::Undecided),
                 };
-                Ok(Self { range: 0..=degree, source, bytes })
+                Self { range: 0..=degree, source }
             }
         }
     }

@@ -10,6 +10,7 @@ use crate::backend::{KeptPhotographs, MomentStorage, ROWS_AT_A_TIME, Setup, Shor
 use crate::dataset::images::ImageDemand;
 use crate::dataset::{Dataset, View};
 use crate::export::{PLY, Shape};
+use crate::exposure::Exposures;
 use crate::gaussians::sh_coefficients;
 use crate::memory::{Ledger, RunSize, Section};
 use crate::metrics::{geometry, scratch_bytes};
@@ -36,6 +37,8 @@ const PLANNING: u64 = 20;
 const THREAD: u64 = 64 << 10;
 /// What is promised holds for any number of threads up to this, so that it does not depend on them.
 pub(super) const THREADS: usize = 64;
+/// What the exposures take at most as a copy and as text, for each of their bytes.
+const EXPOSURE_TEXT: u64 = 1 + 4;
 /// A point with its colour.
 const POINT: u64 = (size_of::<DVec3>() + 3) as u64;
 
@@ -53,6 +56,7 @@ impl Inputs<'_> {
             storage: self.knobs.storage,
             shortcuts: self.knobs.shortcuts,
             needs,
+            exposures: self.exposure.is_on,
             ..Setup::new(setting.rows)
         }
     }
@@ -92,8 +96,14 @@ impl Inputs<'_> {
         let budget = setting.rows as u64;
         let float = size_of::<f32>() as u64;
         let row = float * (11 + 3 * sh_coefficients(degree) as u64);
-        if self.degree.bytes > 0 {
-            let bytes = self.degree.bytes + train.held(0) + train.decoding(1);
+        // Values and moments of the exposures; the same again, as text, in a checkpoint.
+        let exposures =
+            if self.exposure.is_on { Exposures::bytes(self.dataset.train.len()) } else { 0 };
+        if exposures > 0 {
+            ledger.add_to(Section::Model, "exposures of the views", exposures);
+        }
+        if self.track_bytes > 0 {
+            let bytes = self.track_bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
         }
         if let Some(model) = self.init_model {
@@ -114,7 +124,7 @@ impl Inputs<'_> {
         // writer holds.
         let piece = budget.min(ROWS_AT_A_TIME as u64);
         let held = PLY.held_bytes(Shape { rows: setting.rows, sh_degree: degree });
-        pass("export of the model, checkpoint", 2 * piece * row + held);
+        pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
         #[cfg(feature = "view")]
         if self.spec.output.view.is_some() {
             let photograph =
@@ -128,7 +138,9 @@ impl Inputs<'_> {
         let measures_test = !self.dataset.test.is_empty();
         if measures_test || self.required != AutoChoices::default() || self.init_model.is_some() {
             let (width, height) = self.dataset.largest_image();
-            let rendering = u64::from(width) * u64::from(height) * 5 * float;
+            // One more of its colours, with the exposure that fits best.
+            let planes = if self.exposure.is_on { 8 } else { 5 };
+            let rendering = u64::from(width) * u64::from(height) * planes * float;
             let of = |images: &ImageDemand| images.held(0) + images.decoding(1);
             let tested = if measures_test { of(&test) } else { 0 };
             let image = tested.max(if self.init_model.is_some() { of(&train) } else { 0 });

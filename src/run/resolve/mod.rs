@@ -2,6 +2,7 @@
 //! cache follow, with the ledger of what they take. Nothing is written.
 
 mod degree;
+mod exposure;
 mod ledger;
 mod plan;
 mod remedy;
@@ -29,14 +30,17 @@ use crate::backend::Accumulation;
 use crate::backend::{BackendKind, Device};
 use crate::dataset::images::ImageDemand;
 use crate::dataset::{Dataset, Tracks, View};
+use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::init::usable_points;
 use crate::knobs::Knobs;
 use crate::memory::{peak_resident, resident};
 use crate::number::grouped;
 use crate::schedule::Background;
+use crate::spread::{self, MIN_TRACKS, TrackColours};
 use crate::trainer::{AutoChoices, growth_signals};
 use degree::Degree;
+use exposure::Exposure;
 
 /// Most points of a random initialisation, where none is given (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
@@ -55,6 +59,9 @@ pub(super) struct Inputs<'a> {
     pub(super) device: Device,
     pub(super) dataset: Dataset,
     pub(super) degree: Degree,
+    pub(super) exposure: Exposure,
+    /// Bytes that the colours of tracks took before, beside an image, where they decide something.
+    track_bytes: u64,
     /// What the run is to find out by itself.
     pub(super) required: AutoChoices,
     /// What training and test images take.
@@ -83,7 +90,9 @@ impl<'a> Inputs<'a> {
         let device = open(spec, &mut knobs, observer)?;
         use_threads(spec.device.threads);
         let scene = spec.scene()?;
-        let with_tracks = saved.is_none() && spec.size.sh_degree == Some(ShDegree::Auto(None));
+        let with_tracks = saved.is_none()
+            && (spec.size.sh_degree == Some(ShDegree::Auto(None))
+                || spec.schedule.exposure != ExposureChoice::Off);
         let mut dataset = Dataset::load(scene, &spec.data.load_options(with_tracks))?;
         for note in &dataset.notes {
             observer.say(format_args!("note: {note}"));
@@ -106,7 +115,14 @@ impl<'a> Inputs<'a> {
         // Tracks have a line of their own, and are given back.
         let resident = resident().map(|now| now.saturating_sub(dataset.tracks.bytes()));
         let peak = peak_resident();
-        let degree = Degree::decide(spec, saved, &dataset)?;
+        let colours = match dataset.tracks.len() {
+            ..MIN_TRACKS => None,
+            _ => Some(TrackColours::read(&dataset.tracks, &dataset.train)?),
+        };
+        let track_bytes =
+            if with_tracks { dataset.tracks.bytes() + spread::bytes(&dataset.tracks) } else { 0 };
+        let degree = Degree::decide(spec, saved, &dataset, colours.as_ref());
+        let exposure = Exposure::decide(spec, saved, colours.as_ref());
         dataset.tracks = Tracks::default();
         let required = AutoChoices {
             rows: spec.size.budget.is_some_and(Budget::is_auto),
@@ -120,6 +136,8 @@ impl<'a> Inputs<'a> {
             device,
             dataset,
             degree,
+            exposure,
+            track_bytes,
             required,
             images,
             init_model,
@@ -139,7 +157,7 @@ impl<'a> Inputs<'a> {
         };
         let degree = match spec.size.sh_degree == self.spec.size.sh_degree {
             true => self.degree.clone(),
-            false => Degree::decide(spec, None, &dataset)?,
+            false => Degree::decide(spec, None, &dataset, None),
         };
         let knobs = match spec.schedule.knob == self.spec.schedule.knob {
             true => self.knobs.clone(),
@@ -147,7 +165,24 @@ impl<'a> Inputs<'a> {
         };
         let (entry, parameters) = spec.policy()?;
         let (images, device) = (images(&dataset), self.device.clone());
-        Ok(Self { spec, entry, parameters, knobs, dataset, degree, images, device, ..*self })
+        let exposure = self.exposure.clone();
+        Ok(Self {
+            spec,
+            entry,
+            parameters,
+            knobs,
+            dataset,
+            degree,
+            exposure,
+            images,
+            device,
+            ..*self
+        })
+    }
+
+    /// What there is to say of what the scene's colours have decided.
+    pub(super) fn choices(&self) -> impl Iterator<Item = String> {
+        self.degree.line().into_iter().chain(self.exposure.line())
     }
 
     /// What the first rows are.

@@ -40,7 +40,7 @@ pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     let size = Size::choose(&inputs)?;
     let rows = size.setting.rows;
     let ledger = inputs.ledger(&size.setting, &inputs.needs(rows)?);
-    let lines = inputs.degree.line().into_iter().chain(size.lines(&inputs));
+    let lines = inputs.choices().chain(size.lines(&inputs));
     let lines = lines.chain([inputs.promise(&ledger)]).collect();
     let limited = inputs.device.limited_bytes(&ledger);
     let memory = spec.size.memory.map_or(limited.next_multiple_of(MIB), |it| it.0);

@@ -1,6 +1,7 @@
 //! Tests of a step: the order of views, prefetching, the cadence, options, lost models and images.
 
 use super::*;
+use crate::exposure::ExposureModel;
 
 #[test]
 fn every_epoch_shows_every_view_once_and_prefetches() {
@@ -20,6 +21,37 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
     for (i, said) in prefetched.lock().unwrap().iter().enumerate() {
         assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
     }
+}
+
+/// Each view has its own, which its own steps change, and a checkpoint holds them.
+#[test]
+fn exposures_go_with_their_views() {
+    let gains = [[1.0, 0.5, 1.0], [1.0; 3], [1.0, 1.5, 1.0]];
+    let first = |_| Exposures::new(ExposureModel::Channels, &gains);
+    let case = Case { every: 100, ..CASE };
+    let (new, log, _) = trainer(&case);
+    let mut new = new.exposing(Some(first(())));
+    let shown: Vec<usize> = (0..6).map(|_| new.step().unwrap().view).collect();
+    let log = log.lock().unwrap().clone();
+    let noted: Vec<f32> = log
+        .iter()
+        .filter_map(|line| line.strip_prefix("exposure "))
+        .map(|gain| gain.parse().unwrap())
+        .collect();
+    for (gain, view) in noted.iter().zip(&shown) {
+        assert!((gain - gains[*view][1]).abs() < 0.05, "view {view}: {gain}");
+    }
+    // A step makes a factor smaller, and the mean stays, so that the others become larger.
+    assert!(noted[1..3].iter().zip(&shown[1..]).all(|(gain, view)| *gain > gains[*view][1]));
+    let state = new.state().unwrap();
+    assert_eq!(state.exposures.as_ref(), new.exposures());
+    let (same, ..) = trainer(&case);
+    let mut same = same.exposing(Some(first(())));
+    same.resume(state.clone()).unwrap();
+    assert_eq!(same.exposures(), new.exposures());
+    let (mut without, ..) = trainer(&case);
+    let refused = without.resume(state).unwrap_err().to_string();
+    assert!(refused.contains("exposures"), "{refused}");
 }
 
 #[test]

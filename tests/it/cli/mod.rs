@@ -8,6 +8,7 @@ mod comparing;
 mod compressing;
 mod configuring;
 mod exporting;
+mod exposing;
 mod faults;
 mod generated;
 mod geometry;

@@ -60,6 +60,7 @@ pub(super) const STAGES: &[Stage] = &[
     stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")]),
     stage("tiles", On::All, &[VIEW, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
+    stage("exposure", On::All, &[VIEW, shader!("exposure")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
     stage("rasterize_bwd", On::Slots, &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd")]),
     stage(

@@ -111,6 +111,7 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
     };
     let mut sizes = Sizes::new(10, 100, 3, (32, 32), &needs, accumulation);
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
+    sizes.exposures = true;
     sizes
 }
 

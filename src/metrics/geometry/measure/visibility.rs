@@ -107,6 +107,7 @@ impl Visibility {
             camera,
             target: &target,
             background: ground.background,
+            exposure: None,
             sh_degree: ground.sh_degree,
             request,
         })?;

@@ -1,0 +1,92 @@
+// The exposure of the photograph at hand, before the loss and after it; src/backend/cpu/exposure.rs. A group
+// has 256 pixels in a row, an invocation of the backward kernel four of them.
+
+// Three rows of a matrix, each with the offset of its channel behind it; then the background of the photograph.
+@group(0) @binding(1) var<storage, read> exposure: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
+// See rasterize.wgsl.
+@group(0) @binding(3) var<storage, read> finish: array<vec2<u32>>;
+// dL/dpixel: three planes.
+@group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
+// By group: per channel the derivatives times red, green and blue, and their sums; then those times
+// transmittance.
+@group(0) @binding(5) var<storage, read_write> exposure_sums: array<mat4x4<f32>>;
+// The same of the whole image.
+@group(0) @binding(6) var<storage, read_write> exposure_total: array<mat4x4<f32>>;
+
+// Invocations of the kernels that add up.
+const ADDERS: u32 = 64u;
+
+var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
+
+// The image with the photograph's exposure.
+@compute @workgroup_size(256)
+fn expose(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let at = group_of(id) * GROUP + lane;
+    if at >= frame.image.x * frame.image.y {
+        return;
+    }
+    let colour = vec4(canvas[at].xyz, 1.0);
+    let exposed =
+        vec3(dot(exposure[0], colour), dot(exposure[1], colour), dot(exposure[2], colour));
+    canvas[at] = vec4(exposed, canvas[at].w);
+}
+
+// The sum of `reduced`, for the first invocation.
+fn reduced_sum(lane: u32) -> mat4x4<f32> {
+    workgroupBarrier();
+    for (var half = ADDERS / 2u; half > 0u; half /= 2u) {
+        if lane < half {
+            reduced[lane] += reduced[lane + half];
+        }
+        workgroupBarrier();
+    }
+    return reduced[0];
+}
+
+// dL/dpixel of the image without the exposure, and the sums of the group.
+@compute @workgroup_size(64)
+fn expose_bwd(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let size = frame.image.x * frame.image.y;
+    let group = group_of(id);
+    var sums = mat4x4<f32>();
+    for (var k = 0u; k < GROUP / ADDERS; k++) {
+        let at = group * GROUP + k * ADDERS + lane;
+        if at < size {
+            let g = vec3(gradient[at], gradient[size + at], gradient[2u * size + at]);
+            let colour = vec4(canvas[at].xyz, 1.0);
+            let light = bitcast<f32>(finish[at].x);
+            sums += mat4x4(g.x * colour, g.y * colour, g.z * colour, vec4(g * light, 0.0));
+            let back = g.x * exposure[0].xyz + g.y * exposure[1].xyz + g.z * exposure[2].xyz;
+            gradient[at] = back.x;
+            gradient[size + at] = back.y;
+            gradient[2u * size + at] = back.z;
+        }
+    }
+    reduced[lane] = sums;
+    let of_group = reduced_sum(lane);
+    if lane == 0u && group * GROUP < size {
+        exposure_sums[group] = of_group;
+    }
+}
+
+// One group: the sums of the image.
+@compute @workgroup_size(64)
+fn total_exposure(@builtin(local_invocation_index) lane: u32) {
+    let groups = (frame.image.x * frame.image.y + GROUP - 1u) / GROUP;
+    var sums = mat4x4<f32>();
+    for (var group = lane; group < groups; group += ADDERS) {
+        sums += exposure_sums[group];
+    }
+    reduced[lane] = sums;
+    let all = reduced_sum(lane);
+    if lane == 0u {
+        exposure_total[0] = all;
+    }
+}

@@ -1,0 +1,251 @@
+//! Exposures of photographs on every backend: what a step learns of one, and of the rows, against the float64
+//! renderer and central differences; and that nothing is done, or held, where there is none.
+
+use densify::backend::{AuxInput, Differentiable, StepInput, StepOutput};
+use densify::camera::Camera;
+use densify::dataset::images::Image8;
+use densify::exposure::ColourTransform;
+use densify::gaussians::Gaussians;
+use densify::verify::compare::{Table, relative_error};
+use densify::verify::reference::loss::loss;
+use densify::verify::reference::{Model, Rules, Upstream, View, differentiate, render};
+use densify::verify::{Setup, Subject, scenes};
+use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
+use densify_policies::policy::{ErrorMode, Needs};
+
+use crate::subject::{GREY, all, make_with, normalised, repeatable, step_input};
+
+/// Half the distance between two evaluations of the loss.
+const STEP: f64 = 1e-6;
+const SOME: ColourTransform = ColourTransform {
+    matrix: [[1.2, 0.05, -0.1], [0.02, 0.7, 0.15], [-0.05, 0.1, 1.3]],
+    offset: [0.03, -0.06, 0.11],
+};
+
+struct Scene {
+    model: Gaussians,
+    camera: Camera,
+    target: Image8,
+}
+
+/// Rows that leave much of the background to be seen, or the same before a transparent photograph.
+fn scene(with_alpha: bool) -> Scene {
+    let camera = scenes::camera(37, 29, 61);
+    let model = normalised(scenes::cloud(14, 1, &camera, 62));
+    let mut target = scenes::target(&camera);
+    target.alpha = with_alpha.then(|| target.rgb.iter().step_by(3).map(|v| v / 2 + 100).collect());
+    Scene { model, camera, target }
+}
+
+impl Scene {
+    fn size(&self) -> (usize, usize) {
+        (self.camera.width as usize, self.camera.height as usize)
+    }
+
+    fn view(&self) -> View<'_> {
+        View { camera: &self.camera, background: [0.0; 3], sh_degree: 1 }
+    }
+
+    /// The photograph on the background.
+    fn truth(&self) -> Vec<f64> {
+        let (width, height) = self.size();
+        let at = |pixel: usize| self.target.composited(pixel % width, pixel / width, GREY);
+        (0..width * height).flat_map(at).map(f64::from).collect()
+    }
+
+    /// What the photograph is compared with: the foreground with the exposure, on the background.
+    fn shown(&self, foreground: &[f64], alpha: &[f64], exposure: &[f64; 12]) -> Vec<f64> {
+        let pixel = |(colour, alpha): (&[f64; 3], &f64)| -> [f64; 3] {
+            std::array::from_fn(|i| {
+                let row = &exposure[3 * i..3 * i + 3];
+                let mixed: f64 = row.iter().zip(colour).map(|(m, c)| m * c).sum();
+                mixed + alpha * exposure[9 + i] + (1.0 - alpha) * f64::from(GREY[i])
+            })
+        };
+        foreground.as_chunks::<3>().0.iter().zip(alpha).flat_map(pixel).collect()
+    }
+}
+
+/// Matrix and offset, one after the other.
+fn numbers(transform: &ColourTransform) -> [f64; 12] {
+    let all: Vec<f64> =
+        transform.matrix.concat().into_iter().chain(transform.offset).map(f64::from).collect();
+    all.try_into().expect("twelve numbers")
+}
+
+fn backend(subject: &Subject, scene: &Scene) -> Box<dyn Differentiable> {
+    let setup = Setup { exposures: true, tile_cap: Some(60), ..Setup::default() };
+    make_with(subject, &scene.model, setup)
+}
+
+fn step(
+    backend: &mut dyn Differentiable,
+    scene: &Scene,
+    exposure: Option<&ColourTransform>,
+) -> StepOutput {
+    let input = StepInput { exposure, ..step_input(1, &scene.camera, &scene.target, 1) };
+    backend.train_step(&input).expect("a small image is rendered")
+}
+
+/// The gradients of the geometry that the optimiser has seen in its first step: a tenth of them is its first
+/// moment. Shape: [rows, 11].
+fn gradients(backend: &dyn Differentiable) -> Vec<[f64; 11]> {
+    let names = ["moments.first", "device.first rows"];
+    let state = backend.state();
+    let name = names.iter().find(|name| state.iter().any(|array| array.name == **name));
+    let tensor = backend.save(name.expect("moments of the geometry")).expect("an array");
+    let (shape, values) = (tensor.shape.clone(), tensor);
+    let values = values.into_f32(&shape).expect("numbers");
+    let row = |row: &[f32]| std::array::from_fn(|i| 10.0 * f64::from(row[i]));
+    values.chunks(shape[1]).map(row).collect()
+}
+
+#[test]
+fn gradients_are_those_of_the_float64_renderer_and_of_differences() {
+    let mut table = Table::new("exposures against central differences");
+    for with_alpha in [false, true] {
+        let scene = scene(with_alpha);
+        let (width, height) = scene.size();
+        let model = Model::of(&scene.model);
+        let image = render(&model, scene.view(), &Rules::STANDARD);
+        let (truth, at) = (scene.truth(), numbers(&SOME));
+        let compared = |exposure: &[f64; 12]| {
+            loss(&scene.shown(&image.rgb, &image.alpha, exposure), &truth, width, height)
+        };
+        let differences: Vec<f64> = (0..12)
+            .map(|i| {
+                let moved = |by: f64| {
+                    let mut to = at;
+                    to[i] += by;
+                    compared(&to).loss
+                };
+                (moved(STEP) - moved(-STEP)) / (2.0 * STEP)
+            })
+            .collect();
+        // By the chain rule: of the foreground's colours and of its alpha.
+        let by_shown = compared(&at).gradient;
+        let by_shown = by_shown.as_chunks::<3>().0;
+        let rgb = by_shown.iter().flat_map(|g| -> [f64; 3] {
+            std::array::from_fn(|j| (0..3).map(|i| at[3 * i + j] * g[i]).sum())
+        });
+        let alpha = by_shown
+            .iter()
+            .map(|g| -> f64 { (0..3).map(|i| g[i] * (at[9 + i] - f64::from(GREY[i]))).sum() });
+        let upstream = Upstream {
+            rgb: rgb.collect(),
+            alpha: alpha.collect(),
+            depth: vec![0.0; width * height],
+        };
+        let (_, by_row) = differentiate(&model, scene.view(), &Rules::STANDARD, &upstream);
+        let by_row = by_row.model;
+        for subject in all() {
+            let mut backend = backend(&subject, &scene);
+            let output = step(&mut *backend, &scene, Some(&SOME));
+            let what = format!("{}, alpha {with_alpha}", subject.name());
+            let off = (f64::from(output.loss) - compared(&at).loss).abs();
+            table.check(&what, "loss", off, 1e-5);
+            let found = output.exposure.expect("a gradient");
+            let found: Vec<f32> = found.matrix.concat().into_iter().chain(found.offset).collect();
+            let tolerance = 10.0 * subject.gradient();
+            table.check(&what, "exposure", relative_error(&found, &differences), tolerance);
+            let rows = gradients(&*backend);
+            let class = |first: usize, count: usize| -> Vec<f64> {
+                rows.iter().flat_map(|row| row[first..first + count].to_vec()).collect()
+            };
+            for (name, found) in [
+                ("means", class(0, 3)),
+                ("log_scales", class(3, 3)),
+                ("opacity_logits", class(10, 1)),
+            ] {
+                table.check(&what, name, relative_error(&found, by_row.class(name)), tolerance);
+            }
+        }
+    }
+    table.finish();
+}
+
+/// The identity changes nothing, and no exposure is none; without room for exposures there is less memory.
+#[test]
+fn without_an_exposure_a_step_is_what_it_was() {
+    let scene = scene(true);
+    for subject in repeatable() {
+        let run = |exposures: bool, exposure: Option<&ColourTransform>| {
+            let setup = Setup { exposures, tile_cap: Some(60), ..Setup::default() };
+            let mut backend = make_with(&subject, &scene.model, setup);
+            let output = step(&mut *backend, &scene, exposure);
+            (output, backend.download().expect("a model"), backend.ledger().total())
+        };
+        let (plain, model, bytes) = run(false, None);
+        assert_eq!(plain.exposure, None, "{}", subject.name());
+        let (output, same, more) = run(true, None);
+        assert!(output == plain && same == model, "{}", subject.name());
+        let is_native = matches!(subject, Subject::Native { .. });
+        assert_eq!(more == bytes, is_native, "{}: {bytes}, {more}", subject.name());
+        let (output, _, _) = run(true, Some(&ColourTransform::IDENTITY));
+        assert!((output.loss - plain.loss).abs() < 1e-6, "{}", subject.name());
+    }
+}
+
+#[test]
+fn exposures_repeat_at_any_number_of_threads() {
+    let scene = scene(false);
+    let run = |threads: usize| {
+        let Subject::Native { instructions, .. } = Subject::NATIVE else { unreachable!() };
+        let subject = Subject::Native { instructions, threads: Some(threads) };
+        let mut backend = backend(&subject, &scene);
+        (step(&mut *backend, &scene, Some(&SOME)), backend.download().expect("a model"))
+    };
+    let one = run(1);
+    assert!((2..5).all(|threads| run(threads) == one));
+}
+
+/// An auxiliary view and a candidate know the photograph's exposure: the loss is that of the step that follows,
+/// and the candidate's colour is the scene's.
+#[test]
+fn views_are_measured_and_candidates_coloured_with_the_exposure() {
+    let mut scene = scene(false);
+    scene.target.rgb.fill(128);
+    let candidates = CandidateRequest {
+        from: 0,
+        until: 10,
+        rows_per_candidate: 1,
+        capacity: 4,
+        error: ErrorMode::L1,
+        depth: DepthMode::MaxWeight,
+        min_alpha: 0.1,
+        spaced: false,
+    };
+    let request = AuxRequest { columns: vec![AuxColumn::MapSum], ..AuxRequest::default() };
+    let needs =
+        Needs { candidates: Some(candidates), aux: Some(request.clone()), ..Needs::default() };
+    for subject in all() {
+        let setup = Setup {
+            exposures: true,
+            needs: needs.clone(),
+            largest_image: (scene.camera.width, scene.camera.height),
+            ..Setup::default()
+        };
+        let mut backend = make_with(&subject, &scene.model, setup);
+        let seen = backend.observe(&AuxInput {
+            step: 1,
+            view: 0,
+            seed: 3,
+            camera: &scene.camera,
+            target: &scene.target,
+            background: GREY,
+            exposure: Some(&SOME),
+            sh_degree: 1,
+            request: &request,
+        });
+        let seen = seen.expect("a small image is rendered");
+        let output = step(&mut *backend, &scene, Some(&SOME));
+        assert!((seen.loss - output.loss).abs() < 1e-6, "{}", subject.name());
+        let grey = SOME.inverse().apply([128.0 / 255.0; 3]);
+        let list: &[Candidate] = backend.candidates();
+        assert!(!list.is_empty(), "{}", subject.name());
+        for Candidate { colour, .. } in list {
+            let is_near = colour.iter().zip(grey).all(|(a, b)| (a - b).abs() < 1e-5);
+            assert!(is_near, "{}: {colour:?}, {grey:?}", subject.name());
+        }
+    }
+}
