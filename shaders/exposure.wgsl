@@ -8,11 +8,11 @@
 @group(0) @binding(3) var<storage, read> finish: array<vec2<u32>>;
 // dL/dpixel: three planes.
 @group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
-// By group: per channel the derivatives times red, green and blue, and their sums; then those times
+// By group, four each: per channel the derivatives times red, green and blue, and their sums; then those times
 // transmittance.
-@group(0) @binding(5) var<storage, read_write> exposure_sums: array<mat4x4<f32>>;
+@group(0) @binding(5) var<storage, read_write> exposure_sums: array<vec4<f32>>;
 // The same of the whole image.
-@group(0) @binding(6) var<storage, read_write> exposure_total: array<mat4x4<f32>>;
+@group(0) @binding(6) var<storage, read_write> exposure_total: array<vec4<f32>>;
 
 // Invocations of the kernels that add up.
 const ADDERS: u32 = 64u;
@@ -72,7 +72,11 @@ fn expose_bwd(
     reduced[lane] = sums;
     let of_group = reduced_sum(lane);
     if lane == 0u && group * GROUP < size {
-        exposure_sums[group] = of_group;
+        let to = 4u * group;
+        exposure_sums[to] = of_group[0];
+        exposure_sums[to + 1u] = of_group[1];
+        exposure_sums[to + 2u] = of_group[2];
+        exposure_sums[to + 3u] = of_group[3];
     }
 }
 
@@ -82,11 +86,20 @@ fn total_exposure(@builtin(local_invocation_index) lane: u32) {
     let groups = (frame.image.x * frame.image.y + GROUP - 1u) / GROUP;
     var sums = mat4x4<f32>();
     for (var group = lane; group < groups; group += ADDERS) {
-        sums += exposure_sums[group];
+        let at = 4u * group;
+        sums += mat4x4(
+            exposure_sums[at],
+            exposure_sums[at + 1u],
+            exposure_sums[at + 2u],
+            exposure_sums[at + 3u],
+        );
     }
     reduced[lane] = sums;
     let all = reduced_sum(lane);
     if lane == 0u {
-        exposure_total[0] = all;
+        exposure_total[0] = all[0];
+        exposure_total[1] = all[1];
+        exposure_total[2] = all[2];
+        exposure_total[3] = all[3];
     }
 }
