@@ -1,6 +1,7 @@
 //! Base64 (RFC 4648, section 4): read with or without padding, written with it.
 
 /// The bytes; `None` where the text is not base64.
+#[cfg(feature = "formats")]
 pub(crate) fn decode(text: &str) -> Option<Vec<u8>> {
     let text = text.trim_end_matches('=').as_bytes();
     let mut bytes = Vec::with_capacity(text.len() / 4 * 3 + 2);
@@ -17,6 +18,7 @@ pub(crate) fn decode(text: &str) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
+#[cfg(feature = "formats")]
 fn value(symbol: u8) -> Option<u8> {
     Some(match symbol {
         b'A'..=b'Z' => symbol - b'A',
@@ -44,7 +46,7 @@ pub(crate) fn encode(bytes: &[u8]) -> String {
     text
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "formats"))]
 mod tests {
     use super::*;
 

@@ -30,6 +30,7 @@
 
 mod animation;
 pub mod backend;
+#[cfg(any(feature = "formats", feature = "study"))]
 mod base64;
 pub mod blocks;
 pub mod camera;

@@ -92,7 +92,7 @@ pub(crate) fn inline_svg(svg: &str, (width, height): (u32, u32), what: &str) -> 
     assert!(head.starts_with("<svg"), "{head} is no SVG");
     html! {
         (PreEscaped(format!("<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"")))
-        (what)
+        (foreign::one_line(what))
         (PreEscaped("\">"))
         (PreEscaped(rest))
     }

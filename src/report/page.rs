@@ -112,7 +112,7 @@ fn pair(view: &View) -> Markup {
     let several = view.pictures.len() > 2;
     html! {
         figure.pair {
-            div.stack style=(format!("aspect-ratio: {width} / {height}")) {
+            div.stack style=(shape(width, height)) {
                 @for (at, Named { name, picture }) in view.pictures.iter().enumerate() {
                     img src=(picture.uri) alt=(format!("{}: {name}", view.name)) width=(width) height=(height)
                         class=[["left", "right"].get(at)];
@@ -148,6 +148,12 @@ fn pair(view: &View) -> Markup {
     }
 }
 
+/// What a stack of pictures of this size needs to be told, as they lie over each other.
+fn shape(width: u32, height: u32) -> String {
+    let ratio = f64::from(width) / f64::from(height);
+    format!("aspect-ratio: {width} / {height}; --ratio: {ratio:.4}")
+}
+
 fn choice(side: &str, label: &str, chosen: usize, pictures: &[Named]) -> Markup {
     html! {
         label { (label) " "
@@ -166,7 +172,7 @@ fn around(turn: &Turn, is_named: bool) -> Markup {
     let last = turn.frames.len() - 1;
     html! {
         figure.turn {
-            div.stack style=(format!("aspect-ratio: {width} / {height}")) {
+            div.stack style=(shape(width, height)) {
                 @for (at, frame) in turn.frames.iter().enumerate() {
                     img src=(frame.uri) alt=(format!("{}, turned by {}°", turn.name, 360 * at / (last + 1)))
                         width=(width) height=(height) hidden[at > 0];

@@ -45,12 +45,15 @@ pub(crate) fn lasting_bytes(largest_image: (u32, u32), views: usize) -> u64 {
     seats * SEAT + wishes * frame + board::BYTES + views as u64 * VIEW
 }
 
-/// What making a picture takes `[bytes]`: the rendering, the photograph as it is and at the picture's size, their
-/// difference with what measuring it takes, and the picture.
+/// What making a picture takes `[bytes]`: the rendering, the photograph as it is, flattened, half-way to the
+/// picture's size and at it, their difference with what measuring it takes, and the picture.
 pub(crate) fn passing_bytes(largest_image: (u32, u32), photograph: u64, threads: usize) -> u64 {
     let float = size_of::<f32>() as u64;
     let pixel = 5 * float + size_of::<f64>() as u64 + 4 * 3;
-    pixels(largest_image) * pixel + photograph + scratch_bytes(largest_image.0, threads)
+    let whole = u64::from(largest_image.0) * u64::from(largest_image.1);
+    // While it is made smaller its colours and alpha are floats.
+    let smaller = whole * (3 + 4 * float);
+    pixels(largest_image) * pixel + smaller + photograph + scratch_bytes(largest_image.0, threads)
 }
 
 fn pixels((width, height): (u32, u32)) -> u64 {

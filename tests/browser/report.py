@@ -52,6 +52,7 @@ def check(browser: Browser, report: Path, folder: Path | None) -> None:
     assert "100%" in shown(".pair")[1], "End does not move the border"
     browser.press("\ue011")  # Home
     assert shown(".pair")[1].endswith("inset(0px 0px 0px 0%)"), f"Home does not move the border: {shown('.pair')}"
+    browser.run("document.querySelector('.pair .stack').scrollIntoView({ block: 'center' })")
     box = "const b = document.querySelector('.pair .stack').getBoundingClientRect(); return [b.left, b.top, b.width, b.height]"
     x, y, width, height = browser.run(box)
     press = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": round(x + 0.2 * width), "y": round(y + height / 2)}
