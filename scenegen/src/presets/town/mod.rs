@@ -8,7 +8,7 @@
 //! Houses (`houses.rs`) are closed solids, eight to a block, of two to four floors of 2.9 m, with gabled or
 //! flat roofs; blocks of flats have two slabs of four to six floors with balconies. Trees (`outdoors.rs`) have a
 //! trunk and a lumpy crown of 320 triangles. Cars are parked along the streets, lamps (thin structures, 12 cm)
-//! stand on the pavement. Windows, doors and road markings are painted. All Lambert. 4,000 to 9,000 triangles
+//! stand on the pavement. Windows, doors and road markings are painted. All Lambert. About 9,000 triangles
 //! per block; the layout follows from the seed.
 //!
 //! For each block there are 24 training views, two thirds from 45 m above and a third from the street
@@ -90,8 +90,8 @@ fn build(size: u32, seed: u64) -> Staging {
         kind: RigKind::Survey,
         train: 24 * blocks,
         test: 6 * blocks,
-        width: 320,
-        height: 240,
+        width: 256,
+        height: 192,
         fov: 65.0,
         clearance: CLEARANCE / diagonal,
         survey: Some(Survey {
