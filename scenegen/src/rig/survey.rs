@@ -91,7 +91,7 @@ impl Rig {
         if i < above {
             let beside = if test { beside(i, above, trained) } else { i };
             let turn = f64::from(i) + shift + attempt as f64;
-            self.from_above(survey, (beside, trained, test), turn)
+            self.above_ground(survey, (beside, trained, test), turn)
         } else {
             let (i, views, trained) = (i - above, views - above, (self.train - trained).max(1));
             let beside = if test { beside(i, views, trained) } else { i };
@@ -108,7 +108,7 @@ impl Rig {
     }
 
     /// The view from a grid's place number `i` of `count`, or half way from there to the next.
-    fn from_above(
+    fn above_ground(
         &self,
         survey: &Survey,
         (i, count, test): (u32, u32, bool),

@@ -197,7 +197,7 @@ fn of_tint(model: &mut Model, images: [TextureRef; 3], tint: [f32; 3]) -> Walls 
 fn bay(at: DVec2, within: DVec2, surfacing: Surfacing, width: f64, with_door: bool) -> Vec3 {
     let (number, floor) = ((at.x * f64::from(BAYS)).floor(), (at.y * f64::from(BAYS)).floor());
     let within = dvec2((at.x * f64::from(BAYS)).fract(), within.y);
-    let is_door = with_door && number == 1.0;
+    let is_door = with_door && number as u32 == 1;
     let (top, bottom) = if is_door { (0.22, 1.0) } else { (0.2, 0.74) };
     let half = if is_door { 0.2 } else { 0.5 * width };
     let aside = (within.x - 0.5).abs();
