@@ -215,7 +215,8 @@ mod tests {
         for camera in train.iter().chain(&test) {
             let down = camera.forward().y.asin().to_degrees();
             assert!((-65.1..=-44.9).contains(&down), "{down} degrees");
-            assert!(shows_enough(&surface, camera, 0), "{camera:?}");
+            // Around the scene is nothing: half of a view may be empty, as after 40 attempts.
+            assert!(shows_enough(&surface, camera, 40), "{camera:?}");
         }
         // Every corner of the ground that is looked at is shown.
         for (x, z) in [(-30.0, 24.0), (50.0, 24.0), (-30.0, -24.0), (50.0, -24.0), (10.0, 0.0)] {
