@@ -12,6 +12,16 @@ impl Model {
     /// A sphere of `20 · 4^level` triangles, all corners on the sphere, smooth normals. Texture
     /// coordinates are longitude and latitude of the corners.
     pub(crate) fn sphere(&mut self, centre: DVec3, radius: f64, level: u32, material: u32) {
+        self.ball(level, material, |out| (centre + radius * out, out));
+    }
+
+    /// A sphere deformed: `shape` tells the place and the unit normal of each direction's corner.
+    pub(crate) fn ball(
+        &mut self,
+        level: u32,
+        material: u32,
+        shape: impl Fn(DVec3) -> (DVec3, DVec3),
+    ) {
         let (corners, triangles) = icosphere(level);
         // Corners are per triangle, so that longitude can go beyond 1 where it wraps.
         let (mut positions, mut normals, mut uvs) = (Vec::new(), Vec::new(), Vec::new());
@@ -19,8 +29,9 @@ impl Model {
             let corners = triangle.map(|i| corners[i as usize]);
             let middle = longitude(corners[0] + corners[1] + corners[2]);
             for p in corners {
-                positions.push(centre + radius * p);
-                normals.push(p.as_vec3());
+                let (place, normal) = shape(p);
+                positions.push(place);
+                normals.push(normal.as_vec3());
                 let u = longitude(p);
                 let u = u - (u - middle).round();
                 uvs.push(Vec2::new(u as f32, (p.y.clamp(-1.0, 1.0).acos() / PI) as f32));
@@ -32,8 +43,23 @@ impl Model {
     /// A parallelogram from `corner` along `u` and `v`, seen from the side of `u x v`. The image
     /// is upright when `v` points up.
     pub(crate) fn quad(&mut self, corner: DVec3, u: DVec3, v: DVec3, material: u32) {
+        self.tiled(corner, u, v, [0.0, 1.0], [1.0, 1.0], material);
+    }
+
+    /// [`Model::quad`] with the image repeated: how often along `u` and along `v`, from the place
+    /// `first` in the image, which is at `corner`.
+    pub(crate) fn tiled(
+        &mut self,
+        corner: DVec3,
+        u: DVec3,
+        v: DVec3,
+        first: [f32; 2],
+        times: [f32; 2],
+        material: u32,
+    ) {
         let positions = [corner, corner + u, corner + u + v, corner + v];
-        let uvs = [(0.0, 1.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.0)].map(|(x, y)| Vec2::new(x, y));
+        let uvs = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+            .map(|(x, y)| Vec2::new(first[0] + x * times[0], first[1] - y * times[1]));
         self.add(&positions, &[], &uvs, &[[0, 1, 2], [0, 2, 3]], material);
     }
 

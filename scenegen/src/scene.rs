@@ -12,7 +12,7 @@ use crate::error::Error;
 use crate::mesh::{FileCamera, Model, Reflection};
 use crate::panorama::Panorama;
 use crate::points::{InitPoints, PointCollector, PointOptions};
-use crate::presets::{PRESETS, Staging, open_sky, sun};
+use crate::presets::{AskedPreset, Staging, open_sky, sun};
 use crate::random::Draws;
 use crate::rig::{Rig, RigKind};
 use crate::shade::{Ambient, Lighting, TriangleFlags};
@@ -24,7 +24,7 @@ use crate::{gltf, obj};
 /// What to render.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Source {
-    /// A built-in scene, by name.
+    /// A built-in scene, by name; of one that has a size, `NAME:SIZE` too.
     Preset(String),
     /// A `.gltf`, `.glb` or `.obj` file.
     File(PathBuf),
@@ -182,7 +182,7 @@ impl Scene {
     /// unsupported feature, an option is out of range, or no camera can be placed.
     pub fn prepare(source: &Source, options: &Options) -> Result<Self, Error> {
         check(options)?;
-        let (name, staging, cameras) = stage(source)?;
+        let (name, staging, cameras) = stage(source, options.seed)?;
         let Staging { mut model, mut sky, rig, ambient } = staging;
         if options.lambert {
             for material in &mut model.materials {
@@ -315,18 +315,13 @@ fn check(options: &Options) -> Result<(), Error> {
     Ok(())
 }
 
-fn stage(source: &Source) -> Result<(String, Staging, Vec<FileCamera>), Error> {
+fn stage(source: &Source, seed: u64) -> Result<(String, Staging, Vec<FileCamera>), Error> {
     match source {
         Source::Preset(name) => {
-            let Some(preset) = PRESETS.iter().find(|preset| preset.name == name) else {
-                let known = PRESETS.map(|preset| preset.name).join(", ");
-                return Err(Error::Input(format!(
-                    "there is no preset {name:?}; the presets are {known}"
-                )));
-            };
-            let mut staging = (preset.build)();
-            staging.model.name = name.clone();
-            Ok((name.clone(), staging, Vec::new()))
+            let asked: AskedPreset = name.parse()?;
+            let mut staging = asked.build(seed);
+            staging.model.name = asked.to_string();
+            Ok((asked.to_string(), staging, Vec::new()))
         }
         Source::File(path) => {
             let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
@@ -369,6 +364,10 @@ fn with_options(rig: Rig, options: &Options) -> Rig {
             arc: 360.0,
             ..rig
         },
+        RigKind::Survey => {
+            let (radius, clearance, fov) = (default.radius, 0.002, 65.0);
+            Rig { radius, clearance, fov, arc: 360.0, ..rig }
+        }
         _ => Rig { arc: 360.0, radius: default.radius, clearance: default.clearance, ..rig },
     };
     let (width, height) = options.size.unwrap_or((rig.width, rig.height));

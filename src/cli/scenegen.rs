@@ -28,7 +28,7 @@ pub(super) struct ScenegenArgs {
     /// Mesh to render: .gltf, .glb or .obj
     #[arg(conflicts_with_all = ["preset", "list"], required_unless_present_any = ["preset", "list"])]
     input: Option<PathBuf>,
-    /// Render a built-in scene
+    /// Render a built-in scene; of one that has a size, town:4 is a larger one
     #[arg(long, value_name = "NAME", conflicts_with = "list")]
     preset: Option<String>,
     /// List the built-in scenes
@@ -60,7 +60,7 @@ pub(super) struct ScenegenArgs {
     #[arg(long, value_name = "DEGREES", help_heading = "Cameras")]
     fov: Option<f64>,
     /// Distance of the cameras, 1 being where the scene fills the image; with --rig inside, the
-    /// radius of their path as a share of the room
+    /// radius of their path as a share of the room; with --rig survey, a factor on its height
     #[arg(long, value_name = "FACTOR", help_heading = "Cameras")]
     radius: Option<f64>,
     /// Scatter of the cameras' places, as a share of their distance
@@ -122,6 +122,7 @@ const EXAMPLES: &str = "\
 Examples:
   densify scenegen --list
   densify scenegen --preset thin -o data/thin
+  densify scenegen --preset town:4 -o data/town --points 50000
   densify scenegen mesh.glb -o data/mesh --train 100 --size 400
   densify scenegen house.obj -o data/house --rig inside --bounce 64
   densify scenegen mesh.glb -o data/mesh --sky studio.hdr --ao 64
@@ -138,6 +139,8 @@ enum RigArg {
     Inside,
     /// On an ellipse as wide and deep as the scene
     Ellipse,
+    /// In rows above the scene, looking obliquely down; in town also along the streets
+    Survey,
     /// At and around the file's own cameras
     File,
 }
@@ -149,6 +152,7 @@ impl From<RigArg> for RigKind {
             RigArg::Dome => Self::Dome,
             RigArg::Inside => Self::Inside,
             RigArg::Ellipse => Self::Ellipse,
+            RigArg::Survey => Self::Survey,
             RigArg::File => Self::File,
         }
     }

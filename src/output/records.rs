@@ -181,7 +181,8 @@ pub fn write_scores(
     if !lpips.is_empty() {
         views["LPIPS"] = lpips.into();
     }
-    let fitted: [(&str, fn(&FittedScore) -> Option<f64>); 4] = [
+    type Score = fn(&FittedScore) -> Option<f64>;
+    let fitted: [(&str, Score); 4] = [
         ("PSNR_fitted", |v| Some(v.psnr)),
         ("SSIM_fitted", |v| Some(v.ssim)),
         ("FLIP_fitted", |v| Some(v.flip)),

@@ -77,7 +77,7 @@ impl RunSpec {
             return Ok(folder.clone());
         }
         let (scene, policy) = (self.scene()?, &self.density.policy);
-        if let Some(name) = builtin::name(scene) {
+        if let Some(name) = builtin::label(scene) {
             return Ok(Path::new("output").join(format!("{name}-{policy}")));
         }
         let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
@@ -214,6 +214,9 @@ mod tests {
             spec.start.scene = Some(spelling);
             assert_eq!(spec.output_folder().unwrap(), Path::new("output/garden-diet"));
         }
+        let mut built_in = RunSpec::default();
+        built_in.start.scene = Some("scene:town:4".into());
+        assert_eq!(built_in.output_folder().unwrap(), Path::new("output/town-4-diet"));
         assert!(RunSpec::default().output_folder().unwrap_err().message.contains("no scene"));
     }
 

@@ -118,8 +118,8 @@ fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
 fn labels(scenes: &[PathBuf]) -> Result<Vec<String>, Failure> {
     let mut labels = Vec::new();
     for scene in scenes {
-        if let Some(name) = builtin::name(scene) {
-            labels.push(unless_taken(&labels, name.to_owned())?);
+        if let Some(name) = builtin::label(scene) {
+            labels.push(unless_taken(&labels, name)?);
             continue;
         }
         let whole = std::fs::canonicalize(scene).map_err(|e| {

@@ -9,14 +9,14 @@ use std::f64::consts::TAU;
 
 use glam::{DVec2, DVec3, Vec3};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::{Material, Model};
 use crate::rig::{Rig, RigKind};
 
 pub(super) const PRESET: Preset = Preset {
     name: "chirp",
     summary: "Siemens stars, a chirp and flat walls: detail of every scale, and none",
-    build,
+    build: Build::Fixed(build),
 };
 
 const HEIGHT: f64 = 1.6;

@@ -7,7 +7,7 @@
 
 use glam::{DQuat, DVec3, Vec3};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::{Light, LightKind, Material, Model};
 use crate::rig::{Rig, RigKind};
 use crate::shade::Ambient;
@@ -16,7 +16,7 @@ use crate::sky::Sky;
 pub(super) const PRESET: Preset = Preset {
     name: "cornell",
     summary: "an area light in a coloured box: soft shadows, one bounce",
-    build,
+    build: Build::Fixed(build),
 };
 
 fn build() -> Staging {

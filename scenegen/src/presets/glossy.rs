@@ -6,13 +6,16 @@
 
 use glam::{DVec3, Vec3, Vec4};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::{Material, Model, Reflection};
 use crate::primitives::{chequered, marbled};
 use crate::rig::Rig;
 
-pub(super) const PRESET: Preset =
-    Preset { name: "glossy", summary: "GGX spheres: view-dependent colours", build };
+pub(super) const PRESET: Preset = Preset {
+    name: "glossy",
+    summary: "GGX spheres: view-dependent colours",
+    build: Build::Fixed(build),
+};
 
 fn build() -> Staging {
     let mut model = Model::default();

@@ -10,7 +10,7 @@ use std::f64::consts::TAU;
 
 use glam::{DQuat, DVec3, Vec3};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::{Material, Model, Reflection};
 use crate::primitives::{marbled, noise};
 use crate::rig::{Rig, RigKind};
@@ -18,7 +18,7 @@ use crate::rig::{Rig, RigKind};
 pub(super) const PRESET: Preset = Preset {
     name: "layers",
     summary: "near posts, buildings and a far dome: an outdoor scene with a horizon",
-    build,
+    build: Build::Fixed(build),
 };
 
 fn build() -> Staging {

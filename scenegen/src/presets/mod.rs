@@ -2,6 +2,7 @@
 //!
 //! A scene's file documents its geometry. Lengths are in metres; +y is up.
 
+mod ask;
 mod chirp;
 mod cornell;
 mod glossy;
@@ -10,7 +11,9 @@ mod room;
 mod spheres;
 mod table;
 mod thin;
+mod town;
 
+pub use ask::AskedPreset;
 use glam::{DVec3, Vec3};
 
 use crate::mesh::{Light, LightKind, Model};
@@ -25,7 +28,22 @@ pub struct Preset {
     pub name: &'static str,
     /// One line for lists.
     pub summary: &'static str,
-    pub(crate) build: fn() -> Staging,
+    pub(crate) build: Build,
+}
+
+/// How a preset is built.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Build {
+    /// Always the same.
+    Fixed(fn() -> Staging),
+    /// As large as is asked for, and another one for each seed.
+    Sized {
+        /// Its size where none is named.
+        usual: u32,
+        /// Its greatest size; the least is 1.
+        most: u32,
+        build: fn(size: u32, seed: u64) -> Staging,
+    },
 }
 
 /// A preset's geometry, light and cameras.
@@ -37,7 +55,7 @@ pub(crate) struct Staging {
 }
 
 /// All built-in scenes.
-pub const PRESETS: [Preset; 8] = [
+pub const PRESETS: [Preset; 9] = [
     spheres::PRESET,
     thin::PRESET,
     chirp::PRESET,
@@ -46,6 +64,7 @@ pub const PRESETS: [Preset; 8] = [
     room::PRESET,
     glossy::PRESET,
     cornell::PRESET,
+    town::PRESET,
 ];
 
 impl Staging {
@@ -74,10 +93,14 @@ mod tests {
     use super::*;
     use crate::surface::Surface;
 
+    fn asked(name: &str) -> AskedPreset {
+        name.parse().unwrap_or_else(|error| panic!("{error}"))
+    }
+
     #[test]
     fn every_preset_builds_and_is_described() {
         for preset in PRESETS {
-            let staging = (preset.build)();
+            let staging = asked(preset.name).build(0);
             assert!(!preset.summary.is_empty(), "{}", preset.name);
             let surface = Surface::new(&staging.model).expect("triangles");
             let (train, test) = staging.rig.cameras(&surface, &[]).expect("cameras");

@@ -8,15 +8,18 @@
 
 use glam::{DQuat, DVec2, DVec3, Vec3};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::{Light, LightKind, Material, Model};
 use crate::primitives::marbled;
 use crate::rig::{Rig, RigKind};
 use crate::shade::Ambient;
 use crate::sky::Sky;
 
-pub(super) const PRESET: Preset =
-    Preset { name: "room", summary: "a room from inside: plain walls, small text", build };
+pub(super) const PRESET: Preset = Preset {
+    name: "room",
+    summary: "a room from inside: plain walls, small text",
+    build: Build::Fixed(build),
+};
 
 const HALF: DVec3 = DVec3::new(2.5, 1.3, 2.0);
 const LINES: [&str; 5] = ["DENSIFY", "ROWS 200K", "DEPTH 2.50", "PRUNE GROW", "0123456789"];

@@ -6,7 +6,7 @@
 
 use glam::DVec3;
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::Model;
 use crate::primitives::{chequered, marbled};
 use crate::rig::Rig;
@@ -14,7 +14,7 @@ use crate::rig::Rig;
 pub(super) const PRESET: Preset = Preset {
     name: "spheres",
     summary: "five marbled spheres on a floor: the smoke test (128 px, 40 views)",
-    build,
+    build: Build::Fixed(build),
 };
 
 /// (radius, x, z, colours)

@@ -8,14 +8,17 @@
 
 use glam::{DQuat, DVec3};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::Model;
 use crate::primitives::marbled;
 use crate::random::Draws;
 use crate::rig::Rig;
 
-pub(super) const PRESET: Preset =
-    Preset { name: "table", summary: "a cluttered table: many objects, much occlusion", build };
+pub(super) const PRESET: Preset = Preset {
+    name: "table",
+    summary: "a cluttered table: many objects, much occlusion",
+    build: Build::Fixed(build),
+};
 
 const TOP: f64 = 0.76;
 

@@ -8,13 +8,16 @@
 
 use glam::{DVec3, Vec3};
 
-use super::{Preset, Staging};
+use super::{Build, Preset, Staging};
 use crate::mesh::{Material, Model};
 use crate::primitives::marbled;
 use crate::rig::{Rig, RigKind};
 
-pub(super) const PRESET: Preset =
-    Preset { name: "thin", summary: "wires of radius 0.5 to 4 px before a textured wall", build };
+pub(super) const PRESET: Preset = Preset {
+    name: "thin",
+    summary: "wires of radius 0.5 to 4 px before a textured wall",
+    build: Build::Fixed(build),
+};
 
 const RADII: [f64; 4] = [0.006, 0.012, 0.024, 0.048];
 

@@ -23,3 +23,9 @@ pub const PREFIX: &str = "scene:";
 pub fn name(path: &Path) -> Option<&str> {
     path.to_str()?.strip_prefix(PREFIX)
 }
+
+/// The same as a part of a file's name: `scene:town:4` is `town-4`.
+#[must_use]
+pub fn label(path: &Path) -> Option<String> {
+    name(path).map(|name| name.replace(':', "-"))
+}

@@ -158,11 +158,13 @@ fn bad_input_is_refused_and_leaves_nothing() {
     let broken = root.path().join("broken.glb");
     std::fs::write(&broken, b"glTF\x02\0\0\0\xff\xff\xff\xff").expect("write");
     let (broken, out) = (text(&broken), text(&out));
-    let cases: [(&str, &[&str]); 10] = [
+    let cases: [(&str, &[&str]); 12] = [
         (broken, &["broken.glb", "GLB header"]),
         ("nothing.obj", &["nothing.obj"]),
         ("mesh.fbx", &["mesh.fbx", ".obj"]),
         ("--preset nonsense", &["nonsense", "spheres"]),
+        ("--preset room:2", &["room:2", "write room"]),
+        ("--preset town:17", &["town:17", "town:1 to town:16"]),
         ("--preset thin --size 99999", &["--size", "99999"]),
         ("--preset thin --fov 180", &["--fov"]),
         ("--preset thin --rig file", &["--rig"]),
@@ -184,7 +186,8 @@ fn bad_input_is_refused_and_leaves_nothing() {
 #[test]
 fn presets_are_listed() {
     let said = call("scenegen --list").ok().stdout;
-    for name in ["spheres", "thin", "chirp", "table", "layers", "room", "glossy", "cornell"] {
+    for name in ["spheres", "thin", "chirp", "table", "layers", "room", "glossy", "cornell", "town"]
+    {
         assert!(said.lines().any(|line| line.starts_with(name)), "{name} is not in {said}");
     }
 }

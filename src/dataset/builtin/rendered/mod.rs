@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 pub use densify_scenegen::GroundTruth;
 use densify_scenegen::{
-    Frame, Generated, InitPoints, Options, PRESETS, Scene, Source, View as RenderedView, generate,
+    AskedPreset, Frame, InitPoints, Options, Scene, Source, Split, View as RenderedView,
 };
 use serde::{Deserialize, Serialize};
 
@@ -53,15 +53,17 @@ pub(in crate::dataset) fn load(
     options: &LoadOptions,
 ) -> Result<Dataset, DatasetError> {
     let (source, parameters) = (Source::Preset(name.to_owned()), Options::default());
-    let is_known = PRESETS.iter().any(|preset| preset.name == name);
-    let entry = options.cache.as_deref().filter(|_| is_known);
-    let entry = entry.and_then(|folder| Entry::of(folder, name, &parameters));
+    // Of an unknown one no file is named.
+    let asked: AskedPreset = name.parse()?;
+    let entry = options.cache.as_deref();
+    let entry = entry.and_then(|folder| Entry::of(folder, &asked.to_string(), &parameters));
     let kept = entry.as_ref().and_then(Entry::read);
     // A scene has as many images as views, unless somebody else has made the entry.
     if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
         return dataset(path, kept, options);
     }
-    let Generated { scene, frames, points } = generate(&source, &parameters)?;
+    let scene = Scene::prepare(&source, &parameters)?;
+    let (frames, points) = render(&scene);
     let surface_bytes = BUILDING * scene.surface.bytes() as u64;
     let about = About { views: scene.views, notes: scene.model.notes, surface_bytes };
     let rendered = Rendered { about, frames, points };
@@ -69,6 +71,22 @@ pub(in crate::dataset) fn load(
         entry.write(&rendered);
     }
     dataset(path, rendered, options)
+}
+
+/// The images of all views, without the depths and normals that only the points need.
+fn render(scene: &Scene) -> (Vec<Frame>, InitPoints) {
+    let mut collector = scene.point_collector();
+    let mut frames = Vec::with_capacity(scene.views.len());
+    for (i, view) in scene.views.iter().enumerate() {
+        let frame = scene.render(i);
+        if view.split == Split::Train {
+            collector.observe(i, &frame);
+        }
+        let (depth, normals, triangles) = (Vec::new(), Vec::new(), Vec::new());
+        frames.push(Frame { depth, normals, triangles, ..frame });
+    }
+    let points = collector.finish();
+    (frames, points)
 }
 
 impl Dataset {
@@ -110,7 +128,7 @@ fn dataset(
         .zip(frames)
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
-            let held_out = view.split == densify_scenegen::Split::Test;
+            let held_out = view.split == Split::Test;
             let views = vec![dataset_view(&view.name, camera, frame, options)];
             Photograph { views, hidden: Vec::new(), held_out, id: Some(number) }
         })

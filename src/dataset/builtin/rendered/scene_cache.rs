@@ -37,6 +37,8 @@ impl Entry {
     pub(super) fn of(folder: &Path, name: &str, options: &Options) -> Option<Self> {
         let program = fingerprint(&std::env::current_exe().ok()?).ok()?;
         let parameters = crc32c::crc32c(format!("{options:?}").as_bytes());
+        // Some systems keep the colon of `town:4` out of names.
+        let name = name.replace(':', "-");
         let name = format!("{name}-{program:08x}-{parameters:08x}.{ENDING}");
         Some(Self { path: folder.join(name) })
     }
@@ -207,6 +209,10 @@ mod tests {
         Rendered { about, frames: vec![frame(3), frame(250)], points }
     }
 
+    fn has_colon(path: &Path) -> bool {
+        path.file_name().is_some_and(|name| name.to_string_lossy().contains(':'))
+    }
+
     fn same(read: Option<Rendered>) -> bool {
         read.is_some_and(|read| read == sample())
     }
@@ -221,6 +227,11 @@ mod tests {
         assert!(same(default.read()));
         // Other parameters are another scene.
         assert!(entry(&Options { seed: 9, ..Options::default() }).read().is_none());
+        // So is one of another size.
+        let sized = |name| Entry::of(folder.path(), name, &Options::default()).unwrap();
+        let [town, larger] = ["town", "town:4"].map(sized);
+        town.write(&sample());
+        assert!(same(town.read()) && larger.read().is_none() && !has_colon(&larger.path));
         // A damaged entry is none.
         let whole = fs::read(&default.path).unwrap();
         for at in (0..whole.len()).step_by(7) {

@@ -4,6 +4,8 @@
 //! surface than [`Rig::clearance`] of the geometry's diagonal: a view from inside a wall has no use as
 //! ground truth.
 
+mod survey;
+
 use std::f64::consts::TAU;
 
 use glam::{DMat3, DVec3};
@@ -14,6 +16,7 @@ use crate::error::Error;
 use crate::mesh::FileCamera;
 use crate::random::Draws;
 use crate::surface::Surface;
+pub use survey::Survey;
 
 /// How cameras are arranged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,6 +30,8 @@ pub enum RigKind {
     Inside,
     /// An ellipse as wide and deep as the scene, looking at the middle.
     Ellipse,
+    /// In rows above the scene, looking obliquely down, and along its streets, where it names any.
+    Survey,
     /// At and around the file's own cameras.
     File,
 }
@@ -47,7 +52,7 @@ pub struct Rig {
     /// Horizontal field of view `[degrees]`.
     pub fov: f64,
     /// Distance from the middle, in multiples of that at which the scene's bounding sphere fills
-    /// the image; inside, the path's radius as a share of the room.
+    /// the image; inside, the path's radius as a share of the room; of a survey, a factor on its height.
     pub radius: f64,
     /// Lowest and highest elevation `[degrees]`.
     pub elevation: [f64; 2],
@@ -63,6 +68,9 @@ pub struct Rig {
     pub focus: Option<f64>,
     /// Seed of the jitter.
     pub seed: u64,
+    /// Where a survey flies and walks; by default over the bounding box.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub survey: Option<Survey>,
 }
 
 impl Default for Rig {
@@ -82,6 +90,7 @@ impl Default for Rig {
             target: None,
             focus: None,
             seed: 0,
+            survey: None,
         }
     }
 }
@@ -108,7 +117,7 @@ impl Rig {
         self.check()?;
         if self.kind == RigKind::File && file.is_empty() {
             let problem =
-                "the file has no perspective camera; choose orbit, dome, ellipse or inside";
+                "the file has no perspective camera; choose orbit, dome, ellipse, inside or survey";
             return Err(Error::option("--rig", problem));
         }
         let split = |test: bool| {
@@ -161,15 +170,19 @@ impl Rig {
                 // The file's author chose this place.
                 return Ok(self.file_camera(&file[i as usize]));
             }
-            let (place, target) = self.stand(surface, file, i, test);
+            let (place, target) = self.stand(surface, file, (i, test), attempt);
             let reach = (place - target).length();
             // First by the requested jitter, then farther each time.
             let spread = self.jitter.max(0.005 * attempt as f64) * reach;
             let mut shift = || DVec3::new(draws.normal(), draws.normal(), draws.normal());
             let offset = if spread > 0.0 { shift() * spread } else { DVec3::ZERO };
             let place = place + offset;
-            if self.is_free(surface, place) {
-                return Ok(self.looking(place, target, file, i));
+            if !self.is_free(surface, place) {
+                continue;
+            }
+            let camera = self.looking(place, target, file, i);
+            if self.kind != RigKind::Survey || survey::shows_enough(surface, &camera, attempt) {
+                return Ok(camera);
             }
         }
         Err(Error::Input(format!(
@@ -199,7 +212,13 @@ impl Rig {
     }
 
     /// Where view `i` of its split stands before jitter, and what it looks at.
-    fn stand(&self, surface: &Surface, file: &[FileCamera], i: u32, test: bool) -> Viewpoint {
+    fn stand(
+        &self,
+        surface: &Surface,
+        file: &[FileCamera],
+        (number, test): (u32, bool),
+        attempt: u64,
+    ) -> Viewpoint {
         let (lo, hi) = surface.bounds();
         let middle = self.target.map_or(0.5 * (lo + hi), DVec3::from);
         let half = 0.5 * (hi - lo);
@@ -210,7 +229,7 @@ impl Rig {
         let distance = self.radius * fill / (0.5 * fov_x.min(fov_y)).sin();
         let count = f64::from(if test { self.test } else { self.train });
         let (i, low, high) =
-            (f64::from(i), self.elevation[0].to_radians(), self.elevation[1].to_radians());
+            (f64::from(number), self.elevation[0].to_radians(), self.elevation[1].to_radians());
         // Test views stand between training views in every coordinate.
         let shift = if test { 0.5 } else { 0.0 };
         let along = |share: f64| self.arc.to_radians() * (share - 0.5);
@@ -246,8 +265,9 @@ impl Rig {
                 let pitch = low + (i * 0.754_877_666_246_693 + shift).fract() * (high - low);
                 (place, place + on_sphere(yaw, pitch) * half.length())
             }
+            RigKind::Survey => self.on_survey(surface, (number, test), attempt),
             RigKind::File => {
-                let camera = &file[i as usize % file.len()];
+                let camera = &file[number as usize % file.len()];
                 let forward = camera.world_from_camera.z_axis;
                 let met = surface.cast(camera.centre, forward, f64::INFINITY);
                 let focus = met.map_or(half.length(), |hit| hit.t);

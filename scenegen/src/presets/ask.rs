@@ -1,0 +1,92 @@
+//! Reads how a built-in scene is asked for: by its name and, if it has one, its size: `room`, `town:4`.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::{Build, PRESETS, Preset, Staging};
+use crate::error::Error;
+
+/// A built-in scene and its size. Written as it is read, without a size that is the usual one.
+#[derive(Debug, Clone, Copy)]
+pub struct AskedPreset {
+    preset: Preset,
+    size: Option<u32>,
+}
+
+impl AskedPreset {
+    /// The scene. Only those that have a size depend on the seed.
+    pub(crate) fn build(&self, seed: u64) -> Staging {
+        match self.preset.build {
+            Build::Fixed(build) => build(),
+            Build::Sized { usual, build, .. } => build(self.size.unwrap_or(usual), seed),
+        }
+    }
+}
+
+impl FromStr for AskedPreset {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self, Error> {
+        let (name, size) = text.split_once(':').map_or((text, None), |(n, s)| (n, Some(s)));
+        let Some(&preset) = PRESETS.iter().find(|preset| preset.name == name) else {
+            let known = PRESETS.map(|preset| preset.name).join(", ");
+            return Err(Error::Input(format!(
+                "there is no preset {text:?}; the presets are {known}"
+            )));
+        };
+        let size = match (size, preset.build) {
+            (None, _) => None,
+            (Some(_), Build::Fixed(_)) => {
+                let problem = format!("the preset {name} has one size only; write {name}");
+                return Err(Error::Input(format!("{text}: {problem}")));
+            }
+            (Some(size), Build::Sized { usual, most, .. }) => {
+                match size.parse().ok().filter(|size| (1..=most).contains(size)) {
+                    Some(size) => Some(size).filter(|&size| size != usual),
+                    None => {
+                        return Err(Error::Input(format!(
+                            "{text}: {size:?} is no size of the preset {name}; write {name}:1 to {name}:{most}"
+                        )));
+                    }
+                }
+            }
+        };
+        Ok(Self { preset, size })
+    }
+}
+
+impl fmt::Display for AskedPreset {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.preset.name)?;
+        self.size.map_or(Ok(()), |size| write!(f, ":{size}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_and_sizes_are_read_and_written() {
+        for (text, written) in
+            [("room", "room"), ("town", "town"), ("town:2", "town"), ("town:04", "town:4")]
+        {
+            let read: AskedPreset = text.parse().unwrap_or_else(|e| panic!("{text}: {e}"));
+            assert_eq!(read.to_string(), written, "{text}");
+        }
+        for (text, word) in [
+            ("nonsense", "spheres, thin"),
+            ("nonsense:3", "spheres, thin"),
+            ("room:3", "write room"),
+            ("town:", "town:1 to town:16"),
+            ("town:0", "town:1 to town:16"),
+            ("town:17", "town:1 to town:16"),
+            ("town:4x4", "town:1 to town:16"),
+            ("town:4:4", "town:1 to town:16"),
+            ("../town", "spheres, thin"),
+        ] {
+            let error = text.parse::<AskedPreset>().expect_err(text).to_string();
+            assert!(error.contains(word) && error.contains(text), "{error}");
+        }
+    }
+}

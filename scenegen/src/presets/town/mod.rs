@@ -1,0 +1,220 @@
+//! `town`: streets, houses and trees, as large as is asked for: `town:4` has 4 x 4 blocks.
+//!
+//! Ground at y = 0, without relief. Streets 11 m wide, of which 2 m on each side are pavement, run along x
+//! and z every 50 m, about every block and about the town's edge; the middle of the town is the origin.
+//! Between them are blocks of 39 x 39 m, in turn of houses, flats, houses, a park (the seed says with which
+//! the turn begins), and around the town 30 m of meadow with trees.
+//!
+//! Houses (`houses.rs`) are closed solids, eight to a block, of two to four floors of 2.9 m, with gabled or
+//! flat roofs; blocks of flats have two slabs of four to six floors with balconies. Trees (`outdoors.rs`) have a
+//! trunk and a lumpy crown of 320 triangles. Cars are parked along the streets, lamps (thin structures, 12 cm)
+//! stand on the pavement. Windows, doors and road markings are painted. All Lambert. About 9,000 triangles
+//! per block; the layout follows from the seed.
+//!
+//! For each block there are 24 training views, two thirds from 45 m above and a third from the street
+//! at 1.7 m, and 6 test views.
+
+mod houses;
+mod outdoors;
+mod skins;
+
+use glam::{DVec3, dvec3};
+
+use super::{Build, Preset, Staging};
+use crate::mesh::Model;
+use crate::random::Draws;
+use crate::rig::{Rig, RigKind, Survey};
+use skins::Skins;
+
+pub(super) const PRESET: Preset = Preset {
+    name: "town",
+    summary: "streets of houses and trees, from above and from the street; town:4 has 4x4 blocks (1 to 16, else 2)",
+    build: Build::Sized { usual: 2, most: 16, build },
+};
+
+/// From the middle of a street to that of the next.
+const PITCH: f64 = 50.0;
+/// Half a street, pavement included.
+const STREET: f64 = 5.5;
+/// Half a block.
+const BLOCK: f64 = 0.5 * PITCH - STREET;
+/// Width of the meadow around the town.
+const MEADOW: f64 = 30.0;
+/// Height of the flight over the town.
+const FLIGHT: f64 = 45.0;
+/// Height of the eye in the street.
+const EYE: f64 = 1.7;
+/// Least distance of a camera from any surface.
+const CLEARANCE: f64 = 0.5;
+
+/// What stands on a block.
+#[derive(Debug, Clone, Copy)]
+enum Use {
+    Houses,
+    Flats,
+    Park,
+}
+
+/// What blocks are, one after the other.
+const USES: [Use; 6] = [Use::Houses, Use::Flats, Use::Houses, Use::Park, Use::Houses, Use::Flats];
+
+/// The town as it is built.
+struct Town {
+    model: Model,
+    skins: Skins,
+}
+
+fn build(size: u32, seed: u64) -> Staging {
+    let mut model = Model::default();
+    let skins = Skins::paint(&mut model);
+    let mut town = Town { model, skins };
+    town.ground(size);
+    for block in 0..size * size {
+        let (column, row) = (block % size, block / size);
+        let middle = dvec3(crossing(size, column), 0.0, crossing(size, row));
+        let middle = middle + 0.5 * PITCH * (DVec3::X + DVec3::Z);
+        let turn = u64::from(block + row / 2) + seed;
+        let mut draws = Draws::new(seed, &[0x62_6c6f_636b, u64::from(column), u64::from(row)]);
+        match USES[(turn % USES.len() as u64) as usize] {
+            Use::Houses => town.houses(middle, &mut draws),
+            Use::Flats => town.flats(middle, &mut draws),
+            Use::Park => town.park(middle, &mut draws),
+        }
+    }
+    town.furnish_streets(size, seed);
+    town.plant_meadow(size, seed);
+    let blocks = size * size;
+    let edge = crossing(size, size) + STREET;
+    let diagonal = 2.0 * (edge + MEADOW) * 2.0_f64.sqrt();
+    let rig = Rig {
+        kind: RigKind::Survey,
+        train: 24 * blocks,
+        test: 6 * blocks,
+        width: 256,
+        height: 192,
+        fov: 65.0,
+        clearance: CLEARANCE / diagonal,
+        survey: Some(Survey {
+            ground: [[-edge; 2], [edge; 2]],
+            height: [0.0, FLIGHT],
+            streets: streets(size)
+                .map(|ends| ends.map(|end| (end + EYE * DVec3::Y).into()))
+                .collect(),
+            eye: EYE,
+        }),
+        ..Rig::default()
+    };
+    Staging { rig, ..Staging::outdoors(town.model) }
+}
+
+/// Where the middle of street number `i` of the `size + 1` in a direction is, along the other direction.
+fn crossing(size: u32, i: u32) -> f64 {
+    PITCH * (f64::from(i) - 0.5 * f64::from(size))
+}
+
+/// Both ends of each street's middle: those along x and those along z, in turn.
+fn streets(size: u32) -> impl Iterator<Item = [DVec3; 2]> {
+    let end = crossing(size, size);
+    (0..=size).flat_map(move |i| {
+        let at = crossing(size, i);
+        let ends = |along: DVec3, across: DVec3| [-end, end].map(|way| way * along + at * across);
+        [ends(DVec3::X, DVec3::Z), ends(DVec3::Z, DVec3::X)]
+    })
+}
+
+/// A direction on the ground and that to its right: where a thing has its front and how wide it is.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    origin: DVec3,
+    right: DVec3,
+    front: DVec3,
+}
+
+impl Place {
+    /// With its front towards `front`, which is an axis.
+    fn facing(origin: DVec3, front: DVec3) -> Self {
+        Self { origin, right: DVec3::Y.cross(front), front }
+    }
+
+    /// The same place, a quarter turn on.
+    fn turned(self) -> Self {
+        Self::facing(self.origin, self.right)
+    }
+
+    /// A direction: to the right, up, to the front.
+    fn way(&self, right: f64, up: f64, front: f64) -> DVec3 {
+        right * self.right + up * DVec3::Y + front * self.front
+    }
+
+    fn at(&self, right: f64, up: f64, front: f64) -> DVec3 {
+        self.origin + self.way(right, up, front)
+    }
+}
+
+impl Town {
+    /// The horizontal rectangle about a place, its image repeated so often.
+    fn level(&mut self, middle: DVec3, half: [f64; 2], times: [f64; 2], skin: u32) {
+        let [x, z] = half;
+        let (u, v) = (2.0 * x * DVec3::X, -2.0 * z * DVec3::Z);
+        let times = times.map(|times| times as f32);
+        self.model.tiled(middle + dvec3(-x, 0.0, z), u, v, [0.0, 1.0], times, skin);
+    }
+
+    /// A box that stands upright on `place`, with half sides to the right, up and to the front.
+    fn block(&mut self, place: &Place, middle: DVec3, half: DVec3, skin: u32) {
+        let corner = middle - place.way(half.x, half.y, half.z);
+        let sides = [(half.x, 0.0, 0.0), (0.0, 0.0, half.z), (0.0, half.y, 0.0)]
+            .map(|(right, up, front)| 2.0 * place.way(right, up, front));
+        self.slab(corner, sides, [1.0; 2], skin);
+    }
+
+    /// The solid of three sides from a corner, its image repeated on the faces of the first two.
+    fn slab(&mut self, corner: DVec3, sides: [DVec3; 3], times: [f64; 2], skin: u32) {
+        let [mut a, mut b, c] = sides;
+        if a.cross(b).dot(c) < 0.0 {
+            (a, b) = (b, a);
+        }
+        let [x, y] = times.map(|times| times as f32);
+        let faces = [
+            (corner + c, a, b, [x, y]),
+            (corner, b, a, [y, x]),
+            (corner, a, c, [x, 1.0]),
+            (corner + b, c, a, [1.0, x]),
+            (corner + a, b, c, [y, 1.0]),
+            (corner, c, b, [1.0, y]),
+        ];
+        for (corner, u, v, times) in faces {
+            self.model.tiled(corner, u, v, [0.0, 1.0], times, skin);
+        }
+    }
+
+    /// Streets, crossings, and the meadow around them. Blocks bring their own ground.
+    fn ground(&mut self, size: u32) {
+        let Skins { street, street_across, crossing: crossed, grass, .. } = self.skins;
+        for column in 0..=size {
+            for row in 0..=size {
+                let at = dvec3(crossing(size, column), 0.0, crossing(size, row));
+                self.level(at, [STREET; 2], [1.0; 2], crossed);
+                if row < size {
+                    let middle = at + 0.5 * PITCH * DVec3::Z;
+                    self.level(middle, [STREET, BLOCK], [1.0, 4.0], street);
+                }
+                if column < size {
+                    let middle = at + 0.5 * PITCH * DVec3::X;
+                    self.level(middle, [BLOCK, STREET], [4.0, 1.0], street_across);
+                }
+            }
+        }
+        let edge = crossing(size, size) + STREET;
+        let (out, half) = (edge + 0.5 * MEADOW, 0.5 * MEADOW);
+        for sign in [-1.0, 1.0] {
+            let times = [(2.0 * edge + 2.0 * MEADOW) / 12.0, MEADOW / 12.0];
+            self.level(sign * out * DVec3::Z, [edge + MEADOW, half], times, grass);
+            let times = [MEADOW / 12.0, 2.0 * edge / 12.0];
+            self.level(sign * out * DVec3::X, [half, edge], times, grass);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
