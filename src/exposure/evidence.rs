@@ -66,7 +66,7 @@ impl ExposureSpread {
         for (place, seen) in colours.by_track().enumerate() {
             tracks += 1;
             let fitted = colours.reference(place);
-            for channel in 0..3 {
+            for (channel, fitted) in fitted.iter().enumerate() {
                 own.clear();
                 own.extend(seen.iter().map(|colour| f32::from(colour.centre[channel])));
                 let plain = median(&mut own);
@@ -74,7 +74,7 @@ impl ExposureSpread {
                     let value = f32::from(colour.centre[channel]);
                     let gain = colours.gains(colour.view as usize)[channel];
                     alike.push((value - plain).abs());
-                    with_gains.push((value - fitted[channel] * gain).abs());
+                    with_gains.push((value - fitted * gain).abs());
                 }
             }
         }

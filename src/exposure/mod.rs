@@ -193,12 +193,12 @@ mod tests {
             behind: g.map(|g| g * f64::from(light)),
         };
         let found = SOME.gradient(background, &sums);
-        for i in 0..3 {
-            for j in 0..3 {
-                let by = upstream[i] * foreground[j];
+        for (i, upstream) in upstream.into_iter().enumerate() {
+            for (j, foreground) in foreground.into_iter().enumerate() {
+                let by = upstream * foreground;
                 assert!((found.matrix[i][j] - by).abs() < 1e-6, "{i}, {j}: {found:?}");
             }
-            let by = upstream[i] * (1.0 - light);
+            let by = upstream * (1.0 - light);
             assert!((found.offset[i] - by).abs() < 1e-6, "{i}: {found:?}");
         }
     }

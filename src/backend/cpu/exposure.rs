@@ -8,7 +8,7 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::CpuBackend;
-use super::rasterize::{PATCHES, TRANSMITTANCE, TileCanvas, TilePlace};
+use super::rasterize::{TRANSMITTANCE, TileCanvas, TilePlace};
 use super::rasterize_bwd::TileGradient;
 use super::simd::WIDTH;
 use super::tiles::Grid;
@@ -113,12 +113,12 @@ impl WithSimd for ExposeBwd<'_> {
             // Beyond the image there may be a gradient of no pixel.
             let (inside, _) = TilePlace::new(grid, number).inside();
             let mut sums = [[0.0_f32; WIDTH]; SUMS];
-            for p in 0..PATCHES {
+            for (p, inside) in inside.iter().enumerate() {
                 for lane in 0..WIDTH {
                     let colour: [f32; 3] = std::array::from_fn(|c| canvas.planes[c][p][lane]);
                     let light = canvas.planes[TRANSMITTANCE][p][lane];
                     let g: [f32; 3] =
-                        std::array::from_fn(|c| gradient.planes[c][p][lane] * inside[p][lane]);
+                        std::array::from_fn(|c| gradient.planes[c][p][lane] * inside[lane]);
                     for i in 0..3 {
                         for j in 0..3 {
                             sums[3 * i + j][lane] += g[i] * colour[j];
