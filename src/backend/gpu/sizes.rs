@@ -149,8 +149,10 @@ impl Sizes {
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
         }
+        // Without exposures too: the loss binds it, and one buffer cannot stand for all that are missing where a
+        // kernel writes to some of them.
+        add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
         if self.exposures {
-            add(Section::Renderer, "exposure", "exposure", exposure::TRANSFORM);
             let sums = exposure::SUMS * exposure::groups(pixels);
             add(Section::Renderer, "exposure", "exposure sums", sums);
             add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);

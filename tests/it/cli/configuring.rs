@@ -57,7 +57,16 @@ fn a_run_has_every_option_in_its_file() {
     train(scene.path(), &run, 2, "--budget 250").ok();
     let config = config(&run);
     // What is not set is what there is nothing to set to.
-    let unset = ["test_every", "images", "resolution", "init_points", "memory", "preset"];
+    let unset = [
+        "test_every",
+        "images",
+        "resolution",
+        "init_points",
+        "memory",
+        "preset",
+        "views",
+        "freeze",
+    ];
     let elsewhere = ["gpu", "threads", "output", "view"];
     for option in OPTIONS {
         let is_unset = unset.contains(&option.name) || elsewhere.contains(&option.name);
