@@ -32,7 +32,8 @@ const LEAST_SHARE: f64 = 0.05;
 /// A block with fewer Gaussians is none.
 const LEAST_ROWS: usize = 100;
 /// The coarse run: its share of the rows, at least so many; its share of the iterations; width of its images `[px]`.
-const COARSE_ROWS: usize = 10;
+/// Blocks take up what their frozen neighbours show wrongly, so that these must be good; docs/blocks.md has the cost.
+const COARSE_ROWS: [usize; 2] = [2, 5];
 const COARSE_LEAST: usize = 1_000;
 const COARSE_ITERATIONS: u32 = 2;
 const COARSE_WIDTH: u32 = 400;
@@ -97,7 +98,8 @@ pub struct PlanOptions {
     pub memory: Option<u64>,
     /// How many blocks.
     pub grid: Grid,
-    /// Budget of the coarse run; `None`: a tenth of the whole.
+    /// Budget of the coarse run; `None`: two fifths of the whole, or what leaves a block as many rows of its own in
+    /// `memory`.
     pub coarse_rows: Option<usize>,
     /// How far beyond its cell a block trains, as a share of a cell's usual width.
     pub margin: f64,
@@ -198,9 +200,30 @@ impl<'a> Planner<'a> {
                 "a merged model of {rows} Gaussians is none; give --rows or --bytes for at least {LEAST_ROWS}"
             )));
         }
-        let usual = (rows / COARSE_ROWS).max(COARSE_LEAST);
-        let coarse_rows = options.coarse_rows.unwrap_or(usual);
-        Ok(Self { options, scene, spec, dataset, ground, sight, rows, sh_degree, coarse_rows })
+        let planner =
+            Self { options, scene, spec, dataset, ground, sight, rows, sh_degree, coarse_rows: 0 };
+        let coarse_rows = match options.coarse_rows {
+            Some(rows) => rows,
+            None => planner.usual_coarse_rows()?,
+        };
+        Ok(Self { coarse_rows, ..planner })
+    }
+
+    /// Rows of the coarse run where none are given.
+    fn usual_coarse_rows(&self) -> Result<usize, Failure> {
+        let [part, whole] = COARSE_ROWS;
+        let usual = self.rows * part / whole;
+        let most = match self.options.memory {
+            Some(_) => {
+                let mut spec = self.shared().describe()?;
+                spec.start.scene = Some(self.scene.clone());
+                spec.size.budget = Some(Budget::Rows(self.rows));
+                // Half of what fits: a block has frozen rows and its own.
+                promised(&spec, [None, None], &Silent)?.0 / 2
+            }
+            None => usual,
+        };
+        Ok(usual.min(most).max(COARSE_LEAST))
     }
 
     /// The fewest blocks that fit the memory of a task.

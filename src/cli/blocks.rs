@@ -61,7 +61,8 @@ struct PlanArgs {
     /// Most memory of a task: 8GiB
     #[arg(long, value_name = "SIZE", required_if_eq("blocks", "auto"))]
     memory: Option<ByteCount>,
-    /// Budget of the coarse run `[default: a tenth of the merged model, at least 1,000]`
+    /// Budget of the coarse run `[default: two fifths of the merged model, at least 1,000, or half of what fits
+    /// --memory]`
     #[arg(long, value_name = "N")]
     coarse_rows: Option<Rows>,
     /// How far beyond its cell a block trains, as a share of a cell's usual width
