@@ -14,7 +14,7 @@ use crate::run::{Partial, RunSpec};
 /// Most rows of a table of differences: with more, nothing is compared any more.
 const MOST: usize = 60;
 /// Options that name places on the machine that trained. Of these only the last part is told.
-const PLACES: [&str; 3] = ["scene", "images", "init"];
+const PLACES: [&str; 5] = ["scene", "images", "views", "init", "freeze"];
 
 /// All options with their whole names, such as `knob.alpha_min`, and their values as text.
 pub(super) fn flat(options: &Table) -> BTreeMap<String, String> {
@@ -97,7 +97,30 @@ pub(super) fn differing(runs: &[Told]) -> Result<Option<Markup>, Failure> {
 
 #[cfg(test)]
 mod tests {
+    use clap::Args;
+
     use super::*;
+    use crate::run::AbsolutePath;
+
+    /// What takes a file or a folder is a place.
+    #[test]
+    fn every_place_is_known() {
+        let command = RunSpec::augment_args(clap::Command::new("train"));
+        let of = |arg: &clap::Arg| arg.get_value_names().unwrap_or_default().to_vec();
+        let places = command.get_arguments().filter(|arg| {
+            let names = of(arg);
+            ["DIR", "FILE", "MODEL", "SCENE"]
+                .iter()
+                .any(|known| names.iter().any(|name| name.contains(known)))
+        });
+        let found: Vec<&str> = places.map(|arg| arg.get_id().as_str()).collect();
+        assert!(found.len() > PLACES.len(), "{found:?}");
+        // That one is an enumeration, and the output's folder is not told at all.
+        let others = ["exposure_model", "output"];
+        let unknown: Vec<_> =
+            found.iter().filter(|name| !PLACES.contains(name) && !others.contains(name)).collect();
+        assert!(unknown.is_empty(), "{unknown:?} may hold a path of this machine");
+    }
 
     #[test]
     fn options_have_whole_names_and_places_lose_what_lies_above() {
@@ -110,6 +133,8 @@ mod tests {
         spec.start.scene = Some("/home/somebody/secret/garden".into());
         spec.output.output = Some("/home/somebody/out".into());
         spec.data.images = Some("/mnt/photographs".into());
+        spec.data.views = Some(AbsolutePath("/mnt/views.txt".into()));
+        spec.start.freeze = Some(AbsolutePath("/mnt/rest.ply".into()));
         let text = toml::to_string(&told(&spec).unwrap()).unwrap();
         assert!(text.contains("scene = \"garden\"") && text.contains("\"photographs\""), "{text}");
         assert!(!text.contains("somebody") && !text.contains("mnt"), "{text}");
