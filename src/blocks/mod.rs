@@ -12,6 +12,7 @@ mod divide;
 pub mod engine;
 mod ground;
 mod merge;
+mod options;
 mod picture;
 mod plan;
 mod sight;
@@ -29,7 +30,8 @@ use crate::output::OutputError;
 pub use divide::Cell;
 pub use ground::Ground;
 pub use merge::{Merged, merge};
-pub use plan::{Grid, PlanOptions, Size, plan};
+pub use options::{Grid, PlanOptions, Size};
+pub use plan::plan;
 pub use status::{State, status};
 pub use task::run;
 
@@ -172,7 +174,8 @@ impl Blocks {
     }
 
     /// Length of the run of a task; 0 for the merge.
-    fn iterations(&self, task: Task) -> u32 {
+    #[must_use]
+    pub fn iterations(&self, task: Task) -> u32 {
         match task {
             Task::Coarse => self.coarse.iterations,
             Task::Block(place) => self.block[place].iterations,
@@ -190,6 +193,12 @@ impl Blocks {
 fn is_plain(name: &str) -> bool {
     let is_word = |c: char| c.is_ascii_alphanumeric() || c == '-';
     !name.is_empty() && name.chars().all(is_word)
+}
+
+/// A path as text, for commands and descriptions.
+fn utf8(path: &Path) -> Result<&str, Failure> {
+    let wrong = || Failure::input(format!("{}: the name is not UTF-8; rename it", path.display()));
+    path.to_str().ok_or_else(wrong)
 }
 
 /// Folder of a block in that of the plan.

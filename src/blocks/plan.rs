@@ -2,18 +2,17 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use tempfile::TempDir;
 
 use super::divide::cells;
+use super::options::{Grid, MOST, PlanOptions, Size};
 use super::picture::picture;
 use super::sight::{Sight, shows};
 use super::{
     BLOCK_FILE, Block, Blocks, COARSE_FILE, Cell, Coarse, Ground, PLAN_FILE, block_folder,
 };
 use crate::camera::Camera;
-use crate::dataset::normalise::median;
 use crate::dataset::{Dataset, View, builtin};
 use crate::failure::Failure;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
@@ -25,8 +24,6 @@ use crate::run::{
     promised,
 };
 
-/// Most strips, and cells of a strip.
-const MOST: usize = 1000;
 /// A view belongs to a block if at least this share of the points that it sees lie in the block.
 const LEAST_SHARE: f64 = 0.05;
 /// A block with fewer Gaussians is none.
@@ -38,7 +35,7 @@ const COARSE_LEAST: usize = 1_000;
 const COARSE_ITERATIONS: u32 = 2;
 const COARSE_WIDTH: u32 = 400;
 /// Options of a run that the plan itself decides.
-const OWN: [&str; 9] = [
+const OWN: [&str; 10] = [
     "scene",
     "output",
     "budget",
@@ -48,64 +45,8 @@ const OWN: [&str; 9] = [
     "freeze",
     "views",
     "save_iterations",
+    "view",
 ];
-
-/// How many blocks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Grid {
-    /// As few as fit the memory of a task.
-    Auto,
-    /// Strips along the longer side of the ground, and blocks in each.
-    Of([usize; 2]),
-}
-
-impl FromStr for Grid {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let number = |text: &str| text.parse().ok().filter(|n| (1..=MOST).contains(n));
-        let parts = match text.split_once(['x', 'X', '×']) {
-            Some((strips, across)) => number(strips).zip(number(across)),
-            None if text == "auto" => return Ok(Self::Auto),
-            None => number(text).map(|strips| (strips, 1)),
-        };
-        let (strips, across) = parts.ok_or_else(|| {
-            format!("`{text}` is no division into blocks; give 4, 3x2 or auto, at most {MOST} along a side")
-        })?;
-        Ok(Self::Of([strips, across]))
-    }
-}
-
-/// How large the merged model may be.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Size {
-    /// So many Gaussians.
-    Rows(usize),
-    /// So many bytes of its PLY.
-    Bytes(u64),
-}
-
-/// What is planned.
-#[derive(Debug, Clone)]
-pub struct PlanOptions {
-    /// The dataset.
-    pub scene: PathBuf,
-    /// Folder to write the plan to, which does not exist yet or is empty.
-    pub output: PathBuf,
-    /// Size of the merged model.
-    pub size: Size,
-    /// Most memory of a task `[bytes]`.
-    pub memory: Option<u64>,
-    /// How many blocks.
-    pub grid: Grid,
-    /// Budget of the coarse run; `None`: two fifths of the whole, or what leaves a block as many rows of its own in
-    /// `memory`.
-    pub coarse_rows: Option<usize>,
-    /// How far beyond its cell a block trains, as a share of a cell's usual width.
-    pub margin: f64,
-    /// Options of `densify train` for every run; iterations are those of one run over the whole scene.
-    pub given: Partial,
-}
 
 /// Plans, and writes the plan's folder as a whole or not at all.
 ///
@@ -181,7 +122,10 @@ impl<'a> Planner<'a> {
             Some(_) => options.scene.clone(),
             None => std::path::absolute(&options.scene).map_err(Failure::input)?,
         };
-        let dataset = load_with_tracks(&scene, &spec, observer)?;
+        let dataset = Dataset::load(&scene, &spec.data.load_options(true))?;
+        for note in &dataset.notes {
+            observer.say(format_args!("note: {note}"));
+        }
         let to_world = &dataset.normalisation;
         let cameras: Vec<Camera> =
             dataset.train.iter().map(|v| to_world.world_from_scene_camera(&v.camera)).collect();
@@ -260,7 +204,8 @@ impl<'a> Planner<'a> {
     fn divided(&self, grid: [usize; 2], staged: &Path) -> Result<Blocks, Failure> {
         let work = self.sight.work();
         let total: f64 = work.iter().sum();
-        let margin = self.margin(grid);
+        let widths = self.sight.widths();
+        let margin = [0, 1].map(|axis| self.options.margin * widths[axis] / grid[axis] as f64);
         let mut block = Vec::new();
         for (place, cell) in cells(&self.sight.at, &work, grid).into_iter().enumerate() {
             let name = format!("block-{}-{}", place / grid[1], place % grid[1]);
@@ -310,19 +255,6 @@ impl<'a> Planner<'a> {
         let own = self.spec.device.threads.map(|threads| threads.0);
         let cores = || rayon::current_num_threads().try_into().unwrap_or(1);
         own.unwrap_or_else(cores)
-    }
-
-    /// A share of the usual width of a cell, along both axes; outliers do not count.
-    fn margin(&self, grid: [usize; 2]) -> [f64; 2] {
-        [0, 1].map(|axis| {
-            let middle = median(self.sight.at.iter().map(|at| at[axis]).collect());
-            let off = |middle: f64| {
-                median(self.sight.at.iter().map(|at| (at[axis] - middle).abs()).collect())
-            };
-            // Of points that are evenly spread, half lie in the middle half.
-            let width = 4.0 * middle.and_then(off).unwrap_or_default();
-            self.options.margin * width / grid[axis] as f64
-        })
     }
 
     /// Names of the views that see a part of the ground, and whether they are trained on.
@@ -457,20 +389,4 @@ const TOO_LARGE: &str = "a task is too large";
 
 fn is_too_large(failure: &Failure) -> bool {
     failure.message.starts_with(TOO_LARGE)
-}
-
-fn load_with_tracks(
-    scene: &Path,
-    spec: &RunSpec,
-    observer: &dyn Observer,
-) -> Result<Dataset, Failure> {
-    match Dataset::load(scene, &spec.data.load_options(true)) {
-        Ok(dataset) => {
-            for note in &dataset.notes {
-                observer.say(format_args!("note: {note}"));
-            }
-            Ok(dataset)
-        }
-        Err(error) => Err(error.into()),
-    }
 }

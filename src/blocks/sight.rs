@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::Ground;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
+use crate::dataset::normalise::median;
 use crate::failure::Failure;
 
 /// Fewer tracks say too little.
@@ -64,6 +65,17 @@ impl Sight {
     /// The work of each point: how many views see it.
     pub(super) fn work(&self) -> Vec<f64> {
         self.seen_by.iter().map(|views| views.len() as f64).collect()
+    }
+
+    /// How wide the ground is, along both axes; outliers do not count.
+    pub(super) fn widths(&self) -> [f64; 2] {
+        [0, 1].map(|axis| {
+            let middle = median(self.at.iter().map(|at| at[axis]).collect());
+            let off =
+                |middle: f64| median(self.at.iter().map(|at| (at[axis] - middle).abs()).collect());
+            // Of points that are evenly spread, half lie in the middle half.
+            4.0 * middle.and_then(off).unwrap_or_default()
+        })
     }
 
     /// Of how many of the points that `is_inside` each of so many views sees how many, and how many it sees at all.

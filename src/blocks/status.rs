@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::{Blocks, MERGED_FILE, Task, run_folder};
 use crate::checkpoint::newest_step;
-use crate::output::{CONFIG_FILE, Summary, is_in_use, model_path};
+use crate::output::{CONFIG_FILE, is_in_use, model_path, summary_of};
 
 /// How far a task is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,8 +49,7 @@ pub(super) fn is_complete(folder: &Path, blocks: &Blocks, task: Task) -> bool {
         return folder.join(MERGED_FILE).is_file();
     }
     let run = run_folder(folder, blocks, task);
-    let summary = std::fs::read(run.join("stats/summary.json")).ok();
-    let summary = summary.and_then(|text| serde_json::from_slice::<Summary>(&text).ok());
+    let summary = summary_of(&run).ok().flatten();
     let iterations = blocks.iterations(task);
     let is_finished = summary.is_some_and(|it| it.finished && it.iterations >= iterations);
     is_finished && model_path(&run, iterations).is_file()

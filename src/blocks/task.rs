@@ -4,7 +4,9 @@ use std::fs;
 use std::path::Path;
 
 use super::crop::{beyond, inside};
-use super::{BLOCK_FILE, Blocks, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder};
+use super::{
+    BLOCK_FILE, Blocks, COARSE_FILE, MERGED_FILE, Task, block_folder, merge, run_folder, utf8,
+};
 use crate::camera::Camera;
 use crate::dataset::Dataset;
 use crate::export::PLY;
@@ -32,21 +34,20 @@ pub fn run(
     threads: Option<u32>,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    if task == Task::Merge {
-        let output = folder.join(MERGED_FILE);
-        let merged = merge(folder, blocks, &output, PLY, false, observer)?;
-        observer.say(format_args!("{}: {} Gaussians", output.display(), grouped(merged.rows)));
-        return Ok(());
-    }
-    let name = blocks.name(task);
-    if super::status::is_complete(folder, blocks, task) {
-        observer.say(format_args!("{name} is complete"));
+    // A merge is made again, as what it is made of may have changed.
+    if task != Task::Merge && super::status::is_complete(folder, blocks, task) {
+        observer.say(format_args!("{} is complete", blocks.name(task)));
         return Ok(());
     }
     let given = match task {
         Task::Coarse => coarse(folder, blocks)?,
         Task::Block(place) => block(folder, blocks, place, observer)?,
-        Task::Merge => return Ok(()),
+        Task::Merge => {
+            let output = folder.join(MERGED_FILE);
+            let merged = merge(folder, blocks, &output, PLY, false, observer)?;
+            observer.say(format_args!("{}: {} Gaussians", output.display(), grouped(merged.rows)));
+            return Ok(());
+        }
     };
     let output = run_folder(folder, blocks, task);
     let scene = Partial::option("scene", utf8(&blocks.scene)?);
@@ -65,11 +66,6 @@ pub fn run(
 fn text(name: &str, path: &Path) -> Result<Partial, Failure> {
     let path = std::path::absolute(path).map_err(Failure::input)?;
     Ok(Partial::option(name, utf8(&path)?))
-}
-
-fn utf8(path: &Path) -> Result<&str, Failure> {
-    let wrong = || Failure::input(format!("{}: the name is not UTF-8; rename it", path.display()));
-    path.to_str().ok_or_else(wrong)
 }
 
 fn rows(budget: usize) -> Partial {

@@ -10,7 +10,9 @@ use super::export::{check_output, format_of};
 use super::flags::words;
 use super::train::Follower;
 use crate::blocks::engine::{Engine, Submission, submit};
-use crate::blocks::{self, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status};
+use crate::blocks::{
+    self, Block, Blocks, Grid, PlanOptions, Size, State, Task, merge, plan, status,
+};
 use crate::failure::Failure;
 use crate::memory::Bytes;
 use crate::number::{self, grouped};
@@ -174,43 +176,32 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
 
 /// What each task does and takes.
 fn table(blocks: &Blocks) -> String {
-    let mut text = format!(
-        "{:<14} {:>11} {:>7} {:>11} {:>7} {:>11}",
-        "task", "Gaussians", "views", "iterations", "work", "memory"
-    );
-    let coarse = &blocks.coarse;
-    let _ = write!(
-        text,
-        "\n{:<14} {:>11} {:>7} {:>11} {:>7} {:>11}",
-        "coarse",
-        grouped(coarse.rows),
-        "all",
-        grouped(coarse.iterations as usize),
-        "",
-        Bytes(coarse.memory).to_string()
-    );
-    for block in &blocks.block {
+    let mut text = String::new();
+    let mut row = |cells: [String; 6]| {
+        let [task, rows, views, iterations, work, memory] = cells;
+        let line_break = if text.is_empty() { "" } else { "\n" };
         let _ = write!(
             text,
-            "\n{:<14} {:>11} {:>7} {:>11} {:>5.1} % {:>11}",
-            block.name,
-            grouped(block.rows),
-            grouped(block.views),
-            grouped(block.iterations as usize),
-            100.0 * block.work,
-            Bytes(block.memory).to_string()
+            "{line_break}{task:<14} {rows:>11} {views:>7} {iterations:>11} {work:>7} {memory:>11}"
         );
+    };
+    row(["task", "Gaussians", "views", "iterations", "work", "memory"].map(str::to_owned));
+    for task in blocks.tasks() {
+        let (rows, views, work) = match task {
+            Task::Coarse => (blocks.coarse.rows, "all".to_owned(), String::new()),
+            Task::Block(place) => {
+                let Block { rows, views, work, .. } = &blocks.block[place];
+                (*rows, grouped(*views), format!("{:.1} %", 100.0 * work))
+            }
+            Task::Merge => (blocks.rows, String::new(), String::new()),
+        };
+        let iterations = match blocks.iterations(task) {
+            0 => String::new(),
+            iterations => grouped(iterations as usize),
+        };
+        let memory = Bytes(blocks.memory(task)).to_string();
+        row([blocks.name(task).to_owned(), grouped(rows), views, iterations, work, memory]);
     }
-    let _ = write!(
-        text,
-        "\n{:<14} {:>11} {:>7} {:>11} {:>7} {:>11}",
-        "merge",
-        grouped(blocks.rows),
-        "",
-        "",
-        "",
-        Bytes(blocks.merge_memory).to_string()
-    );
     text
 }
 
@@ -243,11 +234,7 @@ fn run_status(args: &StatusArgs, console: &Console) -> Result<(), Failure> {
     let mut counts = [0; 2];
     for (task, state) in status(&args.folder, &blocks) {
         counts[usize::from(state == State::Complete)] += 1;
-        let of = match task {
-            Task::Coarse => blocks.coarse.iterations,
-            Task::Block(place) => blocks.block[place].iterations,
-            Task::Merge => 0,
-        };
+        let of = blocks.iterations(task);
         let state = match state {
             State::Waiting => "waiting".to_owned(),
             State::Running(step) => format!("running, saved {step} of {of} steps"),

@@ -21,18 +21,18 @@ mod cameras;
 pub(crate) mod disk;
 mod folder;
 mod lock;
+mod reading;
 mod records;
 mod tensorboard;
 
 pub use atomic::{WriteError, write_atomically, write_atomically_from};
 pub use cameras::cameras_json;
 pub use folder::{CHECKPOINTS, Guard, RunFolder, is_in_use, model_path, saved_iterations};
-pub use records::{
-    RecordLog, StepRecord, Summary, geometry_of, scores_of, write_geometry, write_json,
-    write_scores,
-};
+pub(crate) use reading::summary_of;
 #[cfg(feature = "study")]
-pub(crate) use records::{all_scores, events_of, psnr_by_view, read_stats, steps_of, summary_of};
+pub(crate) use reading::{all_scores, events_of, psnr_by_view, read_stats, steps_of};
+pub use reading::{geometry_of, scores_of};
+pub use records::{RecordLog, StepRecord, Summary, write_geometry, write_json, write_scores};
 pub use tensorboard::TensorBoard;
 
 pub use crate::evaluate::Mean;

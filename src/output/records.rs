@@ -5,23 +5,15 @@ use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::disk::{Operation, WatchedFile, attempt};
+use super::reading::{entry_name, geometry_file, read_entries};
 use super::{OutputError, write_atomically};
-use crate::evaluate::{FittedScore, Mean, Split, ViewScore};
-#[cfg(feature = "study")]
-use crate::foreign;
+use crate::evaluate::{Mean, Split, ViewScore};
 use crate::memory::Ledger;
 use crate::metrics::geometry::Geometry;
-#[cfg(feature = "study")]
-use crate::trainer::EditEvent;
-
-/// Most bytes of a file of numbers that is read.
-#[cfg(feature = "study")]
-const MOST_BYTES: u64 = 256 << 20;
 
 /// A log of JSON records, one per line.
 #[derive(Debug)]
@@ -168,34 +160,26 @@ pub fn write_scores(
         Split::Test => ("results.json", "per_view.json"),
         Split::Train => ("results_train.json", "per_view_train.json"),
     };
-    let column = |score: fn(&ViewScore) -> Option<f64>| -> Map<String, Value> {
-        let pair = |view: &ViewScore| Some((view.name.clone(), score(view)?.into()));
-        scores.iter().filter_map(pair).collect()
-    };
-    let mut views = serde_json::json!({
-        "PSNR": column(|v| Some(v.psnr)),
-        "SSIM": column(|v| Some(v.ssim)),
-        "FLIP": column(|v| Some(v.flip)),
-    });
-    let lpips = column(|v| v.lpips);
-    if !lpips.is_empty() {
-        views["LPIPS"] = lpips.into();
-    }
-    type Score = fn(&FittedScore) -> Option<f64>;
-    let fitted: [(&str, Score); 4] = [
-        ("PSNR_fitted", |v| Some(v.psnr)),
-        ("SSIM_fitted", |v| Some(v.ssim)),
-        ("FLIP_fitted", |v| Some(v.flip)),
-        ("LPIPS_fitted", |v| v.lpips),
+    type Score = fn(&ViewScore) -> Option<f64>;
+    let columns: [(&str, Score); 8] = [
+        ("PSNR", |v| Some(v.psnr)),
+        ("SSIM", |v| Some(v.ssim)),
+        ("FLIP", |v| Some(v.flip)),
+        ("LPIPS", |v| v.lpips),
+        ("PSNR_fitted", |v| Some(v.fitted?.psnr)),
+        ("SSIM_fitted", |v| Some(v.fitted?.ssim)),
+        ("FLIP_fitted", |v| Some(v.fitted?.flip)),
+        ("LPIPS_fitted", |v| v.fitted?.lpips),
     ];
-    for (name, score) in fitted {
-        let pair = |view: &ViewScore| Some((view.name.clone(), score(&view.fitted?)?.into()));
+    let mut views = Map::new();
+    for (name, score) in columns {
+        let pair = |view: &ViewScore| Some((view.name.clone(), score(view)?.into()));
         let column: Map<String, Value> = scores.iter().filter_map(pair).collect();
         if !column.is_empty() {
-            views[name] = column.into();
+            views.insert(name.to_owned(), column.into());
         }
     }
-    insert_entry(&run.join(per_view), iteration, views)?;
+    insert_entry(&run.join(per_view), iteration, views.into())?;
     let mean = serde_json::to_value(Mean::of(scores)).unwrap_or_default();
     insert_entry(&run.join(results), iteration, mean)
 }
@@ -212,127 +196,16 @@ pub fn write_geometry(
     insert_entry(&run.join(geometry_file(split)), iteration, entry)
 }
 
-/// The mean scores of an iteration on the test views, if there are any.
-pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, OutputError> {
-    entry_of(&run.join("results.json"), iteration)
-}
-
-/// The geometric measurements of an iteration on the test views, if there are any.
-pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, OutputError> {
-    entry_of(&run.join(geometry_file(Split::Test)), iteration)
-}
-
-/// The mean scores of all measured iterations on the test views.
-#[cfg(feature = "study")]
-pub(crate) fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, OutputError> {
-    let path = run.join("results.json");
-    let score = |(name, entry): (String, Value)| {
-        let iteration = name.strip_prefix("ours_").and_then(|number| number.parse().ok());
-        let iteration = iteration
-            .ok_or_else(|| OutputError::malformed(&path, format!("{name:?} is no iteration")))?;
-        let mean = serde_json::from_value(entry).map_err(|e| OutputError::malformed(&path, e))?;
-        Ok((iteration, mean))
-    };
-    read_entries(&path)?.into_iter().map(score).collect()
-}
-
-/// The PSNR of each test view with the model of an iteration `[dB]`, by the view's name; none where it was not
-/// measured.
-#[cfg(feature = "study")]
-pub(crate) fn psnr_by_view(
-    run: &Path,
-    iteration: u32,
-) -> Result<BTreeMap<String, f64>, OutputError> {
-    let path = run.join("per_view.json");
-    let columns: Option<BTreeMap<String, BTreeMap<String, Option<f64>>>> =
-        entry_of(&path, iteration)?;
-    let psnr = columns.and_then(|mut columns| columns.remove("PSNR")).unwrap_or_default();
-    // Equal images have no number.
-    Ok(psnr.into_iter().map(|(name, psnr)| (name, psnr.unwrap_or(f64::INFINITY))).collect())
-}
-
-/// The records of `stats/train.jsonl`; none without the file.
-#[cfg(feature = "study")]
-pub(crate) fn steps_of(run: &Path) -> Result<Vec<StepRecord>, OutputError> {
-    read_log(&run.join("stats/train.jsonl"))
-}
-
-/// The records of `stats/events.jsonl`; none without the file.
-#[cfg(feature = "study")]
-pub(crate) fn events_of(run: &Path) -> Result<Vec<EditEvent>, OutputError> {
-    read_log(&run.join("stats/events.jsonl"))
-}
-
-/// `stats/summary.json`; `None` without the file, as while the run trains.
-#[cfg(feature = "study")]
-pub(crate) fn summary_of(run: &Path) -> Result<Option<Summary>, OutputError> {
-    read_stats(&run.join("stats/summary.json"))
-}
-
-/// A JSON file of a run; `None` where it does not exist.
-#[cfg(feature = "study")]
-pub(crate) fn read_stats<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, OutputError> {
-    match foreign::read_text(path, MOST_BYTES) {
-        Ok(text) => {
-            serde_json::from_str(&text).map(Some).map_err(|e| OutputError::malformed(path, e))
-        }
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(e) => Err(OutputError::io("read", path)(e)),
-    }
-}
-
-/// The records of a log.
-#[cfg(feature = "study")]
-fn read_log<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, OutputError> {
-    let text = match foreign::read_text(path, MOST_BYTES) {
-        Ok(text) => text,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        Err(e) => return Err(OutputError::io("read", path)(e)),
-    };
-    // What a process writes just now may not be whole yet.
-    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-    let record = |(at, line): (usize, &str)| {
-        let record = serde_json::from_str(line);
-        record.map_err(|e| OutputError::malformed(path, format!("line {}: {e}", at + 1)))
-    };
-    whole.lines().enumerate().map(record).collect()
-}
-
-fn geometry_file(split: Split) -> &'static str {
-    match split {
-        Split::Test => "geometry.json",
-        Split::Train => "geometry_train.json",
-    }
-}
-
-fn entry_name(iteration: u32) -> String {
-    format!("ours_{iteration}")
-}
-
 fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), OutputError> {
     let mut all = read_entries(path)?;
     all.insert(entry_name(iteration), entry);
     write_json(path, &all)
 }
 
-/// The entry of an iteration, if there is any.
-fn entry_of<T: DeserializeOwned>(path: &Path, iteration: u32) -> Result<Option<T>, OutputError> {
-    let entry = read_entries(path)?.remove(&entry_name(iteration));
-    entry.map(serde_json::from_value).transpose().map_err(|e| OutputError::malformed(path, e))
-}
-
-/// The entries of a file; none if it does not exist.
-fn read_entries(path: &Path) -> Result<Map<String, Value>, OutputError> {
-    match std::fs::read_to_string(path) {
-        Ok(text) => serde_json::from_str(&text).map_err(|e| OutputError::malformed(path, e)),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(Map::new()),
-        Err(e) => Err(OutputError::io("read", path)(e)),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::evaluate::FittedScore;
 
     fn scores(psnr: f64) -> [ViewScore; 2] {
         let view = |name: &str, psnr| ViewScore {

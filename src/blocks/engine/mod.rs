@@ -10,7 +10,7 @@ use std::process::{Command, Stdio};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Blocks, State, Task, status};
+use super::{Blocks, State, Task, status, utf8};
 use crate::failure::{Failure, OTHER};
 use crate::foreign;
 use crate::output::{OutputError, write_atomically};
@@ -130,12 +130,7 @@ fn command_of(folder: &Path, task: &str) -> Result<[String; 5], Failure> {
         code: OTHER,
         message: format!("cannot find the program that is running: {error}"),
     })?;
-    let text = |path: &Path| {
-        path.to_str().map(str::to_owned).ok_or_else(|| {
-            Failure::input(format!("{}: the name is not UTF-8; rename it", path.display()))
-        })
-    };
-    Ok([text(&program)?, "blocks".into(), "run".into(), text(folder)?, task.to_owned()])
+    Ok([utf8(&program)?, "blocks", "run", utf8(folder)?, task].map(str::to_owned))
 }
 
 /// What a scheduler's program prints.

@@ -5,6 +5,7 @@ use std::fmt;
 use super::size::{self, MIB, RESOLUTIONS, Size};
 use super::{Inputs, ModelSize, RunConfig, RunSpec};
 use crate::dataset::Resolution;
+use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::memory::Ledger;
 use crate::number::grouped;
@@ -48,7 +49,8 @@ pub fn plan(spec: &RunSpec, observer: &dyn Observer) -> Result<Plan, Failure> {
     Ok(Plan { ledger, lines, alternatives })
 }
 
-/// The rows that fit, and what a run takes whose models of `--init` and `--freeze` are not there yet.
+/// The rows that fit, and what a run takes whose models of `--init` and `--freeze` are not there yet. Exposures count
+/// where they may be learned.
 ///
 /// # Errors
 /// As [`plan`].
@@ -57,7 +59,8 @@ pub(crate) fn promised(
     [init_model, frozen]: [Option<ModelSize>; 2],
     observer: &dyn Observer,
 ) -> Result<(usize, Ledger), Failure> {
-    let resolved = Resolved { init_model, frozen, ..Resolved::default() };
+    let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
+    let resolved = Resolved { init_model, frozen, has_exposures, ..Resolved::default() };
     let config = RunConfig { densify: String::new(), spec: spec.clone(), resolved };
     let inputs = Inputs::load(spec, Some(&config), observer)?;
     let setting = Size::choose(&inputs)?.setting;

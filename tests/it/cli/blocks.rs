@@ -193,6 +193,7 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     };
     plan("--rows 400 --blocks 9x9 -- -i 20").refused("too many", &["of 9x9", "--blocks", "--rows"]);
     plan("--rows 50 --blocks 2").refused("too few rows", &["50 Gaussians", "--rows"]);
+    plan("--rows 400 --blocks 2 -- --view").refused("own", &["--view", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --budget 9").refused("own", &["--budget", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --sh-degree auto").refused("auto", &["--sh-degree auto"]);
     plan("--rows 400").refused("auto needs memory", &["--memory"]);
@@ -216,6 +217,11 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     let unbounded =
         plan_of(scene.path(), &root.path().join("other"), "--rows 4000 --blocks 2 -- -i 20");
     assert_eq!(coarse(&unbounded), 1_600, "{unbounded}");
+    // What may be learned beside the model is a part of what each task takes.
+    let words = "--rows 4000 --blocks 2 -- -i 20 --exposure on";
+    let exposed = plan_of(scene.path(), &root.path().join("exposed"), words);
+    let memory = |plan: &Table, at: usize| plan["block"][at]["memory"].as_integer();
+    assert!((0..2).all(|at| memory(&exposed, at) > memory(&unbounded, at)), "{exposed}");
     let again = call(&format!(
         "blocks plan {} -o {} --rows 400 --blocks 2",
         text(scene.path()),
