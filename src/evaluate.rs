@@ -149,8 +149,8 @@ pub struct Comparison<'a> {
 }
 
 impl Comparison<'_> {
-    /// Scores of a rendering.
-    fn score(
+    /// Scores of a rendering, as it is.
+    pub(crate) fn score(
         self,
         rendered: &[f32],
         image: &Image8,

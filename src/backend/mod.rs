@@ -1,7 +1,8 @@
 //! What a renderer-and-optimiser does for the trainer, whatever it runs on.
 //!
 //! Data flows one way: a view goes in, a step is taken on the device, a few scalars come back.
-//! Signals come down when a policy is due, row operations go up; parameters stay where they are.
+//! Signals come down when a policy is due, row operations go up; parameters stay where they are. One piece: the trait
+//! with what goes in and comes out of it.
 
 mod accumulation;
 mod adapter;

@@ -1,7 +1,6 @@
-//! Decodes photographs and masks, and shrinks and undistorts them.
+//! Decodes photographs, and shrinks and undistorts them.
 //!
-//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated. One piece with its
-//! tests, which are a third of it.
+//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
 
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -13,6 +12,7 @@ use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
 use super::jpeg;
+pub use super::mask::{Hides, Mask};
 use super::options::MaskMode;
 pub use super::pixels::{Image8, SharedImage};
 use super::resample;
@@ -85,43 +85,6 @@ pub struct ImageSource {
     pub header: ImageHeader,
     /// Pixels already in memory, at the size of the header; then no file is read.
     pub rendered: Option<SharedImage>,
-}
-
-/// A greyscale image of what is to be seen: the weights of pixels in the loss, or their coverage.
-#[derive(Debug, Clone)]
-pub struct Mask {
-    /// The image file.
-    pub file: SourceFile,
-    /// Which of its values hide a pixel.
-    pub hides: Hides,
-    /// What hidden pixels are.
-    pub mode: MaskMode,
-}
-
-impl Mask {
-    /// Decodes it at its own size; 0 is hidden, whichever colour of the file that is.
-    pub(super) fn weights(&self) -> Result<image::GrayImage, DatasetError> {
-        let mut mask = decode(&self.file)?.into_luma8();
-        match self.hides {
-            Hides::Black => {}
-            Hides::White => mask.iter_mut().for_each(|weight| *weight = 255 - *weight),
-            Hides::AllButBlack => {
-                mask.iter_mut().for_each(|weight| *weight = if *weight == 0 { 255 } else { 0 });
-            }
-        }
-        Ok(mask)
-    }
-}
-
-/// Which values of a mask hide a pixel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Hides {
-    /// Black wholly, grey in part.
-    Black,
-    /// White wholly, grey in part.
-    White,
-    /// All but black, wholly.
-    AllButBlack,
 }
 
 /// The header of an image file.
@@ -218,23 +181,7 @@ impl ImageSource {
         }
         let mut image = pack(decoded);
         if let Some(mask) = &self.mask {
-            let (path, mode) = (&mask.file.path, mask.mode);
-            let mask = mask.weights()?;
-            if mask.iter().all(|&weight| weight == 0) {
-                let problem = "the mask hides every pixel";
-                let remedy = "repair it, or remove the photograph and its pose";
-                return Err(DatasetError::malformed(path, "the mask", problem, remedy));
-            }
-            let mask = if mask.dimensions() == (header.width, header.height) {
-                mask.into_raw()
-            } else {
-                let from = mask.dimensions();
-                resample::shrink_channel(mask.as_raw(), from, (header.width, header.height))
-            };
-            match mode {
-                MaskMode::Ignore => image.mask = Some(mask),
-                MaskMode::Background => image.alpha = carved(image.alpha, mask),
-            }
+            mask.put_on(&mut image)?;
         }
         if let Some(undistortion) = &self.undistortion {
             image = undistortion.apply(&image);
@@ -244,14 +191,6 @@ impl ImageSource {
         }
         Ok(image)
     }
-}
-
-/// The coverage of an image of which a mask hides some; none where all is covered.
-fn carved(alpha: Option<Vec<u8>>, mut mask: Vec<u8>) -> Option<Vec<u8>> {
-    for (m, a) in mask.iter_mut().zip(alpha.iter().flatten()) {
-        *m = ((u32::from(*m) * u32::from(*a) + 127) / 255) as u8;
-    }
-    mask.iter().any(|&m| m < 255).then_some(mask)
 }
 
 /// Converts to 8 bits per channel, without a copy if it is RGB already.
@@ -333,7 +272,7 @@ fn read_header<R: std::io::BufRead + std::io::Seek>(
     Ok(ImageHeader { width, height, has_alpha, decoded_bytes: decoder.total_bytes(), file_bytes })
 }
 
-fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
+pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {
     let path = &source.path;
     let mut reader = ImageReader::new(BufReader::new(source.open()?))
         .with_guessed_format()
@@ -373,70 +312,6 @@ mod tests {
             assert_eq!((loaded.width, loaded.height), (3, 2), "{name}");
             assert_eq!(loaded.rgb, rgb.repeat(6), "{name}");
             assert_eq!(loaded.alpha, alpha.map(|a| vec![a; 6]), "{name}");
-        }
-    }
-
-    #[test]
-    fn a_mask_of_another_size_is_fitted_and_shrunk_along() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a.png");
-        RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
-        let mask = folder.path().join("m.png");
-        image::GrayImage::from_fn(8, 8, |x, _| [if x < 4 { 0 } else { 255 }].into())
-            .save(&mask)
-            .unwrap();
-        let mask = Some(mask_of(mask, Hides::Black));
-        let source = ImageSource { mask, width: 2, height: 2, ..ImageSource::whole(path) };
-        let loaded = source.load().unwrap();
-        assert_eq!(loaded.mask, Some(vec![0, 255, 0, 255]));
-        assert_eq!(loaded.rgb, [10, 20, 30].repeat(4));
-        assert_eq!(loaded.bytes(), source.loaded_bytes());
-        assert!(source.working_bytes() >= 4 * 4 * 4 + loaded.bytes());
-    }
-
-    fn mask_of(path: PathBuf, hides: Hides) -> Mask {
-        Mask { file: SourceFile::found(path).unwrap(), hides, mode: MaskMode::Ignore }
-    }
-
-    /// What a mask hides is as transparent as what the photograph has transparent.
-    #[test]
-    fn what_is_to_be_carved_is_transparent() {
-        let folder = tempfile::tempdir().unwrap();
-        let [path, plain, mask] = ["a.png", "b.png", "m.png"].map(|name| folder.path().join(name));
-        let alpha = |x, _| image::Rgba([10_u8, 20, 30, if x == 0 { 102 } else { 255 }]);
-        ImageBuffer::from_fn(2, 2, alpha).save(&path).unwrap();
-        RgbImage::from_pixel(2, 2, [10, 20, 30].into()).save(&plain).unwrap();
-        image::GrayImage::from_fn(2, 2, |_, y| [if y == 0 { 0 } else { 255 }].into())
-            .save(&mask)
-            .unwrap();
-        for (path, hides, expected) in [
-            (&path, Hides::Black, Some(vec![0, 0, 102, 255])),
-            (&path, Hides::White, Some(vec![102, 255, 0, 0])),
-            (&plain, Hides::Black, Some(vec![0, 0, 255, 255])),
-        ] {
-            let mask = Some(Mask { mode: MaskMode::Background, ..mask_of(mask.clone(), hides) });
-            let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
-            let loaded = source.load().unwrap();
-            assert_eq!((&loaded.alpha, &loaded.mask), (&expected, &None), "{hides:?}");
-            assert!(!source.is_masked());
-            assert_eq!(loaded.bytes(), source.loaded_bytes());
-        }
-    }
-
-    #[test]
-    fn a_mask_that_hides_everything_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let [path, mask] = ["a.png", "m.png"].map(|name| folder.path().join(name));
-        RgbImage::from_pixel(4, 4, [10, 20, 30].into()).save(&path).unwrap();
-        for (colour, hides) in [(0, Hides::Black), (255, Hides::White), (1, Hides::AllButBlack)] {
-            image::GrayImage::from_pixel(4, 4, [colour].into()).save(&mask).unwrap();
-            let mask = Some(mask_of(mask.clone(), hides));
-            let source = ImageSource { mask, ..ImageSource::whole(path.clone()) };
-            let message = source.load().unwrap_err().to_string();
-            assert!(
-                message.contains("m.png") && message.contains("hides every pixel"),
-                "{message}"
-            );
         }
     }
 

@@ -12,6 +12,7 @@ mod folders;
 pub mod images;
 mod jpeg;
 pub mod lens;
+mod mask;
 pub mod normalise;
 mod options;
 mod paths;

@@ -6,7 +6,7 @@ use std::str::Lines;
 
 use maud::{Markup, html};
 
-use super::page;
+use super::{page, table_of};
 use crate::failure::Failure;
 
 /// A page of a text, whose pictures `embed` turns into URIs.
@@ -52,9 +52,9 @@ fn code(lines: &mut Peekable<Lines<'_>>) -> Markup {
 }
 
 fn table(titles: &str, lines: &mut Peekable<Lines<'_>>) -> Markup {
-    let cells = |line: &str| -> Vec<String> {
+    let cells = |line: &str| -> Vec<Markup> {
         let inner = line.trim_start_matches("| ").trim_end_matches(" |");
-        inner.split(" | ").map(str::to_owned).collect()
+        inner.split(" | ").map(inline).collect()
     };
     let mut rows = Vec::new();
     while let Some(line) = lines.next_if(|line| line.starts_with('|')) {
@@ -63,12 +63,7 @@ fn table(titles: &str, lines: &mut Peekable<Lines<'_>>) -> Markup {
             rows.push(cells(line));
         }
     }
-    html! {
-        div.wide tabindex="0" role="group" aria-label="table" { table {
-            thead { tr { @for title in cells(titles) { th scope="col" { (inline(&title)) } } } }
-            tbody { @for row in &rows { tr { @for cell in row { td { (inline(cell)) } } } } }
-        } }
-    }
+    table_of(&cells(titles), &rows, |_| None)
 }
 
 /// Text with its bold and code.

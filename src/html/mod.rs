@@ -13,7 +13,7 @@ pub(crate) use picture::{Embedded, embed_file};
 
 use crate::foreign;
 
-const STYLE: &str = include_str!("page.css");
+const STYLE: &str = concat!(include_str!("palette.css"), include_str!("page.css"));
 const SCRIPT: &str = include_str!("page.js");
 /// What a browser may load for the page: what stands in it. Were something not escaped, it could not speak to
 /// anybody.
@@ -58,23 +58,34 @@ pub(crate) fn table(columns: &[Column<'_>], rows: &[Vec<String>]) -> Markup {
         Some(Column::Number(_)) => Some("number"),
         _ => None,
     };
+    let titles = columns.iter().map(|column| {
+        let (Column::Text(title) | Column::Number(title)) = column;
+        foreign::one_line(title)
+    });
+    let titles: Vec<Markup> = titles.map(|title| html! { (title) }).collect();
+    let cell = |cell: &String| html! { (foreign::one_line(cell)) };
+    let rows: Vec<Vec<Markup>> = rows.iter().map(|row| row.iter().map(cell).collect()).collect();
+    table_of(&titles, &rows, class)
+}
+
+/// A table, with the class of each column.
+fn table_of(
+    titles: &[Markup],
+    rows: &[Vec<Markup>],
+    class: impl Fn(usize) -> Option<&'static str>,
+) -> Markup {
     html! {
         // It scrolls by itself where it is wider than the page.
         div.wide tabindex="0" role="group" aria-label="table" {
             table {
                 thead { tr {
-                    @for (at, column) in columns.iter().enumerate() {
-                        @let (Column::Text(title) | Column::Number(title)) = column;
-                        th scope="col" class=[class(at)] { (foreign::one_line(title)) }
+                    @for (at, title) in titles.iter().enumerate() {
+                        th scope="col" class=[class(at)] { (title) }
                     }
                 } }
                 tbody {
                     @for row in rows {
-                        tr {
-                            @for (at, cell) in row.iter().enumerate() {
-                                td class=[class(at)] { (foreign::one_line(cell)) }
-                            }
-                        }
+                        tr { @for (at, cell) in row.iter().enumerate() { td class=[class(at)] { (cell) } } }
                     }
                 }
             }

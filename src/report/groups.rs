@@ -10,6 +10,7 @@ use super::runs::Told;
 use crate::dataset::builtin;
 use crate::failure::Failure;
 use crate::foreign;
+use crate::run::finished::name_of;
 use crate::run::{DataSpec, OnResume, Partial, RunOption};
 
 /// Runs whose pictures can be laid over each other: of the same photographs, read the same way.
@@ -45,10 +46,7 @@ impl Scene {
 pub(super) fn scene_name(path: &Path) -> String {
     let name = match builtin::name(path) {
         Some(name) => name.to_owned(),
-        None => {
-            let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-            whole.file_name().unwrap_or(whole.as_os_str()).to_string_lossy().into_owned()
-        }
+        None => name_of(path),
     };
     foreign::one_line(&name)
 }

@@ -9,12 +9,11 @@ use super::runs::Told;
 use crate::backend::Backend;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::evaluate::Split;
+use crate::evaluate::{Comparison, FittedScore, Split};
 use crate::failure::Failure;
 use crate::flight::orbit;
 use crate::foreign;
 use crate::html::Embedded;
-use crate::metrics::{flip, psnr, ssim};
 use crate::output::model_path;
 use crate::pictures::{photograph, picture};
 use crate::run::Observer;
@@ -149,18 +148,10 @@ impl Eye {
     ) -> Result<(RgbImage, [f64; 3]), Failure> {
         let truth = image(views, view)?;
         let rendering = self.backend.render(views.camera(view), self.background, self.degree)?;
-        let (rgb, background) = (&rendering.rgb, self.background);
-        let scores = || {
-            Ok([
-                psnr(rgb, &truth, background)?,
-                ssim(rgb, &truth, background)?,
-                flip(rgb, &truth, background)?,
-            ])
-        };
-        let scores = scores().map_err(|error: crate::metrics::MetricError| {
-            Failure::input(format!("{}: {error}", views.name(view)))
-        })?;
-        Ok((picture(&rendering), scores))
+        let score = Comparison::default().score(&rendering.rgb, &truth, self.background);
+        let FittedScore { psnr, ssim, flip, .. } =
+            score.map_err(|error| Failure::input(format!("{}: {error}", views.name(view))))?;
+        Ok((picture(&rendering), [psnr, ssim, flip]))
     }
 
     /// Once around what the cameras look at.

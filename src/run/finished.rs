@@ -141,6 +141,14 @@ pub(crate) fn iteration_so_far(
     Ok((iteration, trains))
 }
 
+/// The last part of a path: what lies above is nobody's business.
+#[cfg(any(feature = "study", feature = "view"))]
+pub(crate) fn name_of(path: &Path) -> String {
+    let last = path.canonicalize().ok();
+    let last = last.as_deref().unwrap_or(path).file_name().unwrap_or(path.as_os_str());
+    last.to_string_lossy().into_owned()
+}
+
 /// The file of what is named: a model, or a run's of the iteration asked for, or its last.
 pub(crate) fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> {
     match is_model(named) {

@@ -1,4 +1,5 @@
-//! The loop around the trainer: progress, logs, saves, measurements, and the end, good or bad.
+//! The loop around the trainer: progress, logs, saves, measurements, and the end, good or bad. One piece, as all of it
+//! happens between two steps, in an order that matters.
 
 use std::collections::BTreeSet;
 use std::ops::ControlFlow;

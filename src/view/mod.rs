@@ -1,8 +1,8 @@
 //! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
 //!
 //! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
-//! [`desk`], which keeps the newest of each page, and take pictures away. Everything that a browser sends is checked before ([`door`], [`asked`]); no path of
-//! the disk is served. Prints nothing.
+//! [`desk`], which keeps the newest of each page, and take pictures away. Everything that a browser sends is
+//! checked before ([`door`], [`asked`]); no path of the disk is served. Prints nothing.
 
 mod asked;
 mod board;

@@ -14,7 +14,9 @@ use crate::flight::Key;
 use crate::gaussians::{Gaussians, logit};
 use crate::init::{initialise, random_points};
 use crate::output::{CONFIG_FILE, model_path};
-use crate::run::finished::{Machine, is_model, iteration_so_far, load, or_moved, read_model};
+use crate::run::finished::{
+    Machine, is_model, iteration_so_far, load, name_of, or_moved, read_model,
+};
 use crate::run::{DataSpec, Observer, RunConfig};
 
 /// Most points of a scene that are shown as Gaussians.
@@ -103,13 +105,6 @@ pub(crate) fn open(
         }
     }
     Ok(stage)
-}
-
-/// The last part of a path: what lies above is nobody's business.
-pub(super) fn name_of(path: &Path) -> String {
-    let last = path.canonicalize().ok();
-    let last = last.as_deref().unwrap_or(path).file_name().unwrap_or(path.as_os_str());
-    last.to_string_lossy().into_owned()
 }
 
 fn no_run(path: &Path) -> Failure {

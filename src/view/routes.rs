@@ -11,7 +11,7 @@ use super::pictures::Frame;
 use super::stage::Extent;
 
 const PAGE: &str = include_str!("page/index.html");
-const STYLE: &str = include_str!("page/view.css");
+const STYLE: &str = concat!(include_str!("../html/palette.css"), include_str!("page/view.css"));
 const SCRIPT: &str = include_str!("page/view.js");
 const LIVE_SCRIPT: &str = include_str!("page/live.js");
 

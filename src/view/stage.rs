@@ -1,6 +1,5 @@
 //! What is looked at: one model or two, in the coordinates of a dataset where there is one.
 
-use super::open::name_of;
 use super::paint::Paint;
 use crate::backend::{Backend, BackendError};
 use crate::camera::Camera;
@@ -8,7 +7,7 @@ use crate::dataset::normalise::Normalisation;
 use crate::dataset::{PointCloud, View};
 use crate::evaluate::Split;
 use crate::run::Run;
-use crate::run::finished::Machine;
+use crate::run::finished::{Machine, name_of};
 use crate::views::DatasetViews;
 
 /// Decoded photographs that are kept `[bytes]`, where a promise does not say how much may be held.

@@ -17,20 +17,13 @@ STATE = "document.getElementById('training').dataset"
 
 
 def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
-    def keep(name: str) -> None:
-        if folder:
-            browser.picture(folder / f"{name}.png")
-
-    def size(width: int, height: int) -> None:
-        browser.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-
     def step() -> int:
         return int(browser.run(f"return {STATE}.step"))
 
     def click(name: str) -> None:
         browser.run("document.getElementById(arguments[0]).click()", name)
 
-    size(1280, 800)
+    browser.size(1280, 800)
     browser.open(url)
     browser.is_sharp()
     browser.press("\ue007")
@@ -41,7 +34,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     before = browser.run("return Number(document.getElementById('stage').dataset.pictures)")
     browser.until(f"Number(document.getElementById('stage').dataset.pictures) > {before}", "the picture does not follow")
     assert browser.run(PROBE)["spread"] > 4, "the picture is empty"
-    keep("live")
+    browser.keep(folder, "live")
 
     click("pause")
     browser.until(f"{STATE}.state === 'paused'", "it is not paused")
@@ -57,18 +50,18 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.is_sharp()
     browser.choose("left", "depth:0")
     browser.run("document.querySelector('details').open = true")
-    keep("live-paused")
-    size(360, 740)
+    browser.keep(folder, "live-paused")
+    browser.size(360, 740)
     width = browser.run("return document.getElementById('panel').scrollWidth")
     assert width <= 360, f"the panel is {width} px wide"
-    keep("live-phone")
+    browser.keep(folder, "live-phone")
     click("pause")
     browser.until(f"Number({STATE}.step) > {paused + 20}", "it does not continue")
     browser.run("window.confirm = () => true")
     click("stop")
     browser.until(f"['stopping', 'gone'].includes({STATE}.state)", "it does not stop")
     browser.until(f"{STATE}.state === 'gone'", "the page does not say that training has ended")
-    keep("live-ended")
+    browser.keep(folder, "live-ended")
     messages = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     strange = [it for it in messages if "ERR_CONNECTION" not in it and "Failed to load" not in it]
     assert not strange, "\n".join(strange)

@@ -18,33 +18,23 @@ return shown.map((it) => `${it.alt}|${it.naturalWidth > 0}|${getComputedStyle(it
 
 
 def check(browser: Browser, report: Path, folder: Path | None) -> None:
-    def keep(name: str) -> None:
-        if folder:
-            browser.picture(folder / f"{name}.png")
-
-    def size(width: int, height: int) -> None:
-        browser.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-
-    def theme(name: str) -> None:
-        browser.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
-
     def show(what: str) -> None:
         browser.run("document.querySelectorAll(arguments[0])[0].scrollIntoView()", what)
 
     def shown(kind: str, at: int = 0) -> list[str]:
         return browser.run(SHOWN, kind, at)
 
-    size(1280, 800)
-    theme("light")
+    browser.size(1280, 800)
+    browser.theme("light")
     url = report.resolve().as_uri()
     browser.open(url)
     broken = browser.run("return [...document.images].filter((it) => !it.complete || it.naturalWidth === 0).length")
     assert broken == 0, f"{broken} pictures cannot be shown"
-    keep("report")
+    browser.keep(folder, "report")
 
     # Photograph on the left, render on the right, and the border between them moves by key and by hand.
     show(".pair")
-    keep("report-views")
+    browser.keep(folder, "report-views")
     left, right = shown(".pair")
     assert "photograph|true|none" in left and "50%" in right, f"{left} {right}"
     browser.run("document.querySelector('.pair input').focus()")
@@ -69,7 +59,7 @@ def check(browser: Browser, report: Path, folder: Path | None) -> None:
 
     # The turn shows one picture at a time, and every one once.
     show(".turn")
-    keep("report-turn")
+    browser.keep(folder, "report-turn")
     browser.run("document.querySelector('.turn input').focus()")
     seen = []
     for _ in range(24):
@@ -78,24 +68,24 @@ def check(browser: Browser, report: Path, folder: Path | None) -> None:
         browser.press("\ue014")  # Right
     assert len(set(seen)) == 24, f"the turn shows {len(set(seen))} pictures"
 
-    theme("dark")
+    browser.theme("dark")
     show(".curve")
-    keep("report-curves-dark")
+    browser.keep(folder, "report-curves-dark")
     browser.run("document.querySelectorAll('details').forEach((it) => { it.open = true })")
     browser.run("document.querySelector('summary').scrollIntoView()")
-    keep("report-details-dark")
+    browser.keep(folder, "report-details-dark")
 
     # Where there is little room; tables scroll by themselves.
-    size(360, 740)
+    browser.size(360, 740)
     width = browser.run("return document.documentElement.scrollWidth")
     assert width <= 360, f"the page is {width} px wide"
     browser.run("window.scrollTo(0, 0)")
-    keep("report-phone-dark")
-    theme("light")
+    browser.keep(folder, "report-phone-dark")
+    browser.theme("light")
     show(".pair")
-    keep("report-phone-views")
+    browser.keep(folder, "report-phone-views")
     show(".curve")
-    keep("report-phone-curves")
+    browser.keep(folder, "report-phone-curves")
 
     severe = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     assert not severe, "\n".join(severe)
@@ -106,13 +96,13 @@ def check(browser: Browser, report: Path, folder: Path | None) -> None:
 
     # Without scripts, as in a mail program: photograph and render beside each other.
     browser.command("Emulation.setScriptExecutionDisabled", value=True)
-    size(1280, 800)
+    browser.size(1280, 800)
     browser.open(url)
     browser.command("Emulation.setScriptExecutionDisabled", value=False)
     pictures = shown(".pair")
     assert len(pictures) >= 2 and all(it.endswith("|true|none") for it in pictures), pictures
     assert len(shown(".turn")) == 1, "a turn without scripts shows its first picture"
-    keep("report-without-scripts")
+    browser.keep(folder, "report-without-scripts")
 
 
 def main(report: str, folder: str | None = None) -> None:

@@ -91,6 +91,17 @@ class Browser:
     def log(self, kind: str) -> list[dict]:
         return self.call("POST", f"{self.session}/se/log", {"type": kind})
 
+    def keep(self, folder: Path | None, name: str) -> None:
+        """Writes a screenshot, where there is a folder for them."""
+        if folder:
+            self.picture(folder / f"{name}.png")
+
+    def size(self, width: int, height: int) -> None:
+        self.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def theme(self, name: str) -> None:
+        self.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
+
     def picture(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("GET", f"{self.session}/screenshot")))
 
@@ -101,28 +112,18 @@ class Browser:
 
 
 def check(browser: Browser, url: str, folder: Path | None) -> None:
-    def keep(name: str) -> None:
-        if folder:
-            browser.picture(folder / f"{name}.png")
-
-    def size(width: int, height: int) -> None:
-        browser.command("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-
-    def theme(name: str) -> None:
-        browser.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
-
-    size(1280, 800)
-    theme("dark")
+    browser.size(1280, 800)
+    browser.theme("dark")
     browser.open(url)
     browser.is_sharp()
     # The first time it says what is seen; the key that everything begins with closes that.
     assert browser.run("return document.getElementById('guide').open"), "no help at first"
-    keep("first")
+    browser.keep(folder, "first")
     browser.press("\ue007")
     assert not browser.run("return document.getElementById('guide').open"), "Enter does not close the help"
 
     browser.choose("view", "test:0")
-    keep("test-camera")
+    browser.keep(folder, "test-camera")
     browser.choose("left", "photograph:0")
     browser.choose("right", "render:0")
     # What the photograph's camera saw, and what is drawn there, at the photograph's own size.
@@ -136,17 +137,17 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     assert before["light"] != after["light"], "the border does not move"
     assert browser.run("return document.getElementById('divider').getAttribute('aria-valuenow')") == "0"
     browser.press(*["\ue014"] * 20)  # Right
-    keep("compare")
+    browser.keep(folder, "compare")
     browser.choose("left", "difference:0")
     assert browser.run("return document.getElementById('mean').textContent").startswith("Difference (FLIP): 0.")
-    keep("difference")
+    browser.keep(folder, "difference")
     browser.choose("right", "")
-    theme("light")
+    browser.theme("light")
     browser.run("document.getElementById('frusta').click()")
     for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
         browser.choose("left", f"{kind}:0")
         assert browser.run(PROBE)["spread"] > 4, f"{kind} is empty"
-    keep("rows")
+    browser.keep(folder, "rows")
     browser.choose("left", "render:0")
 
     # Turning: every picture differs, and none is empty.
@@ -163,7 +164,7 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     assert len(seen) == STEPS, f"{STEPS} steps gave {len(seen)} pictures"
     browser.hand({"type": "pointerUp", "button": 0})
     browser.is_sharp()
-    keep("anywhere")
+    browser.keep(folder, "anywhere")
     pace = "const { rate, rested } = document.getElementById('stage').dataset; return [rate, rested]"
     # Flying by key, as fast as pictures come.
     keys = lambda kind: [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": "s"}]}]
@@ -179,21 +180,21 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     assert browser.run("return keys.length") == 2
 
     # Where there is little room.
-    size(360, 740)
+    browser.size(360, 740)
     browser.is_sharp()
     for element in ["html", "#panel"]:
         width = browser.run("return document.querySelector(arguments[0]).scrollWidth", element)
         assert width <= 360, f"{element} is {width} px wide"
-    keep("phone")
+    browser.keep(folder, "phone")
     browser.run("document.getElementById('help').click()")
     width = browser.run("return document.getElementById('guide').scrollWidth")
     assert width <= 360, f"the help is {width} px wide"
-    keep("phone-help")
-    theme("dark")
+    browser.keep(folder, "phone-help")
+    browser.theme("dark")
     browser.run("document.getElementById('guide').close()")
     browser.run("document.getElementById('fold').click()")
     browser.is_sharp()
-    keep("phone-dark")
+    browser.keep(folder, "phone-dark")
 
     severe = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     assert not severe, "\n".join(severe)

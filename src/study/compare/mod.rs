@@ -47,8 +47,8 @@ Examples:
 ///
 /// Every policy runs with every budget and every seed, one run after another. A run that is
 /// finished is not run again: call the same command to go on after an interruption. The folder then
-/// holds compare.md (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run), plots as SVG, and the
-/// runs themselves.
+/// holds compare.md (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run),
+/// plots as SVG, and the runs themselves.
 ///
 /// Quality is measured on views held out. Differences are taken between runs of the same scene,
 /// budget and seed, against the first policy named, with 95 % intervals of their mean from three

@@ -41,8 +41,8 @@ Examples:
 /// the same seeds.
 ///
 /// A run that is finished is not run again: call the same command to go on after an interruption. The
-/// folder then holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per line), plots as SVG, and
-/// the runs themselves.
+/// folder then holds trade.md (tables and plots), trade.html (the same as one file), trade.jsonl (a record per
+/// line), plots as SVG, and the runs themselves.
 #[derive(Debug, Clone, Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Trade {
