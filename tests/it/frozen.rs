@@ -117,7 +117,9 @@ fn the_others_step_as_ever() {
         let [free, frozen] = [0, FROZEN].map(|frozen| {
             let setup = setup(frozen, Storage::default(), needs.clone());
             let mut backend = make_with(subject, &model(), setup);
-            step(&mut *backend, 1, &needs);
+            for number in 1..=2 {
+                step(&mut *backend, number, &needs);
+            }
             let (model, state) = saved(&*backend);
             let signals = backend.take_signals(needs.signals).expect("signals");
             let column = |signal| signals.get(signal).expect("it was asked for")[FROZEN..].to_vec();

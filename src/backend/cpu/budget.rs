@@ -184,7 +184,7 @@ mod tests {
             let options = Setup { only_renders, threads: Some(1), ..Setup::new(2) };
             let mut backend = CpuBackend::new(&model, &options).unwrap();
             let bytes = backend.moments.held() as usize
-                + size_of_val(backend.ages.of_rows_mut(2))
+                + backend.ages.held() as usize
                 + size_of_val(&backend.sums[..])
                 + size_of_val(&backend.records[..]);
             (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
