@@ -1,20 +1,23 @@
 //! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
 //!
 //! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
-//! [`desk`], which keeps the newest of each page, and take pictures away. Everything that a browser sends is
-//! checked before ([`door`], [`asked`]); no path of the disk is served. Prints nothing.
+//! [`desk`], which keeps the newest of each page, take renderings away ([`negative`]), and make pictures of them
+//! ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path of the disk is
+//! served. Prints nothing.
 
 mod asked;
 mod board;
+mod darkroom;
 mod describe;
 mod desk;
 mod door;
 mod http;
 mod kinds;
 pub(crate) mod live;
+mod measured;
+mod negative;
 mod open;
 mod paint;
-mod pictures;
 mod ramp;
 mod routes;
 mod stage;
@@ -25,11 +28,14 @@ use desk::{Closing, Desk};
 use door::Door;
 pub(crate) use door::{FIRST_PORT, Place};
 pub(crate) use open::{Looked, is_run, open};
+use negative::Brush;
 use routes::Routes;
-pub(crate) use stage::Stage;
+pub(crate) use stage::Exhibition;
 
-use crate::backend::Backend;
 use crate::failure::{Failure, OTHER};
+
+/// Pictures in the making at a time: while one is developed, the next is rendered.
+const AT_ONCE: usize = 2;
 
 /// A page that can be opened.
 pub(crate) struct Server {
@@ -61,27 +67,29 @@ impl Server {
     /// When the network fails, or what renders.
     pub(crate) fn serve(
         &self,
-        mut stage: Stage,
+        exhibition: Exhibition,
         is_over: &dyn Fn() -> bool,
     ) -> Result<(), Failure> {
-        let desk = Desk::default();
+        let Exhibition { stage, mut backends } = exhibition;
+        let desk = Desk::new(None, AT_ONCE);
         let routes = Routes {
             door: &self.door,
             desk: &desk,
+            stage: &stage,
             extent: stage.extent(),
             description: describe::describe(&stage).to_string(),
             board: None,
         };
         let failed = |message: String| Failure { code: OTHER, message };
         thread::scope(|scope| {
-            let desk = &desk;
+            let (desk, stage) = (&desk, &stage);
             let renders = scope.spawn(move || {
                 let _closing = Closing(desk);
-                let mut backends = std::mem::take(&mut stage.backends);
-                let mut backends: Vec<&mut dyn Backend> =
-                    backends.iter_mut().map(|backend| &mut **backend as &mut dyn Backend).collect();
+                let mut brushes: Vec<Brush> = backends.iter().map(|_| Brush::default()).collect();
                 while let Some(ticket) = desk.next() {
-                    let made = pictures::make(&mut stage, &mut backends, &ticket.wanted);
+                    let (wanted, model) = (&ticket.wanted, ticket.wanted.model);
+                    let made =
+                        negative::expose(stage, &mut *backends[model], &mut brushes[model], wanted);
                     ticket.reply(made);
                 }
             });

@@ -7,8 +7,8 @@ use super::board::{Board, Order};
 use super::desk::{Desk, Unmade};
 use super::door::Door;
 use super::http::{Answer, Method, Request};
-use super::pictures::Frame;
-use super::stage::Extent;
+use super::darkroom::{Frame, develop};
+use super::stage::{Extent, Stage};
 
 const PAGE: &str = include_str!("page/index.html");
 const STYLE: &str = concat!(include_str!("../html/palette.css"), include_str!("page/view.css"));
@@ -19,6 +19,7 @@ const LIVE_SCRIPT: &str = include_str!("page/live.js");
 pub(super) struct Routes<'a> {
     pub(super) door: &'a Door,
     pub(super) desk: &'a Desk,
+    pub(super) stage: &'a Stage,
     pub(super) extent: Extent,
     /// The [description](super::describe) of what is shown, as JSON.
     pub(super) description: String,
@@ -80,8 +81,12 @@ impl Routes<'_> {
     }
 
     fn frame(&self, wanted: Wanted) -> Answer {
-        match self.desk.ask(wanted) {
-            Ok(frame) => sent(frame),
+        match self.desk.ask(wanted.clone()) {
+            // While it is developed here, the thread that has rendered it goes on.
+            Ok((negative, _turn)) => match develop(self.stage, &wanted, negative) {
+                Ok(frame) => sent(frame),
+                Err(why) => Answer::refusal(500, why),
+            },
             Err(Unmade::Superseded) => {
                 Answer::refusal(409, "a newer picture was asked for meanwhile")
             }
@@ -94,12 +99,15 @@ impl Routes<'_> {
 
 /// A picture, with what is known of it in the head.
 fn sent(frame: Frame) -> Answer {
-    let Frame { jpeg, size: (width, height), range, mean, distance, milliseconds } = frame;
+    let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } = frame;
     let mut answer = Answer::of("image/jpeg", jpeg)
         .with("X-Size", format!("{width}x{height}"))
         .with("X-Milliseconds", format!("{milliseconds:.1}"));
     if let Some(range) = range {
         answer = answer.with("X-Range", format!("{} {}", range.start, range.end));
+    }
+    if let Some([seen, all]) = measured {
+        answer = answer.with("X-Measured", format!("{seen} {all}"));
     }
     let numbers = [("X-Mean", mean), ("X-Distance", distance)];
     for (name, value) in numbers.into_iter().filter_map(|(name, it)| Some((name, it?))) {
@@ -113,8 +121,11 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::*;
+    use crate::dataset::PointCloud;
     use crate::dataset::normalise::Normalisation;
+    use crate::run::finished::Machine;
     use crate::view::door::Place;
+    use crate::view::stage::Shown;
 
     #[test]
     fn only_what_is_built_in_is_served() {
@@ -124,19 +135,18 @@ mod tests {
             has_secret: false,
         })
         .unwrap();
-        let extent = Extent {
-            models: 1,
-            views: [0, 0],
-            normalisation: Normalisation::IDENTITY,
-            counts: true,
-            paints: true,
-        };
-        let desk = Desk::default();
+        let none = || [Vec::new(), Vec::new()];
+        let points = PointCloud::default();
+        let (machine, place) = (Machine::default(), Normalisation::IDENTITY);
+        let mut stage = Stage::new(machine, "a".into(), place, [0.0; 3], none(), points);
+        stage.models.push(Shown { name: "a".into(), rows: 1, sh_degree: 0, near: 0.1 });
+        let desk = Desk::new(None, 1);
         desk.close();
         let routes = Routes {
             door: &door,
             desk: &desk,
-            extent: extent.clone(),
+            stage: &stage,
+            extent: stage.extent(),
             description: "{}".into(),
             board: None,
         };
@@ -179,7 +189,8 @@ mod tests {
         let live = Routes {
             door: &door,
             desk: &desk,
-            extent,
+            stage: &stage,
+            extent: stage.extent(),
             description: "{}".into(),
             board: Some(&board),
         };

@@ -10,6 +10,7 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -28,6 +29,30 @@ const light = [];
 for (let i = 0; i < data.length; i += 4) light.push(data[i] + data[i + 1] + data[i + 2]);
 const mean = light.reduce((a, b) => a + b) / light.length;
 return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join() };
+"""
+# Decibels between the right one of two pictures and a PNG, of one size.
+PSNR = """
+const done = arguments[arguments.length - 1], image = new Image();
+image.onload = () => {
+  const { bitmap } = shown[1];
+  const [a, b] = [bitmap, image].map((it) => {
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [it.width, it.height];
+    canvas.getContext("2d").drawImage(it, 0, 0);
+    return canvas.getContext("2d").getImageData(0, 0, it.width, it.height).data;
+  });
+  if (a.length !== b.length) return done(0);
+  const sum = a.reduce((sum, x, i) => sum + (x - b[i]) ** 2, 0);
+  done(10 * Math.log10(255 ** 2 / Math.max(sum / (a.length * 3 / 4), 1e-9)));
+};
+image.src = arguments[0];
+"""
+# What the keyboard cannot reach, or has no name, of what is seen.
+UNREACHED = """
+const seen = [...document.querySelectorAll("button, select, input, summary, [tabindex='0']")]
+  .filter((it) => it.offsetParent !== null && !it.disabled && (it.type !== "radio" || it.checked));
+const name = (it) => it.ariaLabel || it.labels?.[0]?.textContent || it.textContent;
+return seen.filter((it) => !it.dataset.reached || !name(it).trim()).map((it) => it.id || it.outerHTML);
 """
 
 
@@ -60,6 +85,10 @@ class Browser:
     def run(self, script: str, *arguments: object) -> object:
         return self.call("POST", f"{self.session}/execute/sync", {"script": script, "args": list(arguments)})
 
+    def wait(self, script: str, *arguments: object) -> object:
+        """Runs a script that calls its last argument when it is done."""
+        return self.call("POST", f"{self.session}/execute/async", {"script": script, "args": list(arguments)})
+
     def command(self, name: str, **parameters: object) -> None:
         """A command of the DevTools."""
         self.call("POST", f"{self.session}/goog/cdp/execute", {"cmd": name, "params": parameters})
@@ -88,6 +117,16 @@ class Browser:
         pointer = {"type": "pointer", "id": "hand", "parameters": {"pointerType": "mouse"}, "actions": list(actions)}
         self.call("POST", f"{self.session}/actions", {"actions": [pointer]})
 
+    def pinch(self, *places: tuple[int, int]) -> None:
+        """Two fingers: their places, one of each in turn, and where each goes."""
+        sources = []
+        for finger, (at, to) in enumerate([(places[0], places[2]), (places[1], places[3])]):
+            move = lambda place, duration: {"type": "pointerMove", "duration": duration, "x": place[0], "y": place[1]}
+            actions = [move(at, 0), {"type": "pointerDown"}, move(to, 200), {"type": "pointerUp"}]
+            parameters = {"pointerType": "touch"}
+            sources.append({"type": "pointer", "id": f"finger{finger}", "parameters": parameters, "actions": actions})
+        self.call("POST", f"{self.session}/actions", {"actions": sources})
+
     def log(self, kind: str) -> list[dict]:
         return self.call("POST", f"{self.session}/se/log", {"type": kind})
 
@@ -111,7 +150,7 @@ class Browser:
         self.driver.wait()
 
 
-def check(browser: Browser, url: str, folder: Path | None) -> None:
+def check(browser: Browser, url: str, rendered: Path, folder: Path | None) -> None:
     browser.size(1280, 800)
     browser.theme("dark")
     browser.open(url)
@@ -130,6 +169,11 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     own = browser.run("const { width, height } = scene.views.test[0]; return `${width}x${height}`")
     found = browser.run("return document.getElementById('stage').dataset.size")
     assert found == own, f"{found} instead of {own}"
+    # Pixel by pixel it is what `densify render` writes.
+    name = Path(browser.run("return scene.views.test[0].name")).with_suffix(".png")
+    png = base64.b64encode((rendered / name).read_bytes()).decode()
+    near = browser.wait(PSNR, f"data:image/png;base64,{png}")
+    assert near >= 38, f"the picture is {near:.1f} dB from that of densify render"
     before = browser.run(PROBE)
     browser.run("document.getElementById('divider').focus()")
     browser.press("\ue011")  # Home
@@ -175,6 +219,19 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     browser.is_sharp()
     rate, rested = browser.run(pace)
     print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
+    # Two fingers that part go nearer.
+    before = browser.run("return camera.away")
+    browser.pinch((400, 300), (480, 300), (300, 300), (580, 300))
+    after = browser.run("return camera.away")
+    assert after < 0.9 * before, f"fingers that part: from {before} to {after} away"
+    browser.is_sharp()
+    # Everything that is seen is reached by key, and has a name.
+    for _ in range(60):
+        browser.press("\ue004")  # Tab
+        browser.run("document.activeElement.dataset.reached = true")
+    unreached = browser.run(UNREACHED)
+    assert not unreached, f"not reached by key, or without a name: {unreached}"
+    browser.run("document.getElementById('marks').focus()")
     browser.press("k", "r", "]", "k")
     assert not browser.run("return document.getElementById('save').disabled"), "no camera path to save"
     assert browser.run("return keys.length") == 2
@@ -208,20 +265,24 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
 def main(densify: str, run: str, folder: str | None = None) -> None:
     if folder:
         Path(folder).mkdir(parents=True, exist_ok=True)
+    rendered = tempfile.TemporaryDirectory()
+    pictures = Path(rendered.name) / "pictures"
+    subprocess.run([densify, "render", run, "-o", str(pictures), "--backend", "cpu"], check=True, capture_output=True)
     program = subprocess.Popen([densify, "view", run, "--port", "0", "--backend", "cpu"], stdout=subprocess.PIPE, text=True)
     try:
         assert program.stdout
         line = next(line for line in program.stdout if line.startswith("page "))
         browser = Browser()
         try:
-            check(browser, line.split()[1], Path(folder) if folder else None)
+            check(browser, line.split()[1], pictures, Path(folder) if folder else None)
         finally:
             browser.close()
         program.send_signal(signal.SIGINT)
         assert program.wait(PATIENCE) == 0, "Ctrl-C does not end it well"
     finally:
         program.kill()
-    print("the page shows a test camera, compares, turns, flies, fits 360 px, and asks nobody else")
+        rendered.cleanup()
+    print("the page shows a test camera as densify render does, compares, turns, flies, fits 360 px, and asks nobody else")
 
 
 if __name__ == "__main__":

@@ -179,12 +179,12 @@ async function ask(place, { kind, model }, isMoving) {
   if (answer.status === 409) return null;
   if (!answer.ok) throw new Error(await answer.text());
   const number = (name) => answer.headers.has(name) ? Number(answer.headers.get(name)) : null;
-  const range = answer.headers.get("X-Range");
+  const numbers = (name) => answer.headers.get(name)?.split(" ").map(Number) ?? null;
   const bitmap = await createImageBitmap(await answer.blob());
   return {
     bitmap, kind, model,
     mean: number("X-Mean"), distance: number("X-Distance"), milliseconds: number("X-Milliseconds"),
-    range: range && range.split(" ").map(Number), took: performance.now() - begun,
+    range: numbers("X-Range"), measured: numbers("X-Measured"), took: performance.now() - begun,
   };
 }
 
@@ -212,7 +212,10 @@ async function keepAsking() {
       if (!isMoving) complete = asked;
       stage.dataset.pictures = Number(stage.dataset.pictures || 0) + 1;
       stage.dataset.size = `${frames[0].bitmap.width}x${frames[0].bitmap.height}`;
-      stage.dataset.state = complete === version ? "sharp" : "moving";
+      // What is measured in some of the views only is asked for again.
+      const isPart = frames.some((frame) => frame?.measured && frame.measured[0] < frame.measured[1]);
+      if (isPart && complete === version) complete = -1;
+      stage.dataset.state = complete === version ? "sharp" : isPart ? "measuring" : "moving";
       // What is in the middle is what one turns about next.
       if (complete === version && frames[0].distance) camera.away = frames[0].distance;
       if (complete === version) stage.dataset.rested = Math.round(performance.now() - changedAt);
@@ -244,7 +247,9 @@ function pace(frames, isMoving) {
     stage.dataset.rate = (1000 / mean).toFixed(1);
     byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
   } else {
-    byId("status").textContent = `${size} · sharp · drawn in ${milliseconds.toFixed(0)} ms`;
+    const [seen, all] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
+    const how = seen < all ? `measured in ${seen} of ${all} training views` : `sharp · drawn in ${milliseconds.toFixed(0)} ms`;
+    byId("status").textContent = `${size} · ${how}`;
   }
 }
 
@@ -635,13 +640,25 @@ function fill() {
   byId("right").append(option("", "nothing"));
   const isOfModel = (kind) => kind !== "photograph";
   scene.models.forEach(({ name }, model) => {
-    for (const { kind, label } of scene.kinds) {
-      if (model && !isOfModel(kind)) continue;
-      const text = scene.models.length > 1 && isOfModel(kind) ? `${label}, ${name}` : label;
-      byId("left").append(option(`${kind}:${model}`, text));
-      byId("right").append(option(`${kind}:${model}`, text));
+    const of = scene.models.length > 1 ? `, ${name}` : "";
+    for (const list of [byId("left"), byId("right")]) {
+      for (const [title, isRows] of [["Pictures", false], ["Single Gaussians", true]]) {
+        const group = document.createElement("optgroup");
+        group.label = title + of;
+        for (const { kind, label } of scene.kinds) {
+          if (kind.startsWith("row") !== isRows || model && !isOfModel(kind)) continue;
+          group.append(option(`${kind}:${model}`, isOfModel(kind) ? label + of : label));
+        }
+        list.append(group);
+      }
     }
   });
+  byId("lacking").hidden = !scene.lacking.length;
+  for (const { label, why } of scene.lacking) {
+    const item = document.createElement("li");
+    item.textContent = `${label}: ${why}.`;
+    byId("lacking").querySelector("ul").append(item);
+  }
   if (scene.models.length > 1) byId("right").value = "render:1";
   byId("view").append(option("", "anywhere"));
   for (const [split, label] of [["test", "Held out"], ["train", "Trained on"]]) {
