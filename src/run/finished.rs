@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
+use crate::backend::{Backend, Device, Setup};
 #[cfg(feature = "view")]
 use crate::backend::{BackendError, MomentStorage, Storage};
-use crate::backend::{Backend, Device, Setup};
 use crate::dataset::{Dataset, View, builtin};
 use crate::evaluate::Split;
 use crate::failure::Failure;

@@ -142,7 +142,8 @@ mod tests {
 
     fn extent() -> Extent {
         let normalisation = Normalisation { centre: glam::DVec3::ZERO, scale: 0.5 };
-        let lacking = vec![(Kind::Count, "on a GPU".to_owned()), (Kind::RowAge, "trains".to_owned())];
+        let lacking =
+            vec![(Kind::Count, "on a GPU".to_owned()), (Kind::RowAge, "trains".to_owned())];
         Extent { models: 2, views: [3, 0], normalisation, lacking }
     }
 

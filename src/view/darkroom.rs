@@ -1,13 +1,17 @@
 //! From a rendering to a JPEG: compares with the photograph, colours, and encodes. None of this is done by the thread
-//! that renders, which may be training.
+//! that renders, which may be training; and all of it by one other thread, as of each that ever had a large picture
+//! the allocator may keep its buffers.
 
+use std::io;
 use std::ops::Range;
+use std::thread::{Builder, Scope, ScopedJoinHandle};
 use std::time::Instant;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::{ExtendedColorType, Rgb, RgbImage, imageops};
 
 use super::asked::{Viewpoint, Wanted};
+use super::desk::{Closing, Desk, Unmade};
 use super::kinds::Kind;
 use super::negative::Negative;
 use super::paint::ends;
@@ -21,6 +25,8 @@ use crate::metrics::flip_map;
 use crate::pictures::{photograph, picture, to_u8};
 use crate::views::ViewSource;
 
+/// Bytes of the stack of the thread that makes pictures. Decoders of photographs need the most of it, less than 64 KiB.
+pub(super) const STACK: usize = 512 << 10;
 /// Quality of a picture that stays: at least 38 dB from what was rendered, and 45 dB mostly.
 const STILL: u8 = 95;
 /// Quality of one that the next will replace at once.
@@ -56,12 +62,23 @@ struct Drawn {
     distance: Option<f64>,
 }
 
+/// Makes pictures of what is rendered until the desk closes; and closes it, should that fail.
+pub(super) fn open<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    desk: &'scope Desk,
+    stage: &'scope Stage,
+) -> io::Result<ScopedJoinHandle<'scope, ()>> {
+    Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
+        let _closing = Closing(desk);
+        while let Some((ticket, negative)) = desk.next_exposed() {
+            let made = develop(stage, &ticket.wanted, negative).map_err(Unmade::Failed);
+            desk.answer(ticket, made);
+        }
+    })
+}
+
 /// Makes the picture of a rendering.
-pub(super) fn develop(
-    stage: &Stage,
-    wanted: &Wanted,
-    negative: Negative,
-) -> Result<Frame, String> {
+fn develop(stage: &Stage, wanted: &Wanted, negative: Negative) -> Result<Frame, String> {
     let begun = Instant::now();
     let measured = negative.measured;
     let rendered = negative.milliseconds;
@@ -97,7 +114,8 @@ fn draw(stage: &Stage, wanted: &Wanted, negative: Negative) -> Result<Drawn, Str
         (Kind::Count, _) => {
             let counts = &rendering.depth;
             let most = ends(counts).end.max(1.0);
-            let mean = counts.iter().copied().map(f64::from).sum::<f64>() / counts.len().max(1) as f64;
+            let mean =
+                counts.iter().copied().map(f64::from).sum::<f64>() / counts.len().max(1) as f64;
             let image = coloured(&rendering, |at| counts[at] / most, |_| true);
             Drawn { image, range: Some(0.0..most.into()), mean: Some(mean), distance: None }
         }
@@ -210,7 +228,89 @@ fn distance(
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use image::DynamicImage;
+    use serde_json::json;
+
     use super::*;
+    use crate::run::finished::Machine;
+    use crate::run::{DataSpec, Silent};
+    use crate::view::open::{Looked, open};
+
+    /// A photograph of a camera as there are today, in each format, through a lens that bends.
+    fn large_photographs(folder: &Path) {
+        let (width, height) = (4096, 3072);
+        let noise = |x: u32, y: u32| (x.wrapping_mul(2_654_435_769) ^ y.wrapping_mul(40_503)) >> 9;
+        let image = RgbImage::from_fn(width, height, |x, y| {
+            let grain = noise(x, y) as u8 / 4;
+            Rgb([(x / 16) as u8 / 2 + grain, (y / 12) as u8 / 2 + grain, grain])
+        });
+        let image = DynamicImage::from(image);
+        image.save(folder.join("a.jpg")).expect("a JPEG");
+        DynamicImage::from(image.to_rgb16()).save(folder.join("b.png")).expect("a PNG");
+        image.save(folder.join("c.webp")).expect("a WebP");
+        let frame = |name: &str, x: f64| {
+            let pose = [
+                [1.0, 0.0, 0.0, x],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 4.0],
+                [0.0, 0.0, 0.0, 1.0],
+            ];
+            json!({ "file_path": name, "transform_matrix": pose })
+        };
+        let scene = json!({
+            "w": width, "h": height, "fl_x": 4000.0, "fl_y": 4000.0, "cx": 2048.0, "cy": 1536.0, "k1": -0.05,
+            "frames": [frame("a.jpg", 0.0), frame("b.png", 1.0), frame("c.webp", -1.0)],
+        });
+        std::fs::write(folder.join("transforms.json"), scene.to_string()).expect("a file");
+    }
+
+    #[test]
+    fn large_photographs_need_less_than_half_of_the_stack() {
+        let folder = tempfile::tempdir().expect("a folder");
+        large_photographs(folder.path());
+        let looked = Looked {
+            what: folder.path(),
+            other: None,
+            scene: None,
+            iteration: None,
+            near: 0.04,
+            data: DataSpec::default(),
+        };
+        let stage = open(looked, Machine::default(), &Silent).expect("a scene").stage;
+        std::thread::scope(|scope| {
+            let made = Builder::new().stack_size(STACK / 2).spawn_scoped(scope, || {
+                for (kind, size) in
+                    [(Kind::Photograph, (2364, 1773)), (Kind::Difference, (640, 480))]
+                {
+                    for number in 0..3 {
+                        let wanted = Wanted {
+                            owner: ("a".to_owned(), 0),
+                            kind,
+                            model: 0,
+                            size,
+                            is_moving: false,
+                            from: Viewpoint::View(Split::Train, number),
+                        };
+                        let Camera { width, height, .. } = camera(&stage, &wanted);
+                        let pixels = width as usize * height as usize;
+                        let rendering = Rendering {
+                            width,
+                            height,
+                            rgb: vec![0.5; 3 * pixels],
+                            alpha: vec![1.0; pixels],
+                            depth: vec![1.0; pixels],
+                        };
+                        let negative = Negative { rendering, ..Negative::default() };
+                        let frame = develop(&stage, &wanted, negative).expect("a picture");
+                        assert_eq!(frame.size, (width, height));
+                    }
+                }
+            });
+            made.expect("a thread").join().expect("pictures");
+        });
+    }
 
     #[test]
     fn pictures_of_a_run_in_training_are_no_larger_than_its_photographs() {

@@ -56,7 +56,8 @@ pub(super) fn describe(stage: &Stage) -> Value {
         .map(|model| json!({ "name": model.name, "rows": model.rows, "degree": model.sh_degree }));
     let lacks = |kind: Kind| stage.lacking.iter().find(|(lacking, _)| *lacking == kind);
     let kinds = Kind::ALL.into_iter().filter(|&kind| lacks(kind).is_none());
-    let lacking = stage.lacking.iter().map(|(kind, why)| json!({ "label": kind.legend().label, "why": why }));
+    let lacking =
+        stage.lacking.iter().map(|(kind, why)| json!({ "label": kind.legend().label, "why": why }));
     json!({
         "title": stage.title,
         "live": stage.largest.is_some(),

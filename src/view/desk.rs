@@ -1,11 +1,12 @@
 //! Wishes on their way to the one thread that has the models: of each owner only the newest is kept. That thread
-//! renders; pictures are made of its renderings by who asked, and only so many at a time.
+//! renders, another makes the pictures, and only so many are in the making at a time.
 
 use std::sync::mpsc::{SyncSender, sync_channel};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use super::asked::Wanted;
+use super::darkroom::Frame;
 use super::negative::Negative;
 
 /// Why there is no picture.
@@ -21,90 +22,63 @@ pub(super) enum Unmade {
     Over,
 }
 
-/// A rendering, with the turn of who makes a picture of it.
-pub(super) type Handed = (Negative, Turn);
-
-/// A wish, and where its rendering goes.
+/// A wish, and where its picture goes.
+#[derive(Debug)]
 pub(super) struct Ticket {
     pub(super) wanted: Wanted,
-    reply: SyncSender<Result<Handed, Unmade>>,
-    turn: Turn,
+    reply: SyncSender<Result<Frame, Unmade>>,
 }
 
 impl Ticket {
-    /// Hands over what has come of it.
-    pub(super) fn reply(self, made: Result<Negative, Unmade>) {
-        let Self { reply, turn, .. } = self;
+    fn reply(self, made: Result<Frame, Unmade>) {
         // Whoever asked may have gone.
-        let _ = reply.send(made.map(|negative| (negative, turn)));
+        let _ = self.reply.send(made);
     }
 }
 
-/// A wish that is not waited for at the desk any more: while there are as many as may be, no other is begun.
-#[derive(Debug)]
-pub(super) struct Turn(Arc<Hall>);
-
-impl Drop for Turn {
-    fn drop(&mut self) {
-        self.0.queue().begun -= 1;
-        self.0.bell.notify_all();
-    }
-}
-
-struct Waiting {
-    wanted: Wanted,
-    reply: SyncSender<Result<Handed, Unmade>>,
-}
-
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Queue {
     /// First come, first served. As many at most as there are connections.
-    waiting: Vec<Waiting>,
-    /// Wishes that are rendered, or made a picture of.
+    waiting: Vec<Ticket>,
+    /// Those that are rendered, but are no pictures yet.
+    exposed: Vec<(Ticket, Negative)>,
+    /// Wishes that were taken, and not answered yet.
     begun: usize,
     is_over: bool,
 }
 
-#[derive(Default)]
-struct Hall {
+/// Where wishes wait.
+#[derive(Debug)]
+pub(super) struct Desk {
     queue: Mutex<Queue>,
     bell: Condvar,
-}
-
-impl std::fmt::Debug for Hall {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Hall")
-    }
-}
-
-/// Where wishes wait.
-pub(super) struct Desk {
-    hall: Arc<Hall>,
     /// Most wishes that wait; as many as there are connections without.
     most: Option<usize>,
-    /// Most wishes that are rendered, or made a picture of, at a time.
+    /// Most wishes that are taken and not answered yet.
     at_once: usize,
 }
 
-impl Hall {
+impl Desk {
+    /// A desk at which no more wishes wait than `most`, and so many are in the making at a time.
+    pub(super) fn new(most: Option<usize>, at_once: usize) -> Self {
+        Self { queue: Mutex::default(), bell: Condvar::new(), most, at_once }
+    }
+
     fn queue(&self) -> MutexGuard<'_, Queue> {
         // Each change is whole before anything can fail.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
 
-impl Desk {
-    /// A desk at which no more wishes wait than `most`, and so many are begun at a time.
-    pub(super) fn new(most: Option<usize>, at_once: usize) -> Self {
-        Self { hall: Arc::default(), most, at_once }
+    fn wait<'a>(&self, queue: MutexGuard<'a, Queue>) -> MutexGuard<'a, Queue> {
+        self.bell.wait(queue).unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for the rendering.
-    pub(super) fn ask(&self, wanted: Wanted) -> Result<Handed, Unmade> {
+    /// Waits for the picture.
+    pub(super) fn ask(&self, wanted: Wanted) -> Result<Frame, Unmade> {
         let (reply, made) = sync_channel(1);
-        let newest = Waiting { wanted, reply };
+        let newest = Ticket { wanted, reply };
         {
-            let mut queue = self.hall.queue();
+            let mut queue = self.queue();
             if queue.is_over {
                 return Err(Unmade::Over);
             }
@@ -117,12 +91,11 @@ impl Desk {
                 None => queue.waiting.push(newest),
                 Some(place) => {
                     let older = std::mem::replace(&mut queue.waiting[place], newest);
-                    // Whoever asked may have gone.
-                    let _ = older.reply.send(Err(Unmade::Superseded));
+                    older.reply(Err(Unmade::Superseded));
                 }
             }
         }
-        self.hall.bell.notify_all();
+        self.bell.notify_all();
         made.recv().unwrap_or(Err(Unmade::Over))
     }
 
@@ -131,14 +104,13 @@ impl Desk {
         if queue.waiting.is_empty() || queue.begun >= self.at_once {
             return None;
         }
-        let Waiting { wanted, reply } = queue.waiting.remove(0);
         queue.begun += 1;
-        Some(Ticket { wanted, reply, turn: Turn(Arc::clone(&self.hall)) })
+        Some(queue.waiting.remove(0))
     }
 
-    /// The next wish; `None` when no more are taken.
+    /// The next wish to render; `None` when no more are taken.
     pub(super) fn next(&self) -> Option<Ticket> {
-        let mut queue = self.hall.queue();
+        let mut queue = self.queue();
         loop {
             if queue.is_over {
                 return None;
@@ -146,39 +118,76 @@ impl Desk {
             if let Some(ticket) = self.take(&mut queue) {
                 return Some(ticket);
             }
-            queue = self.hall.bell.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            queue = self.wait(queue);
         }
     }
 
-    /// The next wish, if its turn has come or comes within this time.
+    /// The next wish to render, if its turn has come or comes within this time.
     pub(super) fn next_within(&self, patience: Duration) -> Option<Ticket> {
-        let mut queue = self.hall.queue();
+        let mut queue = self.queue();
         if let Some(ticket) = self.take(&mut queue) {
             return Some(ticket);
         }
         if queue.is_over || patience.is_zero() {
             return None;
         }
-        let waited = self.hall.bell.wait_timeout(queue, patience);
+        let waited = self.bell.wait_timeout(queue, patience);
         self.take(&mut waited.unwrap_or_else(PoisonError::into_inner).0)
+    }
+
+    /// Hands over what has come of rendering it, so that a picture is made of it.
+    pub(super) fn expose(&self, ticket: Ticket, made: Result<Negative, Unmade>) {
+        match made {
+            Err(why) => self.answer(ticket, Err(why)),
+            Ok(negative) => {
+                let mut queue = self.queue();
+                // Once it is over nobody makes pictures.
+                if !queue.is_over {
+                    queue.exposed.push((ticket, negative));
+                }
+                drop(queue);
+                self.bell.notify_all();
+            }
+        }
+    }
+
+    /// The next rendering to make a picture of; `None` when no more are made.
+    pub(super) fn next_exposed(&self) -> Option<(Ticket, Negative)> {
+        let mut queue = self.queue();
+        loop {
+            if queue.is_over {
+                return None;
+            }
+            if !queue.exposed.is_empty() {
+                return Some(queue.exposed.remove(0));
+            }
+            queue = self.wait(queue);
+        }
+    }
+
+    /// Answers a wish that was taken.
+    pub(super) fn answer(&self, ticket: Ticket, made: Result<Frame, Unmade>) {
+        ticket.reply(made);
+        self.queue().begun -= 1;
+        self.bell.notify_all();
     }
 
     /// Whether nothing is made any more.
     pub(super) fn is_over(&self) -> bool {
-        self.hall.queue().is_over
+        self.queue().is_over
     }
 
     /// Takes no more wishes; those that wait are told.
     pub(super) fn close(&self) {
-        let waiting = {
-            let mut queue = self.hall.queue();
+        let (waiting, exposed) = {
+            let mut queue = self.queue();
             queue.is_over = true;
-            std::mem::take(&mut queue.waiting)
+            (std::mem::take(&mut queue.waiting), std::mem::take(&mut queue.exposed))
         };
-        for Waiting { reply, .. } in waiting {
-            let _ = reply.send(Err(Unmade::Over));
+        for ticket in waiting.into_iter().chain(exposed.into_iter().map(|(ticket, _)| ticket)) {
+            ticket.reply(Err(Unmade::Over));
         }
-        self.hall.bell.notify_all();
+        self.bell.notify_all();
     }
 }
 
@@ -217,7 +226,7 @@ mod tests {
         assert!(desk.next_within(Duration::ZERO).is_none());
         thread::scope(|scope| {
             let first = scope.spawn(|| desk.ask(wish("a", 0)));
-            while desk.hall.queue().waiting.is_empty() {
+            while desk.queue().waiting.is_empty() {
                 thread::yield_now();
             }
             assert_eq!(desk.ask(wish("b", 0)).unwrap_err(), Unmade::Crowded);
@@ -225,7 +234,7 @@ mod tests {
             let second = scope.spawn(|| desk.ask(wish("a", 1)));
             assert_eq!(first.join().unwrap().unwrap_err(), Unmade::Superseded);
             let ticket = desk.next_within(Duration::ZERO).unwrap();
-            ticket.reply(Err(Unmade::Failed("made".into())));
+            desk.expose(ticket, Err(Unmade::Failed("made".into())));
             assert_eq!(second.join().unwrap().unwrap_err(), Unmade::Failed("made".into()));
             assert!(!desk.is_over());
             desk.close();
@@ -236,27 +245,44 @@ mod tests {
     #[test]
     fn no_more_are_begun_than_may_be_until_a_picture_is_made() {
         let desk = Desk::new(None, 1);
+        let frame = Frame {
+            jpeg: vec![3],
+            size: (1, 1),
+            range: None,
+            mean: None,
+            distance: None,
+            measured: None,
+            milliseconds: 0.0,
+        };
         thread::scope(|scope| {
-            let [one, two] = ["a", "b"].map(|page| scope.spawn({
+            let asked = ["a", "b"].map(|page| {
                 let desk = &desk;
-                move || desk.ask(wish(page, 0)).map(|(negative, turn)| (negative.milliseconds, turn))
-            }));
-            while desk.hall.queue().waiting.len() < 2 {
+                scope.spawn(move || desk.ask(wish(page, 0)).map(|frame| frame.jpeg))
+            });
+            while desk.queue().waiting.len() < 2 {
                 thread::yield_now();
             }
             let ticket = desk.next_within(Duration::ZERO).unwrap();
             assert!(desk.next_within(Duration::ZERO).is_none(), "two at once");
-            let is_first = ticket.wanted == wish("a", 0);
-            ticket.reply(Ok(Negative { milliseconds: 3.0, ..Negative::default() }));
-            let (first, second) = if is_first { (one, two) } else { (two, one) };
-            let (milliseconds, turn) = first.join().unwrap().unwrap();
-            assert!((milliseconds - 3.0).abs() < 1e-9);
-            // The rendering is not a picture yet.
+            let (first, second) = match (&*ticket.wanted.owner.0, asked) {
+                ("a", [first, second]) | (_, [second, first]) => (first, second),
+            };
+            desk.expose(ticket, Ok(Negative::default()));
+            // The rendering is no picture yet.
             assert!(desk.next_within(Duration::ZERO).is_none());
-            drop(turn);
-            desk.next().unwrap().reply(Err(Unmade::Failed("made".into())));
+            let (ticket, _) = desk.next_exposed().unwrap();
+            desk.answer(ticket, Ok(frame));
+            assert_eq!(first.join().unwrap().unwrap(), [3]);
+            let ticket = desk.next().unwrap();
+            desk.expose(ticket, Err(Unmade::Failed("made".into())));
             assert!(second.join().unwrap().is_err());
-            assert_eq!(desk.hall.queue().begun, 0, "who fails has no turn");
+            // Who waits for a picture of a rendering is told of the end, too.
+            let last = scope.spawn(|| desk.ask(wish("c", 0)).unwrap_err());
+            let ticket = desk.next().expect("who fails has no turn any more");
+            desk.expose(ticket, Ok(Negative::default()));
+            desk.close();
+            assert_eq!(last.join().unwrap(), Unmade::Over);
+            assert!(desk.next_exposed().is_none());
         });
     }
 
@@ -264,12 +290,12 @@ mod tests {
     fn only_the_newest_wish_of_an_owner_is_kept_and_nobody_is_passed_over() {
         let desk = Desk::new(None, 1);
         let waiting = |count: usize| {
-            while desk.hall.queue().waiting.len() < count {
+            while desk.queue().waiting.len() < count {
                 thread::yield_now();
             }
         };
         let newest_is = |number: usize| {
-            while desk.hall.queue().waiting[0].wanted != wish("a", number) {
+            while desk.queue().waiting[0].wanted != wish("a", number) {
                 thread::yield_now();
             }
         };
@@ -293,7 +319,7 @@ mod tests {
             for (expected, asked) in [(wish("a", 2), third), (wish("b", 9), other)] {
                 let ticket = desk.next().unwrap();
                 assert_eq!(ticket.wanted, expected);
-                ticket.reply(Err(Unmade::Failed("made".into())));
+                desk.expose(ticket, Err(Unmade::Failed("made".into())));
                 assert_eq!(asked.join().unwrap().unwrap_err(), Unmade::Failed("made".into()));
             }
             let left = ask("c", 0);

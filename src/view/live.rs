@@ -17,7 +17,7 @@ use super::negative;
 use super::paint::Known;
 use super::routes::Routes;
 use super::stage::Stage;
-use super::{Server, describe};
+use super::{Server, darkroom, describe};
 use crate::backend::{Backend, Device};
 use crate::evaluate::Mean;
 use crate::failure::{Failure, OTHER};
@@ -70,7 +70,8 @@ pub(crate) fn lasting_bytes(
     let smaller = whole * (3 + 4 * float);
     let making = pixels * pixel + smaller + photograph + scratch_bytes(largest_image.0, threads);
     let said = board::BYTES + POINTS + views as u64 * VIEW;
-    seats * SEAT + wishes * frame + said + rows * RowHistory::BYTES + AT_ONCE as u64 * making
+    let darkroom = darkroom::STACK as u64 + AT_ONCE as u64 * making;
+    seats * SEAT + wishes * frame + said + rows * RowHistory::BYTES + darkroom
 }
 
 /// What painting so many rows takes, between two steps `[bytes]`.
@@ -100,7 +101,6 @@ impl Server {
         let routes = Routes {
             door: &self.door,
             desk: &desk,
-            stage: &stage,
             extent: stage.extent(),
             description: describe::describe(&stage).to_string(),
             board: Some(&board),
@@ -108,6 +108,11 @@ impl Server {
         thread::scope(|scope| {
             let _closing = Closing(&desk);
             let (desk, routes) = (&desk, &routes);
+            let no_thread = |error| Failure {
+                code: OTHER,
+                message: format!("--view: the system gives no thread for the page: {error}"),
+            };
+            let develops = darkroom::open(scope, desk, &stage).map_err(no_thread)?;
             let serves = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
                 let answer = |request: &http::Request| routes.answer(request);
                 let served = http::serve(&routes.door.listener, &answer, &|| desk.is_over());
@@ -117,13 +122,15 @@ impl Server {
                     );
                 }
             });
-            serves.map_err(|error| Failure {
-                code: OTHER,
-                message: format!("--view: the system gives no thread for the page: {error}"),
-            })?;
+            serves.map_err(no_thread)?;
             let (board, stage, step) = (&board, &stage, Cell::new(0));
             let live = Live { observer, desk, board, stage, rows, signals, step };
-            train(run, &live)
+            let trained = train(run, &live);
+            desk.close();
+            if develops.join().is_err() {
+                tracing::error!("what makes the page's pictures has failed; this is a bug");
+            }
+            trained
         })
     }
 }
@@ -149,7 +156,7 @@ impl Live<'_> {
             let history = rows.map(|rows| (rows, self.step.get()));
             let known = Known { signals: self.signals, history, measured: None };
             let made = negative::expose_live(self.stage, model, known, &ticket.wanted);
-            ticket.reply(made);
+            self.desk.expose(ticket, made);
         }
     }
 }

@@ -47,11 +47,7 @@ impl std::fmt::Debug for Measured {
 
 impl Measured {
     /// Nothing yet, of the model in this backend.
-    pub(super) fn new(
-        stage: &Stage,
-        shown: &Shown,
-        model: &dyn Backend,
-    ) -> Result<Self, String> {
+    pub(super) fn new(stage: &Stage, shown: &Shown, model: &dyn Backend) -> Result<Self, String> {
         let needs = Needs { signals: SIGNALS.into(), ..Needs::default() };
         let model = model.download().map_err(|error| error.to_string())?;
         let backend = stage.machine.backend_to_measure(&model, shown.near, needs);

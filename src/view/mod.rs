@@ -1,8 +1,8 @@
 //! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
 //!
 //! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
-//! [`desk`], which keeps the newest of each page, take renderings away ([`negative`]), and make pictures of them
-//! ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path of the disk is
+//! [`desk`], which keeps the newest of each page; that thread renders them ([`negative`]), and another makes pictures
+//! of what is rendered ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path of the disk is
 //! served. Prints nothing.
 
 mod asked;
@@ -27,14 +27,14 @@ use std::thread;
 use desk::{Closing, Desk};
 use door::Door;
 pub(crate) use door::{FIRST_PORT, Place};
-pub(crate) use open::{Looked, is_run, open};
 use negative::Brush;
+pub(crate) use open::{Looked, is_run, open};
 use routes::Routes;
 pub(crate) use stage::Exhibition;
 
 use crate::failure::{Failure, OTHER};
 
-/// Pictures in the making at a time: while one is developed, the next is rendered.
+/// Pictures in the making at a time: while one is encoded, the next is rendered.
 const AT_ONCE: usize = 2;
 
 /// A page that can be opened.
@@ -75,7 +75,6 @@ impl Server {
         let routes = Routes {
             door: &self.door,
             desk: &desk,
-            stage: &stage,
             extent: stage.extent(),
             description: describe::describe(&stage).to_string(),
             board: None,
@@ -83,6 +82,8 @@ impl Server {
         let failed = |message: String| Failure { code: OTHER, message };
         thread::scope(|scope| {
             let (desk, stage) = (&desk, &stage);
+            let develops = darkroom::open(scope, desk, stage)
+                .map_err(|error| failed(format!("the system gives no thread: {error}")))?;
             let renders = scope.spawn(move || {
                 let _closing = Closing(desk);
                 let mut brushes: Vec<Brush> = backends.iter().map(|_| Brush::default()).collect();
@@ -90,7 +91,7 @@ impl Server {
                     let (wanted, model) = (&ticket.wanted, ticket.wanted.model);
                     let made =
                         negative::expose(stage, &mut *backends[model], &mut brushes[model], wanted);
-                    ticket.reply(made);
+                    desk.expose(ticket, made);
                 }
             });
             let answer = |request: &http::Request| routes.answer(request);
@@ -105,7 +106,7 @@ impl Server {
             };
             let served = http::serve(&self.door.listener, &answer, &ends);
             desk.close();
-            let rendered = renders.join();
+            let rendered = renders.join().and(develops.join());
             served
                 .map_err(|error| failed(format!("the page cannot be served any more: {error}")))?;
             rendered.map_err(|_| failed("what renders has failed; this is a bug".into()))

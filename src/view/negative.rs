@@ -74,7 +74,8 @@ pub(super) fn expose(
     }
     if wanted.kind.paints() {
         let views = progress.map_or(0, |[seen, _]| seen);
-        let is_kept = kept.as_ref().is_some_and(|(kind, of, _)| (*kind, *of) == (wanted.kind, views));
+        let is_kept =
+            kept.as_ref().is_some_and(|(kind, of, _)| (*kind, *of) == (wanted.kind, views));
         if !is_kept {
             let known = Known { measured: measured.as_ref(), ..Known::default() };
             let units = 1.0 / stage.normalisation.scale;

@@ -203,6 +203,7 @@ pub(super) fn ends(values: &[f32]) -> Range<f32> {
 #[cfg(test)]
 mod tests {
     use densify_policies::plan::{EditPlan, RowOps, Update};
+    use densify_policies::policy::Needs;
 
     use super::*;
     use crate::backend::{Device, Setup};
@@ -228,7 +229,8 @@ mod tests {
     fn history() -> RowHistory {
         let mut history = RowHistory::of(&[0; 3], 3);
         let ops = |rows: std::ops::RangeInclusive<u32>| -> RowOps {
-            let mut plan = EditPlan::new(3, 3);
+            let needs = Needs { detailed_edits: true, ..Needs::default() };
+            let mut plan = EditPlan::new(3, 3).allowing(&needs);
             rows.for_each(|row| plan.update(row, Update::NONE).unwrap());
             plan.compile()
         };

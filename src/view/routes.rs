@@ -4,11 +4,11 @@ use serde::Deserialize;
 
 use super::asked::{self, Wanted};
 use super::board::{Board, Order};
+use super::darkroom::Frame;
 use super::desk::{Desk, Unmade};
 use super::door::Door;
 use super::http::{Answer, Method, Request};
-use super::darkroom::{Frame, develop};
-use super::stage::{Extent, Stage};
+use super::stage::Extent;
 
 const PAGE: &str = include_str!("page/index.html");
 const STYLE: &str = concat!(include_str!("../html/palette.css"), include_str!("page/view.css"));
@@ -19,7 +19,6 @@ const LIVE_SCRIPT: &str = include_str!("page/live.js");
 pub(super) struct Routes<'a> {
     pub(super) door: &'a Door,
     pub(super) desk: &'a Desk,
-    pub(super) stage: &'a Stage,
     pub(super) extent: Extent,
     /// The [description](super::describe) of what is shown, as JSON.
     pub(super) description: String,
@@ -81,12 +80,8 @@ impl Routes<'_> {
     }
 
     fn frame(&self, wanted: Wanted) -> Answer {
-        match self.desk.ask(wanted.clone()) {
-            // While it is developed here, the thread that has rendered it goes on.
-            Ok((negative, _turn)) => match develop(self.stage, &wanted, negative) {
-                Ok(frame) => sent(frame),
-                Err(why) => Answer::refusal(500, why),
-            },
+        match self.desk.ask(wanted) {
+            Ok(frame) => sent(frame),
             Err(Unmade::Superseded) => {
                 Answer::refusal(409, "a newer picture was asked for meanwhile")
             }
@@ -99,7 +94,8 @@ impl Routes<'_> {
 
 /// A picture, with what is known of it in the head.
 fn sent(frame: Frame) -> Answer {
-    let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } = frame;
+    let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } =
+        frame;
     let mut answer = Answer::of("image/jpeg", jpeg)
         .with("X-Size", format!("{width}x{height}"))
         .with("X-Milliseconds", format!("{milliseconds:.1}"));
@@ -125,7 +121,7 @@ mod tests {
     use crate::dataset::normalise::Normalisation;
     use crate::run::finished::Machine;
     use crate::view::door::Place;
-    use crate::view::stage::Shown;
+    use crate::view::stage::{Shown, Stage};
 
     #[test]
     fn only_what_is_built_in_is_served() {
@@ -145,7 +141,6 @@ mod tests {
         let routes = Routes {
             door: &door,
             desk: &desk,
-            stage: &stage,
             extent: stage.extent(),
             description: "{}".into(),
             board: None,
@@ -189,7 +184,6 @@ mod tests {
         let live = Routes {
             door: &door,
             desk: &desk,
-            stage: &stage,
             extent: stage.extent(),
             description: "{}".into(),
             board: Some(&board),

@@ -17,8 +17,7 @@ use densify_policies::policy::Signal;
 const KEPT_PHOTOGRAPHS: u64 = 64 << 20;
 
 const NO_COUNTS: &str = "they are not counted on a GPU; start with --backend cpu";
-const NO_HISTORY: &str =
-    "no file says when a Gaussian was made or edited; densify train --view shows it while a run trains";
+const NO_HISTORY: &str = "no file says when a Gaussian was made or edited; densify train --view shows it while a run trains";
 const NO_PHOTOGRAPHS: &str = "no photographs are known; name their dataset with --scene";
 const NO_TRAINING_VIEWS: &str =
     "it is measured in training photographs, and none are known; name their dataset with --scene";

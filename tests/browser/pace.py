@@ -9,12 +9,10 @@ shown, and how long after the last movement the picture was as sharp as it gets.
     densify train scene:room -o RUN --budget 30k --init random --init-points 30k --iterations 600 --eval
 """
 
-import signal
-import subprocess
 import sys
 from statistics import mean, median
 
-from view import PATIENCE, Browser
+from view import Browser, served
 
 SECONDS = 4
 TURN = """
@@ -63,20 +61,8 @@ def measure(browser: Browser, url: str, rounds: int) -> None:
 
 
 def main(densify: str, run: str, rounds: str = "5") -> None:
-    command = [densify, "view", run, "--port", "0", "--backend", "cpu"]
-    program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert program.stdout
-        line = next(line for line in program.stdout if line.startswith("page "))
-        browser = Browser()
-        try:
-            measure(browser, line.split()[1], int(rounds))
-        finally:
-            browser.close()
-        program.send_signal(signal.SIGINT)
-        program.wait(PATIENCE)
-    finally:
-        program.kill()
+    with served(densify, run) as (browser, url):
+        measure(browser, url, int(rounds))
 
 
 if __name__ == "__main__":

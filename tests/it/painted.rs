@@ -13,7 +13,8 @@ fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
     on_each(repeatable(), |subject| {
         let view = scenes::camera(33, 25, 71);
         let model = scenes::cloud(ROWS, DEGREE, &view, 72);
-        let mut backend = make_with(subject, &model, Setup { budget: ROWS + 3, ..Setup::default() });
+        let mut backend =
+            make_with(subject, &model, Setup { budget: ROWS + 3, ..Setup::default() });
         let target = scenes::target(&view);
         backend.train_step(&step_input(1, &view, &target, DEGREE)).expect("a step");
         let (before, own) = (saved(&*backend), backend.render(&view, GREY, DEGREE));

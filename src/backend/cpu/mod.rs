@@ -350,8 +350,7 @@ impl Backend for CpuBackend {
         colours: &[[f32; 3]],
     ) -> Result<Rendering, BackendError> {
         assert_eq!(colours.len(), self.rows, "colours of other rows");
-        let frame =
-            self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
         Ok(self.rendering(&frame))
     }
 

@@ -394,20 +394,27 @@ function cameraAt(x, y) {
 
 // ---- Moving.
 
+/** Pointers that were put on the stage, and where each was last, in pixels of the page. */
 const hands = new Map();
 let travelled = 0;
 
 marks.addEventListener("pointerdown", (event) => {
+  // The first finger, or the mouse, begins anew.
+  if (event.isPrimary) drop();
   marks.setPointerCapture(event.pointerId);
-  hands.set(event.pointerId, [event.offsetX, event.offsetY]);
+  hands.set(event.pointerId, [event.clientX, event.clientY]);
   marks.classList.add("dragging");
   travelled = 0;
 });
 
-marks.addEventListener("pointermove", (event) => {
+// Of the whole page, as not every browser keeps to the capture: whoever leaves the stage still drags, and lifts the
+// hand somewhere else.
+addEventListener("pointermove", (event) => {
   const before = hands.get(event.pointerId);
   if (!before) return;
-  const now = [event.offsetX, event.offsetY];
+  // It was lifted where the page did not see it.
+  if (!event.buttons) return drop();
+  const now = [event.clientX, event.clientY];
   const [dx, dy] = add(now, before, -1);
   if (!dx && !dy) return;
   const height = area()[1];
@@ -429,14 +436,19 @@ marks.addEventListener("pointermove", (event) => {
   hands.set(event.pointerId, now);
 });
 
-function lift(event) {
-  if (!hands.delete(event.pointerId)) return;
-  if (!hands.size) marks.classList.remove("dragging");
-  const found = travelled < 4 && event.type === "pointerup" && cameraAt(event.offsetX, event.offsetY);
-  if (found) goTo(found);
+/** Ends all dragging. */
+function drop() {
+  hands.clear();
+  marks.classList.remove("dragging");
 }
-marks.addEventListener("pointerup", lift);
-marks.addEventListener("pointercancel", lift);
+
+addEventListener("pointerup", (event) => {
+  if (!hands.delete(event.pointerId)) return;
+  if (!hands.size) drop();
+  const found = travelled < 4 && event.target === marks && cameraAt(event.offsetX, event.offsetY);
+  if (found) goTo(found);
+});
+addEventListener("pointercancel", (event) => { if (hands.has(event.pointerId)) drop(); });
 marks.addEventListener("contextmenu", (event) => event.preventDefault());
 marks.addEventListener("wheel", (event) => {
   event.preventDefault();
@@ -486,16 +498,21 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 document.addEventListener("keyup", (event) => { held.delete(event.key.toLowerCase()); changedAt = performance.now(); wake(); });
-addEventListener("blur", () => held.clear());
+addEventListener("blur", () => { held.clear(); drop(); });
 
 // ---- The border between two pictures.
 
 const divider = byId("divider");
 const setBorder = (share) => { border = clamp(share, 0, 1); draw(); };
-divider.addEventListener("pointerdown", (event) => divider.setPointerCapture(event.pointerId));
-divider.addEventListener("pointermove", (event) => {
-  if (!divider.hasPointerCapture(event.pointerId)) return;
-  setBorder((event.clientX - stage.getBoundingClientRect().left) / area()[0]);
+let dragger = null;
+divider.addEventListener("pointerdown", (event) => {
+  divider.setPointerCapture(event.pointerId);
+  dragger = event.pointerId;
+});
+addEventListener("pointermove", (event) => {
+  if (event.pointerId !== dragger) return;
+  if (event.buttons) setBorder((event.clientX - stage.getBoundingClientRect().left) / area()[0]);
+  else dragger = null;
 });
 divider.addEventListener("keydown", (event) => {
   const to = { ArrowLeft: border - 0.02, ArrowRight: border + 0.02, Home: 0, End: 1 }[event.key];

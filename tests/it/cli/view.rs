@@ -223,7 +223,8 @@ fn the_picture_of_a_camera_is_that_which_render_writes() {
     // What training alone knows is measured in the training views, some at a time, until all are.
     let measured = |kind: &str| {
         let reply = page.frame(&wish(kind, "test", 0, SIZE));
-        let (seen, all) = reply.header("X-Measured").and_then(|it| it.split_once(' ')).expect("how many");
+        let (seen, all) =
+            reply.header("X-Measured").and_then(|it| it.split_once(' ')).expect("how many");
         (seen == all, all.parse::<usize>().expect("a number"), reply.body)
     };
     let train = described["views"]["train"].as_array().expect("views").len();

@@ -200,7 +200,7 @@ fn the_page_says_how_training_goes() {
 
     // What the policy does not measure is not shown, and it is said why.
     let (_root, other) = scratch();
-    let quiet = watched(scene.path(), &other, "--policy mcmc");
+    let quiet = watched(scene.path(), &other, "--policy mcmc --eval");
     let described: Value =
         serde_json::from_slice(&quiet.get(&format!("{}scene", quiet.path)).body).expect("JSON");
     let lacking: Vec<&Value> = described["lacking"].as_array().into_iter().flatten().collect();
