@@ -234,9 +234,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::run::finished::Machine;
-    use crate::run::{DataSpec, Silent};
-    use crate::view::open::{Looked, open};
+    use crate::view::open::stage_of;
 
     /// A photograph of a camera as there are today, in each format, through a lens that bends.
     fn large_photographs(folder: &Path) {
@@ -270,15 +268,7 @@ mod tests {
     fn large_photographs_need_less_than_half_of_the_stack() {
         let folder = tempfile::tempdir().expect("a folder");
         large_photographs(folder.path());
-        let looked = Looked {
-            what: folder.path(),
-            other: None,
-            scene: None,
-            iteration: None,
-            near: 0.04,
-            data: DataSpec::default(),
-        };
-        let stage = open(looked, Machine::default(), &Silent).expect("a scene").stage;
+        let stage = stage_of(folder.path());
         std::thread::scope(|scope| {
             let made = Builder::new().stack_size(STACK / 2).spawn_scoped(scope, || {
                 for (kind, size) in

@@ -108,45 +108,45 @@ impl Kind {
                 ("Opacity", "How much of what lies behind the model it hides.", Some("opacity"))
             }
             Self::Count => (
-                "Rows per pixel",
+                "Gaussians per pixel",
                 "How many Gaussians are blended into a pixel: what a picture costs.",
-                Some("rows"),
+                Some("Gaussians"),
             ),
-            Self::Rows => ("Rows apart", "Every Gaussian in a colour of its own.", None),
+            Self::Rows => ("Gaussians apart", "Every Gaussian in a colour of its own.", None),
             Self::RowOpacity => {
-                ("Opacity of rows", "Every Gaussian coloured by its opacity.", Some("opacity"))
+                ("Opacity of Gaussians", "Every Gaussian coloured by its opacity.", Some("opacity"))
             }
             Self::RowSize => (
-                "Size of rows",
+                "Size of Gaussians",
                 "Every Gaussian coloured by its longest standard deviation, on a logarithmic scale.",
                 Some("units"),
             ),
             Self::RowShape => (
-                "Shape of rows",
+                "Shape of Gaussians",
                 "Every Gaussian coloured by its longest axis over its middle one, on a logarithmic scale: \
                  needles are bright.",
                 Some("to 1"),
             ),
             Self::RowGradient => (
-                "Gradient of rows",
+                "Gradient of Gaussians",
                 "Every Gaussian coloured by how strongly the photographs pull at its place: the mean gradient of \
                  its projected centre, on a logarithmic scale. Policies split or clone where it is large.",
                 Some("per view"),
             ),
             Self::RowWeight => (
-                "Largest weight of rows",
+                "Largest weight of Gaussians",
                 "Every Gaussian coloured by the largest weight that it has in any pixel of the training views: \
                  what is dark hardly shows anywhere.",
                 Some("weight"),
             ),
             Self::RowAge => (
-                "Age of rows",
+                "Age of Gaussians",
                 "Every Gaussian coloured by the steps since it was made; if training was resumed meanwhile, at \
                  least so many.",
                 Some("steps"),
             ),
             Self::RowEdit => (
-                "Last edit of rows",
+                "Last edit of Gaussians",
                 "Every Gaussian coloured by the steps since the policy made or rewrote it.",
                 Some("steps"),
             ),

@@ -119,3 +119,71 @@ impl Measured {
         Self { backend: None, order: Vec::new(), seen: 0, gradient, weight }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use image::{Rgb, RgbImage};
+    use serde_json::json;
+
+    use super::*;
+    use crate::backend::{Device, Setup};
+    use crate::gaussians::{Gaussians, logit};
+    use crate::view::open::stage_of;
+
+    #[test]
+    fn all_views_count_and_the_model_stays_as_it_is() {
+        let folder = tempfile::tempdir().expect("a folder");
+        // Two cameras, back to back.
+        let mut frames = Vec::new();
+        for (name, side) in [("a.png", 1.0), ("b.png", -1.0)] {
+            let noise =
+                |x: u32, y: u32| Rgb([(x * 37 + y * 91) as u8, (x * y * 7) as u8, (x * 11) as u8]);
+            RgbImage::from_fn(48, 48, noise).save(folder.path().join(name)).expect("a PNG");
+            let pose = [
+                [side, 0.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, side, side],
+                [0.0, 0.0, 0.0, 1.0],
+            ];
+            frames.push(json!({ "file_path": name, "transform_matrix": pose }));
+        }
+        let scene = json!({ "w": 48, "h": 48, "fl_x": 50, "fl_y": 50, "cx": 24, "cy": 24, "frames": frames });
+        std::fs::write(folder.path().join("transforms.json"), scene.to_string()).expect("a file");
+        let stage = stage_of(folder.path());
+        // A row before each.
+        let mut model = Gaussians::zeros(2, 0);
+        for row in 0..2 {
+            let camera = stage.view(Split::Train, row).camera;
+            model.means[row] = (camera.centre() + 2.0 * camera.forward()).as_vec3().to_array();
+            model.log_scales[row] = [-2.0, -1.7, -1.4];
+            model.quats[row] = [1.0, 0.0, 0.0, 0.0];
+            model.opacity_logits[row] = logit(0.8);
+        }
+        let backend = Device::default().backend(&model, &Setup::new(2)).expect("a backend");
+        let shown = Shown { name: "a".into(), rows: 2, sh_degree: 0, near: 0.1 };
+        let mut measured = Measured::new(&stage, &shown, &*backend).expect("a backend");
+        assert_eq!(measured.progress(), [0, 2]);
+        let seen = |of: &[f32]| of.iter().filter(|&&number| number > 0.0).count();
+        for views in 1..=2 {
+            measured.go_on(&stage, 0, Duration::ZERO).expect("a view");
+            assert_eq!(measured.progress(), [views, 2]);
+            assert_eq!(
+                [seen(&measured.weight), seen(&measured.gradient)],
+                [views; 2],
+                "{measured:?}"
+            );
+            let measures =
+                measured.backend.as_ref().map(|backend| backend.download().expect("a model"));
+            assert_eq!(measures.is_none(), views == 2, "what has measured all is kept");
+            assert!(measures.is_none_or(|measures| measures == model), "measuring has trained");
+        }
+        let before = (measured.weight.clone(), measured.gradient.clone());
+        measured.go_on(&stage, 0, Duration::ZERO).expect("nothing to do");
+        assert_eq!((&measured.weight, &measured.gradient), (&before.0, &before.1));
+        assert!(
+            measured.weight.iter().all(|weight| (0.5..=1.0).contains(weight)),
+            "{:?}",
+            measured.weight
+        );
+    }
+}

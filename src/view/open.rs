@@ -210,6 +210,20 @@ fn of_points(
     Ok(shown)
 }
 
+/// A dataset in a folder, to test with.
+#[cfg(test)]
+pub(super) fn stage_of(folder: &Path) -> Stage {
+    let looked = Looked {
+        what: folder,
+        other: None,
+        scene: None,
+        iteration: None,
+        near: 0.04,
+        data: DataSpec::default(),
+    };
+    open(looked, Machine::default(), &crate::run::Silent).expect("a scene").stage
+}
+
 impl Exhibition {
     /// Shows a model that is in the dataset's own coordinates.
     fn show(&mut self, name: String, model: Gaussians, near: f64) -> Result<(), Failure> {

@@ -51,7 +51,10 @@ image.src = arguments[0];
 """
 # Pixels of the marks over the picture.
 MARKED = """
-const { data } = marks.getContext("2d").getImageData(0, 0, marks.width, marks.height);
+const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
+[copy.width, copy.height] = [marks.width, marks.height];
+out.drawImage(marks, 0, 0);
+const { data } = out.getImageData(0, 0, copy.width, copy.height);
 return data.filter((value, i) => i % 4 === 3 && value).length;
 """
 # A camera that is drawn: where, and which one a click there goes to.
