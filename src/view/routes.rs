@@ -4,10 +4,10 @@ use serde::Deserialize;
 
 use super::asked::{self, Wanted};
 use super::board::{Board, Order};
+use super::darkroom::Frame;
 use super::desk::{Desk, Unmade};
 use super::door::Door;
 use super::http::{Answer, Method, Request};
-use super::pictures::Frame;
 use super::stage::Extent;
 
 const PAGE: &str = include_str!("page/index.html");
@@ -94,12 +94,16 @@ impl Routes<'_> {
 
 /// A picture, with what is known of it in the head.
 fn sent(frame: Frame) -> Answer {
-    let Frame { jpeg, size: (width, height), range, mean, distance, milliseconds } = frame;
+    let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } =
+        frame;
     let mut answer = Answer::of("image/jpeg", jpeg)
         .with("X-Size", format!("{width}x{height}"))
         .with("X-Milliseconds", format!("{milliseconds:.1}"));
     if let Some(range) = range {
         answer = answer.with("X-Range", format!("{} {}", range.start, range.end));
+    }
+    if let Some([seen, all]) = measured {
+        answer = answer.with("X-Measured", format!("{seen} {all}"));
     }
     let numbers = [("X-Mean", mean), ("X-Distance", distance)];
     for (name, value) in numbers.into_iter().filter_map(|(name, it)| Some((name, it?))) {
@@ -113,8 +117,11 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::*;
+    use crate::dataset::PointCloud;
     use crate::dataset::normalise::Normalisation;
+    use crate::run::finished::Machine;
     use crate::view::door::Place;
+    use crate::view::stage::{Shown, Stage};
 
     #[test]
     fn only_what_is_built_in_is_served() {
@@ -124,19 +131,17 @@ mod tests {
             has_secret: false,
         })
         .unwrap();
-        let extent = Extent {
-            models: 1,
-            views: [0, 0],
-            normalisation: Normalisation::IDENTITY,
-            counts: true,
-            paints: true,
-        };
-        let desk = Desk::default();
+        let none = || [Vec::new(), Vec::new()];
+        let points = PointCloud::default();
+        let (machine, place) = (Machine::default(), Normalisation::IDENTITY);
+        let mut stage = Stage::new(machine, "a".into(), place, [0.0; 3], none(), points);
+        stage.models.push(Shown { name: "a".into(), rows: 1, sh_degree: 0, near: 0.1 });
+        let desk = Desk::new(None, 1);
         desk.close();
         let routes = Routes {
             door: &door,
             desk: &desk,
-            extent: extent.clone(),
+            extent: stage.extent(),
             description: "{}".into(),
             board: None,
         };
@@ -179,7 +184,7 @@ mod tests {
         let live = Routes {
             door: &door,
             desk: &desk,
-            extent,
+            extent: stage.extent(),
             description: "{}".into(),
             board: Some(&board),
         };

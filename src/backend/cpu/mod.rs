@@ -344,6 +344,17 @@ impl Backend for CpuBackend {
         Ok(self.rendering(&frame))
     }
 
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
+        Ok(self.rendering(&frame))
+    }
+
     fn download_array(
         &self,
         array: ModelArray,

@@ -74,6 +74,18 @@ impl CpuBackend {
         sh_degree: u8,
         beside: Beside,
     ) -> Result<Frame, BackendError> {
+        self.forward_painted(camera, background, sh_degree, beside, None)
+    }
+
+    /// The same, with the rows in other colours than their own, where there are some.
+    pub(super) fn forward_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        beside: Beside,
+        colours: Option<&[[f32; 3]]>,
+    ) -> Result<Frame, BackendError> {
         if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
             return Err(BackendError::ImageTooLarge {
                 width: camera.width,
@@ -116,7 +128,13 @@ impl CpuBackend {
                 }
                 let (view, log2_reach) = (&view, blending.log2_reach);
                 let lanes = &mut *seen;
-                arch.dispatch(Project { view, log2_reach, params, rows, splats, seen: lanes });
+                let kernel =
+                    Project { view, log2_reach, params, rows, splats: &mut *splats, seen: lanes };
+                arch.dispatch(kernel);
+                if let Some(colours) = colours {
+                    let own = &colours[task * ROWS_PER_TASK..];
+                    splats.iter_mut().zip(own).for_each(|(splat, &own)| splat.colour = own);
+                }
                 seen.iter().map(|seen| seen.count_ones() as usize).sum()
             });
             clock.lap("project");

@@ -48,7 +48,7 @@ use super::{
     StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
 };
 use crate::camera::Camera;
-use crate::gaussians::{Gaussians, ModelArray};
+use crate::gaussians::{Gaussians, ModelArray, rgb_to_dc};
 use crate::memory::Ledger;
 
 pub use adapter::{adapters, may_be_present};
@@ -296,6 +296,23 @@ impl Backend for GpuBackend {
             passes.forward(to);
         })?;
         self.rendering(camera.width, camera.height)
+    }
+
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        // The colours take the place of band 0 meanwhile, which costs the device no memory.
+        let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
+        let own = self.parameters_of(&band, rows.clone())?;
+        let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
+        self.set_parameters(&band, rows.clone(), &painted)?;
+        let made = self.render(camera, background, 0);
+        self.set_parameters(&band, rows, &own)?;
+        made
     }
 
     fn download_array(

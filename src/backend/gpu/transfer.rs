@@ -185,9 +185,18 @@ impl GpuBackend {
         rows: Range<usize>,
         values: &[f32],
     ) -> Result<(), BackendError> {
-        let given = array.parameters(self.sizes.sh_degree);
+        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
+    }
+
+    /// Writes what [`parameters_of`](Self::parameters_of) returned.
+    pub(super) fn set_parameters(
+        &self,
+        given: &Range<usize>,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
         for to in self.sizes.parameters() {
-            if let Some((here, there)) = shared(&given, &to.parameters) {
+            if let Some((here, there)) = shared(given, &to.parameters) {
                 let mut all = match there.len() == to.numbers {
                     true => vec![0.0; to.numbers * rows.len()],
                     false => self.read_rows(&to, rows.clone())?,
