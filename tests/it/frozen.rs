@@ -132,7 +132,8 @@ fn the_others_step_as_ever() {
         for (free, frozen) in free.1.iter().zip(&frozen.1) {
             assert_eq!((&free.name, &free.shape), (&frozen.name, &frozen.shape));
             let [free_rows, frozen_rows] = [free, frozen].map(|tensor| by_rows(&tensor.values));
-            if free.shape[0] == ROWS {
+            // Bands that the model does not have are arrays without numbers.
+            if free.shape[0] == ROWS && !free_rows.is_empty() {
                 assert!(free_rows[FROZEN..] == frozen_rows[FROZEN..], "{}", free.name);
                 let rests = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
                 assert!(frozen_rows[..FROZEN].iter().all(rests), "{}", free.name);
