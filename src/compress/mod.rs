@@ -54,7 +54,7 @@ pub struct Options<'a> {
     pub seed: u64,
     /// Formats that the file may have, at least one; of those that hold equally many Gaussians the first is taken.
     pub formats: &'a [&'static Format],
-    /// The file, as [`file`] names it.
+    /// The file, as [`file()`] names it.
     pub output: &'a Path,
 }
 
