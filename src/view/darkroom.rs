@@ -25,7 +25,8 @@ use crate::metrics::flip_map;
 use crate::pictures::{photograph, picture, to_u8};
 use crate::views::ViewSource;
 
-/// Bytes of the stack of the thread that makes pictures. Decoders of photographs need the most of it, less than 64 KiB.
+/// Bytes of the stack of the thread that makes pictures. Decoders of photographs need the most of it, less than a
+/// quarter.
 pub(super) const STACK: usize = 512 << 10;
 /// Quality of a picture that stays: at least 38 dB from what was rendered, and 45 dB mostly.
 const STILL: u8 = 95;
@@ -265,12 +266,12 @@ mod tests {
     }
 
     #[test]
-    fn large_photographs_need_less_than_half_of_the_stack() {
+    fn large_photographs_need_less_than_a_quarter_of_the_stack() {
         let folder = tempfile::tempdir().expect("a folder");
         large_photographs(folder.path());
         let stage = stage_of(folder.path());
         std::thread::scope(|scope| {
-            let made = Builder::new().stack_size(STACK / 2).spawn_scoped(scope, || {
+            let made = Builder::new().stack_size(STACK / 4).spawn_scoped(scope, || {
                 for (kind, size) in
                     [(Kind::Photograph, (2364, 1773)), (Kind::Difference, (640, 480))]
                 {

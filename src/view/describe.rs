@@ -72,7 +72,6 @@ pub(super) fn describe(stage: &Stage) -> Value {
         "start": first.map(|camera| pose(&world(&camera))),
         "views": { "test": views[0], "train": views[1] },
         "points": {
-            "all": stage.points.len(),
             "positions": positions.collect::<Vec<_>>(),
             "colours": points.colours,
         },

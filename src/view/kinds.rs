@@ -112,7 +112,7 @@ impl Kind {
                 "How many Gaussians are blended into a pixel: what a picture costs.",
                 Some("Gaussians"),
             ),
-            Self::Rows => ("Gaussians apart", "Every Gaussian in a colour of its own.", None),
+            Self::Rows => ("Gaussians told apart", "Every Gaussian in a colour of its own.", None),
             Self::RowOpacity => {
                 ("Opacity of Gaussians", "Every Gaussian coloured by its opacity.", Some("opacity"))
             }
@@ -142,12 +142,13 @@ impl Kind {
             Self::RowAge => (
                 "Age of Gaussians",
                 "Every Gaussian coloured by the steps since it was made; if training was resumed meanwhile, at \
-                 least so many.",
+                 least that many.",
                 Some("steps"),
             ),
             Self::RowEdit => (
                 "Last edit of Gaussians",
-                "Every Gaussian coloured by the steps since the policy made or rewrote it.",
+                "Every Gaussian coloured by the steps since the policy made or rewrote it, as far as is \
+                 known if training was resumed.",
                 Some("steps"),
             ),
         };

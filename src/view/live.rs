@@ -102,7 +102,7 @@ impl Server {
             door: &self.door,
             desk: &desk,
             extent: stage.extent(),
-            description: describe::describe(&stage).to_string(),
+            description: describe::describe(&stage).to_string().into_bytes().into(),
             board: Some(&board),
         };
         thread::scope(|scope| {
@@ -114,6 +114,7 @@ impl Server {
             };
             let develops = darkroom::open(scope, desk, &stage).map_err(no_thread)?;
             let serves = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
+                let _closing = Closing(desk);
                 let answer = |request: &http::Request| routes.answer(request);
                 let served = http::serve(&routes.door.listener, &answer, &|| desk.is_over());
                 if let Err(error) = served {
@@ -209,7 +210,10 @@ impl Observer for Live<'_> {
             match self.board.next() {
                 Next::Checkpoint => return Between::Checkpoint,
                 Next::Step | Next::Stop => return Between::Step,
-                Next::Wait if self.observer.interrupt().is_some() => return Between::Step,
+                // Without a page nobody can let it go on.
+                Next::Wait if self.observer.interrupt().is_some() || self.desk.is_over() => {
+                    return Between::Step;
+                }
                 Next::Wait => self.draw(model, rows, PULSE),
             }
         }
@@ -218,5 +222,50 @@ impl Observer for Live<'_> {
     fn interrupt(&self) -> Option<Interrupt> {
         let stopped = || self.board.stops().then_some(STOPPED);
         self.observer.interrupt().or_else(stopped)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::{Device, Setup};
+    use crate::gaussians::Gaussians;
+    use crate::run::Silent;
+    use crate::view::board::Order;
+    use crate::view::open::stage_of;
+
+    #[test]
+    fn a_run_that_is_paused_goes_on_when_its_page_is_gone() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let frame = r#"{"w":8,"h":8,"fl_x":8,"fl_y":8,"frames":[{"file_path":"a.png",
+            "transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]}]}"#;
+        std::fs::write(folder.path().join("transforms.json"), frame).expect("a file");
+        image::RgbImage::new(8, 8).save(folder.path().join("a.png")).expect("a PNG");
+        let stage = stage_of(folder.path());
+        let (desk, board) = (Desk::new(Some(1), 1), Board::default());
+        board.begin(0, 10, 1, 1);
+        board.order(Order::Pause);
+        let (signals, step) = (SignalSet::default(), Cell::new(0));
+        let live = Live {
+            observer: &Silent,
+            desk: &desk,
+            board: &board,
+            stage: &stage,
+            rows: 1,
+            signals,
+            step,
+        };
+        let model = Gaussians::zeros(1, 0);
+        let mut backend = Device::default().backend(&model, &Setup::new(1)).expect("a backend");
+        thread::scope(|scope| {
+            let waits = scope.spawn(|| {
+                thread::sleep(5 * PULSE);
+                let is_paused = matches!(board.next(), Next::Wait);
+                desk.close();
+                is_paused
+            });
+            assert_eq!(live.between(&mut *backend, None), Between::Step);
+            assert!(desk.is_over() && waits.join().expect("it ends"), "it has not waited");
+        });
     }
 }

@@ -53,13 +53,13 @@ impl Measured {
         let backend = stage.machine.backend_to_measure(&model, shown.near, needs);
         let mut backend = backend.map_err(|error| error.to_string())?;
         backend.begin_epoch();
-        let views = stage.photographs(Split::Train).count();
+        let (views, rows) = (stage.photographs(Split::Train).count(), model.len());
         Ok(Self {
             backend: Some(backend),
             order: view_order(views, 0, 0),
             seen: 0,
-            gradient: Vec::new(),
-            weight: Vec::new(),
+            gradient: vec![0.0; rows],
+            weight: vec![0.0; rows],
         })
     }
 
@@ -81,9 +81,8 @@ impl Measured {
             let ahead = &self.order[self.seen + 1..self.order.len().min(self.seen + 3)];
             views.prefetch(ahead);
             let image = views.image(view).map_err(|error| error.to_string())?;
-            self.seen += 1;
             let input = StepInput {
-                step: self.seen as u32,
+                step: self.seen as u32 + 1,
                 view,
                 camera: views.camera(view),
                 target: &image,
@@ -97,6 +96,7 @@ impl Measured {
                 seed: 0,
             };
             backend.train_step(&input).map_err(|error| error.to_string())?;
+            self.seen += 1;
             if begun.elapsed() >= patience {
                 break;
             }

@@ -76,7 +76,7 @@ impl Server {
             door: &self.door,
             desk: &desk,
             extent: stage.extent(),
-            description: describe::describe(&stage).to_string(),
+            description: describe::describe(&stage).to_string().into_bytes().into(),
             board: None,
         };
         let failed = |message: String| Failure { code: OTHER, message };

@@ -16,8 +16,7 @@ pub(super) const BACKGROUND: [f32; 3] = [0.02, 0.02, 0.03];
 /// Share of the rows at each end of a scale that do not stretch it.
 const OUTLIERS: f64 = 0.01;
 /// Signals of which any says how strongly photographs pull at a row, the best first.
-pub(super) const GRADIENTS: [Signal; 3] =
-    [Signal::ScreenGradient, Signal::ScreenGradientAbs, Signal::MeanGradientNorm];
+const GRADIENTS: [Signal; 2] = [Signal::ScreenGradient, Signal::ScreenGradientAbs];
 
 /// The colours of all rows.
 #[derive(Debug, Clone)]
@@ -40,9 +39,11 @@ pub(super) struct Known<'a> {
 }
 
 impl Known<'_> {
-    /// The signal that says how strongly photographs pull at a row.
+    /// The signal that says how strongly photographs pull at a row, where the views are counted over which it is the
+    /// mean.
     pub(super) fn gradient(&self) -> Option<Signal> {
-        GRADIENTS.into_iter().find(|&signal| self.signals.contains(signal))
+        let counts = self.signals.contains(Signal::VisibleCount);
+        GRADIENTS.into_iter().find(|&signal| counts && self.signals.contains(signal))
     }
 }
 
@@ -82,8 +83,10 @@ impl Numbers {
         let width = (ends.end - ends.start).max(f32::MIN_POSITIVE);
         let colour = |&value: &f32| ramp::colour((value - ends.start) / width);
         let said = |end: f32| if self.is_logarithmic { f64::from(end).exp() } else { end.into() };
-        let range = said(ends.start)..said(ends.end);
-        Colours { rows: self.values.iter().map(colour).collect(), range: Some(range) }
+        // Where nothing has been measured yet, a scale would say something of it.
+        let is_known = self.values.iter().any(|value| value.is_finite());
+        let range = is_known.then(|| said(ends.start)..said(ends.end));
+        Colours { rows: self.values.iter().map(colour).collect(), range }
     }
 }
 
@@ -131,14 +134,11 @@ pub(super) fn colours(
             let values = match (known.measured, known.gradient()) {
                 (Some(measured), _) => measured.gradient.clone(),
                 (None, Some(gradient)) => {
-                    let (wanted, views) = ([gradient].into(), Signal::VisibleCount);
-                    match known.signals.contains(views) {
-                        true => reads(SignalSet::with(wanted, views), &|signals| {
-                            let of = |signal| signals.get(signal).unwrap_or_default();
-                            mean_over_views(of(gradient), of(views))
-                        })?,
-                        false => reads(wanted, &|signals| column(signals, gradient))?,
-                    }
+                    let views = Signal::VisibleCount;
+                    reads([gradient, views].into(), &|signals| {
+                        let of = |signal| signals.get(signal).unwrap_or_default();
+                        mean_over_views(of(gradient), of(views))
+                    })?
                 }
                 (None, None) => vec![0.0; backend.rows()],
             };

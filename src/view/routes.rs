@@ -1,5 +1,7 @@
 //! Which request gets what. No path names a file: what is served is built in, or made on request.
 
+use std::sync::Arc;
+
 use serde::Deserialize;
 
 use super::asked::{self, Wanted};
@@ -21,7 +23,7 @@ pub(super) struct Routes<'a> {
     pub(super) desk: &'a Desk,
     pub(super) extent: Extent,
     /// The [description](super::describe) of what is shown, as JSON.
-    pub(super) description: String,
+    pub(super) description: Arc<[u8]>,
     /// What is said of a run in training, and asked of it.
     pub(super) board: Option<&'a Board>,
 }
@@ -68,7 +70,9 @@ impl Routes<'_> {
             (Method::Get | Method::Head, "live.js") => {
                 text("text/javascript; charset=utf-8", LIVE_SCRIPT)
             }
-            (Method::Get | Method::Head, "scene") => json(self.description.clone()),
+            (Method::Get | Method::Head, "scene") => {
+                Answer::of("application/json", self.description.clone())
+            }
             (_, path)
                 if known.contains(&path)
                     || self.board.is_some() && known_of_training.contains(&path) =>
@@ -87,7 +91,10 @@ impl Routes<'_> {
             }
             Err(Unmade::Crowded) => Answer::refusal(503, "too many pages look at once; close some"),
             Err(Unmade::Failed(why)) => Answer::refusal(500, why),
-            Err(Unmade::Over) => Answer::refusal(503, "densify has ended; start it again"),
+            Err(Unmade::Over) => Answer::refusal(
+                503,
+                "no more pictures are made; start densify again when it has ended",
+            ),
         }
     }
 }
@@ -142,7 +149,7 @@ mod tests {
             door: &door,
             desk: &desk,
             extent: stage.extent(),
-            description: "{}".into(),
+            description: Arc::from(*b"{}"),
             board: None,
         };
         let status = |request: &Request| routes.answer(request).status();
@@ -185,7 +192,7 @@ mod tests {
             door: &door,
             desk: &desk,
             extent: stage.extent(),
-            description: "{}".into(),
+            description: Arc::from(*b"{}"),
             board: Some(&board),
         };
         let send = |body: &str| {

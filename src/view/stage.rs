@@ -21,7 +21,7 @@ const NO_HISTORY: &str = "no file says when a Gaussian was made or edited; densi
 const NO_PHOTOGRAPHS: &str = "no photographs are known; name their dataset with --scene";
 const NO_TRAINING_VIEWS: &str =
     "it is measured in training photographs, and none are known; name their dataset with --scene";
-pub(super) const NO_MODEL: &str = "points are no model yet";
+pub(super) const NO_MODEL: &str = "points are not a model yet";
 
 /// A model that is shown.
 pub(super) struct Shown {
@@ -162,7 +162,7 @@ impl Stage {
             stage.lacks(&[Kind::Count], NO_COUNTS);
         }
         let unmeasured = format!(
-            "the policy {policy} does not measure it; densify view does, when a model has been saved"
+            "the policy {policy} does not measure it; densify view does, once a model has been saved"
         );
         if (Known { signals, ..Known::default() }).gradient().is_none() {
             stage.lacks(&[Kind::RowGradient], &unmeasured);

@@ -344,18 +344,20 @@ impl CpuBackend {
         let (planes, layout) = (signals.planes(), signals.layout());
         let signal_stride = signals.blocks.stride();
         let storing = PolicyRng::new(input.seed, input.step);
-        let blocks = rows.div_ceil(WIDTH);
-        let tasks = blocks.div_ceil(BLOCKS_PER_TASK);
+        // Whole tasks of frozen rows have nothing to do.
+        let first_row = moments.first();
+        let blocks = first_row / WIDTH..rows.div_ceil(WIDTH);
+        let tasks = blocks.len().div_ceil(BLOCKS_PER_TASK);
         let per_task = signal_stride * BLOCKS_PER_TASK;
-        let sums = &sums[..blocks * WIDTH * layout.stride()];
+        let sums = &sums[first_row * layout.stride()..blocks.end * WIDTH * layout.stride()];
         let parts = (
-            params.tasks(rows),
+            params.tasks(rows).skip(first_row / ROWS_PER_TASK),
             moments.tasks(rows),
             masks.tasks(rows, rows - frozen),
-            ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
+            ages.of_rows_mut(rows).par_chunks_mut(ROWS_PER_TASK),
             parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),
-            visible[..blocks].par_chunks(BLOCKS_PER_TASK),
+            visible[blocks].par_chunks(BLOCKS_PER_TASK),
             self.summed.tasks(rows, tasks).enumerate(),
         );
         threads.install(|| {
@@ -363,6 +365,7 @@ impl CpuBackend {
                 "project_bwd + adam",
                 parts,
                 |(params, moments, masks, ages, signals, sums, visible, (task, summed))| {
+                    let first_row = first_row + task * ROWS_PER_TASK;
                     arch.dispatch(Optimise {
                         params,
                         moments,
@@ -382,9 +385,9 @@ impl CpuBackend {
                         due,
                         terms,
                         noise,
-                        first_row: task * ROWS_PER_TASK,
-                        frozen: frozen.saturating_sub(task * ROWS_PER_TASK),
-                        rows: rows - task * ROWS_PER_TASK,
+                        first_row,
+                        frozen: frozen.saturating_sub(first_row),
+                        rows: rows - first_row,
                     });
                 },
             );

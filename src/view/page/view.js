@@ -514,6 +514,9 @@ addEventListener("pointermove", (event) => {
   if (event.buttons) setBorder((event.clientX - stage.getBoundingClientRect().left) / area()[0]);
   else dragger = null;
 });
+for (const end of ["pointerup", "pointercancel"]) {
+  addEventListener(end, (event) => { if (event.pointerId === dragger) dragger = null; });
+}
 divider.addEventListener("keydown", (event) => {
   const to = { ArrowLeft: border - 0.02, ArrowRight: border + 0.02, Home: 0, End: 1 }[event.key];
   if (to === undefined) return;

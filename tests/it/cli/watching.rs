@@ -188,15 +188,17 @@ fn the_page_says_how_training_goes() {
         .collect();
     assert_eq!(kinds.len(), 14, "{kinds:?}");
     assert!(described["points"]["positions"].as_array().is_some_and(|it| !it.is_empty()));
-    let most = |kind: &str| {
+    let range = |kind: &str| {
         let reply = page.frame(&wish(kind, "test", 0, SIZE));
         let range = reply.header("X-Range").expect("a range").to_owned();
-        range.split_once(' ').and_then(|(_, most)| most.parse::<f64>().ok()).expect("a number")
+        let (least, most) = range.split_once(' ').expect("two numbers");
+        [least, most].map(|end| end.parse::<f64>().expect("a number"))
     };
     // Some rows are as old as the run, and some were edited since.
-    let [age, edit] = ["row_age", "row_edit"].map(most);
+    let [age, edit] = ["row_age", "row_edit"].map(|kind| range(kind)[1]);
     assert!(edit <= age && age <= step as f64 && age > 0.0, "{age} {edit} {step}");
-    assert!(most("row_gradient") > 0.0);
+    let [least, most] = range("row_gradient");
+    assert!(0.0 < least && least < most && most < 1.0, "{least} {most}");
 
     // What the policy does not measure is not shown, and it is said why.
     let (_root, other) = scratch();
