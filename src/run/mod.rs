@@ -42,7 +42,7 @@ pub use values::{
 };
 
 use crate::checkpoint::Fingerprint;
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, PointCloud};
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
@@ -109,6 +109,11 @@ impl Run {
     #[cfg(feature = "view")]
     pub(crate) fn dataset(&self) -> &Dataset {
         &self.dataset
+    }
+
+    /// Those points of the dataset that a page draws, if there is one.
+    pub(crate) fn take_points(&mut self) -> PointCloud {
+        std::mem::take(&mut self.dataset.points)
     }
 
     /// The trainer.

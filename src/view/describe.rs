@@ -1,6 +1,10 @@
 //! What the page is told when it opens: models, kinds of pictures, cameras, points, and where to begin.
 
+use std::mem;
+use std::sync::Arc;
+
 use glam::DVec3;
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::asked::{MOST_PIXELS, MOST_SIDE};
@@ -24,8 +28,35 @@ fn pose(camera: &Camera) -> Value {
     json!({ "camera_to_world": rows.as_flattened(), "fov": fov })
 }
 
-/// All of it.
-pub(super) fn describe(stage: &Stage) -> Value {
+/// Most that a point takes of the description `[bytes]`.
+pub(super) const POINT: usize = 128;
+
+/// What is said of everything else, and the points. There are many: as [`Value`]s they would take a multiple.
+#[derive(Serialize)]
+struct Description {
+    #[serde(flatten)]
+    rest: Value,
+    points: Points,
+}
+
+/// In the dataset's own coordinates, and their colours.
+#[derive(Serialize)]
+struct Points {
+    positions: Vec<[f64; 3]>,
+    colours: Vec<[u8; 3]>,
+}
+
+/// All of it, as JSON. The points go into it: nothing else needs them.
+pub(super) fn describe(stage: &mut Stage) -> Arc<[u8]> {
+    let points = mem::take(&mut stage.points).thinned(POINTS_TO_LOOK_AT);
+    let positions =
+        points.positions.iter().map(|&at| stage.normalisation.world_from_scene(at).to_array());
+    let points = Points { positions: positions.collect(), colours: points.colours };
+    let description = Description { rest: all_but_points(stage), points };
+    serde_json::to_vec(&description).expect("numbers and text are JSON").into()
+}
+
+fn all_but_points(stage: &Stage) -> Value {
     let world = |camera: &Camera| stage.normalisation.world_from_scene_camera(camera);
     let point = |scene: DVec3| stage.normalisation.world_from_scene(scene).to_array();
     let views = stage.views.each_ref().map(|views| {
@@ -48,8 +79,6 @@ pub(super) fn describe(stage: &Stage) -> Value {
             (up, if looks_inward { focus } else { ahead })
         }
     };
-    let points = stage.points.thinned(POINTS_TO_LOOK_AT);
-    let positions = points.positions.iter().map(|&at| point(at));
     let models = stage
         .models
         .iter()
@@ -71,10 +100,6 @@ pub(super) fn describe(stage: &Stage) -> Value {
         "radius": 1.0 / stage.normalisation.scale,
         "start": first.map(|camera| pose(&world(&camera))),
         "views": { "test": views[0], "train": views[1] },
-        "points": {
-            "positions": positions.collect::<Vec<_>>(),
-            "colours": points.colours,
-        },
     })
 }
 
@@ -82,6 +107,35 @@ pub(super) fn describe(stage: &Stage) -> Value {
 mod tests {
     use super::*;
     use crate::flight::Key;
+    use crate::view::open::stage_of;
+
+    #[test]
+    fn points_take_no_more_than_they_may() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let frame = r#"{"w":8,"h":8,"fl_x":8,"fl_y":8,"frames":[{"file_path":"a.png",
+            "transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]}]}"#;
+        std::fs::write(folder.path().join("transforms.json"), frame).expect("a file");
+        image::RgbImage::new(8, 8).save(folder.path().join("a.png")).expect("a PNG");
+        let mut stage = stage_of(folder.path());
+        let without = describe(&mut stage).len();
+        // As many digits as numbers can have.
+        let count = 2 * POINTS_TO_LOOK_AT;
+        stage.points.positions = vec![DVec3::splat(-1.234_567_890_123_456_7e30); count];
+        stage.points.colours = vec![[255; 3]; count];
+        let said = describe(&mut stage);
+        let points = said.len() - without;
+        assert!(
+            points <= POINTS_TO_LOOK_AT * POINT && points > POINTS_TO_LOOK_AT * POINT / 3,
+            "{points}"
+        );
+        assert!(stage.points.is_empty(), "they are held twice");
+        let said: Value = serde_json::from_slice(&said).expect("JSON");
+        assert_eq!(
+            said["points"]["positions"].as_array().expect("points").len(),
+            POINTS_TO_LOOK_AT
+        );
+        assert_eq!(said["title"], stage.title);
+    }
 
     #[test]
     fn a_camera_is_said_as_a_camera_path_has_it() {

@@ -3,6 +3,7 @@
 
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
 use std::time::Duration;
 
 use super::asked::Wanted;
@@ -196,14 +197,15 @@ pub(super) struct Closing<'a>(pub(super) &'a Desk);
 
 impl Drop for Closing<'_> {
     fn drop(&mut self) {
+        if thread::panicking() {
+            tracing::error!("no pictures are made for the page any more; this is a bug");
+        }
         self.0.close();
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::thread;
-
     use super::*;
     use crate::evaluate::Split;
     use crate::view::asked::Viewpoint;

@@ -42,8 +42,8 @@ const PULSE: Duration = Duration::from_millis(20);
 /// How a run ends that the page has stopped: as by a signal.
 const STOPPED: Interrupt = Interrupt { name: "the page", exit_code: 130 };
 
-/// Points that are drawn, and what is said of them `[bytes]`.
-const POINTS: u64 = POINTS_TO_LOOK_AT as u64 * 128;
+/// What is said of the points that are drawn `[bytes]`.
+const POINTS: u64 = (POINTS_TO_LOOK_AT * describe::POINT) as u64;
 /// Numbers per row while it is painted: what it is painted by, for its scale once more, and its colour; and on the host
 /// of a GPU the lengths of its axes, and colours of its own.
 const PAINT: u64 = 5;
@@ -95,14 +95,14 @@ impl Server {
         observer: &dyn Observer,
         train: impl FnOnce(Run, &dyn Observer) -> Result<T, Failure>,
     ) -> Result<T, Failure> {
-        let stage = Stage::of_run(&mut run);
+        let mut stage = Stage::of_run(&mut run);
         let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
         let (desk, board) = (Desk::new(Some(MOST_WISHES), AT_ONCE), Board::default());
         let routes = Routes {
             door: &self.door,
             desk: &desk,
             extent: stage.extent(),
-            description: describe::describe(&stage).to_string().into_bytes().into(),
+            description: describe::describe(&mut stage),
             board: Some(&board),
         };
         thread::scope(|scope| {
@@ -128,9 +128,8 @@ impl Server {
             let live = Live { observer, desk, board, stage, rows, signals, step };
             let trained = train(run, &live);
             desk.close();
-            if develops.join().is_err() {
-                tracing::error!("what makes the page's pictures has failed; this is a bug");
-            }
+            // If it has failed it has said so, and training needs none of it.
+            let _ = develops.join();
             trained
         })
     }

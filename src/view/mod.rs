@@ -70,13 +70,13 @@ impl Server {
         exhibition: Exhibition,
         is_over: &dyn Fn() -> bool,
     ) -> Result<(), Failure> {
-        let Exhibition { stage, mut backends } = exhibition;
+        let Exhibition { mut stage, mut backends } = exhibition;
         let desk = Desk::new(None, AT_ONCE);
         let routes = Routes {
             door: &self.door,
             desk: &desk,
             extent: stage.extent(),
-            description: describe::describe(&stage).to_string().into_bytes().into(),
+            description: describe::describe(&mut stage),
             board: None,
         };
         let failed = |message: String| Failure { code: OTHER, message };
@@ -109,7 +109,7 @@ impl Server {
             let rendered = renders.join().and(develops.join());
             served
                 .map_err(|error| failed(format!("the page cannot be served any more: {error}")))?;
-            rendered.map_err(|_| failed("what renders has failed; this is a bug".into()))
+            rendered.map_err(|_| failed("what makes the pictures has failed; this is a bug".into()))
         })
     }
 }

@@ -57,7 +57,7 @@ pub(super) struct Stage {
     /// The views of the dataset, in its order: those held out, those trained on.
     pub(super) views: [Vec<View>; 2],
     photographs: [DatasetViews; 2],
-    /// Points that the dataset brings, in scene coordinates.
+    /// Points that the dataset brings, in scene coordinates, until they are part of the description.
     pub(super) points: PointCloud,
     /// Where to look from at first, where there are no views.
     pub(super) start: Option<Camera>,
@@ -143,6 +143,7 @@ impl Stage {
     pub(super) fn of_run(run: &mut Run) -> Self {
         let counts = run.trainer().backend().counts_rows();
         let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
+        let points = run.take_points();
         let (config, dataset) = (run.config(), run.dataset());
         let title = name_of(&config.scene_path());
         let background = config.spec.data.background.fixed();
@@ -155,7 +156,6 @@ impl Stage {
         }];
         let views = [dataset.test.clone(), dataset.train.clone()];
         let place = (dataset.normalisation, background);
-        let points = dataset.points.clone();
         let stage = Self::keeping(0, Machine::default(), title, place, views, points);
         let mut stage = Self { models, largest: Some(dataset.largest_image()), ..stage };
         if !counts {

@@ -28,10 +28,13 @@ small.width = small.height = 48;
 const out = small.getContext("2d", { willReadFrequently: true });
 out.drawImage(document.getElementById("picture"), 0, 0, 48, 48);
 const { data } = out.getImageData(0, 0, 48, 48);
-const light = [];
-for (let i = 0; i < data.length; i += 4) light.push(data[i] + data[i + 1] + data[i + 2]);
+const light = [], colours = new Set();
+for (let i = 0; i < data.length; i += 4) {
+  light.push(data[i] + data[i + 1] + data[i + 2]);
+  colours.add([0, 1, 2].map((c) => data[i + c] >> 5).join());
+}
 const mean = light.reduce((a, b) => a + b) / light.length;
-return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join() };
+return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join(), colours: colours.size };
 """
 # Decibels between the right one of two pictures and a PNG, of one size.
 PSNR = """
@@ -257,10 +260,12 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     # Flying by key, as fast as pictures come.
     keys = lambda kind: [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": "s"}]}]
     browser.run("document.getElementById('marks').focus()")
+    before = browser.run("return [...camera.at]")
     browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyDown")})
     time.sleep(1.5)
     browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyUp")})
     browser.is_sharp()
+    assert browser.run("return length(add(camera.at, arguments[0], -1))", before) > 0, "no key flies"
     rate, rested = browser.run(pace)
     print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
     # Two fingers that part go nearer.

@@ -46,8 +46,8 @@ use densify::verify::{Subject, cases, table};
 use crate::subject::others;
 
 /// Cases that take software drivers, and a processor without its vectors, a minute or more each;
-/// `densify selftest --gpu NAME 11 21 30` runs them.
-const SLOW: [u8; 3] = [11, 21, 30];
+/// `densify selftest --gpu NAME 11 13 21 30` runs them. Long lists are on every device in `gpu/long_lists.rs`.
+const SLOW: [u8; 4] = [11, 13, 21, 30];
 
 /// Fails with the lines of all cases that do not hold; those numbered in `but` are not tried.
 fn check(subject: &Subject, but: &[u8]) {

@@ -7,8 +7,9 @@ use densify::verify::reference::CLASSES;
 use densify::verify::values::SIZES;
 use densify::verify::{Setup, Subject, scenes};
 use proptest::prelude::*;
+use proptest::test_runner::{TestCaseResult, TestRunner};
 
-use crate::subject::{GREY, bits, cases, class, make_with, repeatable};
+use crate::subject::{GREY, bits, cases_on, class, make_with, on_each, repeatable};
 
 /// A row: position in the camera's axes as shares of the image and depth, log-scales, quaternion,
 /// opacity logit, and what its colours are drawn from.
@@ -56,12 +57,6 @@ fn render(
     backend.render(camera, background, model.sh_degree).expect("a small image is rendered")
 }
 
-/// The repeatable backends; SwiftShader is left out, which takes seconds a case.
-fn fast() -> Vec<Subject> {
-    let is_slow = |subject: &Subject| subject.name().contains("SwiftShader");
-    repeatable().into_iter().filter(|subject| !is_slow(subject)).collect()
-}
-
 /// Depths as a backend has them: rows at the same one are drawn in their order.
 fn depths(model: &Gaussians, camera: &Camera) -> Vec<f64> {
     let depth = |mean: &[f32; 3]| camera.project(mean.map(f64::from).into()).1;
@@ -70,17 +65,20 @@ fn depths(model: &Gaussians, camera: &Camera) -> Vec<f64> {
     depths
 }
 
-proptest! {
-    #![proptest_config(cases(24))]
+/// Checks that something holds of any such input, on every repeatable backend.
+fn for_any<S: Strategy>(inputs: &S, check: impl Fn(&Subject, S::Value) -> TestCaseResult) {
+    on_each(repeatable(), |subject| {
+        let mut runner = TestRunner::new(cases_on(subject, 24));
+        let outcome = runner.run(inputs, |input| check(subject, input));
+        outcome.unwrap_or_else(|error| panic!("{}: {error}", subject.name()));
+    });
+}
 
-    #[test]
-    fn any_finite_scene_is_rendered_in_any_order_and_in_any_bands(
-        camera in view(),
-        degree in 0..=3_u8,
-        rows in prop::collection::vec(row(), 0..60),
-        by in 0..60_usize,
-        cap in 1..400_usize,
-    ) {
+#[test]
+fn any_finite_scene_is_rendered_in_any_order_and_in_any_bands() {
+    let rows = prop::collection::vec(row(), 0..60);
+    let inputs = (view(), 0..=3_u8, rows, 0..60_usize, 1..400_usize);
+    for_any(&inputs, |subject, (camera, degree, rows, by, cap)| {
         let whole = model(&camera, degree, &rows);
         let depths = depths(&whole, &camera);
         let mut turned = whole.clone();
@@ -90,51 +88,48 @@ proptest! {
         turned.quats.rotate_left(by);
         turned.opacity_logits.rotate_left(by);
         turned.sh.rotate_left(by * 3 * sh_coefficients(degree));
-        for subject in fast() {
-            let render = |model: &Gaussians, cap| render(&subject, model, &camera, GREY, cap);
-            let image = render(&whole, None);
-            prop_assert!(image.rgb.iter().chain(&image.depth).all(|v| v.is_finite()));
-            let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
-            let mut backend = make_with(&subject, &whole, Setup::default());
-            let outcome = backend.differentiate(&camera, GREY, degree, &upstream);
-            let (_, gradient) = outcome.expect("a small image is rendered");
-            for name in CLASSES {
-                prop_assert!(class(&gradient, name).iter().all(|g| g.is_finite()), "{}", name);
-            }
-            prop_assert!(image.alpha.iter().all(|a| (0.0..=1.0).contains(a)));
-            prop_assert!(bits(&render(&whole, Some(cap))) == bits(&image), "bands");
-            if depths.windows(2).all(|pair| pair[1] - pair[0] > 1e-5 * pair[1].abs()) {
-                prop_assert!(bits(&render(&turned, None)) == bits(&image), "order");
-            }
+        let render = |model: &Gaussians, cap| render(subject, model, &camera, GREY, cap);
+        let image = render(&whole, None);
+        prop_assert!(image.rgb.iter().chain(&image.depth).all(|v| v.is_finite()));
+        let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
+        let mut backend = make_with(subject, &whole, Setup::default());
+        let outcome = backend.differentiate(&camera, GREY, degree, &upstream);
+        let (_, gradient) = outcome.expect("a small image is rendered");
+        for name in CLASSES {
+            prop_assert!(class(&gradient, name).iter().all(|g| g.is_finite()), "{}", name);
         }
-    }
+        prop_assert!(image.alpha.iter().all(|a| (0.0..=1.0).contains(a)));
+        prop_assert!(bits(&render(&whole, Some(cap))) == bits(&image), "bands");
+        if depths.windows(2).all(|pair| pair[1] - pair[0] > 1e-5 * pair[1].abs()) {
+            prop_assert!(bits(&render(&turned, None)) == bits(&image), "order");
+        }
+        Ok(())
+    });
+}
 
-    #[test]
-    fn what_is_not_seen_changes_nothing_and_the_background_enters_linearly(
-        camera in view(),
-        rows in prop::collection::vec(row(), 0..40),
-        background in prop::array::uniform3(0.0..1.0_f32),
-        place in 0..3_usize,
-    ) {
+#[test]
+fn what_is_not_seen_changes_nothing_and_the_background_enters_linearly() {
+    let rows = prop::collection::vec(row(), 0..40);
+    let inputs = (view(), rows, prop::array::uniform3(0.0..1.0_f32), 0..3_usize);
+    for_any(&inputs, |subject, (camera, rows, background, place)| {
         let seen = model(&camera, 1, &rows);
         let mut more = seen.clone();
         let (local, logit) =
             [([0.0, 0.0, -1.0], 1.0), ([500.0, 0.0, 2.0], 1.0), ([0.0, 0.0, 2.0], -6.0)][place];
         let mean = scenes::world(&camera, local);
         scenes::push(&mut more, mean, [0.1; 3], [1.0, 0.0, 0.0, 0.0], logit, |_| 0.3);
-        for subject in fast() {
-            let render = |model: &Gaussians, on| render(&subject, model, &camera, on, None);
-            let on_black = render(&seen, [0.0; 3]);
-            prop_assert!(bits(&render(&more, [0.0; 3])) == bits(&on_black));
-            let on_colour = render(&seen, background);
-            for (p, alpha) in on_black.alpha.iter().enumerate() {
-                for (c, background) in background.iter().enumerate() {
-                    let black = on_black.rgb[3 * p + c];
-                    let expected = black + (1.0 - alpha) * background;
-                    let off = (on_colour.rgb[3 * p + c] - expected).abs();
-                    prop_assert!(off <= 1e-6 * (1.0 + black.abs()), "pixel {p}: {off:e}");
-                }
+        let render = |model: &Gaussians, on| render(subject, model, &camera, on, None);
+        let on_black = render(&seen, [0.0; 3]);
+        prop_assert!(bits(&render(&more, [0.0; 3])) == bits(&on_black));
+        let on_colour = render(&seen, background);
+        for (p, alpha) in on_black.alpha.iter().enumerate() {
+            for (c, background) in background.iter().enumerate() {
+                let black = on_black.rgb[3 * p + c];
+                let expected = black + (1.0 - alpha) * background;
+                let off = (on_colour.rgb[3 * p + c] - expected).abs();
+                prop_assert!(off <= 1e-6 * (1.0 + black.abs()), "pixel {p}: {off:e}");
             }
         }
-    }
+        Ok(())
+    });
 }

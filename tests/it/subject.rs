@@ -135,11 +135,14 @@ pub(crate) fn make_with(
     subject.with(model, setup).expect("a small model fits")
 }
 
-/// How proptest is set up: as many cases as `PROPTEST_CASES` says, or so many.
-pub(crate) fn cases(default: u32) -> ProptestConfig {
+/// How proptest is set up for a backend: as many cases as `PROPTEST_CASES` says, or so many; on devices an eighth, as
+/// software drivers take forty times as long.
+pub(crate) fn cases_on(subject: &Subject, default: u32) -> ProptestConfig {
     let base = ProptestConfig { failure_persistence: None, ..ProptestConfig::default() };
     let is_set = std::env::var_os("PROPTEST_CASES").is_some();
-    ProptestConfig { cases: if is_set { base.cases } else { default }, ..base }
+    let all = if is_set { base.cases } else { default };
+    let cases = if matches!(subject, Subject::Gpu(_)) { all.div_ceil(8) } else { all };
+    ProptestConfig { cases, ..base }
 }
 
 /// A training step towards an image, at the degree of the model.

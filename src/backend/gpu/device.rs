@@ -175,6 +175,14 @@ impl Device {
         }
     }
 
+    /// The error of a device that has failed. It is kept: what should have been done was not, so that nothing that
+    /// the device does from now on is what it seems.
+    pub(super) fn failed(&self, why: String) -> BackendError {
+        lock(&self.reported).error.get_or_insert_with(|| why.clone());
+        let device = self.summary.name.clone();
+        self.check().err().unwrap_or(BackendError::Device { device, why })
+    }
+
     /// Runs `create`, with the device's errors as ours.
     pub(super) fn guarded<T>(
         &self,
@@ -248,6 +256,78 @@ pub(crate) mod faults {
             }
             Some(left) => LEFT.set(Some(left - 1)),
             None => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DMat3, DVec3};
+
+    use super::super::adapter::adapters;
+    use super::*;
+    use crate::backend::{AdapterKind, Backend};
+    use crate::camera::Camera;
+
+    /// Software drivers, opened anew: what is lost cannot be used again.
+    #[expect(clippy::print_stderr, reason = "a skipped test must say so")]
+    fn drivers() -> Vec<GpuDevice> {
+        let is_software =
+            |it: &AdapterSummary| it.kind == AdapterKind::Software && it.missing.is_empty();
+        let choice = |it: AdapterSummary| AdapterChoice { name: Some(it.name), accumulation: None };
+        let found = adapters().into_iter().filter(is_software).map(choice);
+        let found: Vec<GpuDevice> =
+            found.map(|it| GpuDevice::open(&it).expect("a driver")).collect();
+        if found.is_empty() {
+            let needed = std::env::var_os("DENSIFY_REQUIRE_GPU").is_some();
+            assert!(!needed, "DENSIFY_REQUIRE_GPU is set, but there is no software driver");
+            eprintln!("skipped: there is no software driver whose device could be lost");
+        }
+        found
+    }
+
+    fn model() -> (Gaussians, Camera) {
+        let mut model = Gaussians::zeros(2, 0);
+        model.means = vec![[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]];
+        model.quats = vec![[1.0, 0.0, 0.0, 0.0]; 2];
+        (model, Camera::centred((16, 16), (16.0, 16.0), DMat3::IDENTITY, DVec3::ZERO))
+    }
+
+    #[test]
+    fn a_model_whose_own_colours_are_not_restored_is_not_used_any_more() {
+        let (model, camera) = model();
+        for number in 0..drivers().len() {
+            let mut failed = 0;
+            for checks in 0.. {
+                let device = drivers().swap_remove(number);
+                let mut backend =
+                    GpuBackend::new(&model, &Setup::new(2), &device).expect("a backend");
+                let paint =
+                    || backend.render_painted(&camera, [0.0; 3], &[[1.0, 0.0, 0.0]; 2]).err();
+                let (error, lost) = faults::with_device_lost_after(checks, paint);
+                if !lost {
+                    assert!(error.is_none() && failed > 2, "{checks} checks: {error:?}");
+                    assert!(
+                        backend.download().expect("a model") == model,
+                        "its colours have changed"
+                    );
+                    break;
+                }
+                failed += 1;
+                assert!(error.is_some() && backend.download().is_err(), "after {checks} checks");
+            }
+        }
+    }
+
+    #[test]
+    fn a_device_that_has_failed_once_has_failed() {
+        let (model, camera) = model();
+        for device in drivers() {
+            let mut backend = GpuBackend::new(&model, &Setup::new(2), &device).expect("a backend");
+            assert!(backend.render(&camera, [0.0; 3], 0).is_ok());
+            device.0.failed("nothing can be mapped".into());
+            let error = backend.render(&camera, [0.0; 3], 0).expect_err("it has failed");
+            assert!(error.to_string().contains("nothing can be mapped"), "{error}");
         }
     }
 }

@@ -311,6 +311,7 @@ impl Backend for GpuBackend {
         let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
         self.set_parameters(&band, rows.clone(), &painted)?;
         let made = self.render(camera, background, 0);
+        // If that fails the device has: it takes no step with these colours.
         self.set_parameters(&band, rows, &own)?;
         made
     }

@@ -34,16 +34,12 @@ pub(super) fn finish(
     bytes: u64,
 ) -> Result<Vec<u8>, BackendError> {
     device.queue.submit([encoder.finish()]);
-    let failed = |why: String| {
-        let name = device.summary.name.clone();
-        device.check().err().unwrap_or(BackendError::Device { device: name, why })
-    };
     let slice = staging.slice(..bytes);
     // Whether it can be mapped shows when it is read.
     slice.map_async(MapMode::Read, |_| ());
-    device.device.poll(PollType::wait_indefinitely()).map_err(|e| failed(e.to_string()))?;
+    device.device.poll(PollType::wait_indefinitely()).map_err(|e| device.failed(e.to_string()))?;
     device.check()?;
-    let copied = slice.get_mapped_range().map_err(|e| failed(e.to_string()))?.to_vec();
+    let copied = slice.get_mapped_range().map_err(|e| device.failed(e.to_string()))?.to_vec();
     staging.unmap();
     Ok(copied)
 }

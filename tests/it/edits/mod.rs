@@ -22,7 +22,7 @@ use densify_policies::rng::PolicyRng;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
-use crate::subject::{cases, make_with, repeatable, step_input, turned_away};
+use crate::subject::{cases_on, make_with, repeatable, step_input, turned_away};
 use calls::{Call, call, enter};
 use plain::{Row, execute};
 
@@ -191,10 +191,11 @@ fn any_plans_do_to_the_backend_what_they_do_to_a_plain_vector() {
     for subject in repeatable() {
         let twin = twin(&subject);
         let plans = prop::collection::vec(prop::collection::vec(call(), 0..40), 1..4);
-        let outcome = TestRunner::new(cases(32)).run(&(0..14_usize, plans), |(spare, plans)| {
-            check_plans(&subject, &twin, spare, &plans);
-            Ok(())
-        });
+        let outcome =
+            TestRunner::new(cases_on(&subject, 32)).run(&(0..14_usize, plans), |(spare, plans)| {
+                check_plans(&subject, &twin, spare, &plans);
+                Ok(())
+            });
         outcome.unwrap_or_else(|error| panic!("{}: {error}", subject.name()));
     }
 }
