@@ -105,7 +105,7 @@ fn every_policy_goes_on_a_device_as_if_nothing_had_been() {
     if let Some(device) = devices().first() {
         let name = device.adapter().name.split(' ').next().expect("a name");
         // Few Gaussians: software drivers take long for each, and it is states and edits that are tested.
-        every_policy_goes_on(&format!("--budget 450 --backend gpu --gpu {name} --deterministic"));
+        every_policy_goes_on(&format!("--budget 900 --backend gpu --gpu {name} --deterministic"));
     }
 }
 
