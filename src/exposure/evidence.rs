@@ -14,7 +14,7 @@ pub const MIN_STOPS: f64 = 0.3;
 /// Gains must leave at most this share of the difference between the colours.
 pub const MOST_LEFT: f64 = 0.8;
 /// Stops per doubling of an encoded value: the sRGB curve is nearly the power 1/2.4.
-const STOPS: f64 = 2.4;
+pub(super) const STOPS: f64 = 2.4;
 
 /// How the exposures of the training views differ.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
