@@ -5,7 +5,7 @@
 // are summed over views where the optimiser steps less often than every iteration (summed.rs).
 
 @group(0) @binding(1) var<storage, read> state: State;
-// Parameters, moments, and the gradients summed so far.
+// Parameters; moments and the gradients summed so far, of rows that are not frozen.
 @group(0) @binding(2) var<storage, read_write> params: array<f32>;
 @group(0) @binding(3) var<storage, read_write> first: array<f32>;
 @group(0) @binding(4) var<storage, read_write> second: array<f32>;
@@ -34,25 +34,26 @@ fn is_set(bit: u32) -> bool {
     return (frame.draw.z & bit) != 0u;
 }
 
-// The gradient of parameter `at` together with what waits for it; or 0 where it goes on waiting.
-fn exchange(at: u32, g: f32, steps: bool, waited: bool) -> f32 {
+// The gradient of a parameter together with what waits for it, at `own`; or 0 where it goes on waiting.
+fn exchange(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
     if !steps {
-        waiting[at] += g;
+        waiting[own] += g;
         return 0.0;
     }
     if waited {
-        let sum = g + waiting[at];
-        waiting[at] = 0.0;
+        let sum = g + waiting[own];
+        waiting[own] = 0.0;
         return sum;
     }
     return g;
 }
 
-fn step(at: u32, g: f32, rate: f32, correction: vec2<f32>) {
-    let m = first[at] * BETA1 + g * (1.0 - BETA1);
-    let v = second[at] * BETA2 + g * g * (1.0 - BETA2);
-    first[at] = m;
-    second[at] = v;
+// Steps the parameter at `at`, whose moments are at `own`.
+fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
+    let m = first[own] * BETA1 + g * (1.0 - BETA1);
+    let v = second[own] * BETA2 + g * g * (1.0 - BETA2);
+    first[own] = m;
+    second[own] = v;
     params[at] -= m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
 }
 
@@ -96,22 +97,24 @@ fn adam_band(
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
+    let own = row - frame.frozen.x;
     let is_rest = now.a > 0u;
     let steps = is_set(select(MAIN_STEPS, REST_STEPS, is_rest));
     let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
     let rate = select(frame.more_rates.x, frame.more_rates.y, is_rest);
     let apart = is_rest && is_set(REST_AGES);
-    let age = grown(select(ages[row] & 0xffffu, ages[row] >> 16u, apart));
+    let age = grown(select(ages[own] & 0xffffu, ages[own] >> 16u, apart));
     let correction = bias[min(age, MATURE)];
-    let by_colour = gradient[5u * row + 3u].xyz;
-    let d = gradient[5u * row + 4u].xyz;
+    let by_colour = gradient[5u * own + 3u].xyz;
+    let d = gradient[5u * own + 4u].xyz;
     for (var k = 0u; k < now.b; k++) {
         let g = basis_of(now.a + k, d) * by_colour;
         let at = 3u * (row * now.b + k);
+        let own_at = 3u * (own * now.b + k);
         for (var channel = 0u; channel < 3u; channel++) {
-            let sum = exchange(at + channel, g[channel], steps, waited);
+            let sum = exchange(own_at + channel, g[channel], steps, waited);
             if steps {
-                step(at + channel, sum, rate, correction);
+                step(at + channel, own_at + channel, sum, rate, correction);
             }
         }
     }
@@ -129,7 +132,8 @@ fn adam_geometry(
     }
     let steps = is_set(MAIN_STEPS);
     let waited = is_set(MAIN_WAITED);
-    let age = ages[row];
+    let own = row - frame.frozen.x;
+    let age = ages[own];
     let correction = bias[min(grown(age & 0xffffu), MATURE)];
     let base = 12u * row;
     var add = array<f32, 11>();
@@ -142,14 +146,14 @@ fn adam_geometry(
         }
     }
     for (var k = 0u; k < 11u; k++) {
-        let g = gradient[5u * row + k / 4u][k % 4u] + add[k];
-        let sum = exchange(base + k, g, steps, waited);
+        let g = gradient[5u * own + k / 4u][k % 4u] + add[k];
+        let sum = exchange(12u * own + k, g, steps, waited);
         if steps {
             var rate = frame.rates.x;
             if k >= 3u { rate = frame.rates.y; }
             if k >= 6u { rate = frame.rates.z; }
             if k >= 10u { rate = frame.rates.w; }
-            step(base + k, sum, rate, correction);
+            step(base + k, 12u * own + k, sum, rate, correction);
         }
     }
     var main_age = age & 0xffffu;
@@ -164,7 +168,7 @@ fn adam_geometry(
     if is_set(REST_STEPS) && is_set(REST_AGES) {
         rest_age = grown(rest_age);
     }
-    ages[row] = main_age | rest_age << 16u;
+    ages[own] = main_age | rest_age << 16u;
 }
 
 // Brings the parameters of a row back to where they are safe.

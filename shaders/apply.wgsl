@@ -1,6 +1,7 @@
 // Stage 9: executes a compiled plan in place, in chunks of operations; src/backend/cpu/apply.rs.
 // Pass 1 writes families, updates and seeds, no row twice; pass 2 moves tail rows into holes and brings all
-// rows into their order. Each buffer that has rows is edited by itself.
+// rows into their order. Each buffer that has rows is edited by itself; in those that have none for frozen rows,
+// rows are counted from the first that is not.
 
 // Numbers per operation.
 const WORDS: u32 = 20u;
@@ -263,7 +264,7 @@ const OPACITY_LEAST: f32 = 2e-4;
 
 // Takes something off opacities and scales; now.a: rows, now.b: bits of what opacities lose, now.c: bits of
 // the logarithm of the factor of scales, now.d: where the numbers of views that have shown each row begin in
-// `signals`, or NONE if rows decay that none has shown too. The first number of `ops`: the first row.
+// `signals`, or NONE if rows decay that none has shown too. The first number of `ops`: the first row that is not frozen.
 @compute @workgroup_size(256)
 fn decay(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -273,7 +274,7 @@ fn decay(
     if row < ops[0] || row >= now.a {
         return;
     }
-    if now.d != NONE && !(signals[now.d + row] > 0.0) {
+    if now.d != NONE && !(signals[now.d + row - ops[0]] > 0.0) {
         return;
     }
     let loss = bitcast<f32>(now.b);
@@ -291,7 +292,7 @@ fn decay(
 }
 
 // Bounds all opacities and forgets their moments; now.a: rows, now.b: bits of the largest logit,
-// now.c: whether gradients of the opacity wait for a step. The first number of `ops`: the first row.
+// now.c: whether gradients of the opacity wait for a step. The first number of `ops`: the first row that is not frozen.
 @compute @workgroup_size(256)
 fn clamp_opacity(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -303,9 +304,10 @@ fn clamp_opacity(
     }
     let at = 12u * row + 10u;
     rows[at] = min(rows[at], bitcast<f32>(now.b));
-    first_rows[at] = 0.0;
-    second_rows[at] = 0.0;
+    let own = at - 12u * ops[0];
+    first_rows[own] = 0.0;
+    second_rows[own] = 0.0;
     if now.c != 0u {
-        waiting_rows[at] = 0.0;
+        waiting_rows[own] = 0.0;
     }
 }

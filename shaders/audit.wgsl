@@ -7,18 +7,19 @@
 
 const NOT_FINITE: u32 = 0x7f800000u;
 
-// now.a: rows; now.b: numbers per row; now.c: place of the first.
+// now.a: rows; now.b: numbers per row; now.c: place of the first; now.d: the first row that has numbers.
 @compute @workgroup_size(256)
 fn audit(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let row = group_of(id) * GROUP + lane;
+    let own = group_of(id) * GROUP + lane;
+    let row = own + now.d;
     if row >= now.a || marks[row] != 0u {
         return;
     }
     for (var k = 0u; k < now.b; k++) {
-        if (numbers[row * now.b + k] & NOT_FINITE) == NOT_FINITE {
+        if (numbers[own * now.b + k] & NOT_FINITE) == NOT_FINITE {
             marks[row] = now.c + k + 1u;
             return;
         }

@@ -23,21 +23,22 @@ fn step_masks(
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
+    let own = row - frame.frozen.x;
     let start = bitcast<f32>(now.a);
     let opacity_at = 12u * row + 10u;
-    let g_opacity = gradient[5u * row + 2u].z;
-    let g_scales = gradient[5u * row].w + gradient[5u * row + 1u].x + gradient[5u * row + 1u].y;
+    let g_opacity = gradient[5u * own + 2u].z;
+    let g_scales = gradient[5u * own].w + gradient[5u * own + 1u].x + gradient[5u * own + 1u].y;
     let by_factor = g_opacity / sigmoid(-rows[opacity_at]) + g_scales;
-    let m = start + mask_offsets[row];
+    let m = start + mask_offsets[own];
     let g = (by_factor + bitcast<f32>(now.c)) * sigmoid(m) * sigmoid(-m);
-    let first = mask_moments[2u * row] * BETA1 + g * (1.0 - BETA1);
-    let second = mask_moments[2u * row + 1u] * BETA2 + g * g * (1.0 - BETA2);
-    let correction = bias[min((ages[row] & 0xffffu) + 1u, MATURE)];
+    let first = mask_moments[2u * own] * BETA1 + g * (1.0 - BETA1);
+    let second = mask_moments[2u * own + 1u] * BETA2 + g * g * (1.0 - BETA2);
+    let correction = bias[min((ages[own] & 0xffffu) + 1u, MATURE)];
     let step = first * correction.x * bitcast<f32>(now.b) / (sqrt(second) * correction.y + EPSILON);
-    mask_offsets[row] -= step;
-    mask_moments[2u * row] = first;
-    mask_moments[2u * row + 1u] = second;
-    if start + mask_offsets[row] <= bitcast<f32>(now.d) {
+    mask_offsets[own] -= step;
+    mask_moments[2u * own] = first;
+    mask_moments[2u * own + 1u] = second;
+    if start + mask_offsets[own] <= bitcast<f32>(now.d) {
         rows[opacity_at] = -LOGIT_MAX;
     }
 }

@@ -4,7 +4,7 @@
 // Sums of the records, one record per row.
 @group(0) @binding(6) var<storage, read> row_sums: array<f32>;
 @group(0) @binding(7) var<storage, read> depths: array<u32>;
-// Five per row: by mean and log-scale x | log-scale y, z, quaternion w, x | quaternion y, z, logit,
+// Five per row that is not frozen: by mean and log-scale x | log-scale y, z, quaternion w, x | quaternion y, z, logit,
 // projected mean x | colour (through its clamp), projected mean y | direction of view, unused.
 @group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
 
@@ -14,12 +14,13 @@ fn project_bwd(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let i = group_of(id) * GROUP + lane;
-    if i >= frame.model.x {
+    if i < frame.frozen.x || i >= frame.model.x {
         return;
     }
+    let to = 5u * (i - frame.frozen.x);
     if depths[i] == NONE {
         for (var k = 0u; k < 5u; k++) {
-            gradient[5u * i + k] = vec4(0.0);
+            gradient[to + k] = vec4(0.0);
         }
         return;
     }
@@ -95,11 +96,11 @@ fn project_bwd(
     // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
     let by_logit = q / (1.0 + exp_exact(row.logit));
 
-    gradient[5u * i] = vec4(by_mean, by_log_scale.x);
-    gradient[5u * i + 1u] = vec4(by_log_scale.yz, by_w, by_v.x);
-    gradient[5u * i + 2u] = vec4(by_v.yz, by_logit, dm.x);
-    gradient[5u * i + 3u] = vec4(dc, dm.y);
-    gradient[5u * i + 4u] = vec4(d, 0.0);
+    gradient[to] = vec4(by_mean, by_log_scale.x);
+    gradient[to + 1u] = vec4(by_log_scale.yz, by_w, by_v.x);
+    gradient[to + 2u] = vec4(by_v.yz, by_logit, dm.x);
+    gradient[to + 3u] = vec4(dc, dm.y);
+    gradient[to + 4u] = vec4(d, 0.0);
 }
 
 // Σ_k (dc·sh_k) ∇Y_k(d); see src/sh.rs.

@@ -1,5 +1,5 @@
 // Stage 8: the signals that policies ask for, accumulated over views; src/backend/cpu/signals.rs. One row per
-// invocation. Accumulators are planes of budget numbers; only what was asked for has one.
+// invocation. Accumulators are planes of a number for each row that is not frozen; only what was asked for has one.
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read_write> signals: array<f32>;
@@ -51,14 +51,14 @@ fn plane(signal: u32) -> u32 {
 fn add(signal: u32, row: u32, value: f32) {
     let p = plane(signal);
     if p != NONE {
-        signals[p * frame.model.w + row] += value;
+        signals[p * frame.model.w + row - frame.frozen.x] += value;
     }
 }
 
 fn raise(signal: u32, row: u32, value: f32) {
     let p = plane(signal);
     if p != NONE {
-        let at = p * frame.model.w + row;
+        let at = p * frame.model.w + row - frame.frozen.x;
         signals[at] = max(signals[at], value);
     }
 }
@@ -69,12 +69,13 @@ fn accumulate(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= frame.model.x || state.short != 0u || depths[row] == NONE {
+    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u || depths[row] == NONE {
         return;
     }
+    let own = 5u * (row - frame.frozen.x);
     let half = 0.5 * vec2<f32>(frame.image.xy);
-    let by_mean = gradient[5u * row].xyz;
-    let by_projected = vec2(gradient[5u * row + 2u].w, gradient[5u * row + 3u].w);
+    let by_mean = gradient[own].xyz;
+    let by_projected = vec2(gradient[own + 2u].w, gradient[own + 3u].w);
     let at = row * RECORD;
     let by_colour = vec3(row_sums[at + 6u], row_sums[at + 7u], row_sums[at + 8u]);
     add(VISIBLE_COUNT, row, 1.0);
@@ -161,29 +162,30 @@ fn norm3(v: vec3<f32>) -> f32 {
 
 // Present values into the first plane of `signals`, which is a scratch buffer then; now.a: the signal,
 // now.b: the number of rows, as no view need have been rendered yet, now.c: bits of the logit at which masks
-// begin.
+// begin, now.d: the number of frozen rows, of which nothing is asked.
 @compute @workgroup_size(256)
 fn present(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let row = group_of(id) * GROUP + lane;
-    if row >= now.b {
+    if row < now.d || row >= now.b {
         return;
     }
+    let own = row - now.d;
     let s = vec3(rows[12u * row + 3u], rows[12u * row + 4u], rows[12u * row + 5u]);
     let logit = rows[12u * row + 10u];
     var value = 0.0;
     if now.a == OPACITY {
         value = sigmoid(logit);
     } else if now.a == MASK {
-        value = sigmoid(bitcast<f32>(now.c) + mask_offsets[row]);
+        value = sigmoid(bitcast<f32>(now.c) + mask_offsets[own]);
     } else if now.a == SCALE_MAX {
         value = exp_exact(max(max(s.x, s.y), s.z));
     } else if now.a == SCALE_PRODUCT {
         value = exp_exact(s.x + s.y + s.z);
     } else if now.a == AGE {
-        value = f32(ages[row] & 0xffffu);
+        value = f32(ages[own] & 0xffffu);
     }
-    signals[row] = value;
+    signals[own] = value;
 }

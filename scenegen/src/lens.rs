@@ -93,7 +93,11 @@ impl Lens {
         let angle = |step: u32| widest * f64::from(step) / f64::from(STEPS);
         let rises = |step: &u32| self.radius(angle(step + 1)) > self.radius(angle(*step));
         let last = (0..STEPS).find(|step| !rises(step)).unwrap_or(STEPS);
-        if !(factor > 0.0 && factor.is_finite() && corner < self.radius(angle(last))) {
+        if !(factor > 0.0
+            && factor.is_finite()
+            && corner < self.radius(angle(last))
+            && (half / camera.fx).atan() < angle(last))
+        {
             let field = 2.0 * angle(last).to_degrees();
             return Err(Error::option(
                 "--lens",
@@ -188,7 +192,9 @@ mod tests {
         for bad in ["", "fish", "fisheye:x", "fisheye:1,2,3,4,5", "radial:1,2,3", "fisheye:nan"] {
             assert!(bad.parse::<Lens>().unwrap_err().contains("fisheye:K1"), "{bad}");
         }
-        for (text, fov) in [("radial:-0.9", 70.0), ("fisheye:0,-2", 90.0), ("fisheye:0,-0.3", 150.0)] {
+        for (text, fov) in
+            [("radial:-0.9", 70.0), ("fisheye:0,-2", 90.0), ("fisheye:0,-0.3", 150.0)]
+        {
             let message = text.parse::<Lens>().unwrap().on(pinhole(fov)).unwrap_err().to_string();
             assert!(message.contains("--lens") && message.contains("degrees"), "{message}");
         }

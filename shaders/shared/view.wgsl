@@ -14,7 +14,7 @@ struct Frame {
     background: vec4<f32>,
     // Width, height [px], columns of tiles, tiles.
     image: vec4<u32>,
-    // Rows, degree evaluated now, cap on tile entries, budget.
+    // Rows, degree evaluated now, cap on tile entries, most rows that are not frozen.
     model: vec4<u32>,
     // Step sizes: mean, log-scale, quaternion, opacity.
     rates: vec4<f32>,
@@ -27,7 +27,7 @@ struct Frame {
     score: vec4<f32>,
     // Seed, step, bits of what is due (see adam.wgsl), kind of target (see loss.wgsl).
     draw: vec4<u32>,
-    // Rows at the front that never change; unused ×3.
+    // Rows at the front that never change, and have no place in arrays that only training needs; unused ×3.
     frozen: vec4<u32>,
     // Planes of the signals' accumulators, by their numbers; NONE where not asked for.
     planes: array<vec4<u32>, 8>,

@@ -317,6 +317,21 @@ pub trait Backend: Send {
         self.render(camera, [0.0; 3], 0)
     }
 
+    /// Renders a view with the rows in these colours instead of their own, from everywhere the same; >= 0, sRGB-encoded.
+    /// Changes nothing of the model.
+    ///
+    /// # Errors
+    /// See [`BackendError`].
+    ///
+    /// # Panics
+    /// When there is not one colour per row: a bug in the caller.
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError>;
+
     /// Copies the model to the host.
     ///
     /// # Errors

@@ -9,7 +9,8 @@ use super::cpu::InstructionSet;
 pub struct Setup {
     /// Most rows there may ever be, >= 1 and >= the model's.
     pub budget: usize,
-    /// Rows at the front that are rendered, and never change: no optimiser steps them.
+    /// Rows at the front that are rendered, and never change: no optimiser steps them, and they have memory for
+    /// nothing but what rendering needs.
     pub frozen: usize,
     /// Near plane `[scene units]`, > 0: rows nearer to the camera are not rendered.
     pub near: f32,
@@ -62,11 +63,6 @@ impl Setup {
             exposures: false,
             only_renders: false,
         }
-    }
-
-    /// Rows that may be trained.
-    pub(super) fn trained(&self) -> usize {
-        if self.only_renders { 0 } else { self.budget }
     }
 }
 

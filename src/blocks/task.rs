@@ -129,7 +129,8 @@ fn block(
         all = put(FROZEN_FILE, model.gather(&frozen))?.over(all);
     }
     let all = text("views", &views)?.over(all).over(rows(block.rows + frozen.len()));
-    Ok(all.over(given))
+    // The coarse model is where a block begins, not what it is to keep.
+    Ok(all.over(given).over(Partial::option("init_rates", "full")))
 }
 
 /// The cameras of a block's training views, in world coordinates.

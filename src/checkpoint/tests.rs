@@ -135,6 +135,12 @@ fn what_is_written_is_read_back_to_the_bit() {
 }
 
 #[test]
+fn equal_states_are_equal_files() {
+    let [(_one, a), (_other, b)] = [written(), written()];
+    assert!(std::fs::read(a).unwrap() == std::fs::read(b).unwrap());
+}
+
+#[test]
 fn other_programs_read_the_arrays() {
     let (_root, path) = written();
     let bytes = std::fs::read(&path).unwrap();

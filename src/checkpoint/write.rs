@@ -1,11 +1,12 @@
 //! Writes checkpoints array by array and some rows at a time, to limit memory.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::io;
 use std::ops::Range;
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
+use serde::Serialize;
 
 use super::format::{
     CHECKSUM_KEY, Contents, HEADER_KEY, LENGTH, Record, VERSION, VERSION_KEY, name_of, shape_of,
@@ -95,14 +96,23 @@ impl Record {
     }
 }
 
+/// The safetensors header. The library has its metadata in an order that changes from run to run.
+#[derive(Serialize)]
+struct Table {
+    #[serde(rename = "__metadata__")]
+    metadata: BTreeMap<&'static str, String>,
+    #[serde(flatten)]
+    tensors: Metadata,
+}
+
 /// The safetensors header, padded to align the arrays.
 fn header_bytes(header: &Header, records: &[Record]) -> io::Result<Vec<u8>> {
     let contents = Contents { header, tensors: records.to_vec() };
     let json = serde_json::to_string(&contents)?;
-    let metadata = HashMap::from([
-        (VERSION_KEY.to_owned(), VERSION.to_string()),
-        (CHECKSUM_KEY.to_owned(), format!("{:08x}", crc32c::crc32c(json.as_bytes()))),
-        (HEADER_KEY.to_owned(), json),
+    let metadata = BTreeMap::from([
+        (VERSION_KEY, VERSION.to_string()),
+        (CHECKSUM_KEY, format!("{:08x}", crc32c::crc32c(json.as_bytes()))),
+        (HEADER_KEY, json),
     ]);
     let mut end = 0;
     let infos = records.iter().map(|record| {
@@ -115,8 +125,8 @@ fn header_bytes(header: &Header, records: &[Record]) -> io::Result<Vec<u8>> {
         };
         (record.name.clone(), info)
     });
-    let table = Metadata::new(Some(metadata), infos.collect()).map_err(io::Error::other)?;
-    let mut bytes = serde_json::to_vec(&table)?;
+    let tensors = Metadata::new(None, infos.collect()).map_err(io::Error::other)?;
+    let mut bytes = serde_json::to_vec(&Table { metadata, tensors })?;
     bytes.resize(bytes.len().next_multiple_of(LENGTH as usize), b' ');
     Ok(bytes)
 }

@@ -9,7 +9,7 @@ use super::console::Console;
 use super::export::{check_output, format_of};
 use super::render::{RenderingArgs, refuse_options_of_a_file};
 use super::train::Follower;
-use crate::compress::{Attempt, Compressed, Options, Target, compress};
+use crate::compress::{Attempt, Compressed, Options, Target, compress, file};
 use crate::export::{Format, find};
 use crate::failure::Failure;
 use crate::number::{self, grouped, percent};
@@ -33,7 +33,8 @@ pub(super) struct CompressArgs {
     /// File to write; its extension says in which format, as for `densify export`
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Format of the file `[default: the one with FILE's extension]`
+    /// Format of the file, or any: the one that holds most Gaussians, whose extension is added to FILE
+    /// `[default: the one with FILE's extension]`
     #[arg(long, value_name = "NAME")]
     format: Option<String>,
     /// Replace a file that exists
@@ -60,8 +61,14 @@ Options under Scene are for a file; a run brings its own.
 
 Examples:
   densify compress output/garden-diet --to 5MiB -o garden.sog
+  densify compress output/garden-diet --to 800kB --format any -o garden
   densify compress output/garden-diet --to 20k -o small.ply
   densify compress others.ply --scene data/garden --to 800kB -o garden.spz";
+
+/// The name that stands for whichever format holds most.
+const ANY: &str = "any";
+/// What is chosen from, the more exact first.
+const CHOICE: [&str; 4] = ["ply", "sog", "compressed-ply", "spz"];
 
 /// What `--to` may be.
 #[derive(Debug, Clone, Copy)]
@@ -88,8 +95,10 @@ pub(super) fn run(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
-    let format = format(args)?;
-    check_output(&args.output, args.overwrite)?;
+    let formats = formats(args)?;
+    for format in &formats {
+        check_output(&file(&args.output, &formats, format), args.overwrite)?;
+    }
     let RenderingArgs { near, device, data } = &args.rendering;
     let model = model_file(&args.model, args.iteration)?;
     let (scene, data, near) = if is_model(&args.model) {
@@ -115,38 +124,45 @@ pub(super) fn run(
         to: args.to.0,
         iterations: args.iterations.0,
         seed: args.seed,
-        format,
+        formats: &formats,
         output: &args.output,
     };
     let follower = Follower::new(console);
     follower.listen();
     let compressed = compress(&options, &follower)?;
     console.result(table(&compressed));
-    console.result(format_args!("{} ({})", args.output.display(), format.name));
+    let format = compressed.attempts[compressed.best].format;
+    console.result(format_args!("{} ({format})", compressed.file.display()));
     Ok(())
 }
 
-fn format(args: &CompressArgs) -> Result<&'static Format, Failure> {
+/// The formats to choose from.
+fn formats(args: &CompressArgs) -> Result<Vec<&'static Format>, Failure> {
     match args.format.as_deref() {
-        Some(name) => find(name).map_err(|error| Failure::input(format!("--format: {error}"))),
-        None => format_of(&args.output),
+        Some(ANY) => Ok(CHOICE.into_iter().filter_map(|name| find(name).ok()).collect()),
+        Some(name) => {
+            let wrong = |error| Failure::input(format!("--format: {error}, {ANY}"));
+            Ok(vec![find(name).map_err(wrong)?])
+        }
+        None => Ok(vec![format_of(&args.output)?]),
     }
 }
 
 /// The curve of size against quality.
 fn table(compressed: &Compressed) -> String {
-    let Compressed { whole, attempts, best } = compressed;
+    let Compressed { whole, attempts, best, .. } = compressed;
     let mut text = format!(
-        "\n{:<9} {:>10} {:>7} {:>13} {:>11} {:>11}",
-        "", "Gaussians", "degree", "bytes", "train [dB]", "test [dB]"
+        "\n{:<9} {:>10} {:>7} {:>14} {:>13} {:>11} {:>11}",
+        "", "Gaussians", "degree", "format", "bytes", "train [dB]", "test [dB]"
     );
     let mut line = |name: &str, it: &Attempt, of_whole: &str| {
         let test = it.test.map_or_else(|| "–".to_owned(), |test| format!("{test:.2}"));
         let bytes = grouped(usize::try_from(it.bytes).unwrap_or(usize::MAX));
         text += &format!(
-            "\n{name:<9} {:>10} {:>7} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
+            "\n{name:<9} {:>10} {:>7} {:>14} {bytes:>13} {:>11.2} {test:>11}{of_whole}",
             grouped(it.rows),
             it.sh_degree,
+            it.format,
             it.train
         );
     };

@@ -4,38 +4,41 @@ use std::fmt::Write as _;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::limits::{self, Limit};
+use super::render::{Named, RenderingArgs};
 use crate::evaluate::{Comparison, FittedScore, Mean, Split, evaluate};
 use crate::failure::Failure;
 use crate::metrics::Lpips;
 use crate::metrics::geometry::{self, Geometry};
 use crate::number::{grouped, percent};
 use crate::output::{write_geometry, write_scores};
-use crate::run::finished::{Machine, iteration, open_run};
-use crate::run::{DeviceSpec, RunConfig};
+use crate::run::RunConfig;
+use crate::run::finished::{is_model, iteration};
 
-/// Measures a trained scene against its photographs: PSNR, SSIM, FLIP, and LPIPS on request.
+/// Measures a model against the photographs of its scene: PSNR, SSIM, FLIP, and LPIPS on request.
 ///
-/// Prints the scores of each view and their mean, and writes them to results.json and
-/// per_view.json in the run's folder (results_train.json and per_view_train.json for the views
-/// trained on). Where the geometry is known (built-in scenes, and those that `densify scenegen`
+/// Prints the scores of each view and their mean, and writes those of a run to results.json and
+/// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). Of a
+/// file of Gaussian splats it writes nothing, and measures every 8th photograph where neither the dataset nor
+/// an option says which. Where the geometry is known (built-in scenes, and those that `densify scenegen`
 /// wrote), also measures how the Gaussians sit on it: a second table, and geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct EvalArgs {
-    /// Folder that `densify train` wrote
-    run: PathBuf,
-    /// Saved iteration to measure `[default: the last]`
+    /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
+    #[arg(value_name = "RUN_OR_MODEL")]
+    model: PathBuf,
+    /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
     /// Which views to measure
     #[arg(long, value_enum, default_value_t = Split::Test)]
     split: Split,
-    /// Folder of the dataset, where it is no longer where it was
+    /// Folder of the dataset: needed for a file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Also measure LPIPS, with the weights in this safetensors file (VGG-16 or AlexNet; they are not part
@@ -54,26 +57,32 @@ pub(super) struct EvalArgs {
     #[arg(long, value_name = "KEY=VALUE")]
     fail_above: Vec<Limit>,
     #[command(flatten)]
-    device: DeviceSpec,
+    rendering: RenderingArgs,
 }
 
 const EXAMPLES: &str = "\
+Options under Scene are for a file; a run brings its own.
+
 Examples:
   densify eval output/garden-diet
   densify eval output/garden-diet --iteration 7000 --split train
   densify eval output/garden-diet --lpips lpips-vgg.safetensors
+  densify eval others.spz --scene data/garden -r 4
   densify eval output/garden-diet --fail-below psnr=25 --fail-above flip=0.1";
 
-pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
-    let run = &args.run;
+pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
+    let model = &args.model;
     // A folder without config.toml is no run, whatever else it holds.
-    let config = RunConfig::read(run)?;
+    let run = match is_model(model) {
+        true => None,
+        false => Some((RunConfig::read(model)?, iteration(model, args.iteration)?)),
+    };
+    let mut rendering = args.rendering.clone();
+    rendering.data.eval |= rendering.data.test_every.is_none();
     let lpips = args.lpips.as_deref().map(Lpips::open).transpose();
     let lpips = lpips.map_err(|e| Failure::input(format!("--lpips: {e}")))?;
-    let iteration = iteration(run, args.iteration)?;
-    let moved_to = args.scene.clone();
-    let machine = Machine::open(&args.device, console)?;
-    let mut opened = open_run(run, iteration, moved_to, machine, geometry::needs(), console)?;
+    let named = Named { model, scene: args.scene.as_deref(), iteration: args.iteration };
+    let mut opened = named.open(&rendering, geometry::needs(), matches, console)?;
     let views = opened.views(args.split)?;
     let knows_geometry = opened.dataset.surface_bytes.is_some();
     limits::check_keys(knows_geometry, lpips.is_some(), &args.fail_below, &args.fail_above)?;
@@ -87,7 +96,8 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
         console.result(format_args!("{name:width$}  {psnr:9.3}  {ssim:.4}  {flip:.4}{lpips}"));
     };
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
-    let fits_exposure = args.fit_exposure || config.resolved.has_exposures;
+    let has_exposures = run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
+    let fits_exposure = args.fit_exposure || has_exposures;
     let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };
     let scores = evaluate(backend, &views, background, degree, comparison, |view| {
         line(&view.name, view.psnr, view.ssim, view.flip, view.lpips);
@@ -98,11 +108,15 @@ pub(super) fn run(args: &EvalArgs, console: &Console) -> Result<(), Failure> {
     if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {
         line("fitted", psnr, ssim, flip, lpips);
     }
-    write_scores(run, args.split, iteration, &scores)?;
+    if let Some((_, iteration)) = run {
+        write_scores(model, args.split, iteration, &scores)?;
+    }
     let geometry = opened.geometry(&views, &|| false)?;
     if let Some(measured) = &geometry {
         console.result(table(measured));
-        write_geometry(run, args.split, iteration, measured)?;
+        if let Some((_, iteration)) = run {
+            write_geometry(model, args.split, iteration, measured)?;
+        }
     }
     limits::check(&limits::values(&mean, geometry.as_ref()), &args.fail_below, &args.fail_above)
 }

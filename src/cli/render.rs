@@ -63,7 +63,7 @@ pub(super) struct RenderArgs {
 }
 
 /// How a model is rendered, and with which dataset if it brings none.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub(super) struct RenderingArgs {
     /// Nearest distance to a camera at which anything of a file is drawn, as a fraction of the
     /// scene's extent
@@ -93,7 +93,9 @@ pub(super) fn run(
     if args.film.path.is_some() && args.side_by_side {
         return Err(Failure::input("--side-by-side: a flight has no photographs; leave it out"));
     }
-    let mut opened = open_model(args, matches, console)?;
+    let named =
+        Named { model: &args.model, scene: args.scene.as_deref(), iteration: args.iteration };
+    let mut opened = named.open(&args.rendering, Needs::default(), matches, console)?;
     if let Some(route) = &args.film.path {
         return film::run(&args.film, route, &args.output, extras, &mut opened, console);
     }
@@ -188,32 +190,46 @@ pub(super) fn refuse_options_of_a_file(matches: &ArgMatches) -> Result<(), Failu
     }
 }
 
-fn open_model(
-    args: &RenderArgs,
-    matches: &ArgMatches,
-    console: &Console,
-) -> Result<Opened, Failure> {
-    if !is_model(&args.model) {
-        refuse_options_of_a_file(matches)?;
+/// What a command line names: a run, or a model with the dataset that it shows.
+pub(super) struct Named<'a> {
+    pub(super) model: &'a Path,
+    pub(super) scene: Option<&'a Path>,
+    pub(super) iteration: Option<u32>,
+}
+
+impl Named<'_> {
+    /// Opens it, as the options of a file say where it is one.
+    pub(super) fn open(
+        &self,
+        rendering: &RenderingArgs,
+        needs: Needs,
+        matches: &ArgMatches,
+        console: &Console,
+    ) -> Result<Opened, Failure> {
+        let is_run = !is_model(self.model);
+        if is_run {
+            refuse_options_of_a_file(matches)?;
+        }
+        let machine = Machine::open(&rendering.device, console)?;
+        if is_run {
+            RunConfig::read(self.model)?;
+            let iteration = iteration(self.model, self.iteration)?;
+            let moved_to = self.scene.map(Path::to_owned);
+            return open_run(self.model, iteration, moved_to, machine, needs, console);
+        }
+        let Some(scene) = self.scene else {
+            return Err(Failure::input(format!(
+                "{} is a file, which has no cameras; name a dataset with --scene DIR",
+                self.model.display()
+            )));
+        };
+        if self.iteration.is_some() {
+            let why = "--iteration is for a run's folder; a file has only one model";
+            return Err(Failure::input(why));
+        }
+        let RenderingArgs { near, data, .. } = rendering;
+        open(self.model, scene, data.clone(), (near.0, machine), needs, console)
     }
-    let machine = Machine::open(&args.rendering.device, console)?;
-    if !is_model(&args.model) {
-        RunConfig::read(&args.model)?;
-        let iteration = iteration(&args.model, args.iteration)?;
-        let moved_to = args.scene.clone();
-        return open_run(&args.model, iteration, moved_to, machine, Needs::default(), console);
-    }
-    let Some(scene) = &args.scene else {
-        return Err(Failure::input(format!(
-            "{} is a file, which has no cameras; name a dataset with --scene DIR",
-            args.model.display()
-        )));
-    };
-    if args.iteration.is_some() {
-        return Err(Failure::input("--iteration is for a run's folder; a file has only one model"));
-    }
-    let RenderingArgs { near, data, .. } = &args.rendering;
-    open(&args.model, scene, data.clone(), (near.0, machine), Needs::default(), console)
 }
 
 /// A file name without ending for each view. Names come from data files: no part of one may lead

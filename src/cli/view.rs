@@ -17,8 +17,8 @@ use crate::view::{self, FIRST_PORT, Looked, Place, Server};
 ///
 /// Serves a page on this machine, whose pictures are those of `densify render`: turn the model with mouse,
 /// fingers or keys, go to the cameras of the photographs, compare render and photograph, see depth, opacity,
-/// and single Gaussians, and save a camera path for `densify render --path`. Two runs are shown with a slider
-/// between them. Ctrl-C ends it.
+/// and Gaussians coloured by what training knows of each, and save a camera path for `densify render --path`.
+/// Two runs are shown with a slider between them. Ctrl-C ends it.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ViewArgs {

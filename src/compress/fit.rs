@@ -55,21 +55,42 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
     }
 }
 
+/// The format in which most rows of this model, as it is, make a file of the target, the first of equals, and how many
+/// these are; `None` where not even one does.
+pub(super) fn format(
+    options: &Options<'_>,
+    model: &Gaussians,
+) -> Result<Option<(&'static Format, usize)>, Failure> {
+    let mut best = None;
+    for &format in options.formats {
+        let most = best.map_or(0, |(_, rows)| rows);
+        match rows(options.to, format, model)? {
+            Some(rows) if rows > most => best = Some((format, rows)),
+            _ => {}
+        }
+    }
+    Ok(best)
+}
+
 /// How many rows of this model, as it is, make a file of the target; `None` where not even one does.
-pub(super) fn rows(options: &Options<'_>, model: &Gaussians) -> Result<Option<usize>, Failure> {
-    let most = match options.to {
+pub(super) fn rows(
+    to: Target,
+    format: &Format,
+    model: &Gaussians,
+) -> Result<Option<usize>, Failure> {
+    let most = match to {
         Target::Rows(rows) => return Ok(Some(rows.min(model.len()))),
         Target::Bytes(most) => most,
     };
     let mut rows = model.len();
-    let mut size = bytes(options.format, model)?;
+    let mut size = bytes(format, model)?;
     if size <= most {
         return Ok(Some(rows));
     }
     for _ in 0..ESTIMATES {
         let next = (rows as f64 * (FILLED * most as f64 / size as f64)) as usize;
         rows = next.clamp(1, model.len());
-        size = bytes(options.format, &spread(model, rows))?;
+        size = bytes(format, &spread(model, rows))?;
         let filled = size as f64 / most as f64;
         if (FILLED - 0.01..=1.0).contains(&filled) || (rows == 1 && size > most) {
             break;
@@ -87,12 +108,13 @@ fn spread(model: &Gaussians, rows: usize) -> Gaussians {
 /// The model with as few rows left out, the faintest and smallest first, as make its file small enough, and the file's
 /// size; `None` where no row is left.
 pub(super) fn trimmed(
-    options: &Options<'_>,
+    to: Target,
+    format: &Format,
     mut model: Gaussians,
 ) -> Result<Option<(Gaussians, u64)>, Failure> {
     loop {
-        let size = bytes(options.format, &model)?;
-        let most = match options.to {
+        let size = bytes(format, &model)?;
+        let most = match to {
             Target::Bytes(most) if size > most => most,
             _ => return Ok(Some((model, size))),
         };
@@ -115,9 +137,10 @@ pub(super) fn trimmed(
 
 /// What to say where not even one Gaussian fits.
 pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
-    let one = bytes(options.format, &model.gather(&[0]).with_degree(0)).unwrap_or_default();
+    let one = model.gather(&[0]).with_degree(0);
+    let sizes = options.formats.iter().filter_map(|it| Some((bytes(it, &one).ok()?, it.name)));
+    let (least, format) = sizes.min().unwrap_or_default();
     Failure::input(format!(
-        "--to: no model fits; one Gaussian takes {one} bytes as {}; give more",
-        options.format.name
+        "--to: no model fits; one Gaussian takes {least} bytes as {format}; give more"
     ))
 }

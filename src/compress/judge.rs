@@ -3,6 +3,7 @@
 use super::{Attempt, Options};
 use crate::dataset::Dataset;
 use crate::evaluate::Split;
+use crate::export::Format;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::metrics::psnr;
@@ -28,7 +29,12 @@ impl Judge {
     }
 
     /// Measures a model whose file has this size.
-    pub(super) fn attempt(&self, model: Gaussians, bytes: u64) -> Result<Attempt, Failure> {
+    pub(super) fn attempt(
+        &self,
+        model: Gaussians,
+        format: &Format,
+        bytes: u64,
+    ) -> Result<Attempt, Failure> {
         let (rows, sh_degree) = (model.len(), model.sh_degree);
         let mut backend = self.machine.backend(&self.dataset, model, self.near)?;
         let mut mean = |split: Split| {
@@ -44,6 +50,6 @@ impl Judge {
         };
         let train = mean(Split::Train)?;
         let test = if self.dataset.test.is_empty() { None } else { Some(mean(Split::Test)?) };
-        Ok(Attempt { rows, sh_degree, bytes, train, test })
+        Ok(Attempt { rows, sh_degree, format: format.name, bytes, train, test })
     }
 }

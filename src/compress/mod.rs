@@ -3,15 +3,15 @@
 //! Gaussians are pruned by how much they show in the training views, at most half of them at once, and the rest
 //! trained on in between (`tune.rs`). Colour that depends on the view is dropped from each Gaussian by itself where
 //! nobody would see it (`colour.rs`). How much of a file colour is worth depends on the scene, so several degrees of it
-//! are tried, each with as many Gaussians as then fit (`fit.rs`), and the one is kept whose file, read back, shows the
-//! training views best (`judge.rs`).
+//! are tried, each with as many Gaussians as then fit, in the format that holds most of them (`fit.rs`), and the one is
+//! kept whose file, read back, shows the training views best (`judge.rs`).
 
 mod colour;
 mod fit;
 mod judge;
 mod tune;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use tempfile::TempPath;
 
@@ -52,10 +52,20 @@ pub struct Options<'a> {
     pub iterations: u32,
     /// Seed of these.
     pub seed: u64,
-    /// The format of the file.
-    pub format: &'static Format,
-    /// The file.
+    /// Formats that the file may have, at least one; of those that hold equally many Gaussians the first is taken.
+    pub formats: &'a [&'static Format],
+    /// The file, as [`file()`] names it.
     pub output: &'a Path,
+}
+
+/// The file in one of several formats: then with its extension added, else as it is named.
+#[must_use]
+pub fn file(output: &Path, formats: &[&Format], format: &Format) -> PathBuf {
+    let mut name = output.as_os_str().to_owned();
+    if formats.len() > 1 {
+        name.push(format!(".{}", format.extension));
+    }
+    name.into()
 }
 
 /// A model that was made.
@@ -65,6 +75,8 @@ pub struct Attempt {
     pub rows: usize,
     /// Highest degree of colour in it.
     pub sh_degree: u8,
+    /// The format of its file.
+    pub format: &'static str,
     /// The size of its file.
     pub bytes: u64,
     /// Mean PSNR of the training views `[dB]`.
@@ -82,6 +94,8 @@ pub struct Compressed {
     pub attempts: Vec<Attempt>,
     /// Which of them is in the file.
     pub best: usize,
+    /// The file.
+    pub file: PathBuf,
 }
 
 /// Compresses a model, and writes its file.
@@ -93,40 +107,45 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let judge = Judge::open(options, observer)?;
     let model = read_model(options.model, observer)?;
     fit::check(options, &model)?;
-    let whole = judge.attempt(model.clone(), fit::bytes(PLY, &model)?)?;
+    let whole = judge.attempt(model.clone(), PLY, fit::bytes(PLY, &model)?)?;
     let scratch = scratch(options.output)?;
     let mut attempts: Vec<Attempt> = Vec::new();
-    let mut best: Option<(usize, Gaussians)> = None;
+    let mut best: Option<(usize, &Format, Gaussians)> = None;
     for degree in degrees(model.sh_degree, options.to) {
         let start = colour::reduced(model.clone(), degree);
-        let Some(rows) = fit::rows(options, &start)? else { continue };
+        let Some((format, rows)) = fit::format(options, &start)? else { continue };
         let is_whole = rows == model.len() && degree == model.sh_degree;
         let tuned = match is_whole {
             true => start,
-            false => colour::reduced(tune::tune(start, rows, options, &scratch, observer)?, degree),
+            false => {
+                let wanted = (format, rows);
+                colour::reduced(tune::tune(start, wanted, options, &scratch, observer)?, degree)
+            }
         };
-        let Some((small, bytes)) = fit::trimmed(options, tuned)? else { continue };
+        let Some((small, bytes)) = fit::trimmed(options.to, format, tuned)? else { continue };
         // What the file says, not what was written.
-        write_atomically(&scratch, |out| options.format.write(&small, out))?;
-        let attempt = judge.attempt(read_model(&scratch, observer)?, bytes)?;
+        write_atomically(&scratch, |out| format.write(&small, out))?;
+        let attempt = judge.attempt(read_model(&scratch, observer)?, format, bytes)?;
         observer.say(format_args!(
-            "tried    {} Gaussians of degree {degree}: {} bytes, {:.2} dB",
+            "tried    {} Gaussians of degree {degree} as {}: {} bytes, {:.2} dB",
             grouped(attempt.rows),
+            format.name,
             grouped(usize::try_from(bytes).unwrap_or(usize::MAX)),
             attempt.train
         ));
-        let is_best = best.as_ref().is_none_or(|&(at, _)| attempt.train > attempts[at].train);
+        let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
         attempts.push(attempt);
         if is_best {
-            best = Some((attempts.len() - 1, small));
+            best = Some((attempts.len() - 1, format, small));
         }
         if is_whole {
             break;
         }
     }
-    let Some((best, small)) = best else { return Err(fit::too_small(options, &model)) };
-    write_atomically(options.output, |out| options.format.write(&small, out))?;
-    Ok(Compressed { whole, attempts, best })
+    let Some((best, format, small)) = best else { return Err(fit::too_small(options, &model)) };
+    let file = file(options.output, options.formats, format);
+    write_atomically(&file, |out| format.write(&small, out))?;
+    Ok(Compressed { whole, attempts, best, file })
 }
 
 /// A file for what is between two steps, in the folder that has room for the result; gone with this value.

@@ -2,33 +2,41 @@
 
 use std::path::Path;
 
-use super::Options;
-use crate::export::PLY;
+use super::colour::reduced;
+use super::{Options, Target, fit};
+use crate::export::{Format, PLY};
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::output::write_atomically;
 use crate::run::{
     AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Whole,
 };
+use crate::schedule::InitRates;
 
 /// A policy that, set so, neither adds nor prunes.
 const POLICY: &str = "vanilla";
 const STILL: [&str; 3] =
     ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
 
-/// So many rows of the model, those that show most, trained on.
+/// About so many rows of the model, those that show most, trained on. How many fit a file is estimated once more before
+/// the last stage, as training changes how well rows pack.
 ///
 /// # Errors
 /// As a run's, and when the observer asks to stop.
 pub(super) fn tune(
     mut model: Gaussians,
-    rows: usize,
+    (format, rows): (&Format, usize),
     options: &Options<'_>,
     scratch: &Path,
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
-    let stages = stages(model.len(), rows, options.iterations);
-    for (stage, &(budget, iterations)) in stages.iter().enumerate() {
+    let least = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
+    let stages = stages((model.len(), rows), options.iterations, least);
+    for (stage, &(mut budget, iterations)) in stages.iter().enumerate() {
+        if stage > 0 && stage + 1 == stages.len() {
+            model = reduced(model, u8::MAX);
+            budget = fit::rows(options.to, format, &model)?.unwrap_or(1);
+        }
         observer.say(format_args!(
             "training {budget} Gaussians of degree {} for {iterations} iterations ({} of {})",
             model.sh_degree,
@@ -44,10 +52,11 @@ pub(super) fn tune(
     Ok(model)
 }
 
-/// Bounds, each at least half of the one before, and the training steps under each; the last has two shares.
-fn stages(whole: usize, rows: usize, iterations: u32) -> Vec<(usize, u32)> {
+/// Bounds, at least `least`, each at least half of the one before, and the training steps under each; the last has two
+/// shares.
+fn stages((whole, rows): (usize, usize), iterations: u32, least: u32) -> Vec<(usize, u32)> {
     let ratio = whole as f64 / rows.max(1) as f64;
-    let count = (ratio.log2().ceil() as u32).clamp(1, iterations);
+    let count = (ratio.log2().ceil() as u32).max(least).min(iterations);
     let share = iterations / (count + 1);
     let stage = |number: u32| match number == count {
         true => (rows, iterations - share * (count - 1)),
@@ -71,6 +80,8 @@ fn described(
     let file = std::path::absolute(scratch).map_err(Failure::input)?;
     spec.start.init = Some(InitChoice::Model(AbsolutePath(file)));
     spec.start.near = options.near;
+    // What pruning leaves has to change.
+    spec.start.init_rates = InitRates::Full;
     spec.size.budget = Some(Budget::Rows(budget));
     spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));
     POLICY.clone_into(&mut spec.density.policy);
@@ -87,12 +98,13 @@ mod tests {
 
     #[test]
     fn no_stage_prunes_more_than_half() {
-        assert_eq!(stages(1_000, 1_000, 300), [(1_000, 300)]);
-        assert_eq!(stages(1_000, 600, 300), [(600, 300)]);
-        assert_eq!(stages(1_000, 250, 300), [(500, 100), (250, 200)]);
+        assert_eq!(stages((1_000, 1_000), 300, 1), [(1_000, 300)]);
+        assert_eq!(stages((1_000, 640), 300, 1), [(640, 300)]);
+        assert_eq!(stages((1_000, 640), 300, 2), [(800, 100), (640, 200)]);
+        assert_eq!(stages((1_000, 250), 300, 1), [(500, 100), (250, 200)]);
         for (whole, rows, iterations) in [(90_000, 1_000, 2_000), (7, 3, 10), (8, 1, 4), (5, 1, 1)]
         {
-            let stages = stages(whole, rows, iterations);
+            let stages = stages((whole, rows), iterations, 1);
             assert_eq!(stages.last().map(|stage| stage.0), Some(rows));
             assert_eq!(stages.iter().map(|stage| stage.1).sum::<u32>(), iterations);
             let bounds = [whole].into_iter().chain(stages.iter().map(|stage| stage.0));

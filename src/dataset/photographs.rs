@@ -215,10 +215,10 @@ fn photograph(
         };
         let pinhole = undistortion.as_ref().map_or(whole, |undistortion| *undistortion.pinhole());
         // A rotation changes nothing if there is none, to the last bit.
-        let turn =
+        let looks =
             undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole().transpose());
-        let (rotation, translation) = match turn.filter(|turn| *turn != DMat3::IDENTITY) {
-            Some(turn) => (turn * frame.rotation, turn * frame.translation),
+        let (rotation, translation) = match looks.filter(|looks| *looks != DMat3::IDENTITY) {
+            Some(looks) => (looks * frame.rotation, looks * frame.translation),
             None => (frame.rotation, frame.translation),
         };
         let camera = Camera {

@@ -48,6 +48,16 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
+    /// At most so many points, equally spaced in their order.
+    #[must_use]
+    pub fn thinned(&self, most: usize) -> Self {
+        let stride = self.len().div_ceil(most.max(1)).max(1);
+        Self {
+            positions: self.positions.iter().copied().step_by(stride).collect(),
+            colours: self.colours.iter().copied().step_by(stride).collect(),
+        }
+    }
+
     /// Drops the points whose positions fail `keep`; returns how many.
     pub(crate) fn retain(&mut self, keep: impl Fn(DVec3) -> bool) -> usize {
         let before = self.positions.len();

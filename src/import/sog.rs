@@ -200,7 +200,7 @@ fn quaternion(bytes: [usize; 3], tag: u8) -> [f32; 4] {
         return [1.0, 0.0, 0.0, 0.0];
     };
     let small = bytes.map(|v| (v as f32 / 127.5 - 1.0) * std::f32::consts::FRAC_1_SQRT_2);
-    from_smallest_three(small)
+    from_smallest_three(largest, small)
 }
 
 /// Decodes a WebP or PNG, whose size is looked at first.

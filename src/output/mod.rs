@@ -84,7 +84,7 @@ pub enum OutputError {
         source: Box<OutputError>,
     },
     /// Reading or writing failed.
-    #[error("cannot {action} {path}: {source}")]
+    #[error("cannot {action} {path}: {source}{}", remedy(source))]
     Io {
         /// The attempted action.
         action: &'static str,
@@ -93,6 +93,15 @@ pub enum OutputError {
         /// The error of the system.
         source: std::io::Error,
     },
+}
+
+/// What to do where a disk is full.
+fn remedy(source: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    match source.kind() {
+        StorageFull | QuotaExceeded | FileTooLarge => "; make room there, or write to another disk",
+        _ => "",
+    }
 }
 
 impl OutputError {

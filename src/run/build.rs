@@ -14,6 +14,7 @@ use super::spec::RunSpec;
 use super::start::{Start, behind_frozen, first_model, fits};
 use super::values::{Assignment, ImageCache, InitChoice, Rows, ShDegree, assignments};
 use crate::checkpoint::Fingerprint;
+use crate::dataset::PointCloud;
 use crate::failure::Failure;
 use crate::init::restart;
 use crate::memory::RunSize;
@@ -22,6 +23,8 @@ use crate::schedule::RateOptions;
 use crate::trainer::{TrainOptions, Trainer};
 use crate::views::DatasetViews;
 
+/// Most of the dataset's points that a page draws: more hide what they are on.
+pub(crate) const POINTS_TO_LOOK_AT: usize = 4000;
 /// Views announced ahead: enough that each decoder has one at work and one waiting.
 const AHEAD: usize = 2 * DECODERS;
 
@@ -107,7 +110,11 @@ pub(super) fn build(
     let mut dataset = inputs.dataset;
     let views = DatasetViews::new(dataset.train.clone(), setting.image_cache, DECODERS);
     let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
-    dataset.points = crate::dataset::PointCloud::default();
+    // The page draws some; training has made its rows of them.
+    dataset.points = match spec.output.view {
+        Some(_) => dataset.points.thinned(POINTS_TO_LOOK_AT),
+        None => PointCloud::default(),
+    };
     let policy: Box<dyn DensityPolicy> = policy;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
     let mut trainer = trainer.requiring(required).exposing(exposures);
@@ -115,6 +122,9 @@ pub(super) fn build(
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
     };
+    if spec.output.view.is_some() {
+        trainer.remember_rows()?;
+    }
     Ok(Run {
         config,
         output,

@@ -8,11 +8,11 @@ use densify_policies::registry::{PolicyEntry, find};
 use toml::{Table, Value};
 
 use super::spec::{DataSpec, RunSpec};
-use super::values;
+use super::values::{self, InitChoice};
 use crate::dataset::{LoadOptions, Split, builtin};
 use crate::failure::Failure;
 use crate::knobs::Knobs;
-use crate::schedule::RateOptions;
+use crate::schedule::{InitRates, RateOptions};
 
 impl DataSpec {
     /// How the dataset is to be read, with tracks if they are wanted.
@@ -96,16 +96,20 @@ impl RunSpec {
         Knobs::from_table(&table).map_err(|error| Failure::input(format!("--knob: {error}")))
     }
 
-    /// The default learning rates for a run of this length, overlaid with the policy's, and these with
-    /// `--lr`, which are taken as given.
+    /// The default learning rates for a run of this length, overlaid with the policy's, fine ones where it starts from a
+    /// model, and these overlaid with `--lr`, which are taken as given.
     ///
     /// # Errors
     /// When there is no such rate, or it is not a positive number.
     pub fn learning_rates(&self, of_policy: &RateOverrides) -> Result<RateOptions, Failure> {
         let fail = |problem: &str| Failure::input(format!("--lr: {}", problem.trim()));
         let iterations = self.schedule.iterations.0;
-        let defaults = Table::try_from(RateOptions::for_run(iterations).with(of_policy));
-        let mut table = defaults.map_err(|error| fail(&error.to_string()))?;
+        let mut defaults = RateOptions::for_run(iterations).with(of_policy);
+        let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
+        if is_model && self.start.init_rates == InitRates::Fine {
+            defaults = defaults.fine();
+        }
+        let mut table = Table::try_from(defaults).map_err(|error| fail(&error.to_string()))?;
         let given = values::table(&self.schedule.lr).map_err(|error| fail(&error))?;
         for (name, rate) in given {
             let number = match rate {

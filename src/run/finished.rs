@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use densify_policies::policy::Needs;
 
 use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
-#[cfg(feature = "view")]
-use crate::backend::BackendError;
 use crate::backend::{Backend, Device, Setup};
+#[cfg(feature = "view")]
+use crate::backend::{BackendError, MomentStorage, Storage};
 use crate::dataset::{Dataset, View, builtin, is_archive};
 use crate::evaluate::Split;
 use crate::failure::Failure;
@@ -65,7 +65,7 @@ impl Machine {
         Ok(self.device.backend(&model, &options)?)
     }
 
-    /// A backend with a model in scene coordinates.
+    /// A backend with a model in scene coordinates, only to render it.
     #[cfg(feature = "view")]
     pub(crate) fn backend_in_scene(
         &self,
@@ -73,14 +73,26 @@ impl Machine {
         near: f32,
         largest_image: (u32, u32),
     ) -> Result<Box<dyn Backend>, BackendError> {
-        let options = Setup {
-            near,
-            threads: self.threads,
-            largest_image,
-            only_renders: true,
-            ..Setup::new(model.len().max(1))
-        };
-        self.device.backend(model, &options)
+        let setup = Setup { largest_image, only_renders: true, ..self.setup_in_scene(model, near) };
+        self.device.backend(model, &setup)
+    }
+
+    /// The same, to measure signals by steps that change nothing.
+    #[cfg(feature = "view")]
+    pub(crate) fn backend_to_measure(
+        &self,
+        model: &Gaussians,
+        near: f32,
+        needs: Needs,
+    ) -> Result<Box<dyn Backend>, BackendError> {
+        // Moments that change nothing may be small.
+        let storage = Storage { moments: MomentStorage::Both8, ..Storage::default() };
+        self.device.backend(model, &Setup { needs, storage, ..self.setup_in_scene(model, near) })
+    }
+
+    #[cfg(feature = "view")]
+    fn setup_in_scene(&self, model: &Gaussians, near: f32) -> Setup {
+        Setup { near, threads: self.threads, ..Setup::new(model.len().max(1)) }
     }
 }
 

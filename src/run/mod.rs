@@ -20,6 +20,8 @@ mod values;
 
 use std::path::PathBuf;
 
+#[cfg(feature = "view")]
+pub(crate) use build::POINTS_TO_LOOK_AT;
 pub use config::{DegreeSource, ExposureSource, ModelSize, Resolved, RunConfig};
 pub use observer::{Between, Interrupt, Observer, Silent};
 pub use overlay::Partial;
@@ -55,7 +57,7 @@ pub struct Run {
     trainer: Trainer<DatasetViews>,
     /// The test views.
     test: DatasetViews,
-    /// Everything of the dataset but its points.
+    /// Everything of the dataset but its points, of which a page gets some.
     dataset: Dataset,
     ledger: Ledger,
     /// How the model is measured at the end, where the surface is known.
@@ -103,7 +105,7 @@ impl Run {
         &self.config
     }
 
-    /// The dataset, without its points.
+    /// The dataset; of its points, those that a page draws.
     #[cfg(feature = "view")]
     pub(crate) fn dataset(&self) -> &Dataset {
         &self.dataset

@@ -5,7 +5,7 @@ use std::fmt;
 use crate::backend::Backend;
 use crate::evaluate::Mean;
 use crate::output::StepRecord;
-use crate::trainer::EditEvent;
+use crate::trainer::{EditEvent, RowHistory};
 
 /// A signal that asks a run to end in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,8 +48,9 @@ pub trait Observer {
     /// A checkpoint was written, or this is why it could not be.
     fn kept(&self, _step: u32, _trouble: Option<&str>) {}
 
-    /// Before every step the model may be looked at: what is rendered here changes nothing. Training waits.
-    fn between(&self, _model: &mut dyn Backend) -> Between {
+    /// Before every step the model may be looked at: what is rendered here changes nothing. Training waits. When rows
+    /// were made and edited is known where there is a [page](super::OutputSpec::view).
+    fn between(&self, _model: &mut dyn Backend, _rows: Option<&RowHistory>) -> Between {
         Between::Step
     }
 

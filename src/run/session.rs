@@ -204,8 +204,12 @@ impl<'a> Session<'a> {
 
     /// Lets the observer look at the model, and writes the checkpoints that it asks for.
     fn rest(&mut self) {
-        while self.observer.between(self.run.trainer.backend()) == Between::Checkpoint {
-            self.keep_or_say();
+        loop {
+            let (model, rows) = self.run.trainer.looked_at();
+            match self.observer.between(model, rows) {
+                Between::Checkpoint => self.keep_or_say(),
+                Between::Step => return,
+            }
         }
     }
 

@@ -18,7 +18,7 @@ use super::values::{
 use crate::backend::BackendChoice;
 use crate::dataset::{FarCameras, MaskMode, Resolution};
 use crate::exposure::{ExposureChoice, ExposureModel};
-use crate::schedule::{Background, REFERENCE_ITERATIONS};
+use crate::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
 use crate::trainer::OnNan;
 
 /// What `--resume` may do with an option.
@@ -177,6 +177,10 @@ run_spec! {
         /// colours are cut to --sh-degree, or given room to it
         #[arg(long, value_name = "points|random|MODEL")]
         init: Option<InitChoice> = None, Fixed;
+
+        /// Step sizes of a run from a model; --lr changes single ones
+        #[arg(long, value_name = "WHICH")]
+        init_rates: InitRates = InitRates::Fine, Fixed;
 
         /// A model in the dataset's coordinates, by any program, whose Gaussians are rendered but never change: no
         /// policy removes or moves them, and no step trains them. What --init gives is trained beside them; the

@@ -100,6 +100,27 @@ impl RateOptions {
         Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
     }
 
+    /// These step sizes as they are at the end, from the start on: a model that is trained already keeps what it has
+    /// learned, of which larger steps take 4 to 6 dB at first.
+    #[must_use]
+    pub fn fine(self) -> Self {
+        Self {
+            mean_start: self.mean_end,
+            log_scale: self.log_scale_end.unwrap_or(self.log_scale),
+            quat: self.quat_end.unwrap_or(self.quat),
+            opacity: self.opacity_end.unwrap_or(self.opacity),
+            sh_dc: self.sh_dc_end.unwrap_or(self.sh_dc),
+            sh_rest: self.sh_rest_end.unwrap_or(self.sh_rest),
+            log_scale_end: None,
+            quat_end: None,
+            opacity_end: None,
+            sh_dc_end: None,
+            sh_rest_end: None,
+            boost: 1.0,
+            ..self
+        }
+    }
+
     /// These step sizes, overlaid with those of a policy's paper.
     #[must_use]
     pub fn with(self, overrides: &RateOverrides) -> Self {
@@ -175,6 +196,17 @@ impl RateOptions {
         .into_iter()
         .find_map(|(name, rate)| (!(rate.is_finite() && rate > 0.0)).then_some(name))
     }
+}
+
+/// Step sizes of a run that starts from a model.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitRates {
+    /// Those of the end of a run: the model keeps what it has learned
+    #[default]
+    Fine,
+    /// Those of a run from its start: the model may change much
+    Full,
 }
 
 /// A number of steps chosen for a run of [`REFERENCE_ITERATIONS`], scaled to a run of

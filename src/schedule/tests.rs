@@ -163,3 +163,34 @@ fn rates_end_where_they_are_told_to_and_fade_late() {
     near(short.mean, 4e-5);
     near(short.noise, 2e-5);
 }
+
+#[test]
+fn fine_step_sizes_are_those_of_the_end_all_along() {
+    let of_paper = RateOptions {
+        log_scale_end: Some(1e-3),
+        quat_end: Some(2e-4),
+        opacity_end: Some(3e-3),
+        sh_dc_end: Some(4e-4),
+        sh_rest_end: Some(5e-5),
+        ..RateOptions::for_run(2_000)
+    };
+    for rates in [RateOptions::for_run(2_000), of_paper] {
+        let end = rates.at(2_000, 2_000, 3.0);
+        for step in [1, 700, 2_000] {
+            let now = rates.fine().at(step, 2_000, 3.0);
+            for (found, expected) in [
+                (now.mean, end.mean),
+                (now.log_scale, end.log_scale),
+                (now.quat, end.quat),
+                (now.opacity, end.opacity),
+                (now.sh_dc, end.sh_dc),
+                (now.sh_rest, end.sh_rest),
+            ] {
+                assert!(
+                    (found - expected).abs() <= 1e-6 * expected,
+                    "step {step}: {found} {expected}"
+                );
+            }
+        }
+    }
+}

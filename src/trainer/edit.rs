@@ -50,6 +50,9 @@ impl<V: ViewSource> Trainer<V> {
         self.backend
             .apply(&ops, self.options.seed, step)
             .map_err(|e| self.backend_error(step, e))?;
+        if let Some(history) = &mut self.history {
+            history.follow(&ops, step);
+        }
         self.peak_rows = self.peak_rows.max(peak_rows(&ops)).max(self.backend.rows());
         if !ops.edits_rows() && ops.counts.denied == 0 {
             return Ok(None);

@@ -9,6 +9,7 @@ mod auto_budget;
 mod distinct_views;
 mod edit;
 mod error;
+mod history;
 mod nonfinite;
 mod options;
 mod policy_views;
@@ -33,6 +34,7 @@ use crate::views::ViewSource;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, signals as growth_signals};
 use distinct_views::distinct_views;
 pub use error::TrainError;
+pub use history::RowHistory;
 use nonfinite::AUDIT_EVERY;
 pub use options::{AutoChoices, OnNan, TrainOptions};
 use policy_views::call_policy;
@@ -66,6 +68,8 @@ pub struct Trainer<V> {
     auto_budget: Option<AutoBudget>,
     /// How each training view was exposed, where that is learned.
     exposures: Option<Exposures>,
+    /// When each row was made and edited, where somebody wants to know.
+    history: Option<RowHistory>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -100,6 +104,7 @@ impl<V: ViewSource> Trainer<V> {
             probes: Vec::new(),
             auto_budget: None,
             exposures: None,
+            history: None,
         })
     }
 

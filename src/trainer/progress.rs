@@ -2,7 +2,9 @@
 
 use std::time::Duration;
 
-use super::{AutoBudget, Trainer};
+use densify_policies::policy::{Signal, SignalSet};
+
+use super::{AutoBudget, RowHistory, Trainer};
 use crate::backend::{Backend, BackendError};
 use crate::exposure::Exposures;
 use crate::gaussians::Gaussians;
@@ -74,6 +76,36 @@ impl<V: ViewSource> Trainer<V> {
     /// A copy of the current model, in the coordinates of training.
     pub fn model(&self) -> Result<Gaussians, BackendError> {
         self.backend.download()
+    }
+
+    /// The signals that the policy reads.
+    #[must_use]
+    pub fn signals(&self) -> SignalSet {
+        self.needs.signals
+    }
+
+    /// Remembers from now on when rows are made and edited. Of a run that goes on, what was before is known as far as
+    /// the optimiser's ages say it; of frozen rows there is none.
+    ///
+    /// # Errors
+    /// When the ages cannot be read.
+    pub fn remember_rows(&mut self) -> Result<(), BackendError> {
+        let ages = self.backend.take_signals(SignalSet::from([Signal::Age]))?;
+        let step = self.step;
+        let edited = |(row, &age): (usize, &f32)| match row < self.options.frozen {
+            true => 0,
+            false => step.saturating_sub(age as u32),
+        };
+        let known = ages.get(Signal::Age).unwrap_or_default().iter().enumerate();
+        let edited: Vec<u32> = known.map(edited).collect();
+        self.history = Some(RowHistory::of(&edited, self.backend.budget()));
+        self.backend.give_back(ages);
+        Ok(())
+    }
+
+    /// The backend, and when rows were made and edited where that is [remembered](Self::remember_rows).
+    pub fn looked_at(&mut self) -> (&mut dyn Backend, Option<&RowHistory>) {
+        (self.backend.as_mut(), self.history.as_ref())
     }
 
     /// The backend, for rendering and its ledger.

@@ -115,13 +115,8 @@ fn check(asked: Asked, extent: &Extent) -> Result<Wanted, String> {
     if kind.needs_photograph() && matches!(from, Viewpoint::Free(_)) {
         return Err("there is a photograph only from the camera of a view".into());
     }
-    if kind == Kind::Count && !extent.counts {
-        return Err("rows per pixel are not counted on a GPU; start with --backend cpu".into());
-    }
-    if kind.paints() && !extent.paints {
-        return Err(
-            "rows are not painted while a run trains; look at the run with densify view".into()
-        );
+    if let Some((_, why)) = extent.lacking.iter().find(|(lacking, _)| *lacking == kind) {
+        return Err(format!("this cannot be shown: {why}"));
     }
     let (size, is_moving) = ((width, height), moving);
     Ok(Wanted { owner: (page, place), kind, model, size, is_moving, from })
@@ -147,7 +142,9 @@ mod tests {
 
     fn extent() -> Extent {
         let normalisation = Normalisation { centre: glam::DVec3::ZERO, scale: 0.5 };
-        Extent { models: 2, views: [3, 0], normalisation, counts: false, paints: false }
+        let lacking =
+            vec![(Kind::Count, "on a GPU".to_owned()), (Kind::RowAge, "trains".to_owned())];
+        Extent { models: 2, views: [3, 0], normalisation, lacking }
     }
 
     fn asked(changes: Value) -> Result<Wanted, String> {
@@ -200,7 +197,7 @@ mod tests {
             (json!({ "model": 2 }), "model"),
             (json!({ "kind": "shadow" }), "no picture"),
             (json!({ "kind": "count" }), "GPU"),
-            (json!({ "kind": "row_size" }), "trains"),
+            (json!({ "kind": "row_age" }), "trains"),
             (json!({ "path": "/etc/passwd" }), "unknown field"),
             (json!({ "camera": null }), "either"),
             (json!({ "view": { "split": "test", "number": 0 } }), "either"),

@@ -9,9 +9,8 @@ use super::ramp;
 use super::stage::Stage;
 use crate::camera::Camera;
 use crate::flight;
+use crate::run::POINTS_TO_LOOK_AT;
 
-/// Most points that are drawn: more hide what they are on.
-const MOST_POINTS: usize = 4000;
 /// Which way is up where no camera says so: as structure from motion has it, y points down.
 const UP: DVec3 = DVec3::NEG_Y;
 
@@ -49,25 +48,22 @@ pub(super) fn describe(stage: &Stage) -> Value {
             (up, if looks_inward { focus } else { ahead })
         }
     };
-    let stride = stage.points.len().div_ceil(MOST_POINTS).max(1);
-    let positions = stage.points.positions.iter().step_by(stride).map(|&at| point(at));
-    let colours = stage.points.colours.iter().step_by(stride);
+    let points = stage.points.thinned(POINTS_TO_LOOK_AT);
+    let positions = points.positions.iter().map(|&at| point(at));
     let models = stage
         .models
         .iter()
         .map(|model| json!({ "name": model.name, "rows": model.rows, "degree": model.sh_degree }));
-    let extent = stage.extent();
-    let has_views = extent.views.iter().any(|&views| views > 0);
-    let kinds = Kind::ALL.into_iter().filter(|kind| {
-        (has_views || !kind.needs_photograph())
-            && (extent.counts || *kind != Kind::Count)
-            && (extent.paints || !kind.paints())
-    });
+    let lacks = |kind: Kind| stage.lacking.iter().find(|(lacking, _)| *lacking == kind);
+    let kinds = Kind::ALL.into_iter().filter(|&kind| lacks(kind).is_none());
+    let lacking =
+        stage.lacking.iter().map(|(kind, why)| json!({ "label": kind.legend().label, "why": why }));
     json!({
         "title": stage.title,
         "live": stage.largest.is_some(),
         "models": models.collect::<Vec<Value>>(),
         "kinds": kinds.map(Kind::legend).collect::<Vec<_>>(),
+        "lacking": lacking.collect::<Vec<Value>>(),
         "ramp": ramp::STOPS,
         "limits": { "side": MOST_SIDE, "pixels": MOST_PIXELS },
         "up": up.to_array(),
@@ -76,9 +72,8 @@ pub(super) fn describe(stage: &Stage) -> Value {
         "start": first.map(|camera| pose(&world(&camera))),
         "views": { "test": views[0], "train": views[1] },
         "points": {
-            "all": stage.points.len(),
             "positions": positions.collect::<Vec<_>>(),
-            "colours": colours.collect::<Vec<_>>(),
+            "colours": points.colours,
         },
     })
 }

@@ -26,13 +26,21 @@ pub(super) enum Kind {
     RowSize,
     /// Rows coloured by how long they are for their width.
     RowShape,
+    /// Rows coloured by how strongly the photographs pull at their place.
+    RowGradient,
+    /// Rows coloured by their largest blend weight.
+    RowWeight,
+    /// Rows coloured by the steps since they were made.
+    RowAge,
+    /// Rows coloured by the steps since they were edited.
+    RowEdit,
 }
 
 /// How a kind is called and explained on the page.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Legend {
     pub(super) kind: Kind,
-    label: &'static str,
+    pub(super) label: &'static str,
     /// What is seen, in a sentence.
     about: &'static str,
     needs_photograph: bool,
@@ -41,7 +49,7 @@ pub(super) struct Legend {
 }
 
 impl Kind {
-    pub(super) const ALL: [Self; 10] = [
+    pub(super) const ALL: [Self; 14] = [
         Self::Render,
         Self::Photograph,
         Self::Difference,
@@ -52,6 +60,10 @@ impl Kind {
         Self::RowOpacity,
         Self::RowSize,
         Self::RowShape,
+        Self::RowGradient,
+        Self::RowWeight,
+        Self::RowAge,
+        Self::RowEdit,
     ];
 
     /// Whether it is there only where a photograph was taken.
@@ -61,7 +73,17 @@ impl Kind {
 
     /// Whether rows are in other colours than their own.
     pub(super) fn paints(self) -> bool {
-        matches!(self, Self::Rows | Self::RowOpacity | Self::RowSize | Self::RowShape)
+        matches!(
+            self,
+            Self::Rows
+                | Self::RowOpacity
+                | Self::RowSize
+                | Self::RowShape
+                | Self::RowGradient
+                | Self::RowWeight
+                | Self::RowAge
+                | Self::RowEdit
+        )
     }
 
     pub(super) fn legend(self) -> Legend {
@@ -86,24 +108,48 @@ impl Kind {
                 ("Opacity", "How much of what lies behind the model it hides.", Some("opacity"))
             }
             Self::Count => (
-                "Rows per pixel",
+                "Gaussians per pixel",
                 "How many Gaussians are blended into a pixel: what a picture costs.",
-                Some("rows"),
+                Some("Gaussians"),
             ),
-            Self::Rows => ("Rows apart", "Every Gaussian in a colour of its own.", None),
+            Self::Rows => ("Gaussians told apart", "Every Gaussian in a colour of its own.", None),
             Self::RowOpacity => {
-                ("Opacity of rows", "Every Gaussian coloured by its opacity.", Some("opacity"))
+                ("Opacity of Gaussians", "Every Gaussian coloured by its opacity.", Some("opacity"))
             }
             Self::RowSize => (
-                "Size of rows",
+                "Size of Gaussians",
                 "Every Gaussian coloured by its longest standard deviation, on a logarithmic scale.",
                 Some("units"),
             ),
             Self::RowShape => (
-                "Shape of rows",
+                "Shape of Gaussians",
                 "Every Gaussian coloured by its longest axis over its middle one, on a logarithmic scale: \
                  needles are bright.",
                 Some("to 1"),
+            ),
+            Self::RowGradient => (
+                "Gradient of Gaussians",
+                "Every Gaussian coloured by how strongly the photographs pull at its place: the mean gradient of \
+                 its projected centre, on a logarithmic scale. Policies split or clone where it is large.",
+                Some("per view"),
+            ),
+            Self::RowWeight => (
+                "Largest weight of Gaussians",
+                "Every Gaussian coloured by the largest weight that it has in any pixel of the training views: \
+                 what is dark hardly shows anywhere.",
+                Some("weight"),
+            ),
+            Self::RowAge => (
+                "Age of Gaussians",
+                "Every Gaussian coloured by the steps since it was made; if training was resumed meanwhile, at \
+                 least that many.",
+                Some("steps"),
+            ),
+            Self::RowEdit => (
+                "Last edit of Gaussians",
+                "Every Gaussian coloured by the steps since the policy made or rewrote it, as far as is \
+                 known if training was resumed.",
+                Some("steps"),
             ),
         };
         Legend { kind: self, label, about, needs_photograph: self.needs_photograph(), unit }

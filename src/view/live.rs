@@ -1,30 +1,35 @@
-//! `train --view`: the page of a run in training. Pictures are made between two steps, by the thread that trains
-//! and with its model, so that training needs no second copy of it; while nobody asks, a step costs a look at an
-//! empty desk.
+//! `train --view`: the page of a run in training. It is rendered between two steps, by the thread that trains and with
+//! its model, so that training needs no second copy of it, and waits for nothing else; while nobody asks, a step costs
+//! a look at an empty desk.
 
-use std::cell::RefCell;
+use std::cell::Cell;
 use std::fmt;
 use std::thread;
 use std::time::Duration;
+
+use densify_policies::policy::SignalSet;
 
 use super::asked::MOST_PIXELS;
 use super::board::{self, Board, Next};
 use super::desk::{Closing, Desk};
 use super::http;
-use super::pictures;
+use super::negative;
+use super::paint::Known;
 use super::routes::Routes;
 use super::stage::Stage;
-use super::{Server, describe};
-use crate::backend::Backend;
+use super::{Server, darkroom, describe};
+use crate::backend::{Backend, Device};
 use crate::evaluate::Mean;
 use crate::failure::{Failure, OTHER};
 use crate::metrics::scratch_bytes;
 use crate::output::StepRecord;
-use crate::run::{Between, Interrupt, Observer, Run};
-use crate::trainer::EditEvent;
+use crate::run::{Between, Interrupt, Observer, POINTS_TO_LOOK_AT, Run};
+use crate::trainer::{EditEvent, RowHistory};
 
 /// Most pictures that are waited for.
 const MOST_WISHES: usize = 8;
+/// Pictures in the making at a time: what they take is promised.
+const AT_ONCE: usize = 1;
 /// What a connection takes: what its thread touches of its stack and keeps of its buffers, and its request
 /// `[bytes]`.
 const SEAT: u64 = 80 << 10;
@@ -37,23 +42,42 @@ const PULSE: Duration = Duration::from_millis(20);
 /// How a run ends that the page has stopped: as by a signal.
 const STOPPED: Interrupt = Interrupt { name: "the page", exit_code: 130 };
 
-/// What the page takes throughout: connections, answers on their way, and what it says of the run `[bytes]`.
-pub(crate) fn lasting_bytes(largest_image: (u32, u32), views: usize) -> u64 {
-    // JPEG at the best quality that is used takes under 3 bytes of a pixel, noise included.
-    let frame = pixels(largest_image) * 3;
-    let (seats, wishes) = (http::SEATS as u64, MOST_WISHES as u64);
-    seats * SEAT + wishes * frame + board::BYTES + views as u64 * VIEW
-}
+/// Points that are drawn, and what is said of them `[bytes]`.
+const POINTS: u64 = POINTS_TO_LOOK_AT as u64 * 128;
+/// Numbers per row while it is painted: what it is painted by, for its scale once more, and its colour; and on the host
+/// of a GPU the lengths of its axes, and colours of its own.
+const PAINT: u64 = 5;
+const PAINT_ON_GPU: usize = 12;
 
-/// What making a picture takes `[bytes]`: the rendering, the photograph as it is, flattened, half-way to the
-/// picture's size and at it, their difference with what measuring it takes, and the picture.
-pub(crate) fn passing_bytes(largest_image: (u32, u32), photograph: u64, threads: usize) -> u64 {
+/// What the page takes throughout: connections, answers on their way, what it says of the run and remembers of so many
+/// rows, and the making of a picture, which may be at any time: the rendering, the photograph as it is, flattened,
+/// half-way to the picture's size and at it, their difference with what measuring it takes, and the picture `[bytes]`.
+pub(crate) fn lasting_bytes(
+    largest_image: (u32, u32),
+    photograph: u64,
+    views: usize,
+    rows: u64,
+    threads: usize,
+) -> u64 {
+    let pixels = pixels(largest_image);
+    // JPEG at the best quality that is used takes under 3 bytes of a pixel, noise included.
+    let frame = pixels * 3;
+    let (seats, wishes) = (http::SEATS as u64, MOST_WISHES as u64);
     let float = size_of::<f32>() as u64;
     let pixel = 5 * float + size_of::<f64>() as u64 + 4 * 3;
     let whole = u64::from(largest_image.0) * u64::from(largest_image.1);
     // While it is made smaller its colours and alpha are floats.
     let smaller = whole * (3 + 4 * float);
-    pixels(largest_image) * pixel + smaller + photograph + scratch_bytes(largest_image.0, threads)
+    let making = pixels * pixel + smaller + photograph + scratch_bytes(largest_image.0, threads);
+    let said = board::BYTES + POINTS + views as u64 * VIEW;
+    let darkroom = darkroom::STACK as u64 + AT_ONCE as u64 * making;
+    seats * SEAT + wishes * frame + said + rows * RowHistory::BYTES + darkroom
+}
+
+/// What painting so many rows takes, between two steps `[bytes]`.
+pub(crate) fn passing_bytes(rows: u64, device: &Device) -> u64 {
+    let numbers = PAINT + device.columns_on_host(PAINT_ON_GPU) as u64;
+    rows * numbers * size_of::<f32>() as u64
 }
 
 fn pixels((width, height): (u32, u32)) -> u64 {
@@ -72,19 +96,25 @@ impl Server {
         train: impl FnOnce(Run, &dyn Observer) -> Result<T, Failure>,
     ) -> Result<T, Failure> {
         let stage = Stage::of_run(&mut run);
-        let rows = run.trainer().rows();
-        let (desk, board) = (Desk::bounded(MOST_WISHES), Board::default());
+        let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
+        let (desk, board) = (Desk::new(Some(MOST_WISHES), AT_ONCE), Board::default());
         let routes = Routes {
             door: &self.door,
             desk: &desk,
             extent: stage.extent(),
-            description: describe::describe(&stage).to_string(),
+            description: describe::describe(&stage).to_string().into_bytes().into(),
             board: Some(&board),
         };
         thread::scope(|scope| {
             let _closing = Closing(&desk);
             let (desk, routes) = (&desk, &routes);
+            let no_thread = |error| Failure {
+                code: OTHER,
+                message: format!("--view: the system gives no thread for the page: {error}"),
+            };
+            let develops = darkroom::open(scope, desk, &stage).map_err(no_thread)?;
             let serves = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
+                let _closing = Closing(desk);
                 let answer = |request: &http::Request| routes.answer(request);
                 let served = http::serve(&routes.door.listener, &answer, &|| desk.is_over());
                 if let Err(error) = served {
@@ -93,12 +123,15 @@ impl Server {
                     );
                 }
             });
-            serves.map_err(|error| Failure {
-                code: OTHER,
-                message: format!("--view: the system gives no thread for the page: {error}"),
-            })?;
-            let live = Live { observer, desk, board: &board, stage: RefCell::new(stage), rows };
-            train(run, &live)
+            serves.map_err(no_thread)?;
+            let (board, stage, step) = (&board, &stage, Cell::new(0));
+            let live = Live { observer, desk, board, stage, rows, signals, step };
+            let trained = train(run, &live);
+            desk.close();
+            if develops.join().is_err() {
+                tracing::error!("what makes the page's pictures has failed; this is a bug");
+            }
+            trained
         })
     }
 }
@@ -108,17 +141,23 @@ struct Live<'a> {
     observer: &'a dyn Observer,
     desk: &'a Desk,
     board: &'a Board,
-    stage: RefCell<Stage>,
+    stage: &'a Stage,
     /// At the beginning.
     rows: usize,
+    /// Those that training accumulates.
+    signals: SignalSet,
+    /// The last that was taken.
+    step: Cell<u32>,
 }
 
 impl Live<'_> {
-    /// Makes a picture that is waited for, or waits so long for one to be wanted.
-    fn draw(&self, model: &mut dyn Backend, patience: Duration) {
+    /// Renders a picture that is waited for, or waits so long for one to be wanted.
+    fn draw(&self, model: &mut dyn Backend, rows: Option<&RowHistory>, patience: Duration) {
         if let Some(ticket) = self.desk.next_within(patience) {
-            let made = pictures::make(&mut self.stage.borrow_mut(), &mut [model], &ticket.wanted);
-            ticket.reply(made);
+            let history = rows.map(|rows| (rows, self.step.get()));
+            let known = Known { signals: self.signals, history, measured: None };
+            let made = negative::expose_live(self.stage, model, known, &ticket.wanted);
+            self.desk.expose(ticket, made);
         }
     }
 }
@@ -129,11 +168,13 @@ impl Observer for Live<'_> {
     }
 
     fn begin(&self, done: u32, last: u32, budget: usize) {
+        self.step.set(done);
         self.board.begin(done, last, budget, self.rows);
         self.observer.begin(done, last, budget);
     }
 
     fn step(&self, step: u32, loss: f32, rows: usize) {
+        self.step.set(step);
         self.board.step(step, rows);
         self.observer.step(step, loss, rows);
     }
@@ -163,14 +204,17 @@ impl Observer for Live<'_> {
         self.observer.end();
     }
 
-    fn between(&self, model: &mut dyn Backend) -> Between {
-        self.draw(model, Duration::ZERO);
+    fn between(&self, model: &mut dyn Backend, rows: Option<&RowHistory>) -> Between {
+        self.draw(model, rows, Duration::ZERO);
         loop {
             match self.board.next() {
                 Next::Checkpoint => return Between::Checkpoint,
                 Next::Step | Next::Stop => return Between::Step,
-                Next::Wait if self.observer.interrupt().is_some() => return Between::Step,
-                Next::Wait => self.draw(model, PULSE),
+                // Without a page nobody can let it go on.
+                Next::Wait if self.observer.interrupt().is_some() || self.desk.is_over() => {
+                    return Between::Step;
+                }
+                Next::Wait => self.draw(model, rows, PULSE),
             }
         }
     }
@@ -178,5 +222,50 @@ impl Observer for Live<'_> {
     fn interrupt(&self) -> Option<Interrupt> {
         let stopped = || self.board.stops().then_some(STOPPED);
         self.observer.interrupt().or_else(stopped)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::{Device, Setup};
+    use crate::gaussians::Gaussians;
+    use crate::run::Silent;
+    use crate::view::board::Order;
+    use crate::view::open::stage_of;
+
+    #[test]
+    fn a_run_that_is_paused_goes_on_when_its_page_is_gone() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let frame = r#"{"w":8,"h":8,"fl_x":8,"fl_y":8,"frames":[{"file_path":"a.png",
+            "transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]}]}"#;
+        std::fs::write(folder.path().join("transforms.json"), frame).expect("a file");
+        image::RgbImage::new(8, 8).save(folder.path().join("a.png")).expect("a PNG");
+        let stage = stage_of(folder.path());
+        let (desk, board) = (Desk::new(Some(1), 1), Board::default());
+        board.begin(0, 10, 1, 1);
+        board.order(Order::Pause);
+        let (signals, step) = (SignalSet::default(), Cell::new(0));
+        let live = Live {
+            observer: &Silent,
+            desk: &desk,
+            board: &board,
+            stage: &stage,
+            rows: 1,
+            signals,
+            step,
+        };
+        let model = Gaussians::zeros(1, 0);
+        let mut backend = Device::default().backend(&model, &Setup::new(1)).expect("a backend");
+        thread::scope(|scope| {
+            let waits = scope.spawn(|| {
+                thread::sleep(5 * PULSE);
+                let is_paused = matches!(board.next(), Next::Wait);
+                desk.close();
+                is_paused
+            });
+            assert_eq!(live.between(&mut *backend, None), Between::Step);
+            assert!(desk.is_over() && waits.join().expect("it ends"), "it has not waited");
+        });
     }
 }

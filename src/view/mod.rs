@@ -1,20 +1,23 @@
 //! `densify view`: a page in the browser whose pictures are rendered here, by the backend that trains.
 //!
 //! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
-//! [`desk`], which keeps the newest of each page, and take pictures away. Everything that a browser sends is
-//! checked before ([`door`], [`asked`]); no path of the disk is served. Prints nothing.
+//! [`desk`], which keeps the newest of each page; that thread renders them ([`negative`]), and another makes pictures
+//! of what is rendered ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path of the disk is
+//! served. Prints nothing.
 
 mod asked;
 mod board;
+mod darkroom;
 mod describe;
 mod desk;
 mod door;
 mod http;
 mod kinds;
 pub(crate) mod live;
+mod measured;
+mod negative;
 mod open;
 mod paint;
-mod pictures;
 mod ramp;
 mod routes;
 mod stage;
@@ -24,12 +27,15 @@ use std::thread;
 use desk::{Closing, Desk};
 use door::Door;
 pub(crate) use door::{FIRST_PORT, Place};
+use negative::Brush;
 pub(crate) use open::{Looked, is_run, open};
 use routes::Routes;
-pub(crate) use stage::Stage;
+pub(crate) use stage::Exhibition;
 
-use crate::backend::Backend;
 use crate::failure::{Failure, OTHER};
+
+/// Pictures in the making at a time: while one is encoded, the next is rendered.
+const AT_ONCE: usize = 2;
 
 /// A page that can be opened.
 pub(crate) struct Server {
@@ -61,28 +67,31 @@ impl Server {
     /// When the network fails, or what renders.
     pub(crate) fn serve(
         &self,
-        mut stage: Stage,
+        exhibition: Exhibition,
         is_over: &dyn Fn() -> bool,
     ) -> Result<(), Failure> {
-        let desk = Desk::default();
+        let Exhibition { stage, mut backends } = exhibition;
+        let desk = Desk::new(None, AT_ONCE);
         let routes = Routes {
             door: &self.door,
             desk: &desk,
             extent: stage.extent(),
-            description: describe::describe(&stage).to_string(),
+            description: describe::describe(&stage).to_string().into_bytes().into(),
             board: None,
         };
         let failed = |message: String| Failure { code: OTHER, message };
         thread::scope(|scope| {
-            let desk = &desk;
+            let (desk, stage) = (&desk, &stage);
+            let develops = darkroom::open(scope, desk, stage)
+                .map_err(|error| failed(format!("the system gives no thread: {error}")))?;
             let renders = scope.spawn(move || {
                 let _closing = Closing(desk);
-                let mut backends = std::mem::take(&mut stage.backends);
-                let mut backends: Vec<&mut dyn Backend> =
-                    backends.iter_mut().map(|backend| &mut **backend as &mut dyn Backend).collect();
+                let mut brushes: Vec<Brush> = backends.iter().map(|_| Brush::default()).collect();
                 while let Some(ticket) = desk.next() {
-                    let made = pictures::make(&mut stage, &mut backends, &ticket.wanted);
-                    ticket.reply(made);
+                    let (wanted, model) = (&ticket.wanted, ticket.wanted.model);
+                    let made =
+                        negative::expose(stage, &mut *backends[model], &mut brushes[model], wanted);
+                    desk.expose(ticket, made);
                 }
             });
             let answer = |request: &http::Request| routes.answer(request);
@@ -97,7 +106,7 @@ impl Server {
             };
             let served = http::serve(&self.door.listener, &answer, &ends);
             desk.close();
-            let rendered = renders.join();
+            let rendered = renders.join().and(develops.join());
             served
                 .map_err(|error| failed(format!("the page cannot be served any more: {error}")))?;
             rendered.map_err(|_| failed("what renders has failed; this is a bug".into()))

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
+use super::kinds::Kind;
 use super::paint::ends;
-use super::stage::{Shown, Stage};
+use super::stage::{Exhibition, NO_MODEL, Shown, Stage};
 use crate::camera::Camera;
 use crate::dataset::normalise::{EXTENT, Normalisation, median};
 use crate::dataset::{Dataset, PointCloud, builtin};
@@ -58,29 +59,29 @@ pub(crate) fn open(
     looked: Looked<'_>,
     machine: Machine,
     observer: &dyn Observer,
-) -> Result<Stage, Failure> {
+) -> Result<Exhibition, Failure> {
     let Looked { what, other, scene, iteration, near, data } = looked;
     if iteration.is_some() && !is_run(what) {
         return Err(Failure::input("--iteration is for a run's folder; leave it out"));
     }
-    let mut stage = if is_model(what) {
+    let mut shown = if is_model(what) {
         let model = read_model(what, observer)?;
-        let mut stage = match scene {
+        let mut shown = match scene {
             Some(scene) => of_dataset(machine, what, load(&scene, &data, observer)?, &data),
             None => without_cameras(machine, what, &model, &data)?,
         };
-        stage.show(name_of(what), model, near)?;
-        stage
+        shown.show(name_of(what), model, near)?;
+        shown
     } else if is_run(what) {
         let (model, config, iteration) = of_run(what, iteration, observer)?;
         let has_moved = scene.is_some();
         let path = scene.unwrap_or_else(|| config.scene_path());
         let dataset = load(&path, &config.spec.data, observer)
             .map_err(|failure| if has_moved { failure } else { or_moved(failure, &path) })?;
-        let mut stage = of_dataset(machine, what, dataset, &config.spec.data);
+        let mut shown = of_dataset(machine, what, dataset, &config.spec.data);
         let called = format!("{}, iteration {iteration}", name_of(what));
-        stage.show(called, model, config.spec.start.near.0)?;
-        stage
+        shown.show(called, model, config.spec.start.near.0)?;
+        shown
     } else {
         if scene.is_some() {
             return Err(no_run(what).and("--scene is for a run or a model"));
@@ -97,14 +98,14 @@ pub(crate) fn open(
     if let Some(other) = other {
         let called = name_of(other);
         if is_model(other) {
-            stage.show(called, read_model(other, observer)?, near)?;
+            shown.show(called, read_model(other, observer)?, near)?;
         } else {
             let (model, config, iteration) = of_run(other, None, observer)?;
             let called = format!("{called}, iteration {iteration}");
-            stage.show(called, model, config.spec.start.near.0)?;
+            shown.show(called, model, config.spec.start.near.0)?;
         }
     }
-    Ok(stage)
+    Ok(shown)
 }
 
 fn no_run(path: &Path) -> Failure {
@@ -127,10 +128,12 @@ fn of_run(
     Ok((model, config, iteration))
 }
 
-fn of_dataset(machine: Machine, what: &Path, dataset: Dataset, data: &DataSpec) -> Stage {
+fn of_dataset(machine: Machine, what: &Path, dataset: Dataset, data: &DataSpec) -> Exhibition {
     let Dataset { train, test, points, normalisation, .. } = dataset;
     let views = [test, train];
-    Stage::new(machine, name_of(what), normalisation, data.background.fixed(), views, points)
+    let background = data.background.fixed();
+    let stage = Stage::new(machine, name_of(what), normalisation, background, views, points);
+    Exhibition { stage, backends: Vec::new() }
 }
 
 /// A model alone: the middle of its rows is the middle of what is looked at.
@@ -139,7 +142,7 @@ fn without_cameras(
     what: &Path,
     model: &Gaussians,
     data: &DataSpec,
-) -> Result<Stage, Failure> {
+) -> Result<Exhibition, Failure> {
     if model.is_empty() {
         let what = what.display();
         return Err(Failure::input(format!(
@@ -156,7 +159,8 @@ fn without_cameras(
         model.means.iter().map(|mean| DVec3::from(mean.map(f64::from)).distance(centre)).collect();
     let most = (away.len() - 1) * 4 / 5;
     let radius = *away.select_nth_unstable_by(most, f64::total_cmp).1;
-    let radius = if radius > 0.0 { radius } else { ends(&away).end.max(1.0) };
+    let most = || ends(&away.iter().map(|&away| away as f32).collect::<Vec<f32>>()).end.max(1.0);
+    let radius = if radius > 0.0 { radius } else { most().into() };
     let scale = 1.0 / radius;
     let normalisation = match scale.is_normal() && centre.is_finite() {
         true => Normalisation { centre, scale },
@@ -172,7 +176,7 @@ fn without_cameras(
     let key = Key::looking_at(centre, DVec3::ZERO, DVec3::NEG_Y, FOV);
     let camera: Camera = key.camera((1024, 768));
     stage.start = Some(camera);
-    Ok(stage)
+    Ok(Exhibition { stage, backends: Vec::new() })
 }
 
 /// A scene that has not been trained: its points.
@@ -182,7 +186,7 @@ fn of_points(
     dataset: Dataset,
     data: &DataSpec,
     near: f64,
-) -> Result<Stage, Failure> {
+) -> Result<Exhibition, Failure> {
     let cameras = || dataset.train.iter().map(|view| view.camera).collect::<Vec<Camera>>();
     let is_random = dataset.points.is_empty();
     let drawn = if is_random {
@@ -198,23 +202,40 @@ fn of_points(
         true => format!("{}: random points, as it has none of its own", name_of(what)),
         false => format!("{}: its points", name_of(what)),
     };
-    let mut stage = of_dataset(machine, what, dataset, data);
-    stage.show_in_scene(called, &model, near)?;
-    Ok(stage)
+    let mut shown = of_dataset(machine, what, dataset, data);
+    let of_models = [Kind::RowGradient, Kind::RowWeight, Kind::RowAge, Kind::RowEdit];
+    shown.stage.lacking.retain(|(kind, _)| !of_models.contains(kind));
+    shown.stage.lacks(&of_models, NO_MODEL);
+    shown.show_in_scene(called, &model, near)?;
+    Ok(shown)
 }
 
-impl Stage {
+/// A dataset in a folder, to test with.
+#[cfg(test)]
+pub(super) fn stage_of(folder: &Path) -> Stage {
+    let looked = Looked {
+        what: folder,
+        other: None,
+        scene: None,
+        iteration: None,
+        near: 0.04,
+        data: DataSpec::default(),
+    };
+    open(looked, Machine::default(), &crate::run::Silent).expect("a scene").stage
+}
+
+impl Exhibition {
     /// Shows a model that is in the dataset's own coordinates.
     fn show(&mut self, name: String, model: Gaussians, near: f64) -> Result<(), Failure> {
-        let model = self.normalisation.model_from_world(model);
+        let model = self.stage.normalisation.model_from_world(model);
         self.show_in_scene(name, &model, near)
     }
 
     /// The same in scene coordinates. The near plane is a fraction of the scene's extent.
     fn show_in_scene(&mut self, name: String, model: &Gaussians, near: f64) -> Result<(), Failure> {
         let (sh_degree, near) = (model.sh_degree, (near * EXTENT) as f32);
-        let backend = self.machine.backend_in_scene(model, near, (1, 1))?;
-        self.add(Shown { name, rows: model.len(), sh_degree, near, paint: None }, backend);
+        let backend = self.stage.machine.backend_in_scene(model, near, (1, 1))?;
+        self.add(Shown { name, rows: model.len(), sh_degree, near }, backend);
         Ok(())
     }
 }

@@ -1,13 +1,15 @@
 //! Which request gets what. No path names a file: what is served is built in, or made on request.
 
+use std::sync::Arc;
+
 use serde::Deserialize;
 
 use super::asked::{self, Wanted};
 use super::board::{Board, Order};
+use super::darkroom::Frame;
 use super::desk::{Desk, Unmade};
 use super::door::Door;
 use super::http::{Answer, Method, Request};
-use super::pictures::Frame;
 use super::stage::Extent;
 
 const PAGE: &str = include_str!("page/index.html");
@@ -21,7 +23,7 @@ pub(super) struct Routes<'a> {
     pub(super) desk: &'a Desk,
     pub(super) extent: Extent,
     /// The [description](super::describe) of what is shown, as JSON.
-    pub(super) description: String,
+    pub(super) description: Arc<[u8]>,
     /// What is said of a run in training, and asked of it.
     pub(super) board: Option<&'a Board>,
 }
@@ -68,7 +70,9 @@ impl Routes<'_> {
             (Method::Get | Method::Head, "live.js") => {
                 text("text/javascript; charset=utf-8", LIVE_SCRIPT)
             }
-            (Method::Get | Method::Head, "scene") => json(self.description.clone()),
+            (Method::Get | Method::Head, "scene") => {
+                Answer::of("application/json", self.description.clone())
+            }
             (_, path)
                 if known.contains(&path)
                     || self.board.is_some() && known_of_training.contains(&path) =>
@@ -87,19 +91,26 @@ impl Routes<'_> {
             }
             Err(Unmade::Crowded) => Answer::refusal(503, "too many pages look at once; close some"),
             Err(Unmade::Failed(why)) => Answer::refusal(500, why),
-            Err(Unmade::Over) => Answer::refusal(503, "densify has ended; start it again"),
+            Err(Unmade::Over) => Answer::refusal(
+                503,
+                "no more pictures are made; start densify again when it has ended",
+            ),
         }
     }
 }
 
 /// A picture, with what is known of it in the head.
 fn sent(frame: Frame) -> Answer {
-    let Frame { jpeg, size: (width, height), range, mean, distance, milliseconds } = frame;
+    let Frame { jpeg, size: (width, height), range, mean, distance, measured, milliseconds } =
+        frame;
     let mut answer = Answer::of("image/jpeg", jpeg)
         .with("X-Size", format!("{width}x{height}"))
         .with("X-Milliseconds", format!("{milliseconds:.1}"));
     if let Some(range) = range {
         answer = answer.with("X-Range", format!("{} {}", range.start, range.end));
+    }
+    if let Some([seen, all]) = measured {
+        answer = answer.with("X-Measured", format!("{seen} {all}"));
     }
     let numbers = [("X-Mean", mean), ("X-Distance", distance)];
     for (name, value) in numbers.into_iter().filter_map(|(name, it)| Some((name, it?))) {
@@ -113,8 +124,11 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::*;
+    use crate::dataset::PointCloud;
     use crate::dataset::normalise::Normalisation;
+    use crate::run::finished::Machine;
     use crate::view::door::Place;
+    use crate::view::stage::{Shown, Stage};
 
     #[test]
     fn only_what_is_built_in_is_served() {
@@ -124,20 +138,18 @@ mod tests {
             has_secret: false,
         })
         .unwrap();
-        let extent = Extent {
-            models: 1,
-            views: [0, 0],
-            normalisation: Normalisation::IDENTITY,
-            counts: true,
-            paints: true,
-        };
-        let desk = Desk::default();
+        let none = || [Vec::new(), Vec::new()];
+        let points = PointCloud::default();
+        let (machine, place) = (Machine::default(), Normalisation::IDENTITY);
+        let mut stage = Stage::new(machine, "a".into(), place, [0.0; 3], none(), points);
+        stage.models.push(Shown { name: "a".into(), rows: 1, sh_degree: 0, near: 0.1 });
+        let desk = Desk::new(None, 1);
         desk.close();
         let routes = Routes {
             door: &door,
             desk: &desk,
-            extent: extent.clone(),
-            description: "{}".into(),
+            extent: stage.extent(),
+            description: Arc::from(*b"{}"),
             board: None,
         };
         let status = |request: &Request| routes.answer(request).status();
@@ -179,8 +191,8 @@ mod tests {
         let live = Routes {
             door: &door,
             desk: &desk,
-            extent,
-            description: "{}".into(),
+            extent: stage.extent(),
+            description: Arc::from(*b"{}"),
             board: Some(&board),
         };
         let send = |body: &str| {

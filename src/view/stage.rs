@@ -1,7 +1,9 @@
-//! What is looked at: one model or two, in the coordinates of a dataset where there is one.
+//! What is looked at: one model or two, in the coordinates of a dataset where there is one. All threads read it; the
+//! models themselves are with the one that renders.
 
-use super::paint::Paint;
-use crate::backend::{Backend, BackendError};
+use super::kinds::Kind;
+use super::paint::Known;
+use crate::backend::Backend;
 use crate::camera::Camera;
 use crate::dataset::normalise::Normalisation;
 use crate::dataset::{PointCloud, View};
@@ -9,9 +11,17 @@ use crate::evaluate::Split;
 use crate::run::Run;
 use crate::run::finished::{Machine, name_of};
 use crate::views::DatasetViews;
+use densify_policies::policy::Signal;
 
 /// Decoded photographs that are kept `[bytes]`, where a promise does not say how much may be held.
 const KEPT_PHOTOGRAPHS: u64 = 64 << 20;
+
+const NO_COUNTS: &str = "they are not counted on a GPU; start with --backend cpu";
+const NO_HISTORY: &str = "no file says when a Gaussian was made or edited; densify train --view shows it while a run trains";
+const NO_PHOTOGRAPHS: &str = "no photographs are known; name their dataset with --scene";
+const NO_TRAINING_VIEWS: &str =
+    "it is measured in training photographs, and none are known; name their dataset with --scene";
+pub(super) const NO_MODEL: &str = "points are not a model yet";
 
 /// A model that is shown.
 pub(super) struct Shown {
@@ -22,21 +32,24 @@ pub(super) struct Shown {
     pub(super) sh_degree: u8,
     /// Near plane `[scene units]`.
     pub(super) near: f32,
-    /// The same rows in other colours, once they were asked for.
-    pub(super) paint: Option<Paint>,
 }
 
-/// Everything that is looked at.
-pub(crate) struct Stage {
+/// What is looked at, with the models.
+pub(crate) struct Exhibition {
+    pub(super) stage: Stage,
+    /// What renders the models, in their order.
+    pub(super) backends: Vec<Box<dyn Backend>>,
+}
+
+/// Everything that is looked at, but the models' rows.
+pub(super) struct Stage {
     pub(super) machine: Machine,
     /// What the page calls it.
     pub(super) title: String,
     /// One or two.
     pub(super) models: Vec<Shown>,
-    /// What renders them, in their order; of a run in training its own does.
-    pub(super) backends: Vec<Box<dyn Backend>>,
-    /// Whether rows per pixel can be counted.
-    pub(super) counts: bool,
+    /// The kinds of pictures that cannot be made of it, with the reasons.
+    pub(super) lacking: Vec<(Kind, String)>,
     /// The largest picture that may be rendered, where a promise holds: that of training.
     pub(super) largest: Option<(u32, u32)>,
     pub(super) normalisation: Normalisation,
@@ -57,10 +70,24 @@ pub(super) struct Extent {
     /// Number of views of each split.
     pub(super) views: [usize; 2],
     pub(super) normalisation: Normalisation,
-    /// Whether rows per pixel can be counted.
-    pub(super) counts: bool,
-    /// Whether rows can be painted: that takes a second model.
-    pub(super) paints: bool,
+    /// The kinds of pictures that cannot be made, with the reasons.
+    pub(super) lacking: Vec<(Kind, String)>,
+}
+
+impl Exhibition {
+    /// Adds a model with what renders it.
+    pub(super) fn add(&mut self, shown: Shown, backend: Box<dyn Backend>) {
+        if !backend.counts_rows() {
+            self.stage.lacks(&[Kind::Count], NO_COUNTS);
+        }
+        self.stage.models.push(shown);
+        self.backends.push(backend);
+    }
+
+    /// Names and rows of the models.
+    pub(crate) fn models(&self) -> impl Iterator<Item = (&str, usize)> {
+        self.stage.models.iter().map(|model| (&*model.name, model.rows))
+    }
 }
 
 impl Stage {
@@ -73,7 +100,13 @@ impl Stage {
         points: PointCloud,
     ) -> Self {
         let views = [test, train];
-        Self::keeping(KEPT_PHOTOGRAPHS, machine, title, (normalisation, background), views, points)
+        let place = (normalisation, background);
+        let mut stage = Self::keeping(KEPT_PHOTOGRAPHS, machine, title, place, views, points);
+        stage.lacks(&[Kind::RowAge, Kind::RowEdit], NO_HISTORY);
+        if stage.views[1].is_empty() {
+            stage.lacks(&[Kind::RowGradient, Kind::RowWeight], NO_TRAINING_VIEWS);
+        }
+        stage
     }
 
     /// The same, keeping so many bytes of photographs.
@@ -85,13 +118,13 @@ impl Stage {
         [test, train]: [Vec<View>; 2],
         points: PointCloud,
     ) -> Self {
+        let has_views = !(test.is_empty() && train.is_empty());
         let photographs = |views: &Vec<View>| DatasetViews::new(views.clone(), kept, 1);
-        Self {
+        let mut stage = Self {
             machine,
             title,
             models: Vec::new(),
-            backends: Vec::new(),
-            counts: true,
+            lacking: Vec::new(),
             largest: None,
             normalisation,
             background,
@@ -99,45 +132,54 @@ impl Stage {
             views: [test, train],
             points,
             start: None,
+        };
+        if !has_views {
+            stage.lacks(&[Kind::Photograph, Kind::Difference], NO_PHOTOGRAPHS);
         }
+        stage
     }
 
     /// A run in training: rendered by what trains it, and in no larger pictures.
     pub(super) fn of_run(run: &mut Run) -> Self {
         let counts = run.trainer().backend().counts_rows();
-        let rows = run.trainer().rows();
+        let (rows, signals) = (run.trainer().rows(), run.trainer().signals());
         let (config, dataset) = (run.config(), run.dataset());
         let title = name_of(&config.scene_path());
         let background = config.spec.data.background.fixed();
+        let policy = &config.spec.density.policy;
         let models = vec![Shown {
-            name: format!("{}, in training", config.spec.density.policy),
+            name: format!("{policy}, in training"),
             rows,
             sh_degree: config.sh_degree(),
             near: 0.0,
-            paint: None,
         }];
         let views = [dataset.test.clone(), dataset.train.clone()];
-        let stage = Self::keeping(
-            0,
-            Machine::default(),
-            title,
-            (dataset.normalisation, background),
-            views,
-            PointCloud::default(),
+        let place = (dataset.normalisation, background);
+        let points = dataset.points.clone();
+        let stage = Self::keeping(0, Machine::default(), title, place, views, points);
+        let mut stage = Self { models, largest: Some(dataset.largest_image()), ..stage };
+        if !counts {
+            stage.lacks(&[Kind::Count], NO_COUNTS);
+        }
+        let unmeasured = format!(
+            "the policy {policy} does not measure it; densify view does, once a model has been saved"
         );
-        Self { models, counts, largest: Some(dataset.largest_image()), ..stage }
+        if (Known { signals, ..Known::default() }).gradient().is_none() {
+            stage.lacks(&[Kind::RowGradient], &unmeasured);
+        }
+        if !signals.contains(Signal::WeightMax) {
+            stage.lacks(&[Kind::RowWeight], &unmeasured);
+        }
+        stage
     }
 
-    /// Adds a model with what renders it.
-    pub(super) fn add(&mut self, shown: Shown, backend: Box<dyn Backend>) {
-        self.counts &= backend.counts_rows();
-        self.models.push(shown);
-        self.backends.push(backend);
-    }
-
-    /// Names and rows of the models.
-    pub(crate) fn models(&self) -> impl Iterator<Item = (&str, usize)> {
-        self.models.iter().map(|model| (&*model.name, model.rows))
+    /// These kinds of pictures cannot be made of it, for this reason, if there is no other one already.
+    pub(super) fn lacks(&mut self, kinds: &[Kind], why: &str) {
+        for &kind in kinds {
+            if self.lacking.iter().all(|(lacking, _)| *lacking != kind) {
+                self.lacking.push((kind, why.to_owned()));
+            }
+        }
     }
 
     pub(super) fn extent(&self) -> Extent {
@@ -145,8 +187,7 @@ impl Stage {
             models: self.models.len(),
             views: [self.views[0].len(), self.views[1].len()],
             normalisation: self.normalisation,
-            counts: self.counts,
-            paints: self.largest.is_none(),
+            lacking: self.lacking.clone(),
         }
     }
 
@@ -158,19 +199,5 @@ impl Stage {
     /// Photographs of a split.
     pub(super) fn photographs(&self, split: Split) -> &DatasetViews {
         &self.photographs[split as usize]
-    }
-
-    /// The same rows in other colours.
-    pub(super) fn paint(
-        &mut self,
-        model: usize,
-        backend: &dyn Backend,
-    ) -> Result<&mut Paint, BackendError> {
-        let Self { machine, models, .. } = self;
-        let Shown { near, paint, .. } = &mut models[model];
-        if paint.is_none() {
-            *paint = Some(Paint::new(machine, backend, *near)?);
-        }
-        Ok(paint.as_mut().expect("it was made just now"))
     }
 }

@@ -48,6 +48,14 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.until("document.getElementById('training-numbers').textContent.includes('Checkpoint of step')", "no checkpoint is shown")
     assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
     browser.is_sharp()
+    # What only a run in training knows.
+    for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
+        if kind.startswith("row_"):
+            browser.choose("left", f"{kind}:0")
+            # Some signals may not have been seen since the last edit.
+            assert browser.run(PROBE)["spread"] > 1, f"{kind} is empty"
+    browser.choose("left", "row_edit:0")
+    browser.keep(folder, "live-edits")
     browser.choose("left", "depth:0")
     browser.run("document.querySelector('details').open = true")
     browser.keep(folder, "live-paused")

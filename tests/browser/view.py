@@ -1,8 +1,8 @@
 """Drives the page of `densify view` in a real browser: Chromium without a window, through chromedriver.
 
-    python view.py DENSIFY RUN [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
+    python view.py DENSIFY RUN OTHER [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
 
-RUN must hold views out. WebDriver is JSON over HTTP, for which Python's own library is enough.
+RUN and OTHER are of one scene, and RUN must hold views out. WebDriver is JSON over HTTP, for which Python's own library is enough.
 """
 
 import base64
@@ -10,9 +10,12 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 STEPS = 50
@@ -28,6 +31,45 @@ const light = [];
 for (let i = 0; i < data.length; i += 4) light.push(data[i] + data[i + 1] + data[i + 2]);
 const mean = light.reduce((a, b) => a + b) / light.length;
 return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join() };
+"""
+# Decibels between the right one of two pictures and a PNG, of one size.
+PSNR = """
+const done = arguments[arguments.length - 1], image = new Image();
+image.onload = () => {
+  const { bitmap } = shown[1];
+  const [a, b] = [bitmap, image].map((it) => {
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [it.width, it.height];
+    canvas.getContext("2d").drawImage(it, 0, 0);
+    return canvas.getContext("2d").getImageData(0, 0, it.width, it.height).data;
+  });
+  if (a.length !== b.length) return done(0);
+  const sum = a.reduce((sum, x, i) => sum + (x - b[i]) ** 2, 0);
+  done(10 * Math.log10(255 ** 2 / Math.max(sum / (a.length * 3 / 4), 1e-9)));
+};
+image.src = arguments[0];
+"""
+# Pixels of the marks over the picture.
+MARKED = """
+const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
+[copy.width, copy.height] = [marks.width, marks.height];
+out.drawImage(marks, 0, 0);
+const { data } = out.getImageData(0, 0, copy.width, copy.height);
+return data.filter((value, i) => i % 4 === 3 && value).length;
+"""
+# A camera that is drawn: where, and which one a click there goes to.
+DRAWN = """
+const places = allViews().map(({ split, number }) => projector()(frustum(scene.views[split][number])[0]));
+const [width, height] = area();
+const [x, y] = places.find(([x, y, z]) => z > 0 && x > 20 && y > 60 && x < width - 120 && y < height - 60).map(Math.round);
+return [x, y, cameraAt(x, y)];
+"""
+# What the keyboard cannot reach, or has no name, of what is seen.
+UNREACHED = """
+const seen = [...document.querySelectorAll("button, select, input, summary, [tabindex='0']")]
+  .filter((it) => it.offsetParent !== null && !it.disabled && (it.type !== "radio" || it.checked));
+const name = (it) => it.ariaLabel || it.labels?.[0]?.textContent || it.textContent;
+return seen.filter((it) => !it.dataset.reached || !name(it).trim()).map((it) => it.id || it.outerHTML);
 """
 
 
@@ -60,6 +102,10 @@ class Browser:
     def run(self, script: str, *arguments: object) -> object:
         return self.call("POST", f"{self.session}/execute/sync", {"script": script, "args": list(arguments)})
 
+    def wait(self, script: str, *arguments: object) -> object:
+        """Runs a script that calls its last argument when it is done."""
+        return self.call("POST", f"{self.session}/execute/async", {"script": script, "args": list(arguments)})
+
     def command(self, name: str, **parameters: object) -> None:
         """A command of the DevTools."""
         self.call("POST", f"{self.session}/goog/cdp/execute", {"cmd": name, "params": parameters})
@@ -88,6 +134,16 @@ class Browser:
         pointer = {"type": "pointer", "id": "hand", "parameters": {"pointerType": "mouse"}, "actions": list(actions)}
         self.call("POST", f"{self.session}/actions", {"actions": [pointer]})
 
+    def pinch(self, *places: tuple[int, int]) -> None:
+        """Two fingers: their places, one of each in turn, and where each goes."""
+        sources = []
+        for finger, (at, to) in enumerate([(places[0], places[2]), (places[1], places[3])]):
+            move = lambda place, duration: {"type": "pointerMove", "duration": duration, "x": place[0], "y": place[1]}
+            actions = [move(at, 0), {"type": "pointerDown"}, move(to, 200), {"type": "pointerUp"}]
+            parameters = {"pointerType": "touch"}
+            sources.append({"type": "pointer", "id": f"finger{finger}", "parameters": parameters, "actions": actions})
+        self.call("POST", f"{self.session}/actions", {"actions": sources})
+
     def log(self, kind: str) -> list[dict]:
         return self.call("POST", f"{self.session}/se/log", {"type": kind})
 
@@ -111,7 +167,7 @@ class Browser:
         self.driver.wait()
 
 
-def check(browser: Browser, url: str, folder: Path | None) -> None:
+def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, folder: Path | None) -> None:
     browser.size(1280, 800)
     browser.theme("dark")
     browser.open(url)
@@ -130,6 +186,11 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     own = browser.run("const { width, height } = scene.views.test[0]; return `${width}x${height}`")
     found = browser.run("return document.getElementById('stage').dataset.size")
     assert found == own, f"{found} instead of {own}"
+    # Pixel by pixel it is what `densify render` writes.
+    name = Path(browser.run("return scene.views.test[0].name")).with_suffix(".png")
+    png = base64.b64encode((rendered / "pictures" / name).read_bytes()).decode()
+    near = browser.wait(PSNR, f"data:image/png;base64,{png}")
+    assert near >= 38, f"the picture is {near:.1f} dB from that of densify render"
     before = browser.run(PROBE)
     browser.run("document.getElementById('divider').focus()")
     browser.press("\ue011")  # Home
@@ -143,7 +204,13 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     browser.keep(folder, "difference")
     browser.choose("right", "")
     browser.theme("light")
+    bare = browser.run(MARKED)
     browser.run("document.getElementById('frusta').click()")
+    cameras = browser.run(MARKED)
+    browser.run("document.getElementById('points').click()")
+    assert bare == 0 < cameras < browser.run(MARKED), "cameras or points are not drawn"
+    browser.keep(folder, "marks")
+    browser.run("document.getElementById('points').click()")
     for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
         browser.choose("left", f"{kind}:0")
         assert browser.run(PROBE)["spread"] > 4, f"{kind} is empty"
@@ -162,9 +229,29 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
         assert found["spread"] > 4, f"picture {step} is empty"
         seen.add(found["light"])
     assert len(seen) == STEPS, f"{STEPS} steps gave {len(seen)} pictures"
+    # Lifted over the panel, the hand turns no more.
     browser.hand({"type": "pointerUp", "button": 0})
     browser.is_sharp()
     browser.keep(folder, "anywhere")
+    before = browser.run("return version")
+    browser.hand(middle)
+    assert browser.run("return version") == before, "who has let go still turns"
+    # A click on a camera that is drawn goes there.
+    x, y, found = browser.run(DRAWN)
+    place = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": x, "y": y}
+    browser.hand(place, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0})
+    assert found and browser.run("return view") == found, f"no click goes to {found}"
+    browser.is_sharp()
+    # The wheel goes nearer; on the way pictures are smaller than at rest.
+    watch = "window.sizes = []; const note = () => sizes.push(Number(stage.dataset.size.split('x')[0]));"
+    browser.run(watch + "coarse = 0.4; new MutationObserver(note).observe(stage, { attributeFilter: ['data-size'] });")
+    before = browser.run("return camera.away")
+    wheel = {"type": "scroll", "x": 440, "y": 380, "deltaX": 0, "deltaY": -300, "duration": 0}
+    browser.call("POST", f"{browser.session}/actions", {"actions": [{"type": "wheel", "id": "wheel", "actions": [wheel]}]})
+    assert browser.run("return camera.away") < 0.9 * before, "the wheel does not go nearer"
+    browser.is_sharp()
+    sizes = browser.run("return sizes")
+    assert sizes[0] < 0.6 * sizes[-1], f"pictures of {sizes} px on the way"
     pace = "const { rate, rested } = document.getElementById('stage').dataset; return [rate, rested]"
     # Flying by key, as fast as pictures come.
     keys = lambda kind: [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": "s"}]}]
@@ -175,9 +262,32 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     browser.is_sharp()
     rate, rested = browser.run(pace)
     print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
+    # Two fingers that part go nearer.
+    before = browser.run("return camera.away")
+    browser.pinch((400, 300), (480, 300), (300, 300), (580, 300))
+    after = browser.run("return camera.away")
+    assert after < 0.9 * before, f"fingers that part: from {before} to {after} away"
+    browser.is_sharp()
+    # Everything that is seen is reached by key, and has a name.
+    for _ in range(60):
+        browser.press("\ue004")  # Tab
+        browser.run("document.activeElement.dataset.reached = true")
+    unreached = browser.run(UNREACHED)
+    assert not unreached, f"not reached by key, or without a name: {unreached}"
+    browser.run("document.getElementById('marks').focus()")
     browser.press("k", "r", "]", "k")
     assert not browser.run("return document.getElementById('save').disabled"), "no camera path to save"
     assert browser.run("return keys.length") == 2
+    # What the page saves, densify flies along.
+    keep = "URL.createObjectURL = (blob) => { blob.text().then((text) => { window.saved = text; }); return 'data:,'; };"
+    browser.run(keep + "document.getElementById('save').click()")
+    browser.until("window.saved", "no camera path is saved")
+    path = rendered / "camera_path.json"
+    path.write_text(browser.run("return saved"))
+    flight = ["--path", path, "--frames", "3", "--size", "64x48", "-o", rendered / "flight", "--backend", "cpu"]
+    subprocess.run([densify, "render", run, *flight], check=True, capture_output=True)
+    frames = {it.read_bytes() for it in (rendered / "flight").rglob("*.png")}
+    assert len(frames) == 3, f"{len(frames)} pictures of the flight"
 
     # Where there is little room.
     browser.size(360, 740)
@@ -196,6 +306,53 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     browser.is_sharp()
     browser.keep(folder, "phone-dark")
 
+    is_clean(browser, url)
+
+
+def check_two(browser: Browser, url: str, folder: Path | None) -> None:
+    """Two runs, seen from one camera, with a border between them."""
+
+    def halves() -> list[str]:
+        lights = []
+        for share in (0, 1):
+            browser.run("setBorder(arguments[0])", share)
+            lights.append(browser.run(PROBE)["light"])
+        return lights
+
+    browser.size(1280, 800)
+    browser.theme("light")
+    browser.open(url)
+    browser.is_sharp()
+    if browser.run("return document.getElementById('guide').open"):
+        browser.press("\ue007")
+    names = browser.run("return scene.models.map(({ name }) => name)")
+    tags = browser.run("return ['left-name', 'right-name'].map((id) => document.getElementById(id).textContent)")
+    assert len(names) == 2 and all(name in tag for name, tag in zip(names, tags)), f"{names}: {tags}"
+    before = halves()
+    assert before[0] != before[1], "both sides show one model"
+    # Whoever turns one turns the other.
+    browser.run("document.getElementById('marks').focus()")
+    browser.press("\ue012", "\ue012")  # Left
+    browser.is_sharp()
+    after = halves()
+    assert before[0] != after[0] and before[1] != after[1], "one side stands still"
+    # By hand, in steps of their own, and lifted beyond the edge.
+    x = browser.run("setBorder(0.5); return Math.round(area()[0] / 2)")
+    move = lambda x: {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": x, "y": 400}
+    browser.hand(move(x), {"type": "pointerDown", "button": 0})
+    browser.hand(move(x - 100))
+    browser.hand(move(x + 700))
+    browser.hand({"type": "pointerUp", "button": 0})
+    assert browser.run("return border") == 1, "the border does not follow the hand"
+    browser.hand(move(x))
+    assert browser.run("return border") == 1, "the border follows a hand that has let go"
+    browser.run("setBorder(0.5)")
+    browser.keep(folder, "two")
+    is_clean(browser, url)
+
+
+def is_clean(browser: Browser, url: str) -> None:
+    """Nothing was complained about, and nothing asked of others."""
     severe = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     assert not severe, "\n".join(severe)
     events = [json.loads(entry["message"])["message"] for entry in browser.log("performance")]
@@ -205,23 +362,37 @@ def check(browser: Browser, url: str, folder: Path | None) -> None:
     assert not strange, f"requests beyond the page: {strange}"
 
 
-def main(densify: str, run: str, folder: str | None = None) -> None:
-    if folder:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    program = subprocess.Popen([densify, "view", run, "--port", "0", "--backend", "cpu"], stdout=subprocess.PIPE, text=True)
+@contextmanager
+def served(densify: str, *shown: str) -> Iterator[tuple[Browser, str]]:
+    """A browser, and the address of a page that is served meanwhile."""
+    command = [densify, "view", *shown, "--port", "0", "--backend", "cpu"]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert program.stdout
         line = next(line for line in program.stdout if line.startswith("page "))
         browser = Browser()
         try:
-            check(browser, line.split()[1], Path(folder) if folder else None)
+            yield browser, line.split()[1]
         finally:
             browser.close()
         program.send_signal(signal.SIGINT)
         assert program.wait(PATIENCE) == 0, "Ctrl-C does not end it well"
     finally:
         program.kill()
-    print("the page shows a test camera, compares, turns, flies, fits 360 px, and asks nobody else")
+
+
+def main(densify: str, run: str, other: str, folder: str | None = None) -> None:
+    kept = Path(folder) if folder else None
+    if kept:
+        kept.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as rendered:
+        command = [densify, "render", run, "-o", f"{rendered}/pictures", "--backend", "cpu"]
+        subprocess.run(command, check=True, capture_output=True)
+        with served(densify, run) as (browser, url):
+            check(browser, url, densify, run, Path(rendered), kept)
+    with served(densify, run, other) as (browser, url):
+        check_two(browser, url, kept)
+    print("the page shows a test camera as densify render does, compares, turns, flies, fits 360 px, and asks nobody else")
 
 
 if __name__ == "__main__":

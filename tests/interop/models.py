@@ -41,7 +41,7 @@ def main(densify: str, other: str, model: str) -> None:
     truth = rows(Path(model))
     with tempfile.TemporaryDirectory() as folder:
         there, here = Path(folder, "there.ply"), Path(folder, "here.ply")
-        for name in ("m.compressed.ply", "m.spz", "m.sog"):
+        for name in ("m.compressed.ply", "m.spz", "m.v4.spz", "m.sog"):
             ours, theirs = Path(folder, f"ours.{name}"), Path(folder, f"theirs.{name}")
             subprocess.run([densify, "export", model, "-o", ours], check=True)
             subprocess.run([other, "-q", "-w", ours, there], check=True)

@@ -1,18 +1,21 @@
-//! Frozen rows: whatever a step or a plan does to the others, these keep their bits.
+//! Frozen rows: whatever a step or a plan does to the others, these keep their bits, and they have no memory for
+//! what only training needs.
 
-use densify::backend::{Backend, StepInput, Storage};
+use densify::backend::{Attribute, Backend, Kept, StepInput, Storage, Unsound, Values};
 use densify::camera::Camera;
 use densify::gaussians::Gaussians;
 use densify::verify::{Setup, Subject, scenes};
 use densify_policies::adc::split_by;
 use densify_policies::plan::{Decay, EditPlan};
-use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm};
+use densify_policies::policy::{Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalSet};
 
 use crate::subject::{all, make_with, on_each, repeatable, saved, step_input, storages};
 
-const ROWS: usize = 59;
-/// A block of the native backend, and a part of another.
-const FROZEN: usize = 21;
+const ROWS: usize = 190;
+/// Rows of a task of the native backend, which has memory for whole tasks.
+const TASK: usize = 128;
+/// A task, a block of the next, and a part of another.
+const FROZEN: usize = TASK + 21;
 
 fn view() -> Camera {
     scenes::camera(41, 33, 81)
@@ -54,16 +57,23 @@ fn bits(model: &Gaussians, rows: std::ops::Range<usize>) -> Vec<Vec<u32>> {
     rows.map(row).collect()
 }
 
-#[test]
-fn nothing_changes_them() {
+/// Everything that has memory for each row.
+fn all_of_it() -> Needs {
     let mask = MaskTerm { start: 1.0, rate: 0.2, weight: 1.0, threshold: 0.72 };
-    let all_of_it = Needs {
+    let signals = [Signal::VisibleCount, Signal::ScreenGradient, Signal::Age, Signal::Mask];
+    Needs {
+        signals: SignalSet::from(signals),
         loss_terms: LossTerms { opacity: 0.1, scale: 0.1 },
         noise: Some(NoiseTerm { strength: 50.0, sharpness: 1.0, opacity: 0.9 }),
         mask: Some(mask),
         cadence: Cadence { all: 2, sh_rest: 3 },
         ..Needs::default()
-    };
+    }
+}
+
+#[test]
+fn nothing_changes_them() {
+    let all_of_it = all_of_it();
     on_each(all(), |subject| {
         let storages = storages();
         let storages = match subject {
@@ -97,17 +107,99 @@ fn nothing_changes_them() {
     });
 }
 
-/// Rows step as they do where none is frozen, as long as all are where they would be.
+/// Rows step as they do where none is frozen, as long as all are where they would be; and so do their moments, ages,
+/// masks and signals. Of frozen rows these are 0.
 #[test]
 fn the_others_step_as_ever() {
+    // The derivatives of terms are means over the rows that train.
+    let needs = Needs { loss_terms: LossTerms::default(), noise: None, mask: None, ..all_of_it() };
     on_each(repeatable(), |subject| {
         let [free, frozen] = [0, FROZEN].map(|frozen| {
-            let setup = setup(frozen, Storage::default(), Needs::default());
+            let setup = setup(frozen, Storage::default(), needs.clone());
             let mut backend = make_with(subject, &model(), setup);
-            step(&mut *backend, 1, &Needs::default());
-            let (model, _) = saved(&*backend);
-            bits(&model, FROZEN..ROWS)
+            for number in 1..=2 {
+                step(&mut *backend, number, &needs);
+            }
+            let (model, state) = saved(&*backend);
+            let signals = backend.take_signals(needs.signals).expect("signals");
+            let column = |signal| signals.get(signal).expect("it was asked for")[FROZEN..].to_vec();
+            let columns = [Signal::VisibleCount, Signal::ScreenGradient, Signal::Age].map(column);
+            assert!(columns.iter().all(|column| column.iter().any(|value| *value > 0.0)));
+            (bits(&model, FROZEN..ROWS), state, columns)
         });
-        assert!(free == frozen);
+        assert!(free.0 == frozen.0 && free.2 == frozen.2);
+        assert_eq!(free.1.len(), frozen.1.len());
+        for (free, frozen) in free.1.iter().zip(&frozen.1) {
+            assert_eq!((&free.name, &free.shape), (&frozen.name, &frozen.shape));
+            let [free_rows, frozen_rows] = [free, frozen].map(|tensor| by_rows(&tensor.values));
+            // Bands that the model does not have are arrays without numbers.
+            if free.shape[0] == ROWS && !free_rows.is_empty() {
+                assert!(free_rows[FROZEN..] == frozen_rows[FROZEN..], "{}", free.name);
+                let rests = |row: &Vec<u32>| row.iter().all(|value| *value == 0);
+                assert!(frozen_rows[..FROZEN].iter().all(rests), "{}", free.name);
+            }
+        }
+    });
+}
+
+/// The bits of an array, row by row.
+fn by_rows(values: &Values) -> Vec<Vec<u32>> {
+    let all: Vec<u32> = match values {
+        Values::F32(values) => values.iter().map(|value| value.to_bits()).collect(),
+        Values::U16(values) => values.iter().map(|&value| value.into()).collect(),
+        Values::U8(values) => values.iter().map(|&value| value.into()).collect(),
+    };
+    let width = (all.len() / ROWS).max(1);
+    all.chunks(width).map(<[u32]>::to_vec).collect()
+}
+
+/// What a row takes that never changes is what the ledger loses where it is frozen.
+#[test]
+fn they_have_no_memory_for_training() {
+    let of = |subject: &Subject, frozen: usize| {
+        make_with(subject, &model(), setup(frozen, Storage::default(), all_of_it()))
+            .ledger()
+            .total()
+    };
+    // At degree 1, 23 parameters: two moments and a waiting gradient of each. Ages of two kinds, two sums of
+    // signals, a mask with two moments.
+    let numbers = 3 * 23 + 2 + 3;
+    let native = |frozen: usize| of(&Subject::NATIVE, frozen);
+    assert_eq!(native(0) - native(TASK), (TASK * (4 * numbers + 2 * 2)) as u64);
+    assert_eq!(native(TASK), native(FROZEN), "whole tasks are left out");
+    on_each(all(), |subject| {
+        let Subject::Gpu(_) = subject else { return };
+        // Padding of the geometry, three times; the gradient of a row in the view at hand.
+        let bytes = 4 * (numbers + 3 + 1 + 20);
+        let padding = 16 * 16;
+        let saved = of(subject, 0) - of(subject, FROZEN);
+        assert!(saved.abs_diff((FROZEN * bytes) as u64) < padding, "{saved} of {}", FROZEN * bytes);
+    });
+}
+
+#[test]
+fn what_is_unsound_behind_them_is_found() {
+    on_each(repeatable(), |subject| {
+        let setup = setup(FROZEN, Storage::default(), Needs::default());
+        let mut broken = model();
+        broken.opacity_logits[5] = f32::NAN;
+        broken.means[FROZEN + 2][1] = f32::INFINITY;
+        let mut backend = make_with(subject, &broken, setup);
+        let names: Vec<String> = backend.state().into_iter().map(|array| array.name).collect();
+        let first = names.iter().find(|name| name.contains("first")).expect("moments");
+        let mut moments = backend.save(first).expect("moments");
+        let width = moments.shape[1];
+        let Values::F32(values) = &mut moments.values else { panic!("{first} has no numbers") };
+        values[(FROZEN + 7) * width] = f32::NAN;
+        backend.restore(moments).expect("they are taken back");
+        let unsound = |row: usize, attribute, kept| Unsound { row: row as u32, attribute, kept };
+        assert_eq!(
+            backend.audit().expect("an audit"),
+            [
+                unsound(5, Attribute::Opacity, Kept::Parameter),
+                unsound(FROZEN + 2, Attribute::Mean, Kept::Parameter),
+                unsound(FROZEN + 7, Attribute::Mean, Kept::Moment),
+            ]
+        );
     });
 }

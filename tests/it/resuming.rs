@@ -33,8 +33,12 @@ fn needs() -> Needs {
     }
 }
 
-fn backend(subject: &Subject, storage: Storage, model: &Gaussians) -> Box<dyn Differentiable> {
-    make_with(subject, model, Setup { storage, needs: needs(), ..Setup::default() })
+fn backend(
+    subject: &Subject,
+    (storage, frozen): (Storage, usize),
+    model: &Gaussians,
+) -> Box<dyn Differentiable> {
+    make_with(subject, model, Setup { storage, frozen, needs: needs(), ..Setup::default() })
 }
 
 fn step(backend: &mut dyn Backend, camera: &Camera, number: u32) {
@@ -78,10 +82,13 @@ fn is_zero(tensor: &Tensor) -> bool {
 fn a_backend_that_took_back_its_state_has_the_same_future() {
     let camera = scenes::camera(48, 40, 51);
     let model = scenes::cloud(200, 3, &camera, 52);
-    let stored = storages().map(|storage| (Subject::NATIVE, storage));
-    let all = repeatable().into_iter().map(|subject| (subject, Storage::default()));
-    for (subject, storage) in all.chain(stored) {
-        let mut whole = backend(&subject, storage, &model);
+    let stored = storages().map(|storage| (Subject::NATIVE, (storage, 0)));
+    // With frozen rows too: a task of the native backend, and a part of another.
+    let all = repeatable()
+        .into_iter()
+        .flat_map(|subject| [0, 141].map(|frozen| (subject.clone(), (Storage::default(), frozen))));
+    for (subject, setup) in all.chain(stored) {
+        let mut whole = backend(&subject, setup, &model);
         whole.begin_epoch();
         for i in 1..=BEFORE {
             step(&mut *whole, &camera, i);
@@ -90,13 +97,13 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
         let expected = future(&mut *whole);
 
         let without = |left_out: &str| {
-            let mut backend = backend(&subject, storage, &model);
+            let mut backend = backend(&subject, setup, &model);
             for tensor in state.iter().filter(|t| t.name != left_out) {
                 backend.restore(tensor.clone()).expect("it is this backend's");
             }
             future(&mut *backend)
         };
-        let name = format!("{}, {storage:?}", subject.name());
+        let name = format!("{}, {setup:?}", subject.name());
         assert!(without("") == expected, "{name}");
         // None of it is idle.
         let told: Vec<&Tensor> = state.iter().filter(|t| !is_zero(t)).collect();

@@ -77,6 +77,7 @@ fn growth_is_that_of_vanilla() {
 
 #[test]
 fn the_control_leaves_so_many_at_random() {
+    assert_eq!(run(&event(15_000, &[1.0; 100]), "random_keep = 1").ops.rows_after, 1);
     let event = event(15_000, &[0.0; 100]);
     let done = run(&event, "random_keep = 40");
     assert_eq!(done.ops.rows_after, 40);

@@ -145,6 +145,8 @@
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
 
+// One piece: a third is the manual page, and growth, compensation and pruning meet in `plan`.
+
 use crate::adc::{PruneLimits, Window, add_colour_gradient, mean_over_views, spare_one};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};

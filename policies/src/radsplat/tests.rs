@@ -110,6 +110,7 @@ fn the_control_may_be_told_what_the_second_prune_leaves() {
     // Not at the first prune, and not by the real policy; a smaller model is left as it is.
     assert_eq!(run(&Event { step: 16_000, ..event.clone() }, set).ops.rows_after, 4);
     assert_eq!(run(&event, "random_keep = 3").ops.rows_after, 4);
+    assert_eq!(run(&event, "victims = \"random\"\nrandom_keep = 1").ops.rows_after, 1);
     assert_eq!(run(&event, "victims = \"random\"\nrandom_keep = 9").ops.rows_after, 5);
     let views = |step| build("radsplat", set, &scene).aux_views(step, 9, 9);
     assert_eq!([16_000, 24_000].map(views), [u32::MAX, 0]);

@@ -222,6 +222,8 @@ fn the_control_may_end_at_a_given_number() {
     assert_eq!(left(29_000, 90, "prune_until = 90000"), 30);
     // Of the sixteen from the end of growth on, the first leaves 810·(1/81)^(1/16) = 615.5.
     assert_eq!(left(15_000, 810, ""), 615);
+    let one = "victims = \"random\"\nrandom_keep = 1";
+    assert_eq!(run(&event(30_000, &xs[..30]), one).ops.rows_after, 1);
     // During growth as many as the rule would prune, which is none here.
     assert_eq!(left(14_000, 810, "grow_every = 0"), 810);
 }

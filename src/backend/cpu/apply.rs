@@ -9,7 +9,7 @@ use densify_policies::plan::{
 use densify_policies::policy::Signal;
 use densify_policies::rng::{PolicyRng, Purpose};
 
-use super::blocks::{plane, planes, reorder};
+use super::blocks::{Blocks, plane, planes};
 use super::mask::Masks;
 use super::moments::Moments;
 use super::parameters::Parameters;
@@ -22,7 +22,7 @@ use crate::gaussians::{logit, rgb_to_dc, sigmoid};
 pub(super) struct Model<'a> {
     pub(super) params: &'a mut Parameters,
     pub(super) moments: &'a mut Moments,
-    pub(super) ages: &'a mut [u16],
+    pub(super) ages: &'a mut Blocks<u16>,
     pub(super) masks: &'a mut Masks,
     pub(super) signals: &'a mut Accumulators,
     pub(super) summed: &'a mut Summed,
@@ -186,7 +186,7 @@ impl Model<'_> {
     fn reborn(&mut self, row: usize) {
         self.moments.clear_row(row);
         self.masks.forget(row);
-        self.ages[row] = 0;
+        self.ages.clear_row(row);
         self.signals.blocks.clear_row(row);
         self.summed.clear_row(row);
     }
@@ -195,7 +195,7 @@ impl Model<'_> {
         self.params.copy_row(from, to);
         self.moments.copy_row(from, to);
         self.masks.copy_row(from, to);
-        self.ages[to] = self.ages[from];
+        self.ages.copy_row(from, to);
         self.signals.blocks.copy_row(from, to);
         self.summed.copy_row(from, to);
     }
@@ -204,7 +204,7 @@ impl Model<'_> {
         self.params.reorder(order);
         self.moments.reorder(order);
         self.masks.reorder(order);
-        reorder(self.ages, order);
+        self.ages.reorder(order);
         self.signals.blocks.reorder(order);
         self.summed.reorder(order);
     }

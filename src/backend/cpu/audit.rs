@@ -9,6 +9,7 @@ impl CpuBackend {
     /// The rows with a number that is not finite, in order.
     pub(super) fn unsound(&self) -> Vec<Unsound> {
         let rows = self.rows;
+        let first_block = self.moments.first() / WIDTH;
         let (params, moments) = (self.params.view(rows), self.moments.view(rows));
         let planes = planes(self.sh_degree);
         let find = |row: usize| {
@@ -16,15 +17,22 @@ impl CpuBackend {
                 let number = (0..planes).position(|plane| !get(plane).is_finite())?;
                 Some(Unsound { row: row as u32, attribute: Attribute::of(number), kept })
             };
+            let moment = |which: usize| {
+                let of_row = |plane| self.moments.get(row, plane)[which];
+                (row >= self.moments.first()).then(|| first(&of_row, Kept::Moment))?
+            };
             first(&|plane| self.params.get(row, plane), Kept::Parameter)
-                .or_else(|| first(&|plane| self.moments.get(row, plane)[0], Kept::Moment))
-                .or_else(|| first(&|plane| self.moments.get(row, plane)[1], Kept::Moment))
+                .or_else(|| moment(0))
+                .or_else(|| moment(1))
         };
         let blocks = rows.div_ceil(WIDTH);
         let is_suspect = |block: usize| {
             let mut scratch = [Scratch::ZERO; 2];
+            let have_unsound = |block: usize, scratch| {
+                !moments.open(block, planes, scratch).into_iter().all(is_sound)
+            };
             !is_sound(params.open(block, planes, &mut scratch[0]))
-                || !moments.open(block, planes, &mut scratch).into_iter().all(is_sound)
+                || block.checked_sub(first_block).is_some_and(|it| have_unsound(it, &mut scratch))
         };
         let of_task = |task: usize| -> Vec<Unsound> {
             let blocks = task * BLOCKS_PER_TASK..blocks.min((task + 1) * BLOCKS_PER_TASK);

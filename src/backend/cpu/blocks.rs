@@ -12,8 +12,8 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::BLOCKS_PER_TASK;
 use super::simd::WIDTH;
+use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
 use crate::gaussians::sh_coefficients;
 
 /// First plane of each parameter class.
@@ -44,22 +44,25 @@ impl Scratch {
     pub(super) const ZERO: Self = Self([0.0; plane::MOST * WIDTH]);
 }
 
-/// `capacity` rows of `planes` numbers each.
+/// Rows of `planes` numbers each, from a first one on: those before it have none.
 #[derive(Debug, Clone)]
 pub(super) struct Blocks<T = f32> {
     planes: usize,
+    /// A multiple of [`ROWS_PER_TASK`], so that blocks and tasks are those of all rows.
+    first: usize,
     data: Vec<T>,
 }
 
 impl<T: Copy + Default> Blocks<T> {
-    pub(super) fn zeros(capacity: usize, planes: usize) -> Self {
-        let data = vec![T::default(); capacity.div_ceil(WIDTH) * WIDTH * planes];
-        Self { planes, data }
+    pub(super) fn zeros(rows: Range<usize>, planes: usize) -> Self {
+        assert!(rows.start.is_multiple_of(ROWS_PER_TASK), "the first row is {}", rows.start);
+        let data = vec![T::default(); rows.len().next_multiple_of(WIDTH) * planes];
+        Self { planes, first: rows.start, data }
     }
 
-    /// Bytes for `capacity` rows.
-    pub(super) fn bytes(capacity: usize, planes: usize) -> u64 {
-        (capacity.div_ceil(WIDTH) * WIDTH * planes * size_of::<T>()) as u64
+    /// Bytes for these rows.
+    pub(super) fn bytes(rows: Range<usize>, planes: usize) -> u64 {
+        (rows.len().next_multiple_of(WIDTH) * planes * size_of::<T>()) as u64
     }
 
     /// Bytes that are there.
@@ -78,16 +81,25 @@ impl<T: Copy + Default> Blocks<T> {
         self.planes
     }
 
-    /// The blocks that hold rows `0..rows`.
+    /// The first row that has numbers.
+    pub(super) fn first(&self) -> usize {
+        self.first
+    }
+
+    /// Numbers of the blocks that hold the rows before `rows`.
+    fn numbers(&self, rows: usize) -> usize {
+        rows.saturating_sub(self.first).div_ceil(WIDTH) * self.stride()
+    }
+
+    /// The blocks that hold the rows before `rows`.
     pub(super) fn of_rows_mut(&mut self, rows: usize) -> &mut [T] {
-        let numbers = rows.div_ceil(WIDTH) * self.stride();
+        let numbers = self.numbers(rows);
         &mut self.data[..numbers]
     }
 
     /// The same, to be read block by block.
     pub(super) fn view(&self, rows: usize) -> BlockView<'_, T> {
-        let stride = self.stride();
-        BlockView { stride, data: &self.data[..rows.div_ceil(WIDTH) * stride] }
+        BlockView { stride: self.stride(), data: &self.data[..self.numbers(rows)] }
     }
 
     /// The same, cut for the optimiser's tasks.
@@ -99,13 +111,14 @@ impl<T: Copy + Default> Blocks<T> {
         T: Send,
     {
         let stride = self.stride();
-        let tasks = rows.div_ceil(WIDTH).div_ceil(BLOCKS_PER_TASK);
+        let tasks = rows.saturating_sub(self.first).div_ceil(ROWS_PER_TASK);
         let parts = parts(self.of_rows_mut(rows), stride * BLOCKS_PER_TASK, tasks);
         parts.map(move |data| BlockTask { stride, data })
     }
 
     fn at(&self, row: usize, plane: usize) -> usize {
         debug_assert!(plane < self.planes, "plane {plane} of {}", self.planes);
+        let row = row - self.first;
         row / WIDTH * self.stride() + plane * WIDTH + row % WIDTH
     }
 
@@ -124,15 +137,16 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    /// Row i becomes what row `order[i]` was.
+    /// Row i becomes what row `order[i]` was; rows before the first are where they were.
     pub(super) fn reorder(&mut self, order: &[u32]) {
+        let order = order.get(self.first..).unwrap_or_default();
         let mut values = vec![T::default(); order.len()];
         // Plane by plane: rows mostly move a little, so that what is read lies mostly in a row.
         for plane in 0..self.planes {
             for (value, &row) in values.iter_mut().zip(order) {
                 *value = self.get(row as usize, plane);
             }
-            for (row, &value) in values.iter().enumerate() {
+            for (row, &value) in (self.first..).zip(&values) {
                 self.set(row, plane, value);
             }
         }
@@ -144,10 +158,12 @@ impl<T: Copy + Default> Blocks<T> {
         }
     }
 
-    /// Some planes of some rows, row by row. Shape: `[rows.len(), planes.len()]`.
+    /// Some planes of some rows, row by row; zeros of rows before the first. Shape: `[rows.len(), planes.len()]`.
     pub(super) fn to_rows(&self, rows: Range<usize>, planes: Range<usize>) -> Vec<T> {
         let mut values = Vec::with_capacity(rows.len() * planes.len());
-        for row in rows {
+        let without = rows.end.min(self.first).saturating_sub(rows.start);
+        values.resize(without * planes.len(), T::default());
+        for row in rows.start + without..rows.end {
             values.extend(planes.clone().map(|plane| self.get(row, plane)));
         }
         values
@@ -155,19 +171,14 @@ impl<T: Copy + Default> Blocks<T> {
 
     /// The opposite of [`to_rows`](Self::to_rows).
     pub(super) fn set_rows(&mut self, rows: Range<usize>, planes: Range<usize>, values: &[T]) {
-        let mut values = values.iter();
-        for row in rows {
+        let without = rows.end.min(self.first).saturating_sub(rows.start);
+        let mut values = values.iter().skip(without * planes.len());
+        for row in rows.start + without..rows.end {
             for (plane, &value) in planes.clone().zip(&mut values) {
                 self.set(row, plane, value);
             }
         }
     }
-}
-
-/// Number i becomes what number `order[i]` was.
-pub(super) fn reorder<T: Copy>(numbers: &mut [T], order: &[u32]) {
-    let reordered: Vec<T> = order.iter().map(|&row| numbers[row as usize]).collect();
-    numbers[..order.len()].copy_from_slice(&reordered);
 }
 
 /// Blocks that follow each other, to read.

@@ -1,7 +1,10 @@
 //! The memory of the native backend: bytes per buffer, and the reservation before training.
 
+use std::ops::Range;
+
+use super::ROWS_PER_TASK;
 use super::adam::BiasCorrection;
-use super::blocks::planes;
+use super::blocks::{Blocks, planes};
 use super::loss::LossBuffers;
 use super::mask::Masks;
 use super::moments::Moments;
@@ -30,40 +33,57 @@ pub(super) fn record_cap(options: &Setup) -> usize {
     if options.only_renders { 1 } else { options.record_cap.clamp(1, tile_cap(options)) }
 }
 
+/// The rows that may be trained, from a whole task on: those before them are frozen, and have nothing but what
+/// rendering needs.
+pub(super) fn trained(options: &Setup) -> Range<usize> {
+    match options.only_renders {
+        true => 0..0,
+        false => {
+            let budget = options.budget.max(1);
+            options.frozen.min(budget) / ROWS_PER_TASK * ROWS_PER_TASK..budget
+        }
+    }
+}
+
+/// Rows for which there is room where gradients of splats are summed in a step, frozen or not.
+pub(super) fn summed_rows(options: &Setup) -> usize {
+    if options.only_renders { 0 } else { options.budget.max(1).next_multiple_of(WIDTH) }
+}
+
 /// Bytes per buffer for these options.
 pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let budget = options.budget.max(1);
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
-    let signals = Accumulators::new(1, needs);
+    let signals = Accumulators::new(0..1, needs);
     let stride = signals.layout().stride();
     let per_row = planes(sh_degree);
     let padded = budget.next_multiple_of(WIDTH) as u64;
-    let trained = options.trained().next_multiple_of(WIDTH) as u64;
+    let trained = trained(options);
     let (width, height) = options.largest_image;
     let grid = Grid::new(width, height);
     let float = size_of::<f32>() as u64;
     let mut ledger = Ledger::default();
     let parameters = Parameters::bytes(budget, per_row, options.storage.parameters);
     ledger.add_to(Section::Model, "parameters", parameters);
-    let moments = Moments::bytes(options.trained(), per_row, options.storage.moments);
+    let moments = Moments::bytes(trained.clone(), per_row, options.storage.moments);
     ledger.add_to(Section::Model, "optimiser moments", moments);
     ledger.add_to(
         Section::Model,
         "optimiser ages and bias tables",
-        trained * 2 + BiasCorrection::bytes(),
+        Blocks::<u16>::bytes(trained.clone(), 1) + BiasCorrection::bytes(),
     );
     if Summed::is_wanted(needs.cadence) {
-        let bytes = Summed::bytes(budget, per_row, needs.cadence);
+        let bytes = Summed::bytes(trained.clone(), per_row, needs.cadence);
         ledger.add_to(Section::Gradients, "gradients summed between steps", bytes);
     }
     if let Some(request) = &needs.aux {
         let bytes = observe::bytes(request, grid.width * grid.height);
         ledger.add_to(Section::Policy, "auxiliary views", bytes);
     }
-    ledger.add_to(Section::Policy, "signals", Accumulators::bytes(budget, needs));
+    ledger.add_to(Section::Policy, "signals", Accumulators::bytes(trained.clone(), needs));
     if needs.mask.is_some() {
-        ledger.add_to(Section::Policy, "masks", Masks::bytes(budget));
+        ledger.add_to(Section::Policy, "masks", Masks::bytes(trained));
     }
     if counts_dominant(needs) {
         ledger.add_to(Section::Policy, "dominated pixels", 4 * budget as u64);
@@ -78,7 +98,7 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
         "projected splats",
         budget as u64 * size_of::<Splat>() as u64 + padded / WIDTH as u64 * 2,
     );
-    let sums = trained * signals.sums() as u64 * float;
+    let sums = (summed_rows(options) * signals.sums()) as u64 * float;
     ledger.add_to(Section::Gradients, "splat gradients, signals at events", sums);
     ledger.add_to(Section::Tiles, "entries", TileLists::bytes(budget, cap as usize, grid.tiles()));
     let records = record_cap(options) as u64 * stride as u64 * float;
@@ -164,7 +184,7 @@ mod tests {
             let options = Setup { only_renders, threads: Some(1), ..Setup::new(2) };
             let mut backend = CpuBackend::new(&model, &options).unwrap();
             let bytes = backend.moments.held() as usize
-                + size_of_val(&backend.ages[..])
+                + backend.ages.held() as usize
                 + size_of_val(&backend.sums[..])
                 + size_of_val(&backend.records[..]);
             (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())

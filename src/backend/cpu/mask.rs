@@ -18,7 +18,7 @@ const FIRST: usize = 1;
 const SECOND: usize = 2;
 const PLANES: usize = 3;
 
-/// The masks of all rows; nothing where none are declared.
+/// The masks of the rows that may be trained; nothing where none are declared.
 #[derive(Debug)]
 pub(super) struct Masks {
     term: Option<MaskTerm>,
@@ -35,12 +35,12 @@ pub(super) struct MaskTask<'a> {
 }
 
 impl Masks {
-    pub(super) fn new(budget: usize, term: Option<MaskTerm>) -> Self {
-        Self { term, blocks: Blocks::zeros(budget, if term.is_some() { PLANES } else { 0 }) }
+    pub(super) fn new(rows: Range<usize>, term: Option<MaskTerm>) -> Self {
+        Self { term, blocks: Blocks::zeros(rows, if term.is_some() { PLANES } else { 0 }) }
     }
 
-    pub(super) fn bytes(budget: usize) -> u64 {
-        Blocks::<f32>::bytes(budget, PLANES)
+    pub(super) fn bytes(rows: Range<usize>) -> u64 {
+        Blocks::<f32>::bytes(rows, PLANES)
     }
 
     pub(super) fn is_declared(&self) -> bool {

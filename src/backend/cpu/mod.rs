@@ -61,7 +61,7 @@ use crate::memory::Ledger;
 #[cfg(test)]
 use crate::verify::sabotage;
 use adam::BiasCorrection;
-use blocks::planes;
+use blocks::{Blocks, planes};
 use loss::{ImageTerms, LossBuffers};
 use mask::Masks;
 use moments::Moments;
@@ -103,7 +103,8 @@ pub struct CpuBackend {
     shortcuts: Shortcuts,
     params: Parameters,
     moments: Moments,
-    ages: Vec<u16>,
+    /// Steps of each row that may be trained: one plane.
+    ages: Blocks<u16>,
     bias: BiasCorrection,
     summed: Summed,
     masks: Masks,
@@ -153,10 +154,10 @@ impl CpuBackend {
         let threads = Threads::new(options.threads)?;
         let ledger = budget::ledger(model.sh_degree, options, threads.count());
         budget::reserve(&ledger)?;
-        let signals = Accumulators::new(budget, &options.needs);
+        let trained = budget::trained(options);
+        let signals = Accumulators::new(trained.clone(), &options.needs);
         let (stride, sums) = (signals.layout().stride(), signals.sums());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
-        let (blocks, trained) = (budget.div_ceil(WIDTH), options.trained());
         let per_row = planes(model.sh_degree);
         let storage = options.storage;
         let mut params = Parameters::zeros(budget, per_row, storage.parameters);
@@ -172,11 +173,11 @@ impl CpuBackend {
             near: options.near,
             shortcuts: options.shortcuts,
             params,
-            moments: Moments::zeros(trained, per_row, storage.moments),
-            ages: vec![0; trained.next_multiple_of(WIDTH)],
+            moments: Moments::zeros(trained.clone(), per_row, storage.moments),
+            ages: Blocks::zeros(trained.clone(), 1),
             bias: BiasCorrection::new(),
-            summed: Summed::new(budget, per_row, options.needs.cadence),
-            masks: Masks::new(budget, options.needs.mask),
+            summed: Summed::new(trained.clone(), per_row, options.needs.cadence),
+            masks: Masks::new(trained, options.needs.mask),
             signals,
             candidates: Candidates::new(options.needs.candidates),
             dominant: bytemuck::zeroed_vec(if counts_dominant(&options.needs) {
@@ -185,14 +186,14 @@ impl CpuBackend {
                 0
             }),
             splats: vec![Splat::default(); budget],
-            visible: vec![0; blocks],
+            visible: vec![0; budget.div_ceil(WIDTH)],
             lists: TileLists::new(budget, cap),
             canvas: Vec::new(),
             gradient: Vec::new(),
             loss: LossBuffers::new(),
             records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
-            sums: vec![0.0; trained.next_multiple_of(WIDTH) * sums],
+            sums: vec![0.0; budget::summed_rows(options) * sums],
             clock: StageClock::default(),
         })
     }
@@ -283,7 +284,7 @@ impl Backend for CpuBackend {
         // The sums are not used between two steps.
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::within(memory, self.rows, wanted);
-        let of_rows = (&self.params, &self.masks, &self.ages[..]);
+        let of_rows = (&self.params, &self.masks, &self.ages);
         self.signals.read(&self.threads, &mut signals, wanted, of_rows);
         Ok(signals)
     }
@@ -340,6 +341,17 @@ impl Backend for CpuBackend {
 
     fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
         let frame = self.forward(camera, [0.0; 3], 0, Beside::Count)?;
+        Ok(self.rendering(&frame))
+    }
+
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        let frame = self.forward_painted(camera, background, 0, Beside::Depth, Some(colours))?;
         Ok(self.rendering(&frame))
     }
 

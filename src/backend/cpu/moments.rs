@@ -14,7 +14,7 @@ use super::narrow::{Draws, F8, Narrow, first_moment, first_moments, narrow, rati
 use super::simd::WIDTH;
 use crate::backend::{MomentStorage, StateError, Tensor};
 
-/// The moments of all rows.
+/// The moments of the rows that may be trained.
 #[derive(Debug)]
 pub(super) struct Moments {
     /// The first and the second, or none.
@@ -34,19 +34,19 @@ fn split(planes: usize, storage: MomentStorage) -> [usize; 2] {
 }
 
 impl Moments {
-    pub(super) fn zeros(capacity: usize, planes: usize, storage: MomentStorage) -> Self {
+    pub(super) fn zeros(rows: Range<usize>, planes: usize, storage: MomentStorage) -> Self {
         let [wide, narrow] = split(planes, storage);
         Self {
-            wide: [0, 1].map(|_| Blocks::zeros(capacity, wide)),
-            ratios: Blocks::zeros(capacity, narrow),
-            seconds: Blocks::zeros(capacity, narrow),
+            wide: [0, 1].map(|_| Blocks::zeros(rows.clone(), wide)),
+            ratios: Blocks::zeros(rows.clone(), narrow),
+            seconds: Blocks::zeros(rows, narrow),
         }
     }
 
-    /// Bytes for `capacity` rows.
-    pub(super) fn bytes(capacity: usize, planes: usize, storage: MomentStorage) -> u64 {
+    /// Bytes for these rows.
+    pub(super) fn bytes(rows: Range<usize>, planes: usize, storage: MomentStorage) -> u64 {
         let [wide, narrow] = split(planes, storage);
-        2 * (Blocks::<f32>::bytes(capacity, wide) + Blocks::<F8>::bytes(capacity, narrow))
+        2 * (Blocks::<f32>::bytes(rows.clone(), wide) + Blocks::<F8>::bytes(rows, narrow))
     }
 
     /// Bytes that are there.
@@ -54,6 +54,11 @@ impl Moments {
     pub(super) fn held(&self) -> u64 {
         let wide: u64 = self.wide.iter().map(Blocks::held).sum();
         wide + self.ratios.held() + self.seconds.held()
+    }
+
+    /// The first row that has moments.
+    pub(super) fn first(&self) -> usize {
+        self.ratios.first()
     }
 
     fn is_narrow(&self) -> bool {

@@ -122,7 +122,7 @@ impl WithSimd for Optimise<'_> {
             let ages = &mut ages[lanes.clone()];
             let (main, rest) = (0..trained.min(plane::SH_REST), plane::SH_REST..trained);
             let g = &gradient.params;
-            match summed.rest_ages(lanes) {
+            match summed.rest_ages(lanes.clone()) {
                 // Bands 1–3 step with the others.
                 None if due.main => {
                     adam::step(s, params, [m, v], ages, g, 0..trained, rates, bias);
@@ -148,6 +148,10 @@ impl WithSimd for Optimise<'_> {
             if frozen > 0 {
                 for plane in (0..trained * WIDTH).step_by(WIDTH) {
                     params[plane..plane + frozen].copy_from_slice(&kept.0[plane..plane + frozen]);
+                }
+                ages[..frozen].fill(0);
+                if let Some(rest_ages) = summed.rest_ages(lanes) {
+                    rest_ages[..frozen].fill(0);
                 }
             }
             if is_narrow && (due.main || due.rest) {

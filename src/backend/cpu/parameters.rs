@@ -55,18 +55,18 @@ impl Parameters {
     pub(super) fn zeros(capacity: usize, planes: usize, storage: ParameterStorage) -> Self {
         let [wide, fixed, half] = split(planes, storage);
         Self {
-            wide: Blocks::zeros(capacity, wide),
-            fixed: Blocks::zeros(capacity, fixed),
-            half: Blocks::zeros(capacity, half),
+            wide: Blocks::zeros(0..capacity, wide),
+            fixed: Blocks::zeros(0..capacity, fixed),
+            half: Blocks::zeros(0..capacity, half),
         }
     }
 
     /// Bytes for `capacity` rows.
     pub(super) fn bytes(capacity: usize, planes: usize, storage: ParameterStorage) -> u64 {
         let [wide, fixed, half] = split(planes, storage);
-        Blocks::<f32>::bytes(capacity, wide)
-            + Blocks::<i16>::bytes(capacity, fixed)
-            + Blocks::<F16>::bytes(capacity, half)
+        Blocks::<f32>::bytes(0..capacity, wide)
+            + Blocks::<i16>::bytes(0..capacity, fixed)
+            + Blocks::<F16>::bytes(0..capacity, half)
     }
 
     /// Bytes that are there.

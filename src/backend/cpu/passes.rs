@@ -74,6 +74,18 @@ impl CpuBackend {
         sh_degree: u8,
         beside: Beside,
     ) -> Result<Frame, BackendError> {
+        self.forward_painted(camera, background, sh_degree, beside, None)
+    }
+
+    /// The same, with the rows in other colours than their own, where there are some.
+    pub(super) fn forward_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+        beside: Beside,
+        colours: Option<&[[f32; 3]]>,
+    ) -> Result<Frame, BackendError> {
         if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
             return Err(BackendError::ImageTooLarge {
                 width: camera.width,
@@ -116,7 +128,13 @@ impl CpuBackend {
                 }
                 let (view, log2_reach) = (&view, blending.log2_reach);
                 let lanes = &mut *seen;
-                arch.dispatch(Project { view, log2_reach, params, rows, splats, seen: lanes });
+                let kernel =
+                    Project { view, log2_reach, params, rows, splats: &mut *splats, seen: lanes };
+                arch.dispatch(kernel);
+                if let Some(colours) = colours {
+                    let own = &colours[task * ROWS_PER_TASK..];
+                    splats.iter_mut().zip(own).for_each(|(splat, &own)| splat.colour = own);
+                }
                 seen.iter().map(|seen| seen.count_ones() as usize).sum()
             });
             clock.lap("project");
@@ -326,18 +344,20 @@ impl CpuBackend {
         let (planes, layout) = (signals.planes(), signals.layout());
         let signal_stride = signals.blocks.stride();
         let storing = PolicyRng::new(input.seed, input.step);
-        let blocks = rows.div_ceil(WIDTH);
-        let tasks = blocks.div_ceil(BLOCKS_PER_TASK);
+        // Whole tasks of frozen rows have nothing to do.
+        let first_row = moments.first();
+        let blocks = first_row / WIDTH..rows.div_ceil(WIDTH);
+        let tasks = blocks.len().div_ceil(BLOCKS_PER_TASK);
         let per_task = signal_stride * BLOCKS_PER_TASK;
-        let sums = &sums[..blocks * WIDTH * layout.stride()];
+        let sums = &sums[first_row * layout.stride()..blocks.end * WIDTH * layout.stride()];
         let parts = (
-            params.tasks(rows),
+            params.tasks(rows).skip(first_row / ROWS_PER_TASK),
             moments.tasks(rows),
             masks.tasks(rows, rows - frozen),
-            ages[..blocks * WIDTH].par_chunks_mut(ROWS_PER_TASK),
+            ages.of_rows_mut(rows).par_chunks_mut(ROWS_PER_TASK),
             parts(signals.blocks.of_rows_mut(rows), per_task, tasks),
             sums.par_chunks(ROWS_PER_TASK * layout.stride()),
-            visible[..blocks].par_chunks(BLOCKS_PER_TASK),
+            visible[blocks].par_chunks(BLOCKS_PER_TASK),
             self.summed.tasks(rows, tasks).enumerate(),
         );
         threads.install(|| {
@@ -345,6 +365,7 @@ impl CpuBackend {
                 "project_bwd + adam",
                 parts,
                 |(params, moments, masks, ages, signals, sums, visible, (task, summed))| {
+                    let first_row = first_row + task * ROWS_PER_TASK;
                     arch.dispatch(Optimise {
                         params,
                         moments,
@@ -364,9 +385,9 @@ impl CpuBackend {
                         due,
                         terms,
                         noise,
-                        first_row: task * ROWS_PER_TASK,
-                        frozen: frozen.saturating_sub(task * ROWS_PER_TASK),
-                        rows: rows - task * ROWS_PER_TASK,
+                        first_row,
+                        frozen: frozen.saturating_sub(first_row),
+                        rows: rows - first_row,
                     });
                 },
             );

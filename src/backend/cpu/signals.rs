@@ -129,13 +129,13 @@ impl SignalPlanes {
 }
 
 impl Accumulators {
-    pub(super) fn new(budget: usize, needs: &Needs) -> Self {
+    pub(super) fn new(rows: Range<usize>, needs: &Needs) -> Self {
         let planes = SignalPlanes::new(needs);
-        Self { requested: needs.signals, planes, blocks: Blocks::zeros(budget, planes.count) }
+        Self { requested: needs.signals, planes, blocks: Blocks::zeros(rows, planes.count) }
     }
 
-    pub(super) fn bytes(budget: usize, needs: &Needs) -> u64 {
-        Blocks::<f32>::bytes(budget, SignalPlanes::new(needs).count)
+    pub(super) fn bytes(rows: Range<usize>, needs: &Needs) -> u64 {
+        Blocks::<f32>::bytes(rows, SignalPlanes::new(needs).count)
     }
 
     pub(super) fn planes(&self) -> SignalPlanes {
@@ -180,13 +180,13 @@ impl Accumulators {
         threads.install(|| threads.each("clear signals", tasks, clear));
     }
 
-    /// Writes the columns of the wanted signals.
+    /// Writes the columns of the wanted signals; zeros of rows that have none.
     pub(super) fn read(
         &self,
         threads: &Threads,
         signals: &mut Signals,
         wanted: SignalSet,
-        (params, masks, ages): (&Parameters, &Masks, &[u16]),
+        (params, masks, ages): (&Parameters, &Masks, &Blocks<u16>),
     ) {
         for signal in wanted.iter() {
             let Some(column) = signals.get_mut(signal) else { continue };
@@ -210,6 +210,10 @@ impl Accumulators {
             let width = signal.width();
             let tasks = column.par_chunks_mut(ROWS_PER_TASK * width).enumerate();
             let of_task = |(task, column): (usize, &mut [f32])| {
+                if task < self.blocks.first() / ROWS_PER_TASK {
+                    column.fill(0.0);
+                    return;
+                }
                 for (row, numbers) in (task * ROWS_PER_TASK..).zip(column.chunks_exact_mut(width)) {
                     of_row(row, numbers);
                 }
@@ -219,7 +223,13 @@ impl Accumulators {
     }
 }
 
-fn present(signal: Signal, row: usize, params: &Parameters, masks: &Masks, ages: &[u16]) -> f32 {
+fn present(
+    signal: Signal,
+    row: usize,
+    params: &Parameters,
+    masks: &Masks,
+    ages: &Blocks<u16>,
+) -> f32 {
     let log_scales = || params.get_n::<3>(row, plane::LOG_SCALE);
     match signal {
         Signal::Opacity => 1.0 / (1.0 + (-params.get(row, plane::OPACITY)).exp()),
@@ -232,7 +242,7 @@ fn present(signal: Signal, row: usize, params: &Parameters, masks: &Masks, ages:
             (x + y + z).exp()
         }
         Signal::Mask => masks.value(row),
-        Signal::Age => f32::from(ages[row]),
+        Signal::Age => f32::from(ages.get(row, 0)),
         summed => unreachable!("{summed:?} is no present value"),
     }
 }

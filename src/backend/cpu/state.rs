@@ -1,5 +1,5 @@
 //! The native backend's state as named arrays. Each stage that keeps something between steps says
-//! what it is; lanes beyond the last row are left out.
+//! what it is; lanes beyond the last row are left out, and rows that have nothing, as they never change, have zeros.
 
 use std::ops::Range;
 
@@ -45,7 +45,7 @@ impl CpuBackend {
             return self.moments.tensor(i, name, rows, planes);
         }
         if name == AGES {
-            return Tensor::u16(name, &[rows.len()], self.ages[rows].to_vec());
+            return Tensor::u16(name, &[rows.len()], self.ages.to_rows(rows, 0..1));
         }
         if name == MASKS {
             return self.masks.tensor(name, rows);
@@ -73,7 +73,7 @@ impl CpuBackend {
             self.moments.restore(i, rows, planes, tensor)?;
         } else if name == AGES {
             let ages = tensor.into_u16(&[rows.len()])?;
-            self.ages[rows].copy_from_slice(&ages);
+            self.ages.set_rows(rows, 0..1, &ages);
         } else if name == MASKS && self.masks.is_declared() {
             self.masks.restore(rows, tensor)?;
         } else if name == CANDIDATES && self.candidates.is_wanted() {

@@ -11,19 +11,19 @@ use densify_policies::policy::Cadence;
 use rayon::prelude::*;
 
 use super::ROWS_PER_TASK;
-use super::blocks::{BlockTask, Blocks, parts, plane, reorder};
+use super::blocks::{BlockTask, Blocks, parts, plane};
 use super::simd::WIDTH;
 use crate::backend::{StateError, StepInput, Tensor};
 
-/// The sums of all rows.
+/// The sums of the rows that may be trained.
 #[derive(Debug)]
 pub(super) struct Summed {
     longest: Cadence,
     /// First parameter plane that is summed.
     first: usize,
     sums: Blocks,
-    /// Steps of bands 1–3, where they may differ from the others'. Shape: `[rows]`.
-    rest_ages: Vec<u16>,
+    /// Steps of bands 1–3, where they may differ from the others': one plane, or none.
+    rest_ages: Blocks<u16>,
     /// Whether sums of bands 1–3, and of all others, wait for a step.
     pending: Due,
 }
@@ -61,14 +61,13 @@ fn first_plane(planes: usize, longest: Cadence) -> usize {
 }
 
 impl Summed {
-    pub(super) fn new(budget: usize, planes: usize, longest: Cadence) -> Self {
+    pub(super) fn new(rows: Range<usize>, planes: usize, longest: Cadence) -> Self {
         let first = first_plane(planes, longest);
-        let rows = if longest.sh_rest > 1 { budget.next_multiple_of(WIDTH) } else { 0 };
         Self {
             longest,
             first,
-            sums: Blocks::zeros(budget, planes - first),
-            rest_ages: vec![0; rows],
+            sums: Blocks::zeros(rows.clone(), planes - first),
+            rest_ages: Blocks::zeros(rows, usize::from(longest.sh_rest > 1)),
             pending: Due::default(),
         }
     }
@@ -77,10 +76,9 @@ impl Summed {
         longest.all > 1 || longest.sh_rest > 1
     }
 
-    pub(super) fn bytes(budget: usize, planes: usize, longest: Cadence) -> u64 {
-        let rows = if longest.sh_rest > 1 { budget.next_multiple_of(WIDTH) } else { 0 };
-        let sums = Blocks::<f32>::bytes(budget, planes - first_plane(planes, longest));
-        sums + (rows * size_of::<u16>()) as u64
+    pub(super) fn bytes(rows: Range<usize>, planes: usize, longest: Cadence) -> u64 {
+        let sums = Blocks::<f32>::bytes(rows.clone(), planes - first_plane(planes, longest));
+        sums + Blocks::<u16>::bytes(rows, usize::from(longest.sh_rest > 1))
     }
 
     /// The parameter groups that step now; records those that wait.
@@ -105,14 +103,13 @@ impl Summed {
     ) -> impl IndexedParallelIterator<Item = TaskSums<'_>> {
         let Self { first, sums, rest_ages, .. } = self;
         let first = *first;
-        let aged = rest_ages.len().min(rows.next_multiple_of(WIDTH));
-        let ages = parts(&mut rest_ages[..aged], ROWS_PER_TASK, tasks);
+        let ages = parts(rest_ages.of_rows_mut(rows), ROWS_PER_TASK, tasks);
         sums.tasks(rows).zip(ages).map(move |(sums, rest_ages)| TaskSums { first, sums, rest_ages })
     }
 
     /// What is kept between steps, by name.
     pub(super) fn state(&self) -> &'static [&'static str] {
-        match (Self::is_wanted(self.longest), self.rest_ages.is_empty()) {
+        match (Self::is_wanted(self.longest), self.rest_ages.planes() == 0) {
             (false, _) => &[],
             (true, true) => &[GRADIENTS, WAITING],
             (true, false) => &[GRADIENTS, WAITING, REST_AGES],
@@ -139,7 +136,7 @@ impl Summed {
                 let Due { main, rest, .. } = self.pending;
                 Tensor::u8(name, &[2], vec![u8::from(main), u8::from(rest)])
             }
-            _ => Tensor::u16(name, &[rows.len()], self.rest_ages[rows].to_vec()),
+            _ => Tensor::u16(name, &[rows.len()], self.rest_ages.to_rows(rows, 0..1)),
         })
     }
 
@@ -164,7 +161,7 @@ impl Summed {
             }
             Some(_) => {
                 let ages = tensor.into_u16(&[rows.len()])?;
-                self.rest_ages[rows].copy_from_slice(&ages);
+                self.rest_ages.set_rows(rows, 0..1, &ages);
             }
         }
         Ok(())
@@ -177,23 +174,17 @@ impl Summed {
 
     pub(super) fn clear_row(&mut self, row: usize) {
         self.sums.clear_row(row);
-        if let Some(age) = self.rest_ages.get_mut(row) {
-            *age = 0;
-        }
+        self.rest_ages.clear_row(row);
     }
 
     pub(super) fn copy_row(&mut self, from: usize, to: usize) {
         self.sums.copy_row(from, to);
-        if !self.rest_ages.is_empty() {
-            self.rest_ages[to] = self.rest_ages[from];
-        }
+        self.rest_ages.copy_row(from, to);
     }
 
     pub(super) fn reorder(&mut self, order: &[u32]) {
         self.sums.reorder(order);
-        if !self.rest_ages.is_empty() {
-            reorder(&mut self.rest_ages, order);
-        }
+        self.rest_ages.reorder(order);
     }
 
     /// As the moments of a parameter are forgotten.

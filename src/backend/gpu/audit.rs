@@ -15,8 +15,9 @@ impl GpuBackend {
         encoder.clear_buffer(self.buffers.get("sums"), 0, Some(bytes.next_multiple_of(16)));
         let pass = encoder.begin_compute_pass(&Default::default());
         let mut to = Recorder { pass };
-        for Audit { launch, numbers, place } in &self.launches.audits {
-            to.run(launch, [rows, *numbers, *place, 0], rows.div_ceil(256));
+        for Audit { launch, first_row, numbers, place } in &self.launches.audits {
+            let groups = rows.saturating_sub(*first_row).div_ceil(256);
+            to.run(launch, [rows, *numbers, *place, *first_row], groups);
         }
         drop(to);
         self.device.queue.submit([encoder.finish()]);

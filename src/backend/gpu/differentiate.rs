@@ -68,6 +68,7 @@ impl Differentiable for GpuBackend {
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError> {
         upstream.assert_size(camera);
+        assert_eq!(self.sizes.frozen, 0, "frozen rows have no gradients");
         if !self.sizes.more {
             (self.sizes.more, self.sizes.records) = (true, RecordLayout::ALL);
             self.rebuild()?;

@@ -185,9 +185,17 @@ impl GpuBackend {
         pairs: &[[u32; 2]],
         arrays: impl Iterator<Item = &'a RowLaunch<Launch>> + Clone,
     ) {
-        for chunk in pairs.chunks(CHUNK / 2) {
-            self.execute(chunk.as_flattened(), |to| {
-                for array in arrays.clone() {
+        // Where arrays have no place for frozen rows, which no plan names, rows count from the first that they have.
+        let mut firsts: Vec<u32> = arrays.clone().map(|array| array.first_row).collect();
+        firsts.sort_unstable();
+        firsts.dedup();
+        for (chunk, first) in
+            pairs.chunks(CHUNK / 2).flat_map(|c| firsts.iter().map(move |f| (c, *f)))
+        {
+            let own = |row: u32| if row == NOTHING { NOTHING } else { row - first };
+            let words: Vec<u32> = chunk.as_flattened().iter().map(|&row| own(row)).collect();
+            self.execute(&words, |to| {
+                for array in arrays.clone().filter(|array| array.first_row == first) {
                     let RowLaunch { launch, numbers, pitch: [row, number], .. } = array;
                     let count = chunk.len() as u32;
                     let now = [count, *numbers, *row, *number];
@@ -296,7 +304,7 @@ impl GpuBackend {
 
     fn decay(&self, decay: Decay, first: u32, rows: u32) {
         let seen = self.planes.current(Signal::VisibleCount).filter(|_| decay.seen_only);
-        let seen = seen.map_or(NOTHING, |plane| (plane as u64 * self.sizes.budget) as u32);
+        let seen = seen.map_or(NOTHING, |plane| (plane as u64 * self.sizes.trained()) as u32);
         let shrunk = (1.0 - decay.scale).ln();
         let now = [rows, decay.opacity.to_bits(), shrunk.to_bits(), seen];
         self.execute(&[first], |to| to.run(self.launches.get("decay"), now, rows.div_ceil(256)));
@@ -308,7 +316,7 @@ impl GpuBackend {
             return;
         }
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        let bytes = 4 * self.sizes.budget;
+        let bytes = 4 * self.sizes.trained();
         for &plane in planes {
             let from = plane as u64 * bytes;
             encoder.clear_buffer(self.buffers.get("signals"), from, Some(bytes));

@@ -108,7 +108,7 @@ impl Frame {
         camera: &Camera,
         background: [f32; 3],
         near: f32,
-        [rows, sh_degree, cap, budget]: [u32; 4],
+        [rows, sh_degree, cap, trained]: [u32; 4],
     ) -> Self {
         let c = camera;
         let low = |p: f64, size: f64, f: f64| ((-FOV_MARGIN * size - p) / f) as f32;
@@ -133,7 +133,7 @@ impl Frame {
             ],
             background: [r, g, b, 0.0],
             image: [c.width, c.height, columns, tiles],
-            model: [rows, sh_degree, cap, budget],
+            model: [rows, sh_degree, cap, trained],
             ..Self::zeroed()
         }
     }

@@ -47,22 +47,24 @@ pub(super) struct Launches<L = Launch> {
     pub(super) audits: Vec<Audit<L>>,
 }
 
-/// A kernel for one array of rows: how many numbers a row has, how far apart rows are, and a row's
-/// numbers.
+/// A kernel for one array of rows: the first row that it has, how many numbers a row has, how far apart rows are,
+/// and a row's numbers.
 #[derive(Debug)]
 pub(super) struct RowLaunch<L> {
     pub(super) launch: L,
     pub(super) edited: Edited,
+    pub(super) first_row: u32,
     /// The first of the parameters that the numbers belong to; 0 where they belong to none.
     pub(super) first_parameter: usize,
     pub(super) numbers: u32,
     pub(super) pitch: [u32; 2],
 }
 
-/// The audit of one array: how many numbers a row has, and the place of the first of them.
+/// The audit of one array: the first row that it has, how many numbers a row has, and the place of the first of them.
 #[derive(Debug)]
 pub(super) struct Audit<L> {
     pub(super) launch: L,
+    pub(super) first_row: u32,
     pub(super) numbers: u32,
     pub(super) place: u32,
 }
@@ -202,12 +204,16 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Instead>>> {
 
 /// One dispatch of a kernel for each array that an edit touches.
 fn of_rows<L>(kernel: &str, bind: Bind<'_, L>, sizes: &Sizes) -> Vec<RowLaunch<L>> {
-    let launch = |array: &RowArray| RowLaunch {
-        launch: bind(kernel, &[("buffer", array.name)]),
-        edited: array.holds.traits().edited,
-        first_parameter: array.parameters.start,
-        numbers: array.numbers as u32,
-        pitch: array.pitch(sizes.budget),
+    let launch = |array: &RowArray| {
+        let [first_row, rows] = sizes.places(array);
+        RowLaunch {
+            launch: bind(kernel, &[("buffer", array.name)]),
+            edited: array.holds.traits().edited,
+            first_row: first_row as u32,
+            first_parameter: array.parameters.start,
+            numbers: array.numbers as u32,
+            pitch: array.pitch(rows),
+        }
     };
     let arrays = sizes.row_arrays();
     let edited = arrays.iter().filter(|array| array.holds.traits().edited != Edited::Untouched);
@@ -221,6 +227,7 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
         let first = array.parameters.start as u32;
         Some(Audit {
             launch: bind("audit", &[("marks", "sums"), ("numbers", array.name)]),
+            first_row: sizes.places(array)[0] as u32,
             numbers: array.numbers as u32,
             place: match array.holds.traits().audited? {
                 Kept::Parameter => first,

@@ -48,7 +48,7 @@ use super::{
     StateArray, StateError, StepInput, StepOutput, Tensor, Unsound, assert_fits,
 };
 use crate::camera::Camera;
-use crate::gaussians::{Gaussians, ModelArray};
+use crate::gaussians::{Gaussians, ModelArray, rgb_to_dc};
 use crate::memory::Ledger;
 
 pub use adapter::{adapters, may_be_present};
@@ -79,8 +79,6 @@ pub struct GpuBackend {
     launches: Launches,
     ledger: Ledger,
     budget: usize,
-    /// Rows at the front that never change.
-    frozen: usize,
     rows: usize,
     near: f32,
     shortcuts: Shortcuts,
@@ -130,7 +128,6 @@ impl GpuBackend {
             buffers,
             launches,
             budget,
-            frozen: options.frozen,
             rows: model.len(),
             near: options.near,
             shortcuts,
@@ -192,9 +189,10 @@ impl GpuBackend {
 
     fn frame(&self, camera: &Camera, background: [f32; 3], sh_degree: u8) -> Frame {
         let degree = u32::from(sh_degree.min(self.sizes.sh_degree));
-        let of_model = [self.rows as u32, degree, self.sizes.cap as u32, self.budget as u32];
+        let Sizes { cap, frozen, .. } = self.sizes;
+        let of_model = [self.rows as u32, degree, cap as u32, self.sizes.trained() as u32];
         let mut frame = Frame::of_view(camera, background, self.near, of_model);
-        frame.frozen[0] = self.frozen as u32;
+        frame.frozen[0] = frozen as u32;
         frame
     }
 }
@@ -274,7 +272,7 @@ impl Backend for GpuBackend {
     }
 
     fn apply(&mut self, ops: &RowOps, seed: u64, step: u32) -> Result<(), BackendError> {
-        assert_fits(ops, self.frozen, self.rows, self.budget);
+        assert_fits(ops, self.sizes.frozen as usize, self.rows, self.budget);
         self.edit(ops, seed, step);
         if ops.reset_candidates {
             self.candidates.clear();
@@ -298,6 +296,23 @@ impl Backend for GpuBackend {
             passes.forward(to);
         })?;
         self.rendering(camera.width, camera.height)
+    }
+
+    fn render_painted(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        colours: &[[f32; 3]],
+    ) -> Result<Rendering, BackendError> {
+        assert_eq!(colours.len(), self.rows, "colours of other rows");
+        // The colours take the place of band 0 meanwhile, which costs the device no memory.
+        let (band, rows) = (ModelArray::Sh.parameters(0), 0..self.rows);
+        let own = self.parameters_of(&band, rows.clone())?;
+        let painted: Vec<f32> = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
+        self.set_parameters(&band, rows.clone(), &painted)?;
+        let made = self.render(camera, background, 0);
+        self.set_parameters(&band, rows, &own)?;
+        made
     }
 
     fn download_array(

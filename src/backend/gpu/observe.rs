@@ -47,7 +47,7 @@ impl GpuBackend {
 
     /// Pixels of which the gradients of the rows have room, beside their number.
     fn found_room(&self) -> usize {
-        (GRADIENT / 2 * self.budget - 1).min(u32::MAX as usize)
+        (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize)
     }
 
     /// Adds the worst pixels of the view to the candidates; `search` is what was looked for, if it was.
@@ -134,7 +134,7 @@ impl GpuBackend {
         let which = u32::from(mode == DepthMode::Median);
         let mut found = Vec::new();
         // What fits the upload, and the points, of four numbers each, that come back.
-        let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.budget);
+        let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.sizes.trained() as usize);
         for chunk in pixels.chunks(room) {
             let numbers: Vec<u32> =
                 chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();

@@ -34,6 +34,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     // The adapter takes fewer rows than the sums do entries.
     let cap = cap.min(MOST_ENTRIES).max(budget as u64);
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
+    sizes.frozen = options.frozen as u64;
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
     // They lie in one buffer, which nothing binds.

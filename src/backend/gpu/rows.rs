@@ -72,6 +72,8 @@ pub(super) struct Traits {
     pub(super) is_saved: bool,
     /// Searched for numbers that are not finite.
     pub(super) audited: Option<Kept>,
+    /// Needed by training only, so that frozen rows have no place in it.
+    pub(super) is_for_training: bool,
 }
 
 impl Holds {
@@ -97,7 +99,9 @@ impl Holds {
             Self::SplatGradients => (Section::Gradients, "splat gradients", Untouched, false, None),
             Self::RowGradients => (Section::Gradients, "row gradients", Untouched, false, None),
         };
-        Traits { section, line, edited, is_saved, audited }
+        let is_for_training =
+            matches!(edited, Cleared) || matches!(self, Self::Masks | Self::RowGradients);
+        Traits { section, line, edited, is_saved, audited, is_for_training }
     }
 }
 
@@ -119,10 +123,10 @@ impl RowArray {
         4 * self.numbers as u64
     }
 
-    /// How far apart rows lie, and the numbers of a row, for this budget.
-    pub(super) fn pitch(&self, budget: u64) -> [u32; 2] {
+    /// How far apart rows lie, and the numbers of a row, where the array has so many rows.
+    pub(super) fn pitch(&self, rows: u64) -> [u32; 2] {
         match self.holds {
-            Holds::Signals => [1, budget as u32],
+            Holds::Signals => [1, rows as u32],
             _ => [self.numbers as u32, 1],
         }
     }

@@ -27,6 +27,8 @@ pub(super) const MOST_ENTRIES: u64 = 1 << 28;
 #[derive(Debug, Clone)]
 pub(super) struct Sizes {
     pub(super) budget: u64,
+    /// Rows at the front that never change.
+    pub(super) frozen: u64,
     pub(super) cap: u64,
     pub(super) sh_degree: u8,
     pub(super) image: (u32, u32),
@@ -72,6 +74,7 @@ impl Sizes {
     ) -> Self {
         Self {
             budget: budget as u64,
+            frozen: 0,
             cap,
             sh_degree,
             image,
@@ -93,6 +96,19 @@ impl Sizes {
     pub(super) fn waits(&self) -> [bool; 2] {
         let Cadence { all, sh_rest } = self.cadence;
         [all > 1, all > 1 || sh_rest > 1]
+    }
+
+    /// Most rows that are not frozen, >= 1.
+    pub(super) fn trained(&self) -> u64 {
+        self.budget.saturating_sub(self.frozen).max(1)
+    }
+
+    /// The first row that has a place in an array, and how many have one at most.
+    pub(super) fn places(&self, array: &RowArray) -> [u64; 2] {
+        match array.holds.traits().is_for_training {
+            true => [self.frozen, self.trained()],
+            false => [0, self.budget],
+        }
     }
 
     /// Every array with an entry per row.
@@ -120,7 +136,8 @@ impl Sizes {
         let (b, cap) = (self.budget, self.cap);
         for array in self.row_arrays() {
             let traits = array.holds.traits();
-            add(traits.section, traits.line, array.name, b * array.row_bytes());
+            let [_, rows] = self.places(&array);
+            add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
         add(Section::Model, Holds::Ages.traits().line, "bias", 8 * (MATURE as u64 + 1));
         for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {

@@ -1,4 +1,5 @@
-//! The GPU backend's state as named arrays: its buffers row by row, as the device holds them.
+//! The GPU backend's state as named arrays: its buffers row by row, as the device holds them; zeros of frozen rows that
+//! have no place there.
 //!
 //! They are named after the device, so that the native backend, whose sums have another order, does
 //! not go on from them unasked.
@@ -7,6 +8,7 @@ use std::ops::Range;
 
 use super::GpuBackend;
 use super::rows::{Holds, RowArray};
+use super::transfer::held;
 use crate::backend::{BackendError, StateArray, StateError, Tensor};
 
 /// Before the name of a buffer.
@@ -76,7 +78,6 @@ impl GpuBackend {
         tensor: Tensor,
         rows: Range<usize>,
     ) -> Result<(), StateError> {
-        let first = rows.start as u64;
         let name = tensor.name.clone();
         if name == WAITS {
             let waits = tensor.into_u8(&[2])?;
@@ -86,14 +87,19 @@ impl GpuBackend {
             self.candidates.restore(tensor)?;
         } else if let Some(plane) = self.signal(&name) {
             let values = tensor.into_f32(&[rows.len()])?;
-            let start = plane as u64 * self.sizes.budget + first;
-            self.write_at("signals", 4 * start, &values);
+            let (first, without) = held(self.sizes.frozen, &rows);
+            let start = plane as u64 * self.sizes.trained() + first;
+            self.write_at("signals", 4 * start, &values[without..]);
         } else if let Some(array) = self.array(&name) {
+            let [first_row, _] = self.sizes.places(&array);
+            let (first, without) = held(first_row, &rows);
             let at = array.row_bytes() * first;
             if array.holds == Holds::Ages {
-                self.write_at(array.name, at, &tensor.into_u8(&[rows.len(), 4])?);
+                let values = tensor.into_u8(&[rows.len(), 4])?;
+                self.write_at(array.name, at, &values[4 * without..]);
             } else {
-                self.write_at(array.name, at, &tensor.into_f32(&[rows.len(), array.numbers])?);
+                let values = tensor.into_f32(&[rows.len(), array.numbers])?;
+                self.write_at(array.name, at, &values[array.numbers * without..]);
             }
         } else {
             return Err(tensor.error("this run keeps nothing of that name"));

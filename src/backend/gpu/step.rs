@@ -52,7 +52,7 @@ impl GpuBackend {
             }
         }
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
-        let trained = (self.rows - self.frozen).max(1) as f32;
+        let trained = (self.rows - self.sizes.frozen as usize).max(1) as f32;
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let pixels = camera.width * camera.height;
         // Up to dL/dpixel.

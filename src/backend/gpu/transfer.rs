@@ -130,14 +130,17 @@ impl GpuBackend {
         })
     }
 
-    /// Some rows of an array.
+    /// Some rows of an array; zeros of those that it does not have.
     pub(super) fn read_rows(
         &self,
         array: &RowArray,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let bytes = array.row_bytes();
-        self.read(array.name, bytes * rows.start as u64, bytes * rows.len() as u64)
+        let (place, without) = held(self.sizes.places(array)[0], &rows);
+        let (bytes, count) = (array.row_bytes(), rows.len() - without);
+        let mut values = vec![0.0; array.numbers * without];
+        values.extend(self.read(array.name, bytes * place, bytes * count as u64)?);
+        Ok(values)
     }
 
     /// Some parameters of some rows, row after row.
@@ -182,9 +185,18 @@ impl GpuBackend {
         rows: Range<usize>,
         values: &[f32],
     ) -> Result<(), BackendError> {
-        let given = array.parameters(self.sizes.sh_degree);
+        self.set_parameters(&array.parameters(self.sizes.sh_degree), rows, values)
+    }
+
+    /// Writes what [`parameters_of`](Self::parameters_of) returned.
+    pub(super) fn set_parameters(
+        &self,
+        given: &Range<usize>,
+        rows: Range<usize>,
+        values: &[f32],
+    ) -> Result<(), BackendError> {
         for to in self.sizes.parameters() {
-            if let Some((here, there)) = shared(&given, &to.parameters) {
+            if let Some((here, there)) = shared(given, &to.parameters) {
                 let mut all = match there.len() == to.numbers {
                     true => vec![0.0; to.numbers * rows.len()],
                     false => self.read_rows(&to, rows.clone())?,
@@ -199,23 +211,29 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// Some rows of the column of one plane of numbers.
+    /// Some rows, zeros of frozen ones, of the column of one plane of numbers.
     pub(super) fn column(
         &self,
         plane: usize,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, BackendError> {
-        let start = plane as u64 * self.sizes.budget + rows.start as u64;
-        self.read("signals", 4 * start, 4 * rows.len() as u64)
+        let (place, without) = held(self.sizes.frozen, &rows);
+        let start = plane as u64 * self.sizes.trained() + place;
+        let mut values = vec![0.0; without];
+        values.extend(self.read("signals", 4 * start, 4 * (rows.len() - without) as u64)?);
+        Ok(values)
     }
 
-    /// A column of present values; see `present` in `shaders/signals.wgsl`.
+    /// A column of present values, zeros of frozen rows; see `present` in `shaders/signals.wgsl`.
     pub(super) fn present(&self, signal: Signal) -> Result<Vec<f32>, BackendError> {
         let (rows, launch) = (self.rows as u32, self.launches.get("present"));
         let start = self.mask.map_or(0.0, |mask| mask.start);
-        let now = [signal as u32, rows, start.to_bits(), 0];
+        let frozen = self.sizes.frozen as usize;
+        let now = [signal as u32, rows, start.to_bits(), frozen as u32];
         self.submit(|to| to.run(launch, now, rows.div_ceil(256)));
-        self.read("sums", 0, 4 * self.rows as u64)
+        let mut values = vec![0.0; frozen];
+        values.extend(self.read("sums", 0, 4 * (self.rows - frozen) as u64)?);
+        Ok(values)
     }
 }
 
@@ -223,4 +241,11 @@ impl GpuBackend {
 fn shared(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<usize>)> {
     let (start, end) = (a.start.max(b.start), a.end.min(b.end));
     (start < end).then(|| (start - a.start..end - a.start, start - b.start..end - b.start))
+}
+
+/// Of an array whose first row is `first`: the place of the first of some rows that it has, and how many of them it
+/// does not have.
+pub(super) fn held(first: u64, rows: &Range<usize>) -> (u64, usize) {
+    let held = (first as usize).clamp(rows.start, rows.end);
+    ((held as u64).saturating_sub(first), held - rows.start)
 }

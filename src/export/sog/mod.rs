@@ -3,6 +3,7 @@
 //! What a byte or a label stands for is fitted to the model, and there most to the rows that show most.
 
 mod codebook;
+mod lossless;
 mod palette;
 mod picture;
 mod zip;
@@ -52,9 +53,9 @@ impl ModelWriter for SogWriter {
     fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
         let held = 12 + 12 + 4 + 12 + 1 + 4 + 4 * bands;
-        // One picture at a time, plain and encoded in two ways; all that are done, at most 32 bytes a row; and what
-        // the fit of the palette takes.
-        let picture = 3 * 4;
+        // One picture at a time, as it is, as it is coded, and as the best and the last file of it; all that are done,
+        // at most 32 bytes a row; and what the fit of the palette takes.
+        let picture = 5 * 4;
         let palette = if bands > 0 { palette::row_bytes(bands) } else { 0 };
         ((rows + 64 * PALETTE_WIDTH) * (held + picture + 32 + palette)) as u64 + (1 << 20)
     }

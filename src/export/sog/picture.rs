@@ -2,6 +2,7 @@
 
 use std::io;
 
+use super::lossless;
 use image_webp::{ColorType, EncoderParams, WebPEncoder};
 
 /// A picture. Shape of `rgba`: `[height, width, 4]`.
@@ -32,7 +33,8 @@ impl Picture {
         self
     }
 
-    /// The file: with the prediction of pixels from their neighbours or without, whichever is smaller.
+    /// The file: by our own encoder, or by one that knows runs of equal pixels, with the prediction of pixels from those
+    /// above or without, whichever is smallest.
     pub(super) fn encode(&self) -> io::Result<Vec<u8>> {
         let opaque = self.rgba.as_chunks::<4>().0.iter().all(|pixel| pixel[3] == 255);
         let rgb: Vec<u8>;
@@ -60,8 +62,14 @@ impl Picture {
             done.map_err(io::Error::other)?;
             Ok::<_, io::Error>(file)
         };
-        let (predicted, plain) = (encoded(true)?, encoded(false)?);
-        Ok(if predicted.len() < plain.len() { predicted } else { plain })
+        let mut best = lossless::encode(&self.rgba, (self.width, self.height));
+        for predicted in [true, false] {
+            let file = encoded(predicted)?;
+            if file.len() < best.len() {
+                best = file;
+            }
+        }
+        Ok(best)
     }
 }
 

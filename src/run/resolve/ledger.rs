@@ -127,12 +127,13 @@ impl Inputs<'_> {
         pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
         #[cfg(feature = "view")]
         if self.spec.output.view.is_some() {
+            pass("a picture for the page", page::passing_bytes(budget, &self.device));
             let photograph =
                 train.held(0).max(test.held(0)) + train.decoding(1).max(test.decoding(1));
-            let image = self.dataset.largest_image();
-            pass("a picture for the page", page::passing_bytes(image, photograph, threads));
-            let views = self.dataset.train.len() + self.dataset.test.len();
-            ledger.add_to(Section::Renderer, "the page", page::lasting_bytes(image, views));
+            let (image, views) =
+                (self.dataset.largest_image(), self.dataset.train.len() + self.dataset.test.len());
+            let bytes = page::lasting_bytes(image, photograph, views, budget, threads);
+            ledger.add_to(Section::Renderer, "the page", bytes);
         }
         let mut pass = |what: &str, bytes| ledger.add_to(Section::Passing, what, bytes);
         let measures_test = !self.dataset.test.is_empty();

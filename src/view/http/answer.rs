@@ -1,8 +1,8 @@
 //! Answers, with the lines that keep a browser from doing with them what is not meant.
 
-use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, Write};
+use std::sync::Arc;
 
 /// Sent with every answer. Nothing is kept, nothing of others is loaded, and no other page may frame this one
 /// or use its pictures.
@@ -21,15 +21,13 @@ pub(in crate::view) struct Answer {
     content_type: &'static str,
     /// Lines of the head beyond those that every answer has.
     lines: Vec<(&'static str, String)>,
-    body: Cow<'static, [u8]>,
+    /// Shared, so that what all ask for is there once.
+    body: Arc<[u8]>,
 }
 
 impl Answer {
     /// What was asked for.
-    pub(in crate::view) fn of(
-        content_type: &'static str,
-        body: impl Into<Cow<'static, [u8]>>,
-    ) -> Self {
+    pub(in crate::view) fn of(content_type: &'static str, body: impl Into<Arc<[u8]>>) -> Self {
         Self { status: 200, content_type, lines: Vec::new(), body: body.into() }
     }
 
@@ -75,12 +73,10 @@ impl Answer {
             let _ = write!(head, "{name}: {value}\r\n");
         }
         head.push_str("\r\n");
-        let mut bytes = head.into_bytes();
+        out.write_all(head.as_bytes())?;
         if with_body {
-            bytes.extend_from_slice(&self.body);
+            out.write_all(&self.body)?;
         }
-        // In one piece: two would wait for each other's acknowledgement.
-        out.write_all(&bytes)?;
         out.flush()
     }
 }

@@ -179,12 +179,12 @@ async function ask(place, { kind, model }, isMoving) {
   if (answer.status === 409) return null;
   if (!answer.ok) throw new Error(await answer.text());
   const number = (name) => answer.headers.has(name) ? Number(answer.headers.get(name)) : null;
-  const range = answer.headers.get("X-Range");
+  const numbers = (name) => answer.headers.get(name)?.split(" ").map(Number) ?? null;
   const bitmap = await createImageBitmap(await answer.blob());
   return {
     bitmap, kind, model,
     mean: number("X-Mean"), distance: number("X-Distance"), milliseconds: number("X-Milliseconds"),
-    range: range && range.split(" ").map(Number), took: performance.now() - begun,
+    range: numbers("X-Range"), measured: numbers("X-Measured"), took: performance.now() - begun,
   };
 }
 
@@ -212,7 +212,10 @@ async function keepAsking() {
       if (!isMoving) complete = asked;
       stage.dataset.pictures = Number(stage.dataset.pictures || 0) + 1;
       stage.dataset.size = `${frames[0].bitmap.width}x${frames[0].bitmap.height}`;
-      stage.dataset.state = complete === version ? "sharp" : "moving";
+      // What is measured in some of the views only is asked for again.
+      const isPart = frames.some((frame) => frame?.measured && frame.measured[0] < frame.measured[1]);
+      if (isPart && complete === version) complete = -1;
+      stage.dataset.state = complete === version ? "sharp" : isPart ? "measuring" : "moving";
       // What is in the middle is what one turns about next.
       if (complete === version && frames[0].distance) camera.away = frames[0].distance;
       if (complete === version) stage.dataset.rested = Math.round(performance.now() - changedAt);
@@ -244,7 +247,9 @@ function pace(frames, isMoving) {
     stage.dataset.rate = (1000 / mean).toFixed(1);
     byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
   } else {
-    byId("status").textContent = `${size} · sharp · drawn in ${milliseconds.toFixed(0)} ms`;
+    const [seen, all] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
+    const how = seen < all ? `measured in ${seen} of ${all} training views` : `sharp · drawn in ${milliseconds.toFixed(0)} ms`;
+    byId("status").textContent = `${size} · ${how}`;
   }
 }
 
@@ -389,20 +394,27 @@ function cameraAt(x, y) {
 
 // ---- Moving.
 
+/** Pointers that were put on the stage, and where each was last, in pixels of the page. */
 const hands = new Map();
 let travelled = 0;
 
 marks.addEventListener("pointerdown", (event) => {
+  // The first finger, or the mouse, begins anew.
+  if (event.isPrimary) drop();
   marks.setPointerCapture(event.pointerId);
-  hands.set(event.pointerId, [event.offsetX, event.offsetY]);
+  hands.set(event.pointerId, [event.clientX, event.clientY]);
   marks.classList.add("dragging");
   travelled = 0;
 });
 
-marks.addEventListener("pointermove", (event) => {
+// Of the whole page, as not every browser keeps to the capture: whoever leaves the stage still drags, and lifts the
+// hand somewhere else.
+addEventListener("pointermove", (event) => {
   const before = hands.get(event.pointerId);
   if (!before) return;
-  const now = [event.offsetX, event.offsetY];
+  // It was lifted where the page did not see it.
+  if (!event.buttons) return drop();
+  const now = [event.clientX, event.clientY];
   const [dx, dy] = add(now, before, -1);
   if (!dx && !dy) return;
   const height = area()[1];
@@ -424,14 +436,19 @@ marks.addEventListener("pointermove", (event) => {
   hands.set(event.pointerId, now);
 });
 
-function lift(event) {
-  if (!hands.delete(event.pointerId)) return;
-  if (!hands.size) marks.classList.remove("dragging");
-  const found = travelled < 4 && event.type === "pointerup" && cameraAt(event.offsetX, event.offsetY);
-  if (found) goTo(found);
+/** Ends all dragging. */
+function drop() {
+  hands.clear();
+  marks.classList.remove("dragging");
 }
-marks.addEventListener("pointerup", lift);
-marks.addEventListener("pointercancel", lift);
+
+addEventListener("pointerup", (event) => {
+  if (!hands.delete(event.pointerId)) return;
+  if (!hands.size) drop();
+  const found = travelled < 4 && event.target === marks && cameraAt(event.offsetX, event.offsetY);
+  if (found) goTo(found);
+});
+addEventListener("pointercancel", (event) => { if (hands.has(event.pointerId)) drop(); });
 marks.addEventListener("contextmenu", (event) => event.preventDefault());
 marks.addEventListener("wheel", (event) => {
   event.preventDefault();
@@ -481,17 +498,25 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 document.addEventListener("keyup", (event) => { held.delete(event.key.toLowerCase()); changedAt = performance.now(); wake(); });
-addEventListener("blur", () => held.clear());
+addEventListener("blur", () => { held.clear(); drop(); });
 
 // ---- The border between two pictures.
 
 const divider = byId("divider");
 const setBorder = (share) => { border = clamp(share, 0, 1); draw(); };
-divider.addEventListener("pointerdown", (event) => divider.setPointerCapture(event.pointerId));
-divider.addEventListener("pointermove", (event) => {
-  if (!divider.hasPointerCapture(event.pointerId)) return;
-  setBorder((event.clientX - stage.getBoundingClientRect().left) / area()[0]);
+let dragger = null;
+divider.addEventListener("pointerdown", (event) => {
+  divider.setPointerCapture(event.pointerId);
+  dragger = event.pointerId;
 });
+addEventListener("pointermove", (event) => {
+  if (event.pointerId !== dragger) return;
+  if (event.buttons) setBorder((event.clientX - stage.getBoundingClientRect().left) / area()[0]);
+  else dragger = null;
+});
+for (const end of ["pointerup", "pointercancel"]) {
+  addEventListener(end, (event) => { if (event.pointerId === dragger) dragger = null; });
+}
 divider.addEventListener("keydown", (event) => {
   const to = { ArrowLeft: border - 0.02, ArrowRight: border + 0.02, Home: 0, End: 1 }[event.key];
   if (to === undefined) return;
@@ -635,13 +660,25 @@ function fill() {
   byId("right").append(option("", "nothing"));
   const isOfModel = (kind) => kind !== "photograph";
   scene.models.forEach(({ name }, model) => {
-    for (const { kind, label } of scene.kinds) {
-      if (model && !isOfModel(kind)) continue;
-      const text = scene.models.length > 1 && isOfModel(kind) ? `${label}, ${name}` : label;
-      byId("left").append(option(`${kind}:${model}`, text));
-      byId("right").append(option(`${kind}:${model}`, text));
+    const of = scene.models.length > 1 ? `, ${name}` : "";
+    for (const list of [byId("left"), byId("right")]) {
+      for (const [title, isRows] of [["Pictures", false], ["Single Gaussians", true]]) {
+        const group = document.createElement("optgroup");
+        group.label = title + of;
+        for (const { kind, label } of scene.kinds) {
+          if (kind.startsWith("row") !== isRows || model && !isOfModel(kind)) continue;
+          group.append(option(`${kind}:${model}`, isOfModel(kind) ? label + of : label));
+        }
+        list.append(group);
+      }
     }
   });
+  byId("lacking").hidden = !scene.lacking.length;
+  for (const { label, why } of scene.lacking) {
+    const item = document.createElement("li");
+    item.textContent = `${label}: ${why}.`;
+    byId("lacking").querySelector("ul").append(item);
+  }
   if (scene.models.length > 1) byId("right").value = "render:1";
   byId("view").append(option("", "anywhere"));
   for (const [split, label] of [["test", "Held out"], ["train", "Trained on"]]) {

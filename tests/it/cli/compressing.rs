@@ -43,6 +43,16 @@ fn what_is_written_is_no_larger_than_asked() {
     assert!(!outcome.ok().stdout.contains("training"));
     assert_eq!(read(&same).len(), whole);
 
+    // The format that holds most: what half of a PLY's bytes hold as a whole is written as it is.
+    let (outcome, any) = compress(&format!("{}B", whole / 2), "any", "--format any");
+    let outcome = outcome.ok();
+    let found: Vec<_> =
+        files(root.path()).into_keys().filter(|it| it.starts_with("any.")).collect();
+    let [name] = &found[..] else { panic!("{found:?}: {outcome:?}") };
+    assert!(outcome.stdout.contains(name) && !outcome.stdout.contains("training"), "{outcome:?}");
+    assert_eq!(gaussians(&root.path().join(name)).len(), rows);
+    assert!(!any.exists() && read(&root.path().join(name)).len() <= whole / 2);
+
     let before = files(root.path()).len();
     for (to, name, flags, words) in [
         ("100B", "tiny.ply", "", &["--to", "no model fits"][..]),
@@ -50,6 +60,8 @@ fn what_is_written_is_no_larger_than_asked() {
         ("much", "tiny.ply", "", &["much", "5MiB"]),
         ("1MiB", "tiny.doc", "", &["-o", "tiny.doc"]),
         ("1MiB", "same.ply", "", &["exists", "--overwrite"]),
+        ("1MiB", "any", "--format any", &["any.", "exists", "--overwrite"]),
+        ("1MiB", "tiny.ply", "--format all", &["`all`", "any"]),
         ("1MiB", "tiny.ply", "--near 0.1", &["--near", "leave it out"]),
     ] {
         let (outcome, _) = compress(to, name, flags);

@@ -10,6 +10,8 @@ mod configuring;
 mod exporting;
 mod exposing;
 mod faults;
+#[cfg(unix)]
+mod filling;
 mod generated;
 mod geometry;
 mod hostile;
@@ -24,6 +26,7 @@ mod same;
 mod starting;
 mod trading;
 mod training;
+mod travelling;
 mod view;
 mod watching;
 
@@ -72,6 +75,10 @@ fn densify(arguments: &[&str]) -> Outcome {
     command.args(arguments).env_remove("RUST_LOG").env("NODEVICE_SELECT", "1");
     // The user's cache is left alone; built-in scenes are rendered once for all tests.
     command.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+    outcome_of(command)
+}
+
+fn outcome_of(mut command: Command) -> Outcome {
     let output = command.output().expect("it starts");
     let text = |bytes| String::from_utf8(bytes).expect("messages are UTF-8");
     Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }

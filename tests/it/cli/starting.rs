@@ -82,6 +82,29 @@ fn a_run_goes_on_from_any_model() {
     resume(scene.path(), &part, &format!("--init {}", text(&ply))).refused("another", &["--init"]);
 }
 
+/// Of a finished model the steps of a run from its start would take much at first.
+#[test]
+fn a_finished_model_keeps_its_quality_within_2_percent_of_the_iterations() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 300, &format!("--budget 300 --eval --quiet {STILL}")).ok();
+    let own = json(&run.join("results.json"))["ours_300"]["PSNR"].as_f64().unwrap();
+    let after = |rates: &str| {
+        let to = root.path().join(rates);
+        let flags = format!(
+            "--init {} --init-rates {rates} --budget 300 --eval --quiet --test-iterations 6 {STILL}",
+            text(&model_path(&run, 300))
+        );
+        train(scene.path(), &to, 300, &flags).ok();
+        json(&to.join("results.json"))["ours_6"]["PSNR"].as_f64().unwrap()
+    };
+    let (fine, full) = (after("fine"), after("full"));
+    assert!(
+        fine > own - 0.1 && full < own - 0.3,
+        "{own}: {fine} with fine steps, {full} with full"
+    );
+}
+
 #[test]
 fn frozen_gaussians_stay_as_they_are_through_a_stop_too() {
     let scene = Photographs::colmap_text();

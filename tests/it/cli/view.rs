@@ -37,6 +37,12 @@ impl Reply {
         String::from_utf8_lossy(&self.body).into_owned()
     }
 
+    /// A line of the head.
+    pub(super) fn header(&self, name: &str) -> Option<&str> {
+        let mut lines = self.head.lines().filter_map(|line| line.split_once(": "));
+        lines.find(|(it, _)| *it == name).map(|(_, value)| value)
+    }
+
     pub(super) fn picture(&self) -> RgbImage {
         assert_eq!(self.status, 200, "{}", self.text());
         let format = image::ImageFormat::Jpeg;
@@ -171,6 +177,7 @@ fn the_picture_of_a_camera_is_that_which_render_writes() {
     let page = Page::open(text(&run));
     let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
     assert_eq!(described["views"]["test"][1]["name"], "view_08.png");
+    let first = page.frame(&wish("render", "test", 0, SIZE)).picture();
     for (number, name) in [(0, "view_00"), (1, "view_08")] {
         let found = page.frame(&wish("render", "test", number, SIZE));
         let written = image::open(pictures.join(format!("{name}.png"))).expect("a PNG").into_rgb8();
@@ -192,22 +199,43 @@ fn the_picture_of_a_camera_is_that_which_render_writes() {
     for (wanted, size) in sizes {
         assert_eq!(page.frame(&wish("render", "train", 0, wanted)).picture().dimensions(), size);
     }
-    let kinds =
-        ["difference", "depth", "opacity", "count", "rows", "row_opacity", "row_size", "row_shape"];
+    let all = described["kinds"].as_array().expect("kinds").iter();
+    let kinds: Vec<&str> = all.filter_map(|kind| kind["kind"].as_str()).collect();
+    // When rows were made and edited no file says; the page says so.
+    let lacking = described["lacking"].as_array().expect("what lacks");
+    assert_eq!((kinds.len(), lacking.len()), (12, 2), "{described}");
+    assert_eq!(page.frame(&wish("row_age", "test", 0, SIZE)).status, 400);
     let mut seen: Vec<Vec<u8>> = Vec::new();
     for kind in kinds {
         let reply = page.frame(&wish(kind, "test", 0, SIZE));
         assert_eq!(reply.picture().dimensions(), SIZE, "{kind}");
-        assert_eq!(reply.head.contains("X-Range: "), !matches!(kind, "opacity" | "rows"), "{kind}");
+        let has_range = !matches!(kind, "render" | "photograph" | "opacity" | "rows");
+        assert_eq!(reply.header("X-Range").is_some(), has_range, "{kind}");
         assert!(!seen.contains(&reply.body), "{kind} is as another");
         seen.push(reply.body);
     }
     // The mean difference is the FLIP that training measured of this view.
-    let head = page.frame(&wish("difference", "test", 0, SIZE)).head;
-    let mean = head.lines().find_map(|line| line.strip_prefix("X-Mean: ")).expect("a mean");
+    let difference = page.frame(&wish("difference", "test", 0, SIZE));
+    let mean = difference.header("X-Mean").expect("a mean");
     let flip = json(&run.join("per_view.json"))["ours_40"]["FLIP"]["view_00.png"].clone();
     let apart = (mean.parse::<f64>().expect("a number") - flip.as_f64().expect("a number")).abs();
     assert!(apart < 2e-3, "{mean} is not {flip}");
+    // What training alone knows is measured in the training views, some at a time, until all are.
+    let measured = |kind: &str| {
+        let reply = page.frame(&wish(kind, "test", 0, SIZE));
+        let (seen, all) =
+            reply.header("X-Measured").and_then(|it| it.split_once(' ')).expect("how many");
+        (seen == all, all.parse::<usize>().expect("a number"), reply.body)
+    };
+    let train = described["views"]["train"].as_array().expect("views").len();
+    while !measured("row_gradient").0 {}
+    let (is_whole, all, gradient) = measured("row_gradient");
+    assert_eq!((is_whole, all), (true, train));
+    assert!(gradient == measured("row_gradient").2, "it goes on measuring");
+    let (is_whole, _, weight) = measured("row_weight");
+    assert!(is_whole && weight != gradient);
+    // The model is as it was.
+    assert!(psnr(&page.frame(&wish("render", "test", 0, SIZE)).picture(), &first) > 99.0);
     #[cfg(unix)]
     assert_eq!(page.end().trim(), "Ctrl-C ends it");
 }
@@ -284,7 +312,8 @@ fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
     let page = Page::open(&format!("{} --eval", text(scene.path())));
     let described: Value = serde_json::from_slice(&page.get("/scene").body).expect("JSON");
     assert!(described["models"][0]["name"].as_str().expect("a name").ends_with("its points"));
-    assert!(described["points"]["all"].as_u64() > Some(100), "{}", described["points"]["all"]);
+    let points = described["points"]["positions"].as_array().map_or(0, Vec::len);
+    assert!(points > 100, "{points}");
     page.frame(&wish("render", "test", 0, SIZE)).picture();
     run_of(&scene, &run);
     let other = root.path().join("other");

@@ -104,7 +104,11 @@ fn a_run_is_the_same_to_the_byte_with_viewers_and_without() {
         page.order("continue");
         // From here on somebody looks all the time, in every way.
         let mut pictures = 0;
-        let kinds = ["render", "depth", "opacity", "count", "difference", "photograph"];
+        let mut kinds = vec!["render", "depth", "opacity", "count", "difference", "photograph"];
+        kinds.extend(["rows", "row_opacity", "row_size", "row_shape", "row_age", "row_edit"]);
+        // What the policy itself measures.
+        kinds.extend((policy != "mcmc").then_some("row_gradient"));
+        kinds.extend((policy == "diet").then_some("row_weight"));
         for at in 0.. {
             let wish = match at % 3 {
                 0 => wish(kinds[at as usize / 3 % kinds.len()], "test", 1, SIZE),
@@ -182,9 +186,31 @@ fn the_page_says_how_training_goes() {
         .flatten()
         .filter_map(|kind| kind["kind"].as_str())
         .collect();
-    assert_eq!(kinds, ["render", "photograph", "difference", "depth", "opacity", "count"]);
-    let painted = page.frame(&wish("row_size", "test", 0, SIZE));
-    assert_eq!(painted.status, 400, "{}", painted.text());
+    assert_eq!(kinds.len(), 14, "{kinds:?}");
+    assert!(described["points"]["positions"].as_array().is_some_and(|it| !it.is_empty()));
+    let range = |kind: &str| {
+        let reply = page.frame(&wish(kind, "test", 0, SIZE));
+        let range = reply.header("X-Range").expect("a range").to_owned();
+        let (least, most) = range.split_once(' ').expect("two numbers");
+        [least, most].map(|end| end.parse::<f64>().expect("a number"))
+    };
+    // Some rows are as old as the run, and some were edited since.
+    let [age, edit] = ["row_age", "row_edit"].map(|kind| range(kind)[1]);
+    assert!(edit <= age && age <= step as f64 && age > 0.0, "{age} {edit} {step}");
+    let [least, most] = range("row_gradient");
+    assert!(0.0 < least && least < most && most < 1.0, "{least} {most}");
+
+    // What the policy does not measure is not shown, and it is said why.
+    let (_root, other) = scratch();
+    let quiet = watched(scene.path(), &other, "--policy mcmc --eval");
+    let described: Value =
+        serde_json::from_slice(&quiet.get(&format!("{}scene", quiet.path)).body).expect("JSON");
+    let lacking: Vec<&Value> = described["lacking"].as_array().into_iter().flatten().collect();
+    let says = |lacking: &&Value| lacking["why"].as_str().is_some_and(|why| why.contains("mcmc"));
+    assert!(lacking.len() == 2 && lacking.iter().all(says), "{lacking:?}");
+    let refused = quiet.frame(&wish("row_gradient", "test", 0, SIZE));
+    assert!(refused.status == 400 && refused.text().contains("mcmc"), "{}", refused.text());
+    drop(quiet);
 
     // Stopped, it leaves a checkpoint, and goes on to the same end.
     page.order("stop");

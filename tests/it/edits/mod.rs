@@ -1,6 +1,6 @@
 //! Any plans, one after the other, on the backend and on a plain vector of Gaussians that follows
 //! the words of the plan's documentation: parameters, moments, ages and signals go where they
-//! should, and the rows never exceed the budget.
+//! should, and the rows never exceed the budget. What is remembered of when rows were made and edited goes along.
 //!
 //! Moments cannot be read. They show in a step that sees nothing: without a gradient a row moves by
 //! what its moments still hold, and by its age. A twin that is not edited tells how far.
@@ -14,6 +14,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use densify::backend::Backend;
 use densify::camera::Camera;
+use densify::trainer::RowHistory;
 use densify::verify::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::{EditPlan, RowOps, Seed, Update};
 use densify_policies::policy::{Needs, Signal, SignalSet};
@@ -80,6 +81,7 @@ fn rows(backend: &mut dyn Backend) -> Vec<Row> {
         opacity_rests: false,
         sh_rests_from: usize::MAX,
         has_decayed: false,
+        steps: [1000 + row as u32; 2],
     };
     (0..model.len()).map(row).collect()
 }
@@ -163,14 +165,21 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
     let budget = ROWS + spare;
     let mut backend = trained(subject, budget);
     let mut expected = rows(&mut *backend);
+    // As if no two had been edited in the same step.
+    let steps: Vec<u32> = expected.iter().map(|row| row.steps[1]).collect();
+    let mut history = RowHistory::of(&steps, budget);
     for (event, calls) in (4..).zip(plans) {
         let mut plan = EditPlan::new(backend.rows(), budget).allowing(&needs());
         let taken: Vec<Call> =
             calls.iter().filter(|call| enter(&mut plan, call)).cloned().collect();
-        backend.apply(&plan.compile(), SEED, event).expect("a plan is applied");
+        let ops = plan.compile();
+        backend.apply(&ops, SEED, event).expect("a plan is applied");
+        history.follow(&ops, event);
         assert!(backend.rows() <= backend.budget());
-        expected = execute(expected, &taken, budget, &PolicyRng::new(SEED, event));
+        expected = execute(expected, &taken, budget, (&PolicyRng::new(SEED, event), event));
         check_rows(&rows(&mut *backend), &expected);
+        let of = |at: usize| expected.iter().map(|row| row.steps[at]).collect::<Vec<u32>>();
+        assert_eq!([history.made(), history.edited()], [of(0), of(1)]);
     }
     let before = rows(&mut *backend);
     assert_eq!(step(&mut *backend, &turned_away(&view()), 9), 0);

@@ -26,6 +26,8 @@ pub(super) struct Row {
     pub(super) sh_rests_from: usize,
     /// Whether the opacity has decayed.
     pub(super) has_decayed: bool,
+    /// When the row was made, and edited last.
+    pub(super) steps: [u32; 2],
 }
 
 fn sigmoid(logit: f32) -> f64 {
@@ -146,15 +148,22 @@ impl Row {
             opacity_rests: false,
             sh_rests_from: usize::MAX,
             has_decayed: false,
+            steps: [0; 2],
         };
         sown.paint(seed.colour);
         sown
     }
 }
 
-/// Executes accepted calls on the plain vector.
-pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &PolicyRng) -> Vec<Row> {
+/// Executes accepted calls of a step on the plain vector.
+pub(super) fn execute(
+    model: Vec<Row>,
+    calls: &[Call],
+    budget: usize,
+    (rng, step): (&PolicyRng, u32),
+) -> Vec<Row> {
     let before = model;
+    let new = |row: Row| Row { steps: [step; 2], ..row };
     let mut slots: Vec<Option<Row>> = before.iter().cloned().map(Some).collect();
     let mut children: Vec<Vec<Row>> = vec![Vec::new(); before.len()];
     let mut seeds = Vec::new();
@@ -167,13 +176,14 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
             Call::Grow(row, how) => {
                 let parent = &before[*row as usize];
                 children[*row as usize] =
-                    (1..=how.children).map(|n| parent.child(*row, n, how, rng)).collect();
+                    (1..=how.children).map(|n| new(parent.child(*row, n, how, rng))).collect();
                 if how.parent == ParentFate::BecomesChild {
-                    slots[*row as usize] = Some(parent.child(*row, 0, how, rng));
+                    slots[*row as usize] = Some(new(parent.child(*row, 0, how, rng)));
                 }
             }
             Call::Update(row, how) => {
                 let mut updated = before[*row as usize].clone();
+                updated.steps[1] = step;
                 updated.rescale(how.scale);
                 updated.cover(how.opacity, 1);
                 if let Some(degree) = how.sh_degree {
@@ -188,7 +198,7 @@ pub(super) fn execute(model: Vec<Row>, calls: &[Call], budget: usize, rng: &Poli
                 slots[*row as usize] =
                     Some(if how.keep_moments { updated } else { updated.reborn() });
             }
-            Call::Append(seed) => seeds.push(Row::sown(seed)),
+            Call::Append(seed) => seeds.push(new(Row::sown(seed))),
             Call::Decay(how) => decay = Some(*how),
             Call::Clamp(max) => clamp = clamp.min(*max),
             Call::Reset => reset = true,

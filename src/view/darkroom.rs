@@ -1,18 +1,23 @@
-//! From a wish to a JPEG: renders, measures, colours, and encodes.
+//! From a rendering to a JPEG: compares with the photograph, colours, and encodes. None of this is done by the thread
+//! that renders, which may be training; and all of it by one other thread, as of each that ever had a large picture
+//! the allocator may keep its buffers.
 
+use std::io;
 use std::ops::Range;
+use std::thread::{Builder, Scope, ScopedJoinHandle};
 use std::time::Instant;
 
 use image::codecs::jpeg::JpegEncoder;
 use image::{ExtendedColorType, Rgb, RgbImage, imageops};
 
 use super::asked::{Viewpoint, Wanted};
-use super::desk::Unmade;
+use super::desk::{Closing, Desk, Unmade};
 use super::kinds::Kind;
-use super::paint::{self, ends};
+use super::negative::Negative;
+use super::paint::ends;
 use super::ramp;
 use super::stage::Stage;
-use crate::backend::{Backend, Rendering};
+use crate::backend::Rendering;
 use crate::camera::Camera;
 use crate::dataset::images::Image8;
 use crate::evaluate::Split;
@@ -20,6 +25,9 @@ use crate::metrics::flip_map;
 use crate::pictures::{photograph, picture, to_u8};
 use crate::views::ViewSource;
 
+/// Bytes of the stack of the thread that makes pictures. Decoders of photographs need the most of it, less than a
+/// quarter.
+pub(super) const STACK: usize = 512 << 10;
 /// Quality of a picture that stays: at least 38 dB from what was rendered, and 45 dB mostly.
 const STILL: u8 = 95;
 /// Quality of one that the next will replace at once.
@@ -41,6 +49,8 @@ pub(super) struct Frame {
     pub(super) mean: Option<f64>,
     /// How far away the model is in the middle, in the dataset's own units, if there is any there.
     pub(super) distance: Option<f64>,
+    /// Of how many training views its colours are known, and how many there are, where they are measured there.
+    pub(super) measured: Option<[usize; 2]>,
     /// What it took to make `[ms]`.
     pub(super) milliseconds: f64,
 }
@@ -53,88 +63,77 @@ struct Drawn {
     distance: Option<f64>,
 }
 
-/// Makes the picture. The models are in these backends.
-pub(super) fn make(
-    stage: &mut Stage,
-    backends: &mut [&mut dyn Backend],
-    wanted: &Wanted,
-) -> Result<Frame, Unmade> {
+/// Makes pictures of what is rendered until the desk closes; and closes it, should that fail.
+pub(super) fn open<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    desk: &'scope Desk,
+    stage: &'scope Stage,
+) -> io::Result<ScopedJoinHandle<'scope, ()>> {
+    Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
+        let _closing = Closing(desk);
+        while let Some((ticket, negative)) = desk.next_exposed() {
+            let made = develop(stage, &ticket.wanted, negative).map_err(Unmade::Failed);
+            desk.answer(ticket, made);
+        }
+    })
+}
+
+/// Makes the picture of a rendering.
+fn develop(stage: &Stage, wanted: &Wanted, negative: Negative) -> Result<Frame, String> {
     let begun = Instant::now();
-    let Drawn { image, range, mean, distance } =
-        draw(stage, backends[wanted.model], wanted).map_err(Unmade::Failed)?;
+    let measured = negative.measured;
+    let rendered = negative.milliseconds;
+    let Drawn { image, range, mean, distance } = draw(stage, wanted, negative)?;
     let quality = if wanted.is_moving { MOVING } else { STILL };
     let mut jpeg = Vec::new();
     let (size, colours) = (image.dimensions(), ExtendedColorType::Rgb8);
     JpegEncoder::new_with_quality(&mut jpeg, quality)
         .encode(image.as_raw(), size.0, size.1, colours)
-        .map_err(|error| Unmade::Failed(error.to_string()))?;
-    let milliseconds = 1e3 * begun.elapsed().as_secs_f64();
-    Ok(Frame { jpeg, size, range, mean, distance, milliseconds })
+        .map_err(|error| error.to_string())?;
+    let milliseconds = rendered + 1e3 * begun.elapsed().as_secs_f64();
+    Ok(Frame { jpeg, size, range, mean, distance, measured, milliseconds })
 }
 
-fn draw(stage: &mut Stage, backend: &mut dyn Backend, wanted: &Wanted) -> Result<Drawn, String> {
-    let camera = camera(stage, wanted);
-    match (wanted.kind, wanted.from) {
+fn draw(stage: &Stage, wanted: &Wanted, negative: Negative) -> Result<Drawn, String> {
+    let Negative { rendering, range, .. } = negative;
+    let distance = distance(stage, &rendering);
+    let plain = |image| Drawn { image, range: None, mean: None, distance };
+    Ok(match (wanted.kind, wanted.from) {
         (Kind::Photograph, Viewpoint::View(split, number)) => {
-            let image = shot(stage, (split, number), &camera)?;
-            Ok(plain(photograph(&image, stage.background)))
+            let image = shot(stage, (split, number), &camera(stage, wanted))?;
+            plain(photograph(&image, stage.background))
         }
         (Kind::Difference, Viewpoint::View(split, number)) => {
-            let image = shot(stage, (split, number), &camera)?;
-            let rendering = render(stage, backend, wanted.model, &camera)?;
+            let image = shot(stage, (split, number), &camera(stage, wanted))?;
             let map = flip_map(&rendering.rgb, &image, stage.background)
                 .map_err(|error| error.to_string())?;
             let mean = map.iter().sum::<f64>() / map.len().max(1) as f64;
             let value = |at: usize| (map[at] / MOST_FLIP) as f32;
             let image = coloured(&rendering, value, |_| true);
-            let distance = distance(stage, &rendering);
-            Ok(Drawn { image, range: Some(0.0..MOST_FLIP), mean: Some(mean), distance })
-        }
-        (Kind::Rows | Kind::RowOpacity | Kind::RowSize | Kind::RowShape, _) => {
-            let units = 1.0 / stage.normalisation.scale;
-            let painted = stage.paint(wanted.model, backend).map_err(|error| error.to_string())?;
-            let range = painted.show(wanted.kind, units).map_err(|error| error.to_string())?;
-            let rendering = painted
-                .backend
-                .render(&camera, paint::BACKGROUND, 0)
-                .map_err(|error| error.to_string())?;
-            let distance = distance(stage, &rendering);
-            Ok(Drawn { range, distance, ..plain(picture(&rendering)) })
+            Drawn { image, range: Some(0.0..MOST_FLIP), mean: Some(mean), distance }
         }
         (Kind::Count, _) => {
-            let rendering = backend.render_counts(&camera).map_err(|error| error.to_string())?;
-            let counts: Vec<f64> = rendering.depth.iter().copied().map(f64::from).collect();
-            let most = ends(&counts).end.max(1.0);
-            let mean = counts.iter().sum::<f64>() / counts.len().max(1) as f64;
-            let image = coloured(&rendering, |at| (counts[at] / most) as f32, |_| true);
-            Ok(Drawn { image, range: Some(0.0..most), mean: Some(mean), distance: None })
+            let counts = &rendering.depth;
+            let most = ends(counts).end.max(1.0);
+            let mean =
+                counts.iter().copied().map(f64::from).sum::<f64>() / counts.len().max(1) as f64;
+            let image = coloured(&rendering, |at| counts[at] / most, |_| true);
+            Drawn { image, range: Some(0.0..most.into()), mean: Some(mean), distance: None }
         }
-        (Kind::Depth, _) => {
-            let rendering = render(stage, backend, wanted.model, &camera)?;
-            Ok(depth(stage, &rendering))
-        }
+        (Kind::Depth, _) => depth(stage, &rendering),
         (Kind::Opacity, _) => {
-            let rendering = render(stage, backend, wanted.model, &camera)?;
             let Rendering { width, height, alpha, .. } = &rendering;
             let grey =
                 |x: u32, y: u32| Rgb([to_u8(alpha[y as usize * *width as usize + x as usize]); 3]);
-            let image = RgbImage::from_fn(*width, *height, grey);
-            Ok(Drawn { distance: distance(stage, &rendering), ..plain(image) })
+            plain(RgbImage::from_fn(*width, *height, grey))
         }
-        (Kind::Render | Kind::Photograph | Kind::Difference, _) => {
-            let rendering = render(stage, backend, wanted.model, &camera)?;
-            Ok(Drawn { distance: distance(stage, &rendering), ..plain(picture(&rendering)) })
-        }
-    }
-}
-
-fn plain(image: RgbImage) -> Drawn {
-    Drawn { image, range: None, mean: None, distance: None }
+        _ => Drawn { range, ..plain(picture(&rendering)) },
+    })
 }
 
 /// The camera to render with. That of a view keeps its shape; at its own size the picture is the one that is
 /// measured.
-fn camera(stage: &Stage, wanted: &Wanted) -> Camera {
+pub(super) fn camera(stage: &Stage, wanted: &Wanted) -> Camera {
     let wanted = &Wanted { size: within(wanted.size, stage.largest), ..wanted.clone() };
     match wanted.from {
         Viewpoint::Free(key) => {
@@ -173,16 +172,6 @@ fn fitted(own: (u32, u32), Wanted { size, kind, .. }: &Wanted) -> (u32, u32) {
     }
 }
 
-fn render(
-    stage: &Stage,
-    backend: &mut dyn Backend,
-    model: usize,
-    camera: &Camera,
-) -> Result<Rendering, String> {
-    let made = backend.render(camera, stage.background, stage.models[model].sh_degree);
-    made.map_err(|error| error.to_string())
-}
-
 /// What the camera saw, at the size of the picture.
 fn shot(stage: &Stage, (split, number): (Split, usize), camera: &Camera) -> Result<Image8, String> {
     let image = stage.photographs(split).image(number).map_err(|error| error.to_string())?;
@@ -213,14 +202,14 @@ fn coloured(
 fn depth(stage: &Stage, rendering: &Rendering) -> Drawn {
     let Rendering { alpha, depth, .. } = rendering;
     let is_there = |at: usize| alpha[at] >= LEAST_ALPHA;
-    let mean = |at: usize| f64::from(depth[at] / alpha[at]);
-    let seen: Vec<f64> = (0..alpha.len()).filter(|&at| is_there(at)).map(mean).collect();
+    let mean = |at: usize| depth[at] / alpha[at];
+    let seen: Vec<f32> = (0..alpha.len()).filter(|&at| is_there(at)).map(mean).collect();
     let range = ends(&seen);
-    let width = (range.end - range.start).max(f64::MIN_POSITIVE);
-    let image = coloured(rendering, |at| ((range.end - mean(at)) / width) as f32, is_there);
+    let width = (range.end - range.start).max(f32::MIN_POSITIVE);
+    let image = coloured(rendering, |at| (range.end - mean(at)) / width, is_there);
     let units = 1.0 / stage.normalisation.scale;
     // From dark to light, as the scale is.
-    let range = Some(range.end * units..range.start * units);
+    let range = Some(f64::from(range.end) * units..f64::from(range.start) * units);
     Drawn { image, range, mean: None, distance: distance(stage, rendering) }
 }
 
@@ -230,13 +219,89 @@ fn distance(
     Rendering { width, height, alpha, depth, .. }: &Rendering,
 ) -> Option<f64> {
     let at = (*height / 2) as usize * *width as usize + (*width / 2) as usize;
+    // Of a photograph nothing is rendered.
+    if alpha.is_empty() {
+        return None;
+    }
     let mean = f64::from(depth[at] / alpha[at]) / stage.normalisation.scale;
     (alpha[at] > 0.5 && mean.is_finite()).then_some(mean)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use image::DynamicImage;
+    use serde_json::json;
+
     use super::*;
+    use crate::view::open::stage_of;
+
+    /// A photograph of a camera as there are today, in each format, through a lens that bends.
+    fn large_photographs(folder: &Path) {
+        let (width, height) = (4096, 3072);
+        let noise = |x: u32, y: u32| (x.wrapping_mul(2_654_435_769) ^ y.wrapping_mul(40_503)) >> 9;
+        let image = RgbImage::from_fn(width, height, |x, y| {
+            let grain = noise(x, y) as u8 / 4;
+            Rgb([(x / 16) as u8 / 2 + grain, (y / 12) as u8 / 2 + grain, grain])
+        });
+        let image = DynamicImage::from(image);
+        image.save(folder.join("a.jpg")).expect("a JPEG");
+        DynamicImage::from(image.to_rgb16()).save(folder.join("b.png")).expect("a PNG");
+        image.save(folder.join("c.webp")).expect("a WebP");
+        let frame = |name: &str, x: f64| {
+            let pose = [
+                [1.0, 0.0, 0.0, x],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 4.0],
+                [0.0, 0.0, 0.0, 1.0],
+            ];
+            json!({ "file_path": name, "transform_matrix": pose })
+        };
+        let scene = json!({
+            "w": width, "h": height, "fl_x": 4000.0, "fl_y": 4000.0, "cx": 2048.0, "cy": 1536.0, "k1": -0.05,
+            "frames": [frame("a.jpg", 0.0), frame("b.png", 1.0), frame("c.webp", -1.0)],
+        });
+        std::fs::write(folder.join("transforms.json"), scene.to_string()).expect("a file");
+    }
+
+    #[test]
+    fn large_photographs_need_less_than_a_quarter_of_the_stack() {
+        let folder = tempfile::tempdir().expect("a folder");
+        large_photographs(folder.path());
+        let stage = stage_of(folder.path());
+        std::thread::scope(|scope| {
+            let made = Builder::new().stack_size(STACK / 4).spawn_scoped(scope, || {
+                for (kind, size) in
+                    [(Kind::Photograph, (2364, 1773)), (Kind::Difference, (640, 480))]
+                {
+                    for number in 0..3 {
+                        let wanted = Wanted {
+                            owner: ("a".to_owned(), 0),
+                            kind,
+                            model: 0,
+                            size,
+                            is_moving: false,
+                            from: Viewpoint::View(Split::Train, number),
+                        };
+                        let Camera { width, height, .. } = camera(&stage, &wanted);
+                        let pixels = width as usize * height as usize;
+                        let rendering = Rendering {
+                            width,
+                            height,
+                            rgb: vec![0.5; 3 * pixels],
+                            alpha: vec![1.0; pixels],
+                            depth: vec![1.0; pixels],
+                        };
+                        let negative = Negative { rendering, ..Negative::default() };
+                        let frame = develop(&stage, &wanted, negative).expect("a picture");
+                        assert_eq!(frame.size, (width, height));
+                    }
+                }
+            });
+            made.expect("a thread").join().expect("pictures");
+        });
+    }
 
     #[test]
     fn pictures_of_a_run_in_training_are_no_larger_than_its_photographs() {

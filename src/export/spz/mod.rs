@@ -1,16 +1,18 @@
-//! SPZ version 3 (Niantic), which every reader of the format takes; `import::spz` says how it is laid out.
+//! SPZ (Niantic): version 3, which every reader of the format takes, and version 4 by choice; `import::spz` says how
+//! they are laid out.
 //!
 //! Coordinates stay those of the dataset, as with splat-transform. The fixed point of positions and the bits of
 //! coefficients follow from the model, as readers need not know them.
 
+mod containers;
+
 use std::io::{self, Write};
 
-use flate2::Compression;
-use flate2::write::GzEncoder;
+use containers::Array;
 
 use super::{Format, ModelWriter, Shape};
 use crate::gaussians::{Gaussians, sh_coefficients, sigmoid};
-use crate::import::spz::{COLOUR, MAGIC};
+use crate::import::spz::COLOUR;
 
 pub(super) const FORMAT: Format = Format {
     name: "spz",
@@ -19,7 +21,16 @@ pub(super) const FORMAT: Format = Format {
     writer: || Box::new(SpzWriter::default()),
 };
 
+/// Its extension ends in the other's, which is the default.
+pub(super) const IN_FRAMES: Format = Format {
+    name: "spz-v4",
+    extension: "v4.spz",
+    summary: "SPZ version 4: the same in zstd frames, which some readers do not take",
+    writer: || Box::new(SpzWriter { is_in_frames: true, ..SpzWriter::default() }),
+};
+
 inventory::submit! { FORMAT }
+inventory::submit! { IN_FRAMES }
 
 /// Fractional bits that other writers give positions; ours has as many or, for a small scene, more.
 const FRACTIONAL_BITS: u8 = 12;
@@ -35,6 +46,8 @@ const COLOUR_ERROR: f64 = 0.012;
 /// Holds what all rows become but positions, which stay as they are until the fixed point is known.
 #[derive(Default)]
 struct SpzWriter {
+    /// Version 4.
+    is_in_frames: bool,
     sh_degree: u8,
     positions: Vec<[f32; 3]>,
     sizes: Vec<f32>,
@@ -48,8 +61,12 @@ struct SpzWriter {
 impl ModelWriter for SpzWriter {
     fn held_bytes(&self, Shape { rows, sh_degree }: Shape) -> u64 {
         let bands = 3 * (sh_coefficients(sh_degree) - 1);
-        // The compressor has a window, tables and a buffer of its own.
-        (rows * (12 + 4 + 1 + 3 + 3 + 4 + bands)) as u64 + COMPRESSOR
+        let held = (rows * (12 + 4 + 1 + 3 + 3 + 4 + bands)) as u64;
+        let arrays = [9, 1, 3, 3, 4, bands].map(|bytes| rows * bytes);
+        held + match self.is_in_frames {
+            false => containers::GZIP,
+            true => containers::frames_bytes(&arrays),
+        }
     }
 
     fn is_for_neighbours(&self) -> bool {
@@ -91,29 +108,32 @@ impl ModelWriter for SpzWriter {
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let fractional_bits = self.fractional_bits()?;
         self.coarsen();
-        let mut out = GzEncoder::new(out, Compression::best());
-        out.write_all(&MAGIC.to_le_bytes())?;
-        out.write_all(&3u32.to_le_bytes())?;
-        out.write_all(&(self.positions.len() as u32).to_le_bytes())?;
-        out.write_all(&[self.sh_degree, fractional_bits, 0, 0])?;
         let unit = 2f32.powi(fractional_bits.into());
-        for value in self.positions.as_flattened() {
-            let fixed = (value * unit).round() as i32;
-            out.write_all(&fixed.to_le_bytes()[..3])?;
+        let positions = |out: &mut dyn Write| {
+            self.positions.as_flattened().iter().try_for_each(|value| {
+                let fixed = (value * unit).round() as i32;
+                out.write_all(&fixed.to_le_bytes()[..3])
+            })
+        };
+        let rotations = |out: &mut dyn Write| {
+            self.rotations.iter().try_for_each(|word| out.write_all(&word.to_le_bytes()))
+        };
+        let rows = self.positions.len();
+        let arrays: [Array<'_>; 6] = [
+            (9 * rows, &positions),
+            (rows, &|out| out.write_all(&self.opacities)),
+            (3 * rows, &|out| out.write_all(&self.colours)),
+            (3 * rows, &|out| out.write_all(&self.scales)),
+            (4 * rows, &rotations),
+            (self.bands.len(), &|out| out.write_all(&self.bands)),
+        ];
+        let facts = [self.sh_degree, fractional_bits];
+        match self.is_in_frames {
+            false => containers::in_gzip(rows as u32, facts, &arrays, out),
+            true => containers::in_frames(rows as u32, facts, &arrays, out),
         }
-        out.write_all(&self.opacities)?;
-        out.write_all(&self.colours)?;
-        out.write_all(&self.scales)?;
-        for word in &self.rotations {
-            out.write_all(&word.to_le_bytes())?;
-        }
-        out.write_all(&self.bands)?;
-        out.finish().map(drop)
     }
 }
-
-/// Most memory of the compressor `[bytes]`: measured 0.35 MiB.
-const COMPRESSOR: u64 = 1 << 19;
 
 impl SpzWriter {
     /// Fractional bits that all positions have room for, and that do not move what is seen.

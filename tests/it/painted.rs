@@ -1,0 +1,39 @@
+//! Rows in other colours than their own: drawn as if they had these, and nothing that training depends on changes.
+
+use densify::gaussians::rgb_to_dc;
+use densify::verify::{Setup, scenes};
+
+use crate::subject::{GREY, bits, make_with, on_each, repeatable, saved, step_input};
+
+const ROWS: usize = 37;
+const DEGREE: u8 = 2;
+
+#[test]
+fn rows_are_drawn_in_the_colours_given_and_keep_their_own() {
+    on_each(repeatable(), |subject| {
+        let view = scenes::camera(33, 25, 71);
+        let model = scenes::cloud(ROWS, DEGREE, &view, 72);
+        let mut backend =
+            make_with(subject, &model, Setup { budget: ROWS + 3, ..Setup::default() });
+        let target = scenes::target(&view);
+        backend.train_step(&step_input(1, &view, &target, DEGREE)).expect("a step");
+        let (before, own) = (saved(&*backend), backend.render(&view, GREY, DEGREE));
+        let own = bits(&own.expect("a rendering"));
+        let share = |row: usize| row as f32 / ROWS as f32;
+        let colours: Vec<[f32; 3]> =
+            (0..ROWS).map(|row| [share(row), 0.5, 1.0 - share(row)]).collect();
+        let painted = backend.render_painted(&view, GREY, &colours).expect("a rendering");
+
+        let mut flat = before.0.clone().with_degree(0);
+        flat.sh = colours.as_flattened().iter().copied().map(rgb_to_dc).collect();
+        let mut other = make_with(subject, &flat, Setup { budget: ROWS, ..Setup::default() });
+        let expected = other.render(&view, GREY, 0).expect("a rendering");
+        for (found, expected) in painted.rgb.iter().zip(&expected.rgb) {
+            assert!((found - expected).abs() < 2e-6, "{found}, expected {expected}");
+        }
+        assert_ne!(bits(&painted), own, "the colours are not those that were given");
+        assert_eq!((painted.alpha, painted.depth), (expected.alpha, expected.depth));
+        assert_eq!(saved(&*backend), before, "the model has changed");
+        assert_eq!(bits(&backend.render(&view, GREY, DEGREE).expect("a rendering")), own);
+    });
+}
