@@ -63,6 +63,19 @@ pub struct LearningRates {
     pub sh_rest: f32,
 }
 
+impl LearningRates {
+    /// Steps of length zero: the model stays as it is, and signals are measured all the same.
+    pub const STILL: Self = Self {
+        mean: 0.0,
+        noise: 0.0,
+        log_scale: 0.0,
+        quat: 0.0,
+        opacity: 0.0,
+        sh_dc: 0.0,
+        sh_rest: 0.0,
+    };
+}
+
 /// One training step: what to render, what it should look like, how far to go.
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput<'a> {

@@ -121,7 +121,7 @@ enum Command {
     /// images of full, half and quarter size. Writes nothing.
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
-    Eval(eval::EvalArgs),
+    Eval(Box<eval::EvalArgs>),
     Compress(Box<compress::CompressArgs>),
     Export(Box<export::ExportArgs>),
     Render(Box<render::RenderArgs>),

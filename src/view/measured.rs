@@ -14,16 +14,6 @@ use crate::views::ViewSource;
 
 /// What is measured.
 const SIGNALS: [Signal; 3] = [Signal::ScreenGradient, Signal::VisibleCount, Signal::WeightMax];
-/// Steps change nothing.
-const STILL: LearningRates = LearningRates {
-    mean: 0.0,
-    noise: 0.0,
-    log_scale: 0.0,
-    quat: 0.0,
-    opacity: 0.0,
-    sh_dc: 0.0,
-    sh_rest: 0.0,
-};
 
 /// What has been measured so far.
 pub(super) struct Measured {
@@ -89,7 +79,7 @@ impl Measured {
                 background: stage.background,
                 exposure: None,
                 sh_degree,
-                rates: STILL,
+                rates: LearningRates::STILL,
                 loss_terms: LossTerms::default(),
                 noise: None,
                 cadence: Cadence::default(),

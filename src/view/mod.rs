@@ -2,8 +2,8 @@
 //!
 //! One thread has the models, of a run in training ([`live`]) the one that trains. Connections bring wishes to its
 //! [`desk`], which keeps the newest of each page; that thread renders them ([`negative`]), and another makes pictures
-//! of what is rendered ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path of the disk is
-//! served. Prints nothing.
+//! of what is rendered ([`darkroom`]). Everything that a browser sends is checked before ([`door`], [`asked`]); no path
+//! of the disk is served. Prints nothing.
 
 mod asked;
 mod board;

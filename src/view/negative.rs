@@ -78,9 +78,7 @@ pub(super) fn expose(
             kept.as_ref().is_some_and(|(kind, of, _)| (*kind, *of) == (wanted.kind, views));
         if !is_kept {
             let known = Known { measured: measured.as_ref(), ..Known::default() };
-            let units = 1.0 / stage.normalisation.scale;
-            let made = colours(wanted.kind, backend, known, units);
-            *kept = Some((wanted.kind, views, made.map_err(failed)?));
+            *kept = Some((wanted.kind, views, coloured(stage, backend, known, wanted.kind)?));
         }
     }
     let painted = kept.as_ref().filter(|_| wanted.kind.paints()).map(|(.., colours)| colours);
@@ -98,13 +96,19 @@ pub(super) fn expose_live(
     let begun = Instant::now();
     let painted = match wanted.kind.paints() {
         false => None,
-        true => {
-            let units = 1.0 / stage.normalisation.scale;
-            Some(colours(wanted.kind, backend, known, units).map_err(failed)?)
-        }
+        true => Some(coloured(stage, backend, known, wanted.kind)?),
     };
     let negative = rendered(stage, backend, wanted, painted.as_ref())?;
     Ok(Negative { milliseconds: milliseconds(begun), ..negative })
+}
+
+fn coloured(
+    stage: &Stage,
+    backend: &mut dyn Backend,
+    known: Known<'_>,
+    kind: Kind,
+) -> Result<Colours, Unmade> {
+    colours(kind, backend, known, 1.0 / stage.normalisation.scale).map_err(failed)
 }
 
 fn rendered(

@@ -204,7 +204,6 @@ fn of_points(
     };
     let mut shown = of_dataset(machine, what, dataset, data);
     let of_models = [Kind::RowGradient, Kind::RowWeight, Kind::RowAge, Kind::RowEdit];
-    shown.stage.lacking.retain(|(kind, _)| !of_models.contains(kind));
     shown.stage.lacks(&of_models, NO_MODEL);
     shown.show_in_scene(called, &model, near)?;
     Ok(shown)

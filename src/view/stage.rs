@@ -173,13 +173,10 @@ impl Stage {
         stage
     }
 
-    /// These kinds of pictures cannot be made of it, for this reason, if there is no other one already.
+    /// These kinds of pictures cannot be made of it, for this reason, whatever was said before.
     pub(super) fn lacks(&mut self, kinds: &[Kind], why: &str) {
-        for &kind in kinds {
-            if self.lacking.iter().all(|(lacking, _)| *lacking != kind) {
-                self.lacking.push((kind, why.to_owned()));
-            }
-        }
+        self.lacking.retain(|(lacking, _)| !kinds.contains(lacking));
+        self.lacking.extend(kinds.iter().map(|&kind| (kind, why.to_owned())));
     }
 
     pub(super) fn extent(&self) -> Extent {

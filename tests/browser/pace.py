@@ -1,4 +1,4 @@
-"""Measures how fluent the page of `densify view` is, in a real browser: a benchmark, not a test.
+"""Measures how smoothly the page of `densify view` moves, in a real browser: a benchmark, not a test.
 
     python pace.py DENSIFY RUN [ROUNDS]          needs chromium and chromium-driver
 

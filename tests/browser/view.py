@@ -2,7 +2,8 @@
 
     python view.py DENSIFY RUN OTHER [FOLDER FOR SCREENSHOTS]          needs chromium and chromium-driver
 
-RUN and OTHER are of one scene, and RUN must hold views out. WebDriver is JSON over HTTP, for which Python's own library is enough.
+RUN and OTHER are of one scene, and RUN must hold views out. WebDriver is JSON over HTTP, for which Python's own
+library is enough.
 """
 
 import base64

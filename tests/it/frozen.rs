@@ -113,13 +113,20 @@ fn nothing_changes_them() {
 fn the_others_step_as_ever() {
     // The derivatives of terms are means over the rows that train.
     let needs = Needs { loss_terms: LossTerms::default(), noise: None, mask: None, ..all_of_it() };
+    // Some that no view shows, and that do not decay.
+    let mut model = model();
+    let behind = (view().centre() - 2.0 * view().forward()).as_vec3().to_array();
+    (0..ROWS).step_by(3).for_each(|row| model.means[row] = behind);
     on_each(repeatable(), |subject| {
         let [free, frozen] = [0, FROZEN].map(|frozen| {
             let setup = setup(frozen, Storage::default(), needs.clone());
-            let mut backend = make_with(subject, &model(), setup);
+            let mut backend = make_with(subject, &model, setup);
             for number in 1..=2 {
                 step(&mut *backend, number, &needs);
             }
+            let mut plan = EditPlan::new(ROWS - frozen, 2 * ROWS - frozen).allowing(&needs);
+            plan.decay(Decay { opacity: 0.01, scale: 0.1, seen_only: true }).expect("sound");
+            backend.apply(&plan.compile().behind(frozen), 5, 2).expect("a plan is applied");
             let (model, state) = saved(&*backend);
             let signals = backend.take_signals(needs.signals).expect("signals");
             let column = |signal| signals.get(signal).expect("it was asked for")[FROZEN..].to_vec();

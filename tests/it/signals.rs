@@ -29,16 +29,6 @@ fn tolerance(subject: &Subject) -> f64 {
 /// The share of its pixels that a row may gain or lose at the step of alpha.
 const FLIPPED: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
-/// Steps of length zero: every view sees the same model.
-const STILL: LearningRates = LearningRates {
-    mean: 0.0,
-    noise: 0.0,
-    log_scale: 0.0,
-    quat: 0.0,
-    opacity: 0.0,
-    sh_dc: 0.0,
-    sh_rest: 0.0,
-};
 
 struct Views {
     model: Gaussians,
@@ -169,7 +159,7 @@ fn collect_with(
     let mut backend = make_with(subject, &views.model, setup);
     for (v, (camera, target)) in views.cameras.iter().zip(&views.targets).enumerate() {
         let step = step_input(v as u32 + 1, camera, target, 2);
-        let input = StepInput { background: BACKGROUND, rates: STILL, ..step };
+        let input = StepInput { background: BACKGROUND, rates: LearningRates::STILL, ..step };
         backend.train_step(&input).expect("a small image is rendered");
     }
     let signals = backend.take_signals(needs.signals).expect("signals can be taken");

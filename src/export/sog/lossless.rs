@@ -199,7 +199,7 @@ fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
         put_single(to, used.first().map_or(0, |&symbol| symbol as u8));
         return vec![(0, 0); 256];
     }
-    let mut lengths = code_lengths(counts);
+    let mut lengths = limited(counts, MAX_BITS);
     lengths.resize(symbols, 0);
     to.put(0, 1);
     put_lengths(to, &lengths);
@@ -250,12 +250,8 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     }
 }
 
-/// The best lengths of a code with words of at most 15 bits; 0 for what is not there.
-fn code_lengths(counts: &[u32]) -> Vec<u8> {
-    limited(counts, MAX_BITS)
-}
-
-/// Huffman's lengths (1952); where they are too long, those of counts that differ less.
+/// The lengths of a code with words of at most `most` bits, 0 for what is not there: Huffman's (1952); where they are
+/// too long, those of counts that differ less.
 fn limited(counts: &[u32], most: u8) -> Vec<u8> {
     let mut counts = counts.to_vec();
     loop {
