@@ -64,10 +64,13 @@ pub fn complete(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f64>]) -
     }
     let told: Vec<usize> =
         (0..known.len()).filter(|&view| known[view] || stops[view].is_some()).collect();
-    for channel in 0..3 {
-        let middle = mean(told.iter().map(|&view| f64::from(gains[view][channel]).log2()));
-        for &view in &told {
-            gains[view][channel] = (f64::from(gains[view][channel]) / middle.exp2()) as f32;
+    let log = |gains: &[[f32; 3]], channel: usize| {
+        mean(told.iter().map(|&view| f64::from(gains[view][channel]).log2()))
+    };
+    let middle = [0, 1, 2].map(|channel| log(gains, channel));
+    for &view in &told {
+        for (gain, middle) in gains[view].iter_mut().zip(middle) {
+            *gain = (f64::from(*gain) / middle.exp2()) as f32;
         }
     }
     Believed::Views(reporting.len())

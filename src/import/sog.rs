@@ -194,7 +194,7 @@ fn book(numbers: &[f32]) -> Vec<f32> {
     book
 }
 
-/// Three components from −1/√2 to 1/√2 in order (w, x, y, z), without the which `tag` − 252 names.
+/// Three components from −1/√2 to 1/√2 in order (w, x, y, z), without the largest, which `tag` − 252 names.
 fn quaternion(bytes: [usize; 3], tag: u8) -> [f32; 4] {
     let Some(largest) = tag.checked_sub(252).map(usize::from) else {
         return [1.0, 0.0, 0.0, 0.0];
