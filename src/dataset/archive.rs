@@ -38,15 +38,17 @@ pub(super) struct Unpacked {
     bytes: u64,
 }
 
-/// Whether a file is a ZIP archive that is not a model (SOG), by its contents.
+/// Whether a file is a whole ZIP archive that is not a model (SOG), by its contents.
 pub(crate) fn is_archive(path: &Path) -> bool {
-    let is_zip = path.is_file() && starts_as_zip(path);
-    is_zip && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
+    is_zip(path) && open(path).is_ok_and(|archive| archive.index_for_name("meta.json").is_none())
 }
 
-fn starts_as_zip(path: &Path) -> bool {
+/// Whether a file begins as a ZIP archive, which may be damaged.
+pub(super) fn is_zip(path: &Path) -> bool {
     let mut start = [0; 2];
-    foreign::open(path).is_ok_and(|mut file| file.read_exact(&mut start).is_ok() && start == *b"PK")
+    path.is_file()
+        && foreign::open(path)
+            .is_ok_and(|mut file| file.read_exact(&mut start).is_ok() && start == *b"PK")
 }
 
 /// Loads the dataset in an archive.

@@ -141,7 +141,7 @@ impl Dataset {
         if let Some(name) = builtin::name(path) {
             return builtin::load(path, name, options);
         }
-        if is_archive(path) {
+        if archive::is_zip(path) {
             return archive::load(path, options);
         }
         Self::in_folder(path, options)

@@ -88,7 +88,7 @@ impl Exposure {
         }
         if let Some(example) = &reported.example {
             found.notes.push(format!(
-                "the EXIF of {} photographs is nonsense and not used ({example})",
+                "{} photographs have nonsense in their EXIF, which is not used ({example})",
                 reported.nonsense
             ));
         }
@@ -154,5 +154,64 @@ impl Exposure {
             Believed::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
             Believed::Nothing | Believed::Contradicted { .. } => String::new(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposure::ExposureModel;
+
+    fn decided(choice: ExposureChoice, reported: &ReportedExposures) -> Exposure {
+        let mut spec = RunSpec::default();
+        spec.schedule.exposure = choice;
+        Exposure::decide(&spec, None, None, reported)
+    }
+
+    fn two_stops_apart() -> ReportedExposures {
+        let stops = vec![Some(-5.0), Some(-7.0), None];
+        ReportedExposures {
+            stops,
+            nonsense: 1,
+            example: Some("c.jpg says an exposure of 0 s".to_owned()),
+        }
+    }
+
+    #[test]
+    fn where_no_tracks_are_known_exposures_begin_from_exif() {
+        let found = decided(ExposureChoice::On, &two_stops_apart());
+        assert_eq!(found.line().as_deref(), Some("exposure on, from the EXIF of 2 views"));
+        // A stop up and a stop down, by the power 1/2.4 of the encoding.
+        let up = 2.0_f32.powf(1.0 / 2.4);
+        let begun = Exposures::new(ExposureModel::Channels, &found.gains);
+        for (view, gain) in [up, 1.0 / up, 1.0].into_iter().enumerate() {
+            let diagonal = begun.of(view).matrix[1][1];
+            assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
+        }
+        let [note] = found.notes() else { panic!("{:?}", found.notes()) };
+        assert!(
+            note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
+            "{note}"
+        );
+        // Where nothing is told, all begin alike.
+        let nothing = ReportedExposures { stops: vec![None; 3], ..ReportedExposures::default() };
+        let found = decided(ExposureChoice::On, &nothing);
+        assert_eq!(found.line().as_deref(), Some("exposure on, from one for all views"));
+        assert!(found.gains.is_empty() && found.notes().is_empty());
+    }
+
+    #[test]
+    fn exif_alone_switches_nothing_on_but_is_told_of() {
+        let found = decided(ExposureChoice::Auto, &two_stops_apart());
+        assert!(!found.is_on && found.gains.is_empty());
+        let line = found.line().unwrap();
+        assert!(line.contains("off (auto)") && line.contains("differ by 1.00 stops"), "{line}");
+        assert!(line.contains("--exposure on"), "{line}");
+        let alike =
+            ReportedExposures { stops: vec![Some(-5.0); 3], ..ReportedExposures::default() };
+        let line = decided(ExposureChoice::Auto, &alike).line().unwrap();
+        assert!(!line.contains("EXIF"), "{line}");
+        let found = decided(ExposureChoice::Off, &two_stops_apart());
+        assert_eq!((found.is_on, found.line(), found.gains.len()), (false, None, 0));
     }
 }

@@ -19,6 +19,8 @@ mod killing;
 mod knobs;
 mod looking;
 mod memory;
+mod photographing;
+mod photographing;
 mod reporting;
 mod requiring;
 mod resuming;
