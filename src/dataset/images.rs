@@ -71,6 +71,11 @@ impl SourceFile {
         }
     }
 
+    /// Its length `[bytes]`; 0 if it is no longer there.
+    pub(crate) fn length(&self) -> u64 {
+        self.real.metadata().map_or(0, |data| data.len())
+    }
+
     /// Opens it, unless links lead elsewhere by now.
     pub(super) fn open(&self) -> Result<File, DatasetError> {
         if self.archive.is_some() {

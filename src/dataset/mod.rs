@@ -207,8 +207,8 @@ fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError>
     } else if here(transforms::SINGLE) {
         transforms::read(root, &Folders::new(root, options, false)?, transforms::SINGLE, false)
     } else if let Some(file) = realitycapture::find(root)? {
-        let in_images = options.images.is_some() || root.path().join("images").is_dir();
-        realitycapture::read(root, &file, &Folders::new(root, options, in_images)?)
+        let [inside, beside] = [true, false].map(|within| Folders::new(root, options, within));
+        realitycapture::read(root, &file, &[inside?, beside?])
     } else {
         Err(DatasetError(format!(
             "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \

@@ -71,11 +71,16 @@ pub(super) fn find(root: &Root) -> Result<Option<PathBuf>, DatasetError> {
     Ok(found.pop())
 }
 
-/// Reads the file.
+/// Reads the file. Photographs are looked for in the first of the folders, then in the second: names do not say
+/// where these are.
 ///
 /// # Errors
 /// When a line is damaged, or a camera is none.
-pub(super) fn read(root: &Root, path: &Path, folders: &Folders) -> Result<Scene, DatasetError> {
+pub(super) fn read(
+    root: &Root,
+    path: &Path,
+    folders: &[Folders; 2],
+) -> Result<Scene, DatasetError> {
     let text = foreign::read_text(path, MAX_BYTES).map_err(DatasetError::io(path))?;
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     let Some(columns) = lines.find_map(|(_, line)| Columns::of(line)) else {
@@ -101,10 +106,17 @@ pub(super) fn read(root: &Root, path: &Path, folders: &Folders) -> Result<Scene,
         let name = row.text("name").trim();
         let field = format!("line {number}: name");
         let named = DataPath { file: path, field: &field, value: name };
-        let Some(found) = folders.image(named)? else {
-            first_missing.get_or_insert_with(|| folders.place(named));
-            missing.push(name.to_owned());
-            continue;
+        let [first, second] = folders;
+        let (folders, found) = match first.image(named)? {
+            Some(found) => (first, found),
+            None => {
+                let Some(found) = second.image(named)? else {
+                    first_missing.get_or_insert_with(|| first.place(named));
+                    missing.push(name.to_owned());
+                    continue;
+                };
+                (second, found)
+            }
         };
         fell_back += usize::from(found.fell_back);
         let origin = format!("line {number} ({name})");
@@ -132,7 +144,7 @@ pub(super) fn read(root: &Root, path: &Path, folders: &Folders) -> Result<Scene,
         ));
     }
     if fell_back > 0 {
-        notes.push(folders.fell_back_note(fell_back));
+        notes.push(folders[0].fell_back_note(fell_back));
     }
     let points_file = usual_points(root, path, &mut notes)?;
     let points = points_file.as_deref().map(crate::import::ply::read_points).transpose()?;

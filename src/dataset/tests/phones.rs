@@ -37,7 +37,8 @@ fn exported(names: [&str; 3], points: &str, edit: impl Fn(&mut Value)) -> Made {
 
 #[test]
 fn exports_of_apps_are_the_same_scene() {
-    let plain = load(&Made::transforms(|_| ()));
+    let made = Made::transforms(|_| ());
+    let plain = load(&made);
     let each = |json: &mut Value, field: &str, value: Value| {
         for frame in json["frames"].as_array_mut().unwrap() {
             frame[field] = value.clone();

@@ -145,7 +145,7 @@ fn damaged_tables_are_refused_by_line_and_column() {
         (
             "no photographs",
             |m| std::fs::remove_dir_all(m.file("images")).unwrap(),
-            "cameras.csv, images/a.png",
+            "cameras.csv, no image, a.png, --images",
         ),
         ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
         ("a far-off camera", |m| m.replace(TABLE, "images/a.png,", "images/a.png,1e308"), "line 3"),

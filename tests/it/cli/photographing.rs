@@ -7,7 +7,7 @@ use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
 use super::{call, config, files, json, model, read, resume, scratch, text, train};
-use crate::photographs::Photographs;
+use crate::photographs::{Photographs, SIZE, name};
 
 /// Packs a folder, with its own name before all.
 fn packed(folder: &Path) -> Vec<u8> {
@@ -24,6 +24,10 @@ fn packed(folder: &Path) -> Vec<u8> {
 #[test]
 fn an_archive_is_trained_on_as_its_folder() {
     let scene = Photographs::colmap_text();
+    std::fs::create_dir(scene.file("masks")).expect("a folder");
+    let mask =
+        image::GrayImage::from_fn(SIZE.0, SIZE.1, |x, _| [if x < 9 { 0 } else { 255 }].into());
+    mask.save(scene.file(&format!("masks/{}", name(3)))).expect("a mask");
     let (root, plain) = scratch();
     let archive = root.path().join("garden 1.zip");
     std::fs::write(&archive, packed(scene.path())).expect("an archive");
@@ -51,6 +55,9 @@ fn an_archive_is_trained_on_as_its_folder() {
     resume(Path::new("ARCHIVE"), &run, "").refused("another dataset", &["ARCHIVE"]);
     let again = with_archive(&format!("train ARCHIVE -o {} --resume --iterations 70", text(&run)));
     assert!(again.ok().stdout.contains("from step 60"));
+    // It is the same dataset.
+    let again = resume(scene.path(), &run, "--iterations 80").ok().stdout;
+    assert!(again.contains("from step 70"), "{again}");
     // One message, and nothing is written.
     let bytes = std::fs::read(&archive).expect("the archive");
     std::fs::write(&archive, &bytes[..bytes.len() - 100]).expect("a part of it");
