@@ -125,7 +125,7 @@ fn damaged_tables_are_refused_by_line_and_column() {
         (",27,", ",0,", "cameras.csv, line 3 (images/a.png), fx"),
         (",27,", ",-27,", "line 3 (images/a.png), fx"),
         (",27,", ",1e9,", "line 3 (images/a.png), field of view"),
-        (",27,0,", ",27,9,", "line 3 (images/a.png), principal point"),
+        (",27,0,", ",27,9,", "cameras.csv, images/a.png, principal point"),
         (",27,0,0,0,", ",27,0,0,nan,", "line 3 (images/a.png), not finite"),
         (",27,0,0,0,", ",27,0,0,-9,", "a.png, folds over, largest usable field"),
         ("images/b.png,", "images/b.png,nan", "line 4: x, not a number"),

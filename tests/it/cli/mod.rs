@@ -20,7 +20,6 @@ mod knobs;
 mod looking;
 mod memory;
 mod photographing;
-mod photographing;
 mod reporting;
 mod requiring;
 mod resuming;
