@@ -96,3 +96,23 @@ impl ExposureSpread {
         is_enough.then_some(differ)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exposures_are_learned_where_gains_differ_and_explain_colours() {
+        let (stops, alike, with_gains) = (0.3, 10.0, 8.0);
+        let enough = ExposureSpread { tracks: MIN_TRACKS, views: 6, stops, alike, with_gains };
+        for (found, expected) in [
+            (enough, Some(true)),
+            (ExposureSpread { stops: 0.29, ..enough }, Some(false)),
+            (ExposureSpread { with_gains: 8.1, ..enough }, Some(false)),
+            (ExposureSpread { tracks: MIN_TRACKS - 1, ..enough }, None),
+            (ExposureSpread { views: 5, ..enough }, None),
+        ] {
+            assert_eq!(found.decides(10), expected, "{found:?}");
+        }
+    }
+}

