@@ -88,7 +88,7 @@ fn distortion_is_that_of_other_formats() {
     let with = |from: &str, to: &str| {
         let made = Made::realitycapture();
         made.replace(TABLE, from, to);
-        load(&made).train[0].source.undistortion.clone()
+        load(&made).train[0].source.undistortion
     };
     let none = ",27,0,0,0,0,0,0,0,0";
     let some = [with(none, ",27,0,0,0,0,0.05,0,0,0"), with(none, ",27,0,0,0,0,0,0.05,0,0")];
