@@ -53,6 +53,16 @@ pub(crate) fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     })
 }
 
+/// Most bytes that a packed file of this many may be unpacked to.
+pub(crate) fn most_unpacked(packed: u64) -> u64 {
+    /// Most bytes that any file may unpack to.
+    const LEAST: u64 = 64 << 20;
+    /// Most bytes that a byte of a larger file may unpack to: models take 2 to 5, those with little colour up
+    /// to 20, tables of text up to 10.
+    const RATIO: u64 = 100;
+    LEAST.max(packed.saturating_mul(RATIO))
+}
+
 /// What a file is that begins so, if it is often found where data is expected, with the remedy.
 pub(crate) fn mistaken(start: &[u8]) -> Option<&'static str> {
     if start.starts_with(b"version https://git-lfs") {

@@ -6,7 +6,9 @@
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A pinhole camera. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
+use crate::lens::Lens;
+
+/// A camera, a pinhole unless it has a lens. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Image width `[px]`, >= 1.
@@ -25,6 +27,9 @@ pub struct Camera {
     pub world_from_camera: DMat3,
     /// The camera's place in the world.
     pub centre: DVec3,
+    /// What bends straight lines, if anything does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lens: Option<Lens>,
 }
 
 impl Camera {
@@ -54,7 +59,7 @@ impl Camera {
         centre: DVec3,
     ) -> Self {
         let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-        Self { width, height, fx: focal, fy: focal, cx, cy, world_from_camera, centre }
+        Self { width, height, fx: focal, fy: focal, cx, cy, world_from_camera, centre, lens: None }
     }
 
     /// The direction through a place in the image `[px]`, in the world. Its component along the
@@ -62,9 +67,9 @@ impl Camera {
     #[must_use]
     pub fn direction(&self, pixel: DVec2) -> DVec3 {
         let m = &self.world_from_camera;
-        (pixel.x - self.cx) / self.fx * m.x_axis
-            + (pixel.y - self.cy) / self.fy * m.y_axis
-            + m.z_axis
+        let place = DVec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
+        let ray = self.lens.map_or(place, |lens| lens.ray(place));
+        ray.x * m.x_axis + ray.y * m.y_axis + m.z_axis
     }
 
     /// The direction the camera looks into, unit length.
@@ -79,6 +84,10 @@ impl Camera {
         let way = world - self.centre;
         let m = &self.world_from_camera;
         let (x, y, depth) = (way.dot(m.x_axis), way.dot(m.y_axis), way.dot(m.z_axis));
+        if let Some(lens) = &self.lens {
+            let place = lens.image(DVec2::new(x / depth, y / depth));
+            return (DVec2::new(self.cx + self.fx * place.x, self.cy + self.fy * place.y), depth);
+        }
         (DVec2::new(self.cx + self.fx * x / depth, self.cy + self.fy * y / depth), depth)
     }
 

@@ -9,8 +9,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
 use crate::error::Error;
+use crate::lens::Lens;
 use crate::mesh::{FileCamera, Model, Reflection};
 use crate::panorama::Panorama;
+use crate::passers;
 use crate::points::{InitPoints, PointCollector, PointOptions};
 use crate::presets::{AskedPreset, Staging, open_sky, sun};
 use crate::random::Draws;
@@ -64,6 +66,12 @@ pub struct Options {
     /// 0 also changes the light of its red and its blue by up to 10 %.
     #[serde(default)]
     pub exposure_jitter: f32,
+    /// What training views are photographed with; `None`: a pinhole, as test views are.
+    #[serde(default)]
+    pub lens: Option<Lens>,
+    /// Share of the training views through which people walk, who are masked.
+    #[serde(default)]
+    pub passers_by: f64,
     /// Initial points.
     pub points: PointOptions,
     /// Seed of everything random.
@@ -87,6 +95,8 @@ impl Default for Options {
             lambert: false,
             exposure: None,
             exposure_jitter: 0.0,
+            lens: None,
+            passers_by: 0.0,
             points: PointOptions::default(),
             seed: 0,
         }
@@ -143,6 +153,8 @@ pub struct Scene {
     train_cameras: Vec<Camera>,
     lighting: Lighting,
     flags: Vec<TriangleFlags>,
+    /// Whether somebody walks through a training view. Shape: `[training views]`.
+    has_passers: Vec<bool>,
 }
 
 /// A scene with all its views, in memory.
@@ -193,7 +205,10 @@ impl Scene {
         }
         let surface = Surface::new(&model)?;
         let rig = with_options(rig, options);
-        let (train, test) = rig.cameras(&surface, &cameras)?;
+        let (mut train, test) = rig.cameras(&surface, &cameras)?;
+        if let Some(lens) = options.lens {
+            train = train.into_iter().map(|camera| lens.on(camera)).collect::<Result<_, _>>()?;
+        }
         let ambient = options.ambient.unwrap_or(ambient);
         let flags = TriangleFlags::all(&surface, &model);
         let is_file = matches!(source, Source::File(_));
@@ -241,6 +256,7 @@ impl Scene {
             ambient,
             sky,
             exposure,
+            has_passers: passers::chosen(options.seed, train.len(), options.passers_by),
             train_cameras: train,
             lighting,
             flags,
@@ -251,7 +267,12 @@ impl Scene {
     /// Renders a view. The same at any number of threads.
     #[must_use]
     pub fn render(&self, view: usize) -> Frame {
-        self.tracer().render(&self.views[view].camera, view as u64, self.gains(view))
+        let (camera, gains) = (&self.views[view].camera, self.gains(view));
+        let mut frame = self.tracer().render(camera, view as u64, gains);
+        if self.has_passers.get(view) == Some(&true) {
+            passers::walk_into(&mut frame, camera, self.options.seed, view, gains);
+        }
+        frame
     }
 
     /// The factors on the light of each channel in a training view, where [exposures
@@ -295,6 +316,7 @@ fn check(options: &Options) -> Result<(), Error> {
     share("--point-noise", options.points.noise)?;
     share("--outliers", options.points.outliers)?;
     share("--dropout", options.points.dropout)?;
+    share("--passers-by", options.passers_by)?;
     if !(1..=64).contains(&options.grid) {
         return Err(Error::option(
             "--samples",

@@ -65,8 +65,7 @@ impl ViewsFingerprint {
         for View { name, camera, source } in views {
             names.add(format_args!("{name}\0"));
             cameras.add(format_args!("{camera:?}"));
-            let mask =
-                source.mask.as_ref().map(|mask| mask.file.path.metadata().map_or(0, |m| m.len()));
+            let mask = source.mask.as_ref().map(|mask| mask.file.length());
             images.add(format_args!("{:?}{mask:?}{:?}", source.header, source.undistortion));
             if let Some(image) = &source.rendered {
                 for pixels in [Some(&image.rgb), image.alpha.as_ref(), image.mask.as_ref()] {

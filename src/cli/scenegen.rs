@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use densify_scenegen::{
-    Ambient, Error, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
+    Ambient, Error, Lens, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
     contact_sheet, write,
 };
 use image::{DynamicImage, RgbaImage};
@@ -63,6 +63,13 @@ pub(super) struct ScenegenArgs {
     /// radius of their path as a share of the room; with --rig survey, a factor on its height
     #[arg(long, value_name = "FACTOR", help_heading = "Cameras")]
     radius: Option<f64>,
+    /// Photograph training views through a lens, fisheye:K1[,K2,K3,K4] or radial:K1[,K2], with the coefficients of
+    /// COLMAP's OPENCV_FISHEYE and OPENCV. Test views stay as a pinhole sees them
+    #[arg(long, value_name = "LENS", help_heading = "Cameras")]
+    lens: Option<Lens>,
+    /// Let people walk through this share of the training views, each in another place, and mask them
+    #[arg(long, value_name = "SHARE", help_heading = "Cameras", default_value_t = 0.0)]
+    passers_by: f64,
     /// Scatter of the cameras' places, as a share of their distance
     #[arg(long, value_name = "SHARE", help_heading = "Cameras")]
     jitter: Option<f64>,
@@ -196,6 +203,8 @@ impl ScenegenArgs {
             lambert: self.lambert,
             exposure: self.exposure,
             exposure_jitter: self.exposure_jitter,
+            lens: self.lens,
+            passers_by: self.passers_by,
             points: PointOptions {
                 count: self.points,
                 noise: self.point_noise,

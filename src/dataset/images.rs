@@ -5,10 +5,13 @@
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use image::error::ImageFormatHint;
+use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 
+use super::archive::Unpacked;
 pub use super::cache::{ImageCache, ImageDemand};
 use super::error::DatasetError;
 use super::jpeg;
@@ -39,6 +42,8 @@ pub struct SourceFile {
     pub path: PathBuf,
     /// Where links led when it was checked.
     real: PathBuf,
+    /// The archive that it is in, if any.
+    archive: Option<Arc<Unpacked>>,
 }
 
 impl SourceFile {
@@ -48,17 +53,34 @@ impl SourceFile {
     /// When it is no longer there.
     pub fn found(path: PathBuf) -> Result<Self, DatasetError> {
         let real = path.canonicalize().map_err(DatasetError::io(&path))?;
-        Ok(Self { path, real })
+        Ok(Self { path, real, archive: None })
     }
 
     /// Stands for pixels that no file holds.
     #[must_use]
     pub fn rendered(path: PathBuf) -> Self {
-        Self { path, real: PathBuf::new() }
+        Self { path, real: PathBuf::new(), archive: None }
+    }
+
+    /// The same, as one of an archive's files, which is named so.
+    pub(super) fn of_archive(self, archive: &Arc<Unpacked>) -> Self {
+        Self {
+            path: archive.shown(&self.path),
+            real: self.real,
+            archive: Some(Arc::clone(archive)),
+        }
+    }
+
+    /// Its length `[bytes]`; 0 if it is no longer there.
+    pub(crate) fn length(&self) -> u64 {
+        self.real.metadata().map_or(0, |data| data.len())
     }
 
     /// Opens it, unless links lead elsewhere by now.
-    fn open(&self) -> Result<File, DatasetError> {
+    pub(super) fn open(&self) -> Result<File, DatasetError> {
+        if self.archive.is_some() {
+            return foreign::open(&self.real).map_err(DatasetError::io(&self.path));
+        }
         let real = self.path.canonicalize().map_err(DatasetError::io(&self.path))?;
         if real != self.real {
             let problem = "it has become a link to another file since the run began";
@@ -81,8 +103,10 @@ pub struct ImageSource {
     pub height: u32,
     /// Resampling of the whole file to a pinhole, if the lens has distortion.
     pub undistortion: Option<Undistortion>,
-    /// Header of the image file.
+    /// Header of the image file, turned where the image is.
     pub header: ImageHeader,
+    /// How the image is turned before anything else.
+    pub turn: Option<Orientation>,
     /// Pixels already in memory, at the size of the header; then no file is read.
     pub rendered: Option<SharedImage>,
 }
@@ -108,9 +132,9 @@ impl ImageSource {
     pub(super) fn whole(path: PathBuf) -> Self {
         let header = probe(&path).expect("an image");
         let (width, height) = (header.width, header.height);
-        let (mask, undistortion, rendered) = (None, None, None);
+        let (mask, undistortion, turn, rendered) = (None, None, None, None);
         let file = SourceFile::found(path).expect("an image");
-        Self { file, mask, width, height, undistortion, header, rendered }
+        Self { file, mask, width, height, undistortion, header, turn, rendered }
     }
 
     /// Most bytes of the loaded image.
@@ -129,7 +153,8 @@ impl ImageSource {
         let whole = bytes(self.whole_size());
         let undistort = if self.undistortion.is_some() { packed + whole } else { packed };
         let shrink = if self.shrinks() { whole + self.loaded_bytes() } else { whole };
-        decode.max(pack).max(undistort).max(shrink)
+        let turn = if self.turn.is_some() { 2 * self.header.decoded_bytes } else { 0 };
+        decode.max(turn).max(pack).max(undistort).max(shrink)
     }
 
     fn channels(&self) -> u64 {
@@ -174,7 +199,10 @@ impl ImageSource {
                 Image8::clone(image)
             });
         }
-        let decoded = decode(&self.file)?;
+        let mut decoded = decode(&self.file)?;
+        if let Some(turn) = self.turn {
+            decoded.apply_orientation(turn);
+        }
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
             let found = (decoded.width(), decoded.height());
             return Err(DatasetError::size(&self.file.path, found, (header.width, header.height)));

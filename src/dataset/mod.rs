@@ -1,13 +1,15 @@
 //! Loads datasets: photographs with known cameras, in any of the supported formats.
 //!
 //! The files in the folder decide the format: `transforms_train.json` with `transforms_test.json`,
-//! else a COLMAP model under `sparse/0`, else `transforms.json`. All files are untrusted: see
-//! [`DatasetError`].
+//! else a COLMAP model under `sparse/0`, else `transforms.json`, else a CSV file of RealityCapture. An
+//! archive is read as the folder in it. All files are untrusted: see [`DatasetError`].
 
+mod archive;
 pub mod builtin;
 mod cache;
 mod colmap;
 mod error;
+mod exif;
 mod folders;
 pub mod images;
 mod jpeg;
@@ -20,6 +22,7 @@ mod photographs;
 mod pixels;
 mod pose;
 mod prepare;
+mod realitycapture;
 mod resample;
 mod tracks;
 mod transforms;
@@ -35,6 +38,7 @@ mod wanted;
 pub(crate) mod tests;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
@@ -42,8 +46,10 @@ use crate::camera::Camera;
 pub use crate::import::PointCloud;
 use crate::memory::Bytes;
 use crate::number::grouped;
+pub(crate) use archive::is_archive;
 pub use builtin::GroundTruth;
 pub use error::DatasetError;
+pub use exif::ReportedExposures;
 use folders::{Folders, MaskFile};
 use lens::Lens;
 use normalise::Normalisation;
@@ -54,8 +60,10 @@ pub use tracks::{MIN_VIEWS, Tracks};
 /// A scene ready for training: cameras and points in normalised coordinates.
 #[derive(Debug, Clone)]
 pub struct Dataset {
-    /// Folder of the dataset; no image lies outside it, except with `--images`.
+    /// Folder of the dataset, or its archive; no image lies outside it, except with `--images`.
     pub root: PathBuf,
+    /// The files of an archive.
+    unpacked: Option<Arc<archive::Unpacked>>,
     /// Views to train on, sorted by name; never empty.
     pub train: Vec<View>,
     /// Views held out, sorted by name.
@@ -122,7 +130,7 @@ struct Frame {
 }
 
 impl Dataset {
-    /// Loads the dataset in the folder `path`, or the built-in scene that `path` names
+    /// Loads the dataset in the folder or ZIP archive `path`, or the built-in scene that `path` names
     /// (`scene:NAME`, see [`builtin`]). Image files are checked by their headers; pixels
     /// are read later, through [`images::ImageCache`].
     ///
@@ -133,6 +141,13 @@ impl Dataset {
         if let Some(name) = builtin::name(path) {
             return builtin::load(path, name, options);
         }
+        if archive::is_zip(path) {
+            return archive::load(path, options);
+        }
+        Self::in_folder(path, options)
+    }
+
+    fn in_folder(path: &Path, options: &LoadOptions) -> Result<Self, DatasetError> {
         let root = Root::new(path)?;
         let scene = read_scene(&root, options)?;
         if scene.frames.is_empty() {
@@ -191,11 +206,14 @@ fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError>
         colmap::read(root, &folder, &Folders::new(root, options, true)?, options.tracks)
     } else if here(transforms::SINGLE) {
         transforms::read(root, &Folders::new(root, options, false)?, transforms::SINGLE, false)
+    } else if let Some(file) = realitycapture::find(root)? {
+        let [inside, beside] = [true, false].map(|within| Folders::new(root, options, within));
+        realitycapture::read(root, &file, &[inside?, beside?])
     } else {
         Err(DatasetError(format!(
             "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \
-             sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt, nor transforms.json; name a folder \
-             with a COLMAP model or transforms files",
+             sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt, nor transforms.json, nor a .csv of \
+             RealityCapture's camera parameters; name a folder or ZIP archive with one of these",
             root.path().display()
         )))
     }

@@ -72,7 +72,8 @@ pub(super) fn relative(value: &str) -> String {
     value.split('/').filter(|part| !part.is_empty() && *part != ".").collect::<Vec<_>>().join("/")
 }
 
-fn lexical_fault(value: &str) -> Option<&'static str> {
+/// What is wrong with a path, as far as its text says.
+pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
     // Both separators count: paths may come from another system.
     let parts = || value.split(['/', '\\']);
     if relative(value).is_empty() {

@@ -4,9 +4,11 @@
 use std::path::Path;
 
 use glam::{DMat3, DVec2};
+use image::metadata::Orientation;
 use rayon::prelude::*;
 
 use super::error::DatasetError;
+use super::exif;
 use super::images::{self, Hides, ImageHeader, ImageSource, Mask, SourceFile};
 use super::lens::{Cut, CutFault, Lens};
 use super::undistort::{Pinhole, Undistortion};
@@ -46,9 +48,10 @@ pub(super) fn photographs(
     }
     // All first, then the first error: the message does not depend on the threads.
     let checked: Vec<_> = frames.par_iter().map(|frame| checked(listing, frame)).collect();
-    let checked: Vec<(ImageHeader, Lens)> = checked.into_iter().collect::<Result<_, _>>()?;
+    let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
+    notes.extend(turned_note(frames, &checked));
     if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, frames.first())
-        && checked.iter().any(|(header, _)| header.width < width)
+        && checked.iter().any(|checked| checked.header.width < width)
     {
         let first = &first.name;
         notes.push(format!("images narrower than {width} px are not enlarged ({first})"));
@@ -56,12 +59,12 @@ pub(super) fn photographs(
     // Photographs of one camera mostly follow each other, and are cut alike.
     let mut runs = Vec::new();
     let mut first = 0;
-    for run in checked.chunk_by(|a, b| a.1 == b.1) {
+    for run in checked.chunk_by(|a, b| a.lens == b.lens) {
         runs.push((first, run));
         first += run.len();
     }
-    let cut = |&(first, run): &(usize, &[(ImageHeader, Lens)])| -> Result<_, DatasetError> {
-        let lens = &run[0].1;
+    let cut = |&(first, run): &(usize, &[Checked])| -> Result<_, DatasetError> {
+        let lens = &run[0].lens;
         if !lens.is_distorted() {
             return Ok(None);
         }
@@ -74,24 +77,38 @@ pub(super) fn photographs(
     notes.extend(cut_notes(runs.iter().map(|(_, run)| run.len()).zip(&cuts), options.keep_fov));
     let cut_of = runs.iter().zip(&cuts).flat_map(|((_, run), cut)| run.iter().map(move |_| cut));
     let each = frames.iter().zip(&checked).zip(cut_of);
-    each.map(|((frame, (header, lens)), cut)| {
-        photograph(frame, header, lens, cut.as_ref(), options)
-    })
-    .collect()
+    each.map(|((frame, checked), cut)| photograph(frame, checked, cut.as_ref(), options)).collect()
 }
 
-/// Checks an image's header against its camera.
-fn checked(listing: &Path, frame: &Frame) -> Result<(ImageHeader, Lens), DatasetError> {
-    let header = images::probe(&frame.image)?;
+/// What is known of a photograph whose image fits its camera.
+#[derive(Debug)]
+struct Checked {
+    header: ImageHeader,
+    /// At the image's size.
+    lens: Lens,
+    turn: Option<Orientation>,
+}
+
+/// Checks an image's header against its camera. An image that lies on its side for this camera, and says so in its
+/// EXIF, is turned: some programs do so before they find poses, and others do not.
+fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
+    let mut header = images::probe(&frame.image)?;
     let lens = &frame.lens;
-    let size = (header.width, header.height);
     let k = frame.reduced.unwrap_or(1);
     let expected = (divided(lens.width, k), divided(lens.height, k));
-    let fits = match frame.reduced {
+    let fits = |size: (u32, u32)| match frame.reduced {
         Some(_) => size.0.abs_diff(expected.0) <= 1 && size.1.abs_diff(expected.1) <= 1,
         None => proportional(size, (lens.width, lens.height)),
     };
-    if !fits {
+    let mut turn = None;
+    if !fits((header.width, header.height)) && fits((header.height, header.width)) {
+        turn = exif::quarter_turn(&frame.image);
+    }
+    if turn.is_some() {
+        header = ImageHeader { width: header.height, height: header.width, ..header };
+    }
+    let size = (header.width, header.height);
+    if !fits(size) {
         return Err(DatasetError::size(&frame.image, size, expected));
     }
     if let Some(mask) = &frame.mask {
@@ -111,7 +128,18 @@ fn checked(listing: &Path, frame: &Frame) -> Result<(ImageHeader, Lens), Dataset
         let remedy = "repair the camera or remove the frame";
         return Err(DatasetError::malformed(listing, &frame.name, problem, remedy));
     }
-    Ok((header, lens))
+    Ok(Checked { header, lens, turn })
+}
+
+/// What is said about photographs that are turned.
+fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
+    let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.turn.is_some());
+    let (first, _) = turned().next()?;
+    Some(format!(
+        "{} photographs lie on their side for their cameras, and are turned as their EXIF says ({} is the first)",
+        turned().count(),
+        first.name
+    ))
 }
 
 /// Why a lens cannot be cut, with the remedy.
@@ -163,8 +191,7 @@ fn cut_notes<'a>(
 /// The views of a frame whose image and lens are checked.
 fn photograph(
     frame: &Frame,
-    header: &ImageHeader,
-    lens: &Lens,
+    Checked { header, lens, turn }: &Checked,
     cut: Option<&Cut>,
     options: &LoadOptions,
 ) -> Result<Photograph, DatasetError> {
@@ -188,10 +215,10 @@ fn photograph(
         };
         let pinhole = undistortion.as_ref().map_or(whole, |undistortion| *undistortion.pinhole());
         // A rotation changes nothing if there is none, to the last bit.
-        let turn =
+        let looks =
             undistortion.as_ref().map(|undistortion| undistortion.lens_from_pinhole().transpose());
-        let (rotation, translation) = match turn.filter(|turn| *turn != DMat3::IDENTITY) {
-            Some(turn) => (turn * frame.rotation, turn * frame.translation),
+        let (rotation, translation) = match looks.filter(|looks| *looks != DMat3::IDENTITY) {
+            Some(looks) => (looks * frame.rotation, looks * frame.translation),
             None => (frame.rotation, frame.translation),
         };
         let camera = Camera {
@@ -217,6 +244,7 @@ fn photograph(
                 height,
                 undistortion,
                 header: *header,
+                turn: *turn,
                 rendered: None,
             },
         }

@@ -136,7 +136,8 @@ pub(super) fn assemble(
         if numbers.len() == 1 { numbers.next() } else { numbers.find(|&view| shows(view, point)) }
     });
     let root = path.to_owned();
-    Ok(Dataset { root, train, test, points, tracks, normalisation, surface_bytes, notes })
+    let unpacked = None;
+    Ok(Dataset { root, unpacked, train, test, points, tracks, normalisation, surface_bytes, notes })
 }
 
 /// Names the views whose camera is far from all others.

@@ -157,13 +157,19 @@ fn points_file(
         let missing = || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
         return Ok(Some(root.existing(named)?.ok_or_else(missing)?));
     }
-    if !held_out {
-        for value in POINT_FILES {
-            let named = DataPath { file: top.path, field: "initial points", value };
-            if let Some(found) = root.existing(named)? {
-                notes.push(format!("initial points are taken from {value}"));
-                return Ok(Some(found));
-            }
+    if held_out { Ok(None) } else { usual_points(root, top.path, notes) }
+}
+
+/// The file of initial points under one of the [usual names](POINT_FILES), which `file` does not name.
+pub(super) fn usual_points(
+    root: &Root,
+    file: &Path,
+    notes: &mut Vec<String>,
+) -> Result<Option<PathBuf>, DatasetError> {
+    for value in POINT_FILES {
+        if let Some(found) = root.existing(DataPath { file, field: "initial points", value })? {
+            notes.push(format!("initial points are taken from {value}"));
+            return Ok(Some(found));
         }
     }
     Ok(None)

@@ -14,7 +14,7 @@ pub const MIN_STOPS: f64 = 0.3;
 /// Gains must leave at most this share of the difference between the colours.
 pub const MOST_LEFT: f64 = 0.8;
 /// Stops per doubling of an encoded value: the sRGB curve is nearly the power 1/2.4.
-const STOPS: f64 = 2.4;
+pub(super) const STOPS: f64 = 2.4;
 
 /// How the exposures of the training views differ.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -94,5 +94,25 @@ impl ExposureSpread {
         let is_enough = self.tracks >= MIN_TRACKS && 2 * self.views > views;
         let differ = self.stops >= MIN_STOPS && self.with_gains <= MOST_LEFT * self.alike;
         is_enough.then_some(differ)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exposures_are_learned_where_gains_differ_and_explain_colours() {
+        let (stops, alike, with_gains) = (0.3, 10.0, 8.0);
+        let enough = ExposureSpread { tracks: MIN_TRACKS, views: 6, stops, alike, with_gains };
+        for (found, expected) in [
+            (enough, Some(true)),
+            (ExposureSpread { stops: 0.29, ..enough }, Some(false)),
+            (ExposureSpread { with_gains: 8.1, ..enough }, Some(false)),
+            (ExposureSpread { tracks: MIN_TRACKS - 1, ..enough }, None),
+            (ExposureSpread { views: 5, ..enough }, None),
+        ] {
+            assert_eq!(found.decides(10), expected, "{found:?}");
+        }
     }
 }

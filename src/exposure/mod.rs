@@ -12,6 +12,7 @@
 
 pub mod evidence;
 mod fit;
+pub mod reported;
 mod views;
 
 use clap::ValueEnum;

@@ -25,17 +25,6 @@ pub struct SplatFile {
     pub repaired: usize,
 }
 
-/// Most bytes that a file of this many may be unfolded to.
-#[cfg(feature = "formats")]
-pub(super) fn largest(file_bytes: u64) -> u64 {
-    /// Most bytes that any file may unfold to.
-    const UNFOLDED: u64 = 64 << 20;
-    /// Most bytes that a byte of a larger file may unfold to: models take 2 to 5, those with little colour up
-    /// to 20.
-    const RATIO: u64 = 100;
-    UNFOLDED.max(file_bytes.saturating_mul(RATIO))
-}
-
 /// The file contradicts its format in this place.
 pub(super) fn malformed(path: &Path, field: impl Display, problem: impl Display) -> DatasetError {
     DatasetError::malformed(path, field, problem, "export the file again")

@@ -11,10 +11,11 @@ use std::path::Path;
 use image::{ImageDecoder, ImageFormat, ImageReader};
 use serde::Deserialize;
 
-use super::model::{Row, Rows, from_smallest_three, largest, malformed, quantised_logit};
+use super::model::{Row, Rows, from_smallest_three, malformed, quantised_logit};
 use super::zip::Archive;
 use super::{SplatFile, beside};
 use crate::dataset::DatasetError;
+use crate::foreign::most_unpacked;
 use crate::gaussians::sh_coefficients;
 
 /// Entries of the palette in a row of its picture.
@@ -89,7 +90,7 @@ pub(super) fn read_folder(path: &Path, text: &str) -> Result<SplatFile, DatasetE
         let mut bytes = Vec::new();
         let file = beside::open(path, "files", name)?;
         // No picture within the limits has more.
-        file.take(largest(0)).read_to_end(&mut bytes).map_err(DatasetError::io(path))?;
+        file.take(most_unpacked(0)).read_to_end(&mut bytes).map_err(DatasetError::io(path))?;
         Ok(bytes)
     })
 }
@@ -212,7 +213,7 @@ fn decode(path: &Path, name: &str, bytes: &[u8], length: u64) -> Result<Picture,
     }
     let decoder = reader.into_decoder().map_err(|error| bad(error.to_string()))?;
     let (width, height) = decoder.dimensions();
-    let limit = largest(length.max(bytes.len() as u64));
+    let limit = most_unpacked(length.max(bytes.len() as u64));
     if 4 * u64::from(width) * u64::from(height) > limit || decoder.total_bytes() > limit {
         return Err(bad(format!("{width}×{height} pixels are too many for a file of its size")));
     }

@@ -13,9 +13,10 @@ use flate2::bufread::GzDecoder;
 use ruzstd::decoding::StreamingDecoder;
 
 use super::SplatFile;
-use super::model::{Row, Rows, from_smallest_three, largest, malformed, quantised_logit};
+use super::model::{Row, Rows, from_smallest_three, malformed, quantised_logit};
 use super::unfold::{exactly, fault, to_the_end};
 use crate::dataset::DatasetError;
+use crate::foreign::most_unpacked;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 
 /// What begins the data, as a number in little endian.
@@ -93,7 +94,7 @@ fn header(
         ("bands", rest),
     ];
     let bytes = rows * arrays.iter().map(|(_, bytes)| bytes).sum::<u64>();
-    if bytes > largest(length) {
+    if bytes > most_unpacked(length) {
         return wrong(format!("{rows} rows take {bytes} bytes, too many for a file of {length}"));
     }
     Ok(Layout { rows, version, sh_degree, fractional_bits, arrays })

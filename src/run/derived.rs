@@ -68,7 +68,7 @@ impl RunSpec {
     }
 
     /// The folder to write to: `output/SCENE-POLICY` unless another is given, SCENE being the name of
-    /// the dataset's folder.
+    /// the dataset's folder, or of its archive without the ending.
     ///
     /// # Errors
     /// When neither scene nor folder is given.
@@ -81,7 +81,8 @@ impl RunSpec {
             return Ok(Path::new("output").join(format!("{name}-{policy}")));
         }
         let full = scene.canonicalize().unwrap_or_else(|_| scene.to_owned());
-        let name = full.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy());
+        let last = if full.is_file() { full.file_stem() } else { full.file_name() };
+        let name = last.map_or_else(|| "scene".into(), |name| name.to_string_lossy());
         Ok(Path::new("output").join(format!("{name}-{policy}")))
     }
 
@@ -218,6 +219,11 @@ mod tests {
             spec.start.scene = Some(spelling);
             assert_eq!(spec.output_folder().unwrap(), Path::new("output/garden-diet"));
         }
+        let archive = root.path().join("garden.v2.zip");
+        std::fs::write(&archive, "").unwrap();
+        let mut packed = RunSpec::default();
+        packed.start.scene = Some(archive);
+        assert_eq!(packed.output_folder().unwrap(), Path::new("output/garden.v2-diet"));
         let mut built_in = RunSpec::default();
         built_in.start.scene = Some("scene:town:4".into());
         assert_eq!(built_in.output_folder().unwrap(), Path::new("output/town-4-diet"));

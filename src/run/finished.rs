@@ -8,7 +8,7 @@ use super::{DataSpec, DeviceSpec, Observer, RunConfig, use_threads};
 use crate::backend::{Backend, Device, Setup};
 #[cfg(feature = "view")]
 use crate::backend::{BackendError, MomentStorage, Storage};
-use crate::dataset::{Dataset, View, builtin};
+use crate::dataset::{Dataset, View, builtin, is_archive};
 use crate::evaluate::Split;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
@@ -104,9 +104,9 @@ pub(crate) struct Opened {
     pub(crate) backend: Box<dyn Backend>,
 }
 
-/// Whether a path is a model by itself: a file, or a folder of SOG.
+/// Whether a path is a model by itself: a file that is no archive of a dataset, or a folder of SOG.
 pub(crate) fn is_model(path: &Path) -> bool {
-    path.is_file() || path.join("meta.json").is_file()
+    (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
 }
 
 /// The iteration asked for, or the last one saved.
@@ -174,7 +174,7 @@ pub(crate) fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Fa
 
 /// Says what to do where the dataset of a run is no longer at `path`, which the user has not named.
 pub(crate) fn or_moved(failure: Failure, path: &Path) -> Failure {
-    match path.is_dir() || builtin::name(path).is_some() {
+    match path.exists() || builtin::name(path).is_some() {
         true => failure,
         false => failure.and("if the dataset has moved, say where it is with --scene"),
     }

@@ -165,7 +165,7 @@ run_spec! {
 
     /// What a run starts from.
     start: StartSpec, "Scene" {
-        /// Folder of the dataset, or scene:NAME for a built-in scene
+        /// Folder or ZIP archive of the dataset, or scene:NAME for a built-in scene
         #[arg(value_name = "SCENE")]
         scene: Option<PathBuf> = None, Free;
 

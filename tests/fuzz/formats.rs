@@ -20,10 +20,12 @@ use densify_scenegen::{Options, PointOptions, Scene, Source};
 pub type Format = (&'static str, fn(&[u8]) -> bool);
 
 /// All of them. The names are those of the fuzz targets in `Cargo.toml` and of the corpora's folders.
-pub const FORMATS: [Format; 15] = [
+pub const FORMATS: [Format; 17] = [
     ("colmap_bin", colmap_bin),
     ("colmap_txt", colmap_txt),
     ("transforms", transforms),
+    ("realitycapture", realitycapture),
+    ("archive", archive),
     ("ply", ply),
     ("gltf", gltf),
     ("glb", glb),
@@ -72,6 +74,16 @@ fn colmap(bytes: &[u8], names: [&str; 3]) -> bool {
 /// `transforms.json`.
 fn transforms(bytes: &[u8]) -> bool {
     dataset(&[("transforms.json", bytes)])
+}
+
+/// RealityCapture's table of cameras.
+fn realitycapture(bytes: &[u8]) -> bool {
+    dataset(&[("cameras.csv", bytes)])
+}
+
+/// A dataset in a ZIP archive.
+fn archive(bytes: &[u8]) -> bool {
+    within(&[("scan.zip", bytes)], |folder| loads(&folder.join("scan.zip")))
 }
 
 /// A photograph: its header when the dataset is loaded, its pixels after that.
@@ -182,17 +194,19 @@ fn config(bytes: &[u8]) -> bool {
 fn dataset(files: &[(&str, &[u8])]) -> bool {
     let images = ["images/0.png", "images/1.png"].map(|name| (name, PHOTOGRAPH));
     let all: Vec<_> = images.into_iter().chain(files.iter().copied()).collect();
-    within(&all, |folder| {
-        let options = LoadOptions { tracks: true, ..LoadOptions::default() };
-        let Ok(dataset) = Dataset::load(folder, &options) else {
-            return false;
-        };
-        assert!(!dataset.train.is_empty());
-        dataset.train.iter().all(|view| {
-            let Ok(image) = view.source.load() else { return false };
-            assert_eq!((image.width, image.height), (view.camera.width, view.camera.height));
-            true
-        })
+    within(&all, loads)
+}
+
+fn loads(path: &Path) -> bool {
+    let options = LoadOptions { tracks: true, ..LoadOptions::default() };
+    let Ok(dataset) = Dataset::load(path, &options) else {
+        return false;
+    };
+    assert!(!dataset.train.is_empty());
+    dataset.train.iter().all(|view| {
+        let Ok(image) = view.source.load() else { return false };
+        assert_eq!((image.width, image.height), (view.camera.width, view.camera.height));
+        true
     })
 }
 

@@ -32,8 +32,12 @@ pub struct Frame {
     pub height: u32,
     /// sRGB colour and straight alpha, which is coverage. Shape: `[height, width, 4]`.
     pub rgba: Vec<u8>,
-    /// The same as a camera shows it that exposes each view differently, if it does. Same shape.
+    /// The same as it is photographed, with an exposure of its own or with passers-by, if it has either. Same
+    /// shape.
     pub exposed: Option<Vec<u8>>,
+    /// 0 where passers-by hide the scene, 255 elsewhere, where [some walk
+    /// through](crate::Options::passers_by). Shape: `[height, width]`.
+    pub mask: Option<Vec<u8>>,
     /// Camera z of the first surface with alpha of at least 0.5, through the pixel's centre; 0
     /// where there is none. Shape: `[height, width]`.
     pub depth: Vec<f32>,
@@ -104,6 +108,11 @@ impl Rays {
 }
 
 impl Frame {
+    /// The view as it is photographed. Shape: as that of `rgba`.
+    pub(crate) fn photograph(&self) -> &[u8] {
+        self.exposed.as_ref().unwrap_or(&self.rgba)
+    }
+
     fn empty(width: u32, height: u32) -> Self {
         let pixels = width as usize * height as usize;
         Self {
@@ -111,6 +120,7 @@ impl Frame {
             height,
             rgba: vec![0; 4 * pixels],
             exposed: None,
+            mask: None,
             depth: vec![0.0; pixels],
             normals: vec![[0.0; 3]; pixels],
             triangles: vec![u32::MAX; pixels],
@@ -144,7 +154,8 @@ impl Tracer<'_> {
             let rows = depth.len() / row;
             for left in (0..row).step_by(TILE) {
                 let tile = (left, top, TILE.min(row - left), rows);
-                if self.is_empty(camera, tile) {
+                // A lens bends the sides of a tile.
+                if camera.lens.is_none() && self.is_empty(camera, tile) {
                     continue;
                 }
                 let places = (0..rows).flat_map(|y| (left..left + tile.2).map(move |x| (x, y)));

@@ -37,7 +37,7 @@ pub struct GroundTruth {
 
 enum Kind {
     Scene(Box<Scene>),
-    Folder { root: PathBuf, surface: Box<Surface>, thin: Vec<bool> },
+    Folder { root: PathBuf, surface: Box<Surface>, thin: Vec<bool>, has_lens: bool },
 }
 
 /// Depth and normals of a view: what renderers call a G-buffer.
@@ -63,11 +63,7 @@ impl GroundTruth {
     /// Whether a folder holds a scene that this program wrote, by its `scene.json`.
     #[must_use]
     pub fn is_in(root: &Path) -> bool {
-        let record = root.join(SCENE_FILE);
-        let is_short = fs::metadata(&record).is_ok_and(|data| data.len() <= LONGEST_RECORD);
-        let text = if is_short { fs::read(&record).unwrap_or_default() } else { Vec::new() };
-        let record: Value = serde_json::from_slice(&text).unwrap_or_default();
-        record["generator"].as_str().is_some_and(|by| by.starts_with("densify-scenegen"))
+        record_in(root)["generator"].as_str().is_some_and(|by| by.starts_with("densify-scenegen"))
     }
 
     /// The ground truth in a folder; `None` where the folder holds no scene of this program.
@@ -86,7 +82,8 @@ impl GroundTruth {
         model.triangle_materials = vec![material; thin.len()];
         model.positions = corners;
         let surface = Box::new(Surface::new(&model)?);
-        Ok(Some(Self { kind: Kind::Folder { root: root.to_owned(), surface, thin } }))
+        let has_lens = !record_in(root)["options"]["lens"].is_null();
+        Ok(Some(Self { kind: Kind::Folder { root: root.to_owned(), surface, thin, has_lens } }))
     }
 
     /// The surface, in world coordinates.
@@ -110,8 +107,13 @@ impl GroundTruth {
                 let (depth, normal, _) = scene.tracer().first_solid(camera.centre, ray, None)?;
                 Some((depth, normal))
             })),
-            Kind::Folder { root, surface, .. } => {
-                if let Some(stored) = stored(root, view, (camera.width, camera.height))? {
+            Kind::Folder { root, surface, has_lens, .. } => {
+                // What a lens saw is not what a camera without sees.
+                let is_bent = *has_lens && view.contains("train/");
+                let size = (camera.width, camera.height);
+                if let Some(stored) =
+                    (!is_bent).then(|| stored(root, view, size)).transpose()?.flatten()
+                {
                     return Ok(stored);
                 }
                 Ok(trace(camera, |ray| {
@@ -165,6 +167,14 @@ impl std::fmt::Debug for GroundTruth {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("GroundTruth").field("surface", self.surface()).finish_non_exhaustive()
     }
+}
+
+/// The `scene.json` in a folder; null where it is none of this program's size.
+fn record_in(root: &Path) -> Value {
+    let record = root.join(SCENE_FILE);
+    let is_short = fs::metadata(&record).is_ok_and(|data| data.len() <= LONGEST_RECORD);
+    let text = if is_short { fs::read(&record).unwrap_or_default() } else { Vec::new() };
+    serde_json::from_slice(&text).unwrap_or_default()
 }
 
 /// Traces the rays through the pixels' centres.

@@ -10,6 +10,7 @@ use glam::DQuat;
 
 use super::write_file;
 use crate::error::Error;
+use crate::lens::{Lens, LensKind};
 use crate::points::InitPoints;
 use crate::scene::Scene;
 
@@ -31,10 +32,11 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     }
     for (number, view) in scene.views.iter().enumerate() {
         let (id, c) = (number + 1, &view.camera);
+        let (model, rest) = model(c.lens.as_ref());
         // Writing to a String does not fail.
         let _ = writeln!(
             cameras,
-            "{id} PINHOLE {} {} {} {} {} {}",
+            "{id} {model} {} {} {} {} {} {}{rest}",
             c.width, c.height, c.fx, c.fy, c.cx, c.cy
         );
         let rotation = c.world_from_camera.transpose();
@@ -65,6 +67,15 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     write_file(&folder.join("cameras.txt"), cameras.as_bytes())?;
     write_file(&folder.join("images.txt"), images.as_bytes())?;
     write_file(&folder.join("points3D.txt"), cloud.as_bytes())
+}
+
+/// COLMAP's model of a lens, and the parameters after those of a pinhole.
+fn model(lens: Option<&Lens>) -> (&'static str, String) {
+    let Some(Lens { kind, k: [a, b, c, d] }) = lens else { return ("PINHOLE", String::new()) };
+    match kind {
+        LensKind::Fisheye => ("OPENCV_FISHEYE", format!(" {a} {b} {c} {d}")),
+        LensKind::Radial => ("OPENCV", format!(" {a} {b} 0 0")),
+    }
 }
 
 /// Mean distance from where a point was found to where it is drawn, over the views that see it `[px]`;

@@ -62,6 +62,9 @@ pub fn write(
             collector.observe(number, &frame);
         }
         write_frame(root, &view.name, &frame)?;
+        if scene.options.passers_by > 0.0 {
+            write_mask(root, &view.name, &frame)?;
+        }
         progress(number);
     }
     let points = collector.finish();
@@ -137,11 +140,23 @@ fn readable(folder: &Path) -> Result<(), Error> {
 
 fn write_frame(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
     let path = root.join("images").join(format!("{name}.png"));
-    let image = frame.exposed.as_ref().unwrap_or(&frame.rgba);
-    write_png(&path, frame.width, frame.height, image)?;
+    write_png(&path, frame.width, frame.height, frame.photograph(), ExtendedColorType::Rgba8)?;
     exr::write_depth(&root.join("depth").join(format!("{name}.exr")), frame)?;
     npy::write_depth(&root.join("depth").join(format!("{name}.npy")), frame)?;
     exr::write_normals(&root.join("normals").join(format!("{name}.exr")), frame)
+}
+
+/// The mask of a view, white where nobody is: nerfstudio wants one of every view or of none.
+fn write_mask(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
+    let path = root.join(mask_of(name));
+    let white = || vec![255; frame.depth.len()];
+    let mask = frame.mask.clone().unwrap_or_else(white);
+    write_png(&path, frame.width, frame.height, &mask, ExtendedColorType::L8)
+}
+
+/// The file of a view's mask.
+fn mask_of(name: &str) -> String {
+    format!("masks/{name}.png")
 }
 
 fn write_rest(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
@@ -152,10 +167,16 @@ fn write_rest(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Err
     record::write(scene, root, points)
 }
 
-fn write_png(path: &Path, width: u32, height: u32, rgba: &[u8]) -> Result<(), Error> {
+fn write_png(
+    path: &Path,
+    width: u32,
+    height: u32,
+    pixels: &[u8],
+    colours: ExtendedColorType,
+) -> Result<(), Error> {
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes)
-        .write_image(rgba, width, height, ExtendedColorType::Rgba8)
+        .write_image(pixels, width, height, colours)
         .map_err(|error| Error::write(path)(std::io::Error::other(error)))?;
     write_file(path, &bytes)
 }
@@ -179,7 +200,7 @@ pub fn contact_sheet(scene: &Scene) -> (u32, u32, Vec<u8>) {
     for place in 0..2 * COLUMNS {
         let frame = scene.render((place * train / (2 * COLUMNS)).min(train - 1));
         let (left, top) = (place % COLUMNS * width, place / COLUMNS * height);
-        for (i, pixel) in frame.rgba.chunks_exact(4).enumerate() {
+        for (i, pixel) in frame.photograph().chunks_exact(4).enumerate() {
             let at = 4 * ((top + i / width) * COLUMNS * width + left + i % width);
             let alpha = f32::from(pixel[3]) / 255.0;
             for channel in 0..3 {

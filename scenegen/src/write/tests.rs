@@ -20,6 +20,90 @@ fn small() -> Scene {
     Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset")
 }
 
+/// Files of `small` as it is, and with other options, in two folders.
+fn written(options: Options) -> (tempfile::TempDir, [std::path::PathBuf; 2]) {
+    let plain = small();
+    let other = Scene::prepare(&Source::Preset("spheres".into()), &options).expect("preset");
+    let root = tempfile::tempdir().expect("folder");
+    let targets = [(&plain, "plain"), (&other, "other")].map(|(scene, name)| {
+        let target = root.path().join(name);
+        write(scene, &target, false, |_| ()).expect("write");
+        target
+    });
+    (root, targets)
+}
+
+/// A lens is in the files of training views, for every reader, and in no test view.
+#[test]
+fn a_lens_bends_training_views_alone() {
+    let lens = Some("fisheye:0.05,-0.01".parse().expect("a lens"));
+    let (_root, [a, b]) = written(Options { lens, ..small().options });
+    let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
+    assert!(read(&a, "images/test/r_001.png") == read(&b, "images/test/r_001.png"));
+    assert!(read(&a, "images/train/r_001.png") != read(&b, "images/train/r_001.png"));
+    let cameras = String::from_utf8(read(&b, "sparse/0/cameras.txt")).expect("text");
+    let lines: Vec<&str> = cameras.lines().filter(|line| !line.starts_with('#')).collect();
+    let is_bent =
+        |line: &&str| line.contains(" OPENCV_FISHEYE ") && line.ends_with(" 0.05 -0.01 0 0");
+    assert!(lines[..4].iter().all(is_bent), "{cameras}");
+    assert!(lines[4..].iter().all(|line| line.contains(" PINHOLE ")), "{cameras}");
+    for name in ["transforms_train.json", "transforms_test.json", "transforms.json"] {
+        let top: Value = serde_json::from_slice(&read(&b, name)).expect("JSON");
+        for frame in top["frames"].as_array().expect("frames") {
+            let field = |key: &str| frame.get(key).unwrap_or(&top[key]).clone();
+            let is_test = text(&frame["file_path"]).contains("/test/");
+            let (model, k1) = if is_test { ("OPENCV", 0.0) } else { ("OPENCV_FISHEYE", 0.05) };
+            assert_eq!(
+                (text(&field("camera_model")), field("k1").as_f64()),
+                (model, Some(k1)),
+                "{name}"
+            );
+        }
+    }
+}
+
+/// Where people walk through, the mask hides every pixel that they change; all else stays, the truth too.
+#[test]
+fn passers_by_are_in_some_training_views_and_masked() {
+    let (_root, [a, b]) = written(Options { passers_by: 0.5, ..small().options });
+    let read = |folder: &Path, name: &str| fs::read(folder.join(name)).expect(name);
+    for name in
+        ["images/test/r_001.png", "depth/train/r_001.exr", "points3d.ply", "sparse/0/points3D.txt"]
+    {
+        assert!(read(&a, name) == read(&b, name), "{name}");
+    }
+    assert!(!a.join("masks").exists());
+    let pixels = |path: std::path::PathBuf| image::open(path).expect("PNG").into_rgba8();
+    let mut walked = 0;
+    for name in
+        ["train/r_000", "train/r_001", "train/r_002", "train/r_003", "test/r_000", "test/r_001"]
+    {
+        let image = format!("images/{name}.png");
+        let [plain, other] = [&a, &b].map(|folder| pixels(folder.join(&image)));
+        let mask = image::open(b.join(format!("masks/{name}.png"))).expect("a mask").into_luma8();
+        let hidden = mask.iter().filter(|&&value| value == 0).count();
+        walked += usize::from(hidden > 0);
+        assert!(hidden == 0 || (20..300).contains(&hidden), "{name}: {hidden} of 480 pixels");
+        let mut changed = 0;
+        for ((plain, other), mask) in plain.pixels().zip(other.pixels()).zip(mask.pixels()) {
+            assert!(plain == other || mask.0 == [0], "{name}: {plain:?} {other:?}");
+            changed += usize::from(plain != other);
+        }
+        assert!(2 * changed >= hidden, "{name}: {changed} of {hidden}");
+    }
+    assert_eq!(walked, 2);
+    let top: Value = serde_json::from_slice(&read(&b, "transforms.json")).expect("JSON");
+    for frame in top["frames"].as_array().expect("frames") {
+        assert!(b.join(text(&frame["mask_path"])).is_file(), "{frame}");
+    }
+    for bad in [-0.1, 1.1, f64::NAN] {
+        let options = Options { passers_by: bad, ..small().options };
+        let refused =
+            Scene::prepare(&Source::Preset("spheres".into()), &options).err().expect("refused");
+        assert!(refused.to_string().contains("--passers-by"), "{refused}");
+    }
+}
+
 fn names(folder: &Path) -> Vec<String> {
     let entries = fs::read_dir(folder).expect("folder");
     let mut names: Vec<String> =

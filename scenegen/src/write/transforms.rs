@@ -5,15 +5,16 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::write_file;
+use super::{mask_of, write_file};
 use crate::camera::Camera;
 use crate::error::Error;
+use crate::lens::{Lens, LensKind};
 use crate::scene::{Scene, Split, View};
 
 const POINTS: &str = "points3d.ply";
 
 pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
-    let Some(first) = scene.views.first().map(|view| intrinsics(&view.camera)) else {
+    let Some(first) = scene.views.first().map(|view| intrinsics(scene, &view.camera)) else {
         return Ok(());
     };
     for (name, value) in [
@@ -30,7 +31,7 @@ pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
 fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     let frame = |view: &View| {
         let mut frame = posed(view, format!("./images/{}", view.name));
-        extend(&mut frame, &intrinsics(&view.camera), |key, value| first[key] != *value);
+        extend(&mut frame, &intrinsics(scene, &view.camera), |key, value| first[key] != *value);
         frame
     };
     let frames = scene.views.iter().filter(|view| view.split == split).map(frame);
@@ -42,12 +43,15 @@ fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
 /// All views. What nerfstudio finds at the top it takes for all of them, so intrinsics stand there
 /// only if all have the same.
 fn nerfstudio(scene: &Scene, first: &Value) -> Value {
-    let shared = scene.views.iter().all(|view| intrinsics(&view.camera) == *first);
+    let shared = scene.views.iter().all(|view| intrinsics(scene, &view.camera) == *first);
     let image = |view: &View| format!("images/{}.png", view.name);
     let frame = |view: &View| {
         let mut frame = posed(view, image(view));
         frame["depth_file_path"] = json!(format!("depth/{}.npy", view.name));
-        extend(&mut frame, &intrinsics(&view.camera), |_, _| !shared);
+        extend(&mut frame, &intrinsics(scene, &view.camera), |_, _| !shared);
+        if scene.options.passers_by > 0.0 {
+            frame["mask_path"] = json!(mask_of(&view.name));
+        }
         frame
     };
     let mut top = json!({
@@ -81,9 +85,10 @@ fn extend(to: &mut Value, from: &Value, wanted: impl Fn(&str, &Value) -> bool) {
     }
 }
 
-fn intrinsics(camera: &Camera) -> Value {
+/// The fields of a camera; of its lens too where any view has one, which the others must not inherit.
+fn intrinsics(scene: &Scene, camera: &Camera) -> Value {
     let angle = |side: u32, focal: f64| 2.0 * (0.5 * f64::from(side) / focal).atan();
-    json!({
+    let mut fields = json!({
         "camera_angle_x": angle(camera.width, camera.fx),
         "camera_angle_y": angle(camera.height, camera.fy),
         "w": camera.width,
@@ -92,7 +97,19 @@ fn intrinsics(camera: &Camera) -> Value {
         "fl_y": camera.fy,
         "cx": camera.cx,
         "cy": camera.cy,
-    })
+    });
+    if scene.options.lens.is_some() {
+        let (model, k) = match camera.lens {
+            Some(Lens { kind: LensKind::Fisheye, k }) => ("OPENCV_FISHEYE", k),
+            Some(Lens { kind: LensKind::Radial, k }) => ("OPENCV", k),
+            None => ("OPENCV", [0.0; 4]),
+        };
+        fields["camera_model"] = json!(model);
+        for (name, k) in ["k1", "k2", "k3", "k4"].iter().zip(k) {
+            fields[name] = json!(k);
+        }
+    }
+    fields
 }
 
 /// Camera to world with OpenGL axes: x right, y up, z backward. Rows.

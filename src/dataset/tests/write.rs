@@ -98,15 +98,17 @@ impl Made {
                 "transform_matrix": opengl(*q, *t),
             })).collect::<Vec<_>>(),
         });
-        let mut ply = String::from(
-            "ply\nformat ascii 1.0\nelement vertex 200\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
-        );
-        for index in 0..200 {
-            ply += &format!("{} {} 0.5 {index} 20 30\n", index % 20, index / 20);
-        }
-        made.write("points.ply", ply);
+        made.write("points.ply", cloud());
         edit(&mut json);
         made.write("transforms.json", json.to_string());
+        made
+    }
+
+    /// RealityCapture's table; its cameras have one focal length, the lens in `colmap_txt` two.
+    pub(super) fn realitycapture() -> Self {
+        let made = Self::with_images();
+        made.write("cameras.csv", table());
+        made.write("points3d.ply", cloud());
         made
     }
 
@@ -146,6 +148,39 @@ impl Made {
 pub(super) fn image(path: &Path, (width, height): (u32, u32), value: u8) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     image::RgbImage::from_pixel(width, height, [value, 100, 200].into()).save(path).unwrap();
+}
+
+/// The 200 points.
+fn cloud() -> String {
+    let mut ply = String::from(
+        "ply\nformat ascii 1.0\nelement vertex 200\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+    );
+    for index in 0..200 {
+        ply += &format!("{} {} 0.5 {index} 20 30\n", index % 20, index / 20);
+    }
+    ply
+}
+
+/// RealityCapture's table of the three cameras.
+fn table() -> String {
+    let mut table =
+        "#cameras 3\n#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n".to_owned();
+    for (pose, name) in POSES.into_iter().zip(NAMES) {
+        let matrix = opengl(pose.0, pose.1);
+        let numbers = (0..3).map(|axis| matrix[axis][3]).chain(angles(&matrix));
+        let numbers: Vec<String> = numbers.map(|number| number.to_string()).collect();
+        // 15 px of a picture of 20 px: 27 mm of 36 mm.
+        table += &format!("images/{name},{},27,0,0,0,0,0,0,0,0\n", numbers.join(","));
+    }
+    table
+}
+
+/// Heading, pitch and roll `[degrees]` of a camera-to-world matrix with OpenGL axes, which is
+/// Rz(−heading)·Rx(pitch)·Ry(roll).
+fn angles(matrix: &[Vec<f64>]) -> [f64; 3] {
+    let heading = matrix[0][1].atan2(matrix[1][1]);
+    let roll = (-matrix[2][0]).atan2(matrix[2][2]);
+    [heading, matrix[2][1].clamp(-1.0, 1.0).asin(), roll].map(f64::to_degrees)
 }
 
 /// The camera-to-world matrix with OpenGL axes of a COLMAP pose.

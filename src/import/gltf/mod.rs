@@ -14,10 +14,11 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::model::{Row, Rows, largest, log_of_scale, malformed, quantised_logit};
+use super::model::{Row, Rows, log_of_scale, malformed, quantised_logit};
 use super::{SplatFile, beside, spz, unfold};
 use crate::base64;
 use crate::dataset::DatasetError;
+use crate::foreign::most_unpacked;
 use crate::gaussians::{Gaussians, MAX_SH_DEGREE, sh_coefficients, sigmoid};
 pub(crate) use accessors::SHAPES;
 use accessors::{Accessor, Buffers, View};
@@ -161,7 +162,7 @@ fn read(
             // Nodes may show the same data any number of times.
             let bytes =
                 4 * (11 + found.gaussians.sh.len() as u64 + 11 * found.gaussians.len() as u64);
-            if bytes > largest(all) {
+            if bytes > most_unpacked(all) {
                 return Err(malformed(
                     path,
                     "nodes",

@@ -1,7 +1,8 @@
 //! `--exposure`: whether each photograph has an exposure of its own, and who decides it.
 
-use crate::dataset::Dataset;
-use crate::exposure::evidence::ExposureSpread;
+use crate::dataset::{Dataset, ReportedExposures};
+use crate::exposure::evidence::{ExposureSpread, MIN_STOPS};
+use crate::exposure::reported::{Believed, complete, spread};
 use crate::exposure::{ExposureChoice, Exposures};
 use crate::number::grouped;
 use crate::run::config::{ExposureSource, RunConfig};
@@ -15,22 +16,38 @@ pub(in crate::run) struct Exposure {
     pub(in crate::run) is_on: bool,
     /// Who decided it.
     pub(in crate::run) source: ExposureSource,
-    /// Gains of the training views to begin with, by the colours of tracks; none where these are not known.
+    /// Gains of the training views to begin with; none where all begin alike.
     gains: Vec<[f32; 3]>,
+    /// Whether the colours of tracks gave them.
+    by_tracks: bool,
+    /// What became of the exposures in EXIF.
+    believed: Believed,
+    /// How these differ `[stops]`.
+    reported: f64,
+    /// What else there is to say of EXIF.
+    notes: Vec<String>,
 }
 
 impl Exposure {
     /// Decides it: from the configuration of a run that goes on, else as the option says, else from the
-    /// colours of tracks.
+    /// colours of tracks. What it begins with is from these, and from EXIF where they say nothing.
     pub(in crate::run) fn decide(
         spec: &RunSpec,
         saved: Option<&RunConfig>,
         colours: Option<&TrackColours>,
+        reported: &ReportedExposures,
     ) -> Self {
+        let so = |is_on, source| Self {
+            is_on,
+            source,
+            gains: Vec::new(),
+            by_tracks: false,
+            believed: Believed::Nothing,
+            reported: spread(reported.stops.iter().copied().flatten()),
+            notes: Vec::new(),
+        };
         if let Some(saved) = saved {
-            let resolved = &saved.resolved;
-            let source = resolved.exposure_from;
-            return Self { is_on: resolved.has_exposures, source, gains: Vec::new() };
+            return so(saved.resolved.has_exposures, saved.resolved.exposure_from);
         }
         let measured = colours.map(ExposureSpread::measure);
         let source = |found: Option<ExposureSpread>| match found {
@@ -47,8 +64,40 @@ impl Exposure {
                 (decided.is_some_and(|(differ, _)| differ), source(decided.map(|(_, found)| found)))
             }
         };
-        let gains = measured.filter(|_| is_on && decided.is_some()).map(|(_, gains)| gains);
-        Self { is_on, source, gains: gains.unwrap_or_default() }
+        let mut found = so(is_on, source);
+        if !is_on {
+            return found;
+        }
+        let views = reported.stops.len();
+        let known = match (measured, colours) {
+            (Some((_, gains)), Some(colours)) if decided.is_some() => {
+                (found.gains, found.by_tracks) = (gains, true);
+                (0..views).map(|view| colours.knows(view)).collect()
+            }
+            _ => vec![false; views],
+        };
+        found.gains.resize(views, [1.0; 3]);
+        found.believed = complete(&mut found.gains, &known, &reported.stops);
+        if !found.by_tracks && found.believed == Believed::Nothing {
+            found.gains.clear();
+        }
+        if let Believed::Contradicted { by } = found.believed {
+            found.notes.push(format!(
+                "the exposures in EXIF are {by:.1} stops (rms) from what the colours of points show, and are not used"
+            ));
+        }
+        if let Some(example) = &reported.example {
+            found.notes.push(format!(
+                "{} photographs have nonsense in their EXIF, which is not used ({example})",
+                reported.nonsense
+            ));
+        }
+        found
+    }
+
+    /// Notes for the user.
+    pub(in crate::run) fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// What the run begins with, if exposures are learned.
@@ -62,26 +111,107 @@ impl Exposure {
     pub(in crate::run) fn line(&self) -> Option<String> {
         let word = if self.is_on { "on" } else { "off" };
         match self.source {
-            ExposureSource::Given if self.is_on && self.gains.is_empty() => {
-                Some("exposure on, from one for all views".to_owned())
-            }
-            ExposureSource::Given if self.is_on => {
-                Some("exposure on, from the gains of points in several views".to_owned())
-            }
+            ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.believed) {
+                (true, _) => {
+                    format!(
+                        "exposure on, from the gains of points in several views{}",
+                        self.others()
+                    )
+                }
+                (false, Believed::Views(views)) => {
+                    format!("exposure on, from the EXIF of {} views", grouped(views))
+                }
+                (false, _) => "exposure on, from one for all views".to_owned(),
+            }),
             ExposureSource::Given => None,
             ExposureSource::Tracks(found) => Some(format!(
                 "exposure {word} (auto): by the colours of {} points, {} views differ by {:.2} stops (rms); \
-                 with gains, colours differ by {:.1}/255 instead of {:.1}/255",
+                 with gains, colours differ by {:.1}/255 instead of {:.1}/255{}",
                 grouped(found.tracks),
                 found.views,
                 found.stops,
                 found.with_gains,
                 found.alike,
+                self.others(),
             )),
             ExposureSource::Undecided => Some(format!(
                 "exposure {word} (auto): fewer than {MIN_TRACKS} points of a reconstruction are known in enough \
-                 views to say; --exposure on learns exposures all the same"
+                 views to say{}; --exposure on learns exposures all the same",
+                match self.reported >= MIN_STOPS {
+                    true => format!(
+                        ", but by EXIF photographs differ by {:.2} stops (rms)",
+                        self.reported
+                    ),
+                    false => String::new(),
+                }
             )),
         }
+    }
+
+    /// What is said of views that begin from EXIF beside those that begin from tracks.
+    fn others(&self) -> String {
+        match self.believed {
+            Believed::Views(views) => format!("; {} views begin from their EXIF", grouped(views)),
+            Believed::Nothing | Believed::Contradicted { .. } => String::new(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposure::ExposureModel;
+
+    fn decided(choice: ExposureChoice, reported: &ReportedExposures) -> Exposure {
+        let mut spec = RunSpec::default();
+        spec.schedule.exposure = choice;
+        Exposure::decide(&spec, None, None, reported)
+    }
+
+    fn two_stops_apart() -> ReportedExposures {
+        let stops = vec![Some(-5.0), Some(-7.0), None];
+        ReportedExposures {
+            stops,
+            nonsense: 1,
+            example: Some("c.jpg says an exposure of 0 s".to_owned()),
+        }
+    }
+
+    #[test]
+    fn where_no_tracks_are_known_exposures_begin_from_exif() {
+        let found = decided(ExposureChoice::On, &two_stops_apart());
+        assert_eq!(found.line().as_deref(), Some("exposure on, from the EXIF of 2 views"));
+        // A stop up and a stop down, by the power 1/2.4 of the encoding.
+        let up = 2.0_f32.powf(1.0 / 2.4);
+        let begun = Exposures::new(ExposureModel::Channels, &found.gains);
+        for (view, gain) in [up, 1.0 / up, 1.0].into_iter().enumerate() {
+            let diagonal = begun.of(view).matrix[1][1];
+            assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
+        }
+        let [note] = found.notes() else { panic!("{:?}", found.notes()) };
+        assert!(
+            note.contains("1 photographs have nonsense") && note.contains("c.jpg says"),
+            "{note}"
+        );
+        // Where nothing is told, all begin alike.
+        let nothing = ReportedExposures { stops: vec![None; 3], ..ReportedExposures::default() };
+        let found = decided(ExposureChoice::On, &nothing);
+        assert_eq!(found.line().as_deref(), Some("exposure on, from one for all views"));
+        assert!(found.gains.is_empty() && found.notes().is_empty());
+    }
+
+    #[test]
+    fn exif_alone_switches_nothing_on_but_is_told_of() {
+        let found = decided(ExposureChoice::Auto, &two_stops_apart());
+        assert!(!found.is_on && found.gains.is_empty());
+        let line = found.line().unwrap();
+        assert!(line.contains("off (auto)") && line.contains("differ by 1.00 stops"), "{line}");
+        assert!(line.contains("--exposure on"), "{line}");
+        let alike =
+            ReportedExposures { stops: vec![Some(-5.0); 3], ..ReportedExposures::default() };
+        let line = decided(ExposureChoice::Auto, &alike).line().unwrap();
+        assert!(!line.contains("EXIF"), "{line}");
+        let found = decided(ExposureChoice::Off, &two_stops_apart());
+        assert_eq!((found.is_on, found.line(), found.gains.len()), (false, None, 0));
     }
 }

@@ -29,7 +29,7 @@ use super::values::{Budget, InitChoice, ShDegree, Threads};
 use crate::backend::Accumulation;
 use crate::backend::{BackendKind, Device};
 use crate::dataset::images::ImageDemand;
-use crate::dataset::{Dataset, Tracks, View};
+use crate::dataset::{Dataset, ReportedExposures, Tracks, View};
 use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::init::usable_points;
@@ -122,7 +122,14 @@ impl<'a> Inputs<'a> {
         let track_bytes =
             if with_tracks { dataset.tracks.bytes() + spread::bytes(&dataset.tracks) } else { 0 };
         let degree = Degree::decide(spec, saved, &dataset, colours.as_ref());
-        let exposure = Exposure::decide(spec, saved, colours.as_ref());
+        let reported = match saved.is_none() && spec.schedule.exposure != ExposureChoice::Off {
+            true => ReportedExposures::of(&dataset.train),
+            false => ReportedExposures::default(),
+        };
+        let exposure = Exposure::decide(spec, saved, colours.as_ref(), &reported);
+        for note in exposure.notes() {
+            observer.say(format_args!("note: {note}"));
+        }
         dataset.tracks = Tracks::default();
         let required = AutoChoices {
             rows: spec.size.budget.is_some_and(Budget::is_auto),

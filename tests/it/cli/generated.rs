@@ -158,7 +158,7 @@ fn bad_input_is_refused_and_leaves_nothing() {
     let broken = root.path().join("broken.glb");
     std::fs::write(&broken, b"glTF\x02\0\0\0\xff\xff\xff\xff").expect("write");
     let (broken, out) = (text(&broken), text(&out));
-    let cases: [(&str, &[&str]); 12] = [
+    let cases: [(&str, &[&str]); 16] = [
         (broken, &["broken.glb", "GLB header"]),
         ("nothing.obj", &["nothing.obj"]),
         ("mesh.fbx", &["mesh.fbx", ".obj"]),
@@ -169,6 +169,10 @@ fn bad_input_is_refused_and_leaves_nothing() {
         ("--preset thin --fov 180", &["--fov"]),
         ("--preset thin --rig file", &["--rig"]),
         ("--preset thin --train 0", &["--train", "0 views"]),
+        ("--preset thin --lens fish", &["--lens", "fisheye:K1"]),
+        ("--preset thin --lens radial:-0.9", &["--lens", "degrees", "--fov"]),
+        ("--preset thin --passers-by 1.5", &["--passers-by", "1.5"]),
+        ("--preset thin --passers-by some", &["--passers-by", "some"]),
         ("--preset thin --sky none.hdr", &["none.hdr"]),
         (&format!("--preset thin --sky {broken}"), &["broken.glb", "HDR"]),
     ];

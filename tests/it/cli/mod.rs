@@ -19,6 +19,7 @@ mod killing;
 mod knobs;
 mod looking;
 mod memory;
+mod photographing;
 mod reporting;
 mod requiring;
 mod resuming;

@@ -96,6 +96,10 @@ impl Dataset {
     /// # Errors
     /// When it exists but cannot be read.
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, DatasetError> {
+        if let Some(unpacked) = &self.unpacked {
+            let found = GroundTruth::open(unpacked.folder());
+            return found.map_err(|error| DatasetError(unpacked.named(&error.to_string())));
+        }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
         let scene = Scene::prepare(&Source::Preset(name.to_owned()), &Options::default())?;
         Ok(Some(GroundTruth::of_scene(scene)))
@@ -199,6 +203,7 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
             height,
             undistortion: None,
             header,
+            turn: None,
             rendered: Some(Arc::new(image)),
         },
     }

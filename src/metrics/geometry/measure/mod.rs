@@ -60,6 +60,7 @@ impl KnownScene<'_> {
             cy: world.cy,
             world_from_camera: world.rotation.transpose(),
             centre: world.centre(),
+            lens: None,
         };
         (world, caster)
     }

@@ -1,0 +1,97 @@
+//! Photographs as people take and send them: archives, lenses, people who walk through.
+
+use std::io::{Cursor, Write};
+use std::path::Path;
+
+use zip::ZipWriter;
+use zip::write::SimpleFileOptions;
+
+use super::{call, config, files, json, model, read, resume, scratch, text, train};
+use crate::photographs::{Photographs, SIZE, name};
+
+/// Packs a folder, with its own name before all.
+fn packed(folder: &Path) -> Vec<u8> {
+    let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in files(folder) {
+        let name = format!("My scan – 1/{name}");
+        writer.start_file(name, SimpleFileOptions::default()).expect("a file");
+        writer.write_all(&bytes).expect("its bytes");
+    }
+    writer.finish().expect("an archive").into_inner()
+}
+
+/// Training, evaluating and resuming take an archive as they take its folder: to the byte, also in the ledger.
+#[test]
+fn an_archive_is_trained_on_as_its_folder() {
+    let scene = Photographs::colmap_text();
+    std::fs::create_dir(scene.file("masks")).expect("a folder");
+    let mask =
+        image::GrayImage::from_fn(SIZE.0, SIZE.1, |x, _| [if x < 9 { 0 } else { 255 }].into());
+    mask.save(scene.file(&format!("masks/{}", name(3)))).expect("a mask");
+    let (root, plain) = scratch();
+    let archive = root.path().join("garden 1.zip");
+    std::fs::write(&archive, packed(scene.path())).expect("an archive");
+    let run = root.path().join("packed");
+    let flags = "--policy mcmc --backend cpu --budget 400 --eval --checkpoint-every 30";
+    train(scene.path(), &plain, 60, flags).ok();
+    let arguments =
+        format!("train ARCHIVE -o {} --sh-degree 1 --iterations 60 {flags}", text(&run));
+    let with_archive = |words: &str| {
+        let words: Vec<&str> = words.split_whitespace().collect();
+        let words: Vec<&str> = words
+            .iter()
+            .map(|word| if *word == "ARCHIVE" { text(&archive) } else { word })
+            .collect();
+        super::densify(&words)
+    };
+    let said = with_archive(&arguments).ok().stdout;
+    assert!(said.contains("is unpacked in"), "{said}");
+    assert!(model(&run, 60) == model(&plain, 60));
+    assert!(read(&run.join("results.json")) == read(&plain.join("results.json")));
+    let ledger = |run: &Path| json(&run.join("stats/summary.json"))["ledger"].clone();
+    assert_eq!(ledger(&run), ledger(&plain));
+    assert!(config(&run)["scene"].as_str().is_some_and(|scene| scene.ends_with("garden 1.zip")));
+    assert!(call(&format!("eval {} --backend cpu", text(&run))).ok().stdout.contains("PSNR"));
+    resume(Path::new("ARCHIVE"), &run, "").refused("another dataset", &["ARCHIVE"]);
+    let again = with_archive(&format!("train ARCHIVE -o {} --resume --iterations 70", text(&run)));
+    assert!(again.ok().stdout.contains("from step 60"));
+    // It is the same dataset.
+    let again = resume(scene.path(), &run, "--iterations 80").ok().stdout;
+    assert!(again.contains("from step 70"), "{again}");
+    // One message, and nothing is written.
+    let bytes = std::fs::read(&archive).expect("the archive");
+    std::fs::write(&archive, &bytes[..bytes.len() - 100]).expect("a part of it");
+    let none = root.path().join("none");
+    with_archive(&format!("train ARCHIVE -o {}", text(&none)))
+        .refused("a cut archive", &["garden 1.zip", "pack the folder again"]);
+    assert!(!none.exists());
+}
+
+/// PSNR of the test views of `spheres`, written with these options and trained for a moment. At half size, where
+/// what resampling blurs does not count.
+fn score(root: &Path, name: &str, options: &str) -> f64 {
+    let [folder, run] = ["scene", "run"].map(|what| root.join(format!("{what}-{name}")));
+    let words =
+        "scenegen --preset spheres --size 128 --train 20 --test 6 --points 1000 --samples 1";
+    call(&format!("{words} -o {} {options}", text(&folder))).ok();
+    if name == "seen" {
+        std::fs::remove_dir_all(folder.join("masks")).expect("masks");
+    }
+    train(&folder, &run, 300, "--eval --backend cpu --budget 1500 -r 2").ok();
+    json(&run.join("results.json"))["ours_300"]["PSNR"].as_f64().expect("a score")
+}
+
+/// Against the true test views, which are of a pinhole and show nobody.
+#[test]
+#[ignore = "takes ten seconds: run by .ci/run"]
+fn lenses_and_masked_passers_by_cost_hardly_anything() {
+    let (root, _) = scratch();
+    let score = |name: &str, options: &str| score(root.path(), name, options);
+    let plain = score("plain", "");
+    let bent = score("bent", "--lens fisheye:0.02,-0.005");
+    let masked = score("masked", "--passers-by 0.3");
+    let seen = score("seen", "--passers-by 1");
+    let all = format!("{plain:.2}, fisheye {bent:.2}, masked {masked:.2}, not masked {seen:.2}");
+    assert!(plain - bent < 0.3 && plain - masked < 0.3, "{all}");
+    assert!(plain - seen > 0.4, "without masks nothing is lost: {all}");
+}
