@@ -41,7 +41,7 @@ pub struct SourceFile {
     /// Where it is, as messages show it.
     pub path: PathBuf,
     /// Where links led when it was checked.
-    real: PathBuf,
+    real: Box<Path>,
     /// The archive that it is in, if any.
     archive: Option<Arc<Unpacked>>,
 }
@@ -53,13 +53,13 @@ impl SourceFile {
     /// When it is no longer there.
     pub fn found(path: PathBuf) -> Result<Self, DatasetError> {
         let real = path.canonicalize().map_err(DatasetError::io(&path))?;
-        Ok(Self { path, real, archive: None })
+        Ok(Self { path, real: real.into(), archive: None })
     }
 
     /// Stands for pixels that no file holds.
     #[must_use]
     pub fn rendered(path: PathBuf) -> Self {
-        Self { path, real: PathBuf::new(), archive: None }
+        Self { path, real: Path::new("").into(), archive: None }
     }
 
     /// The same, as one of an archive's files, which is named so.
@@ -82,7 +82,7 @@ impl SourceFile {
             return foreign::open(&self.real).map_err(DatasetError::io(&self.path));
         }
         let real = self.path.canonicalize().map_err(DatasetError::io(&self.path))?;
-        if real != self.real {
+        if *real != *self.real {
             let problem = "it has become a link to another file since the run began";
             return Err(DatasetError::malformed(&self.path, "the file", problem, "restore it"));
         }
@@ -103,10 +103,8 @@ pub struct ImageSource {
     pub height: u32,
     /// Resampling of the whole file to a pinhole, if the lens has distortion.
     pub undistortion: Option<Undistortion>,
-    /// Header of the image file, turned where the image is.
+    /// Header of the image file.
     pub header: ImageHeader,
-    /// How the image is turned before anything else.
-    pub turn: Option<Orientation>,
     /// Pixels already in memory, at the size of the header; then no file is read.
     pub rendered: Option<SharedImage>,
 }
@@ -120,6 +118,8 @@ pub struct ImageHeader {
     pub height: u32,
     /// Whether there is an alpha channel.
     pub has_alpha: bool,
+    /// How the image is turned before anything else. Width and height are those afterwards.
+    pub turn: Option<Orientation>,
     /// Size as decoded `[bytes]`.
     pub decoded_bytes: u64,
     /// Size of the file `[bytes]`.
@@ -132,9 +132,9 @@ impl ImageSource {
     pub(super) fn whole(path: PathBuf) -> Self {
         let header = probe(&path).expect("an image");
         let (width, height) = (header.width, header.height);
-        let (mask, undistortion, turn, rendered) = (None, None, None, None);
+        let (mask, undistortion, rendered) = (None, None, None);
         let file = SourceFile::found(path).expect("an image");
-        Self { file, mask, width, height, undistortion, header, turn, rendered }
+        Self { file, mask, width, height, undistortion, header, rendered }
     }
 
     /// Most bytes of the loaded image.
@@ -153,7 +153,7 @@ impl ImageSource {
         let whole = bytes(self.whole_size());
         let undistort = if self.undistortion.is_some() { packed + whole } else { packed };
         let shrink = if self.shrinks() { whole + self.loaded_bytes() } else { whole };
-        let turn = if self.turn.is_some() { 2 * self.header.decoded_bytes } else { 0 };
+        let turn = if self.header.turn.is_some() { 2 * self.header.decoded_bytes } else { 0 };
         decode.max(turn).max(pack).max(undistort).max(shrink)
     }
 
@@ -200,7 +200,7 @@ impl ImageSource {
             });
         }
         let mut decoded = decode(&self.file)?;
-        if let Some(turn) = self.turn {
+        if let Some(turn) = header.turn {
             decoded.apply_orientation(turn);
         }
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
@@ -297,7 +297,8 @@ fn read_header<R: std::io::BufRead + std::io::Seek>(
     let decoder = reader.into_decoder()?;
     let (width, height) = decoder.dimensions();
     let has_alpha = decoder.color_type().has_alpha();
-    Ok(ImageHeader { width, height, has_alpha, decoded_bytes: decoder.total_bytes(), file_bytes })
+    let decoded_bytes = decoder.total_bytes();
+    Ok(ImageHeader { width, height, has_alpha, turn: None, decoded_bytes, file_bytes })
 }
 
 pub(super) fn decode(source: &SourceFile) -> Result<DynamicImage, DatasetError> {

@@ -4,7 +4,6 @@
 use std::path::Path;
 
 use glam::{DMat3, DVec2};
-use image::metadata::Orientation;
 use rayon::prelude::*;
 
 use super::error::DatasetError;
@@ -86,7 +85,6 @@ struct Checked {
     header: ImageHeader,
     /// At the image's size.
     lens: Lens,
-    turn: Option<Orientation>,
 }
 
 /// Checks an image's header against its camera. An image that lies on its side for this camera, and says so in its
@@ -100,11 +98,10 @@ fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
         Some(_) => size.0.abs_diff(expected.0) <= 1 && size.1.abs_diff(expected.1) <= 1,
         None => proportional(size, (lens.width, lens.height)),
     };
-    let mut turn = None;
     if !fits((header.width, header.height)) && fits((header.height, header.width)) {
-        turn = exif::quarter_turn(&frame.image);
+        header.turn = exif::quarter_turn(&frame.image);
     }
-    if turn.is_some() {
+    if header.turn.is_some() {
         header = ImageHeader { width: header.height, height: header.width, ..header };
     }
     let size = (header.width, header.height);
@@ -128,12 +125,12 @@ fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
         let remedy = "repair the camera or remove the frame";
         return Err(DatasetError::malformed(listing, &frame.name, problem, remedy));
     }
-    Ok(Checked { header, lens, turn })
+    Ok(Checked { header, lens })
 }
 
 /// What is said about photographs that are turned.
 fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
-    let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.turn.is_some());
+    let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.turn.is_some());
     let (first, _) = turned().next()?;
     Some(format!(
         "{} photographs lie on their side for their cameras, and are turned as their EXIF says ({} is the first)",
@@ -191,7 +188,7 @@ fn cut_notes<'a>(
 /// The views of a frame whose image and lens are checked.
 fn photograph(
     frame: &Frame,
-    Checked { header, lens, turn }: &Checked,
+    Checked { header, lens }: &Checked,
     cut: Option<&Cut>,
     options: &LoadOptions,
 ) -> Result<Photograph, DatasetError> {
@@ -244,7 +241,6 @@ fn photograph(
                 height,
                 undistortion,
                 header: *header,
-                turn: *turn,
                 rendered: None,
             },
         }

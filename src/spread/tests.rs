@@ -49,6 +49,7 @@ fn posed(image: Image8) -> View {
         width,
         height,
         has_alpha: false,
+        turn: None,
         decoded_bytes: image.bytes(),
         file_bytes: 0,
     };
@@ -59,7 +60,6 @@ fn posed(image: Image8) -> View {
         width,
         height,
         undistortion: None,
-        turn: None,
         header,
         rendered,
     };

@@ -171,7 +171,7 @@ fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
         // Turning takes the picture twice.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
-        assert!(data.train[0].source.turn.is_none());
+        assert!(data.train[0].source.header.turn.is_none());
         // Its mask is that of the turned picture.
         std::fs::create_dir(made.file("masks")).unwrap();
         image::GrayImage::from_pixel(SIZE.0, SIZE.1, [9].into())

@@ -188,6 +188,7 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
         width: frame.width,
         height: frame.height,
         has_alpha,
+        turn: None,
         decoded_bytes: image.bytes(),
         file_bytes: 0,
     };
@@ -203,7 +204,6 @@ fn dataset_view(name: &str, camera: Camera, frame: Frame, options: &LoadOptions)
             height,
             undistortion: None,
             header,
-            turn: None,
             rendered: Some(Arc::new(image)),
         },
     }
