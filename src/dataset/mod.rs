@@ -213,7 +213,8 @@ fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, DatasetError>
         Err(DatasetError(format!(
             "{} is not a dataset: found neither transforms_train.json with transforms_test.json, nor \
              sparse/0/cameras.bin or .txt, nor sparse/cameras.bin or .txt, nor transforms.json, nor a .csv of \
-             RealityCapture's camera parameters; name a folder or ZIP archive with one of these",
+             RealityCapture's camera parameters; name a folder or ZIP archive with a COLMAP model, transforms files or \
+             such a table",
             root.path().display()
         )))
     }
