@@ -117,6 +117,7 @@ impl Unpacked {
     }
 
     /// The dataset's folder.
+    #[cfg(feature = "scenegen")]
     pub(super) fn folder(&self) -> &Path {
         &self.folder
     }

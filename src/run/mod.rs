@@ -42,7 +42,7 @@ pub use values::{
 };
 
 use crate::checkpoint::Fingerprint;
-use crate::dataset::{Dataset, PointCloud};
+use crate::dataset::Dataset;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::memory::Ledger;
@@ -112,7 +112,8 @@ impl Run {
     }
 
     /// Those points of the dataset that a page draws, if there is one.
-    pub(crate) fn take_points(&mut self) -> PointCloud {
+    #[cfg(feature = "view")]
+    pub(crate) fn take_points(&mut self) -> crate::dataset::PointCloud {
         std::mem::take(&mut self.dataset.points)
     }
 
