@@ -70,7 +70,7 @@ return [x, y, cameraAt(x, y)];
 """
 # What the keyboard cannot reach, or has no name, of what is seen.
 UNREACHED = """
-const seen = [...document.querySelectorAll("button, select, input, summary, [tabindex='0']")]
+const seen = [...document.querySelectorAll("button, select, input, summary, [tabindex]")]
   .filter((it) => it.offsetParent !== null && !it.disabled && (it.type !== "radio" || it.checked));
 const name = (it) => it.ariaLabel || it.labels?.[0]?.textContent || it.textContent;
 return seen.filter((it) => !it.dataset.reached || !name(it).trim()).map((it) => it.id || it.outerHTML);
