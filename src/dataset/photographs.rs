@@ -98,11 +98,12 @@ fn checked(listing: &Path, frame: &Frame) -> Result<Checked, DatasetError> {
         Some(_) => size.0.abs_diff(expected.0) <= 1 && size.1.abs_diff(expected.1) <= 1,
         None => proportional(size, (lens.width, lens.height)),
     };
-    if !fits((header.width, header.height)) && fits((header.height, header.width)) {
-        header.turn = exif::quarter_turn(&frame.image);
-    }
-    if header.turn.is_some() {
-        header = ImageHeader { width: header.height, height: header.width, ..header };
+    let (width, height) = (header.height, header.width);
+    if !fits((header.width, header.height))
+        && fits((width, height))
+        && let turn @ Some(_) = exif::quarter_turn(&frame.image)
+    {
+        header = ImageHeader { width, height, turn, ..header };
     }
     let size = (header.width, header.height);
     if !fits(size) {

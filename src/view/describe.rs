@@ -107,16 +107,11 @@ fn all_but_points(stage: &Stage) -> Value {
 mod tests {
     use super::*;
     use crate::flight::Key;
-    use crate::view::open::stage_of;
+    use crate::view::open::stage_of_one_view;
 
     #[test]
     fn points_take_no_more_than_they_may() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let frame = r#"{"w":8,"h":8,"fl_x":8,"fl_y":8,"frames":[{"file_path":"a.png",
-            "transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]}]}"#;
-        std::fs::write(folder.path().join("transforms.json"), frame).expect("a file");
-        image::RgbImage::new(8, 8).save(folder.path().join("a.png")).expect("a PNG");
-        let mut stage = stage_of(folder.path());
+        let (_folder, mut stage) = stage_of_one_view();
         let without = describe(&mut stage).len();
         // As many digits as numbers can have.
         let count = 2 * POINTS_TO_LOOK_AT;

@@ -231,16 +231,11 @@ mod tests {
     use crate::gaussians::Gaussians;
     use crate::run::Silent;
     use crate::view::board::Order;
-    use crate::view::open::stage_of;
+    use crate::view::open::stage_of_one_view;
 
     #[test]
     fn a_run_that_is_paused_goes_on_when_its_page_is_gone() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let frame = r#"{"w":8,"h":8,"fl_x":8,"fl_y":8,"frames":[{"file_path":"a.png",
-            "transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]}]}"#;
-        std::fs::write(folder.path().join("transforms.json"), frame).expect("a file");
-        image::RgbImage::new(8, 8).save(folder.path().join("a.png")).expect("a PNG");
-        let stage = stage_of(folder.path());
+        let (_folder, stage) = stage_of_one_view();
         let (desk, board) = (Desk::new(Some(1), 1), Board::default());
         board.begin(0, 10, 1, 1);
         board.order(Order::Pause);

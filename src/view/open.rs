@@ -223,6 +223,18 @@ pub(super) fn stage_of(folder: &Path) -> Stage {
     open(looked, Machine::default(), &crate::run::Silent).expect("a scene").stage
 }
 
+/// That of one black photograph, and the folder that it is in.
+#[cfg(test)]
+pub(super) fn stage_of_one_view() -> (tempfile::TempDir, Stage) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let frame = r#"{"w":8,"h":8,"fl_x":8,"fl_y":8,"frames":[{"file_path":"a.png",
+        "transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,1],[0,0,0,1]]}]}"#;
+    std::fs::write(folder.path().join("transforms.json"), frame).expect("a file");
+    image::RgbImage::new(8, 8).save(folder.path().join("a.png")).expect("a PNG");
+    let stage = stage_of(folder.path());
+    (folder, stage)
+}
+
 impl Exhibition {
     /// Shows a model that is in the dataset's own coordinates.
     fn show(&mut self, name: String, model: Gaussians, near: f64) -> Result<(), Failure> {
