@@ -49,11 +49,15 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     assert (run / f"checkpoints/iteration_{paused + 1}.safetensors").is_file(), "no checkpoint is there"
     browser.is_sharp()
     # What only a run in training knows.
+    colours = {}
     for kind in browser.run("return scene.kinds.map(({ kind }) => kind)"):
         if kind.startswith("row_"):
             browser.choose("left", f"{kind}:0")
+            found = browser.run(PROBE)
             # Some signals may not have been seen since the last edit.
-            assert browser.run(PROBE)["spread"] > 1, f"{kind} is empty"
+            assert found["spread"] > 1, f"{kind} is empty"
+            colours[kind] = found["colours"]
+    assert max(colours.values()) > 12, f"Gaussians have {colours} colours"
     browser.choose("left", "row_edit:0")
     browser.keep(folder, "live-edits")
     browser.choose("left", "depth:0")

@@ -53,6 +53,17 @@ image.onload = () => {
 };
 image.src = arguments[0];
 """
+# Decibels between the middle of the stage now and at the last call.
+MIDDLE = """
+const { width, height } = picture, side = Math.round(height / 3);
+const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
+[copy.width, copy.height] = [side, side];
+out.drawImage(picture, Math.round((side - width) / 2), Math.round((side - height) / 2));
+const { data } = out.getImageData(0, 0, side, side), before = window.middle ?? data;
+window.middle = data;
+const sum = data.reduce((sum, x, i) => sum + (x - before[i]) ** 2, 0);
+return 10 * Math.log10(255 ** 2 / Math.max(sum / (data.length * 3 / 4), 1e-9));
+"""
 # Pixels of the marks over the picture.
 MARKED = """
 const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
@@ -184,6 +195,13 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
 
     browser.choose("view", "test:0")
     browser.keep(folder, "test-camera")
+    # Whoever leaves a photograph's camera sees the same, with more around it.
+    browser.run(MIDDLE)
+    browser.run("orbit(0, 0)")
+    browser.is_sharp()
+    near = browser.run(MIDDLE)
+    assert near >= 38, f"the picture is {near:.1f} dB from that of the camera that was left"
+    browser.choose("view", "test:0")
     browser.choose("left", "photograph:0")
     browser.choose("right", "render:0")
     # What the photograph's camera saw, and what is drawn there, at the photograph's own size.
@@ -285,7 +303,8 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     assert not browser.run("return document.getElementById('save').disabled"), "no camera path to save"
     assert browser.run("return keys.length") == 2
     # What the page saves, densify flies along.
-    keep = "URL.createObjectURL = (blob) => { blob.text().then((text) => { window.saved = text; }); return 'data:,'; };"
+    keep = "URL.createObjectURL = (blob) => { window.made = blob; return 'data:,'; };"
+    keep += "HTMLAnchorElement.prototype.click = function () { if (this.download) made.text().then((it) => { window.saved = it; }); };"
     browser.run(keep + "document.getElementById('save').click()")
     browser.until("window.saved", "no camera path is saved")
     path = rendered / "camera_path.json"
@@ -301,6 +320,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     for element in ["html", "#panel"]:
         width = browser.run("return document.querySelector(arguments[0]).scrollWidth", element)
         assert width <= 360, f"{element} is {width} px wide"
+    assert browser.run("return area()[0]") > 340, "the panel leaves the picture no room"
     browser.keep(folder, "phone")
     browser.run("document.getElementById('help').click()")
     width = browser.run("return document.getElementById('guide').scrollWidth")
