@@ -19,8 +19,9 @@ use crate::run::{RunConfig, Whole};
 /// Makes a trained model smaller: as many Gaussians as asked, or a file no larger than asked.
 ///
 /// Prunes the Gaussians that show least in the training views, at most half of them at once, and trains the others on
-/// in between. For a file it tries the model's degree of colour and lower ones, which leave room for more Gaussians, and
-/// keeps what shows the training views best as the file has it. Views held out are measured too, and decide nothing.
+/// in between. For a file it tries the model's degree of colour and lower ones, and coarser colour where the format has
+/// it, which leave room for more Gaussians, and keeps what shows the training views best as the file has it. Views held
+/// out are measured too, and decide nothing.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CompressArgs {
@@ -41,7 +42,7 @@ pub(super) struct CompressArgs {
     #[arg(long)]
     overwrite: bool,
     /// Training steps of each attempt
-    #[arg(short, long, value_name = "N", default_value = "2000")]
+    #[arg(short, long, value_name = "N", default_value = "600")]
     iterations: Whole<1, { u32::MAX }>,
     /// Everything random follows from this number
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]

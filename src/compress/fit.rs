@@ -11,7 +11,7 @@ use crate::number::grouped;
 /// Share of the size that the first estimate fills: training changes how well the rows pack.
 const FILLED: f64 = 0.98;
 /// Estimates until the number of rows is taken as it is.
-const ESTIMATES: usize = 6;
+const ESTIMATES: usize = 8;
 /// Share of the rows that is left out at a time where the file is still too large.
 const TRIMMED: f64 = 0.01;
 
@@ -55,12 +55,14 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
     }
 }
 
-/// The format in which most rows of this model, as it is, make a file of the target, the first of equals, and how many
-/// these are; `None` where not even one does.
-pub(super) fn format(
+/// In which formats to try this model, and how many of its rows, as it is, then make a file of the target: the format
+/// that holds most, the first of equals, and `with_smaller` its smaller forms that hold more. None where not even one
+/// row fits.
+pub(super) fn packings(
     options: &Options<'_>,
     model: &Gaussians,
-) -> Result<Option<(&'static Format, usize)>, Failure> {
+    with_smaller: bool,
+) -> Result<Vec<(&'static Format, usize)>, Failure> {
     let mut best = None;
     for &format in options.formats {
         let most = best.map_or(0, |(_, rows)| rows);
@@ -69,7 +71,17 @@ pub(super) fn format(
             _ => {}
         }
     }
-    Ok(best)
+    let Some((format, mut most)) = best else { return Ok(Vec::new()) };
+    let mut found = vec![(format, most)];
+    let smaller = if with_smaller { (format.writer)().smaller() } else { &[] };
+    for format in smaller {
+        let Some(rows) = rows(options.to, format, model)?.filter(|&rows| rows > most) else {
+            break;
+        };
+        most = rows;
+        found.push((format, rows));
+    }
+    Ok(found)
 }
 
 /// How many rows of this model, as it is, make a file of the target; `None` where not even one does.
@@ -82,21 +94,28 @@ pub(super) fn rows(
         Target::Rows(rows) => return Ok(Some(rows.min(model.len()))),
         Target::Bytes(most) => most,
     };
-    let mut rows = model.len();
-    let mut size = bytes(format, model)?;
+    let size = bytes(format, model)?;
     if size <= most {
-        return Ok(Some(rows));
+        return Ok(Some(model.len()));
     }
+    // Files need not grow evenly with their rows, so each estimate stays between what fits and what does not.
+    let (mut fits, mut over, mut rows, mut size) = (0, model.len(), model.len(), size);
     for _ in 0..ESTIMATES {
         let next = (rows as f64 * (FILLED * most as f64 / size as f64)) as usize;
-        rows = next.clamp(1, model.len());
+        rows = if fits < next && next < over { next } else { fits.midpoint(over) }.max(1);
         size = bytes(format, &spread(model, rows))?;
+        if size <= most {
+            fits = rows;
+        } else {
+            over = rows;
+        }
         let filled = size as f64 / most as f64;
-        if (FILLED - 0.01..=1.0).contains(&filled) || (rows == 1 && size > most) {
+        if (FILLED - 0.01..=1.0).contains(&filled) || over - fits <= 1 + model.len() / 500 {
             break;
         }
     }
-    Ok((size <= most || rows > 1).then_some(rows))
+    let found = if fits > 0 { fits } else { rows };
+    Ok((fits > 0 || rows > 1).then_some(found))
 }
 
 /// So many rows, evenly from first to last, which is through space.

@@ -3,8 +3,8 @@
 //! Gaussians are pruned by how much they show in the training views, at most half of them at once, and the rest
 //! trained on in between (`tune.rs`). Colour that depends on the view is dropped from each Gaussian by itself where
 //! nobody would see it (`colour.rs`). How much of a file colour is worth depends on the scene, so several degrees of it
-//! are tried, each with as many Gaussians as then fit, in the format that holds most of them (`fit.rs`), and the one is
-//! kept whose file, read back, shows the training views best (`judge.rs`).
+//! are tried, and a format's coarser ways to keep it, each with as many Gaussians as then fit, in the format that holds
+//! most of them (`fit.rs`); and the one is kept whose file, read back, shows the training views best (`judge.rs`).
 
 mod colour;
 mod fit;
@@ -109,23 +109,70 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     fit::check(options, &model)?;
     let whole = judge.attempt(model.clone(), PLY, fit::bytes(PLY, &model)?)?;
     let scratch = scratch(options.output)?;
+    let search = Search { options, observer, judge, scratch, model };
     let mut attempts: Vec<Attempt> = Vec::new();
     let mut best: Option<(usize, &Format, Gaussians)> = None;
-    for degree in degrees(model.sh_degree, options.to) {
-        let start = colour::reduced(model.clone(), degree);
-        let Some((format, rows)) = fit::format(options, &start)? else { continue };
-        let is_whole = rows == model.len() && degree == model.sh_degree;
-        let tuned = match is_whole {
-            true => start,
-            false => {
-                let wanted = (format, rows);
-                colour::reduced(tune::tune(start, wanted, options, &scratch, observer)?, degree)
+    for degree in degrees(search.model.sh_degree, options.to) {
+        let start = colour::reduced(search.model.clone(), degree);
+        let packings = fit::packings(options, &start, degree == search.model.sh_degree)?;
+        for &(format, rows) in &packings {
+            let made = search.attempt(start.clone(), (format, rows), degree)?;
+            let Some((attempt, small)) = made else { continue };
+            let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
+            attempts.push(attempt);
+            if is_best {
+                best = Some((attempts.len() - 1, format, small));
             }
+        }
+        if packings.first().is_some_and(|&(_, rows)| search.is_whole(rows, degree)) {
+            break;
+        }
+    }
+    let Some((best, format, small)) = best else {
+        return Err(fit::too_small(options, &search.model));
+    };
+    let file = file(options.output, options.formats, format);
+    write_atomically(&file, |out| format.write(&small, out))?;
+    Ok(Compressed { whole, attempts, best, file })
+}
+
+/// What all attempts share.
+struct Search<'a> {
+    options: &'a Options<'a>,
+    observer: &'a dyn Observer,
+    judge: Judge,
+    scratch: TempPath,
+    /// The model as it was.
+    model: Gaussians,
+}
+
+impl Search<'_> {
+    /// Whether so many rows of this degree are all of the model.
+    fn is_whole(&self, rows: usize, degree: u8) -> bool {
+        rows == self.model.len() && degree == self.model.sh_degree
+    }
+
+    /// About so many rows of a model, trained on, and what its file shows; `None` where no row fits.
+    fn attempt(
+        &self,
+        start: Gaussians,
+        (format, rows): (&Format, usize),
+        degree: u8,
+    ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
+        let Self { options, observer, judge, scratch, .. } = self;
+        // Where all of it fits, training has nothing to mend.
+        let tuned = if self.is_whole(rows, degree) {
+            start
+        } else {
+            let tuned = tune::tune(start, (format, rows), options, scratch, *observer)?;
+            colour::reduced(tuned, degree)
         };
-        let Some((small, bytes)) = fit::trimmed(options.to, format, tuned)? else { continue };
+        let Some((small, bytes)) = fit::trimmed(options.to, format, tuned)? else {
+            return Ok(None);
+        };
         // What the file says, not what was written.
-        write_atomically(&scratch, |out| format.write(&small, out))?;
-        let attempt = judge.attempt(read_model(&scratch, observer)?, format, bytes)?;
+        write_atomically(scratch, |out| format.write(&small, out))?;
+        let attempt = judge.attempt(read_model(scratch, *observer)?, format, bytes)?;
         observer.say(format_args!(
             "tried    {} Gaussians of degree {degree} as {}: {} bytes, {:.2} dB",
             grouped(attempt.rows),
@@ -133,19 +180,8 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
             grouped(usize::try_from(bytes).unwrap_or(usize::MAX)),
             attempt.train
         ));
-        let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
-        attempts.push(attempt);
-        if is_best {
-            best = Some((attempts.len() - 1, format, small));
-        }
-        if is_whole {
-            break;
-        }
+        Ok(Some((attempt, small)))
     }
-    let Some((best, format, small)) = best else { return Err(fit::too_small(options, &model)) };
-    let file = file(options.output, options.formats, format);
-    write_atomically(&file, |out| format.write(&small, out))?;
-    Ok(Compressed { whole, attempts, best, file })
 }
 
 /// A file for what is between two steps, in the folder that has room for the result; gone with this value.

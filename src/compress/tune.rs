@@ -11,7 +11,6 @@ use crate::output::write_atomically;
 use crate::run::{
     AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Whole,
 };
-use crate::schedule::InitRates;
 
 /// A policy that, set so, neither adds nor prunes.
 const POLICY: &str = "vanilla";
@@ -80,8 +79,6 @@ fn described(
     let file = std::path::absolute(scratch).map_err(Failure::input)?;
     spec.start.init = Some(InitChoice::Model(AbsolutePath(file)));
     spec.start.near = options.near;
-    // What pruning leaves has to change.
-    spec.start.init_rates = InitRates::Full;
     spec.size.budget = Some(Budget::Rows(budget));
     spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));
     POLICY.clone_into(&mut spec.density.policy);

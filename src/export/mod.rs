@@ -52,6 +52,11 @@ pub trait ModelWriter {
         false
     }
 
+    /// The same format in fewer bytes at the price of accuracy, the most accurate first.
+    fn smaller(&self) -> &'static [Format] {
+        &[]
+    }
+
     /// Writes what comes before the rows.
     ///
     /// # Errors

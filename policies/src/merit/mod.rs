@@ -49,7 +49,7 @@
 //! | grow_every | 100 | >= 0 | steps | interval of events; 0: never |
 //! | curve_until | 30000 | >= 0 | step | when the curve reaches the budget |
 //! | rho | 0.25 | >= 0 | budget | fewest Gaussians that are replaced in all |
-//! | replaceable | 0.3 | >= 0 | median importance | less important ones are replaced; 0: only `rho` |
+//! | replaceable | 0.15 | >= 0 | median importance | less important ones are replaced; 0: only `rho` |
 //! | most_rho | 2.0 | >= 0 | budget | most Gaussians that are replaced in all |
 //! | gradient | "abs" | abs, screen | | screen gradient, of absolute values or as it is |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |

@@ -57,7 +57,7 @@ impl Default for MeritParams {
             grow_every: 100,
             curve_until: 30_000,
             rho: 0.25,
-            replaceable: 0.3,
+            replaceable: 0.15,
             most_rho: 2.0,
             gradient: Gradient::Abs,
             colour_weight: 30.0,

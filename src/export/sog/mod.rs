@@ -29,6 +29,12 @@ pub(super) const FORMAT: Format = Format {
 
 inventory::submit! { FORMAT }
 
+/// With a half and a quarter of the palette.
+const SMALLER: [Format; 2] = [
+    Format { writer: || Box::new(SogWriter { halved: 1, ..SogWriter::default() }), ..FORMAT },
+    Format { writer: || Box::new(SogWriter { halved: 2, ..SogWriter::default() }), ..FORMAT },
+];
+
 /// Longest side of a WebP `[px]`, and so the most rows.
 const MAX_SIDE: usize = 16_383;
 /// Most entries of the palette: a label has 16 bits.
@@ -37,6 +43,8 @@ const MAX_PALETTE: usize = 1 << 16;
 /// Holds all rows: codebooks and palette are fitted to all of them.
 #[derive(Default)]
 struct SogWriter {
+    /// How often the palette is halved.
+    halved: u32,
     sh_degree: u8,
     means: Vec<[f32; 3]>,
     log_scales: Vec<[f32; 3]>,
@@ -62,6 +70,10 @@ impl ModelWriter for SogWriter {
 
     fn is_for_neighbours(&self) -> bool {
         true
+    }
+
+    fn smaller(&self) -> &'static [Format] {
+        &SMALLER
     }
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
@@ -162,7 +174,7 @@ impl SogWriter {
         let rows = self.means.len();
         let coefficients = sh_coefficients(self.sh_degree) - 1;
         let Palette { entries, labels } =
-            Palette::fit(&self.bands, 3 * coefficients, &self.weights, entries(rows));
+            Palette::fit(&self.bands, 3 * coefficients, &self.weights, self.entries());
         let book = Codebook::fit(&entries, |_| 1.0);
         let count = entries.len() / (3 * coefficients);
         let entry = |pixel: usize| {
@@ -186,6 +198,11 @@ impl SogWriter {
         }))
     }
 
+    /// Entries of the palette: as many as splat-transform takes, a power of two, where it is not halved.
+    fn entries(&self) -> usize {
+        (((1 << self.means.len().ilog2()).min(MAX_PALETTE)) >> self.halved).max(1)
+    }
+
     /// Keeps the weights within a factor of a hundred of their mean: a row may show more than it seems.
     fn level_weights(&mut self) {
         let finite = |weight: f32| if weight.is_finite() { weight } else { 0.0 };
@@ -195,11 +212,6 @@ impl SogWriter {
             *weight = (finite(*weight) / mean).clamp(0.01, 100.0);
         }
     }
-}
-
-/// Entries of the palette for so many rows: as many as splat-transform takes, a power of two.
-fn entries(rows: usize) -> usize {
-    (1 << rows.ilog2()).min(MAX_PALETTE)
 }
 
 /// Three components, from −1/√2 to 1/√2, in order (w, x, y, z), and which is the largest.
