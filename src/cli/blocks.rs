@@ -44,7 +44,7 @@ enum Command {
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 struct PlanArgs {
-    /// Folder of the dataset, or scene:NAME for a built-in scene
+    /// Folder or ZIP archive of the dataset, or scene:NAME for a built-in scene
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     /// Folder to write the plan to

@@ -50,7 +50,7 @@ pub(super) struct CompressArgs {
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Folder of the dataset: needed for a file, and for a run whose dataset has moved
+    /// Folder or ZIP archive of the dataset: needed for a file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]

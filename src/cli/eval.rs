@@ -38,7 +38,7 @@ pub(super) struct EvalArgs {
     /// Which views to measure
     #[arg(long, value_enum, default_value_t = Split::Test)]
     split: Split,
-    /// Folder of the dataset: needed for a file, and for a run whose dataset has moved
+    /// Folder or ZIP archive of the dataset: needed for a file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Also measure LPIPS, with the weights in this safetensors file (VGG-16 or AlexNet; they are not part

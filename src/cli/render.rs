@@ -35,7 +35,7 @@ pub(super) struct RenderArgs {
     /// Folder that `densify train` wrote, or a file (of SOG also a folder) of Gaussian splats
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
-    /// Folder of the dataset: needed for a file, and for a run whose dataset has moved
+    /// Folder or ZIP archive of the dataset: needed for a file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Folder for the pictures

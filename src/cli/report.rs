@@ -34,7 +34,7 @@ pub(super) struct ReportArgs {
     /// Saved iteration of the runs `[default: the last of each]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Folder of the dataset, where it is no longer where it was
+    /// Folder or ZIP archive of the dataset, where it is no longer where it was
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]

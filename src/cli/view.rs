@@ -29,8 +29,8 @@ pub(super) struct ViewArgs {
     /// Another run or model of the same scene, to compare with
     #[arg(value_name = "RUN|MODEL")]
     other: Option<PathBuf>,
-    /// Folder of the dataset: brings cameras and photographs to a file, and is needed for a run whose dataset
-    /// has moved
+    /// Folder or ZIP archive of the dataset: brings cameras and photographs to a file, and is needed for a run
+    /// whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Saved iteration of the run `[default: the last]`

@@ -1,6 +1,11 @@
 //! Paths in data files: untrusted, and never followed out of the dataset's folder.
 
+use std::collections::BTreeMap;
+use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use unicode_normalization::UnicodeNormalization;
 
 use super::error::DatasetError;
 
@@ -13,7 +18,12 @@ pub(super) struct Root {
     /// As the user wrote it, for messages.
     shown: PathBuf,
     canonical: PathBuf,
+    /// Folders that were searched for names which Unicode can write in several ways.
+    searched: Arc<Mutex<BTreeMap<PathBuf, Names>>>,
 }
+
+/// Entries of a folder by their composed names, those of ASCII alone left out.
+type Names = BTreeMap<String, PathBuf>;
 
 /// A path in a data file, with its place for error messages.
 #[derive(Debug, Clone, Copy)]
@@ -29,7 +39,7 @@ impl Root {
         if !canonical.is_dir() {
             return Err(DatasetError::io(folder)(std::io::ErrorKind::NotADirectory.into()));
         }
-        Ok(Self { shown: folder.to_owned(), canonical })
+        Ok(Self { shown: folder.to_owned(), canonical, searched: Arc::default() })
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -46,7 +56,10 @@ impl Root {
 
     /// As [`join`](Self::join), also refusing links that lead out; `None` if there is no such file.
     pub(super) fn existing(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
-        let path = self.join(named)?;
+        let mut path = self.join(named)?;
+        if !named.value.is_ascii() && !path.exists() {
+            path = self.spelled_otherwise(&relative(named.value)).unwrap_or(path);
+        }
         match path.canonicalize() {
             Ok(real) if !real.starts_with(&self.canonical) => {
                 Err(named.fault("leads out of the folder through a symbolic link"))
@@ -55,6 +68,43 @@ impl Root {
             _ => Ok(None),
         }
     }
+
+    /// The file with the same letters: an accent may be a part of its letter or follow it. macOS writes names of
+    /// files in the one way, and what lists them mostly in the other.
+    fn spelled_otherwise(&self, value: &str) -> Option<PathBuf> {
+        let mut path = self.shown.clone();
+        for part in value.split('/') {
+            let plain = path.join(part);
+            path = match part.is_ascii() || plain.exists() {
+                true => plain,
+                false => self.entry(path, part)?,
+            };
+        }
+        Some(path)
+    }
+
+    /// The entry of a folder that has this name in any spelling.
+    fn entry(&self, folder: PathBuf, name: &str) -> Option<PathBuf> {
+        // What is outside is not even listed.
+        if !folder.canonicalize().ok()?.starts_with(&self.canonical) {
+            return None;
+        }
+        let mut searched = self.searched.lock().unwrap_or_else(PoisonError::into_inner);
+        let names = searched.entry(folder).or_insert_with_key(|folder| names(folder));
+        names.get(&name.nfc().collect::<String>()).cloned()
+    }
+}
+
+fn names(folder: &Path) -> Names {
+    let mut entries: Vec<PathBuf> =
+        fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+    // Of several with the same letters the last counts, in whatever order the system lists them.
+    entries.sort();
+    let name = |path: PathBuf| {
+        let name = path.file_name()?.to_str().filter(|name| !name.is_ascii())?;
+        Some((name.nfc().collect(), path))
+    };
+    entries.into_iter().filter_map(name).collect()
 }
 
 impl DataPath<'_> {
@@ -91,5 +141,50 @@ pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
         Some("contains `..`")
     } else {
         None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Both ways to write "Küche/é.png".
+    const SPELLINGS: [&str; 2] = ["K\u{fc}che/\u{e9}.png", "Ku\u{308}che/e\u{301}.png"];
+
+    fn existing(root: &Root, value: &str) -> Result<Option<PathBuf>, DatasetError> {
+        root.existing(DataPath { file: Path::new("list"), field: "name", value })
+    }
+
+    #[test]
+    fn letters_count_and_not_how_they_are_written() {
+        for (listed, written) in [(0, 1), (1, 0)].map(|(a, b)| (SPELLINGS[a], SPELLINGS[b])) {
+            let folder = tempfile::tempdir().unwrap();
+            let file = folder.path().join(written);
+            fs::create_dir(file.parent().unwrap()).unwrap();
+            fs::write(&file, "photograph").unwrap();
+            let root = Root::new(folder.path()).unwrap();
+            let found = existing(&root, listed).unwrap().expect(listed);
+            assert_eq!(fs::read(found).unwrap(), b"photograph");
+            assert_eq!(existing(&root, "K\u{fc}che/e.png").unwrap(), None, "another letter");
+            assert!(existing(&root, "../K\u{fc}che/\u{e9}.png").is_err());
+            // Where there are both, the one that is listed.
+            let both = folder.path().join(listed);
+            fs::create_dir_all(both.parent().unwrap()).unwrap();
+            fs::write(&both, "itself").unwrap();
+            assert_eq!(fs::read(existing(&root, listed).unwrap().unwrap()).unwrap(), b"itself");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn no_spelling_leads_out() {
+        let (folder, outside) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        fs::write(outside.path().join("e\u{301}.png"), "secret").unwrap();
+        std::os::unix::fs::symlink(outside.path(), folder.path().join("out")).unwrap();
+        let secret = outside.path().join("e\u{301}.png");
+        std::os::unix::fs::symlink(secret, folder.path().join("o\u{308}.png")).unwrap();
+        let root = Root::new(folder.path()).unwrap();
+        assert!(existing(&root, "out/\u{e9}.png").is_ok_and(|found| found.is_none()));
+        assert!(existing(&root, "\u{f6}.png").is_err());
     }
 }

@@ -1,11 +1,14 @@
 //! Reads the CSV file that RealityCapture (RealityScan) exports as "Internal/External camera parameters".
 //!
-//! A line per photograph: `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, angles in degrees. With
-//! all angles 0 a camera looks straight down, its image's upper side to the north (+y); heading turns it clockwise
+//! A line per photograph: `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, angles in degrees;
+//! RealityScan 2 names the same `yaw`, `f_35mm`, `px_norm` and `py_norm`. With all angles 0 a camera looks straight down, its image's upper side to the north (+y); heading turns it clockwise
 //! about the vertical, pitch lifts its view towards the horizon, roll tilts it (Capturing Reality, *Registration
 //! export and camera orientations*). `f` is the focal length of a picture whose longer side is 36 mm; `px` and
 //! `py` are the principal point from the middle, in longer sides. Distortion is that of Brown: k1 to k4 of r² to
-//! r⁸, t1 and t2 as OpenCV's p1 and p2.
+//! r⁸; t1 and t2 are OpenCV's p2 and p1, the order in which its own OpenCV export writes them.
+//!
+//! The table is read here, without a crate for tables: its template writes plain commas and decimal points
+//! whatever the system's language, and names without quotes. Quotes are understood all the same.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -39,9 +42,12 @@ const DISTORTION: [(&str, Term); 6] = [
     ("k2", Term::Radial(1)),
     ("k3", Term::Radial(2)),
     ("k4", Term::Radial(3)),
-    ("t1", Term::Tangential(0)),
-    ("t2", Term::Tangential(1)),
+    ("t1", Term::Tangential(1)),
+    ("t2", Term::Tangential(0)),
 ];
+/// What RealityScan 2 calls columns, and their older names.
+const RENAMED: [(&str, &str); 4] =
+    [("yaw", "heading"), ("f_35mm", "f"), ("px_norm", "px"), ("py_norm", "py")];
 
 /// The file in the dataset's folder, if there is one, whatever its name.
 ///
@@ -152,13 +158,17 @@ pub(super) fn read(
     Ok(Scene { listing, frames, first_missing, points, points_file, notes, ..Scene::default() })
 }
 
-/// The names of the columns, in lower case.
+/// The names of the columns, in lower case; the older of two.
 struct Columns(Vec<String>);
 
 impl Columns {
     /// Those of a line that names them.
     fn of(line: &str) -> Option<Self> {
-        let name = |cell: String| cell.trim().trim_start_matches('#').to_ascii_lowercase();
+        let name = |cell: String| {
+            let name = cell.trim().trim_start_matches('#').to_ascii_lowercase();
+            let older = RENAMED.iter().find(|(newer, _)| *newer == name);
+            older.map_or(name, |(_, older)| (*older).to_owned())
+        };
         let names: Vec<String> = cells(line).into_iter().map(name).collect();
         NEEDED.iter().all(|needed| names.iter().any(|name| name == needed)).then_some(Self(names))
     }

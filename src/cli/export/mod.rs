@@ -43,8 +43,8 @@ pub(super) struct ExportArgs {
     /// Replace files that exist
     #[arg(long)]
     overwrite: bool,
-    /// Folder of the dataset whose held-out views to compare; every 8th photograph where neither the
-    /// dataset nor an option says which
+    /// Folder or ZIP archive of the dataset whose held-out views to compare; every 8th photograph where
+    /// neither the dataset nor an option says which
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]

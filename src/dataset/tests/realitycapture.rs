@@ -71,14 +71,28 @@ fn lengths_are_told_for_the_longer_side() {
     assert!((b.fx - 15.0).abs() < 1e-12);
 }
 
-/// As COLMAP's OPENCV has k1, k2 and p1, p2.
+/// RealityScan 2 has other names for the same columns.
+#[test]
+fn tables_of_realityscan_are_the_same() {
+    let (older, newer) = (Made::realitycapture(), Made::realitycapture());
+    newer.replace(TABLE, "heading", "yaw");
+    newer.replace(TABLE, ",f,px,py,", ",f_35mm,px_norm,py_norm,");
+    for made in [&older, &newer] {
+        made.replace(TABLE, ",27,0,0,", ",27,0.05,-0.1,");
+    }
+    for (a, b) in load(&older).train.iter().zip(&load(&newer).train) {
+        assert_eq!((&a.name, a.camera), (&b.name, b.camera));
+    }
+}
+
+/// As COLMAP's OPENCV has k1, k2 and p2, p1.
 #[test]
 fn distortion_is_that_of_other_formats() {
     let made = Made::realitycapture();
     let text = std::fs::read_to_string(made.file(TABLE)).unwrap();
     made.write(TABLE, text.replace(",27,0,0,0,0,0,0,0,0", ",27,0,0,0.02,-0.01,0,0,0.001,0.002"));
     let colmap = Made::colmap_txt();
-    let camera = "OPENCV 20 12 15 15 10 6 0.02 -0.01 0.001 0.002";
+    let camera = "OPENCV 20 12 15 15 10 6 0.02 -0.01 0.002 0.001";
     colmap.replace("sparse/0/cameras.txt", "PINHOLE 20 12 15 16 10 6", camera);
     for (a, b) in load(&colmap).train.iter().zip(&load(&made).train) {
         assert!(a.source.undistortion.is_some());

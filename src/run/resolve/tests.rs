@@ -8,6 +8,7 @@ use super::*;
 use crate::backend::gpu::adapters;
 use crate::dataset::tests::write::Made;
 use crate::knobs::{PRESETS, Preset};
+use crate::memory::Section;
 use crate::run::{ByteCount, Partial, Silent};
 
 /// A run of these options.
@@ -67,6 +68,54 @@ fn detailed_edits_are_counted_where_they_are_declared() {
     let [(plain, plain_plan), (detailed, detailed_plan)] = declared;
     assert!(plain_plan < detailed_plan);
     assert_eq!(detailed - plain, detailed_plan - plain_plan);
+}
+
+/// The lines of a small run's ledger, without what depends on what else this process has done; and its total.
+fn plain_ledger(made: &Made, exposure: &str) -> (Vec<(Section, String, u64)>, u64) {
+    let scene = made.path().to_str().expect("UTF-8");
+    let spec = described(&[
+        ("scene", scene.into()),
+        ("backend", "cpu".into()),
+        ("policy", "mcmc".into()),
+        ("budget", 1000.into()),
+        ("sh_degree", 1.into()),
+        ("iterations", 100.into()),
+        ("eval", true.into()),
+        ("exposure", exposure.into()),
+    ]);
+    let mut inputs = Inputs::load(&spec, None, &Silent).expect("a scene");
+    (inputs.resident, inputs.peak) = (None, None);
+    let setting = size::solve(&inputs).expect("it is solved").expect("it fits").setting;
+    let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows).expect("needs"));
+    let total = ledger.total();
+    (ledger.lines.into_iter().map(|line| (line.section, line.what, line.bytes)).collect(), total)
+}
+
+/// What a run takes that needs neither exposures nor masks nor lenses is a number: nothing that these need is
+/// paid for without them, not a byte of a view.
+#[cfg(all(unix, target_pointer_width = "64"))]
+#[test]
+fn what_is_not_used_of_photographs_takes_no_byte() {
+    let made = Made::colmap_txt();
+    let (plain, total) = plain_ledger(&made, "off");
+    assert_eq!(total, 0, "{plain:#?}");
+    let differing = |other: &[(Section, String, u64)]| {
+        let found = other.iter().filter(|line| !plain.contains(line));
+        found.map(|(_, what, _)| what.clone()).collect::<Vec<_>>()
+    };
+    // Too few tracks to decide.
+    let (auto, _) = plain_ledger(&made, "auto");
+    assert_eq!(differing(&auto), ["colours of tracks"]);
+    let (exposed, _) = plain_ledger(&made, "on");
+    assert_eq!(differing(&exposed), ["exposures of the views"]);
+    let folder = made.path().join("masks");
+    std::fs::create_dir(&folder).expect("a folder");
+    let mask = image::GrayImage::from_fn(20, 12, |x, _| [if x < 9 { 0 } else { 255 }].into());
+    for name in ["a.png", "b.png", "c.png"] {
+        mask.save(folder.join(name)).expect("a mask");
+    }
+    let (masked, _) = plain_ledger(&made, "off");
+    assert_eq!(differing(&masked), ["decoded training views"]);
 }
 
 proptest! {
