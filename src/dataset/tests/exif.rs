@@ -7,7 +7,7 @@ use ::exif::experimental::Writer;
 use ::exif::{Field, In, Rational, Tag, Value};
 
 use super::super::*;
-use super::write::{Made, SIZE};
+use super::write::{self, Made, NAMES, SIZE};
 
 /// The exposure of a photograph: seconds, f-number, sensitivity.
 type Settings = ((u32, u32), (u32, u32), u16);
@@ -156,8 +156,10 @@ fn on_its_side(made: &Made, orientation: Option<u16>) {
 
 #[test]
 fn a_photograph_that_lies_on_its_side_for_its_camera_is_turned() {
-    // By EXIF: 6 is a quarter clockwise, so the upper side comes to the right; 8 the other way.
-    for (orientation, left) in [(6, [0, 0, 255]), (8, [255, 0, 0])] {
+    // By EXIF: 6 is a quarter clockwise, so the upper side comes to the right; 8 the other way; 5 and 7 are
+    // mirrored, too.
+    let (upper, lower) = ([255, 0, 0], [0, 0, 255]);
+    for (orientation, left) in [(6, lower), (8, upper), (5, upper), (7, lower)] {
         let made = Made::colmap_txt();
         on_its_side(&made, Some(orientation));
         let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
@@ -196,6 +198,15 @@ fn a_photograph_that_fits_its_camera_is_not_turned() {
         say(&made.file("images/b.png"), turned(orientation));
         assert!(bytes(&made) == bytes(&plain), "{orientation}");
     }
+    // Nor of a square one, which fits either way.
+    let made = Made::colmap_txt();
+    made.replace("sparse/0/cameras.txt", "PINHOLE 20 12 15 16 10 6", "PINHOLE 12 12 15 16 6 6");
+    for name in NAMES {
+        write::image(&made.file(&format!("images/{name}")), (12, 12), 9);
+    }
+    say(&made.file("images/b.png"), turned(6));
+    let data = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
+    assert_eq!(data.train[1].source.header.turn, None);
     // One that neither fits nor says how to turn it is refused.
     for orientation in [None, Some(1), Some(3), Some(77)] {
         let made = Made::colmap_txt();

@@ -64,7 +64,7 @@ fn exports_of_apps_are_the_same_scene() {
             json["is_fisheye"] = false.into();
             json["aabb_scale"] = 16.into();
         }),
-        // Scaniverse: spaces and brackets in names, distortion that is there and 0.
+        // Spaces and brackets in names, distortion that is there and 0.
         exported(
             ["images/IMG 0001 (1).png", "images/IMG 0002 (1).png", "images/IMG 0003 (1).png"],
             "My points.ply",
@@ -75,7 +75,7 @@ fn exports_of_apps_are_the_same_scene() {
                 }
             },
         ),
-        // KIRI: names of other scripts, fields that are null.
+        // Names of other scripts, fields that are null.
         exported(
             ["images/厨房 01.png", "images/厨房 02.png", "images/厨房 03 – Süd.png"],
             "点云.ply",
