@@ -67,31 +67,39 @@ fn an_archive_is_trained_on_as_its_folder() {
     assert!(!none.exists());
 }
 
-/// PSNR of the test views of `spheres`, written with these options and trained for a moment. At half size, where
-/// what resampling blurs does not count.
-fn score(root: &Path, name: &str, options: &str) -> f64 {
-    let [folder, run] = ["scene", "run"].map(|what| root.join(format!("{what}-{name}")));
+/// PSNR of the test views of `spheres`, written with these options and trained for a moment.
+fn score(root: &Path, name: &str, options: &str, seed: u32) -> f64 {
+    let [folder, run] = ["scene", "run"].map(|what| root.join(format!("{what}-{name}-{seed}")));
     let words =
-        "scenegen --preset spheres --size 128 --train 20 --test 6 --points 1000 --samples 1";
-    call(&format!("{words} -o {} {options}", text(&folder))).ok();
+        "scenegen --preset spheres --size 128 --train 20 --test 6 --points 1000 --samples 3";
+    call(&format!("{words} --seed {seed} -o {} {options}", text(&folder))).ok();
     if name == "seen" {
         std::fs::remove_dir_all(folder.join("masks")).expect("masks");
     }
-    train(&folder, &run, 300, "--eval --backend cpu --budget 1500 -r 2").ok();
-    json(&run.join("results.json"))["ours_300"]["PSNR"].as_f64().expect("a score")
+    let flags = format!("--eval --backend cpu --budget 3k --seed {seed}");
+    train(&folder, &run, 1000, &flags).ok();
+    json(&run.join("results.json"))["ours_1000"]["PSNR"].as_f64().expect("a score")
 }
 
-/// Against the true test views, which are of a pinhole and show nobody.
+/// Against the true test views, which are of a pinhole and show nobody. Two runs on the same scene differ by
+/// 0.2 dB of themselves, so three pairs count. Measured: -0.1 dB with a lens (docs/data.md), but -0.5 dB where its
+/// photographs are resampled bilinearly; 0.0 dB with masks. 0.3 dB are promised; 0.1 dB more is for machines
+/// that round otherwise.
 #[test]
-#[ignore = "takes ten seconds: run by .ci/run"]
+#[ignore = "takes a minute: run by .ci/run"]
 fn lenses_and_masked_passers_by_cost_hardly_anything() {
+    const PAIRS: u32 = 3;
+    const MOST: f64 = 0.3 + 0.1;
     let (root, _) = scratch();
-    let score = |name: &str, options: &str| score(root.path(), name, options);
-    let plain = score("plain", "");
-    let bent = score("bent", "--lens fisheye:0.02,-0.005");
-    let masked = score("masked", "--passers-by 0.3");
-    let seen = score("seen", "--passers-by 1");
+    let score = |name: &str, options: &str, seed| score(root.path(), name, options, seed);
+    let mean = |name: &str, options: &str| {
+        (0..PAIRS).map(|seed| score(name, options, seed)).sum::<f64>() / f64::from(PAIRS)
+    };
+    let plain = mean("plain", "");
+    let bent = mean("bent", "--lens fisheye:0.02,-0.005");
+    let masked = mean("masked", "--passers-by 0.3");
+    let seen = score("seen", "--passers-by 0.3", 0);
     let all = format!("{plain:.2}, fisheye {bent:.2}, masked {masked:.2}, not masked {seen:.2}");
-    assert!(plain - bent < 0.3 && plain - masked < 0.3, "{all}");
-    assert!(plain - seen > 0.4, "without masks nothing is lost: {all}");
+    assert!((bent - plain).abs() < MOST && (masked - plain).abs() < MOST, "{all}");
+    assert!(plain - seen > 0.6, "without masks nothing is lost: {all}");
 }
