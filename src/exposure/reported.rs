@@ -4,12 +4,14 @@
 //! camera or a program did to the picture afterwards. So EXIF stands in for tracks where these say nothing of a
 //! photograph, and is not believed where the two contradict each other.
 
-use super::evidence::{MIN_STOPS, STOPS};
+use super::evidence::STOPS;
 
 /// Fewest photographs of which both must be known to compare them.
 const MIN_COMPARED: usize = 3;
 /// Largest difference between the two, as a share of the larger spread.
 const MOST_APART: f64 = 0.5;
+/// A difference that is believed however small the spread `[stops]`.
+const NO_CONTRADICTION: f64 = 0.3;
 
 /// What became of the exposures that are reported.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,7 +48,7 @@ pub fn complete(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f64>]) -
         if both.len() < MIN_COMPARED {
             return Believed::Nothing;
         }
-        if apart > MIN_STOPS.max(MOST_APART * tracks.max(exif)) {
+        if apart > NO_CONTRADICTION.max(MOST_APART * tracks.max(exif)) {
             return Believed::Contradicted { by: apart };
         }
         mean(both.iter().map(|(tracks, exif)| exif - tracks))
@@ -146,5 +148,11 @@ mod tests {
         let stops = [Some(1.0), Some(3.0), Some(5.0), Some(9.0)];
         assert!(matches!(complete(&mut alike, &known, &stops), Believed::Contradicted { .. }));
         assert_eq!(alike, [[1.0; 3]; 4]);
+        // Spreads of 0.35 and of 0.24 stops.
+        for (apart, expected) in [(0.43, true), (0.3, false)] {
+            let stops = [Some(5.0 - apart), Some(5.0), Some(5.0 + apart), Some(5.0)];
+            let found = complete(&mut alike.clone(), &known, &stops);
+            assert_eq!(matches!(found, Believed::Contradicted { .. }), expected, "{found:?}");
+        }
     }
 }
