@@ -94,12 +94,13 @@ pub(super) fn rows(
         Target::Rows(rows) => return Ok(Some(rows.min(model.len()))),
         Target::Bytes(most) => most,
     };
-    let size = bytes(format, model)?;
+    let mut rows = model.len();
+    let mut size = bytes(format, model)?;
     if size <= most {
-        return Ok(Some(model.len()));
+        return Ok(Some(rows));
     }
     // Files need not grow evenly with their rows, so each estimate stays between what fits and what does not.
-    let (mut fits, mut over, mut rows, mut size) = (0, model.len(), model.len(), size);
+    let (mut fits, mut over) = (0, rows);
     for _ in 0..ESTIMATES {
         let next = (rows as f64 * (FILLED * most as f64 / size as f64)) as usize;
         rows = if fits < next && next < over { next } else { fits.midpoint(over) }.max(1);

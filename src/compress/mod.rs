@@ -113,10 +113,10 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let mut attempts: Vec<Attempt> = Vec::new();
     let mut best: Option<(usize, &Format, Gaussians)> = None;
     for degree in degrees(search.model.sh_degree, options.to) {
-        let start = colour::reduced(search.model.clone(), degree);
-        let packings = fit::packings(options, &start, degree == search.model.sh_degree)?;
+        let with_smaller = degree == search.model.sh_degree;
+        let packings = fit::packings(options, &search.start(degree), with_smaller)?;
         for &(format, rows) in &packings {
-            let made = search.attempt(start.clone(), (format, rows), degree)?;
+            let made = search.attempt((format, rows), degree)?;
             let Some((attempt, small)) = made else { continue };
             let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
             attempts.push(attempt);
@@ -147,19 +147,25 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
+    /// The model with at most this degree: made anew for each attempt, so that it is not held while one is trained.
+    fn start(&self, degree: u8) -> Gaussians {
+        colour::reduced(self.model.clone(), degree)
+    }
+
     /// Whether so many rows of this degree are all of the model.
     fn is_whole(&self, rows: usize, degree: u8) -> bool {
         rows == self.model.len() && degree == self.model.sh_degree
     }
 
-    /// About so many rows of a model, trained on, and what its file shows; `None` where no row fits.
+    /// About so many rows of the model with this degree, trained on, and what its file shows; `None` where no row
+    /// fits.
     fn attempt(
         &self,
-        start: Gaussians,
         (format, rows): (&Format, usize),
         degree: u8,
     ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
         let Self { options, observer, judge, scratch, .. } = self;
+        let start = self.start(degree);
         // Where all of it fits, training has nothing to mend.
         let tuned = if self.is_whole(rows, degree) {
             start

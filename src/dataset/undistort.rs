@@ -5,6 +5,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::lens::Lens;
 use super::pixels::Image8;
 use super::resample::PixelMean;
+use crate::flight::catmull_rom;
 
 /// A camera's image without distortion. The upper left corner is (0, 0); pixel centres are at +0.5.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,12 +97,12 @@ impl Undistortion {
                     let at = (at - 0.5).clamp(DVec2::ZERO, last);
                     let [columns, rows] =
                         [Stencil::of(at.x, image.width), Stencil::of(at.y, image.height)];
-                    let hides = |(x, y): (u32, u32)| {
-                        let pixel = y as usize * image.width as usize + x as usize;
-                        image.mask.as_ref().is_some_and(|mask| mask[pixel] < 255)
+                    let hides = |mask: &Vec<u8>| {
+                        let row = |y: u32| y as usize * image.width as usize;
+                        let hidden = |x: u32, y: u32| mask[row(y) + x as usize] < 255;
+                        rows.places.iter().any(|&y| columns.places.iter().any(|&x| hidden(x, y)))
                     };
-                    let places = rows.places.iter().flat_map(|&y| columns.places.map(|x| (x, y)));
-                    let weights = match image.mask.is_some() && places.clone().any(hides) {
+                    let weights = match image.mask.as_ref().is_some_and(hides) {
                         true => [columns.linear(), rows.linear()],
                         false => [columns.cubic(), rows.cubic()],
                     };
@@ -139,15 +140,8 @@ impl Stencil {
         [0.0, 1.0 - self.t, self.t, 0.0]
     }
 
-    /// Through the second and the third, with the slopes between their neighbours (Catmull and Rom 1974).
     fn cubic(&self) -> [f32; 4] {
-        let t = self.t;
-        [
-            0.5 * t * (t * (2.0 - t) - 1.0),
-            0.5 * t * t * (3.0 * t - 5.0) + 1.0,
-            0.5 * t * (t * (4.0 - 3.0 * t) + 1.0),
-            0.5 * t * t * (t - 1.0),
-        ]
+        catmull_rom(f64::from(self.t)).map(|weight| weight as f32)
     }
 }
 

@@ -85,8 +85,8 @@ impl Flight {
     }
 }
 
-/// Weights of four values at t in `[0, 1]` between the second and the third.
-fn catmull_rom(t: f64) -> [f64; 4] {
+/// Weights of four values at t in `[0, 1]` between the second and the third (Catmull and Rom 1974).
+pub(crate) fn catmull_rom(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [
         0.5 * (2.0 * t2 - t - t3),

@@ -36,8 +36,15 @@ for (let i = 0; i < data.length; i += 4) {
 const mean = light.reduce((a, b) => a + b) / light.length;
 return { spread: Math.sqrt(light.reduce((a, b) => a + (b - mean) ** 2, 0) / light.length), light: light.join(), colours: colours.size };
 """
+# Between the bytes of two pictures of one size.
+DECIBELS = """
+const decibels = (a, b) => {
+  const sum = a.reduce((sum, x, i) => sum + (x - b[i]) ** 2, 0);
+  return 10 * Math.log10(255 ** 2 / Math.max(sum / (a.length * 3 / 4), 1e-9));
+};
+"""
 # Decibels between the right one of two pictures and a PNG, of one size.
-PSNR = """
+PSNR = DECIBELS + """
 const done = arguments[arguments.length - 1], image = new Image();
 image.onload = () => {
   const { bitmap } = shown[1];
@@ -47,22 +54,19 @@ image.onload = () => {
     canvas.getContext("2d").drawImage(it, 0, 0);
     return canvas.getContext("2d").getImageData(0, 0, it.width, it.height).data;
   });
-  if (a.length !== b.length) return done(0);
-  const sum = a.reduce((sum, x, i) => sum + (x - b[i]) ** 2, 0);
-  done(10 * Math.log10(255 ** 2 / Math.max(sum / (a.length * 3 / 4), 1e-9)));
+  done(a.length === b.length ? decibels(a, b) : 0);
 };
 image.src = arguments[0];
 """
 # Decibels between the middle of the stage now and at the last call.
-MIDDLE = """
+MIDDLE = DECIBELS + """
 const { width, height } = picture, side = Math.round(height / 3);
 const copy = document.createElement("canvas"), out = copy.getContext("2d", { willReadFrequently: true });
 [copy.width, copy.height] = [side, side];
 out.drawImage(picture, Math.round((side - width) / 2), Math.round((side - height) / 2));
 const { data } = out.getImageData(0, 0, side, side), before = window.middle ?? data;
 window.middle = data;
-const sum = data.reduce((sum, x, i) => sum + (x - before[i]) ** 2, 0);
-return 10 * Math.log10(255 ** 2 / Math.max(sum / (data.length * 3 / 4), 1e-9));
+return decibels(data, before);
 """
 # Pixels of the marks over the picture.
 MARKED = """
