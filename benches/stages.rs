@@ -1,6 +1,6 @@
 //! Measures the time per training step and per stage on random scenes.
 //!
-//! Runs on one and on two threads, and on every adapter with each of its methods to add up gradients
+//! Runs on one, on two and on all threads, and on every adapter with each of its methods to add up gradients
 //! (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`, such as
 //! `10000@256` for one scene; `avx2` is for machines that have more. Times are medians: processor time,
 //! which a loaded machine distorts little, wall time, and the wall time of each stage.
@@ -113,18 +113,23 @@ fn main() {
     let avx2 = std::env::args().any(|arg| arg == "avx2");
     let instructions = if avx2 { InstructionSet::Avx2 } else { InstructionSet::Best };
     let usable = adapters().into_iter().filter(|a| a.missing.is_empty());
-    let mut devices: Vec<GpuDevice> = Vec::new();
+    let mut devices: Vec<(GpuDevice, &str)> = Vec::new();
     for adapter in usable {
         for method in adapter.accumulations {
-            let name = Some(adapter.name.clone());
-            devices
-                .extend(GpuDevice::open(&AdapterChoice { name, accumulation: Some(method) }).ok());
+            let choice =
+                AdapterChoice { name: Some(adapter.name.clone()), accumulation: Some(method) };
+            devices.extend(GpuDevice::open(&choice).map(|device| (device, "")).ok());
+            let timed = GpuDevice::open_with_clock(&choice).ok();
+            devices.extend(timed.map(|device| (device, ", stage by stage, which takes longer")));
         }
     }
-    for (i, device) in devices.iter().enumerate() {
+    for (i, (device, what)) in devices.iter().enumerate() {
         let (adapter, method) = (device.adapter(), device.accumulation());
-        println!("adapter {i}: {}, {}, accumulation={method}", adapter.name, adapter.driver);
+        println!("adapter {i}: {}, {}, accumulation={method}{what}", adapter.name, adapter.driver);
     }
+    let all = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    let mut numbers_of_threads = vec![1, 2, all];
+    numbers_of_threads.dedup();
     println!("   rows  image   entries         on  CPU ms  wall ms  stages [ms]");
     for (rows, size) in [
         (10_000, 256),
@@ -138,7 +143,7 @@ fn main() {
             continue;
         }
         let model = steps::scene(rows, 3);
-        for threads in [1, 2] {
+        for &threads in &numbers_of_threads {
             let options = Setup {
                 instructions,
                 threads: Some(threads),
@@ -147,10 +152,10 @@ fn main() {
                 ..Setup::new(rows)
             };
             let backend = CpuBackend::new(&model, &options);
-            let on = if threads == 1 { "1 thread" } else { "2 threads" };
-            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, on);
+            let on = if threads == 1 { "1 thread".into() } else { format!("{threads} threads") };
+            measure(backend.map(|b| Box::new(b) as Box<dyn Backend>), rows, size, &on);
         }
-        for (i, device) in devices.iter().enumerate() {
+        for (i, (device, _)) in devices.iter().enumerate() {
             if device.adapter().kind == AdapterKind::Software && rows > 50_000 {
                 continue;
             }

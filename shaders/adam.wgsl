@@ -1,7 +1,7 @@
-// Stage 7: Adam, with the bias correction of each row's own age; src/backend/cpu/adam.rs. One row
-// per invocation. Bands of colour come first, each buffer by itself: their gradient is the basis at
-// the direction of view times dL/dcolour, formed here and never stored. The geometry comes last, and
-// with it what a policy adds: terms of the loss, and noise on the means (regularise.rs); gradients
+// Stage 7: Adam, with the bias correction of each row's own age; src/backend/cpu/adam.rs. Bands of
+// colour come first, each buffer by itself, one parameter per invocation, so that neighbours read
+// neighbours: their gradient is the basis at the direction of view times dL/dcolour, formed here and
+// never stored. The geometry comes last, one row per invocation, and with it what a policy adds: terms of the loss, and noise on the means (regularise.rs); gradients
 // are summed over views where the optimiser steps less often than every iteration (summed.rs).
 
 @group(0) @binding(1) var<storage, read> state: State;
@@ -93,11 +93,16 @@ fn adam_band(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let row = group_of(id) * GROUP + lane;
+    let at = group_of(id) * GROUP + lane;
+    let width = 3u * now.b;
+    let row = at / width;
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
     let own = row - frame.frozen.x;
+    let own_at = at - frame.frozen.x * width;
+    let k = (at - row * width) / 3u;
+    let channel = (at - row * width) % 3u;
     let is_rest = now.a > 0u;
     let steps = is_set(select(MAIN_STEPS, REST_STEPS, is_rest));
     let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
@@ -105,18 +110,11 @@ fn adam_band(
     let apart = is_rest && is_set(REST_AGES);
     let age = grown(select(ages[own] & 0xffffu, ages[own] >> 16u, apart));
     let correction = bias[min(age, MATURE)];
-    let by_colour = gradient[5u * own + 3u].xyz;
     let d = gradient[5u * own + 4u].xyz;
-    for (var k = 0u; k < now.b; k++) {
-        let g = basis_of(now.a + k, d) * by_colour;
-        let at = 3u * (row * now.b + k);
-        let own_at = 3u * (own * now.b + k);
-        for (var channel = 0u; channel < 3u; channel++) {
-            let sum = exchange(own_at + channel, g[channel], steps, waited);
-            if steps {
-                step(at + channel, own_at + channel, sum, rate, correction);
-            }
-        }
+    let g = basis_of(now.a + k, d) * gradient[5u * own + 3u][channel];
+    let sum = exchange(own_at, g, steps, waited);
+    if steps {
+        step(at, own_at, sum, rate, correction);
     }
 }
 

@@ -217,6 +217,18 @@ impl Device {
         }
     }
 
+    /// Has a GPU's driver compile what a backend with these needs runs, and shows that it computes soundly: what it
+    /// takes of the process, a promise must know.
+    ///
+    /// # Errors
+    /// When it does not.
+    pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
+        match self {
+            Self::Processor => Ok(()),
+            Self::Gpu(device) => device.prove(needs),
+        }
+    }
+
     /// A backend that holds the model.
     ///
     /// # Errors

@@ -15,7 +15,7 @@ use crate::number::grouped;
 /// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; how
 /// much memory there is in all, drivers do not say. `WGPU_BACKEND` (vulkan, metal, dx12) and, for
 /// Vulkan, `VK_DRIVER_FILES` decide which drivers are asked. Accumulation is how gradients are added up:
-/// slots repeat, cas and atomics are faster (`train --knob accumulation=NAME`, `train --deterministic`).
+/// slots repeat, atomics and cas are faster (`train --knob accumulation=NAME`, `train --deterministic`).
 #[derive(Debug, Args)]
 pub(super) struct DevicesArgs {}
 

@@ -234,7 +234,7 @@ mod tests {
         for (features, expected) in [
             (Features::empty(), Slots),
             (subgroups, SubgroupCas),
-            (both, SubgroupAtomics),
+            (both, SubgroupCas),
             // Sums over tiles want subgroups, too.
             (Features::SHADER_FLOAT32_ATOMIC, Slots),
         ] {

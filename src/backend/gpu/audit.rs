@@ -14,7 +14,7 @@ impl GpuBackend {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         encoder.clear_buffer(self.buffers.get("sums"), 0, Some(bytes.next_multiple_of(16)));
         let pass = encoder.begin_compute_pass(&Default::default());
-        let mut to = Recorder { pass };
+        let mut to = Recorder::new(pass);
         for Audit { launch, first_row, numbers, place } in &self.launches.audits {
             let groups = rows.saturating_sub(*first_row).div_ceil(256);
             to.run(launch, [rows, *numbers, *place, *first_row], groups);

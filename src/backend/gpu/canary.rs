@@ -104,9 +104,19 @@ impl GpuBackend {
         options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        let records = RecordLayout::new(options.needs.signals);
-        device.0.prove(records, || check(device, &options.needs))?;
+        device.prove(&options.needs)?;
         Self::without_canary(model, options, device)
+    }
+}
+
+impl GpuDevice {
+    /// Has the device show, once, that it computes what the native backend does with the kernels that these
+    /// needs take. Afterwards the process holds what its driver takes.
+    ///
+    /// # Errors
+    /// As [`GpuBackend::new`].
+    pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
+        self.0.prove(RecordLayout::new(needs.signals), || check(self, needs))
     }
 }
 

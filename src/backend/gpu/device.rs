@@ -9,6 +9,7 @@ use densify_policies::policy::Needs;
 use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::adapter::{choose, enumerate};
+use super::clock::{self, Clock};
 use super::pipelines::{Pipelines, Variant};
 use super::{GpuBackend, promise};
 use crate::backend::signals::RecordLayout;
@@ -36,7 +37,16 @@ impl GpuDevice {
     /// [`BackendError::NoAdapter`] with the adapters found and what they lack, in general or for the
     /// requested accumulation.
     pub fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
-        Ok(Self(Arc::new(Device::open(choice)?)))
+        Ok(Self(Arc::new(Device::open(choice, Features::empty())?)))
+    }
+
+    /// Opens an adapter to measure how long each stage of a step takes on it, which makes steps slower:
+    /// [`stage_times`](crate::backend::Backend::stage_times) then tells the stages apart.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open), and where the adapter has no clock.
+    pub fn open_with_clock(choice: &AdapterChoice) -> Result<Self, BackendError> {
+        Ok(Self(Arc::new(Device::open(choice, clock::FEATURES)?)))
     }
 
     /// The adapter.
@@ -87,6 +97,8 @@ impl GpuDevice {
 pub(super) struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
+    /// For benchmarks.
+    pub(super) clock: Option<Clock>,
     pub(super) summary: AdapterSummary,
     pub(super) accumulation: Accumulation,
     reported: Arc<Mutex<Reported>>,
@@ -97,8 +109,8 @@ pub(super) struct Device {
 }
 
 impl Device {
-    /// Opens the adapter of choice with all of its limits.
-    pub(super) fn open(choice: &AdapterChoice) -> Result<Self, BackendError> {
+    /// Opens the adapter of choice with all of its limits, and with such features beside those that steps need.
+    pub(super) fn open(choice: &AdapterChoice, more: Features) -> Result<Self, BackendError> {
         let mut all = enumerate();
         let summaries: Vec<_> = all.iter().map(|(_, summary)| summary.clone()).collect();
         let (adapter, summary) = all.swap_remove(choose(&summaries, choice)?);
@@ -106,7 +118,7 @@ impl Device {
         let descriptor = DeviceDescriptor {
             label: Some("densify"),
             // No more than is used: what is asked for can change how a driver compiles.
-            required_features: Features::IMMEDIATES | accumulation.features(),
+            required_features: Features::IMMEDIATES | accumulation.features() | more,
             required_limits: adapter.limits(),
             // Buffers are few and made once: no pools beyond what the ledger says.
             memory_hints: MemoryHints::MemoryUsage,
@@ -123,9 +135,11 @@ impl Device {
         device.set_device_lost_callback(move |reason, message| {
             lock(&losses).lost.get_or_insert(format!("{reason:?}: {message}"));
         });
+        let clock = (!more.is_empty()).then(|| Clock::new(&device, &queue));
         Ok(Self {
             device,
             queue,
+            clock,
             summary,
             accumulation,
             reported,

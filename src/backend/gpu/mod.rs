@@ -14,6 +14,7 @@ mod adapter;
 mod audit;
 mod buffers;
 mod canary;
+mod clock;
 mod device;
 mod differentiate;
 mod edits;

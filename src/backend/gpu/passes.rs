@@ -4,6 +4,7 @@
 use densify_policies::policy::MaskTerm;
 use wgpu::ComputePass;
 
+use super::clock::Stages;
 use super::exposure::groups;
 use super::launches::{Launch, Launches};
 use super::sizes::BLOCK;
@@ -66,10 +67,26 @@ pub(super) struct Search {
 
 /// Encodes dispatches into one pass.
 pub(super) struct Recorder<'e> {
-    pub(super) pass: ComputePass<'e>,
+    pass: ComputePass<'e>,
+    pub(super) stages: Stages<'e>,
 }
 
-impl Recorder<'_> {
+impl<'e> Recorder<'e> {
+    pub(super) fn new(pass: ComputePass<'e>) -> Self {
+        Self { pass, stages: Stages::default() }
+    }
+
+    /// Encodes the beginning of a stage.
+    fn stage(&mut self, name: &'static str) {
+        self.stages.begin(&mut self.pass, name);
+    }
+
+    /// Ends the pass, and returns its stages, of which the last is the end.
+    pub(super) fn end(mut self) -> Vec<&'static str> {
+        self.stage("");
+        self.stages.names
+    }
+
     fn set(&mut self, launch: &Launch, now: [u32; 4]) {
         self.pass.set_pipeline(&launch.pipeline);
         self.pass.set_bind_group(0, &launch.bindings, &[]);
@@ -120,6 +137,7 @@ impl Passes<'_> {
     pub(super) fn forward(&self, to: &mut Recorder<'_>) {
         let l = self.launches;
         let Shape { rows, bands, .. } = self.shape;
+        to.stage("project");
         to.run(l.get("project"), [0; 4], rows.div_ceil(256));
         if l.counts_dominant {
             to.run(l.get("clear_dominant"), [0; 4], rows.div_ceil(256));
@@ -127,10 +145,12 @@ impl Passes<'_> {
         to.run(l.get("scan_blocks"), [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
         to.run(l.get("scan_sums"), [FLAGS, bands, 0, 0], 1);
         to.run(l.get("compact"), [0; 4], rows.div_ceil(256));
+        to.stage("sort by depth");
         for pass in 0..8 {
             let number = if pass == 7 { TO_ORDER } else { pass as usize % 2 };
             self.sort_digit(to, pass, 0, l.nth("scatter", number));
         }
+        to.stage("tiles");
         self.count(to, WHOLE, COUNTS_ALL);
         if bands > 1 {
             to.run_counted(l.get("count_tiles"), [0; 4], self.groups, args::ROWS);
@@ -138,6 +158,7 @@ impl Passes<'_> {
         }
         for band in 0..bands {
             self.lists(to, band, COUNTS_BAND);
+            to.stage("rasterize");
             to.run(l.nth("rasterize", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
         }
     }
@@ -157,6 +178,7 @@ impl Passes<'_> {
     /// The lists of a band. With one band its entries are counted already.
     fn lists(&self, to: &mut Recorder<'_>, band: u32, what: u32) {
         let l = self.launches;
+        to.stage("tiles");
         let several = self.shape.bands > 1;
         if several {
             self.count(to, band, what);
@@ -186,6 +208,7 @@ impl Passes<'_> {
     pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [f32; 2]) {
         let l = self.launches;
         let [a, b] = error_weights.map(f32::to_bits);
+        to.stage("loss");
         to.run(l.get("similarity"), [a, b, 0, 0], self.shape.tiles);
         to.run(l.get("pixel_gradient"), [0; 4], self.shape.tiles);
         to.run(l.get("total"), [0; 4], 1);
@@ -196,12 +219,14 @@ impl Passes<'_> {
         let l = self.launches;
         let Shape { rows, tiles, bands } = self.shape;
         let groups = rows.div_ceil(256);
+        to.stage("rasterize_bwd");
         if !l.in_slots {
             to.run(l.get("clear_sums"), [l.record, 0, 0, 0], groups);
         }
         for band in 0..bands {
             if bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
+                to.stage("rasterize_bwd");
             }
             to.run(l.nth("rasterize_bwd", self.sorted()), [band, 0, 0, 0], tiles);
             if l.in_slots {
@@ -212,6 +237,7 @@ impl Passes<'_> {
 
     /// Stage 6.
     pub(super) fn differentiate(&self, to: &mut Recorder<'_>) {
+        to.stage("project_bwd");
         to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
     }
 
@@ -234,9 +260,12 @@ impl Passes<'_> {
             let now = [start, rate, weight, logit(threshold)].map(f32::to_bits);
             to.run(l.get("step_masks"), now, groups);
         }
+        to.stage("adam");
         for band in 0..=usize::from(sh_degree) {
-            let now = [(band * band) as u32, (2 * band + 1) as u32, 0, 0];
-            to.run(l.nth("adam_band", band), now, groups);
+            let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
+            let numbers = self.shape.rows * 3 * coefficients;
+            let now = [first, coefficients, 0, 0];
+            to.run(l.nth("adam_band", band), now, numbers.div_ceil(256));
         }
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }

@@ -27,7 +27,10 @@ impl GpuBackend {
                 encoder.clear_buffer(self.buffers.get("tile counts"), 0, None);
             }
             let pass = encoder.begin_compute_pass(&Default::default());
-            encode(&passes, &mut Recorder { pass });
+            let mut to = Recorder::new(pass);
+            to.stages.clock = self.device.clock.as_ref();
+            encode(&passes, &mut to);
+            let stages = to.end();
             let staging = self.buffers.get("read");
             let of_state = size_of::<State>() as u64;
             encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, of_state);
@@ -46,6 +49,10 @@ impl GpuBackend {
                 return Err(self.broken_off());
             }
             if state.short == 0 {
+                self.laps = match &self.device.clock {
+                    Some(clock) => clock.laps(&self.device, &stages)?,
+                    None => Vec::new(),
+                };
                 self.bands = state.bands.max(1);
                 return Ok((state, shape));
             }
@@ -67,7 +74,7 @@ impl GpuBackend {
     pub(super) fn submit(&self, encode: impl FnOnce(&mut Recorder<'_>)) {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&mut Recorder { pass });
+        encode(&mut Recorder::new(pass));
         self.device.queue.submit([encoder.finish()]);
     }
 

@@ -72,7 +72,7 @@ pub(super) struct Inputs<'a> {
     pub(super) frozen: Option<ModelSize>,
     /// Rows that a start on the dataset's points would have, were there no limit.
     usable: usize,
-    /// Resident memory when the dataset was loaded, and the most until then.
+    /// Resident memory with the dataset and a device's driver, and the most before that had its kernels.
     resident: Option<u64>,
     peak: Option<u64>,
 }
@@ -135,7 +135,7 @@ impl<'a> Inputs<'a> {
             rows: spec.size.budget.is_some_and(Budget::is_auto),
             scored_views: !spec.size.full,
         };
-        Ok(Self {
+        let mut inputs = Self {
             spec,
             entry,
             parameters,
@@ -152,7 +152,17 @@ impl<'a> Inputs<'a> {
             usable,
             resident,
             peak,
-        })
+        };
+        let driver = inputs.driver_bytes()?;
+        inputs.resident = inputs.resident.map(|bytes| bytes + driver);
+        Ok(inputs)
+    }
+
+    /// What a device's driver takes of the process for its kernels.
+    fn driver_bytes(&self) -> Result<u64, Failure> {
+        let before = resident().unwrap_or(0);
+        self.device.prove(&self.needs(1)?)?;
+        Ok(resident().unwrap_or(0).saturating_sub(before))
     }
 
     /// The same scene on the same device, with other options of size, policy, knobs or resolution.

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use toml::Table;
 
-use super::{Outcome, call, count, gaussians, json, read, read_text, scratch, text};
+use super::{Outcome, WITHOUT_GPU, call, count, gaussians, json, read, read_text, scratch, text};
 use crate::photographs::{Photographs, VIEWS};
 
 /// Two blocks of a small scene.
@@ -118,7 +118,8 @@ fn schedulers_are_handed_what_makes_the_same_model() {
     let submit = |flags: &str, path: &str| {
         let mut command = assert_cmd::Command::new(env!("CARGO_BIN_EXE_densify"));
         let words = ["blocks", "submit", text(&folder)].into_iter().chain(flags.split_whitespace());
-        let output = command.args(words).env("PATH", path).output().expect("it starts");
+        let command = command.args(words).envs([WITHOUT_GPU]);
+        let output = command.env("PATH", path).output().expect("it starts");
         let text = |bytes| String::from_utf8(bytes).expect("messages are UTF-8");
         Outcome {
             code: output.status.code(),
@@ -159,7 +160,8 @@ fn schedulers_are_handed_what_makes_the_same_model() {
     assert!(array.contains("#SBATCH --array=0,1\n") && array.contains("#SBATCH --requeue\n"));
     for (name, place) in [("coarse", ""), ("blocks", "1"), ("blocks", "0"), ("merge", "")] {
         let mut bash = assert_cmd::Command::new("bash");
-        let done = bash.arg(script(name)).env("SLURM_ARRAY_TASK_ID", place).output().unwrap();
+        let bash = bash.arg(script(name)).envs([WITHOUT_GPU]);
+        let done = bash.env("SLURM_ARRAY_TASK_ID", place).output().unwrap();
         assert!(done.status.success(), "{name} {place}: {done:?}");
     }
     assert!(read(&folder.join("merged.ply")) == read(&local.join("merged.ply")));
@@ -199,14 +201,18 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     plan("--rows 400").refused("auto needs memory", &["--memory"]);
     plan("--blocks 2").refused("no size", &["--rows"]);
     plan("--rows 400 --blocks 0").refused("no block", &["--blocks", "3x2"]);
-    plan("--rows 1M --memory 64MiB -- -i 20").refused("too large for any", &["--memory", "fits"]);
+    plan("--rows 1M --memory 64MiB -- -i 20 --backend cpu --threads 2")
+        .refused("too large for any", &["--memory", "fits"]);
     let left: Vec<_> = std::fs::read_dir(root.path()).unwrap().collect();
     assert!(left.is_empty(), "{left:?}");
 
     // Few enough blocks for a memory are found; the coarse run leaves them room.
     let most = 96 << 20;
-    let bounded =
-        plan_of(scene.path(), &folder, "--rows 100k --memory 96MiB -- -i 20 --backend cpu");
+    let bounded = plan_of(
+        scene.path(),
+        &folder,
+        "--rows 100k --memory 96MiB -- -i 20 --backend cpu --threads 2",
+    );
     let listed = bounded["block"].as_array().expect("a list of blocks");
     assert!(listed.len() >= 2, "{bounded}");
     for block in listed {

@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
-use super::{call, files, model, read, records, resume, scratch, text, train};
+use super::{WITHOUT_GPU, call, files, model, read, records, resume, scratch, text, train};
 use crate::photographs::Photographs;
 
 /// Kills where the environment does not say.
@@ -70,6 +70,7 @@ fn is_writing(folder: &Path) -> bool {
 fn spawn(words: &str) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
     command.args(words.split_whitespace()).env_remove("RUST_LOG");
+    command.envs([WITHOUT_GPU]);
     command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("it starts")
 }
 

@@ -6,8 +6,8 @@ use std::path::Path;
 use densify_policies::registry::{find, policies};
 
 use super::{
-    Outcome, call, config, copy_unfinished, count, densify, files, json, model, often, records,
-    scratch, text,
+    Outcome, WITHOUT_GPU, call, config, copy_unfinished, count, densify, files, json, model, often,
+    records, scratch, text,
 };
 use crate::photographs::Photographs;
 
@@ -338,8 +338,9 @@ fn limited(limit: usize, flags: &str) -> (Option<i32>, String, bool) {
         text(scene.path()),
         text(&run)
     );
-    let outcome = std::process::Command::new("sh").args(["-c", &call]).output();
-    let outcome = outcome.expect("a shell");
+    let mut shell = std::process::Command::new("sh");
+    shell.envs((!flags.contains("--gpu")).then_some(WITHOUT_GPU));
+    let outcome = shell.args(["-c", &call]).output().expect("a shell");
     let said = String::from_utf8_lossy(&outcome.stderr).into_owned();
     (outcome.status.code(), said, !files(root.path()).is_empty())
 }

@@ -76,7 +76,24 @@ fn densify(arguments: &[&str]) -> Outcome {
     command.args(arguments).env_remove("RUST_LOG").env("NODEVICE_SELECT", "1");
     // The user's cache is left alone; built-in scenes are rendered once for all tests.
     command.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+    if !names_an_adapter(arguments) {
+        command.envs([WITHOUT_GPU]);
+    }
     outcome_of(command)
+}
+
+/// The variable with which `--backend auto` finds no GPU: what a test says of a run that names none holds on the
+/// processor, which repeats to the byte and whose memory is all the process's.
+const WITHOUT_GPU: (&str, &str) = ("WGPU_BACKEND", "noop");
+
+/// Whether a call, or the run that it goes on with, names an adapter, or asks for all.
+fn names_an_adapter(arguments: &[&str]) -> bool {
+    let names_one = |run: &&str| {
+        let config = std::fs::read_to_string(Path::new(run).join("config.toml"));
+        config.is_ok_and(|text| text.lines().any(|line| line.starts_with("gpu = ")))
+    };
+    arguments.iter().any(|word| ["--gpu", "devices", "selftest"].contains(word))
+        || arguments.iter().any(names_one)
 }
 
 fn outcome_of(mut command: Command) -> Outcome {

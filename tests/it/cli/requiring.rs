@@ -77,7 +77,7 @@ fn the_degree_of_a_built_in_scene_is_that_of_its_files() {
     let (_root, folder) = scratch();
     call(&format!("scenegen --preset spheres -o {}", text(&folder))).ok();
     let planned = |flags: &str, start: &str| {
-        let outcome = call(&format!("plan --backend cpu {flags}")).ok();
+        let outcome = call(&format!("plan --backend cpu --threads 2 {flags}")).ok();
         let line = outcome.stdout.lines().find(|line| line.starts_with(start));
         line.unwrap_or_else(|| panic!("{}", outcome.stdout)).to_owned()
     };

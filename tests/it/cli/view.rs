@@ -9,7 +9,7 @@ use std::time::Duration;
 use image::RgbImage;
 use serde_json::{Value, json};
 
-use super::{call, json, scratch, text, train};
+use super::{WITHOUT_GPU, call, json, scratch, text, train};
 use crate::photographs::{Photographs, SIZE};
 
 /// A page that is being served.
@@ -58,6 +58,7 @@ impl Page {
     /// The page of a command.
     pub(super) fn of(command: &str) -> Self {
         let mut program = Command::new(env!("CARGO_BIN_EXE_densify"))
+            .envs([WITHOUT_GPU])
             .args(command.split_whitespace())
             .env_remove("RUST_LOG")
             .env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"))
