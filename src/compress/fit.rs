@@ -55,14 +55,19 @@ pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Fail
     }
 }
 
+/// How many rows of a model, as it is, make a file of the target.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Packing {
+    pub(super) format: &'static Format,
+    pub(super) rows: usize,
+    /// Whether they are all, as accurate as the format usually has them.
+    pub(super) is_whole: bool,
+}
+
 /// In which formats to try this model, and how many of its rows, as it is, then make a file of the target: the format
-/// that holds most, the first of equals, and `with_smaller` its smaller forms that hold more. None where not even one
-/// row fits.
-pub(super) fn packings(
-    options: &Options<'_>,
-    model: &Gaussians,
-    with_smaller: bool,
-) -> Result<Vec<(&'static Format, usize)>, Failure> {
+/// that holds most, the first of equals; where it has several forms all that hold at least half as many as the one
+/// that holds most. None where not even one row fits.
+pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<Packing>, Failure> {
     let mut best = None;
     for &format in options.formats {
         let most = best.map_or(0, |(_, rows)| rows);
@@ -71,16 +76,25 @@ pub(super) fn packings(
             _ => {}
         }
     }
-    let Some((format, mut most)) = best else { return Ok(Vec::new()) };
-    let mut found = vec![(format, most)];
-    let smaller = if with_smaller { (format.writer)().smaller() } else { &[] };
-    for format in smaller {
-        let Some(rows) = rows(options.to, format, model)?.filter(|&rows| rows > most) else {
-            break;
-        };
-        most = rows;
-        found.push((format, rows));
+    let Some((format, rows)) = best else { return Ok(Vec::new()) };
+    let as_it_is = Packing { format, rows, is_whole: rows == model.len() };
+    let forms = (format.writer)().forms();
+    // Without bands above 0 all forms are the same.
+    let has_one = forms.is_empty() || model.sh_degree == 0;
+    if as_it_is.is_whole || has_one || matches!(options.to, Target::Rows(_)) {
+        return Ok(vec![as_it_is]);
     }
+    let mut found: Vec<Packing> = Vec::new();
+    for format in forms {
+        let Some(rows) = self::rows(options.to, format, model)? else { continue };
+        found.push(Packing { format, rows, is_whole: false });
+        if rows == model.len() {
+            break;
+        }
+    }
+    // Rows show more than the accuracy of their colour.
+    let most = found.iter().map(|packing| packing.rows).max().unwrap_or(0);
+    found.retain(|packing| 2 * packing.rows >= most);
     Ok(found)
 }
 

@@ -22,6 +22,7 @@ use crate::number::grouped;
 use crate::output::{OutputError, write_atomically};
 use crate::run::finished::read_model;
 use crate::run::{DataSpec, DeviceSpec, Fraction, Observer};
+use fit::Packing;
 use judge::Judge;
 
 /// What a model is to shrink to.
@@ -113,18 +114,16 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let mut attempts: Vec<Attempt> = Vec::new();
     let mut best: Option<(usize, &Format, Gaussians)> = None;
     for degree in degrees(search.model.sh_degree, options.to) {
-        let with_smaller = degree == search.model.sh_degree;
-        let packings = fit::packings(options, &search.start(degree), with_smaller)?;
-        for &(format, rows) in &packings {
-            let made = search.attempt((format, rows), degree)?;
-            let Some((attempt, small)) = made else { continue };
+        let packings = fit::packings(options, &search.start(degree))?;
+        for packing in &packings {
+            let Some((attempt, small)) = search.attempt(packing, degree)? else { continue };
             let is_best = best.as_ref().is_none_or(|(at, ..)| attempt.train > attempts[*at].train);
             attempts.push(attempt);
             if is_best {
-                best = Some((attempts.len() - 1, format, small));
+                best = Some((attempts.len() - 1, packing.format, small));
             }
         }
-        if packings.first().is_some_and(|&(_, rows)| search.is_whole(rows, degree)) {
+        if packings.first().is_some_and(|packing| search.loses_nothing(packing, degree)) {
             break;
         }
     }
@@ -152,26 +151,25 @@ impl Search<'_> {
         colour::reduced(self.model.clone(), degree)
     }
 
-    /// Whether so many rows of this degree are all of the model.
-    fn is_whole(&self, rows: usize, degree: u8) -> bool {
-        rows == self.model.len() && degree == self.model.sh_degree
+    /// Whether it is the model with this degree as the format has it, which training has nothing to mend in.
+    fn loses_nothing(&self, packing: &Packing, degree: u8) -> bool {
+        packing.is_whole && degree == self.model.sh_degree
     }
 
     /// About so many rows of the model with this degree, trained on, and what its file shows; `None` where no row
     /// fits.
     fn attempt(
         &self,
-        (format, rows): (&Format, usize),
+        packing: &Packing,
         degree: u8,
     ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
         let Self { options, observer, judge, scratch, .. } = self;
         let start = self.start(degree);
-        // Where all of it fits, training has nothing to mend.
-        let tuned = if self.is_whole(rows, degree) {
+        let Packing { format, rows, .. } = *packing;
+        let tuned = if self.loses_nothing(packing, degree) {
             start
         } else {
-            let tuned = tune::tune(start, (format, rows), options, scratch, *observer)?;
-            colour::reduced(tuned, degree)
+            tune::tune(start, (format, rows), options, scratch, *observer)?
         };
         let Some((small, bytes)) = fit::trimmed(options.to, format, tuned)? else {
             return Ok(None);

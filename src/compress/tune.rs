@@ -8,6 +8,7 @@ use crate::export::{Format, PLY};
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::output::write_atomically;
+use crate::run::finished::read_model;
 use crate::run::{
     AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Whole,
 };
@@ -18,7 +19,8 @@ const STILL: [&str; 3] =
     ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
 
 /// About so many rows of the model, those that show most, trained on. How many fit a file is estimated once more before
-/// the last stage, as training changes how well rows pack.
+/// the last stage, as training changes how well rows pack; and the last half of that stage trains what a file has made
+/// of the model, with its colour by direction as it is there: what the file rounds off most, the rest can mend.
 ///
 /// # Errors
 /// As a run's, and when the observer asks to stop.
@@ -42,13 +44,48 @@ pub(super) fn tune(
             stage + 1,
             stages.len()
         ));
-        write_atomically(scratch, |out| PLY.write(&model, out))?;
-        let spec = described(&model, (budget, iterations), options, scratch)?;
-        drop(model);
-        let run = Run::prepare(&spec)?;
-        model = run.model_after_training(observer)?;
+        let settling = if stage + 1 == stages.len() { iterations / 2 } else { 0 };
+        let setting = (budget, iterations - settling);
+        model = train(model, setting, Colour::Steps, options, scratch, observer)?;
+        if settling > 0 {
+            model = reduced(model, u8::MAX);
+            write_atomically(scratch, |out| format.write(&model, out))?;
+            model = read_model(scratch, observer)?;
+            let setting = (model.len(), settling);
+            model = train(model, setting, Colour::Stays, options, scratch, observer)?;
+        }
     }
     Ok(model)
+}
+
+/// Whether the bands of colour above 0 are trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Colour {
+    Steps,
+    Stays,
+}
+
+/// The model after so many iterations with room for so many rows.
+fn train(
+    model: Gaussians,
+    setting: (usize, u32),
+    colour: Colour,
+    options: &Options<'_>,
+    scratch: &Path,
+    observer: &dyn Observer,
+) -> Result<Gaussians, Failure> {
+    write_atomically(scratch, |out| PLY.write(&model, out))?;
+    let mut spec = described(&model, setting, options, scratch)?;
+    if colour == Colour::Stays {
+        // The least rate there is: no value of a band that shows changes by it.
+        spec.schedule.lr = vec![text("sh_rest=1e-30")?];
+    }
+    drop(model);
+    Run::prepare(&spec)?.model_after_training(observer)
+}
+
+fn text(assignment: &str) -> Result<Assignment, Failure> {
+    assignment.parse().map_err(Failure::input)
 }
 
 /// Bounds, at least `least`, each at least half of the one before, and the training steps under each; the last has two
@@ -82,8 +119,7 @@ fn described(
     spec.size.budget = Some(Budget::Rows(budget));
     spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));
     POLICY.clone_into(&mut spec.density.policy);
-    let set = |text: &&str| text.parse::<Assignment>().map_err(Failure::input);
-    spec.density.policy_set = STILL.iter().map(set).collect::<Result<_, _>>()?;
+    spec.density.policy_set = STILL.into_iter().map(text).collect::<Result<_, _>>()?;
     spec.schedule.iterations = Whole(iterations);
     spec.schedule.seed = options.seed;
     Ok(spec)

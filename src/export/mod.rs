@@ -52,8 +52,8 @@ pub trait ModelWriter {
         false
     }
 
-    /// The same format in fewer bytes at the price of accuracy, the most accurate first.
-    fn smaller(&self) -> &'static [Format] {
+    /// The same format with other shares of bytes for accuracy, the most accurate first; empty where there are none.
+    fn forms(&self) -> &'static [Format] {
         &[]
     }
 

@@ -29,10 +29,12 @@ pub(super) const FORMAT: Format = Format {
 
 inventory::submit! { FORMAT }
 
-/// With a half and a quarter of the palette.
-const SMALLER: [Format; 2] = [
-    Format { writer: || Box::new(SogWriter { halved: 1, ..SogWriter::default() }), ..FORMAT },
-    Format { writer: || Box::new(SogWriter { halved: 2, ..SogWriter::default() }), ..FORMAT },
+/// With an entry of the palette for every row, and for every 4, 16 and 64 rows.
+const FORMS: [Format; 4] = [
+    Format { writer: || Box::new(SogWriter::sharing(1)), ..FORMAT },
+    Format { writer: || Box::new(SogWriter::sharing(4)), ..FORMAT },
+    Format { writer: || Box::new(SogWriter::sharing(16)), ..FORMAT },
+    Format { writer: || Box::new(SogWriter::sharing(64)), ..FORMAT },
 ];
 
 /// Longest side of a WebP `[px]`, and so the most rows.
@@ -43,8 +45,8 @@ const MAX_PALETTE: usize = 1 << 16;
 /// Holds all rows: codebooks and palette are fitted to all of them.
 #[derive(Default)]
 struct SogWriter {
-    /// How often the palette is halved.
-    halved: u32,
+    /// How many rows there are for each entry of the palette; none: as splat-transform does.
+    sharing: Option<usize>,
     sh_degree: u8,
     means: Vec<[f32; 3]>,
     log_scales: Vec<[f32; 3]>,
@@ -72,8 +74,8 @@ impl ModelWriter for SogWriter {
         true
     }
 
-    fn smaller(&self) -> &'static [Format] {
-        &SMALLER
+    fn forms(&self) -> &'static [Format] {
+        &FORMS
     }
 
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
@@ -198,9 +200,15 @@ impl SogWriter {
         }))
     }
 
-    /// Entries of the palette: as many as splat-transform takes, a power of two, where it is not halved.
+    /// A writer with an entry of the palette for so many rows.
+    fn sharing(rows: usize) -> Self {
+        Self { sharing: Some(rows), ..Self::default() }
+    }
+
+    /// Entries of the palette: without a choice as many as splat-transform takes, a power of two.
     fn entries(&self) -> usize {
-        (((1 << self.means.len().ilog2()).min(MAX_PALETTE)) >> self.halved).max(1)
+        let rows = self.means.len();
+        self.sharing.map_or(1 << rows.ilog2(), |of| rows.div_ceil(of)).min(MAX_PALETTE)
     }
 
     /// Keeps the weights within a factor of a hundred of their mean: a row may show more than it seems.
