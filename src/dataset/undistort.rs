@@ -212,6 +212,18 @@ mod tests {
     }
 
     #[test]
+    fn beyond_the_border_are_the_pixels_at_it() {
+        for (at, places) in [
+            (0.2, [0, 0, 1, 2]),
+            (5.5, [4, 5, 6, 7]),
+            (88.5, [87, 88, 89, 89]),
+            (89.0, [88, 89, 89, 89]),
+        ] {
+            assert_eq!(Stencil::of(at, 90).places, places, "{at}");
+        }
+    }
+
+    #[test]
     fn hidden_pixels_reach_no_pixel_that_counts() {
         let is_hidden = |at: DVec2| (at - DVec2::new(40.0, 30.0)).length() < 9.0;
         let with = |hidden: u8| {

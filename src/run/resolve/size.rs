@@ -20,7 +20,7 @@ const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget, where memory is not given.
 const PAIRS_PER_ROW: usize = 16;
 /// Fewer rows that are trained are no model of a scene, unless fewer are asked for.
-const LEAST_ROWS: usize = 1_000;
+pub(super) const LEAST_ROWS: usize = 1_000;
 /// What "give --memory" is rounded up to.
 pub(super) const MIB: u64 = 1 << 20;
 /// Divisors of the images' sides that are alternatives.
