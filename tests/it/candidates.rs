@@ -1,7 +1,7 @@
 //! Candidates: on a plane, where they are found, by which error mode, and where never; in any scene, the
 //! same on every backend.
 
-use densify::backend::{Backend, Rendering, StepInput};
+use densify::backend::{AdapterKind, Backend, Rendering, StepInput};
 use densify::camera::Camera;
 use densify::dataset::images::Image8;
 use densify::gaussians::{Gaussians, logit, rgb_to_dc};
@@ -271,7 +271,10 @@ fn the_device_finds_the_pixels_that_the_host_would() {
                 places(train(&mut *backend, &camera, 3).last().expect("three steps"))
             });
             assert!(by_host.len() > 8 * 30, "{error:?}: {} numbers", by_host.len());
-            // A device's square root may differ in its last bit.
+            if device.adapter().kind == AdapterKind::Software {
+                assert_eq!(by_device, by_host, "{error:?}");
+            }
+            // A GPU's square root may differ in its last bit.
             let is_close = |(a, b): (&f32, &f32)| (a - b).abs() <= 2e-7 * b.abs();
             assert_eq!(by_device.len(), by_host.len(), "{error:?}");
             assert!(by_device.iter().zip(&by_host).all(is_close), "{by_device:?} {by_host:?}");

@@ -49,10 +49,9 @@ impl GpuBackend {
                 return Err(self.broken_off());
             }
             if state.short == 0 {
-                self.laps = match &self.device.clock {
-                    Some(clock) => clock.laps(&self.device, &stages)?,
-                    None => Vec::new(),
-                };
+                if let Some(clock) = &self.device.clock {
+                    self.laps = clock.laps(&self.device, &stages)?;
+                }
                 self.bands = state.bands.max(1);
                 return Ok((state, shape));
             }
