@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::error::DatasetError;
-use super::paths::{DataPath, Root, relative};
+use super::paths::{DataPath, Root, is_absolute, relative};
 use super::{LoadOptions, Resolution};
 
 /// Extensions tried for names without one, as in NeRF-synthetic files.
@@ -24,6 +24,8 @@ pub(super) struct Folders {
 /// The file of an image.
 #[derive(Debug)]
 pub(super) struct ImageFile {
+    /// The name of its view: its path as listed, or what of an absolute one is below `--images`.
+    pub(super) name: String,
     pub(super) path: PathBuf,
     /// K, if it is in the folder `images_K`.
     pub(super) reduced: Option<u32>,
@@ -70,9 +72,12 @@ impl Folders {
 
     /// The file of an image, if there is one.
     pub(super) fn image(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
+        if let Some(folder) = self.chosen.as_ref().filter(|_| is_absolute(named.value)) {
+            return moved(folder, named);
+        }
         // Checked as written first: a path out of the folder is refused even if no file is there.
         self.root.join(named)?;
-        let inside = self.inside_images(named.value);
+        let (name, inside) = (relative(named.value), self.inside_images(named.value));
         // COLMAP names files in full.
         let endings = if self.within_images { &ENDINGS[..1] } else { &ENDINGS[..] };
         for ending in endings {
@@ -83,7 +88,8 @@ impl Folders {
                 let below_root = format!("images_{k}/{within}");
                 self.root.existing(DataPath { value: &below_root, ..named })?;
                 if let Some(path) = folder.existing(DataPath { value: &within, ..named })? {
-                    return Ok(Some(ImageFile { path, reduced: Some(*k), fell_back: false }));
+                    let reduced = Some(*k);
+                    return Ok(Some(ImageFile { name, path, reduced, fell_back: false }));
                 }
                 fell_back = true;
             }
@@ -95,16 +101,20 @@ impl Folders {
                 }
             };
             if let Some(path) = path {
-                return Ok(Some(ImageFile { path, reduced: None, fell_back }));
+                return Ok(Some(ImageFile { name, path, reduced: None, fell_back }));
             }
         }
         Ok(None)
     }
 
-    /// The mask of an image, if there is one: `masks/NAME.png`, with or without the extension of NAME; or
+    /// The mask of the image NAME, if there is one: `masks/NAME.png`, with or without the extension of NAME; or
     /// `dynamic_mask_NAME.png` beside the image, as instant-ngp has it, where all but black is hidden.
-    pub(super) fn mask(&self, named: DataPath<'_>) -> Result<Option<MaskFile>, DatasetError> {
-        let inside = self.inside_images(named.value);
+    pub(super) fn mask(
+        &self,
+        name: &str,
+        named: DataPath<'_>,
+    ) -> Result<Option<MaskFile>, DatasetError> {
+        let inside = self.inside_images(name);
         let stem = Path::new(&inside).with_extension("").to_string_lossy().into_owned();
         for value in
             [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")]
@@ -113,7 +123,7 @@ impl Folders {
                 return Ok(Some(MaskFile::of(path)));
             }
         }
-        let image = self.below_root(named.value);
+        let image = self.below_root(name);
         let image = Path::new(&image);
         let Some(stem) = image.file_stem().and_then(|stem| stem.to_str()) else { return Ok(None) };
         let beside = image.with_file_name(format!("dynamic_mask_{stem}.png"));
@@ -129,6 +139,9 @@ impl Folders {
     /// Where an image is looked for first.
     pub(super) fn place(&self, named: DataPath<'_>) -> PathBuf {
         match &self.chosen {
+            Some(folder) if is_absolute(named.value) => {
+                folder.path().join(parts(named.value).last().unwrap_or_default())
+            }
             Some(folder) => folder.path().join(self.inside_images(named.value)),
             None => self.root.path().join(self.below_root(named.value)),
         }
@@ -162,4 +175,24 @@ impl Folders {
         let value = relative(value);
         if self.within_images { format!("images/{value}") } else { value }
     }
+}
+
+/// The image of an absolute path, in the folder that the user names: programs write where photographs lay on their
+/// own machine. As many of its last parts count as are found.
+fn moved(folder: &Root, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
+    let parts: Vec<&str> = parts(named.value).collect();
+    for first in 0..parts.len() {
+        let name = parts[first..].join("/");
+        if let Some(path) = folder.existing(DataPath { value: &name, ..named })? {
+            return Ok(Some(ImageFile { name, path, reduced: None, fell_back: false }));
+        }
+    }
+    Ok(None)
+}
+
+/// The parts of an absolute path of any system, without its drive or scheme.
+fn parts(value: &str) -> impl Iterator<Item = &str> {
+    let drive = |part: &str| part.ends_with(':');
+    let parts = value.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".");
+    parts.enumerate().filter(move |(i, part)| *i > 0 || !drive(part)).map(|(_, part)| part)
 }

@@ -122,6 +122,13 @@ pub(super) fn relative(value: &str) -> String {
     value.split('/').filter(|part| !part.is_empty() && *part != ".").collect::<Vec<_>>().join("/")
 }
 
+/// Whether it begins at the root, a drive or a scheme, of whatever system.
+pub(super) fn is_absolute(value: &str) -> bool {
+    value.starts_with(['/', '\\'])
+        || value.as_bytes().get(1) == Some(&b':')
+        || value.starts_with("file:")
+}
+
 /// What is wrong with a path, as far as its text says.
 pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
     // Both separators count: paths may come from another system.
@@ -132,10 +139,7 @@ pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
         Some("is longer than 4 KiB")
     } else if value.contains(char::is_control) {
         Some("contains a control character")
-    } else if value.starts_with(['/', '\\'])
-        || value.as_bytes().get(1) == Some(&b':')
-        || value.starts_with("file:")
-    {
+    } else if is_absolute(value) {
         Some("is absolute")
     } else if parts().any(|part| part == "..") {
         Some("contains `..`")

@@ -20,7 +20,7 @@ use super::folders::Folders;
 use super::images;
 use super::lens::table::Term;
 use super::lens::{Distortion, Lens, Plane};
-use super::paths::{DataPath, Root, relative};
+use super::paths::{DataPath, Root};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
 use super::{Frame, Scene};
@@ -128,13 +128,14 @@ pub(super) fn read(
         let origin = format!("line {number} ({name})");
         let (rotation, translation) = row.pose(&origin)?;
         let lens = row.lens(&origin, &found.path, found.reduced)?;
+        let mask = folders.mask(&found.name, named)?;
         frames.push(Frame {
-            name: relative(name),
+            name: found.name,
             id: None,
             origin: format!("{}: {origin}", path.display()),
             image: found.path,
             reduced: found.reduced,
-            mask: folders.mask(named)?,
+            mask,
             lens,
             rotation,
             translation,

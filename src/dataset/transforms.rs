@@ -108,14 +108,14 @@ pub(super) fn read(
                 };
                 Some(MaskFile::of(root.existing(named)?.ok_or_else(missing)?))
             }
-            None => folders.mask(named)?,
+            None => folders.mask(&found.name, named)?,
         };
         let lens = fields.lens(&found.path, found.reduced)?;
         let held_out =
             held_out || tests.as_ref().is_some_and(|tests| tests.contains(&relative(file)));
         own_split |= held_out;
         frames.push(Frame {
-            name: relative(file),
+            name: found.name,
             id: None,
             origin: format!("{}: frame {file}", path.display()),
             image: found.path,

@@ -95,9 +95,9 @@ pub(super) fn read(
         let named = DataPath { file: &images, field: &field, value: &image.name };
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
         reduced_missing += usize::from(found.fell_back);
-        let mask = folders.mask(named)?;
+        let mask = folders.mask(&found.name, named)?;
         frames.push(Frame {
-            name: relative(&image.name),
+            name: found.name,
             id: Some(image.id),
             origin: format!("{}: {field}", images.display()),
             image: found.path,

@@ -137,3 +137,45 @@ fn a_frame_without_intrinsics_is_named() {
         }
     }
 }
+
+/// Programs write where photographs lay on the machine that they ran on (RealityScan's `transforms.json`).
+#[test]
+fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
+    let written = [r"C:\Users\me\walk\1\a.png", "/home/me/walk/2/b.png", "file:///home/me/c.png"];
+    let made = Made::transforms(|json| {
+        for (frame, path) in json["frames"].as_array_mut().unwrap().iter_mut().zip(written) {
+            frame["file_path"] = path.into();
+        }
+        json["test_filenames"] = json!(["file:///home/me/c.png"]);
+    });
+    std::fs::create_dir_all(made.file("moved/1")).unwrap();
+    std::fs::rename(made.file("images/a.png"), made.file("moved/1/a.png")).unwrap();
+    for name in ["b.png", "c.png"] {
+        std::fs::rename(made.file(&format!("images/{name}")), made.file(&format!("moved/{name}")))
+            .unwrap();
+    }
+    // Of two with its name, the one in whose folder it lay.
+    image(&made.file("moved/a.png"), (20, 12), 9);
+    image(&made.file("masks/1/a.png"), (20, 12), 255);
+    let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+    let names = |made: &Made| {
+        let data = Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+        let name = |view: &View| (view.name.clone(), view.source.mask.is_some());
+        [data.train.iter().map(name).collect::<Vec<_>>(), data.test.iter().map(name).collect()]
+    };
+    let [train, test] = names(&made);
+    assert_eq!(train, [("1/a.png".to_owned(), true), ("b.png".to_owned(), false)]);
+    assert_eq!(test, [("c.png".to_owned(), false)]);
+    // One that is not there is skipped by name, and links are not followed out of the folder.
+    made.remove("moved/b.png");
+    assert_eq!(names(&made)[0].len(), 1);
+    let outside = tempfile::tempdir().unwrap();
+    image(&outside.path().join("b.png"), (20, 12), 9);
+    std::os::unix::fs::symlink(outside.path().join("b.png"), made.file("moved/b.png")).unwrap();
+    let error = Dataset::load(made.path(), &options).unwrap_err().to_string();
+    assert!(error.contains("symbolic link"), "{error}");
+    // Nor does one that climbs lead anywhere.
+    made.replace("transforms.json", "/home/me/walk/2", "/home/../2");
+    let error = Dataset::load(made.path(), &options).unwrap_err().to_string();
+    assert!(error.contains("`..`"), "{error}");
+}
