@@ -4,6 +4,7 @@ use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap};
 
 use crate::backend::{AuxInput, Backend, BackendError};
 use crate::evaluate::EvaluateError;
+use crate::gaussians::{Gaussians, sigmoid};
 use crate::views::ViewSource;
 
 /// What a backend must have been made for.
@@ -59,6 +60,18 @@ pub fn importance(
         }
     }
     Ok(sums)
+}
+
+/// For each row the logarithm of how much of an image it could cover, alone and seen from where it is largest: opacity
+/// times the two longest axes. For where no views are at hand. Shape: `[rows]`.
+#[must_use]
+pub fn footprints(model: &Gaussians) -> Vec<f64> {
+    let of = |row: usize| {
+        let mut log_scales = model.log_scales[row];
+        log_scales.sort_unstable_by(f32::total_cmp);
+        f64::from(sigmoid(model.opacity_logits[row]).ln() + log_scales[1] + log_scales[2])
+    };
+    (0..model.len()).map(of).collect()
 }
 
 /// The `count` rows of the largest importance, in their order; of equals the first.

@@ -9,6 +9,7 @@ use crate::backend::ROWS_AT_A_TIME;
 use crate::export::{Format, Shape};
 use crate::failure::{Failure, OTHER};
 use crate::gaussians::{Gaussians, sh_coefficients};
+use crate::importance::{footprints, largest};
 use crate::output::{WriteError, model_path, write_atomically_from};
 use crate::run::finished::{iteration, read_model};
 use crate::run::{Observer, RunConfig, Silent};
@@ -89,17 +90,17 @@ pub fn merge(
     Ok(Merged { rows, bytes: bytes.len(), missing })
 }
 
-/// What a block has trained in its cell.
+/// What a block has trained in its cell; of more than its share the faintest and smallest are left out.
 fn part(
     folder: &Path,
     blocks: &Blocks,
     place: usize,
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
-    let Block { cell, .. } = &blocks.block[place];
+    let Block { cell, rows: most, .. } = &blocks.block[place];
     let run = run_folder(folder, blocks, Task::Block(place));
     let frozen = RunConfig::read(&run)?.resolved.frozen.map_or(0, |model| model.rows);
     let model = read_model(&model_path(&run, iteration(&run, None)?), observer)?;
-    let rows = inside(blocks, cell, &model, frozen);
-    Ok(model.gather(&rows).with_degree(blocks.sh_degree))
+    let part = model.gather(&inside(blocks, cell, &model, frozen)).with_degree(blocks.sh_degree);
+    Ok(if part.len() > *most { part.gather(&largest(&footprints(&part), *most)) } else { part })
 }

@@ -88,8 +88,10 @@ pub struct Coarse {
 pub struct Block {
     /// Its name, and that of its folder.
     pub name: String,
-    /// Most Gaussians that it trains.
+    /// Most Gaussians of it in the merged model.
     pub rows: usize,
+    /// Most Gaussians that it trains, in its cell and the margin, of which the others are left out in the end.
+    pub budget: usize,
     /// Training views that see it.
     pub views: usize,
     /// Length of its run.

@@ -209,11 +209,16 @@ impl<'a> Planner<'a> {
         let mut block = Vec::new();
         for (place, cell) in cells(&self.sight.at, &work, grid).into_iter().enumerate() {
             let name = format!("block-{}-{}", place / grid[1], place % grid[1]);
-            let points = self.sight.at.iter().zip(&work);
-            let inside: f64 = points.filter(|(at, _)| cell.has(**at)).map(|(_, work)| work).sum();
-            let share = inside / total.max(f64::MIN_POSITIVE);
-            let rows = (self.rows as f64 * share) as usize;
-            let views = self.views(&cell.widened(margin));
+            let share = |cell: &Cell| {
+                let points = self.sight.at.iter().zip(&work).filter(|(at, _)| cell.has(**at));
+                points.map(|(_, work)| work).sum::<f64>() / total.max(f64::MIN_POSITIVE)
+            };
+            let of_all = |share: f64| (self.rows as f64 * share) as usize;
+            let wide = cell.widened(margin);
+            // As many per unit of work in the margin as in the cell.
+            let (budget, share) = (of_all(share(&wide)), share(&cell));
+            let rows = of_all(share);
+            let views = self.views(&wide);
             let train = views.iter().filter(|(_, is_train)| *is_train).count();
             if train == 0 || rows < LEAST_ROWS {
                 return Err(Failure::input(format!(
@@ -232,11 +237,12 @@ impl<'a> Planner<'a> {
             let share_of_views = train as f64 / self.dataset.train.len() as f64;
             let whole = f64::from(self.spec.schedule.iterations.0);
             let iterations = ((whole * share_of_views).round() as u32).max(1);
-            let memory = self.memory_of_block(&name, rows, iterations, &folder)?;
-            block.push(Block { name, rows, views: train, iterations, memory, work: share, cell });
+            let memory = self.memory_of_block(&name, budget, iterations, &folder)?;
+            let views = train;
+            block.push(Block { name, rows, budget, views, iterations, memory, work: share, cell });
         }
         let coarse = self.coarse()?;
-        let largest = block.iter().map(|block| block.rows).max().unwrap_or(0) + self.coarse_rows;
+        let largest = block.iter().map(|block| block.budget).max().unwrap_or(0) + self.coarse_rows;
         Ok(Blocks {
             densify: env!("CARGO_PKG_VERSION").to_owned(),
             scene: self.scene.clone(),

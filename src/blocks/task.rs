@@ -128,7 +128,7 @@ fn block(
     } else {
         all = put(FROZEN_FILE, model.gather(&frozen))?.over(all);
     }
-    let all = text("views", &views)?.over(all).over(rows(block.rows + frozen.len()));
+    let all = text("views", &views)?.over(all).over(rows(block.budget + frozen.len()));
     // The coarse model is where a block begins, not what it is to keep.
     Ok(all.over(given).over(Partial::option("init_rates", "full")))
 }

@@ -64,6 +64,7 @@ pub(super) fn example() -> Blocks {
     let block = |name: &str, low: f64, high: f64| Block {
         name: name.to_owned(),
         rows: 1_000,
+        budget: 1_200,
         views: 12,
         iterations: 300,
         memory: (50 << 20) + 1,

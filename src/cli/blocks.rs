@@ -177,30 +177,42 @@ fn run_plan(args: &PlanArgs, console: &Console) -> Result<(), Failure> {
 /// What each task does and takes.
 fn table(blocks: &Blocks) -> String {
     let mut text = String::new();
-    let mut row = |cells: [String; 6]| {
-        let [task, rows, views, iterations, work, memory] = cells;
+    let mut row = |cells: [String; 7]| {
+        let [task, rows, trained, views, iterations, work, memory] = cells;
         let line_break = if text.is_empty() { "" } else { "\n" };
         let _ = write!(
             text,
-            "{line_break}{task:<14} {rows:>11} {views:>7} {iterations:>11} {work:>7} {memory:>11}"
+            "{line_break}{task:<14} {rows:>11} {trained:>11} {views:>7} {iterations:>11} {work:>7} {memory:>11}"
         );
     };
-    row(["task", "Gaussians", "views", "iterations", "work", "memory"].map(str::to_owned));
+    let head = ["task", "Gaussians", "in training", "views", "iterations", "work", "memory"];
+    row(head.map(str::to_owned));
     for task in blocks.tasks() {
-        let (rows, views, work) = match task {
-            Task::Coarse => (blocks.coarse.rows, "all".to_owned(), String::new()),
-            Task::Block(place) => {
-                let Block { rows, views, work, .. } = &blocks.block[place];
-                (*rows, grouped(*views), format!("{:.1} %", 100.0 * work))
+        let (rows, trained, views, work) = match task {
+            Task::Coarse => {
+                let rows = blocks.coarse.rows;
+                (rows, grouped(rows), "all".to_owned(), String::new())
             }
-            Task::Merge => (blocks.rows, String::new(), String::new()),
+            Task::Block(place) => {
+                let Block { rows, budget, views, work, .. } = &blocks.block[place];
+                (*rows, grouped(*budget), grouped(*views), format!("{:.1} %", 100.0 * work))
+            }
+            Task::Merge => (blocks.rows, String::new(), String::new(), String::new()),
         };
         let iterations = match blocks.iterations(task) {
             0 => String::new(),
             iterations => grouped(iterations as usize),
         };
         let memory = Bytes(blocks.memory(task)).to_string();
-        row([blocks.name(task).to_owned(), grouped(rows), views, iterations, work, memory]);
+        row([
+            blocks.name(task).to_owned(),
+            grouped(rows),
+            trained,
+            views,
+            iterations,
+            work,
+            memory,
+        ]);
     }
     text
 }

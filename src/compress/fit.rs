@@ -6,6 +6,7 @@ use super::{Options, Target};
 use crate::export::Format;
 use crate::failure::{Failure, OTHER};
 use crate::gaussians::Gaussians;
+use crate::importance::{footprints, largest};
 use crate::number::grouped;
 
 /// Share of the size that the first estimate fills: training changes how well the rows pack.
@@ -158,14 +159,7 @@ pub(super) fn trimmed(
         if left == 0 {
             return Ok(None);
         }
-        let shown = |row: usize| {
-            let mut log_scales = model.log_scales[row];
-            log_scales.sort_unstable_by(f32::total_cmp);
-            let opacity = crate::gaussians::sigmoid(model.opacity_logits[row]);
-            f64::from(opacity.ln() + log_scales[1] + log_scales[2])
-        };
-        let shown: Vec<f64> = (0..model.len()).map(shown).collect();
-        model = model.gather(&crate::importance::largest(&shown, left));
+        model = model.gather(&largest(&footprints(&model), left));
     }
 }
 

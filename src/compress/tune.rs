@@ -19,8 +19,9 @@ const STILL: [&str; 3] =
     ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
 
 /// About so many rows of the model, those that show most, trained on. How many fit a file is estimated once more before
-/// the last stage, as training changes how well rows pack; and the last half of that stage trains what a file has made
-/// of the model, with its colour by direction as it is there: what the file rounds off most, the rest can mend.
+/// the last stage, as training changes how well rows pack; and where the format rounds, the last half of that stage
+/// trains what a file has made of the model, with its colour by direction as it is there: what the file rounds off most,
+/// the rest can mend.
 ///
 /// # Errors
 /// As a run's, and when the observer asks to stop.
@@ -32,6 +33,7 @@ pub(super) fn tune(
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
     let least = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
+    let rounds = (format.writer)().rounds();
     let stages = stages((model.len(), rows), options.iterations, least);
     for (stage, &(mut budget, iterations)) in stages.iter().enumerate() {
         if stage > 0 && stage + 1 == stages.len() {
@@ -44,7 +46,7 @@ pub(super) fn tune(
             stage + 1,
             stages.len()
         ));
-        let settling = if stage + 1 == stages.len() { iterations / 2 } else { 0 };
+        let settling = if rounds && stage + 1 == stages.len() { iterations / 2 } else { 0 };
         let setting = (budget, iterations - settling);
         model = train(model, setting, Colour::Steps, options, scratch, observer)?;
         if settling > 0 {

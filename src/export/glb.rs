@@ -44,6 +44,10 @@ impl ModelWriter for GlbWriter {
         (rows * size_of::<f32>() * (row + 3 * sh_coefficients(sh_degree))) as u64
     }
 
+    fn rounds(&self) -> bool {
+        false
+    }
+
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, _out: &mut dyn Write) -> io::Result<()> {
         if self.held_bytes(Shape { rows, sh_degree }) > u64::from(u32::MAX - (1 << 16)) {
             let problem = "a GLB has at most 4 GiB; export ply or sog instead";

@@ -52,6 +52,11 @@ pub trait ModelWriter {
         false
     }
 
+    /// Whether a file holds less of a number than an `f32` does, so that what is read back differs.
+    fn rounds(&self) -> bool {
+        true
+    }
+
     /// The same format with other shares of bytes for accuracy, the most accurate first; empty where there are none.
     fn forms(&self) -> &'static [Format] {
         &[]

@@ -32,6 +32,10 @@ impl ModelWriter for PlyWriter {
         (rows.min(CHUNK) * row_bytes(sh_degree)) as u64
     }
 
+    fn rounds(&self) -> bool {
+        false
+    }
+
     fn begin(&mut self, Shape { rows, sh_degree }: Shape, out: &mut dyn Write) -> io::Result<()> {
         let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
         for (index, name) in splat_properties(sh_degree).enumerate() {

@@ -84,6 +84,15 @@ fn formats_in_f32_keep_every_bit() {
 }
 
 #[test]
+fn formats_say_whether_they_round() {
+    let model = plausible(100, 3);
+    for format in formats().into_iter().filter(|format| format.name != "call-log") {
+        let changes = in_order(&read(&written(format, &model).unwrap())) != model;
+        assert_eq!((format.writer)().rounds(), changes, "{}", format.name);
+    }
+}
+
+#[test]
 fn others_are_off_by_half_a_step() {
     // Positions: 11 bits of a chunk, 10 of them for y, 12 fractional bits, 16 bits of a logarithm. Scales: 10 bits
     // of 3, sixteenths, a codebook, whose entries are far apart where few values are. Opacity: a byte. Colour: compressed PLY has steps of 1/32; SPZ has steps of 1/38 and, by the
