@@ -1,7 +1,8 @@
 //! `densify render --path`: a flight through the scene, as pictures and as a film.
 
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::str::FromStr;
 
 use clap::Args;
@@ -10,36 +11,41 @@ use super::console::Console;
 use super::render::{Extras, write_pictures};
 use crate::animation::{self, Animation};
 use crate::camera::Camera;
-use crate::failure::{Failure, OTHER};
-use crate::flight;
+use crate::failure::{DEVICE, Failure, OTHER};
+use crate::flight::{self, SavedFlight};
+use crate::foreign::one_line;
+use crate::memory::Bytes;
+use crate::output::write_atomically;
 use crate::pictures::picture;
 use crate::run::finished::Opened;
 
 /// Most frames of a flight.
 const MOST_FRAMES: u32 = 100_000;
-/// Longest side of a frame `[px]`.
-const MAX_SIDE: u32 = 16_384;
-/// Frames of a flight of its own.
+/// Frames of a flight of its own, and how many of them pass in a second.
 const FRAMES: u32 = 120;
+const FPS: u32 = 30;
+/// What rendering takes for each pixel of a frame `[bytes]`.
+const PIXEL: u64 = 64;
 
 /// Options of a flight.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Flight")]
 pub(super) struct FilmArgs {
     /// Render a flight instead of the dataset's views: orbit (once around what the cameras look at),
-    /// spiral (two turns before it), or a camera path of nerfstudio's viewer (JSON), in the
-    /// dataset's coordinates
+    /// spiral (two turns before it), or a camera path as the page of `densify view` or nerfstudio's
+    /// viewer saves it (JSON). It must be in the dataset's coordinates, as the page's are; nerfstudio's
+    /// are where it trained with `--orientation-method none --center-method none --auto-scale-poses False`
     #[arg(long, value_name = "orbit|spiral|FILE")]
     pub(super) path: Option<Route>,
-    /// Number of frames `[default: 120; of a file, as many as it has cameras]`
+    /// Number of frames `[default: 120; of a file, its seconds times its fps, else one for each camera]`
     #[arg(long, value_name = "N", requires = "path", value_parser = clap::value_parser!(u32).range(1..=i64::from(MOST_FRAMES)))]
     frames: Option<u32>,
-    /// Width and height of the frames, such as 640x480 `[default: those of the first photograph]`
+    /// Width and height of the frames, such as 640x480 `[default: those of the file, else of the first photograph]`
     #[arg(long, value_name = "WxH", requires = "path")]
     size: Option<Size>,
-    /// Frames per second of the film
-    #[arg(long, value_name = "N", requires = "video", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=1000))]
-    fps: u32,
+    /// Frames per second of the film `[default: those of the file, else 30]`
+    #[arg(long, value_name = "N", requires = "video", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    fps: Option<u32>,
     /// Also write a film: .mp4 (needs the program ffmpeg) or .webp (lossless, by densify itself)
     #[arg(long, value_name = "FILE", requires = "path")]
     video: Option<PathBuf>,
@@ -76,11 +82,14 @@ impl FromStr for Size {
         let sides = text.split_once('x').map(|(width, height)| [width, height].map(str::parse));
         match sides {
             Some([Ok(width), Ok(height)])
-                if [width, height].iter().all(|side| (1..=MAX_SIDE).contains(side)) =>
+                if [width, height].iter().all(|side| (1..=flight::MOST_SIDE).contains(side)) =>
             {
                 Ok(Self(width, height))
             }
-            _ => Err(format!("give WIDTHxHEIGHT, such as 640x480, each from 1 to {MAX_SIDE}")),
+            _ => Err(format!(
+                "give WIDTHxHEIGHT, such as 640x480, each from 1 to {}",
+                flight::MOST_SIDE
+            )),
         }
     }
 }
@@ -97,7 +106,9 @@ impl<'a> Film<'a> {
         let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
         match ending.to_ascii_lowercase().as_str() {
             "mp4" => {
-                if !ffmpeg(&["-version".as_ref()]).is_ok_and(|status| status.success()) {
+                if !ffmpeg(Path::new("."), &["-version".as_ref()])
+                    .is_ok_and(|it| it.status.success())
+                {
                     return Err(Failure::input(format!(
                         "--video {}: the program ffmpeg is needed for it and was not found; install it, \
                          or name a .webp",
@@ -141,19 +152,21 @@ pub(super) fn run(
     let Some(first) = cameras.first() else {
         return Err(Failure::input("--path: the dataset has no camera to take it from"));
     };
-    let size = args.size.map_or((first.width, first.height), |Size(width, height)| (width, height));
-    let (flight, in_world) = match route {
-        Route::Orbit => (flight::orbit(&cameras), false),
-        Route::Spiral => (flight::spiral(&cameras), false),
+    let own = |flight| SavedFlight { flight, frames: FRAMES, fps: None, size: None };
+    let (saved, in_world) = match route {
+        Route::Orbit => (own(flight::orbit(&cameras)), false),
+        Route::Spiral => (own(flight::spiral(&cameras)), false),
         Route::File(path) => {
             (flight::read(path).map_err(|e| Failure::input(format!("--path: {e}")))?, true)
         }
     };
-    let frames = args.frames.unwrap_or(match route {
-        Route::File(_) => flight.keys.len() as u32,
-        Route::Orbit | Route::Spiral => FRAMES,
-    });
-    let mut film = args.video.as_deref().map(|path| Film::new(path, size, args.fps)).transpose()?;
+    let SavedFlight { flight, frames, fps, size } = saved;
+    let frames = args.frames.unwrap_or(frames);
+    let fps = args.fps.or(fps).unwrap_or(FPS);
+    let size = args.size.map(|Size(width, height)| (width, height)).or(size);
+    let size = size.unwrap_or((first.width, first.height));
+    has_room(size)?;
+    let mut film = args.video.as_deref().map(|path| Film::new(path, size, fps)).transpose()?;
     let background = opened.data.background.fixed();
     let mut depths = extras.depths(&dataset.normalisation);
     for frame in 0..frames {
@@ -177,20 +190,33 @@ pub(super) fn run(
     match film {
         None => return Ok(()),
         Some(Film::WebP(path, animation)) => animation.write(path)?,
-        Some(Film::Mp4(path)) => encode(output, path, args.fps)?,
+        Some(Film::Mp4(path)) => encode(output, path, frames, fps)?,
     }
     let path = args.video.as_deref().unwrap_or(output);
     console.result(format_args!("film in {}", path.display()));
     Ok(())
 }
 
-fn ffmpeg(arguments: &[&std::ffi::OsStr]) -> std::io::Result<std::process::ExitStatus> {
-    let quiet = Stdio::null;
-    Command::new("ffmpeg").args(arguments).stdin(quiet()).stdout(quiet()).stderr(quiet()).status()
+/// Whether a frame can be rendered, so that one that cannot is an error and not an abort.
+fn has_room((width, height): (u32, u32)) -> Result<(), Failure> {
+    let bytes = PIXEL * u64::from(width) * u64::from(height);
+    let size = usize::try_from(bytes).unwrap_or(usize::MAX);
+    Vec::<u8>::new().try_reserve_exact(size).map_err(|_| Failure {
+        code: DEVICE,
+        message: format!(
+            "a frame of {width}x{height} px takes {}, which cannot be allocated; give a smaller --size",
+            Bytes(bytes)
+        ),
+    })
 }
 
-/// Makes a film of the pictures. It has its name only when it is whole.
-fn encode(pictures: &Path, path: &Path, fps: u32) -> Result<(), Failure> {
+fn ffmpeg(folder: &Path, arguments: &[&OsStr]) -> std::io::Result<Output> {
+    let mut command = Command::new("ffmpeg");
+    command.current_dir(folder).args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).output()
+}
+
+/// Makes a film of the first pictures. It has its name only when it is whole.
+fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), Failure> {
     let failed = |problem: String| Failure {
         code: OTHER,
         message: format!(
@@ -199,30 +225,26 @@ fn encode(pictures: &Path, path: &Path, fps: u32) -> Result<(), Failure> {
             pictures.display()
         ),
     };
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    std::fs::create_dir_all(folder).map_err(|e| failed(e.to_string()))?;
-    let unfinished = tempfile::Builder::new()
-        .prefix(".densify-")
-        .suffix(".mp4")
-        .tempfile_in(folder)
-        .map_err(|e| failed(e.to_string()))?
-        .into_temp_path();
-    let (rate, input) = (fps.to_string(), pictures.join("frame_%05d.png"));
-    let words = ["-y", "-loglevel", "error", "-framerate", &rate, "-i"].map(std::ffi::OsStr::new);
-    // Its colours are halved each way, so sides must be even.
+    let film = tempfile::Builder::new().suffix(".mp4").tempfile();
+    let mut film = film.map_err(|e| failed(format!("a temporary file for the film: {e}")))?;
+    let (rate, count) = (fps.to_string(), frames.to_string());
+    // Named from their folder, in whose own name a % would be part of the pattern.
+    let input = ["-framerate", &rate, "-start_number", "0", "-i", "frame_%05d.png"];
+    // More pictures may be left there of a longer flight. Colours are halved each way, so sides must be even.
     let even = "pad=ceil(iw/2)*2:ceil(ih/2)*2";
-    let more =
-        ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "+faststart"].map(std::ffi::OsStr::new);
-    let arguments =
-        [&words[..], &[input.as_os_str()], &more[..], &[unfinished.as_os_str()]].concat();
-    match ffmpeg(&arguments) {
-        Ok(status) if status.success() => {
-            unfinished.persist(path).map_err(|e| failed(e.error.to_string()))
+    let output =
+        ["-frames:v", &count, "-vf", even, "-pix_fmt", "yuv420p", "-movflags", "+faststart"];
+    let words = ["-y", "-loglevel", "error"].into_iter().chain(input).chain(output);
+    let arguments: Vec<&OsStr> = words.map(OsStr::new).chain([film.path().as_os_str()]).collect();
+    match ffmpeg(pictures, &arguments) {
+        Ok(Output { status, .. }) if status.success() => {}
+        Ok(Output { status, stderr, .. }) => {
+            let said = String::from_utf8_lossy(&stderr);
+            let last = said.lines().rfind(|line| !line.trim().is_empty()).unwrap_or_default();
+            return Err(failed(format!("ffmpeg ended with {status}: {}", one_line(last))));
         }
-        Ok(status) => Err(failed(format!("ffmpeg ended with {status}"))),
-        Err(e) => Err(failed(format!("ffmpeg: {e}"))),
+        Err(e) => return Err(failed(format!("ffmpeg: {e}"))),
     }
+    write_atomically(path, |out| std::io::copy(&mut film, out).map(|_| ()))?;
+    Ok(())
 }

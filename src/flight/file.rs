@@ -10,8 +10,10 @@ use crate::foreign;
 
 /// Most bytes of a file.
 const MOST_BYTES: u64 = 64 << 20;
-/// Most cameras of a path.
+/// Most cameras, and most frames, of a path.
 const MOST_KEYS: usize = 100_000;
+/// Longest side of a frame `[px]`.
+pub const MOST_SIDE: u32 = 16_384;
 
 /// Why a camera path cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -34,14 +36,30 @@ pub enum FlightError {
     },
 }
 
-/// The parts of the file that say where cameras are.
+/// A camera path of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SavedFlight {
+    /// The path, in the coordinates of the dataset.
+    pub flight: Flight,
+    /// How many frames it has, >= 1: as long as it lasts at its rate, or one for each camera.
+    pub frames: u32,
+    /// Frames per second, 1 to 1000, if it says so.
+    pub fps: Option<u32>,
+    /// Width and height of a frame `[px]`, if it says so.
+    pub size: Option<(u32, u32)>,
+}
+
+/// The parts of the file that say where cameras are and what is made of them.
 #[derive(Deserialize)]
 struct Saved {
     camera_path: Vec<SavedKey>,
-    #[serde(default)]
     camera_type: Option<String>,
     #[serde(default)]
     is_cycle: bool,
+    seconds: Option<f64>,
+    fps: Option<f64>,
+    render_width: Option<f64>,
+    render_height: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -52,18 +70,18 @@ struct SavedKey {
     fov: f64,
 }
 
-/// Reads a camera path; its cameras are in the coordinates of the dataset.
+/// Reads a camera path.
 ///
 /// # Errors
 /// When the file cannot be read, is longer than 64 MiB, or is no path of 1 to 100,000 perspective cameras with
-/// finite poses and fields of view between 0 and 180 degrees.
-pub fn read(path: &Path) -> Result<Flight, FlightError> {
+/// finite poses and fields of view between 0 and 180 degrees, of 1 to 100,000 frames.
+pub fn read(path: &Path) -> Result<SavedFlight, FlightError> {
     let io = |source| FlightError::Read { path: path.to_owned(), source };
     let text = foreign::read_text(path, MOST_BYTES).map_err(io)?;
     parse(&text).map_err(|problem| FlightError::Malformed { path: path.to_owned(), problem })
 }
 
-pub(super) fn parse(text: &str) -> Result<Flight, String> {
+pub(super) fn parse(text: &str) -> Result<SavedFlight, String> {
     let saved: Saved = serde_json::from_str(text)
         .map_err(|e| format!("it is no camera path of nerfstudio ({e}); save one in its viewer"))?;
     if let Some(kind) = saved.camera_type.filter(|kind| !kind.eq_ignore_ascii_case("perspective")) {
@@ -77,7 +95,23 @@ pub(super) fn parse(text: &str) -> Result<Flight, String> {
         key(&saved.camera_to_world, saved.fov)
             .map_err(|problem| format!("camera {at} of camera_path: {problem}"))
     });
-    Ok(Flight { keys: keys.collect::<Result<_, String>>()?, is_loop: saved.is_cycle })
+    let flight = Flight { keys: keys.collect::<Result<_, String>>()?, is_loop: saved.is_cycle };
+    let bounded = |name: &str, value: Option<f64>, most: f64| match value {
+        Some(value) if !(value > 0.0 && value <= most) => {
+            Err(format!("{name} is {value}; it must be above 0, and {most} at most"))
+        }
+        value => Ok(value),
+    };
+    let frames = bounded("fps", saved.fps, 1000.0)?
+        .zip(bounded("seconds", saved.seconds, f64::MAX)?)
+        .map(|(fps, seconds)| (fps * seconds).round().max(1.0));
+    let frames = bounded("seconds times fps", frames, MOST_KEYS as f64)?.unwrap_or(count as f64);
+    let side = |name, value| bounded(name, value, f64::from(MOST_SIDE));
+    let size = side("render_width", saved.render_width)?
+        .zip(side("render_height", saved.render_height)?)
+        .map(|(width, height)| (width.ceil() as u32, height.ceil() as u32));
+    let fps = saved.fps.map(|fps| fps.round().max(1.0) as u32);
+    Ok(SavedFlight { flight, frames: frames as u32, fps, size })
 }
 
 /// A camera of a path: `camera_to_world` row after row, 4×4, with axes right, up and backward; `fov` in degrees.

@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::camera::Camera;
 pub use around::{Bearings, bearings, orbit, spiral};
-pub use file::{FlightError, key, read};
+pub use file::{FlightError, MOST_SIDE, SavedFlight, key, read};
 
 /// A camera on a path.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -138,10 +138,14 @@ fn a_flight_passes_its_keys_smoothly() {
 #[test]
 fn paths_of_nerfstudio_are_read() {
     let path = r#"{"camera_type": "perspective", "render_height": 4, "fps": 24, "is_cycle": true,
-        "camera_path": [{"fov": 90.0, "aspect": 1.5,
+        "seconds": null, "camera_path": [{"fov": 90.0, "aspect": 1.5,
         "camera_to_world": [1, 0, 0, 7, 0, 0, -1, 8, 0, 1, 0, 9, 0, 0, 0, 1]}]}"#;
-    let flight = parse(path).unwrap();
-    assert!(flight.is_loop);
+    let SavedFlight { flight, frames, fps, size } = parse(path).unwrap();
+    assert_eq!((flight.is_loop, frames, fps, size), (true, 1, Some(24), None));
+    // As long as it lasts.
+    let lasting = path.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
+    let SavedFlight { frames, size, .. } = parse(&lasting).unwrap();
+    assert_eq!((frames, size), (48, Some((6, 4))));
     let key = flight.keys[0];
     assert_eq!(key.centre, DVec3::new(7.0, 8.0, 9.0));
     let camera = key.camera((40, 40));
@@ -172,5 +176,17 @@ fn what_is_no_path_is_refused_with_the_reason() {
         let refused = parse(&text).unwrap_err();
         assert!(refused.contains(reason), "{text}: {refused}");
     }
-    assert!(parse(&pose(unit, "50")).is_ok());
+    let sound = pose(unit, "50");
+    assert!(parse(&sound).is_ok());
+    for (field, reason) in [
+        (r#""fps": 0"#, "fps is 0"),
+        (r#""fps": 1001"#, "fps is 1001"),
+        (r#""seconds": -1, "fps": 9"#, "seconds is -1"),
+        (r#""seconds": 1e4, "fps": 60"#, "seconds times fps is 600000"),
+        (r#""render_width": 20000"#, "render_width is 20000"),
+    ] {
+        let text = sound.replacen('{', &format!("{{{field}, "), 1);
+        let refused = parse(&text).unwrap_err();
+        assert!(refused.contains(reason), "{text}: {refused}");
+    }
 }
