@@ -52,6 +52,29 @@ pub struct Tensor {
     pub values: Values,
 }
 
+impl Tensor {
+    /// Whether an array of this name has the optimiser's [ages](Self::ages).
+    pub(crate) fn has_ages(name: &str) -> bool {
+        // Of the native and of the GPU backend.
+        matches!(name, "ages" | "device.ages")
+    }
+
+    /// Steps since each row was made or rewritten last, if this is the array that has them. Shape: `[rows]`.
+    #[must_use]
+    pub fn ages(&self) -> Option<Vec<u32>> {
+        match &self.values {
+            _ if !Self::has_ages(&self.name) => None,
+            Values::U16(ages) => Some(ages.iter().map(|&age| age.into()).collect()),
+            // A word per row, whose upper half is that of colours that step on their own.
+            Values::U8(bytes) => {
+                let words = bytes.as_chunks::<4>().0.iter();
+                Some(words.map(|&[low, high, ..]| u16::from_le_bytes([low, high]).into()).collect())
+            }
+            Values::F32(_) => None,
+        }
+    }
+}
+
 /// The values of a [`Tensor`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Values {

@@ -163,6 +163,17 @@ impl Checkpoint {
         Ok(())
     }
 
+    /// Steps since each row was made or rewritten last, as the optimiser counts them. Shape: `[rows]`.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Invalid`] if it has none, [`CheckpointError::File`].
+    pub fn ages(&mut self) -> Result<Vec<u32>, CheckpointError> {
+        let missing = || self.invalid("it has no ages of its rows");
+        let is_ages = |(_, record): &(u64, Record)| Tensor::has_ages(&record.name);
+        let place = self.places.iter().position(is_ages).ok_or_else(missing)?;
+        self.tensor(place)?.ages().ok_or_else(|| self.invalid("it has no ages of its rows"))
+    }
+
     fn invalid(&self, problem: impl ToString) -> CheckpointError {
         CheckpointError::invalid(&self.path, problem)
     }

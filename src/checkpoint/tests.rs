@@ -114,6 +114,16 @@ fn written() -> (tempfile::TempDir, PathBuf) {
     (root, path)
 }
 
+#[test]
+fn the_ages_of_the_rows_are_read_alone() {
+    let (_root, path) = written();
+    let ages = Checkpoint::open(&path).unwrap().ages().unwrap();
+    let signals = backend().take_signals(SignalSet::from([Signal::Age])).unwrap();
+    let counted: Vec<f32> = ages.iter().map(|&age| age as f32).collect();
+    assert_eq!(signals.get(Signal::Age), Some(&*counted));
+    assert!(ages.len() == ROWS && ages[1] > ages[0]);
+}
+
 fn problem(path: &Path) -> String {
     Checkpoint::open(path).unwrap_err().to_string()
 }

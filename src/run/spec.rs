@@ -340,7 +340,9 @@ run_spec! {
 
         /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
         /// curves and edits, that can pause, keep and stop the run (default port: the first free one from 8080
-        /// on). The run is the same with it and without; of --memory the page takes a part
+        /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then the whole printed address. Its pictures are
+        /// no larger than the largest photograph. The run is the same with it and without; of --memory the page takes
+        /// a part
         #[arg(
             long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0"
         )]

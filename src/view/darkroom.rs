@@ -235,7 +235,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::view::open::stage_of;
+    use crate::view::open::{stage_of, stage_of_one_view};
 
     /// A photograph of a camera as there are today, in each format, through a lens that bends.
     fn large_photographs(folder: &Path) {
@@ -301,6 +301,47 @@ mod tests {
             });
             made.expect("a thread").join().expect("pictures");
         });
+    }
+
+    #[test]
+    fn numbers_are_drawn_from_dark_to_light() {
+        let (_folder, stage) = stage_of_one_view();
+        let units = 1.0 / stage.normalisation.scale;
+        // Near; three times as far, and translucent; nothing.
+        let rendering = Rendering {
+            width: 3,
+            height: 1,
+            rgb: vec![0.5; 9],
+            alpha: vec![1.0, 0.75, 0.0],
+            depth: vec![2.0, 4.5, 0.0],
+        };
+        let of = |kind| {
+            let wanted = Wanted {
+                owner: ("a".to_owned(), 0),
+                kind,
+                model: 0,
+                size: (3, 1),
+                is_moving: false,
+                from: Viewpoint::View(Split::Train, 0),
+            };
+            let negative = Negative { rendering: rendering.clone(), ..Negative::default() };
+            let drawn = draw(&stage, &wanted, negative).expect("a picture");
+            let light = |x: u32| drawn.image.get_pixel(x, 0).0.into_iter().map(u32::from).sum();
+            let lights: [u32; 3] = [0, 1, 2].map(light);
+            (drawn, lights)
+        };
+        let is_near = |a: f64, b: f64| (a - b).abs() < 1e-5 * units;
+        let (depth, [near, far, nothing]) = of(Kind::Depth);
+        assert!(near > far && far > nothing && nothing == 0, "{near} {far} {nothing}");
+        let range = depth.range.expect("a scale");
+        assert!(is_near(range.start, 6.0 * units) && is_near(range.end, 2.0 * units), "{range:?}");
+        assert!(depth.distance.is_some_and(|it| is_near(it, 6.0 * units)), "{:?}", depth.distance);
+        let (opacity, lights) = of(Kind::Opacity);
+        assert_eq!((lights, opacity.range), ([3 * 255, 3 * 191, 0], None));
+        let (count, [some, more, none]) = of(Kind::Count);
+        assert!(more > some && some > none, "{some} {more} {none}");
+        assert_eq!((count.range, count.distance), (Some(0.0..4.5), None));
+        assert!(count.mean.is_some_and(|mean| (mean - 6.5 / 3.0).abs() < 1e-6));
     }
 
     #[test]

@@ -28,6 +28,12 @@ fn pose(camera: &Camera) -> Value {
     json!({ "camera_to_world": rows.as_flattened(), "fov": fov })
 }
 
+/// Focal lengths and principal point in parts of the image's width and height: fx, fy, cx, cy.
+fn lens(camera: &Camera) -> Vec<f64> {
+    let [width, height] = [camera.width, camera.height].map(f64::from);
+    vec![camera.fx / width, camera.fy / height, camera.cx / width, camera.cy / height]
+}
+
 /// Most that a point takes of the description `[bytes]`.
 pub(super) const POINT: usize = 128;
 
@@ -65,6 +71,7 @@ fn all_but_points(stage: &Stage) -> Value {
             said["name"] = view.name.clone().into();
             said["width"] = view.camera.width.into();
             said["height"] = view.camera.height.into();
+            said["lens"] = lens(&view.camera).into();
             said
         };
         views.iter().map(view).collect::<Vec<Value>>()

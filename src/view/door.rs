@@ -47,13 +47,15 @@ impl Door {
             let listener = TcpListener::bind((host, port))?;
             Ok((listener.local_addr()?, listener))
         };
+        // That of `view`, and of `train`.
+        let flag = if has_secret { "--view=" } else { "--port " };
         let refused = |port: u16, error: std::io::Error| match error.kind() {
             std::io::ErrorKind::AddrInUse => Failure::input(format!(
-                "--port {port}: another program uses this port; choose another, or leave --port out and \
-                 a free one is taken"
+                "{flag}{port}: another program uses this port; choose another, or name none and a free one is \
+                 taken"
             )),
             std::io::ErrorKind::PermissionDenied => Failure::input(format!(
-                "--port {port}: the system keeps this port for itself ({error}); choose one from 1024 on"
+                "{flag}{port}: the system keeps this port for itself ({error}); choose one from 1024 on"
             )),
             _ => Failure::input(format!(
                 "--host {host}: nothing can be served there ({error}); give an address of this machine"

@@ -150,7 +150,7 @@ mod tests {
             model.opacity_logits[row] = logit(0.8);
         }
         let backend = Device::default().backend(&model, &Setup::new(2)).expect("a backend");
-        let shown = Shown { name: "a".into(), rows: 2, sh_degree: 0, near: 0.1 };
+        let shown = Shown { name: "a".into(), rows: 2, sh_degree: 0, near: 0.1, checkpoint: None };
         let mut measured = Measured::new(&stage, &shown, &*backend).expect("a backend");
         assert_eq!(measured.progress(), [0, 2]);
         let seen = |of: &[f32]| of.iter().filter(|&&number| number > 0.0).count();

@@ -10,8 +10,10 @@ use super::desk::Unmade;
 use super::kinds::Kind;
 use super::measured::Measured;
 use super::paint::{self, Colours, Known, colours};
-use super::stage::Stage;
+use super::stage::{Shown, Stage};
 use crate::backend::{Backend, Rendering};
+use crate::checkpoint::{Checkpoint, CheckpointError};
+use crate::trainer::RowHistory;
 
 /// How long rows are measured in training views before what is known of them is shown.
 const PATIENCE: Duration = Duration::from_millis(150);
@@ -48,6 +50,8 @@ pub(super) struct Brush {
     /// The newest colours, what they say, and in how many views that was measured.
     colours: Option<(Kind, usize, Colours)>,
     measured: Option<Measured>,
+    /// When rows were edited, and the step of the model.
+    edits: Option<(RowHistory, u32)>,
 }
 
 /// Renders a model that does not change.
@@ -58,7 +62,7 @@ pub(super) fn expose(
     wanted: &Wanted,
 ) -> Result<Negative, Unmade> {
     let begun = Instant::now();
-    let Brush { colours: kept, measured } = brush;
+    let Brush { colours: kept, measured, edits } = brush;
     let mut progress = None;
     if matches!(wanted.kind, Kind::RowGradient | Kind::RowWeight) {
         let shown = &stage.models[wanted.model];
@@ -72,18 +76,36 @@ pub(super) fn expose(
         }
         progress = Some(measured.progress());
     }
+    if wanted.kind == Kind::RowEdit && edits.is_none() {
+        *edits = edits_of(&stage.models[wanted.model]).map_err(failed)?;
+    }
     if wanted.kind.paints() {
         let views = progress.map_or(0, |[seen, _]| seen);
         let is_kept =
             kept.as_ref().is_some_and(|(kind, of, _)| (*kind, *of) == (wanted.kind, views));
         if !is_kept {
-            let known = Known { measured: measured.as_ref(), ..Known::default() };
+            let history = edits.as_ref().map(|(edits, step)| (edits, *step));
+            let known = Known { measured: measured.as_ref(), history, ..Known::default() };
             *kept = Some((wanted.kind, views, coloured(stage, backend, known, wanted.kind)?));
         }
     }
     let painted = kept.as_ref().filter(|_| wanted.kind.paints()).map(|(.., colours)| colours);
     let negative = rendered(stage, backend, wanted, painted)?;
     Ok(Negative { measured: progress, milliseconds: milliseconds(begun), ..negative })
+}
+
+/// When the rows of a run's model were edited, as its checkpoint says it.
+fn edits_of(shown: &Shown) -> Result<Option<(RowHistory, u32)>, CheckpointError> {
+    let Some(path) = &shown.checkpoint else { return Ok(None) };
+    let mut checkpoint = Checkpoint::open(path)?;
+    let step = checkpoint.header().trainer.step;
+    let edited = checkpoint.ages()?.into_iter().map(|age| step.saturating_sub(age));
+    let edited: Vec<u32> = edited.collect();
+    if edited.len() == shown.rows {
+        return Ok(Some((RowHistory::of(&edited, shown.rows), step)));
+    }
+    let problem = format!("it has {} Gaussians, and the model {}", edited.len(), shown.rows);
+    Err(CheckpointError::Invalid { path: path.clone(), problem })
 }
 
 /// Renders a model in training; nothing is kept.

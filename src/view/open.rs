@@ -8,6 +8,7 @@ use super::kinds::Kind;
 use super::paint::ends;
 use super::stage::{Exhibition, NO_MODEL, Shown, Stage};
 use crate::camera::Camera;
+use crate::checkpoint::checkpoint_path;
 use crate::dataset::normalise::{EXTENT, Normalisation, median};
 use crate::dataset::{Dataset, PointCloud, builtin};
 use crate::failure::Failure;
@@ -64,6 +65,7 @@ pub(crate) fn open(
     if iteration.is_some() && !is_run(what) {
         return Err(Failure::input("--iteration is for a run's folder; leave it out"));
     }
+    let mut first = None;
     let mut shown = if is_model(what) {
         let model = read_model(what, observer)?;
         let mut shown = match scene {
@@ -80,7 +82,8 @@ pub(crate) fn open(
             .map_err(|failure| if has_moved { failure } else { or_moved(failure, &path) })?;
         let mut shown = of_dataset(machine, what, dataset, &config.spec.data);
         let called = format!("{}, iteration {iteration}", name_of(what));
-        shown.show(called, model, config.spec.start.near.0)?;
+        shown.show_of_run(called, model, (what, iteration, &config))?;
+        first = Some(config);
         shown
     } else {
         if scene.is_some() {
@@ -102,7 +105,10 @@ pub(crate) fn open(
         } else {
             let (model, config, iteration) = of_run(other, None, observer)?;
             let called = format!("{called}, iteration {iteration}");
-            shown.show(called, model, config.spec.start.near.0)?;
+            shown.show_of_run(called, model, (other, iteration, &config))?;
+            if let Some(note) = first.and_then(|first| apart(&first, &config)) {
+                observer.say(format_args!("note: {}: {note}", other.display()));
+            }
         }
     }
     Ok(shown)
@@ -114,6 +120,17 @@ fn no_run(path: &Path) -> Failure {
         "{path} is neither a run (it holds no {CONFIG_FILE}) nor a file of Gaussian splats nor a scene; name the \
          folder that `densify train` wrote, a model, or a dataset"
     ))
+}
+
+/// What the datasets of two runs differ in, that they are shown of the first's.
+fn apart(first: &RunConfig, other: &RunConfig) -> Option<&'static str> {
+    let [a, b] = [first, other].map(|config| (config.scene_path(), &config.spec.data));
+    if a.0 != b.0 {
+        return Some("it was trained on another scene, whose coordinates may be others");
+    }
+    let splits = [a.1, b.1].map(|data| (data.eval, data.test_every));
+    (splits[0] != splits[1])
+        .then_some("it was trained on other views; what is held out here it may have seen")
 }
 
 /// A model that a run has saved, while it trains too.
@@ -204,8 +221,8 @@ fn of_points(
     };
     let mut shown = of_dataset(machine, what, dataset, data);
     let of_models = [Kind::RowGradient, Kind::RowWeight, Kind::RowAge, Kind::RowEdit];
+    shown.show_in_scene(called, &model, near, None)?;
     shown.stage.lacks(&of_models, NO_MODEL);
-    shown.show_in_scene(called, &model, near)?;
     Ok(shown)
 }
 
@@ -238,15 +255,42 @@ pub(super) fn stage_of_one_view() -> (tempfile::TempDir, Stage) {
 impl Exhibition {
     /// Shows a model that is in the dataset's own coordinates.
     fn show(&mut self, name: String, model: Gaussians, near: f64) -> Result<(), Failure> {
+        self.show_model(name, model, near, None)
+    }
+
+    fn show_model(
+        &mut self,
+        name: String,
+        model: Gaussians,
+        near: f64,
+        checkpoint: Option<PathBuf>,
+    ) -> Result<(), Failure> {
         let model = self.stage.normalisation.model_from_world(model);
-        self.show_in_scene(name, &model, near)
+        self.show_in_scene(name, &model, near, checkpoint)
+    }
+
+    /// The same of a run.
+    fn show_of_run(
+        &mut self,
+        name: String,
+        model: Gaussians,
+        (run, iteration, config): (&Path, u32, &RunConfig),
+    ) -> Result<(), Failure> {
+        let checkpoint = Some(checkpoint_path(run, iteration)).filter(|path| path.is_file());
+        self.show_model(name, model, config.spec.start.near.0, checkpoint)
     }
 
     /// The same in scene coordinates. The near plane is a fraction of the scene's extent.
-    fn show_in_scene(&mut self, name: String, model: &Gaussians, near: f64) -> Result<(), Failure> {
+    fn show_in_scene(
+        &mut self,
+        name: String,
+        model: &Gaussians,
+        near: f64,
+        checkpoint: Option<PathBuf>,
+    ) -> Result<(), Failure> {
         let (sh_degree, near) = (model.sh_degree, (near * EXTENT) as f32);
         let backend = self.stage.machine.backend_in_scene(model, near, (1, 1))?;
-        self.add(Shown { name, rows: model.len(), sh_degree, near }, backend);
+        self.add(Shown { name, rows: model.len(), sh_degree, near, checkpoint }, backend);
         Ok(())
     }
 }

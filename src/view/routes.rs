@@ -142,7 +142,13 @@ mod tests {
         let points = PointCloud::default();
         let (machine, place) = (Machine::default(), Normalisation::IDENTITY);
         let mut stage = Stage::new(machine, "a".into(), place, [0.0; 3], none(), points);
-        stage.models.push(Shown { name: "a".into(), rows: 1, sh_degree: 0, near: 0.1 });
+        stage.models.push(Shown {
+            name: "a".into(),
+            rows: 1,
+            sh_degree: 0,
+            near: 0.1,
+            checkpoint: None,
+        });
         let desk = Desk::new(None, 1);
         desk.close();
         let routes = Routes {

@@ -1,6 +1,8 @@
 //! What is looked at: one model or two, in the coordinates of a dataset where there is one. All threads read it; the
 //! models themselves are with the one that renders.
 
+use std::path::PathBuf;
+
 use super::kinds::Kind;
 use super::paint::Known;
 use crate::backend::Backend;
@@ -16,8 +18,11 @@ use densify_policies::policy::Signal;
 /// Decoded photographs that are kept `[bytes]`, where a promise does not say how much may be held.
 const KEPT_PHOTOGRAPHS: u64 = 64 << 20;
 
-const NO_COUNTS: &str = "they are not counted on a GPU; start with --backend cpu";
-const NO_HISTORY: &str = "no file says when a Gaussian was made or edited; densify train --view shows it while a run trains";
+const NO_COUNTS: &str = "they are not counted on a GPU; densify view --backend cpu counts them";
+const NO_BIRTHS: &str =
+    "no file says when a Gaussian was made; densify train --view shows it while a run trains";
+const NO_EDITS: &str = "only a run's checkpoint says when a Gaussian was edited, and there is none of this model; \
+                        densify train --view shows it while a run trains";
 const NO_PHOTOGRAPHS: &str = "no photographs are known; name their dataset with --scene";
 const NO_TRAINING_VIEWS: &str =
     "it is measured in training photographs, and none are known; name their dataset with --scene";
@@ -32,6 +37,8 @@ pub(super) struct Shown {
     pub(super) sh_degree: u8,
     /// Near plane `[scene units]`.
     pub(super) near: f32,
+    /// What the run that has it can go on from, where that is kept.
+    pub(super) checkpoint: Option<PathBuf>,
 }
 
 /// What is looked at, with the models.
@@ -80,6 +87,9 @@ impl Exhibition {
         if !backend.counts_rows() {
             self.stage.lacks(&[Kind::Count], NO_COUNTS);
         }
+        if shown.checkpoint.is_none() {
+            self.stage.lacks(&[Kind::RowEdit], NO_EDITS);
+        }
         self.stage.models.push(shown);
         self.backends.push(backend);
     }
@@ -102,7 +112,7 @@ impl Stage {
         let views = [test, train];
         let place = (normalisation, background);
         let mut stage = Self::keeping(KEPT_PHOTOGRAPHS, machine, title, place, views, points);
-        stage.lacks(&[Kind::RowAge, Kind::RowEdit], NO_HISTORY);
+        stage.lacks(&[Kind::RowAge], NO_BIRTHS);
         if stage.views[1].is_empty() {
             stage.lacks(&[Kind::RowGradient, Kind::RowWeight], NO_TRAINING_VIEWS);
         }
@@ -153,6 +163,7 @@ impl Stage {
             rows,
             sh_degree: config.sh_degree(),
             near: 0.0,
+            checkpoint: None,
         }];
         let views = [dataset.test.clone(), dataset.train.clone()];
         let place = (dataset.normalisation, background);

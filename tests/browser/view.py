@@ -186,6 +186,65 @@ class Browser:
         self.driver.wait()
 
 
+def moves(browser: Browser) -> None:
+    """Every other way to move, each in the right direction and no other."""
+    browser.run("document.getElementById('marks').focus()")
+    state = "return [camera.at, camera.right, camera.up, camera.back, camera.away, camera.fov]"
+    dot = lambda a, b: sum(x * y for x, y in zip(a, b))
+
+    def went(act) -> tuple[list[float], list, list]:
+        """How far the camera went to the right, up and back."""
+        browser.is_sharp()
+        before = browser.run(state)
+        act()
+        browser.is_sharp()
+        after = browser.run(state)
+        step = [a - b for a, b in zip(after[0], before[0])]
+        return [dot(step, axis) for axis in before[1:4]], before, after
+
+    def held(key: str) -> None:
+        for kind in ("keyDown", "keyUp"):
+            actions = [{"type": "key", "id": "keys", "actions": [{"type": kind, "value": key}]}]
+            browser.call("POST", f"{browser.session}/actions", {"actions": actions})
+            time.sleep(0.3)
+
+    for key, axis, sign in [("w", 2, -1), ("a", 0, -1), ("d", 0, 1), ("e", 1, 1), ("q", 1, -1)]:
+        step, before, after = went(lambda: held(key))
+        others = [abs(step[i]) for i in range(3) if i != axis]
+        assert step[axis] * sign > 0 and max(others) < 1e-6, f"{key} goes {step}"
+        assert before[3] == after[3], f"{key} turns"
+    drag = lambda button: browser.hand(
+        {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": 440, "y": 380},
+        {"type": "pointerDown", "button": button},
+        {"type": "pointerMove", "duration": 0, "origin": "pointer", "x": 60, "y": 0},
+        {"type": "pointerUp", "button": button},
+    )
+    # What is shifted to the right is seen from farther left.
+    step, before, after = went(lambda: drag(2))
+    assert step[0] < 0 and abs(step[1]) < 1e-6 and before[3] == after[3], f"the right button goes {step}"
+    step, before, after = went(lambda: drag(0))
+    assert before[3] != after[3] and step[0] < 0, f"the left button goes {step}"
+    step, before, after = went(lambda: browser.press("+"))
+    assert step[2] < 0 and after[4] < before[4], f"+ goes {step}"
+    step, before, after = went(lambda: browser.press("-"))
+    assert step[2] > 0 and after[4] > before[4], f"- goes {step}"
+    slide = "const slider = document.getElementById(arguments[0]); slider.value = arguments[1];"
+    slide += "for (const kind of ['input', 'change']) slider.dispatchEvent(new Event(kind, { bubbles: true }));"
+    browser.run(slide, "fov", 30)
+    assert browser.run(state)[5] == 30, "the field of view stays"
+    browser.is_sharp()
+    size = "return Number(document.getElementById('stage').dataset.size.split('x')[0])"
+    whole = browser.run(size)
+    options = browser.run("return Array.from(document.getElementById('sharpness').options, (it) => it.value)")
+    browser.choose("sharpness", min(options, key=float))
+    assert browser.run(size) == int(whole * float(min(options, key=float))), f"{browser.run(size)} px of {whole}"
+    browser.choose("sharpness", "1")
+    browser.run("document.getElementById('marks').focus()")
+    browser.press("[")
+    browser.is_sharp()
+    assert browser.run("return view"), "[ goes to no camera"
+
+
 def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, folder: Path | None) -> None:
     browser.size(1280, 800)
     browser.theme("dark")
@@ -287,7 +346,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     time.sleep(1.5)
     browser.call("POST", f"{browser.session}/actions", {"actions": keys("keyUp")})
     browser.is_sharp()
-    assert browser.run("return length(add(camera.at, arguments[0], -1))", before) > 0, "no key flies"
+    assert browser.run("return dot(add(camera.at, arguments[0], -1), camera.back)", before) > 0, "S does not fly back"
     rate, rested = browser.run(pace)
     print(f"{rate} pictures per second moving; sharp {rested} ms after the last change")
     # Two fingers that part go nearer.
@@ -296,6 +355,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     after = browser.run("return camera.away")
     assert after < 0.9 * before, f"fingers that part: from {before} to {after} away"
     browser.is_sharp()
+    moves(browser)
     # Everything that is seen is reached by key, and has a name.
     for _ in range(60):
         browser.press("\ue004")  # Tab
@@ -313,10 +373,22 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.until("window.saved", "no camera path is saved")
     path = rendered / "camera_path.json"
     path.write_text(browser.run("return saved"))
-    flight = ["--path", path, "--frames", "3", "--size", "64x48", "-o", rendered / "flight", "--backend", "cpu"]
-    subprocess.run([densify, "render", run, *flight], check=True, capture_output=True)
+    fly = lambda to, *more: subprocess.run(
+        [densify, "render", run, "--path", path, *more, "-o", rendered / to, "--backend", "cpu"], check=True, capture_output=True
+    )
+    # Two seconds from camera to camera, 30 pictures each.
+    fly("flight", "--size", "16x12")
     frames = {it.read_bytes() for it in (rendered / "flight").rglob("*.png")}
-    assert len(frames) == 3, f"{len(frames)} pictures of the flight"
+    assert len(frames) == 60, f"{len(frames)} pictures of the flight"
+    # Half-way the page is where the film is.
+    fly("thirds", "--frames", "3")
+    browser.run("setOnPath(0.5); view = null; changed()")
+    browser.is_sharp()
+    png = base64.b64encode((rendered / "thirds" / "frame_00001.png").read_bytes()).decode()
+    near = browser.wait(PSNR.replace("shown[1]", "shown[0]"), f"data:image/png;base64,{png}")
+    assert near >= 36, f"half-way along the path the page is {near:.1f} dB from the film"
+    browser.run("document.getElementById('remove').click()")
+    assert browser.run("return keys.length") == 1, "the last camera is not removed"
 
     # Where there is little room.
     browser.size(360, 740)

@@ -94,6 +94,11 @@ fn a_backend_that_took_back_its_state_has_the_same_future() {
             step(&mut *whole, &camera, i);
         }
         let (model, state) = saved(&*whole);
+        let ages = state.iter().find_map(Tensor::ages).expect("ages of the rows");
+        let signals = whole.take_signals(SignalSet::from([Signal::Age])).expect("signals");
+        let counted: Vec<f32> = ages.into_iter().map(|age| age as f32).collect();
+        assert_eq!(signals.get(Signal::Age), Some(&*counted), "{}", subject.name());
+        whole.give_back(signals);
         let expected = future(&mut *whole);
 
         let without = |left_out: &str| {

@@ -122,7 +122,7 @@ function dolly(factor) {
 /** This page's name for itself: of each page only the newest wish is kept. */
 const page = Array.from(crypto.getRandomValues(new Uint8Array(12)), (x) => x.toString(16).padStart(2, "0")).join("");
 /** So long after the last change the picture is asked for in full [ms]. */
-const REST = 60;
+const REST = 30;
 /** What a picture may take while we move [ms]. */
 const PACE = 45;
 /** The two pictures that are shown, each a bitmap with what is known of it, and what they show. */
@@ -218,7 +218,7 @@ async function keepAsking() {
       stage.dataset.state = complete === version ? "sharp" : isPart ? "measuring" : "moving";
       // What is in the middle is what one turns about next.
       if (complete === version && frames[0].distance) camera.away = frames[0].distance;
-      if (complete === version) stage.dataset.rested = Math.round(performance.now() - changedAt);
+      if (complete === version) stage.dataset.rested = rested();
     } catch (error) {
       const isGone = error instanceof TypeError;
       const gone = scene.live ? "Training has ended, or densify was stopped." : "densify view does not answer; start it again, and this page goes on.";
@@ -235,6 +235,9 @@ async function keepAsking() {
   }
 }
 
+/** How long nothing has changed [ms]. */
+const rested = () => Math.round(performance.now() - changedAt);
+
 /** Says what the picture took, and adapts the coarse size so that movement stays fluent. */
 function pace(frames, isMoving) {
   const took = frames.reduce((sum, frame) => sum + (frame ? frame.took : 0), 0);
@@ -248,7 +251,7 @@ function pace(frames, isMoving) {
     byId("status").textContent = `${size} · ${Math.round(1000 / mean)} pictures/s · ${took.toFixed(0)} ms`;
   } else {
     const [seen, all] = frames.find((frame) => frame?.measured)?.measured ?? [0, 0];
-    const how = seen < all ? `measured in ${seen} of ${all} training views` : `sharp · drawn in ${milliseconds.toFixed(0)} ms`;
+    const how = seen < all ? `measured in ${seen} of ${all} training views` : `sharp after ${rested()} ms, drawn in ${milliseconds.toFixed(0)}`;
     byId("status").textContent = `${size} · ${how}`;
   }
 }
@@ -322,23 +325,26 @@ function describe() {
 
 /** From the world to the stage: x and y in parts of the stage, and depth; on `marks`, in its pixels. */
 function projector() {
-  const fitted = fit(shape(), [marks.width, marks.height]);
-  const focal = fitted[1] / 2 / Math.tan(radians(camera.fov) / 2);
+  const [width, height] = fit(shape(), [marks.width, marks.height]);
+  const focal = 1 / 2 / Math.tan(radians(camera.fov) / 2);
+  // A photograph's middle need not be that of its lens.
+  const [fx, fy, cx, cy] = view ? scene.views[view.split][view.number].lens : [focal * height / width, focal, 0.5, 0.5];
+  const [left, top] = [(marks.width - width) / 2, (marks.height - height) / 2];
   const { right, up, back, at } = camera;
   return (world) => {
     const d = add(world, at, -1);
     const z = -dot(d, back);
-    return [marks.width / 2 + focal * dot(d, right) / z, marks.height / 2 - focal * dot(d, up) / z, z];
+    return [left + width * (cx + fx * dot(d, right) / z), top + height * (cy - fy * dot(d, up) / z), z];
   };
 }
 
 /** The corners of a camera's frustum after its centre, in the world. */
-function frustum({ camera_to_world: m, fov, width, height }) {
+function frustum({ camera_to_world: m, lens: [fx, fy, cx, cy] }) {
   const axis = (i) => [m[i], m[4 + i], m[8 + i]];
   const centre = axis(3), size = 0.06 * scene.radius;
-  const y = Math.tan(radians(fov) / 2) * size, x = y * width / height;
-  const corner = (sx, sy) => add(add(add(centre, axis(0), sx * x), axis(1), sy * y), axis(2), -size);
-  return [centre, corner(-1, 1), corner(1, 1), corner(1, -1), corner(-1, -1)];
+  const [left, right, top, bottom] = [-cx / fx, (1 - cx) / fx, cy / fy, (cy - 1) / fy].map((part) => part * size);
+  const corner = (x, y) => add(add(add(centre, axis(0), x), axis(1), y), axis(2), -size);
+  return [centre, corner(left, top), corner(right, top), corner(right, bottom), corner(left, bottom)];
 }
 
 function drawMarks(ratio) {
@@ -597,8 +603,12 @@ function setOnPath(place) {
   camera.up = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)];
   camera.back = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
   camera.at = mix(near.map(({ camera_to_world: m }) => [m[3], m[7], m[11]]));
-  camera.fov = near[1].fov + (near[2].fov - near[1].fov) * t;
+  const zoom = near.reduce((sum, { fov }, i) => sum + weights[i] * Math.log(Math.tan(radians(fov) / 2)), 0);
+  camera.fov = 2 * Math.atan(Math.exp(zoom)) * 180 / Math.PI;
 }
+
+/** From how many cameras of the path one goes on to the next. */
+const intervals = () => keys.length - (byId("loop").checked ? 0 : 1);
 
 function play() {
   flight = flight ? null : performance.now();
@@ -608,11 +618,10 @@ function play() {
   showPath();
   const next = (now) => {
     if (flight === null) return;
-    const intervals = keys.length - (byId("loop").checked ? 0 : 1);
     // Two seconds from camera to camera.
     const place = Math.max(0, now - flight) / 2000;
-    if (place >= intervals) flight = null;
-    setOnPath(Math.min(place, intervals));
+    if (place >= intervals()) flight = null;
+    setOnPath(Math.min(place, intervals()));
     changed();
     if (flight === null) { showPath(); showControls(); }
     else requestAnimationFrame(next);
@@ -624,7 +633,7 @@ function savePath() {
   const [width, height] = area().map((side) => Math.round(side * devicePixelRatio));
   const path = {
     camera_type: "perspective", render_width: width, render_height: height, fps: 30,
-    seconds: 2 * keys.length, is_cycle: byId("loop").checked, camera_path: keys,
+    seconds: 2 * Math.max(1, intervals()), is_cycle: byId("loop").checked, camera_path: keys,
   };
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([JSON.stringify(path, null, 1)], { type: "application/json" }));

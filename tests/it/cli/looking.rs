@@ -2,8 +2,6 @@
 
 use std::path::Path;
 
-use image::AnimationDecoder;
-use image::codecs::webp::WebPDecoder;
 use safetensors::tensor::{Dtype, TensorView};
 
 use super::{call, files, json, scratch, text, train};
@@ -11,7 +9,7 @@ use crate::photographs::{Photographs, SIZE, VIEWS, name};
 
 const ITERATIONS: u32 = 40;
 
-fn run_of(scene: &Photographs, run: &Path) {
+pub(super) fn run_of(scene: &Photographs, run: &Path) {
     train(scene.path(), run, ITERATIONS, "--budget 320 --eval --quiet").ok();
 }
 
@@ -212,83 +210,4 @@ fn policies_are_listed_and_explained() {
         assert!(manual.contains(entry.manual().lines().next().unwrap_or("?")), "{manual}");
     }
     call("policies diett").refused("misspelt", &["diett", "diet"]);
-}
-
-#[test]
-fn a_flight_is_rendered_as_pictures_and_as_a_film() {
-    let scene = Photographs::colmap_text();
-    let (root, run) = scratch();
-    run_of(&scene, &run);
-    let frames = root.path().join("frames");
-    let film = root.path().join("films/orbit.webp");
-    let call_with =
-        |more: &str| call(&format!("render {} -o {} {more}", text(&run), text(&frames)));
-    let options = "--path orbit --frames 5 --size 31x20 --depth --fps 8";
-    call_with(&format!("{options} --video {}", text(&film))).ok();
-    let names: Vec<String> = files(&frames).into_keys().collect();
-    let expected = (0..5).flat_map(|n| ["depth.png", "png"].map(|e| format!("frame_{n:05}.{e}")));
-    let expected: Vec<String> = ["depth.json".to_owned()].into_iter().chain(expected).collect();
-    assert_eq!(names, expected);
-    assert_eq!(size(&frames, "frame_00004.png"), (31, 20));
-    let still = |n: u32| image::open(frames.join(format!("frame_{n:05}.png"))).expect("a picture");
-    assert!(still(0) != still(1), "the camera moves");
-    let bytes = std::fs::read(&film).expect("a film");
-    let decoder = WebPDecoder::new(std::io::Cursor::new(bytes)).expect("it is WebP");
-    let film = decoder.into_frames().collect_frames().expect("an animation");
-    assert_eq!(film.len(), 5);
-    for (frame, n) in film.iter().zip(0..) {
-        assert_eq!(frame.delay().numer_denom_ms(), (125, 1));
-        let pixels = image::DynamicImage::from(frame.buffer().clone()).into_rgb8();
-        assert!(pixels == still(n).into_rgb8(), "frame {n} is the picture");
-    }
-    // Not a frame is rendered for a film that cannot be made.
-    for (more, words) in [
-        ("--video a.avi --path spiral", [".mp4", ".webp"]),
-        ("--path nowhere.json", ["--path", "nowhere.json"]),
-        ("--path orbit --side-by-side", ["--side-by-side", "flight"]),
-        ("--path orbit --size 0x5", ["--size", "640x480"]),
-        ("--path orbit --frames 0", ["--frames", "1..="]),
-    ] {
-        let other = root.path().join("other");
-        let refused = call(&format!("render {} -o {} {more}", text(&run), text(&other)));
-        refused.refused(more, &words);
-        assert!(!other.exists(), "{more}");
-    }
-}
-
-#[test]
-fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
-    let scene = Photographs::colmap_text();
-    let (root, run) = scratch();
-    run_of(&scene, &run);
-    // The training cameras of the run's folder, as nerfstudio would save them.
-    let cameras = json(&run.join("cameras.json"));
-    let first = &cameras[0];
-    let number = |value: &serde_json::Value| value.as_f64().expect("a number");
-    let row = |i: usize| -> [f64; 4] {
-        let turn = &first["rotation"][i];
-        // Columns are x right, y down, z forward; nerfstudio's y and z point the other way.
-        [number(&turn[0]), -number(&turn[1]), -number(&turn[2]), number(&first["position"][i])]
-    };
-    let pose = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat();
-    let height = number(&first["height"]);
-    let fov = 2.0 * (0.5 * height / number(&first["fy"])).atan().to_degrees();
-    let path = root.path().join("path.json");
-    let key = serde_json::json!({ "camera_to_world": pose, "fov": fov, "aspect": 1.2 });
-    std::fs::write(&path, serde_json::json!({ "camera_path": [key] }).to_string()).unwrap();
-    let frames = root.path().join("frames");
-    let run_text = text(&run);
-    call(&format!("render {run_text} -o {} --path {}", text(&frames), text(&path))).ok();
-    let views = root.path().join("views");
-    call(&format!("render {run_text} -o {} --split train", text(&views))).ok();
-    call(&format!("render {run_text} -o {}", text(&views))).ok();
-    let name = first["img_name"].as_str().expect("a name");
-    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
-    let open = |path: &Path| image::open(path).expect("a picture").into_rgb8();
-    let frame = open(&frames.join("frame_00000.png"));
-    let view = open(&views.join(format!("{stem}.png")));
-    assert_eq!(files(&frames).len(), 1, "as many frames as cameras");
-    assert_eq!(frame.dimensions(), view.dimensions());
-    let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
-    assert!(most.is_some_and(|most| most <= 2), "{most:?}");
 }

@@ -12,6 +12,7 @@ mod exposing;
 mod faults;
 #[cfg(unix)]
 mod filling;
+mod flying;
 mod generated;
 mod geometry;
 mod hostile;

@@ -202,9 +202,9 @@ fn the_picture_of_a_camera_is_that_which_render_writes() {
     }
     let all = described["kinds"].as_array().expect("kinds").iter();
     let kinds: Vec<&str> = all.filter_map(|kind| kind["kind"].as_str()).collect();
-    // When rows were made and edited no file says; the page says so.
+    // When rows were made no file says; the page says so. When they were edited the run's checkpoint does.
     let lacking = described["lacking"].as_array().expect("what lacks");
-    assert_eq!((kinds.len(), lacking.len()), (12, 2), "{described}");
+    assert_eq!((kinds.len(), lacking.len()), (13, 1), "{described}");
     assert_eq!(page.frame(&wish("row_age", "test", 0, SIZE)).status, 400);
     let mut seen: Vec<Vec<u8>> = Vec::new();
     for kind in kinds {
@@ -212,6 +212,9 @@ fn the_picture_of_a_camera_is_that_which_render_writes() {
         assert_eq!(reply.picture().dimensions(), SIZE, "{kind}");
         let has_range = !matches!(kind, "render" | "photograph" | "opacity" | "rows");
         assert_eq!(reply.header("X-Range").is_some(), has_range, "{kind}");
+        if kind == "row_edit" {
+            assert_eq!(reply.header("X-Range"), Some("0 40"), "none was edited in 40 steps");
+        }
         assert!(!seen.contains(&reply.body), "{kind} is as another");
         seen.push(reply.body);
     }
@@ -327,6 +330,16 @@ fn a_scene_without_a_model_shows_its_points_and_two_runs_are_compared() {
     };
     assert!(psnr(&of(0).picture(), &of(1).picture()) < 35.0, "two models, two pictures");
     assert_eq!(of(2).status, 400);
+    assert!(!page.before.contains("note"), "{}", page.before);
+    // Of another scene, or with other views held out, it is said.
+    let elsewhere = Photographs::colmap_text();
+    for (scene, flags, words) in
+        [(&elsewhere, "--eval", "another scene"), (&scene, "", "other views")]
+    {
+        train(scene.path(), &other, 4, &format!("--budget 320 --overwrite --quiet {flags}")).ok();
+        let page = Page::open(&format!("{} {}", text(&run), text(&other)));
+        assert!(page.before.contains(words), "{words}: {}", page.before);
+    }
 }
 
 #[test]
@@ -342,10 +355,7 @@ fn what_cannot_be_shown_is_said_with_the_remedy() {
     let model = densify::output::model_path(&run, 40);
     let model = text(&model);
     for (words, expected) in [
-        (
-            format!("{run_text} --port {port}"),
-            vec!["--port", "another program", "leave --port out"],
-        ),
+        (format!("{run_text} --port {port}"), vec!["--port", "another program", "name none"]),
         (format!("{run_text} --port 70000"), vec!["--port"]),
         (format!("{run_text} --host nowhere"), vec!["--host"]),
         (format!("{run_text} --host 192.0.2.1"), vec!["--host 192.0.2.1", "this machine"]),

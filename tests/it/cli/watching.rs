@@ -286,7 +286,7 @@ fn a_page_that_cannot_be_served_is_refused_before_anything_is_written() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let port = taken.local_addr().expect("an address").port();
     for (flag, words) in [
-        (format!("--view={port}"), vec![port.to_string(), "another program".to_owned()]),
+        (format!("--view={port}"), vec![format!("--view={port}: another program")]),
         ("--view=70000".to_owned(), vec!["--view".to_owned()]),
         ("--view=here".to_owned(), vec!["--view".to_owned()]),
     ] {

@@ -1,0 +1,177 @@
+//! `densify render --path`: flights as pictures and films.
+
+use std::ffi::OsString;
+use std::path::Path;
+
+use image::AnimationDecoder;
+use image::codecs::webp::WebPDecoder;
+
+use super::looking::run_of;
+use super::{Outcome, WITHOUT_GPU, call, files, json, outcome_of, scratch, text};
+use crate::photographs::Photographs;
+
+fn size(folder: &Path, name: &str) -> (u32, u32) {
+    let path = folder.join(name);
+    image::image_dimensions(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+#[test]
+fn a_flight_is_rendered_as_pictures_and_as_a_film() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let frames = root.path().join("frames");
+    let film = root.path().join("films/orbit.webp");
+    let call_with =
+        |more: &str| call(&format!("render {} -o {} {more}", text(&run), text(&frames)));
+    let options = "--path orbit --frames 5 --size 31x20 --depth --fps 8";
+    call_with(&format!("{options} --video {}", text(&film))).ok();
+    let names: Vec<String> = files(&frames).into_keys().collect();
+    let expected = (0..5).flat_map(|n| ["depth.png", "png"].map(|e| format!("frame_{n:05}.{e}")));
+    let expected: Vec<String> = ["depth.json".to_owned()].into_iter().chain(expected).collect();
+    assert_eq!(names, expected);
+    assert_eq!(size(&frames, "frame_00004.png"), (31, 20));
+    let still = |n: u32| image::open(frames.join(format!("frame_{n:05}.png"))).expect("a picture");
+    assert!(still(0) != still(1), "the camera moves");
+    let bytes = std::fs::read(&film).expect("a film");
+    let decoder = WebPDecoder::new(std::io::Cursor::new(bytes)).expect("it is WebP");
+    let film = decoder.into_frames().collect_frames().expect("an animation");
+    assert_eq!(film.len(), 5);
+    for (frame, n) in film.iter().zip(0..) {
+        assert_eq!(frame.delay().numer_denom_ms(), (125, 1));
+        let pixels = image::DynamicImage::from(frame.buffer().clone()).into_rgb8();
+        assert!(pixels == still(n).into_rgb8(), "frame {n} is the picture");
+    }
+    // Not a frame is rendered for a film that cannot be made.
+    for (more, words) in [
+        ("--video a.avi --path spiral", [".mp4", ".webp"]),
+        ("--path nowhere.json", ["--path", "nowhere.json"]),
+        ("--path orbit --side-by-side", ["--side-by-side", "flight"]),
+        ("--path orbit --size 0x5", ["--size", "640x480"]),
+        ("--path orbit --frames 0", ["--frames", "1..="]),
+    ] {
+        let other = root.path().join("other");
+        let refused = call(&format!("render {} -o {} {more}", text(&run), text(&other)));
+        refused.refused(more, &words);
+        assert!(!other.exists(), "{more}");
+    }
+}
+
+#[test]
+fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    // The training cameras of the run's folder, as nerfstudio would save them.
+    let cameras = json(&run.join("cameras.json"));
+    let first = &cameras[0];
+    let number = |value: &serde_json::Value| value.as_f64().expect("a number");
+    let row = |i: usize| -> [f64; 4] {
+        let turn = &first["rotation"][i];
+        // Columns are x right, y down, z forward; nerfstudio's y and z point the other way.
+        [number(&turn[0]), -number(&turn[1]), -number(&turn[2]), number(&first["position"][i])]
+    };
+    let pose = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]].concat();
+    let height = number(&first["height"]);
+    let fov = 2.0 * (0.5 * height / number(&first["fy"])).atan().to_degrees();
+    let path = root.path().join("path.json");
+    let key = serde_json::json!({ "camera_to_world": pose, "fov": fov, "aspect": 1.2 });
+    std::fs::write(&path, serde_json::json!({ "camera_path": [key] }).to_string()).unwrap();
+    let frames = root.path().join("frames");
+    let run_text = text(&run);
+    call(&format!("render {run_text} -o {} --path {}", text(&frames), text(&path))).ok();
+    let views = root.path().join("views");
+    call(&format!("render {run_text} -o {} --split train", text(&views))).ok();
+    call(&format!("render {run_text} -o {}", text(&views))).ok();
+    let name = first["img_name"].as_str().expect("a name");
+    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
+    let open = |path: &Path| image::open(path).expect("a picture").into_rgb8();
+    let frame = open(&frames.join("frame_00000.png"));
+    let view = open(&views.join(format!("{stem}.png")));
+    assert_eq!(files(&frames).len(), 1, "as many frames as cameras");
+    assert_eq!(frame.dimensions(), view.dimensions());
+    let most = frame.iter().zip(view.iter()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(most.is_some_and(|most| most <= 2), "{most:?}");
+    // As long and as large as the file says.
+    let lasting = serde_json::json!({ "camera_path": [key], "seconds": 0.5, "fps": 8, "render_width": 18,
+        "render_height": 10 });
+    std::fs::write(&path, lasting.to_string()).unwrap();
+    let film = root.path().join("film.webp");
+    call(&format!(
+        "render {run_text} -o {} --path {} --video {}",
+        text(&root.path().join("lasting")),
+        text(&path),
+        text(&film)
+    ))
+    .ok();
+    assert_eq!(size(&root.path().join("lasting"), "frame_00003.png"), (18, 10));
+    let bytes = std::fs::read(&film).expect("a film");
+    let decoder = WebPDecoder::new(std::io::Cursor::new(bytes)).expect("it is WebP");
+    let film = decoder.into_frames().collect_frames().expect("an animation");
+    assert_eq!((film.len(), film[0].delay().numer_denom_ms()), (4, (125, 1)));
+}
+
+/// A program named ffmpeg takes down how it is called and writes the film; another fails.
+#[cfg(unix)]
+#[test]
+fn ffmpeg_is_given_the_pictures_of_this_flight_alone() {
+    use std::os::unix::fs::PermissionsExt;
+
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    run_of(&scene, &run);
+    let bin = root.path().join("bin");
+    std::fs::create_dir(&bin).unwrap();
+    // A % would be a part of ffmpeg's pattern.
+    let frames = root.path().join("100%d frames");
+    let film = root.path().join("films/a film.mp4");
+    let fly = |more: &[&str]| -> Outcome {
+        let mut command = assert_cmd::Command::new(env!("CARGO_BIN_EXE_densify"));
+        command.args(["render", text(&run), "-o", text(&frames), "--path", "orbit"]).args(more);
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        let path = [bin.as_os_str(), &path].join(&OsString::from(":"));
+        command.args(["--size", "8x6"]).envs([WITHOUT_GPU]).env("PATH", path);
+        outcome_of(command)
+    };
+    let put = |script: &str| {
+        let program = bin.join("ffmpeg");
+        std::fs::write(&program, format!("#!/bin/sh\n{script}\n")).unwrap();
+        std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
+    };
+    put("exit 127");
+    let alone = ["--frames", "9", "--video", text(&film)];
+    fly(&alone).refused("no ffmpeg", &["--video", "a film.mp4", "install it", ".webp"]);
+    assert!(!frames.exists() && !film.exists());
+
+    fly(&["--frames", "9"]).ok();
+    let log = root.path().join("log");
+    put(&format!(
+        "[ \"$1\" = -version ] && exit 0; pwd > '{0}'; printf '%s\\n' \"$@\" >> '{0}'\n\
+         for last; do :; done; printf film > \"$last\"",
+        log.display()
+    ));
+    fly(&["--frames", "3", "--video", text(&film), "--fps", "12"]).ok();
+    assert_eq!(files(&frames).len(), 9, "pictures of a longer flight are left alone");
+    let said = std::fs::read_to_string(&log).expect("how it was called");
+    let said: Vec<&str> = said.lines().collect();
+    assert_eq!(Path::new(said[0]), frames.canonicalize().unwrap());
+    for pair in
+        [["-framerate", "12"], ["-frames:v", "3"], ["-start_number", "0"], ["-i", "frame_%05d.png"]]
+    {
+        assert!(said.windows(2).any(|words| words == pair), "{pair:?}: {said:?}");
+    }
+    assert_eq!(std::fs::read(&film).expect("a film"), b"film");
+    // As readable as any new file.
+    let mode = |path: &Path| std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    std::fs::write(root.path().join("new"), "").unwrap();
+    assert_eq!(mode(&film), mode(&root.path().join("new")));
+
+    put("[ \"$1\" = -version ] && exit 0; echo 'no room' >&2; echo 'frame 7: bad' >&2; exit 3");
+    let failed = fly(&alone);
+    assert_eq!(failed.code, Some(1), "{failed:?}");
+    assert!(
+        failed.stderr.contains("frame 7: bad") && failed.stderr.contains("100%d frames"),
+        "{failed:?}"
+    );
+    assert_eq!(std::fs::read(&film).expect("the film before"), b"film");
+}
