@@ -29,7 +29,8 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.press("\ue007")
     # Curves and edits grow while it trains, and the picture follows it.
     browser.until(f"Number({STATE}.step) > 300", "training does not go on")
-    browser.until("document.querySelector('#psnr-curve polyline').points.length > 1", "no test was shown")
+    for curve in ("psnr", "loss", "rows"):
+        browser.until(f"document.querySelector('#{curve}-curve polyline').points.length > 1", f"no curve of {curve}")
     browser.until("document.getElementById('edits').rows.length > 0", "no edit was shown")
     before = browser.run("return Number(document.getElementById('stage').dataset.pictures)")
     browser.until(f"Number(document.getElementById('stage').dataset.pictures) > {before}", "the picture does not follow")
@@ -63,6 +64,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.choose("left", "depth:0")
     browser.run("document.querySelector('details').open = true")
     browser.keep(folder, "live-paused")
+    browser.is_reached_by_key()
     browser.size(360, 740)
     width = browser.run("return document.getElementById('panel').scrollWidth")
     assert width <= 360, f"the panel is {width} px wide"

@@ -163,6 +163,14 @@ class Browser:
             sources.append({"type": "pointer", "id": f"finger{finger}", "parameters": parameters, "actions": actions})
         self.call("POST", f"{self.session}/actions", {"actions": sources})
 
+    def is_reached_by_key(self) -> None:
+        """Everything that is seen is reached by key, and has a name."""
+        for _ in range(70):
+            self.press("\ue004")  # Tab
+            self.run("document.activeElement.dataset.reached = true")
+        unreached = self.run(UNREACHED)
+        assert not unreached, f"not reached by key, or without a name: {unreached}"
+
     def log(self, kind: str) -> list[dict]:
         return self.call("POST", f"{self.session}/se/log", {"type": kind})
 
@@ -356,12 +364,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     assert after < 0.9 * before, f"fingers that part: from {before} to {after} away"
     browser.is_sharp()
     moves(browser)
-    # Everything that is seen is reached by key, and has a name.
-    for _ in range(60):
-        browser.press("\ue004")  # Tab
-        browser.run("document.activeElement.dataset.reached = true")
-    unreached = browser.run(UNREACHED)
-    assert not unreached, f"not reached by key, or without a name: {unreached}"
+    browser.is_reached_by_key()
     browser.run("document.getElementById('marks').focus()")
     browser.press("k", "r", "]", "k")
     assert not browser.run("return document.getElementById('save').disabled"), "no camera path to save"

@@ -258,6 +258,18 @@ fn strangers_stop_no_run_and_idle_guests_slow_none() {
         assert_eq!(page.try_post("order", "", order).expect("it answers").status, 400, "{order}");
     }
     assert_eq!(page.get(&format!("{}order", page.path)).status, 405);
+    // Nor is what is no request, or too long for one.
+    let place = &page.place;
+    let head = format!("POST {}order HTTP/1.1\r\nHost: {place}\r\n{json}", page.path);
+    for (request, status) in [
+        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n".to_vec(), 400),
+        (format!("GET /{} HTTP/1.1\r\n", "a".repeat(9000)).into_bytes(), 431),
+        (format!("{head}Content-Length: 99999999999\r\n\r\n").into_bytes(), 413),
+        (format!("{head}Transfer-Encoding: chunked\r\n\r\n5\r\n").into_bytes(), 411),
+    ] {
+        let shown = String::from_utf8_lossy(&request[..request.len().min(60)]).into_owned();
+        assert_eq!(page.send(&request).status, status, "{shown}");
+    }
     let now = page.progress();
     assert_eq!(
         (&now["state"], count(&now, "step")),
