@@ -214,8 +214,8 @@ fn masks_are_found_in_the_folder_that_is_named() {
     let masks = [
         "masks/b.png.png",
         "masks/b.png",
-        "masks/b.mask.png",
         "masks/b.png.mask.png",
+        "masks/b.mask.png",
         "moved/b.png.mask.png",
         "moved/b.mask.png",
         "moved/.mask/b.png",
