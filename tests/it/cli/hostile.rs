@@ -183,7 +183,13 @@ fn what_lenses_and_archives_must_not_be_is_refused() {
         (
             lens("OPENCV 48 40 52 52 24 20 nan 0 0 0"),
             "",
-            &["cameras.txt", "camera 1", "distortion", "not finite", "colmap image_undistorter"],
+            &[
+                "cameras.txt",
+                "camera 1",
+                "distortion",
+                "not finite",
+                "repair the camera's parameters",
+            ],
         ),
         (
             zip("images/zeros.png", &vec![0; 65 << 20]),
