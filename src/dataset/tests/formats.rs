@@ -224,6 +224,8 @@ fn masks_are_found_in_the_folder_that_is_named() {
     for made in [Made::colmap_txt(), Made::transforms(|_| ()), Made::realitycapture()] {
         std::fs::rename(made.file("images"), made.file("moved")).unwrap();
         masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
+        // All but black is hidden by this one.
+        image::GrayImage::new(SIZE.0, SIZE.1).save(made.file(masks[7])).unwrap();
         let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
         for mask in masks {
             let data = load_with(&made, options.clone());
