@@ -14,6 +14,7 @@ use super::{
 };
 use crate::camera::Camera;
 use crate::dataset::{Dataset, View, builtin};
+use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 use crate::memory::Bytes;
@@ -112,6 +113,12 @@ impl<'a> Planner<'a> {
         if spec.size.sh_degree == Some(ShDegree::Auto(None)) {
             return Err(Failure::input(
                 "--sh-degree auto: blocks must have one degree; give 0, 1, 2 or 3",
+            ));
+        }
+        if spec.schedule.exposure == ExposureChoice::Auto {
+            return Err(Failure::input(
+                "--exposure auto: each block would decide for itself, and the blocks of a model must agree; give on \
+                 or off",
             ));
         }
         let sh_degree = match spec.size.sh_degree {

@@ -102,24 +102,27 @@ pub(super) fn run(
     }
     let RenderingArgs { near, device, data } = &args.rendering;
     let model = model_file(&args.model, args.iteration)?;
-    let (scene, data, near) = if is_model(&args.model) {
+    let (scene, data, near, exposure) = if is_model(&args.model) {
         let Some(scene) = args.scene.clone() else {
             return Err(Failure::input(format!(
                 "{} is a file, which has no photographs; name its dataset with --scene DIR",
                 args.model.display()
             )));
         };
-        (scene, data.clone(), *near)
+        (scene, data.clone(), *near, None)
     } else {
         refuse_options_of_a_file(matches)?;
         let config = RunConfig::read(&args.model)?;
         let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
-        (scene, config.spec.data, config.spec.start.near)
+        let model = config.spec.schedule.exposure_model;
+        let exposure = config.resolved.has_exposures.then_some(model);
+        (scene, config.spec.data, config.spec.start.near, exposure)
     };
     let options = Options {
         model: &model,
         scene: &scene,
         data,
+        exposure,
         near,
         device: device.clone(),
         to: args.to.0,

@@ -4,6 +4,7 @@ use super::{Attempt, Options};
 use crate::dataset::Dataset;
 use crate::evaluate::Split;
 use crate::export::Format;
+use crate::exposure::fitted;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::metrics::psnr;
@@ -18,6 +19,8 @@ pub(super) struct Judge {
     /// Distance `[scene units]`.
     near: f32,
     background: [f32; 3],
+    /// Whether each photograph is compared with the exposure that fits it best.
+    fits_exposure: bool,
 }
 
 impl Judge {
@@ -25,7 +28,9 @@ impl Judge {
         let machine = Machine::open(&options.device, observer)?;
         let dataset = load(options.scene, &options.data, observer)?;
         let near = (options.near.0 * dataset.extent()) as f32;
-        Ok(Self { dataset, machine, near, background: options.data.background.fixed() })
+        let background = options.data.background.fixed();
+        let fits_exposure = options.exposure.is_some();
+        Ok(Self { dataset, machine, near, background, fits_exposure })
     }
 
     /// Measures a model whose file has this size.
@@ -44,7 +49,15 @@ impl Judge {
                 views.prefetch_after(view);
                 let image = views.image(view).map_err(Failure::input)?;
                 let shown = backend.render(views.camera(view), self.background, sh_degree)?;
-                sum += psnr(&shown.rgb, &image, self.background).map_err(Failure::input)?;
+                // Which also finds out whether the two can be compared.
+                let plain = psnr(&shown.rgb, &image, self.background).map_err(Failure::input)?;
+                sum += match self.fits_exposure {
+                    true => {
+                        let rgb = fitted(&shown.rgb, &image, self.background);
+                        psnr(&rgb, &image, self.background).map_err(Failure::input)?
+                    }
+                    false => plain,
+                };
             }
             Ok::<_, Failure>(sum / views.count() as f64)
         };

@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempPath;
 
 use crate::export::{Format, PLY};
+use crate::exposure::ExposureModel;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::number::grouped;
@@ -43,6 +44,8 @@ pub struct Options<'a> {
     pub scene: &'a Path,
     /// How the dataset is read.
     pub data: DataSpec,
+    /// What an exposure of each photograph may do, where the model was trained with them.
+    pub exposure: Option<ExposureModel>,
     /// Nearest distance to a camera at which anything is drawn, as a fraction of the scene's extent.
     pub near: Fraction,
     /// Where to compute.
@@ -80,9 +83,9 @@ pub struct Attempt {
     pub format: &'static str,
     /// The size of its file.
     pub bytes: u64,
-    /// Mean PSNR of the training views `[dB]`.
+    /// Mean PSNR of the training views `[dB]`, with the best exposure of each where exposures are learned.
     pub train: f64,
-    /// Mean PSNR of the views held out `[dB]`, if there are any.
+    /// The same of the views held out, if there are any.
     pub test: Option<f64>,
 }
 
@@ -106,6 +109,11 @@ pub struct Compressed {
 /// written.
 pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compressed, Failure> {
     let judge = Judge::open(options, observer)?;
+    if options.exposure.is_some() {
+        observer.say(format_args!(
+            "exposure learned again, as the run has learned it; PSNR is with the best exposure of each photograph"
+        ));
+    }
     let model = read_model(options.model, observer)?;
     fit::check(options, &model)?;
     let whole = judge.attempt(model.clone(), PLY, fit::bytes(PLY, &model)?)?;

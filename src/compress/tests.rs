@@ -40,6 +40,7 @@ fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> O
         model: Path::new("model.ply"),
         scene,
         data: DataSpec::default(),
+        exposure: None,
         near: Fraction(0.04),
         device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
         to,

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::colour::reduced;
 use super::{Options, Target, fit};
 use crate::export::{Format, PLY};
+use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
 use crate::gaussians::Gaussians;
 use crate::output::write_atomically;
@@ -124,6 +125,10 @@ fn described(
     spec.density.policy_set = STILL.into_iter().map(text).collect::<Result<_, _>>()?;
     spec.schedule.iterations = Whole(iterations);
     spec.schedule.seed = options.seed;
+    if let Some(model) = options.exposure {
+        spec.schedule.exposure = ExposureChoice::On;
+        spec.schedule.exposure_model = model;
+    }
     Ok(spec)
 }
 

@@ -1,8 +1,10 @@
-//! Finds the files of images and masks: `images`, `images_2`/`_4`/`_8`, `masks`, or `--images DIR`.
+//! Finds the files of images: `images`, `images_2`/`_4`/`_8`, or `--images DIR`.
 
-use std::path::{Path, PathBuf};
+use std::fs::DirEntry;
+use std::path::PathBuf;
 
 use super::error::DatasetError;
+use super::masks;
 use super::paths::{DataPath, Root, is_absolute, relative};
 use super::{LoadOptions, Resolution};
 
@@ -12,9 +14,9 @@ const ENDINGS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG"
 /// The folders of one dataset.
 #[derive(Debug)]
 pub(super) struct Folders {
-    root: Root,
+    pub(super) root: Root,
     /// The folder named by `--images`.
-    chosen: Option<Root>,
+    pub(super) chosen: Option<Root>,
     /// `images_K` and K, if requested by `-r K` and present.
     reduced: Option<(Root, u32)>,
     /// Whether names are relative to `images/` (COLMAP) or to the dataset.
@@ -31,21 +33,6 @@ pub(super) struct ImageFile {
     pub(super) reduced: Option<u32>,
     /// Whether it is missing in `images_K`, and the full size is used instead.
     pub(super) fell_back: bool,
-}
-
-/// The file of a mask.
-#[derive(Debug, Clone)]
-pub(super) struct MaskFile {
-    pub(super) path: PathBuf,
-    /// Whether every value but 0 hides a pixel, instead of 0 alone doing it wholly.
-    pub(super) hides_all_but_black: bool,
-}
-
-impl MaskFile {
-    /// A mask that hides where it is black.
-    pub(super) fn of(path: PathBuf) -> Self {
-        Self { path, hides_all_but_black: false }
-    }
 }
 
 impl Folders {
@@ -72,15 +59,30 @@ impl Folders {
 
     /// The file of an image, if there is one.
     pub(super) fn image(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
-        if let Some(folder) = self.chosen.as_ref().filter(|_| is_absolute(named.value)) {
-            return moved(folder, named);
+        if let Some(folder) = self.elsewhere(named.value) {
+            return self.moved(folder, named);
         }
+        match self.image_as_listed(named)? {
+            // Programs on Windows write names with its separators.
+            None if named.value.contains('\\') => {
+                let value = named.value.replace('\\', "/");
+                self.image_as_listed(DataPath { value: &value, ..named })
+            }
+            found => Ok(found),
+        }
+    }
+
+    /// The folder named by `--images`, where this is an absolute path: programs write where photographs lay on their
+    /// own machine.
+    pub(super) fn elsewhere(&self, value: &str) -> Option<&Root> {
+        self.chosen.as_ref().filter(|_| is_absolute(value))
+    }
+
+    fn image_as_listed(&self, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
         // Checked as written first: a path out of the folder is refused even if no file is there.
         self.root.join(named)?;
         let (name, inside) = (relative(named.value), self.inside_images(named.value));
-        // COLMAP names files in full.
-        let endings = if self.within_images { &ENDINGS[..1] } else { &ENDINGS[..] };
-        for ending in endings {
+        for ending in self.endings() {
             let within = format!("{inside}{ending}");
             let mut fell_back = false;
             if let Some((folder, k)) = &self.reduced {
@@ -107,29 +109,22 @@ impl Folders {
         Ok(None)
     }
 
-    /// The mask of the image NAME, if there is one: `masks/NAME.png`, with or without the extension of NAME; or
-    /// `dynamic_mask_NAME.png` beside the image, as instant-ngp has it, where all but black is hidden.
-    pub(super) fn mask(
-        &self,
-        name: &str,
-        named: DataPath<'_>,
-    ) -> Result<Option<MaskFile>, DatasetError> {
-        let inside = self.inside_images(name);
-        let stem = Path::new(&inside).with_extension("").to_string_lossy().into_owned();
-        for value in
-            [format!("masks/{inside}.png"), format!("masks/{inside}"), format!("masks/{stem}.png")]
-        {
-            if let Some(path) = self.root.existing(DataPath { value: &value, ..named })? {
-                return Ok(Some(MaskFile::of(path)));
+    /// The image of an absolute path: as many of its last parts count as are found in the folder that the user names.
+    fn moved(&self, folder: &Root, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
+        for name in named.ends()? {
+            for ending in self.endings() {
+                let value = format!("{name}{ending}");
+                if let Some(path) = folder.existing(DataPath { value: &value, ..named })? {
+                    return Ok(Some(ImageFile { name, path, reduced: None, fell_back: false }));
+                }
             }
         }
-        let image = self.below_root(name);
-        let image = Path::new(&image);
-        let Some(stem) = image.file_stem().and_then(|stem| stem.to_str()) else { return Ok(None) };
-        let beside = image.with_file_name(format!("dynamic_mask_{stem}.png"));
-        let value = beside.to_string_lossy();
-        let path = self.root.existing(DataPath { value: &value, ..named })?;
-        Ok(path.map(|path| MaskFile { path, hides_all_but_black: true }))
+        Ok(None)
+    }
+
+    /// What may be missing of a name; COLMAP names files in full.
+    fn endings(&self) -> &'static [&'static str] {
+        if self.within_images { &ENDINGS[..1] } else { &ENDINGS }
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> DatasetError {
@@ -140,19 +135,21 @@ impl Folders {
     pub(super) fn place(&self, named: DataPath<'_>) -> PathBuf {
         match &self.chosen {
             Some(folder) if is_absolute(named.value) => {
-                folder.path().join(parts(named.value).last().unwrap_or_default())
+                let last = named.ends().ok().and_then(Iterator::last);
+                folder.path().join(last.unwrap_or_default())
             }
             Some(folder) => folder.path().join(self.inside_images(named.value)),
             None => self.root.path().join(self.below_root(named.value)),
         }
     }
 
-    /// How many files lie directly in the folder of the images.
+    /// How many files but masks lie directly in the folder of the images.
     pub(super) fn count(&self) -> usize {
         let images = || self.root.path().join("images");
         let folder = self.chosen.as_ref().map_or_else(images, |folder| folder.path().to_owned());
         let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-        entries.filter(|entry| entry.file_type().is_ok_and(|kind| !kind.is_dir())).count()
+        let is_file = |entry: &DirEntry| entry.file_type().is_ok_and(|kind| !kind.is_dir());
+        entries.filter(|entry| is_file(entry) && !masks::is_mask(&entry.file_name())).count()
     }
 
     pub(super) fn fell_back_note(&self, count: usize) -> String {
@@ -163,7 +160,7 @@ impl Folders {
         )
     }
 
-    fn inside_images(&self, value: &str) -> String {
+    pub(super) fn inside_images(&self, value: &str) -> String {
         let value = relative(value);
         match value.strip_prefix("images/") {
             Some(inside) if !self.within_images => inside.to_owned(),
@@ -171,28 +168,8 @@ impl Folders {
         }
     }
 
-    fn below_root(&self, value: &str) -> String {
+    pub(super) fn below_root(&self, value: &str) -> String {
         let value = relative(value);
         if self.within_images { format!("images/{value}") } else { value }
     }
-}
-
-/// The image of an absolute path, in the folder that the user names: programs write where photographs lay on their
-/// own machine. As many of its last parts count as are found.
-fn moved(folder: &Root, named: DataPath<'_>) -> Result<Option<ImageFile>, DatasetError> {
-    let parts: Vec<&str> = parts(named.value).collect();
-    for first in 0..parts.len() {
-        let name = parts[first..].join("/");
-        if let Some(path) = folder.existing(DataPath { value: &name, ..named })? {
-            return Ok(Some(ImageFile { name, path, reduced: None, fell_back: false }));
-        }
-    }
-    Ok(None)
-}
-
-/// The parts of an absolute path of any system, without its drive or scheme.
-fn parts(value: &str) -> impl Iterator<Item = &str> {
-    let drive = |part: &str| part.ends_with(':');
-    let parts = value.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".");
-    parts.enumerate().filter(move |(i, part)| *i > 0 || !drive(part)).map(|(_, part)| part)
 }

@@ -15,6 +15,7 @@ pub mod images;
 mod jpeg;
 pub mod lens;
 mod mask;
+mod masks;
 pub mod normalise;
 mod options;
 mod paths;
@@ -50,8 +51,9 @@ pub(crate) use archive::is_archive;
 pub use builtin::GroundTruth;
 pub use error::DatasetError;
 pub use exif::ReportedExposures;
-use folders::{Folders, MaskFile};
+use folders::Folders;
 use lens::Lens;
+use masks::MaskFile;
 use normalise::Normalisation;
 pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
@@ -119,6 +121,8 @@ struct Frame {
     id: Option<u32>,
     /// File and frame, for messages.
     origin: String,
+    /// The path of the image as the file lists it.
+    listed: String,
     image: PathBuf,
     /// The divisor of the folder `images_K` that the image is in.
     reduced: Option<u32>,

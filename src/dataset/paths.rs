@@ -9,6 +9,8 @@ use unicode_normalization::UnicodeNormalization;
 
 use super::error::DatasetError;
 
+/// What separates the parts of a path: both, as paths may come from another system.
+const SEPARATORS: [char; 2] = ['/', '\\'];
 /// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
 
@@ -51,6 +53,17 @@ impl Root {
         match lexical_fault(named.value) {
             None => Ok(self.shown.join(relative(named.value))),
             Some(problem) => Err(named.fault(problem)),
+        }
+    }
+
+    /// As [`existing`](Self::existing), or else with the separators of Windows read as such. Where there is a file of
+    /// the literal name, it is that one.
+    pub(super) fn listed(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, DatasetError> {
+        match self.existing(named)? {
+            None if named.value.contains('\\') => {
+                self.existing(DataPath { value: &named.value.replace('\\', "/"), ..named })
+            }
+            found => Ok(found),
         }
     }
 
@@ -107,7 +120,20 @@ fn names(folder: &Path) -> Names {
     entries.into_iter().filter_map(name).collect()
 }
 
-impl DataPath<'_> {
+impl<'a> DataPath<'a> {
+    /// What of an absolute path of any system may lie below a folder: all of it, then without its first part, and so
+    /// on. What would be absolute itself is left out.
+    pub(super) fn ends(self) -> Result<impl Iterator<Item = String> + use<'a>, DatasetError> {
+        let parts = parts(self.value);
+        let problem = if parts.is_empty() { Some("is empty") } else { text_fault(self.value) };
+        match problem {
+            Some(problem) => Err(self.fault(problem)),
+            None => Ok((0..parts.len())
+                .map(move |first| parts[first..].join("/"))
+                .filter(|end| !is_absolute(end))),
+        }
+    }
+
     fn fault(self, problem: &str) -> DatasetError {
         let value: String = self.value.chars().take(200).collect();
         let problem = format!("the path {value:?} {problem}");
@@ -131,21 +157,41 @@ pub(super) fn is_absolute(value: &str) -> bool {
 
 /// What is wrong with a path, as far as its text says.
 pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
-    // Both separators count: paths may come from another system.
-    let parts = || value.split(['/', '\\']);
     if relative(value).is_empty() {
         Some("is empty")
-    } else if value.len() > MAX_NAME {
+    } else if is_absolute(value) {
+        // What is worse is said of such a path, too.
+        text_fault(value).or(Some("is absolute"))
+    } else {
+        text_fault(value)
+    }
+}
+
+/// The same, wherever it begins.
+fn text_fault(value: &str) -> Option<&'static str> {
+    if value.len() > MAX_NAME {
         Some("is longer than 4 KiB")
     } else if value.contains(char::is_control) {
         Some("contains a control character")
-    } else if is_absolute(value) {
-        Some("is absolute")
-    } else if parts().any(|part| part == "..") {
+    } else if value.split(SEPARATORS).any(|part| part == "..") {
         Some("contains `..`")
     } else {
         None
     }
+}
+
+/// The parts of an absolute path of any system, without its scheme and drive: `file:///C:/a`, `\\?\C:\a` and `/a`
+/// are all `a`.
+fn parts(value: &str) -> Vec<&str> {
+    let local = value.strip_prefix("file:").unwrap_or(value).trim_start_matches(SEPARATORS);
+    let local = local.strip_prefix(['?', '.']).filter(|rest| rest.starts_with(SEPARATORS));
+    let local = local.unwrap_or_else(|| value.strip_prefix("file:").unwrap_or(value));
+    let local = local.trim_start_matches(SEPARATORS);
+    let local = match local.as_bytes().get(1) {
+        Some(b':') => &local[2..],
+        _ => local,
+    };
+    local.split(SEPARATORS).filter(|part| !part.is_empty() && *part != ".").collect()
 }
 
 #[cfg(test)]

@@ -11,6 +11,7 @@ use super::photographs::{Photograph, photographs};
 use super::pose::POSE_REMEDY;
 use super::wanted::{self, Wanted};
 use super::{Dataset, FarCameras, Frame, LoadOptions, PointCloud, Scene, Split, View};
+use crate::foreign::one_line;
 
 /// Fraction of the points that may be unusable.
 const MAX_BAD_POINTS: f64 = 0.01;
@@ -160,6 +161,20 @@ fn named(names: &[impl AsRef<str>]) -> Option<String> {
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), DatasetError> {
+    // Of a path only its end may count, which another path may have too; one that is trained on would be held out.
+    let mut by_image = HashMap::new();
+    for frame in frames {
+        let first = *by_image.entry(&frame.image).or_insert(frame);
+        if first.listed != frame.listed {
+            return Err(DatasetError(one_line(&format!(
+                "{} and {} are the same file, {}; name with --images a folder that has both, as they lay, or remove one \
+                 of the two",
+                first.origin,
+                frame.origin,
+                frame.image.display()
+            ))));
+        }
+    }
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
             let (problem, remedy) = ("the image is listed twice", "remove one of the two");

@@ -20,7 +20,7 @@ use super::folders::Folders;
 use super::images;
 use super::lens::table::Term;
 use super::lens::{Distortion, Lens, Plane};
-use super::paths::{DataPath, Root};
+use super::paths::{DataPath, Root, relative};
 use super::pose::{check_lens, checked_pose};
 use super::transforms::usual_points;
 use super::{Frame, Scene};
@@ -128,11 +128,12 @@ pub(super) fn read(
         let origin = format!("line {number} ({name})");
         let (rotation, translation) = row.pose(&origin)?;
         let lens = row.lens(&origin, &found.path, found.reduced)?;
-        let mask = folders.mask(&found.name, named)?;
+        let mask = folders.mask(&found, named)?;
         frames.push(Frame {
             name: found.name,
             id: None,
             origin: format!("{}: {origin}", path.display()),
+            listed: relative(name),
             image: found.path,
             reduced: found.reduced,
             mask,

@@ -12,11 +12,12 @@ use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value};
 
 use super::error::DatasetError;
-use super::folders::{Folders, MaskFile};
+use super::folders::{Folders, ImageFile};
 use super::images;
 use super::lens::table::{FISHEYE_FIELDS, OPENCV_FIELDS};
 use super::lens::{Distortion, Lens, Plane};
-use super::paths::{DataPath, Root, relative};
+use super::masks::MaskFile;
+use super::paths::{DataPath, Root, is_absolute, relative};
 use super::pose::{check_lens, checked_pose};
 use super::{Frame, Scene};
 
@@ -75,9 +76,9 @@ pub(super) fn read(
         return Err(top.fault("frames", "there are more than a million"));
     }
     let mut own_split = false;
-    let tests = match top.names("test_filenames")? {
+    let tests = match top.held_out(folders, "test_filenames")? {
         Some(names) => Some(names),
-        None => top.names("val_filenames")?,
+        None => top.held_out(folders, "val_filenames")?,
     };
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
     let mut first_missing = None;
@@ -100,24 +101,20 @@ pub(super) fn read(
         fell_back += usize::from(found.fell_back);
         let (rotation, translation) = fields.pose(file)?;
         let mask = match fields.text("mask_path")? {
-            Some(value) => {
-                let field = fields.full("mask_path");
-                let named = DataPath { file: &path, field: &field, value };
-                let missing = || {
-                    DatasetError::missing_image(&path, &field, &root.path().join(relative(value)))
-                };
-                Some(MaskFile::of(root.existing(named)?.ok_or_else(missing)?))
-            }
-            None => folders.mask(&found.name, named)?,
+            Some(value) => Some(fields.mask(root, folders, &found, value)?),
+            None => folders.mask(&found, named)?,
         };
         let lens = fields.lens(&found.path, found.reduced)?;
-        let held_out =
-            held_out || tests.as_ref().is_some_and(|tests| tests.contains(&relative(file)));
+        let is_test = |tests: &HashSet<String>| {
+            tests.contains(&relative(file)) || tests.contains(&found.name)
+        };
+        let held_out = held_out || tests.as_ref().is_some_and(is_test);
         own_split |= held_out;
         frames.push(Frame {
             name: found.name,
             id: None,
             origin: format!("{}: frame {file}", path.display()),
+            listed: relative(file),
             image: found.path,
             reduced: found.reduced,
             mask,
@@ -135,7 +132,7 @@ pub(super) fn read(
     if fell_back > 0 {
         notes.push(folders.fell_back_note(fell_back));
     }
-    let points_file = points_file(root, &top, held_out, &mut notes)?;
+    let points_file = points_file((root, folders), &top, held_out, &mut notes)?;
     let listing = path.clone();
     let rest = Scene::default();
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
@@ -147,15 +144,28 @@ pub(super) fn read(
 
 /// The file of the initial points: the one that the JSON names, or one of [`POINT_FILES`].
 fn points_file(
-    root: &Root,
+    (root, folders): (&Root, &Folders),
     top: &Fields<'_>,
     held_out: bool,
     notes: &mut Vec<String>,
 ) -> Result<Option<PathBuf>, DatasetError> {
     if let Some(value) = top.text("ply_file_path")? {
         let named = DataPath { file: top.path, field: "ply_file_path", value };
-        let missing = || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
-        return Ok(Some(root.existing(named)?.ok_or_else(missing)?));
+        if folders.elsewhere(value).is_none() {
+            let missing =
+                || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
+            return Ok(Some(root.listed(named)?.ok_or_else(missing)?));
+        }
+        // Of another machine: as the photographs, it may have come along.
+        for value in named.ends()? {
+            if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
+                return Ok(Some(found));
+            }
+        }
+        let file = top.path.file_name().unwrap_or_default().display();
+        notes.push(crate::foreign::one_line(&format!(
+            "{file}: the initial points {value:?} are not in the dataset's folder, and are left out"
+        )));
     }
     if held_out { Ok(None) } else { usual_points(root, top.path, notes) }
 }
@@ -213,15 +223,59 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// A list of file names.
-    fn names(&self, field: &str) -> Result<Option<HashSet<String>>, DatasetError> {
+    /// A list of file names, each as it is listed and as the view is named whose image it is.
+    fn held_out(
+        &self,
+        folders: &Folders,
+        field: &str,
+    ) -> Result<Option<HashSet<String>>, DatasetError> {
         let Some(value) = self.own(field) else {
             return Ok(None);
         };
         let fault = || self.fault(field, "it is not a list of file names");
-        let list = value.as_array().ok_or_else(fault)?;
-        let name = |name: &Value| name.as_str().map(relative).ok_or_else(fault);
-        list.iter().map(name).collect::<Result<_, _>>().map(Some)
+        let mut names = HashSet::new();
+        for name in value.as_array().ok_or_else(fault)? {
+            let value = name.as_str().ok_or_else(fault)?;
+            names.insert(relative(value));
+            // Only such names may be written otherwise than in the frame.
+            if is_absolute(value) || value.contains('\\') {
+                let named = DataPath { file: self.path, field, value };
+                names.extend(folders.image(named)?.map(|found| found.name));
+            }
+        }
+        Ok(Some(names))
+    }
+
+    /// The mask of a frame whose file names it.
+    fn mask(
+        &self,
+        root: &Root,
+        folders: &Folders,
+        image: &ImageFile,
+        value: &str,
+    ) -> Result<MaskFile, DatasetError> {
+        let field = self.full("mask_path");
+        let named = DataPath { file: self.path, field: &field, value };
+        if folders.elsewhere(value).is_none() {
+            let missing = || {
+                let place = root.path().join(relative(value));
+                DatasetError::missing_image(self.path, &field, &place)
+            };
+            return Ok(MaskFile::of(root.listed(named)?.ok_or_else(missing)?));
+        }
+        // Of another machine: where it lay, but below this folder, or where masks are looked for. Its name alone
+        // may be that of a photograph.
+        for value in named.ends()?.filter(|end| end.contains('/')) {
+            if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
+                return Ok(MaskFile::of(found));
+            }
+        }
+        folders.mask(image, named)?.ok_or_else(|| {
+            let problem = format!("the mask {value:?} is not in the dataset's folder");
+            let remedy =
+                "put it into `masks/` there, under the photograph's name, or remove the field";
+            DatasetError::malformed(self.path, &field, problem, remedy)
+        })
     }
 
     fn inherited(&self, field: &str) -> Option<&'a Value> {

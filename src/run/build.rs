@@ -38,7 +38,7 @@ pub(super) fn build(
     spec.check_iterations(last)?;
     let output = spec.output_folder()?;
     let saved = resumed.as_ref().map(|resumed| &resumed.config);
-    let inputs = Inputs::load(spec, saved, observer)?;
+    let inputs = Inputs::load(spec, resumed.as_ref().map(Resumed::known), observer)?;
     if !spec.output.test_iterations.is_empty() && inputs.dataset.test.is_empty() {
         return Err(Failure::input(
             "--test-iterations: no view is held out to measure; add --eval or --test-every K",

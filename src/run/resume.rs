@@ -12,6 +12,7 @@ use super::Partial;
 use super::config::RunConfig;
 use super::observer::Observer;
 use super::records::SavedSession;
+use super::resolve::{Begun, Known};
 use super::spec::{OnResume, RunOption, RunSpec};
 use crate::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest};
 use crate::failure::Failure;
@@ -34,6 +35,15 @@ impl Resumed {
     fn origin(&self, output: &Path) -> PathBuf {
         let config = || output.join(CONFIG_FILE);
         self.checkpoint.as_ref().map_or_else(config, |checkpoint| checkpoint.path().to_owned())
+    }
+
+    /// What need not be found out again.
+    pub(super) fn known(&self) -> Known<'_> {
+        let exposures = match self.checkpoint {
+            Some(_) => Begun::Kept,
+            None => Begun::Anew,
+        };
+        Known { config: &self.config, exposures }
     }
 
     /// Steps done.

@@ -95,11 +95,12 @@ pub(super) fn read(
         let named = DataPath { file: &images, field: &field, value: &image.name };
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
         reduced_missing += usize::from(found.fell_back);
-        let mask = folders.mask(&found.name, named)?;
+        let mask = folders.mask(&found, named)?;
         frames.push(Frame {
             name: found.name,
             id: Some(image.id),
             origin: format!("{}: {field}", images.display()),
+            listed: relative(&image.name),
             image: found.path,
             reduced: found.reduced,
             mask,

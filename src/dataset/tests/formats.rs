@@ -156,6 +156,11 @@ fn masks_are_found() {
         (Made::colmap_txt(), "masks/b.png.png"),
         (Made::colmap_txt(), "masks/b.png"),
         (Made::transforms(|_| ()), "masks/b.png"),
+        (Made::colmap_txt(), "masks/b.mask.png"),
+        (Made::realitycapture(), "masks/b.png.mask.png"),
+        (Made::realitycapture(), "images/b.png.mask.png"),
+        (Made::colmap_txt(), "images/b.mask.png"),
+        (Made::transforms(|_| ()), "images/.mask/b.png"),
         (
             Made::transforms(|json| json["frames"][1]["mask_path"] = "elsewhere/m.png".into()),
             "elsewhere/m.png",
@@ -198,6 +203,82 @@ fn dynamic_masks_are_found_beside_photographs() {
             assert_eq!(data.train[0].source.load().unwrap().mask, None);
             let found = data.train[1].source.load().unwrap().mask.unwrap();
             assert_eq!((found[0], found[19]), expected, "{invert_masks}");
+        }
+    }
+}
+
+/// Masks lie in `masks/` of the dataset or beside the photographs, wherever these are; none is taken for a photograph.
+#[test]
+fn masks_are_found_in_the_folder_that_is_named() {
+    // The first is preferred, and removed for the next.
+    let masks = [
+        "masks/b.png.png",
+        "masks/b.png",
+        "masks/b.png.mask.png",
+        "masks/b.mask.png",
+        "moved/b.png.mask.png",
+        "moved/b.mask.png",
+        "moved/.mask/b.png",
+        "moved/dynamic_mask_b.png",
+    ];
+    for made in [Made::colmap_txt(), Made::transforms(|_| ()), Made::realitycapture()] {
+        std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+        masks.iter().for_each(|mask| image(&made.file(mask), SIZE, 200));
+        // All but black is hidden by this one.
+        image::GrayImage::new(SIZE.0, SIZE.1).save(made.file(masks[7])).unwrap();
+        let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+        for mask in masks {
+            let data = load_with(&made, options.clone());
+            let found = data.train[1].source.mask.clone().expect(mask);
+            assert!(found.file.path.ends_with(mask), "{mask}: {}", found.file.path.display());
+            let dynamic = found.hides == images::Hides::AllButBlack;
+            assert_eq!(dynamic, mask.contains("dynamic"), "{mask}");
+            assert!(data.train[0].source.mask.is_none() && data.train.len() == 3);
+            assert!(!data.notes.iter().any(|note| note.contains("poses")), "{:?}", data.notes);
+            made.remove(mask);
+        }
+    }
+    // Beside the smaller photographs, or the whole ones.
+    let made = Made::colmap_txt();
+    for name in NAMES {
+        image(&made.file("images_2").join(name), (10, 6), 7);
+    }
+    let half = LoadOptions { resolution: Some(Resolution::Divisor(2)), ..LoadOptions::default() };
+    for mask in ["images/b.png.mask.png", "images_2/b.png.mask.png"] {
+        image(&made.file(mask), (10, 6), 200);
+        let found = load_with(&made, half.clone()).train[1].source.mask.clone().expect(mask);
+        assert!(found.file.path.ends_with(mask), "{mask}");
+    }
+}
+
+/// Transparent photographs are composited on the background, whatever lists them.
+#[test]
+fn transparency_is_the_same_in_every_format() {
+    for ending in ["png", "webp"] {
+        for (made, listing) in [
+            (Made::colmap_txt(), "sparse/0/images.txt"),
+            (Made::transforms(|_| ()), "transforms.json"),
+            (Made::realitycapture(), "cameras.csv"),
+        ] {
+            for name in NAMES {
+                made.remove(&format!("images/{name}"));
+                let renamed = name.replace("png", ending);
+                made.replace(listing, name, &renamed);
+                let alpha = |x, _| image::Rgba([255, 102, 0, if x < 10 { 51 } else { 255 }]);
+                let image = image::RgbaImage::from_fn(SIZE.0, SIZE.1, alpha);
+                image.save(made.file(&format!("images/{renamed}"))).unwrap();
+            }
+            let data = load(&made);
+            assert_eq!(data.train.len(), 3);
+            for view in &data.train {
+                assert!(view.source.header.has_alpha, "{}", view.name);
+                let image = view.source.load().unwrap();
+                for (x, expected) in [(0, [0.2, 0.88, 0.8]), (10, [1.0, 0.4, 0.0])] {
+                    let found = image.composited(x, 0, [0.0, 1.0, 1.0]);
+                    let near = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6);
+                    assert!(near, "{listing}, {}: {found:?}", view.name);
+                }
+            }
         }
     }
 }

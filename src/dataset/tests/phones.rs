@@ -179,3 +179,159 @@ fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
     let error = Dataset::load(made.path(), &options).unwrap_err().to_string();
     assert!(error.contains("`..`"), "{error}");
 }
+
+/// Where a path began does not matter, nor on which system, nor whether it is told what the file ends with.
+#[test]
+fn paths_of_any_system_are_found_by_their_ends() {
+    let with_images = || LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+    for (written, found) in [
+        ("file:///C:/Users/me/b.png", Some("b.png")),
+        (r"\\?\C:\Users\me\b.png", Some("b.png")),
+        (r"\\host\share\walk\b.png", Some("b.png")),
+        ("C:b.png", Some("b.png")),
+        ("/home/x:y/walk/b.png", Some("b.png")),
+        ("/home/me/b", Some("b")),
+        (r"C:\Users\me\none.png", None),
+    ] {
+        let made = Made::transforms(|json| json["frames"][1]["file_path"] = written.into());
+        std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+        let data = Dataset::load(made.path(), &with_images()).unwrap_or_else(|e| panic!("{e}"));
+        let names: Vec<&str> = data.train.iter().map(|view| &*view.name).collect();
+        let mut expected: Vec<&str> =
+            found.into_iter().chain(["images/a.png", "images/c.png"]).collect();
+        expected.sort_unstable();
+        assert_eq!(names, expected, "{written}");
+    }
+    for (written, words) in [
+        (r"C:\", "frames[1].file_path, is empty"),
+        ("file:///", "frames[1].file_path, is empty"),
+        ("/home/../b.png", "frames[1].file_path, `..`"),
+        ("/home/me/b.png\u{7}", "frames[1].file_path, control character"),
+    ] {
+        let made = Made::transforms(|json| json["frames"][1]["file_path"] = written.into());
+        std::fs::create_dir(made.file("moved")).unwrap();
+        refused(&made, &with_images(), words);
+    }
+    // The tables of other programs.
+    let colmap = Made::colmap_txt();
+    colmap.replace("sparse/0/images.txt", "b.png", "C:/walk/b.png");
+    let table = Made::realitycapture();
+    table.replace("cameras.csv", "images/b.png", r"C:\walk\b.png");
+    for (made, folder) in [(colmap, ""), (table, "images/")] {
+        refused(&made, &LoadOptions::default(), "C:, is absolute, --images");
+        std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+        let data = Dataset::load(made.path(), &with_images()).unwrap_or_else(|e| panic!("{e}"));
+        let names: Vec<&str> = data.train.iter().map(|view| &*view.name).collect();
+        let [a, c] = ["a.png", "c.png"].map(|name| format!("{folder}{name}"));
+        let mut expected = ["b.png", &*a, &*c];
+        expected.sort_unstable();
+        assert_eq!(names, expected);
+    }
+}
+
+/// Of two paths with one end, only one can be meant; and a view that is trained on must not be held out.
+#[test]
+fn two_paths_to_one_photograph_are_refused() {
+    let twice = ["/x/train/r_0.png", "/x/test/r_0.png"];
+    let made = Made::transforms(|json| {
+        for (frame, path) in json["frames"].as_array_mut().unwrap().iter_mut().zip(twice) {
+            frame["file_path"] = path.into();
+        }
+    });
+    for path in ["moved/r_0.png", "moved/c.png"] {
+        image(&made.file(path), (20, 12), 9);
+    }
+    let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+    let words = "/x/train/r_0.png, /x/test/r_0.png, same file, moved/r_0.png, --images";
+    refused(&made, &options, words);
+    let all = std::fs::read_to_string(made.file("transforms.json")).unwrap();
+    let all: Value = serde_json::from_str(&all).unwrap();
+    for (file, frames) in
+        [("transforms_train.json", &[0, 2][..]), ("transforms_test.json", &[1][..])]
+    {
+        let mut part = all.clone();
+        part["frames"] = frames.iter().map(|&at: &usize| all["frames"][at].clone()).collect();
+        made.write(file, part.to_string());
+    }
+    refused(&made, &options, words);
+    // In folders of their own they are told apart.
+    for path in ["moved/train/r_0.png", "moved/test/r_0.png"] {
+        image(&made.file(path), (20, 12), 9);
+    }
+    let data = Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!((data.train.len(), &*data.test[0].name), (2, "test/r_0.png"));
+}
+
+#[test]
+fn what_belongs_to_photographs_of_another_machine_is_found_too() {
+    let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+    let made = || {
+        let made = Made::transforms(|json| {
+            json["ply_file_path"] = "/home/me/walk/points.ply".into();
+            json["frames"][1]["file_path"] = "/home/me/walk/b.png".into();
+            json["frames"][1]["mask_path"] = "/home/me/walk/masks/hidden.png".into();
+            json["test_filenames"] = json!(["b.png"]);
+        });
+        std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+        made
+    };
+    let load = |made: &Made| Dataset::load(made.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    let place = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
+    let found = made();
+    for path in ["masks/hidden.png", "masks/b.png", "hidden.png"] {
+        image(&found.file(path), (20, 12), 255);
+    }
+    let data = load(&found);
+    assert_eq!((data.train.len(), data.test.len(), data.points.len()), (2, 1, 200));
+    assert!(place(&data).ends_with("masks/hidden.png"));
+    // Else under the photograph's name; what lies elsewhere may be a photograph.
+    found.remove("masks/hidden.png");
+    assert!(place(&load(&found)).ends_with("masks/b.png"));
+    found.remove("masks/b.png");
+    refused(&found, &options, "frames[1].mask_path, hidden.png, `masks/`");
+    // Points that did not come along are left out.
+    let without = made();
+    image(&without.file("masks/b.png"), (20, 12), 255);
+    without.remove("points.ply");
+    let data = load(&without);
+    let said = |note: &String| note.contains("points.ply") && note.contains("left out");
+    assert!(data.points.is_empty() && data.notes.iter().any(said), "{:?}", data.notes);
+    // Without the folder nothing is guessed.
+    std::fs::rename(without.file("moved"), without.file("images")).unwrap();
+    refused(&without, &LoadOptions::default(), "is absolute, --images");
+}
+
+#[test]
+fn names_may_have_the_separators_of_windows() {
+    let made = Made::transforms(|json| {
+        json["ply_file_path"] = r"cloud\points.ply".into();
+        json["frames"][1]["file_path"] = r"images\b.png".into();
+        json["frames"][1]["mask_path"] = r"hidden\b.png".into();
+        json["test_filenames"] = json!([r"images\a.png"]);
+    });
+    std::fs::create_dir(made.file("cloud")).unwrap();
+    std::fs::rename(made.file("points.ply"), made.file("cloud/points.ply")).unwrap();
+    image(&made.file("hidden/b.png"), (20, 12), 255);
+    let data = load(&made);
+    let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+    assert_eq!(names(&data.train), ["images/b.png", "images/c.png"]);
+    assert_eq!(names(&data.test), ["images/a.png"]);
+    assert!(data.train[0].source.mask.is_some() && data.points.len() == 200);
+    std::fs::rename(made.file("images"), made.file("moved")).unwrap();
+    let options = LoadOptions { images: Some("moved".into()), ..LoadOptions::default() };
+    assert_eq!(Dataset::load(made.path(), &options).unwrap().train.len(), 2);
+    // A file of that very name comes first, where there can be one.
+    #[cfg(unix)]
+    {
+        std::fs::rename(made.file("moved"), made.file("images")).unwrap();
+        image(&made.file(r"images\b.png"), (20, 12), 7);
+        assert_eq!(load(&made).train[1].source.load().unwrap().rgb[0], 7);
+    }
+}
+
+fn refused(made: &Made, options: &LoadOptions, words: &str) {
+    let message = Dataset::load(made.path(), options).unwrap_err().to_string();
+    for word in words.split(", ") {
+        assert!(message.contains(word), "{word:?} is not in: {message}");
+    }
+}

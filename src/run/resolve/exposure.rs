@@ -29,8 +29,8 @@ pub(in crate::run) struct Exposure {
 }
 
 impl Exposure {
-    /// Decides it: from the configuration of a run that goes on, else as the option says, else from the
-    /// colours of tracks. What it begins with is from these, and from EXIF where they say nothing.
+    /// Decides it: from the configuration of a run that goes on from a checkpoint, else as the option says, else
+    /// from the colours of tracks. What it begins with is from these, and from EXIF where they say nothing.
     pub(in crate::run) fn decide(
         spec: &RunSpec,
         saved: Option<&RunConfig>,

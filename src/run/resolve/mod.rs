@@ -49,6 +49,26 @@ pub(super) const DECODERS: usize = 2;
 /// Threads that decode test views.
 pub(super) const TEST_DECODERS: usize = 1;
 
+/// What is known of a run before its scene is read.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Known<'a> {
+    /// How it was prepared.
+    pub(super) config: &'a RunConfig,
+    /// What becomes of what its photographs begin with.
+    pub(super) exposures: Begun,
+}
+
+/// What photographs begin with is in no file but a checkpoint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Begun {
+    /// A checkpoint has it.
+    Kept,
+    /// There is none yet: it is found again.
+    Anew,
+    /// Only the bytes that finding it takes are asked for.
+    Reckoned,
+}
+
 /// What a run starts from, before its size is known.
 pub(super) struct Inputs<'a> {
     pub(super) spec: &'a RunSpec,
@@ -78,21 +98,24 @@ pub(super) struct Inputs<'a> {
 }
 
 impl<'a> Inputs<'a> {
-    /// Opens the device and loads the dataset. `saved` is the configuration of a run that is resumed.
+    /// Opens the device and loads the dataset. `known` is of a run that goes on, or is only reckoned.
     pub(super) fn load(
         spec: &'a RunSpec,
-        saved: Option<&RunConfig>,
+        known: Option<Known<'_>>,
         observer: &dyn Observer,
     ) -> Result<Self, Failure> {
+        let saved = known.map(|known| known.config);
+        let exposures = known.map_or(Begun::Anew, |known| known.exposures);
+        let kept = known.filter(|_| exposures != Begun::Anew).map(|known| known.config);
         let (entry, parameters) = spec.policy()?;
         let mut knobs = spec.knobs()?;
         check_automatic(spec)?;
         let device = open(spec, &mut knobs, observer)?;
         use_threads(spec.device.threads);
         let scene = spec.scene()?;
-        let with_tracks = saved.is_none()
-            && (spec.size.sh_degree == Some(ShDegree::Auto(None))
-                || spec.schedule.exposure != ExposureChoice::Off);
+        let is_exposed = spec.schedule.exposure != ExposureChoice::Off;
+        let with_tracks = spec.size.sh_degree == Some(ShDegree::Auto(None)) && saved.is_none()
+            || is_exposed && exposures != Begun::Kept;
         let mut dataset = Dataset::load(scene, &spec.data.load_options(with_tracks))?;
         for note in &dataset.notes {
             observer.say(format_args!("note: {note}"));
@@ -117,16 +140,17 @@ impl<'a> Inputs<'a> {
         let peak = peak_resident();
         let colours = match dataset.tracks.len() {
             ..MIN_TRACKS => None,
+            _ if exposures == Begun::Reckoned => None,
             _ => Some(TrackColours::read(&dataset.tracks, &dataset.train)?),
         };
         let track_bytes =
             if with_tracks { dataset.tracks.bytes() + spread::bytes(&dataset.tracks) } else { 0 };
         let degree = Degree::decide(spec, saved, &dataset, colours.as_ref());
-        let reported = match saved.is_none() && spec.schedule.exposure != ExposureChoice::Off {
+        let reported = match is_exposed && exposures == Begun::Anew {
             true => ReportedExposures::of(&dataset.train),
             false => ReportedExposures::default(),
         };
-        let exposure = Exposure::decide(spec, saved, colours.as_ref(), &reported);
+        let exposure = Exposure::decide(spec, kept, colours.as_ref(), &reported);
         for note in exposure.notes() {
             observer.say(format_args!("note: {note}"));
         }

@@ -3,7 +3,7 @@
 use std::fmt;
 
 use super::size::{self, MIB, RESOLUTIONS, Size};
-use super::{Inputs, ModelSize, RunConfig, RunSpec};
+use super::{Begun, Inputs, Known, ModelSize, RunConfig, RunSpec};
 use crate::dataset::Resolution;
 use crate::exposure::ExposureChoice;
 use crate::failure::Failure;
@@ -62,7 +62,8 @@ pub(crate) fn promised(
     let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
     let resolved = Resolved { init_model, frozen, has_exposures, ..Resolved::default() };
     let config = RunConfig { densify: String::new(), spec: spec.clone(), resolved };
-    let inputs = Inputs::load(spec, Some(&config), observer)?;
+    let known = Known { config: &config, exposures: Begun::Reckoned };
+    let inputs = Inputs::load(spec, Some(known), observer)?;
     let setting = Size::choose(&inputs)?.setting;
     let ledger = inputs.ledger(&setting, &inputs.needs(setting.rows)?);
     Ok((setting.rows, ledger))

@@ -199,6 +199,8 @@ fn what_cannot_be_planned_is_named_and_nothing_is_written() {
     plan("--rows 400 --blocks 2 -- --view").refused("own", &["--view", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --budget 9").refused("own", &["--budget", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --sh-degree auto").refused("auto", &["--sh-degree auto"]);
+    plan("--rows 400 --blocks 2 -- --exposure auto")
+        .refused("auto", &["--exposure auto", "give on or off"]);
     plan("--rows 400").refused("auto needs memory", &["--memory"]);
     plan("--blocks 2").refused("no size", &["--rows"]);
     plan("--rows 400 --blocks 0").refused("no block", &["--blocks", "3x2"]);

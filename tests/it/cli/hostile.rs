@@ -153,6 +153,65 @@ fn what_cannot_be_trained_on_is_refused_with_its_place() {
     assert!(message.contains(&first) && message.contains("--images"), "{message}");
 }
 
+/// A ZIP archive of one file.
+fn archive(name: &str, contents: &[u8]) -> Vec<u8> {
+    let mut writer = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    writer.start_file(name, zip::write::SimpleFileOptions::default()).expect("a file");
+    std::io::Write::write_all(&mut writer, contents).expect("its bytes");
+    writer.finish().expect("an archive").into_inner()
+}
+
+/// What photographs and their archives must not bring along: a message with the remedy, and nothing written.
+#[test]
+fn what_lenses_and_archives_must_not_be_is_refused() {
+    let lens = |lens: &str| {
+        let scene = Photographs::colmap_text();
+        scene.replace("sparse/0/cameras.txt", "PINHOLE 48 40 52 52 24 20", lens);
+        scene
+    };
+    let zip = |name: &str, contents: &[u8]| {
+        let scene = Photographs::colmap_text();
+        scene.write("scan.zip", archive(name, contents));
+        scene
+    };
+    for (scene, file, words) in [
+        (
+            lens("RADIAL 48 40 52 24 20 -3 0"),
+            "",
+            &["images.txt", "folds over", "largest usable field", "--keep-fov"][..],
+        ),
+        (
+            lens("OPENCV 48 40 52 52 24 20 nan 0 0 0"),
+            "",
+            &[
+                "cameras.txt",
+                "camera 1",
+                "distortion",
+                "not finite",
+                "repair the camera's parameters",
+            ],
+        ),
+        (
+            zip("images/zeros.png", &vec![0; 65 << 20]),
+            "scan.zip",
+            &["scan.zip", "unpacks to more than 64.0 MiB", "unpack it yourself"],
+        ),
+        (
+            zip("../../out.png", b"?"),
+            "scan.zip",
+            &["scan.zip", "../../out.png", "`..`", "pack the folder again"],
+        ),
+    ] {
+        let (_root, run) = scratch();
+        let outcome = train(&scene.file(file), &run, 3, "--budget 300");
+        let message = refusal(&outcome);
+        for word in words {
+            assert!(message.contains(word), "{word:?} is not in: {message}");
+        }
+        assert!(!run.exists(), "{message}");
+    }
+}
+
 #[test]
 fn how_many_images_have_poses_is_said() {
     let scene = Photographs::colmap_text();
