@@ -12,6 +12,9 @@ use pulp::{Scalar, Simd};
 /// Rows per block, and pixels per tile row: every lane count divides it.
 pub(super) const WIDTH: usize = 16;
 
+/// The bit of a lane that says whether it is negative.
+const SIGN: u32 = 1 << 31;
+
 /// `[e(0), e(1), …]` without a closure: `each!(k in 3 => e(k))`.
 ///
 /// Closures, those given to `array::map` among them, are compiled without the kernel's instruction
@@ -100,9 +103,12 @@ impl<S: Simd> V<S> {
         Self { s: self.s, v: self.s.max_f32s(self.v, b.v) }
     }
 
+    /// Not by `abs_f32s`, which is called instead of being one instruction: 11 % of a step's time.
     #[inline(always)]
     pub(super) fn abs(self) -> Self {
-        Self { s: self.s, v: self.s.abs_f32s(self.v) }
+        let s = self.s;
+        let bits = s.transmute_u32s_f32s(self.v);
+        Self::of_bits(s, s.and_u32s(bits, s.splat_u32s(!SIGN)))
     }
 
     #[inline(always)]
@@ -386,7 +392,9 @@ impl<S: Simd> Neg for V<S> {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        Self { s: self.s, v: self.s.neg_f32s(self.v) }
+        let s = self.s;
+        let bits = s.transmute_u32s_f32s(self.v);
+        Self::of_bits(s, s.xor_u32s(bits, s.splat_u32s(SIGN)))
     }
 }
 
