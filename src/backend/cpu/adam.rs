@@ -133,8 +133,8 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
 
 /// x in [least, most]; NaN stays NaN.
 #[inline(always)]
-fn clamp<S: Simd>(s: S, x: V<S>, [least, most]: [f32; 2]) -> V<S> {
-    let [least, most] = [least, most].map(|bound| V::splat(s, bound));
+fn clamp<S: Simd>(s: S, x: V<S>, bounds: [f32; 2]) -> V<S> {
+    let [least, most] = each!(i in 2 => V::splat(s, bounds[i]));
     let x = x.lt(least).select(least, x);
     most.lt(x).select(most, x)
 }

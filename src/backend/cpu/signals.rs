@@ -73,7 +73,7 @@ impl SignalPlanes {
                         weight * norm2(line!(g.mean2d[0]) * half[0], line!(g.mean2d[1]) * half[1])
                     }
                     Signal::ScreenGradientAbs => {
-                        let abs = [0, 1].map(|i| line!(g.mean2d_abs[i]) * half[i]);
+                        let abs = each!(i in 2 => line!(g.mean2d_abs[i]) * half[i]);
                         weight * norm2(abs[0], abs[1])
                     }
                     Signal::ColourGradient => {
